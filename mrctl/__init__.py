@@ -1,0 +1,41 @@
+"""A physics testbed for adaptive control of a car-like robot."""
+
+from mrctl.control.fel import Fel, save_weights
+from mrctl.control.kanayama import Kanayama
+from mrctl.control.pid import Pid
+from mrctl.control.rls import Rls
+from mrctl.metrics import per_lap, summary
+from mrctl.record import InputError
+from mrctl.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
+from mrctl.result import open_result as open
+from mrctl.result import save
+from mrctl.robot import PERTURBATIONS, Perturbation, Robot
+from mrctl.scenario import Event, Scenario
+from mrctl.simulate import Simulation, simulate
+
+__all__ = [
+    "PERTURBATIONS",
+    "Circle",
+    "Event",
+    "Fel",
+    "InputError",
+    "Kanayama",
+    "LaneChange",
+    "Lemniscate",
+    "Line",
+    "Perturbation",
+    "Pid",
+    "Rls",
+    "Robot",
+    "RoundedSquare",
+    "Scenario",
+    "Simulation",
+    "StopAndGo",
+    "Waypoints",
+    "open",
+    "per_lap",
+    "save",
+    "save_weights",
+    "simulate",
+    "summary",
+]

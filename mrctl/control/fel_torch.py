@@ -1,0 +1,118 @@
+"""Feedback-error learning with any stateless torch module: the general form of `fel`, per-robot copies by autograd."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import torch
+from torch import nn
+from torch.func import functional_call, stack_module_state, vjp, vmap
+
+from mrctl.control.fel import BIAS_GAIN, HIDDEN_GAIN, INPUTS, OUTPUTS, REGULARISATION, Fel
+from mrctl.control.feedforward import Array, feature_scale, features
+from mrctl.robot import Robot
+
+
+class Network(nn.Module):
+    """The torch twin of the compiled network: 8 features in, 2 scaled channels out; weights move between the two."""
+
+    def __init__(self, hidden: int = 24) -> None:
+        """Takes the number of hidden units; the layers behind them start at zero."""
+        super().__init__()
+        self.hidden = nn.Linear(INPUTS, hidden, dtype=torch.float64)
+        self.output = nn.Linear(hidden, OUTPUTS, dtype=torch.float64)
+        self.direct = nn.Linear(INPUTS, OUTPUTS, bias=False, dtype=torch.float64)
+        for parameter in (self.output.weight, self.output.bias, self.direct.weight):
+            nn.init.zeros_(parameter)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """`(…, 8)` to `(…, 2)`."""
+        hidden = HIDDEN_GAIN * torch.tanh(self.hidden(x))
+        return hidden @ self.output.weight.T + BIAS_GAIN * self.output.bias + self.direct(x)
+
+
+class ModuleLearning:
+    """Feedback-error learning of B copies of a torch module, with the update and safeguards of `fel`.
+
+    The output is scale · (f_W(x) − f_W₀(x)), so learning begins as pure PID whatever the module. Pass it to `simulate`
+    as `feedforward=lambda robot, size: ModuleLearning(module, robot, size)`.
+
+    Attributes:
+        state: Parameters by name, each with a leading B.
+        weight_norm: Euclidean distance of the parameters from their start, `(B,)`.
+    """
+
+    def __init__(
+        self, module: nn.Module, robot: Robot, size: int, settings: Fel | None = None, rigid: bool = False
+    ) -> None:
+        """Copies a module for B robots.
+
+        Args:
+            module: Maps `(8,)` scaled features to `(2,)` channels; no buffers, so no running statistics.
+            robot: Nominal robot, for the scales.
+            size: B.
+            settings: As for `fel`; `hidden` and `weights` are the module's own business.
+            rigid: Whether the second channel is steering.
+
+        Raises:
+            ValueError: The module has buffers, or does not map 8 inputs to 2 outputs.
+        """
+        if buffers := [name for name, _ in module.named_buffers()]:
+            raise ValueError(f"module: {buffers[0]} is a buffer; a module with running state cannot be copied per robot")
+        settings = settings or Fel()
+        self._module = copy.deepcopy(module).double().eval()
+        shape = tuple(self._module(torch.zeros(INPUTS, dtype=torch.float64)).shape)
+        if shape != (OUTPUTS,):
+            raise ValueError(f"module: maps 8 features to shape {shape}, not to 2 channels")
+        self._half_track = robot.half_track
+        self._scale = feature_scale(robot)
+        self._targets = torch.tensor(settings.targets(rigid))
+        self._step, self._leak, self._bound = settings.steps()
+        self._features = np.zeros((size, INPUTS))
+        stacked, _ = stack_module_state([self._module] * size)
+        self.prior = {name: value.detach().clone() for name, value in stacked.items()}
+        self.state = {name: value.clone() for name, value in self.prior.items()}
+        self.weight_norm = np.zeros(size)
+
+    def _forward(self, parameters: dict[str, torch.Tensor]) -> torch.Tensor:
+        x = torch.from_numpy(self._features)
+        return vmap(lambda p, row: functional_call(self._module, p, (row,)))(parameters, x)
+
+    def output(self, command: Array, derivative: Array) -> Array:
+        """The modules at the commanded motion."""
+        features(command, derivative, self._half_track, self._scale, self._features)
+        with torch.no_grad():
+            return (self._targets[0] * (self._forward(self.state) - self._forward(self.prior))).numpy()
+
+    def learn(self, feedback: Array, saturated: Array) -> None:
+        """One normalised step, by a vector-Jacobian product; see `fel.update`."""
+        scale, dead_zone, share = self._targets
+        fb = torch.from_numpy(np.array(feedback))
+        error = torch.where(fb.abs() > dead_zone, share * fb / scale, 0.0)
+        power = (error**2).sum(1)
+        active = (power > 0) & (torch.from_numpy(np.array(saturated)) == 0) & bool(self._step > 0)
+        _, pull = vjp(self._forward, self.state)
+        (gradient,) = pull(error)
+        square = sum(_row(g**2).sum(1) for g in gradient.values())
+        rate = torch.where(active, self._step / (square / power.clamp_min(1e-300) + REGULARISATION), 0.0)
+        leak = torch.where(active, self._leak, 0.0)
+        moved = {
+            name: self.state[name] + _like(rate, g) * g - _like(leak, g) * (self.state[name] - self.prior[name])
+            for name, g in gradient.items()
+        }
+        distance = sum(_row((moved[name] - self.prior[name]) ** 2).sum(1) for name in moved).sqrt()
+        shrink = torch.where(active & (distance > self._bound), self._bound / distance.clamp_min(1e-300), 1.0)
+        for name, value in moved.items():
+            self.state[name] = self.prior[name] + (value - self.prior[name]) * _like(shrink, value)
+        self.weight_norm = torch.where(active, distance.clamp_max(self._bound), torch.from_numpy(self.weight_norm)).numpy()
+
+
+def _row(value: torch.Tensor) -> torch.Tensor:
+    """`(B, …)` to `(B, n)`."""
+    return value.reshape(len(value), -1)
+
+
+def _like(row: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+    """`(B,)` shaped to broadcast against `(B, …)`."""
+    return row.reshape(-1, *[1] * (value.ndim - 1))

@@ -1,0 +1,132 @@
+"""The paper's figure 3: motion controller over velocity controller, wired for B robots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrctl.control import steering
+from mrctl.control.fel import FeedbackErrorLearning
+from mrctl.control.feedforward import Feedforward, InverseDynamics, NoFeedforward
+from mrctl.control.kanayama import Kanayama, kanayama
+from mrctl.control.limiter import limit
+from mrctl.control.pid import Pid, pid
+from mrctl.control.rls import RecursiveLeastSquares
+from mrctl.control.steering import allocate
+from mrctl.robot import Robot
+from mrctl.scenario import Scenario
+
+Array = NDArray[np.float64]
+
+
+def feedforward_of(scenarios: Sequence[Scenario], robot: Robot) -> Feedforward:
+    """The named feedforward of a uniform group of scenarios."""
+    first = scenarios[0]
+    rigid = first.steering == "rigid"
+    if first.feedforward == "none":
+        return NoFeedforward(len(scenarios))
+    if first.feedforward in ("model", "oracle"):  # the loop tells the oracle the truth
+        return InverseDynamics([robot] * len(scenarios), rigid)
+    if first.feedforward == "rls":
+        return RecursiveLeastSquares(robot, [s.rls for s in scenarios])
+    return FeedbackErrorLearning(robot, [s.fel for s in scenarios], [s.seed for s in scenarios], rigid)
+
+
+class Hierarchy:
+    """Both controllers for B robots that share steering arrangement and rates.
+
+    Attributes:
+        feedforward: The feedforward stage.
+        error: Posture error in the robot's frame `(B, 3)`.
+        command: Prefiltered twist command `(B, 2)`.
+        derivative: Its derivative `(B, 2)`.
+        feedback: Output of the PID for the two channels `(B, 2)`.
+        parts: Feedback left and right, feedforward left and right in V, before the limit, `(B, 4)`.
+        output: Voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
+        saturated: 1 where a limit acted, `(B,)`.
+    """
+
+    def __init__(self, scenarios: Sequence[Scenario], robot: Robot, feedforward: Feedforward) -> None:
+        """Takes a uniform group of scenarios, the nominal robot and a feedforward stage."""
+        first, size = scenarios[0], len(scenarios)
+        self.feedforward = feedforward
+        self._robot = robot
+        self._rigid = first.steering == "rigid"
+        self._period = first.control_period
+        self._every = round(first.motion_period / first.control_period)
+        self._tick = 0
+        self._prefilter = np.array([max(s.prefilter, s.control_period) for s in scenarios])
+        self._limits = np.array(
+            [robot.max_speed, robot.max_rotation, robot.max_acceleration, robot.max_rotation_acceleration]
+        )
+        self._parameters = steering.parameters(robot, self._rigid)
+        self._kanayama = np.zeros((size, 3))
+        self._pid = np.zeros((size, 2, 4))
+        self._frozen = np.zeros(size)
+        for row, scenario in enumerate(scenarios):
+            self.set_kanayama(row, scenario.kanayama)
+            self.set_pid(row, scenario.pid)
+        self.state = {"limiter": np.zeros((size, 4)), "pid": np.zeros((size, 7)), "steering": np.zeros((size, 2))}
+        self._request, self._correction = np.zeros((size, 2)), np.zeros((size, 2))
+        self._excess = np.zeros((size, 2))
+        self.error = np.zeros((size, 3))
+        self.command, self.derivative = np.zeros((size, 2)), np.zeros((size, 2))
+        self.feedback, self.parts = np.zeros((size, 2)), np.zeros((size, 4))
+        self.output, self.saturated = np.zeros((size, 4)), np.zeros(size)
+        self._no_weights = np.zeros(size)
+
+    def set_kanayama(self, row: int, gains: Kanayama) -> None:
+        """Changes the motion controller of one robot."""
+        self._kanayama[row] = gains.k_x, gains.k_y, gains.k_theta
+
+    def set_pid(self, row: int, design: Pid) -> None:
+        """Changes the velocity feedback of one robot."""
+        self._pid[row] = design.gains(self._robot, self._rigid)
+
+    def set_learning(self, row: int, on: bool) -> None:
+        """Lets the feedforward of one robot learn, or not."""
+        self._frozen[row] = float(not on)
+
+    def reset(self, twist: Array, steering_angle: Array) -> None:
+        """Starts from a twist `(B, 2)` that the robots already have, and steering angles `(B,)`."""
+        self.state["limiter"][:, 2:] = twist
+        self.state["steering"][:, 0] = steering_angle
+
+    def update(self, pose: Array, twist: Array, reference: Array, reference_twist: Array, acceleration: Array) -> Array:
+        """One control tick.
+
+        Args:
+            pose: Measured posture `(B, 3)`.
+            twist: Measured twist `(B, 2)`.
+            reference: Reference posture `(B, 3)`.
+            reference_twist: Reference twist `(B, 2)`.
+            acceleration: Its derivative `(B, 2)`.
+
+        Returns:
+            `output`, `(B, 4)`.
+        """
+        state = self.state
+        if self._tick % self._every == 0:
+            kanayama(pose, reference, reference_twist, self._kanayama, self.error, self._request)
+            np.subtract(self._request, reference_twist, out=self._correction)
+        self._tick += 1
+        limit(
+            reference_twist + self._correction, reference_twist, acceleration, self._limits, self._prefilter,
+            self._period, state["limiter"], self.command, self.derivative,
+        )  # fmt: skip
+        pid(self.command, twist, self._pid, self._period, self._excess, state["pid"], self.feedback)
+        feedforward = self.feedforward.output(self.command, self.derivative)
+        allocate(
+            self.command, self.derivative, self.feedback, feedforward, self._parameters, self._period, state["steering"],
+            self.output, self.parts, self._excess, self.saturated,
+        )  # fmt: skip
+        # A robot that must not learn is treated as one whose voltage did not act.
+        self.feedforward.learn(self.feedback, np.maximum(self.saturated, self._frozen))
+        return self.output
+
+    @property
+    def weight_norm(self) -> Array:
+        """Size of what the feedforward has learned, `(B,)`."""
+        return getattr(self.feedforward, "weight_norm", self._no_weights)

@@ -1,0 +1,104 @@
+"""Recursive least squares on the 8 physical features, taught by the feedback voltage."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from numba import float64, guvectorize
+from pydantic import Field
+
+from mrctl.control.feedforward import Array, feature_scale, features, linear
+from mrctl.record import Record
+from mrctl.robot import Robot
+
+
+class Rls(Record):
+    """Settings of the `rls` feedforward."""
+
+    initial_covariance: Annotated[float, Field(gt=0, le=1e3)] = 0.05
+    """Diagonal of the initial covariance of the coefficients, relative to the variance of the feedback."""
+    drift: Annotated[float, Field(ge=0, le=1)] = 3e-5
+    """Variance that every coefficient gains each control period: how fast the truth may wander."""
+    covariance_bound: Annotated[float, Field(gt=0, le=1e3)] = 0.05
+    """A diagonal element above this gains no more; without excitation it would grow for ever."""
+    dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
+    """Feedback below this teaches nothing, V (rad/s on a steering channel)."""
+
+
+@guvectorize(
+    [(float64[:], float64[:], float64, float64[:], float64[:, :], float64[:, :], float64[:])],
+    "(f),(u),(),(s),(f,u),(f,f),()",
+    writable_args=("coefficients", "covariance", "norm"),
+    cache=True,
+)
+def update(x, feedback, saturated, settings, coefficients, covariance, norm):  # noqa: ANN001, ANN201
+    """One recursive step whose innovation is the feedback voltage, for one robot.
+
+    Recursive least squares for drifting coefficients (Ljung 1999, section 11.2): the Kalman filter of a random walk.
+    Exponential forgetting would inflate the directions that a lap never excites and starve the others at the bound.
+
+    Args:
+        x: Scaled features `(8,)`.
+        feedback: `(2,)`.
+        saturated: 1 freezes everything.
+        settings: Drift, covariance bound, dead zone, `(3,)`.
+        coefficients: In and out, `(8, 2)`.
+        covariance: In and out, `(8, 8)`.
+        norm: Out: Euclidean norm of the coefficients.
+    """
+    drift, bound, dead_zone = settings[0], settings[1], settings[2]
+    if saturated > 0 or (abs(feedback[0]) <= dead_zone and abs(feedback[1]) <= dead_zone):
+        return
+    n = x.shape[0]
+    gain = np.empty(n)
+    total = 1.0
+    for i in range(n):
+        gain[i] = 0.0
+        for j in range(n):
+            gain[i] += covariance[i, j] * x[j]
+        total += x[i] * gain[i]
+    for i in range(n):
+        for j in range(n):
+            covariance[i, j] -= gain[i] * gain[j] / total
+        if covariance[i, i] < bound:
+            covariance[i, i] += drift
+        for k in range(2):
+            if abs(feedback[k]) > dead_zone:
+                coefficients[i, k] += gain[i] / total * feedback[k]
+    norm[0] = np.sqrt((coefficients**2).sum())
+
+
+class RecursiveLeastSquares:
+    """`rls` for B robots: U_ff = θᵀ features, θ from zero.
+
+    Attributes:
+        state: `coefficients` `(B, 8, 2)` and `covariance` `(B, 8, 8)`.
+        weight_norm: Euclidean norm of the coefficients, `(B,)`.
+    """
+
+    def __init__(self, robot: Robot, settings: list[Rls]) -> None:
+        """Takes the nominal robot (for the scales alone) and settings a row."""
+        size = len(settings)
+        self._half_track = robot.half_track
+        self._scale = feature_scale(robot)
+        self._settings = np.array([[s.drift, s.covariance_bound, s.dead_zone] for s in settings])
+        self._features = np.zeros((size, 8))
+        self.weight_norm = np.zeros(size)
+        self.state = {
+            "coefficients": np.zeros((size, 8, 2)),
+            "covariance": np.array([s.initial_covariance * np.eye(8) for s in settings]),
+        }
+
+    def output(self, command: Array, derivative: Array) -> Array:
+        """θᵀ features of the commanded motion."""
+        features(command, derivative, self._half_track, self._scale, self._features)
+        return linear(self._features, self.state["coefficients"])
+
+    def learn(self, feedback: Array, saturated: Array) -> None:
+        """One recursive step."""
+        state = self.state
+        update(
+            self._features, feedback, saturated, self._settings, state["coefficients"], state["covariance"],
+            self.weight_norm,
+        )  # fmt: skip

@@ -1,0 +1,63 @@
+"""Typed, frozen configuration: the base of everything that is read from a file."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+
+class InputError(ValueError):
+    """Bad input from outside: one line that names the field or the file."""
+
+
+class Record(BaseModel):
+    """A frozen record: unknown keys and non-finite numbers are refused by name."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+    @classmethod
+    def from_dict(cls, values: object, source: str = "") -> Self:
+        """Validates plain data.
+
+        Args:
+            values: What a TOML or JSON file holds.
+            source: Where it came from, for the message.
+
+        Raises:
+            InputError: One line that names the first offending field.
+        """
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise InputError(describe(error, source)) from None
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Reads and validates a TOML file.
+
+        Raises:
+            InputError: The file cannot be read, is not TOML, or names a bad field.
+        """
+        try:
+            text = Path(path).read_bytes().decode()
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+        try:
+            values = tomllib.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path}: not TOML: {error}") from None
+        return cls.from_dict(values, str(path))
+
+
+def describe(error: ValidationError, source: str = "") -> str:
+    """One line for a pydantic error: `source: field.subfield: what is wrong`."""
+    first, *rest = error.errors()
+    field = ".".join(str(part) for part in first["loc"])
+    message = first["msg"].removeprefix("Value error, ")
+    more = f" (and {len(rest)} more)" if rest else ""
+    return " ".join((": ".join(part for part in (source, field, message) if part) + more).split())

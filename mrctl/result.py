@@ -1,0 +1,152 @@
+"""Labelled results: what a run recorded, with units, saved and opened."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from mrctl.record import InputError
+from mrctl.scenario import Scenario
+
+# Name: (unit, meaning), in the order in which the loop records. A sample at time t holds the state at t, the commands
+# computed from it, and the currents and power at the end of the control period that these commands were held for.
+SIGNALS: dict[str, tuple[str, str]] = {
+    "x": ("m", "position of P along the world's x axis"),
+    "y": ("m", "position of P along the world's y axis"),
+    "theta": ("rad", "heading"),
+    "v": ("m/s", "linear velocity"),
+    "omega": ("rad/s", "rotation velocity"),
+    "v_lateral": ("m/s", "lateral velocity of P (slip)"),
+    "wheel_rate_left": ("rad/s", "left wheel rate"),
+    "wheel_rate_right": ("rad/s", "right wheel rate"),
+    "steering_angle": ("rad", "steering angle"),
+    "x_ref": ("m", "reference x"),
+    "y_ref": ("m", "reference y"),
+    "theta_ref": ("rad", "reference heading"),
+    "v_ref": ("m/s", "reference linear velocity"),
+    "omega_ref": ("rad/s", "reference rotation velocity"),
+    "longitudinal_error": ("m", "measured longitudinal error"),
+    "lateral_error": ("m", "measured lateral error"),
+    "heading_error": ("rad", "measured heading error"),
+    "v_measured": ("m/s", "measured linear velocity"),
+    "omega_measured": ("rad/s", "measured rotation velocity"),
+    "v_command": ("m/s", "commanded linear velocity"),
+    "omega_command": ("rad/s", "commanded rotation velocity"),
+    "feedback_left": ("V", "left feedback voltage"),
+    "feedback_right": ("V", "right feedback voltage"),
+    "feedforward_left": ("V", "left feedforward voltage"),
+    "feedforward_right": ("V", "right feedforward voltage"),
+    "voltage_left": ("V", "left commanded voltage"),
+    "voltage_right": ("V", "right commanded voltage"),
+    "steering_command": ("rad", "commanded steering angle"),
+    "steering_rate_command": ("rad/s", "commanded steering rate"),
+    "saturated": ("1", "whether a limit acted"),
+    "weight_norm": ("1", "size of what the feedforward has learned"),
+    "current_left": ("A", "left motor current"),
+    "current_right": ("A", "right motor current"),
+    "power": ("W", "electrical power"),
+}
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that can change a number."""
+    return {name: metadata.version(name) for name in ("mrctl", "mujoco", "dm-control", "numpy", "numba", "torch")}
+
+
+def dataset(
+    scenarios: Sequence[Scenario],
+    labels: Sequence[str],
+    log: NDArray[np.float64],
+    failure: Sequence[str],
+    failure_time: NDArray[np.float64],
+    weights: NDArray[np.float64] | None,
+) -> xr.Dataset:
+    """Labels what a uniform group of runs recorded.
+
+    Args:
+        scenarios: A scenario a run.
+        labels: Name of the feedforward a run.
+        log: `(B, ticks, signals)`.
+        failure: Why a run stopped early, or "".
+        failure_time: When, s, or NaN.
+        weights: Final weights of the network a run, `(B, n)`, or None.
+    """
+    period = scenarios[0].control_period
+    variables: dict[str, tuple] = {
+        name: (("run", "time"), log[:, :, column], {"units": unit, "long_name": meaning})
+        for column, (name, (unit, meaning)) in enumerate(SIGNALS.items())
+    }
+    variables["failed"] = ("run", np.array([bool(reason) for reason in failure]))
+    variables["failure"] = ("run", np.array(failure, dtype=object))
+    variables["failure_time"] = ("run", failure_time, {"units": "s"})
+    if weights is not None:
+        variables["weights"] = (("run", "weight"), weights, {"long_name": "weights at the end, flat"})
+    return xr.Dataset(
+        variables,
+        coords={
+            "time": ("time", period * np.arange(log.shape[1]), {"units": "s"}),
+            "run": np.arange(len(scenarios)),
+            "label": ("run", np.array([s.name or label for s, label in zip(scenarios, labels, strict=True)], object)),
+            "feedforward": ("run", np.array(labels, object)),
+            "steering": ("run", np.array([s.steering for s in scenarios], object)),
+            "seed": ("run", np.array([s.seed for s in scenarios])),
+            "lap_time": ("run", np.array([s.reference.period for s in scenarios]), {"units": "s"}),
+        },
+    )
+
+
+def combine(groups: Sequence[tuple[Sequence[int], xr.Dataset]], scenarios: Sequence[Scenario]) -> xr.Dataset:
+    """Puts groups back into the order the scenarios were given in; shorter runs end in NaN."""
+    parts = [part.assign_coords(run=list(rows)) for rows, part in groups]
+    whole = parts[0] if len(parts) == 1 else xr.concat(parts, "run", join="outer", data_vars="minimal", coords="minimal")
+    whole = whole.sortby("run")
+    whole.attrs = {
+        "scenarios": json.dumps([s.model_dump(mode="json") for s in scenarios]),
+        "versions": json.dumps(versions()),
+        "control_period": scenarios[0].control_period,
+    }
+    return whole
+
+
+def scenarios_of(result: xr.Dataset) -> list[Scenario]:
+    """The resolved scenarios that a result came from, to run again."""
+    return [Scenario.from_dict(values, "scenario") for values in json.loads(result.attrs["scenarios"])]
+
+
+def save(result: xr.Dataset, path: str | Path) -> None:
+    """Writes a result as a zarr store, whole or not at all.
+
+    Raises:
+        InputError: The path exists or cannot be written.
+    """
+    path = Path(path)
+    if path.exists():
+        raise InputError(f"{path}: exists already, nothing was overwritten")
+    partial = path.with_name(path.name + ".partial")
+    text = {name: result[name].astype(str) for name in result.variables if result[name].dtype == object}
+    try:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        result.assign(text).to_zarr(partial, mode="w", zarr_format=3, consolidated=False)
+        partial.rename(path)
+    except OSError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def open_result(path: str | Path) -> xr.Dataset:
+    """Opens a saved result.
+
+    Raises:
+        InputError: There is no result at this path.
+    """
+    try:
+        return xr.open_zarr(path, consolidated=False).load()
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: not a saved result: {str(error).splitlines()[0]}") from None

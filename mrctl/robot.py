@@ -1,0 +1,211 @@
+"""The robot as equations (1) to (3) know it, and what can be wrong with it.
+
+No MuJoCo here: `mrctl.model` reads a `Robot` from a compiled MJCF and applies a `Perturbation` to one.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from mrctl.record import Record
+
+GRAVITY = 9.81  # m/s²
+
+Positive = Annotated[float, Field(ge=1e-9, le=1e9)]
+NonNegative = Annotated[float, Field(ge=0, le=1e9)]
+Factor = Annotated[float, Field(ge=0.05, le=20)]
+
+
+class Robot(Record):
+    """Parameters of a car-like robot, SI units (symbols of the paper in brackets).
+
+    P is the midpoint of the rear axle; the body's x axis points forward, y to the left.
+    """
+
+    mass: Positive
+    """Total mass [M] in kg."""
+    yaw_inertia: Positive
+    """Yaw inertia of the whole robot about its centre of mass [J] in kg·m²."""
+    com_offset: float
+    """Centre of mass ahead of P [c] in m."""
+    com_height: NonNegative
+    """Height of the centre of mass above the ground in m."""
+    wheel_radius: Positive
+    """Rear wheel radius [r] in m."""
+    front_wheel_radius: Positive
+    """Front wheel radius in m."""
+    half_track: Positive
+    """Half the distance between the rear wheels [D] in m."""
+    wheelbase: Positive
+    """Rear axle to steering axis [L] in m."""
+    trail: NonNegative
+    """Front contact point behind the steering axis [t] in m."""
+    steering_limit: Annotated[float, Field(gt=0, lt=1.5)]
+    """Largest steering angle in rad."""
+    resistance: Positive
+    """Terminal resistance [R_a] in Ω."""
+    inductance: NonNegative
+    """Armature inductance [L_a] in H; 0 where the current follows the voltage at once."""
+    torque_constant: Positive
+    """Motor constant [k_M] in N·m/A, and [k_E] in V·s/rad: in SI they are the same number."""
+    gear_ratio: Positive
+    """Motor turns per wheel turn [N]."""
+    rotor_inertia: NonNegative
+    """Rotor inertia at the motor shaft [J_m] in kg·m²."""
+    no_load_current: NonNegative
+    """No-load current [I_0] in A."""
+    gear_loss: NonNegative
+    """Coulomb friction of one gearbox, at the wheel, in N·m."""
+    rolling_coefficient: NonNegative
+    """Rolling resistance over load."""
+    wheel_inertia: Positive
+    """Spin inertia of one rear wheel [J_w] in kg·m²."""
+    front_wheel_inertia: NonNegative
+    """Spin inertia of the front wheel in kg·m²."""
+    supply: Positive
+    """Supply voltage [U_max] in V."""
+    drive_gain: Positive = 1.0
+    """Applied volt per commanded volt; below 1 for a PWM drive on a sagging supply."""
+    tyre_friction: Positive
+    """Coulomb coefficient between tyre and floor."""
+    max_speed: Positive
+    """Limit on |V| for references and commands in m/s."""
+    max_rotation: Positive
+    """Limit on |θ̇| in rad/s."""
+    max_acceleration: Positive
+    """Limit on |V̇| in m/s²."""
+    max_rotation_acceleration: Positive
+    """Limit on |θ̈| in rad/s²."""
+
+    @model_validator(mode="after")
+    def _geometry(self) -> Robot:
+        if self.trail >= self.wheelbase:
+            raise ValueError("trail: must be shorter than the wheelbase")
+        if not 0 <= self.com_offset < self.wheelbase - self.trail:
+            raise ValueError("com_offset: the centre of mass must lie between the rear axle and the front contact")
+        return self
+
+    @property
+    def motor_gain(self) -> float:
+        """Stall torque at the wheel per volt, N k_M / R_a, in N·m/V."""
+        return self.gear_ratio * self.torque_constant / self.resistance
+
+    @property
+    def back_emf(self) -> float:
+        """Back-EMF per wheel rate, k_E N, in V·s/rad."""
+        return self.gear_ratio * self.torque_constant
+
+    @property
+    def drive_loss(self) -> float:
+        """Coulomb torque τ_loss of one drive at the wheel, N k_M I_0 + gearbox, in N·m."""
+        return self.back_emf * self.no_load_current + self.gear_loss
+
+    @property
+    def rolling_force(self) -> float:
+        """Rolling resistance of all wheels on level ground, F_roll, in N."""
+        return self.rolling_coefficient * self.mass * GRAVITY
+
+    @property
+    def front_load(self) -> float:
+        """Share of the weight on the front wheel at rest, by the lever rule."""
+        return self.com_offset / (self.wheelbase - self.trail)
+
+    @property
+    def drive_inertia(self) -> float:
+        """Inertia of one rear wheel with its reflected rotor, J_w + N² J_m, in kg·m²."""
+        return self.wheel_inertia + self.gear_ratio**2 * self.rotor_inertia
+
+    @property
+    def effective_mass(self) -> float:
+        """Mass that the motors accelerate, M_e, in kg: robot, spinning rear drives, spinning front wheel."""
+        return (
+            self.mass
+            + 2 * self.drive_inertia / self.wheel_radius**2
+            + self.front_wheel_inertia / self.front_wheel_radius**2
+        )
+
+    @property
+    def effective_inertia(self) -> float:
+        """Yaw inertia about P that the motors accelerate, J_e, in kg·m²."""
+        return (
+            self.yaw_inertia
+            + self.mass * self.com_offset**2
+            + 2 * self.half_track**2 * self.drive_inertia / self.wheel_radius**2
+        )
+
+    @property
+    def velocity_gain(self) -> float:
+        """Static gain of the common channel, V per U_Σ, in m/s/V."""
+        return self.wheel_radius / self.back_emf
+
+    @property
+    def rotation_gain(self) -> float:
+        """Static gain of the differential channel, θ̇ per U_Δ, in rad/s/V."""
+        return self.velocity_gain / self.half_track
+
+    @property
+    def velocity_time_constant(self) -> float:
+        """Time constant of V under U_Σ in s."""
+        return self.effective_mass * self.wheel_radius**2 / (2 * self.motor_gain * self.back_emf)
+
+    @property
+    def rotation_time_constant(self) -> float:
+        """Time constant of θ̇ under U_Δ in s."""
+        return self.effective_inertia * self.wheel_radius**2 / (2 * self.half_track**2 * self.motor_gain * self.back_emf)
+
+
+class Perturbation(Record):
+    """What the plant does that the controller is not told. The default changes nothing.
+
+    Factors multiply the nominal value; the rest is added to it.
+    """
+
+    mass_factor: Factor = 1.0
+    """Every body denser: mass and inertia of chassis, wheels and fork."""
+    inertia_factor: Factor = 1.0
+    """Yaw inertia of the chassis alone."""
+    payload: Annotated[float, Field(ge=0, le=200)] = 0.0
+    """Point mass on the chassis in kg."""
+    payload_x: Annotated[float, Field(ge=-1, le=1)] = 0.1
+    """Payload ahead of P in m."""
+    payload_y: Annotated[float, Field(ge=-1, le=1)] = 0.0
+    """Payload to the left of the robot's axis in m."""
+    payload_z: Annotated[float, Field(ge=0, le=1)] = 0.2
+    """Payload above the ground in m."""
+    left_radius_factor: Annotated[float, Field(ge=0.8, le=1.2)] = 1.0
+    """Rear left wheel radius."""
+    right_radius_factor: Annotated[float, Field(ge=0.8, le=1.2)] = 1.0
+    """Rear right wheel radius."""
+    drive_friction_factor: Annotated[float, Field(ge=0, le=20)] = 1.0
+    """Loss of gearboxes and motors, τ_loss."""
+    resistance_factor: Factor = 1.0
+    """Terminal resistance R_a."""
+    motor_constant_factor: Factor = 1.0
+    """Motor constant, k_M and k_E together."""
+    supply_factor: Annotated[float, Field(gt=0, le=2)] = 1.0
+    """Applied over commanded voltage: a PWM drive on another supply."""
+    tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
+    """Friction of every tyre on the floor."""
+    slope: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    """Inclination in rad, uphill along the world's +x, as gravity seen in the slope's own frame."""
+    control_delay: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """Delay of voltages and steering in s, in whole control periods."""
+    velocity_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Standard deviation of the measured V in m/s."""
+    rotation_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Standard deviation of the measured θ̇ in rad/s."""
+    position_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Standard deviation of the measured x and y in m (`truth` only: odometry integrates its own)."""
+    heading_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Standard deviation of the measured θ in rad (`truth` only)."""
+
+
+PERTURBATIONS: dict[str, Perturbation] = {
+    "nominal": Perturbation(),
+    "mass +50 %": Perturbation(mass_factor=1.5),
+    "supply -20 %": Perturbation(supply_factor=0.8),
+    "all": Perturbation(mass_factor=1.5, supply_factor=0.8, drive_friction_factor=3.0, resistance_factor=1.3),
+}
+"""The named cases of the comparison tables; `all` is the combination the published targets are stated for."""

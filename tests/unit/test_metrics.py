@@ -1,0 +1,299 @@
+"""Metrics against closed forms on made-up signals."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mrctl import metrics
+from mrctl.record import InputError
+
+DT, LAP = 0.01, 2.0
+
+
+def make(runs=1, laps=3, lap=LAP, **signals):
+    """A result that is zero except for the given signals, functions of time (T,) or arrays that broadcast to (B, T)."""
+    count = int(round(laps * lap / DT))
+    time = np.arange(count) * DT
+    names = (*metrics.SAMPLED, "theta", "feedforward_left", "feedforward_right")
+    zero = np.zeros((runs, count))
+    values = {name: signals.get(name, zero) for name in names}
+    data = {name: np.broadcast_to(v(time) if callable(v) else v, zero.shape).copy() for name, v in values.items()}
+    return xr.Dataset(
+        {name: (("run", "time"), value) for name, value in data.items()}
+        | {"failed": ("run", np.zeros(runs, bool)), "failure_time": ("run", np.full(runs, np.nan))},
+        {"time": time, "run": np.arange(runs), "label": ("run", ["none"] * runs), "lap_time": ("run", [lap] * runs)},
+        {"control_period": DT},
+    )
+
+
+def fail(result, run, time):
+    """The result with one run failed at a time."""
+    result = result.copy(deep=True)
+    result["failed"][run], result["failure_time"][run] = True, time
+    for name in metrics.SAMPLED:
+        result[name][run, result["time"].values >= time] = np.nan
+    return result
+
+
+def lap(result, name, run=0, number=1):
+    """One number of `per_lap`."""
+    return float(metrics.per_lap(result)[name].isel(run=run).sel(lap=number))
+
+
+@pytest.mark.parametrize("name", ["longitudinal", "lateral", "heading"])
+def test_sinusoid(name):
+    """A sinusoid of amplitude a has RMS a/√2 and maximum a."""
+    result = make(**{f"{name}_error": lambda t: -0.3 * np.sin(2 * np.pi * t / LAP)})
+    assert lap(result, f"{name}_rmse") == pytest.approx(0.3 / np.sqrt(2), rel=1e-12)
+    assert lap(result, f"{name}_max") == pytest.approx(0.3, rel=1e-12)
+
+
+def test_position():
+    """A constant offset (3, 4) is a distance of 5."""
+    assert lap(make(x=3.0, y_ref=4.0), "position_rmse") == pytest.approx(5)
+
+
+@pytest.mark.parametrize("name", ["v", "omega"])
+def test_velocity_errors(name):
+    """A constant error e gives RMSE e, IAE e T, ITAE e T²/2 in every lap, against the original reference."""
+    result = make(**{name: 0.5, f"{name}_ref": 0.7, f"{name}_command": 0.5})
+    for number in (1, 3):
+        assert lap(result, f"{name}_rmse", number=number) == pytest.approx(0.2)
+        assert lap(result, f"{name}_iae", number=number) == pytest.approx(0.2 * LAP)
+        assert lap(result, f"{name}_itae", number=number) == pytest.approx(0.2 * LAP**2 / 2)
+
+
+def test_itae_of_ramp():
+    """An error that grows as t has ITAE ∫t² = T³/3."""
+    assert lap(make(v=lambda t: t), "v_itae") == pytest.approx(LAP**3 / 3, rel=0.01)
+
+
+def test_variation_of_triangle():
+    """A triangle of amplitude a and n periods varies by 4 a n; the laps add up to the run."""
+    wave = lambda t: 2 * np.abs((3 * t / LAP) % 1 - 0.5) - 0.5  # noqa: E731
+    result = make(voltage_left=lambda t: 5 * 2 * wave(t), voltage_right=lambda t: -2 * wave(t))
+    whole = np.abs(np.diff(result["voltage_left"])).sum() + np.abs(np.diff(result["voltage_right"])).sum()
+    found = metrics.per_lap(result)["voltage_variation"]
+    assert float(found.sum()) == pytest.approx(whole, rel=1e-12)
+    assert lap(result, "voltage_variation", number=2) == pytest.approx(4 * (5 + 1) * 3, rel=0.02)
+
+
+def test_energy_saturation_weights():
+    """Constant power p is p T joules; half the lap saturated is T/2; the weight norm is that at the lap's end."""
+    result = make(power=7.0, saturated=lambda t: (t % LAP) < LAP / 2 - DT / 2, weight_norm=lambda t: t)
+    assert lap(result, "energy") == pytest.approx(7 * LAP)
+    assert lap(result, "saturation_time") == pytest.approx(LAP / 2)
+    assert lap(result, "weight_norm", number=2) == pytest.approx(2 * LAP - DT)
+
+
+def test_feedback_share():
+    """A feedback of a quarter of the voltage is a share of 1/4; at rest nobody works."""
+    sine = lambda t: np.sin(t)  # noqa: E731
+    result = make(feedback_left=lambda t: sine(t) / 4, voltage_left=sine, feedback_right=-0.25, voltage_right=1.0)
+    assert lap(result, "feedback_share") == pytest.approx(0.25)
+    assert lap(make(), "feedback_share") == 0
+
+
+@given(
+    scale=st.floats(0.01, 100),
+    signal=st.lists(st.floats(-10, 10, allow_subnormal=False), min_size=30, max_size=30),
+)
+@settings(max_examples=30, deadline=None)
+def test_scaling(scale, signal):
+    """RMSE, maximum, IAE and ITAE scale with the error; RMSE never exceeds the maximum."""
+    one, other = (
+        metrics.per_lap(make(laps=1, lap=0.3, v=factor * np.array(signal), lateral_error=factor * np.array(signal)))
+        for factor in (1, scale)
+    )
+    for name in ("v_rmse", "v_iae", "v_itae", "lateral_rmse", "lateral_max"):
+        assert float(other[name][0, 0]) == pytest.approx(scale * float(one[name][0, 0]))
+    assert one["lateral_rmse"][0, 0] <= one["lateral_max"][0, 0] + 1e-12
+
+
+def test_lap_count():
+    """Whole laps only; a run shorter than one lap is one lap; an open path without lap time is one lap."""
+    assert metrics.per_lap(make(laps=3.7)).sizes["lap"] == 3
+    assert metrics.per_lap(make(laps=0.5)).sizes["lap"] == 1
+    assert metrics.per_lap(make().drop_vars("lap_time")).sizes["lap"] == 1
+    assert metrics.per_lap(make(lap=0.1, laps=10)).sizes["lap"] == 10  # 0.1 is not a binary fraction
+
+
+def test_mixed_lap_times():
+    """Runs with different lap times are padded with NaN, not failed; each keeps its own last lap."""
+    result = make(runs=2, laps=4, v=lambda t: t).assign_coords(lap_time=("run", [LAP, 2 * LAP]))
+    laps = metrics.per_lap(result)
+    assert laps["laps"].values.tolist() == [4, 2] and not laps["failed"].any()
+    assert np.isnan(laps["v_rmse"].values[1]).tolist() == [False, False, True, True]
+    for run, (a, b) in enumerate([(3 * LAP, 4 * LAP), (2 * LAP, 4 * LAP)]):
+        exact = np.sqrt((b**3 - a**3) / 3 / (b - a))
+        assert metrics.summary(result)["v_rmse"][run] == pytest.approx(exact, rel=2e-3)
+
+
+def test_padded_run():
+    """A run that ended early without failing counts the laps it has."""
+    result = make(runs=2, laps=4, v=1.0)
+    for name in metrics.SAMPLED:
+        result[name][1, int(2 * LAP / DT) :] = np.nan
+    laps = metrics.per_lap(result)
+    assert laps["laps"].values.tolist() == [4, 2] and metrics.summary(result)["v_rmse"][1] == 1
+
+
+def test_single_run():
+    """A squeezed run gives the same numbers as the run in its batch, and keeps its label."""
+    result = make(runs=2, v=np.array([[1.0], [2.0]]))
+    single = metrics.per_lap(result.isel(run=1))
+    xr.testing.assert_identical(single, metrics.per_lap(result.isel(run=[1])))
+
+
+@pytest.mark.parametrize(("time", "good"), [(0.0, 0), (2.5, 1), (4.0, 2), (5.99, 2), (6.5, 2)])
+def test_failed_run(time, good):
+    """NaN from the lap of the failure on, also when it fails on the edge of a lap or after the last whole one."""
+    laps = metrics.per_lap(fail(make(runs=2, laps=3.4, v=1.0), 1, time))
+    assert np.isfinite(laps["v_rmse"].values[1]).tolist() == [True] * good + [False] * (3 - good)
+    assert np.isfinite(laps["v_rmse"].values[0]).all()
+    assert laps["failed"].values.tolist() == [False, True]
+
+
+def test_failure_without_nan():
+    """The flag alone is believed: a run that tipped over on its last sample has no last lap."""
+    result = make(v=1.0)
+    result["failed"][0] = True
+    assert np.isnan(metrics.per_lap(result)["v_rmse"].values[0]).tolist() == [False, False, True]
+
+
+def test_summary_counts_failures():
+    """A row per run, failures among them, and statistics that count them."""
+    result = fail(make(runs=3, v=np.array([[1.0], [2.0], [3.0]])), 2, 3.0)
+    table = metrics.summary(result)
+    assert len(table) == 3 and table.attrs["failed"] == 1 and table["failed"].tolist() == [False, False, True]
+    assert table.attrs["units"]["energy"] == "J"
+    row = metrics.statistics(table, ["v_rmse"]).loc[("none", "v_rmse")]
+    assert (row["value"], row["samples"], row["failed"]) == (1.5, 2, 1)
+    assert metrics.summary(result, lap=1)["v_rmse"].tolist() == [1, 2, 3]
+
+
+def test_units():
+    """Every metric is there with its unit."""
+    laps = metrics.per_lap(make())
+    for name, (unit, text) in metrics.METRICS.items():
+        assert laps[name].attrs == {"units": unit, "long_name": text} and laps[name].dims == ("run", "lap")
+
+
+@pytest.mark.parametrize("decay", [0.3, 0.5, 0.8])
+def test_laps_to_converge(decay):
+    """An error c + aᵏ is within 1.2 c' of its last value c' from the lap that the logarithm says."""
+    count, floor = 20, 0.1
+    amplitude = np.repeat(floor + decay ** np.arange(count), int(LAP / DT))
+    laps = metrics.per_lap(make(runs=2, laps=count, lateral_error=amplitude * [[1], [0]]))
+    bound = 1.2 * (floor + decay ** (count - 1)) - floor
+    exact = 1 + int(np.ceil(np.log(bound) / np.log(decay)))
+    assert metrics.laps_to_converge(laps, "lateral_rmse").values.tolist() == [exact, 1]
+
+
+def test_laps_to_converge_relapse():
+    """A relapse counts, and a failed run does not converge."""
+    error = np.repeat([5.0, 1.0, 5.0, 1.0, 1.0], int(LAP / DT))
+    result = fail(make(runs=2, laps=5, lateral_error=error), 1, 9.0)
+    found = metrics.laps_to_converge(metrics.per_lap(result), "lateral_rmse").values
+    assert found[0] == 4 and np.isnan(found[1])
+
+
+def test_recovery_time():
+    """After a step to 1 + e^(−t/τ), a short window is back within 1.2 after τ ln 5."""
+    tau, event = 1.5, 4.0
+    result = make(laps=10, lateral_error=lambda t: 1 + np.where(t >= event, np.exp(-(t - event) / tau), 0))
+    found = metrics.recovery_time(result, event, window=DT)
+    assert 0 <= float(found[0]) - tau * np.log(5) <= 2 * DT  # a sample is held for a tick
+    assert float(metrics.recovery_time(result, event)[0]) > float(found[0])  # a longer window forgets later
+
+
+def test_recovery_extremes():
+    """No change recovers at once, a lasting one never, a failed run has no recovery, and `until` ends the search."""
+    step = lambda t: 1.0 + (t >= 4)  # noqa: E731
+    result = make(runs=3, laps=6, lateral_error=step(np.arange(1200) * DT) * [[1], [1], [1]])
+    result["lateral_error"][0] = 1.0
+    found = metrics.recovery_time(fail(result, 2, 8.0), 4.0).values
+    assert found[0] == 0 and np.isinf(found[1]) and np.isnan(found[2])
+    late = make(laps=6, lateral_error=lambda t: 1.0 + (t >= 8))
+    assert float(metrics.recovery_time(late, 4.0, until=8.0)[0]) == 0
+    assert np.isinf(metrics.recovery_time(late, 4.0)[0])
+
+
+def test_error_on_return():
+    """Twice the error on return is a ratio of two; a velocity's error works as well."""
+    wave = lambda t: np.where(t < 4, 1.0, np.where(t < 8, 7.0, 2.0))  # noqa: E731
+    result = make(laps=6, lateral_error=wave, v=wave)
+    for name in ("lateral_error", "v"):
+        assert float(metrics.error_on_return(result, 4.0, 8.0, name)[0]) == pytest.approx(2)
+    assert np.isnan(metrics.error_on_return(fail(result, 0, 9.0), 4.0, 8.0)[0])
+
+
+def test_bootstrap_normal():
+    """For many normal samples the interval is close to mean ± 1.96 s/√n."""
+    samples = np.random.default_rng(1).normal(5, 2, 400)
+    found = metrics.bootstrap_interval(samples)
+    half = 1.96 * samples.std(ddof=1) / 20
+    assert found.value == pytest.approx(samples.mean())
+    assert (found.low, found.high) == pytest.approx((samples.mean() - half, samples.mean() + half), abs=0.1 * half)
+
+
+def test_bootstrap_coverage():
+    """About 95 % of the intervals of 30 samples hold the true mean."""
+    draws = np.random.default_rng(2).normal(3, 1, (200, 30))
+    held = [i.low <= 3 <= i.high for i in (metrics.bootstrap_interval(d, n=500, seed=k) for k, d in enumerate(draws))]
+    assert 0.89 <= np.mean(held) <= 0.99
+
+
+def test_bootstrap_degenerate():
+    """Constant samples have no width, one sample has no interval, NaN and inf are counted, and seeds repeat."""
+    assert metrics.bootstrap_interval([2, 2, 2]) == (2, 2, 2, 3, 0)
+    one = metrics.bootstrap_interval([2, np.nan])
+    assert one.value == 2 and np.isnan(one.low) and (one.samples, one.failed) == (1, 1)
+    assert metrics.bootstrap_interval([1, 2, 4, np.nan, np.inf])[3:] == (3, 2)
+    assert np.isnan(metrics.bootstrap_interval([]).value)
+    assert metrics.bootstrap_interval([1, 2, 4], seed=3) == metrics.bootstrap_interval([1, 2, 4], seed=3)
+
+
+def test_paired_ratio():
+    """An exact ratio has no width however much the seeds differ: pairs are resampled together."""
+    b = np.random.default_rng(0).lognormal(0, 2, 12)
+    found = metrics.paired_ratio(0.5 * b, b)
+    assert found[:3] == pytest.approx((0.5, 0.5, 0.5)) and found[3:] == (12, 0, 0)
+
+
+def test_paired_ratio_failures():
+    """A pair with a failure on either side leaves the means and is counted on its side."""
+    found = metrics.paired_ratio([1, 2, np.nan, 4], [2, 4, 6, np.inf])
+    assert found.value == pytest.approx(0.5) and (found.pairs, found.failed_a, found.failed_b) == (2, 1, 1)
+    noisy = metrics.paired_ratio([1.0, 2.2, 2.9, 4.1], [2, 4, 6, 8])
+    assert noisy.low < noisy.value < noisy.high
+
+
+@pytest.mark.parametrize(
+    ("call", "field"),
+    [
+        (lambda r: metrics.per_lap(r.drop_vars("power")), "power"),
+        (lambda r: metrics.per_lap(r.assign_coords(lap_time=("run", [1e-3]))), "lap_time"),
+        (lambda r: metrics.per_lap(r.isel(time=[0]).assign_attrs({}).drop_attrs()), "control_period"),
+        (lambda r: metrics.summary(r, lap=0), "lap"),
+        (lambda r: metrics.summary(r, lap=9), "lap"),
+        (lambda r: metrics.laps_to_converge(metrics.per_lap(r), "speed"), "metric"),
+        (lambda r: metrics.laps_to_converge(metrics.per_lap(r), "v_rmse", 0.5), "factor"),
+        (lambda r: metrics.statistics(metrics.summary(r), by="colour"), "by"),
+        (lambda r: metrics.recovery_time(r, 0.0), "event_time"),
+        (lambda r: metrics.recovery_time(r, 99.0), "event_time"),
+        (lambda r: metrics.recovery_time(r, 2.0, "power"), "error"),
+        (lambda r: metrics.recovery_time(r, 2.0, window=0.0), "window"),
+        (lambda r: metrics.recovery_time(r.drop_vars("lap_time"), 2.0), "window"),
+        (lambda r: metrics.error_on_return(r, 4.0, 2.0), "return_time"),
+        (lambda r: metrics.bootstrap_interval([1, 2], level=95), "level"),
+        (lambda r: metrics.paired_ratio([1, 2], [1]), "b"),
+    ],
+)
+def test_bad_input(call, field):
+    """One line that begins with the field."""
+    with pytest.raises(InputError, match=rf"^{field}: .+") as caught:
+        call(make())
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,233 @@
+"""Figures hold the data they are given, carry units, and reach the disk."""
+
+import re
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.image import imread
+
+from mrctl import metrics, plots
+from mrctl.record import InputError
+
+LAP = 2.0
+
+
+def make(labels=("none", "fel")):
+    """Runs on a circle, every signal different, so that a curve can be told by its data."""
+    time = np.arange(0, 3 * LAP, 0.02)
+    count = len(labels)
+    rng = np.random.default_rng(0)
+    names = (*metrics.SAMPLED, "feedforward_left", "feedforward_right")
+    data = {name: rng.uniform(0.1, 1, (count, len(time))) for name in names}
+    data["x"], data["y"] = (np.outer(np.linspace(1, 1.2, count), f(np.pi * time)) for f in (np.cos, np.sin))
+    for name in ("x_ref", "y_ref", "v_ref", "omega_ref"):
+        data[name] = np.broadcast_to(data[name][:1], data[name].shape).copy()
+    return xr.Dataset(
+        {name: (("run", "time"), value) for name, value in data.items()}
+        | {"failed": ("run", np.zeros(count, bool)), "failure_time": ("run", np.full(count, np.nan))},
+        {
+            "time": time,
+            "run": np.arange(count),
+            "label": ("run", list(labels)),
+            "lap_time": ("run", [LAP] * count),
+        },
+        {"control_period": 0.02},
+    )
+
+
+def fail(result, run, time):
+    """The result with one run failed."""
+    result = result.copy(deep=True)
+    result["failed"][run], result["failure_time"][run] = True, time
+    for name in metrics.SAMPLED:
+        result[name][run, result["time"].values >= time] = np.nan
+    return result
+
+
+def drawn(axes, x, y):
+    """Whether the axes hold a line through exactly these points."""
+    return any(np.array_equal(line.get_xydata(), np.column_stack([x, y]), equal_nan=True) for line in axes.lines)
+
+
+def legend(figure):
+    """The texts of the figure's legend."""
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+SIGNALS = {
+    plots.velocities: [["v", "v_ref"], ["omega", "omega_ref"]],
+    plots.errors: [["longitudinal_error"], ["lateral_error"], ["heading_error"]],
+    plots.feedforward_outputs: [["feedforward_left"], ["feedforward_right"]],
+}
+
+
+@pytest.mark.parametrize("plot", SIGNALS, ids=lambda plot: plot.__name__)
+@pytest.mark.parametrize("cut", [{}, {"window": (1.0, 3.0)}, {"lap": 2}, {"lap": -1}], ids=str)
+def test_time_series(plot, cut):
+    """Each panel holds the samples of its signals, of every run, within the window or the lap."""
+    result = make()
+    start, end = cut.get("window", {2: (2.0, 3.99), -1: (4.0, 5.99)}.get(cut.get("lap"), (0, 9)))
+    seen = result.sel(time=slice(start - 1e-9, end + 1e-9))
+    figure = plot(result, **cut)
+    assert len(figure.axes) == len(SIGNALS[plot])
+    for axes, names in zip(figure.axes, SIGNALS[plot], strict=True):
+        for name in names:
+            for run in (0, 1):
+                assert drawn(axes, seen["time"], seen[name].isel(run=run)), name
+    assert legend(figure)[-2:] == ["none", "fel"]
+
+
+def test_path():
+    """The path of each run and the reference, once, with equal axes and the start marked."""
+    result = make()
+    (axes,) = plots.path(result).axes
+    for run in (0, 1):
+        one = result.isel(run=run)
+        assert drawn(axes, one["x"], one["y"]) and drawn(axes, one["x"][:1], one["y"][:1])
+    assert drawn(axes, result["x_ref"][0], result["y_ref"][0]) and axes.get_aspect() == 1
+    assert len(axes.lines) == 5
+
+
+def test_voltages():
+    """Feedback, feedforward and total for each wheel, a column per run."""
+    result = make()
+    figure = plots.voltages(result)
+    assert [axes.get_title() for axes in figure.axes] == ["none", "fel", "", ""]
+    for number, axes in enumerate(figure.axes):
+        for part in ("feedback", "feedforward", "voltage"):
+            signal = result[f"{part}_{('left', 'right')[number // 2]}"].isel(run=number % 2)
+            assert drawn(axes, result["time"], signal)
+
+
+def test_compare_errors():
+    """Both controllers in the same axes, with their RMS."""
+    result = make()
+    pid, nn = result.isel(run=0), result.isel(run=[1])
+    figure = plots.compare_errors(pid, nn)
+    for axes, name in zip(figure.axes, plots.ERRORS, strict=True):
+        assert drawn(axes, result["time"], pid[name]) and drawn(axes, result["time"], nn[name][0])
+        rms = [np.sqrt(np.mean(one[name].values ** 2)) for one in (pid, nn)]
+        assert [text.get_text() for text in axes.texts] == [f"RMS {value:.2g}" for value in rms]
+    failed = plots.compare_errors(pid, fail(nn, 0, 3.0))
+    assert failed.axes[0].texts[1].get_text() == "failed" and legend(failed)[1].endswith("(failed)")
+
+
+def test_learning_curve():
+    """The metric of each run lap by lap, its mean by label, on a log axis, the lines named at their ends."""
+    result = make(("fel", "none", "fel"))
+    laps = metrics.per_lap(result)
+    for source in (result, laps):
+        left, right = plots.learning_curve(source, ["v_rmse", "energy"]).axes
+        assert left.get_yscale() == "log" and "(m/s)" in left.get_ylabel() and "(J)" in right.get_ylabel()
+        value = laps["v_rmse"].values
+        for line in (value[0], value[2], (value[0] + value[2]) / 2, value[1]):
+            assert drawn(left, [1, 2, 3], line)
+        assert sorted(text.get_text() for text in left.texts) == ["fel", "none"]
+
+
+def test_names_do_not_overlap():
+    """Names at the ends of lines that end together are spread."""
+    result = make(tuple("abcdefg"))
+    result["lateral_error"][:] = 1.0
+    (axes,) = plots.learning_curve(result, ["lateral_rmse"]).axes
+    heights = sorted(text.xyann[1] for text in axes.texts)
+    assert len(heights) == 7 and min(np.diff(heights)) > 0.07
+
+
+def test_failures_are_shown():
+    """A failed run keeps its place in the legend and is marked where it ended."""
+    result = fail(make(("none", "fel", "fel")), 1, 3.0)
+    figure = plots.path(result)
+    assert legend(figure) == ["reference", "none", "fel (1 of 2 failed)"]
+    crosses = [line for line in figure.axes[0].lines if line.get_marker() == "X"]
+    last = result.isel(run=1).sel(time=2.98, method="nearest")
+    assert len(crosses) == 1 and crosses[0].get_xydata().tolist() == [[float(last["x"]), float(last["y"])]]
+    (axes,) = plots.learning_curve(result, ["v_rmse"]).axes
+    assert "fel (1 of 2 failed)" in [text.get_text() for text in axes.texts]
+    (axes,) = plots.learning_curve(fail(make(), 1, 0.0), ["v_rmse"]).axes
+    assert "fel (failed)" in [text.get_text() for text in axes.texts]
+
+
+ALL = {
+    "path": plots.path,
+    "velocities": plots.velocities,
+    "errors": plots.errors,
+    "voltages": plots.voltages,
+    "feedforward_outputs": plots.feedforward_outputs,
+    "learning_curve": plots.learning_curve,
+    "compare_errors": lambda result: plots.compare_errors(result, result),
+}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_units_on_axes(name):
+    """A single run draws too, and every labelled axis but the lap number has a unit in brackets."""
+    figure = ALL[name](make().isel(run=1))
+    labels = [text for axes in figure.axes for text in (axes.get_xlabel(), axes.get_ylabel()) if text]
+    assert labels and all(text == "lap" or re.search(r"\((m|s|V|rad|m/s|rad/s)\)$", text) for text in labels)
+
+
+@pytest.mark.parametrize(
+    ("draw", "words"),
+    [
+        (plots.posture_definition, ["x_0", "O_0", "y_0", "x_r", "P", "y_r", "theta", "phi", "L", "2D", "V_{AV}"]),
+        (plots.control_structure, ["Kanayama", "PID", "Neural network", "Robot", "eta_c", "U_{ff}", "U_{fb}", "U_l"]),
+    ],
+)
+def test_drawings(draw, words):
+    """The paper's symbols are there, inside the sheet, and no two texts overlap."""
+    figure = draw()
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    text = " ".join(t.get_text() for t in axes.texts)
+    assert all(word in text for word in words)
+    boxes = [t.get_window_extent() for t in axes.texts]
+    for number, box in enumerate(boxes):
+        assert figure.bbox.x0 < box.x0 and box.x1 < figure.bbox.x1 and figure.bbox.y0 < box.y0 < figure.bbox.y1
+        for other in range(number):
+            assert not box.overlaps(boxes[other]), (axes.texts[number].get_text(), axes.texts[other].get_text())
+
+
+def test_save(tmp_path):
+    """PNG and PDF are written into a new folder; the PNG is not blank, and 180 mm at 200 dpi."""
+    png, pdf = plots.save(plots.control_structure(), tmp_path / "new" / "folder", "figure3")
+    assert (png.name, pdf.name) == ("figure3.png", "figure3.pdf") and pdf.read_bytes().startswith(b"%PDF")
+    image = imread(png)
+    assert image.shape[1] == pytest.approx(180 / 25.4 * 200, abs=1) and image[..., :3].std() > 0.05
+
+
+def test_save_unwritable(tmp_path):
+    """A folder that cannot be is named in one line."""
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    for folder in (blocker, blocker / "below"):
+        with pytest.raises(InputError, match=rf"^{re.escape(str(folder))}: cannot write") as caught:
+            plots.save(plots.posture_definition(), folder, "figure2")
+        assert "\n" not in str(caught.value)
+
+
+def test_leaves_settings_alone():
+    """Drawing does not change the user's matplotlib."""
+    before = dict(mpl.rcParams)
+    plots.path(make())
+    assert dict(mpl.rcParams) == before
+
+
+@pytest.mark.parametrize(
+    ("call", "field"),
+    [
+        (lambda r: plots.path(r, lap=0), "lap"),
+        (lambda r: plots.path(r, lap=4), "lap"),
+        (lambda r: plots.errors(r, window=(3, 1)), "window"),
+        (lambda r: plots.errors(r, window=(90, 91)), "window"),
+        (lambda r: plots.errors(r, window=(0, 1), lap=1), "window"),
+        (lambda r: plots.learning_curve(r, ["speed"]), "metric"),
+        (lambda r: plots.learning_curve(r, []), "metrics"),
+    ],
+)
+def test_bad_input(call, field):
+    """One line that begins with the field."""
+    with pytest.raises(InputError, match=rf"^{field}: .+"):
+        call(make())
