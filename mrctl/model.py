@@ -19,14 +19,16 @@ from mrctl.robot import GRAVITY, Perturbation, Robot
 Steering = Literal["compliant", "caster", "rigid"]
 Fields = dict[str, NDArray]
 
+REAR = ("wheel_left", "wheel_right")
+MOTORS = ("motor_left", "motor_right")
 # Elements that a robot's MJCF must name (README: bring your own robot).
 REQUIRED = {
     "body": ("chassis", "wheel_left", "wheel_right", "fork", "front_wheel"),
     "joint": ("chassis", "wheel_left", "wheel_right", "steering", "front_wheel"),
     "geom": ("wheel_left", "wheel_right", "front_wheel"),
-    "actuator": ("motor_left", "motor_right", "steering"),
-    "numeric": ("no_load_current", "limits"),
+    "actuator": (*MOTORS, "steering"),
 }
+NUMERICS = {"no_load_current": 1, "limits": 4}  # and how many values they hold
 
 
 def models_folder() -> Path:
@@ -48,42 +50,66 @@ def world_path(world: str) -> Path:
     return path
 
 
-def load(world: str = "flat", steering: Steering = "compliant") -> mujoco.MjModel:
+def load(world: str = "flat", steering: Steering = "compliant", timestep: float | None = None) -> mujoco.MjModel:
     """Compiles a world with the robot in one of the three steering arrangements.
 
     Args:
         world: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file.
         steering: `compliant` is the MJCF as it stands; `caster` and `rigid` take their stiffness, damping and trail
             from the model's numerics `steering_caster` and `steering_rigid`.
+        timestep: Time step of the physics in s; by default the file's own.
 
     Raises:
-        InputError: The file is missing, does not compile, or lacks a named element.
+        InputError: The file is missing, does not compile, lacks a named element, or holds a robot that makes no sense.
     """
     path = world_path(world)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
+        _complete(model, steering)
+        robot = read_robot(model)
+        if steering != "compliant":
+            _rearrange(model, robot, steering)
     except ValueError as error:
         raise InputError(f"{path}: {' '.join(str(error).split())}") from None
-    required = dict(REQUIRED)
-    if steering != "compliant":
-        required["numeric"] = (*REQUIRED["numeric"], f"steering_{steering}")
-    for kind, names in required.items():
+    if timestep is not None:
+        model.opt.timestep = timestep
+    return model
+
+
+def _complete(model: mujoco.MjModel, steering: Steering) -> None:
+    """Refuses a model without the elements that the rest of this module reads by name.
+
+    Raises:
+        InputError: The first that is missing or of another kind.
+    """
+    numerics = NUMERICS if steering == "compliant" else NUMERICS | {f"steering_{steering}": 3}
+    for kind, names in (*REQUIRED.items(), ("numeric", numerics)):
         for name in names:
             try:
                 getattr(model, kind)(name)
             except KeyError:
-                raise InputError(f"{path}: no {kind} named {name!r}") from None
-    if model.npair == 0:
-        raise InputError(f"{path}: no contact pair between the wheels and a floor")
-    if steering != "compliant":
-        numeric = model.numeric(f"steering_{steering}").data
-        if numeric.shape != (3,):
-            raise InputError(f"{path}: numeric steering_{steering} needs stiffness, damping, trail")
-        stiffness, damping, trail = numeric
-        model.actuator("steering").biasprm[1:3] = -stiffness, -damping
-        model.body("front_wheel").pos[0] = -trail
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-    return model
+                raise InputError(f"no {kind} named {name!r}") from None
+    for name, count in numerics.items():
+        if model.numeric(name).data.shape != (count,):
+            raise InputError(f"numeric {name} needs {count} value{'s' * (count > 1)}")
+    for name in MOTORS:
+        if model.actuator(name).gaintype != mujoco.mjtGain.mjGAIN_DCMOTOR:
+            raise InputError(f"actuator {name} must be a <dcmotor>")
+    if model.actuator_ctrlnum[model.actuator("steering").id] != 2:
+        raise InputError("actuator steering must be a <pid> with position and velocity inputs")
+    if not _tyre_pairs(model):
+        raise InputError("no contact pair between the wheels and a floor")
+
+
+def _rearrange(model: mujoco.MjModel, robot: Robot, steering: Steering) -> None:
+    """Gives the fork another stiffness, damping and trail; rolling losses follow the load that the trail moves."""
+    before = _load_torques(model)
+    stiffness, damping, trail = model.numeric(f"steering_{steering}").data
+    model.actuator("steering").biasprm[1:3] = -stiffness, -damping
+    model.body("front_wheel").pos[0] = -trail
+    for wheel, torque in _load_torques(model).items():
+        model.joint(wheel).frictionloss[0] += robot.rolling_coefficient * (torque - before[wheel])
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
@@ -95,48 +121,36 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
     Raises:
         InputError: A value that `Robot` refuses, or a rear frictionloss below rolling and no-load loss.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    root = model.body("chassis").id
-    bodies = [b for b in range(model.nbody) if model.body_rootid[b] == root]
-    masses = model.body_mass[bodies]
-    mass = masses.sum()
-    com = data.subtree_com[root]
-    origin = data.xpos[root]
-    inertia = 0.0
-    for b, m in zip(bodies, masses, strict=True):
-        frame = data.ximat[b].reshape(3, 3)
-        inertia += (frame * model.body_inertia[b] @ frame.T)[2, 2] + m * np.sum((data.xipos[b] - com)[:2] ** 2)
-    radii = [model.geom(name).size[0] for name in ("wheel_left", "wheel_right")]
-    radius = float(np.mean(radii))
-    front_radius = model.geom("front_wheel").size[0]
-    front_joint, motor = model.joint("front_wheel"), model.actuator("motor_left")
-    wheelbase = model.body("fork").pos[0]
-    trail = -model.body("front_wheel").pos[0]
-    offset = com[0] - origin[0]
-    weight = mass * GRAVITY
-    front_share = offset / (wheelbase - trail)
-    if not 0 < front_share < 1:
-        raise InputError("com_offset: the centre of mass must lie between the rear axle and the front contact")
-    rolling = float(front_joint.frictionloss[0] / (front_share * weight * front_radius))
+    data, com = _at_rest(model)
+    bodies = _bodies(model)
+    masses, centres = model.body_mass[bodies], data.xipos[bodies, :2]
+    inertia = np.sum(masses[:, None] * (centres - np.average(centres, axis=0, weights=masses)) ** 2)
+    for body in bodies:
+        up = data.ximat[body].reshape(3, 3)[2]
+        inertia += up**2 @ model.body_inertia[body]
+    radius = np.mean([model.geom(wheel).size[0] for wheel in REAR])
+    half_track, wheelbase, trail = _layout(model)
+    motor = model.actuator("motor_left")
     gear, constant = motor.gear[0], motor.gainprm[1]
-    no_load = float(model.numeric("no_load_current").data[0])
-    loss = np.mean([model.joint(name).frictionloss[0] for name in ("wheel_left", "wheel_right")])
-    gear_loss = loss - rolling * (1 - front_share) / 2 * weight * radius - gear * constant * no_load
+    no_load = model.numeric("no_load_current").data[0]
+    load = _load_torques(model)
+    if min(load.values()) <= 0:
+        raise InputError("com_offset: the centre of mass must lie over the triangle of the wheels")
+    rolling = model.joint("front_wheel").frictionloss[0] / load["front_wheel"]
+    drives = [model.joint(wheel).frictionloss[0] - rolling * load[wheel] for wheel in REAR]
+    gear_loss = np.mean(drives) - gear * constant * no_load
     if gear_loss < -1e-9:
         raise InputError("frictionloss: a rear wheel's is smaller than its rolling and no-load losses")
     limits = model.numeric("limits").data
-    spin = _spin_inertia(model, "wheel_left")
     return Robot.from_dict(
         {
-            "mass": mass,
+            "mass": masses.sum(),
             "yaw_inertia": inertia,
-            "com_offset": offset,
-            "com_height": com[2] - origin[2] + radius,
+            "com_offset": com[0],
+            "com_height": com[2] + radius,
             "wheel_radius": radius,
-            "front_wheel_radius": front_radius,
-            "half_track": (model.body("wheel_left").pos[1] - model.body("wheel_right").pos[1]) / 2,
+            "front_wheel_radius": model.geom("front_wheel").size[0],
+            "half_track": half_track,
             "wheelbase": wheelbase,
             "trail": trail,
             "steering_limit": model.joint("steering").range[1],
@@ -148,7 +162,7 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
             "no_load_current": no_load,
             "gear_loss": max(0.0, gear_loss),
             "rolling_coefficient": rolling,
-            "wheel_inertia": spin,
+            "wheel_inertia": _spin_inertia(model, "wheel_left"),
             "front_wheel_inertia": _spin_inertia(model, "front_wheel"),
             "supply": model.actuator_ctrlrange[model.actuator_ctrladr[motor.id], 1],
             "drive_gain": drive_gain,
@@ -160,6 +174,37 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
         },
         "robot",
     )
+
+
+def _bodies(model: mujoco.MjModel) -> list[int]:
+    """The bodies of the robot."""
+    chassis = model.body("chassis").id
+    return [body for body in range(model.nbody) if model.body_rootid[body] == chassis]
+
+
+def _at_rest(model: mujoco.MjModel) -> tuple[mujoco.MjData, NDArray[np.float64]]:
+    """Kinematics as the file places the robot, and its centre of mass from P in the chassis' frame, `(3,)` in m."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    bodies, chassis = _bodies(model), data.body("chassis")
+    com = np.average(data.xipos[bodies], axis=0, weights=model.body_mass[bodies])
+    return data, chassis.xmat.reshape(3, 3).T @ (com - chassis.xpos)
+
+
+def _layout(model: mujoco.MjModel) -> tuple[float, float, float]:
+    """Half track, wheelbase and trail in m."""
+    left, right = (model.body(wheel).pos[1] for wheel in REAR)
+    return (left - right) / 2, model.body("fork").pos[0], -model.body("front_wheel").pos[0]
+
+
+def _load_torques(model: mujoco.MjModel) -> dict[str, float]:
+    """Static load on each wheel times its radius in N·m, by the lever rule on level ground."""
+    half_track, wheelbase, trail = _layout(model)
+    _, com = _at_rest(model)
+    front, side = com[0] / (wheelbase - trail), com[1] / (2 * half_track)
+    shares = {"wheel_left": (1 - front) / 2 + side, "wheel_right": (1 - front) / 2 - side, "front_wheel": front}
+    weight = GRAVITY * model.body_mass[_bodies(model)].sum()
+    return {wheel: float(weight * share * model.geom(wheel).size[0]) for wheel, share in shares.items()}
 
 
 def _spin_inertia(model: mujoco.MjModel, wheel: str) -> float:
@@ -195,13 +240,12 @@ def perturb(nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Pertur
     """
     p = perturbation
     base = read_robot(nominal)
-    chassis = nominal.body("chassis").id
-    bodies = [b for b in range(nominal.nbody) if nominal.body_rootid[b] == chassis]
+    chassis, bodies = nominal.body("chassis").id, _bodies(nominal)
     model.body_mass[:] = nominal.body_mass
     model.body_inertia[:] = nominal.body_inertia
     model.body_mass[bodies] *= p.mass_factor
     model.body_inertia[bodies] *= p.mass_factor
-    model.body_inertia[chassis] *= (1, 1, p.inertia_factor)
+    model.body_inertia[chassis, _upright_axis(nominal, chassis)] *= p.inertia_factor
     model.body_ipos[chassis] = nominal.body_ipos[chassis]
     model.body_iquat[chassis] = nominal.body_iquat[chassis]
     if p.payload > 0:
@@ -212,7 +256,7 @@ def perturb(nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Pertur
         model.geom_size[geom] = nominal.geom_size[geom] * factor
         model.geom_rbound[geom] = nominal.geom_rbound[geom] * factor
         model.geom_aabb[geom] = nominal.geom_aabb[geom] * factor
-    motors = [nominal.actuator(name).id for name in ("motor_left", "motor_right")]
+    motors = [nominal.actuator(name).id for name in MOTORS]
     model.actuator_gainprm[motors] = nominal.actuator_gainprm[motors]
     model.actuator_gainprm[motors, 0] *= p.resistance_factor
     model.actuator_gainprm[motors, 1] *= p.motor_constant_factor
@@ -221,34 +265,30 @@ def perturb(nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Pertur
     model.actuator_dynprm[motors, 0] /= p.resistance_factor
     inputs = nominal.actuator_ctrladr[motors]
     model.actuator_ctrlrange[inputs] = nominal.actuator_ctrlrange[inputs] * max(1.0, p.supply_factor)
+    # The no-load torque k_M I_0 is part of the losses: it grows with them, not with the motor constant.
+    no_load = nominal.numeric("no_load_current").data * p.drive_friction_factor / p.motor_constant_factor
+    model.numeric("no_load_current").data[:] = no_load
     model.pair_friction[:] = nominal.pair_friction
     model.pair_friction[:, :2] *= p.tyre_friction_factor
     gx, gy, gz = nominal.opt.gravity
     c, s = np.cos(p.slope), np.sin(p.slope)
     model.opt.gravity[:] = c * gx + s * gz, gy, c * gz - s * gx
-    mujoco.mj_setConst(model, mujoco.MjData(model))  # subtree masses, for the loads below
-    before, after = _rolling_losses(nominal, base), _rolling_losses(model, base)
+    before, after = _load_torques(nominal), _load_torques(model)
     if min(after.values()) <= 0:
         raise InputError("perturbation.payload: the centre of mass lies outside the wheels, the robot would tip over")
     for wheel in after:
         dof = nominal.joint(wheel).dofadr[0]
         drive = 0.0 if wheel == "front_wheel" else base.drive_loss * (p.drive_friction_factor - 1)
-        model.dof_frictionloss[dof] = nominal.dof_frictionloss[dof] + drive + (after[wheel] - before[wheel])
+        rolling = base.rolling_coefficient * (after[wheel] - before[wheel])
+        model.dof_frictionloss[dof] = nominal.dof_frictionloss[dof] + drive + rolling
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def _rolling_losses(model: mujoco.MjModel, robot: Robot) -> dict[str, float]:
-    """Rolling torque of each wheel in N·m from the static load on it (lever rule; `robot` gives the geometry)."""
-    chassis = model.body("chassis").id
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    com = data.subtree_com[chassis] - data.xpos[chassis]
-    front = com[0] / (robot.wheelbase - robot.trail)
-    side = com[1] / (2 * robot.half_track)
-    shares = {"wheel_left": (1 - front) / 2 + side, "wheel_right": (1 - front) / 2 - side, "front_wheel": front}
-    force = robot.rolling_coefficient * GRAVITY * model.body_subtreemass[chassis]
-    return {wheel: float(force * share * model.geom(wheel).size[0]) for wheel, share in shares.items()}
+def _upright_axis(model: mujoco.MjModel, body: int) -> int:
+    """Which principal axis of a body is nearest to its frame's vertical."""
+    frame = np.zeros(9)
+    mujoco.mju_quat2Mat(frame, model.body_iquat[body])
+    return int(np.argmax(np.abs(frame[6:])))
 
 
 def _add_point_mass(model: mujoco.MjModel, body: int, mass: float, at: NDArray) -> None:
@@ -289,6 +329,7 @@ PERTURBED = (
     "actuator_ctrlrange",
     "pair_friction",
     "dof_frictionloss",
+    "numeric_data",
     "opt.gravity",
 )
 
@@ -352,8 +393,11 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray) -> State:
     for _ in range(8):
         up[2] = np.sqrt(1 - up[0] ** 2 - up[1] ** 2)
         up[0] = (robot.front_wheel_radius - height - up[1:] @ centre[1:]) / centre[0]
-    # Rows of the world-from-body matrix: body up is `normal`, body x as near as possible to the heading.
-    frame = _frame(normal, np.append(ahead, 0.0)) @ _frame(up, np.array([1.0, 0.0, 0.0])).T
+    # World from body: `up` becomes `normal`, and body x rises so that it lies over the heading.
+    slope = normal[:2] @ ahead
+    rise = np.arcsin(up[0] / np.hypot(slope, normal[2])) - np.arctan2(slope, normal[2])
+    body_x = np.append(np.cos(rise) * ahead, np.sin(rise))
+    frame = _frame(normal, body_x) @ _frame(up, np.array([1.0, 0.0, 0.0])).T
     point = ground[:2].mean(axis=0)
     origin_z = (height - normal[:2] @ (np.array([x, y]) - point[:2])) / normal[2] + point[2]
     data.qpos[:3] = x, y, origin_z
@@ -378,7 +422,7 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray) -> State:
 
 
 def _frame(up: NDArray, ahead: NDArray) -> NDArray:
-    """Rotation matrix `(3, 3)` whose z axis is `up` and whose x axis lies over `ahead`."""
+    """Rotation matrix `(3, 3)` whose z axis is `up` and whose x axis is nearest to `ahead`."""
     side = np.cross(up, ahead)
     side /= np.linalg.norm(side)
     return np.column_stack([np.cross(side, up), side, up])

@@ -30,10 +30,13 @@ Array = NDArray[np.float64]
 X, Y, THETA, V, OMEGA, V_LATERAL, RATE_LEFT, RATE_RIGHT, STEERING, STEERING_RATE, UPRIGHT = range(11)
 HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) on a sane state
 TILT = float(np.cos(np.radians(30)))
+LONGEST_DELAY = 0.5  # s, the most that `Perturbation.control_delay` may be
 JOINTS = ("chassis", "wheel_left", "wheel_right", "steering")
 
 
-@guvectorize([(float64[:], float64[:], int64[:], float64[:])], "(q),(v),(a),(r)", writable_args=("reading",), cache=True)
+@guvectorize(
+    [(float64[:], float64[:], int64[:], float64[:])], "(q),(v),(a),(r)", writable_args=("reading",), cache=True
+)
 def read(qpos, qvel, address, reading):  # noqa: ANN001, ANN201
     """State to reading: posture, twist in the body frame, wheel rates, steering, cosine of the tilt (NaN: blown up).
 
@@ -64,7 +67,7 @@ def read(qpos, qvel, address, reading):  # noqa: ANN001, ANN201
 
 
 def addresses(model: mujoco.MjModel) -> NDArray[np.int64]:
-    """qpos and dof address of each joint in `JOINTS`, alternating, `(8,)`."""
+    """Addresses in qpos and qvel of each joint in `JOINTS`, alternating, `(8,)`."""
     return np.array([a for name in JOINTS for a in (model.joint(name).qposadr[0], model.joint(name).dofadr[0])])
 
 
@@ -140,7 +143,9 @@ def _motor_parameters(model: mujoco.MjModel) -> tuple[Array, Array, list[int]]:
     return resistance[None], back_emf[None], acts
 
 
-def motor_current(voltage: Array, rates: Array, act: Array, resistance: Array, back_emf: Array, acts: list[int]) -> Array:
+def motor_current(
+    voltage: Array, rates: Array, act: Array, resistance: Array, back_emf: Array, acts: list[int]
+) -> Array:
     """Armature currents `(B, 2)` in A from applied voltages, wheel rates and activations."""
     return act[:, acts] if acts else (voltage - back_emf * rates) / resistance
 
@@ -181,7 +186,8 @@ class Plant(ABC):
         self._resistance, self._back_emf = (np.repeat(a, size, axis=0) for a in (resistance, back_emf))
         self._drive_gain = np.ones((size, 1))
         self._delay = np.zeros(size, int)
-        self._queue = np.zeros((1, size, 4))
+        # As long as any delay, so that a robot's past does not depend on the delays of the others.
+        self._queue = np.zeros((1 + round(LONGEST_DELAY / (substeps * model.opt.timestep)), size, 4))
         self._tick = 0
         self._pushes: dict[int, int] = {}
         self._chassis = model.body("chassis").id
@@ -212,12 +218,6 @@ class Plant(ABC):
         self._resistance[robot], self._back_emf[robot] = resistance[0], back_emf[0]
         self._drive_gain[robot] = perturbation.supply_factor
         self._delay[robot] = delay
-        depth = len(self._queue)
-        if delay >= depth:  # keep what was commanded in the past; before that, the oldest that is known
-            past = self._tick - 1 - np.arange(delay + 1)
-            grown = self._queue[np.maximum(past, past[depth - 1]) % depth]
-            self._queue = np.empty((delay + 1, self.size, 4))
-            self._queue[past % (delay + 1)] = grown
 
     def reset(self, pose: Array, twist: Array) -> None:
         """Stands every robot on the ground, rolling.
@@ -258,7 +258,7 @@ class Plant(ABC):
         """
         depth = len(self._queue)
         self._queue[self._tick % depth] = command
-        if depth > 1:
+        if self._delay.any():
             command = self._queue[(self._tick - self._delay) % depth, np.arange(self.size)]
         np.multiply(command[:, :2], self._drive_gain, out=self.applied)
         self.ctrl[:, self._inputs[0]] = self.applied[:, 0]
@@ -287,9 +287,8 @@ class Plant(ABC):
 
     def current(self) -> Array:
         """Armature currents left and right in A, `(B, 2)`."""
-        return motor_current(
-            self.applied, self.reading[:, RATE_LEFT : RATE_RIGHT + 1], self.act, self._resistance, self._back_emf, self._acts
-        )
+        rates = self.reading[:, RATE_LEFT : RATE_RIGHT + 1]
+        return motor_current(self.applied, rates, self.act, self._resistance, self._back_emf, self._acts)
 
 
 class PhysicsPlant(Plant):

@@ -128,13 +128,19 @@ def path(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int
 
 
 @styled
-def velocities(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
-    """Linear and rotation velocity over time, with the original reference (the paper's figure 4)."""
-    figure, axes = _figure(COLUMN, 0.9 * COLUMN, rows=2)
+def velocities(
+    result: xr.Dataset,
+    signals: Sequence[str] = ("v", "omega"),
+    window: tuple[float, float] | None = None,
+    lap: int | None = None,
+) -> Figure:
+    """Linear and rotation velocity over time, or one of them, with the original reference (the paper's figure 4)."""
+    figure, axes = _figure(COLUMN, (0.1 + 0.4 * len(signals)) * COLUMN, rows=len(signals))
     curves = _curves(result, window, lap)
-    for one, name, text in zip(axes, ("v", "omega"), (r"$V_{AV}$ (m/s)", r"$\dot\theta$ (rad/s)"), strict=True):
+    texts = {"v": r"$V_{AV}$ (m/s)", "omega": r"$\dot\theta$ (rad/s)"}
+    for one, name in zip(axes, signals, strict=True):
         _references(one, curves, "time", f"{name}_ref")
-        _signals(one, curves, name, text)
+        _signals(one, curves, name, texts[name])
     _legend(figure, curves, reference=True)
     return figure
 
@@ -231,11 +237,14 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
         raise InputError("metrics: none given")
     names = [known(name) for name in metrics]
     laps = as_runs(result if "lap" in result.dims else per_lap(result))
-    count = len(names)
-    figure, axes = _figure(COLUMN if count == 1 else PAGE, 0.75 * COLUMN, columns=count)
+    columns = min(2, len(names))
+    rows = -(-len(names) // columns)
+    figure, axes = _figure(COLUMN if columns == 1 else PAGE, 0.75 * rows * COLUMN, rows=rows, columns=columns)
     number = laps["lap"].values
     labels = [str(label) for label in laps["label"].values]
-    for one, name in zip(axes, names, strict=True):
+    for unused in axes[len(names) :]:
+        unused.remove()
+    for one, name in zip(axes, names, strict=False):
         ends: list[tuple[float, float, str, str]] = []
         for order, label in enumerate(dict.fromkeys(labels)):
             rows = [row for row, other in enumerate(labels) if other == label]

@@ -32,9 +32,9 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "theta_ref": ("rad", "reference heading"),
     "v_ref": ("m/s", "reference linear velocity"),
     "omega_ref": ("rad/s", "reference rotation velocity"),
-    "longitudinal_error": ("m", "measured longitudinal error"),
-    "lateral_error": ("m", "measured lateral error"),
-    "heading_error": ("rad", "measured heading error"),
+    "longitudinal_error": ("m", "longitudinal error, reference minus true posture in the body frame"),
+    "lateral_error": ("m", "lateral error, reference minus true posture in the body frame"),
+    "heading_error": ("rad", "heading error, reference minus true posture in the body frame"),
     "v_measured": ("m/s", "measured linear velocity"),
     "omega_measured": ("rad/s", "measured rotation velocity"),
     "v_command": ("m/s", "commanded linear velocity"),
@@ -86,27 +86,25 @@ def dataset(
     variables["failed"] = ("run", np.array([bool(reason) for reason in failure]))
     variables["failure"] = ("run", np.array(failure, dtype=object))
     variables["failure_time"] = ("run", failure_time, {"units": "s"})
+    coords: dict[str, object] = {
+        "time": ("time", period * np.arange(log.shape[1]), {"units": "s"}),
+        "run": np.arange(len(scenarios)),
+        "label": ("run", np.array([s.name or label for s, label in zip(scenarios, labels, strict=True)], object)),
+        "feedforward": ("run", np.array(labels, object)),
+        "steering": ("run", np.array([s.steering for s in scenarios], object)),
+        "seed": ("run", np.array([s.seed for s in scenarios])),
+        "lap_time": ("run", np.array([s.reference.period for s in scenarios]), {"units": "s"}),
+    }
     if weights is not None:
         variables["weights"] = (("run", "weight"), weights, {"long_name": "weights at the end, flat"})
-    return xr.Dataset(
-        variables,
-        coords={
-            "time": ("time", period * np.arange(log.shape[1]), {"units": "s"}),
-            "run": np.arange(len(scenarios)),
-            "label": ("run", np.array([s.name or label for s, label in zip(scenarios, labels, strict=True)], object)),
-            "feedforward": ("run", np.array(labels, object)),
-            "steering": ("run", np.array([s.steering for s in scenarios], object)),
-            "seed": ("run", np.array([s.seed for s in scenarios])),
-            "lap_time": ("run", np.array([s.reference.period for s in scenarios]), {"units": "s"}),
-        },
-    )
+        coords["weight"] = np.arange(weights.shape[1])  # networks of different sizes align on it
+    return xr.Dataset(variables, coords)
 
 
 def combine(groups: Sequence[tuple[Sequence[int], xr.Dataset]], scenarios: Sequence[Scenario]) -> xr.Dataset:
     """Puts groups back into the order the scenarios were given in; shorter runs end in NaN."""
     parts = [part.assign_coords(run=list(rows)) for rows, part in groups]
-    whole = parts[0] if len(parts) == 1 else xr.concat(parts, "run", join="outer", data_vars="minimal", coords="minimal")
-    whole = whole.sortby("run")
+    whole = xr.concat(parts, "run", join="outer", data_vars="minimal", coords="minimal").sortby("run")
     whole.attrs = {
         "scenarios": json.dumps([s.model_dump(mode="json") for s in scenarios]),
         "versions": json.dumps(versions()),
@@ -116,8 +114,9 @@ def combine(groups: Sequence[tuple[Sequence[int], xr.Dataset]], scenarios: Seque
 
 
 def scenarios_of(result: xr.Dataset) -> list[Scenario]:
-    """The resolved scenarios that a result came from, to run again."""
-    return [Scenario.from_dict(values, "scenario") for values in json.loads(result.attrs["scenarios"])]
+    """The resolved scenarios of the runs in a result, or in a selection of them, to run again."""
+    every = json.loads(result.attrs["scenarios"])
+    return [Scenario.from_dict(every[run], "scenario") for run in np.atleast_1d(result["run"])]
 
 
 def save(result: xr.Dataset, path: str | Path) -> None:
@@ -130,10 +129,9 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     if path.exists():
         raise InputError(f"{path}: exists already, nothing was overwritten")
     partial = path.with_name(path.name + ".partial")
-    text = {name: result[name].astype(str) for name in result.variables if result[name].dtype == object}
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
-        result.assign(text).to_zarr(partial, mode="w", zarr_format=3, consolidated=False)
+        result.to_zarr(partial, mode="w", zarr_format=3, consolidated=False)
         partial.rename(path)
     except OSError as error:
         shutil.rmtree(partial, ignore_errors=True)
@@ -147,6 +145,9 @@ def open_result(path: str | Path) -> xr.Dataset:
         InputError: There is no result at this path.
     """
     try:
-        return xr.open_zarr(path, consolidated=False).load()
+        result = xr.open_zarr(path, consolidated=False).load()
     except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: not a saved result: {str(error).splitlines()[0]}") from None
+        raise InputError(f"{path}: not a saved result: {' '.join(str(error).split())}") from None
+    if missing := {"scenarios", "versions", "control_period"} - set(result.attrs):
+        raise InputError(f"{path}: not a saved result: no {min(missing)}")
+    return result

@@ -16,7 +16,11 @@ from mrctl.robot import Perturbation
 
 FeedforwardName = Literal["none", "model", "oracle", "fel", "rls"]
 FEEDFORWARDS: tuple[FeedforwardName, ...] = ("none", "model", "oracle", "fel", "rls")
+LONGEST = 10_000_000  # control periods in a run; its record takes 250 bytes each
 STEERINGS: tuple[Literal["compliant", "caster", "rigid"], ...] = ("compliant", "caster", "rigid")
+
+
+Spread = Annotated[float, Field(ge=0, le=0.2)]
 
 
 class Event(Record):
@@ -69,9 +73,7 @@ class Scenario(Record):
     """What happens during the run."""
     initial_pose: tuple[float, float, float] | None = None
     """Posture at the start in m, m, rad; by default the reference's own."""
-    initial_spread: tuple[
-        Annotated[float, Field(ge=0, le=0.2)], Annotated[float, Field(ge=0, le=0.2)], Annotated[float, Field(ge=0, le=0.5)]
-    ] = (0.02, 0.02, 0.03)
+    initial_spread: tuple[Spread, Spread, Annotated[float, Field(ge=0, le=0.5)]] = (0.02, 0.02, 0.03)
     """Standard deviations of the seeded offset from that posture in m, m, rad."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Seed of the initial offset, the initial weights and the sensor noise."""
@@ -92,6 +94,8 @@ class Scenario(Record):
         changes += [(f"events.{i}.perturbation", e.perturbation) for i, e in enumerate(self.events) if e.perturbation]
         for name, perturbation in changes:
             whole(perturbation.control_delay, self.control_period, f"{name}.control_delay", "control_period")
+        if not 1 <= self.duration / self.control_period <= LONGEST:
+            raise ValueError(f"laps: a run of {self.duration:g} s is not between 1 and {LONGEST:,} control periods")
         return self
 
     @property

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Sequence
 
-import mujoco
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -13,11 +12,12 @@ from tqdm import tqdm
 
 from mrctl import model as mjcf
 from mrctl import result
-from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.feedforward import Feedforward, InverseDynamics
+from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.hierarchy import Hierarchy, feedforward_of
+from mrctl.control.kanayama import posture_error
 from mrctl.measurement import observe
-from mrctl.plant import OMEGA, RATE_LEFT, RATE_RIGHT, STEERING, THETA, V, X, Plant, build
+from mrctl.plant import OMEGA, RATE_LEFT, RATE_RIGHT, STEERING, THETA, Plant, V, X, build
 from mrctl.record import InputError
 from mrctl.references import check
 from mrctl.robot import Perturbation, Robot
@@ -103,7 +103,7 @@ class Simulation:
         self.scenarios = list(scenarios)
         self.ticks, self.tick = first.ticks, 0
         self._period = first.control_period
-        compiled = compile_world(first)
+        compiled = mjcf.load(first.world, first.steering, first.physics_step)
         robot = mjcf.read_robot(compiled)
         rigid = first.steering == "rigid"
         for scenario in scenarios:
@@ -113,7 +113,7 @@ class Simulation:
         self._oracle = stage if first.feedforward == "oracle" and isinstance(stage, InverseDynamics) else None
         self.plant: Plant = build(compiled, size, round(first.control_period / first.physics_step))
         self.hierarchy = Hierarchy(scenarios, robot, stage)
-        times = self._period * np.arange(self.ticks)
+        times = self._period * np.arange(self.ticks, dtype=float)
         motions = [s.reference.sample(times) for s in scenarios]
         self._reference = np.stack([np.hstack(motion) for motion in motions], axis=1)  # (ticks, B, 7)
         self._wheel_radius = robot.wheel_radius
@@ -128,8 +128,9 @@ class Simulation:
         start = self._reference[0]
         self.plant.reset(np.stack([_start(s, start[i, :3]) for i, s in enumerate(scenarios)]), start[:, 3:5])
         reading = self.plant.reading
-        self.hierarchy.reset(start[:, 3:5], reading[:, STEERING])
+        self.hierarchy.reset(start[:, 3:5], start[:, 5:], reading[:, STEERING])
         self._pose, self._twist = reading[:, X : THETA + 1].copy(), reading[:, V : OMEGA + 1].copy()
+        self._error = np.zeros((size, 3))
         self._log = np.full((size, self.ticks, len(result.SIGNALS)), np.nan)
         self._failure_time = np.full(size, np.nan)
 
@@ -138,6 +139,7 @@ class Simulation:
         """Whether there is anything left to do."""
         return self.tick < self.ticks and not self.plant.failed.all()
 
+    @np.errstate(invalid="ignore", over="ignore")  # a robot that blew up is computed on in NaN, to no effect
     def step(self) -> None:
         """One control period: events, measurement, control, record, physics."""
         for row, event in self._schedule.get(self.tick, ()):
@@ -153,21 +155,24 @@ class Simulation:
         )  # fmt: skip
         reference = self._reference[self.tick]
         output = hierarchy.update(self._pose, self._twist, reference[:, :3], reference[:, 3:5], reference[:, 5:])
+        if not np.isfinite(hierarchy.parts.sum()):  # the limit would turn NaN into the full voltage
+            for row in np.flatnonzero(~np.isfinite(hierarchy.parts).all(axis=1)):
+                plant.fail(int(row), "non-finite voltage")
         before = reading[:, : STEERING + 1].copy()
+        posture_error(before[:, X : THETA + 1], reference[:, :3], self._error)
         plant.step(output)
         current = plant.current()
         np.concatenate(  # in the order of result.SIGNALS
             [
-                before, reference[:, :5], hierarchy.error, self._twist, hierarchy.command, hierarchy.parts, output,
+                before, reference[:, :5], self._error, self._twist, hierarchy.command, hierarchy.parts, output,
                 hierarchy.saturated[:, None], hierarchy.weight_norm[:, None], current,
                 (plant.applied * current).sum(axis=1, keepdims=True),
             ],
             axis=1,
             out=self._log[:, self.tick],
         )  # fmt: skip
-        if np.abs(hierarchy.error[:, 1]).max() > DIVERGED:
-            for row in np.flatnonzero(np.abs(hierarchy.error[:, 1]) > DIVERGED):
-                plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
+        for row in np.flatnonzero(np.abs(self._error[:, 1]) > DIVERGED):
+            plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
         self.tick += 1
         if plant.failed.any():
             new = plant.failed & np.isnan(self._failure_time)
@@ -175,11 +180,11 @@ class Simulation:
             self._log[plant.failed, self.tick - 1] = np.nan
 
     def result(self) -> xr.Dataset:
-        """What was recorded so far."""
+        """What was recorded so far; the whole length, ending in NaN, once every robot has failed."""
         stage = self.hierarchy.feedforward
         weights = stage.state["weights"].copy() if isinstance(stage, FeedbackErrorLearning) else None
         labels = [self._label] * len(self.scenarios)
-        log = self._log[:, : self.tick]
+        log = self._log[:, : self.tick] if self.running else self._log
         return result.dataset(self.scenarios, labels, log, self.plant.failure, self._failure_time, weights)
 
     def _perturb(self, row: int, perturbation: Perturbation) -> None:
@@ -203,13 +208,6 @@ class Simulation:
             self.hierarchy.set_learning(row, event.learning)
 
 
-def compile_world(scenario: Scenario) -> mujoco.MjModel:
-    """The nominal model of a scenario at its physics step."""
-    compiled = mjcf.load(scenario.world, scenario.steering)
-    compiled.opt.timestep = scenario.physics_step
-    return compiled
-
-
 def _start(scenario: Scenario, reference: Array) -> Array:
     """Posture at the start `(3,)`: the given one or the reference's, plus the seeded offset.
 
@@ -221,7 +219,7 @@ def _start(scenario: Scenario, reference: Array) -> Array:
     distance = float(np.hypot(*(base + offset - reference)[:2]))
     if distance > FAR:
         raise InputError(
-            f"initial_pose: {distance:.2f} m from the start of the reference at ({reference[0]:.2f}, {reference[1]:.2f}); "
-            f"at most {FAR:g} m"
+            f"initial_pose: {distance:.2f} m from the start of the reference at "
+            f"({reference[0]:.2f}, {reference[1]:.2f}); at most {FAR:g} m"
         )
     return base + offset

@@ -15,6 +15,7 @@ from mrctl.robot import Robot
 Array = NDArray[np.float64]
 FEATURES = ("V", "ω", "V̇", "ω̇", "Vω", "ω²", "sgn V_l", "sgn V_r")
 SIGN_SPEED = 0.05  # m/s over which the smooth sign of the losses turns
+STEERING_SHARE = 0.1  # how much slower a steering channel learns: its geometry is nearly right from the start
 
 
 class Feedforward(Protocol):
@@ -24,7 +25,7 @@ class Feedforward(Protocol):
     """
 
     def output(self, command: Array, derivative: Array) -> Array:
-        """Feedforward of the two channels.
+        """Feedforward of the two channels; asked once before the first tick, too, for a start without a bump.
 
         Args:
             command: Commanded V in m/s and θ̇ in rad/s, `(B, 2)`.

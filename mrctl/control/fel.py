@@ -14,7 +14,7 @@ import numpy as np
 from numba import float64, guvectorize
 from pydantic import Field
 
-from mrctl.control.feedforward import Array, feature_scale, features
+from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features
 from mrctl.record import InputError, Record
 from mrctl.robot import Robot
 
@@ -24,8 +24,7 @@ INPUTS, OUTPUTS = 8, 2
 # to learn what changes during a lap, quick to oscillate.
 HIDDEN_GAIN, BIAS_GAIN = 0.15, 0.1
 REGULARISATION = 1e-3  # keeps the normalised step finite at rest, where the regressor vanishes
-# A steering channel corrects a rad/s that the geometry already gives nearly right.
-STEERING_SCALE, STEERING_SHARE = 0.1, 0.1
+STEERING_SCALE = 0.1  # rad/s that a steering channel corrects, per volt of the other arrangements
 
 
 class Fel(Record):
@@ -136,7 +135,8 @@ def load_weights(path: str | Path, hidden: int) -> Array:
 
             layers = {k: v.double().numpy() for k, v in torch.load(path, map_location="cpu", weights_only=True).items()}
     except Exception as error:  # each format has its own errors; none of them is ours to tell apart
-        raise InputError(f"fel.weights: {path}: not a weights file: {str(error).splitlines()[0]}") from None
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise InputError(f"fel.weights: {path}: not a weights file: {reason}") from None
     expected = shapes(hidden)
     for name, shape in expected.items():
         if name not in layers or layers[name].shape != shape:

@@ -62,7 +62,10 @@ class ModuleLearning:
             raise ValueError(f"module: {buffers[0]} is a buffer; a module with running state cannot be copied per robot")
         settings = settings or Fel()
         self._module = copy.deepcopy(module).double().eval()
-        shape = tuple(self._module(torch.zeros(INPUTS, dtype=torch.float64)).shape)
+        try:
+            shape = tuple(self._module(torch.zeros(INPUTS, dtype=torch.float64)).shape)
+        except RuntimeError as error:
+            raise ValueError(f"module: does not map 8 features to 2 channels: {error}") from None
         if shape != (OUTPUTS,):
             raise ValueError(f"module: maps 8 features to shape {shape}, not to 2 channels")
         self._half_track = robot.half_track
@@ -96,7 +99,7 @@ class ModuleLearning:
         (gradient,) = pull(error)
         square = sum(_row(g**2).sum(1) for g in gradient.values())
         rate = torch.where(active, self._step / (square / power.clamp_min(1e-300) + REGULARISATION), 0.0)
-        leak = torch.where(active, self._leak, 0.0)
+        leak = self._leak * active.double()  # `where` of two plain numbers would be single precision
         moved = {
             name: self.state[name] + _like(rate, g) * g - _like(leak, g) * (self.state[name] - self.prior[name])
             for name, g in gradient.items()

@@ -30,7 +30,7 @@ def feedforward_of(scenarios: Sequence[Scenario], robot: Robot) -> Feedforward:
     if first.feedforward in ("model", "oracle"):  # the loop tells the oracle the truth
         return InverseDynamics([robot] * len(scenarios), rigid)
     if first.feedforward == "rls":
-        return RecursiveLeastSquares(robot, [s.rls for s in scenarios])
+        return RecursiveLeastSquares(robot, [s.rls for s in scenarios], rigid)
     return FeedbackErrorLearning(robot, [s.fel for s in scenarios], [s.seed for s in scenarios], rigid)
 
 
@@ -39,7 +39,7 @@ class Hierarchy:
 
     Attributes:
         feedforward: The feedforward stage.
-        error: Posture error in the robot's frame `(B, 3)`.
+        error: Measured posture error in the robot's frame, as of the motion controller's last tick, `(B, 3)`.
         command: Prefiltered twist command `(B, 2)`.
         derivative: Its derivative `(B, 2)`.
         feedback: Output of the PID for the two channels `(B, 2)`.
@@ -89,10 +89,20 @@ class Hierarchy:
         """Lets the feedforward of one robot learn, or not."""
         self._frozen[row] = float(not on)
 
-    def reset(self, twist: Array, steering_angle: Array) -> None:
-        """Starts from a twist `(B, 2)` that the robots already have, and steering angles `(B,)`."""
+    def reset(self, twist: Array, acceleration: Array, steering_angle: Array) -> None:
+        """Starts without a bump, as if the nominal robot had been driven here steadily.
+
+        Args:
+            twist: What the robots already do, `(B, 2)`.
+            acceleration: Its derivative along the reference, `(B, 2)`.
+            steering_angle: Angles of the forks in rad, `(B,)`.
+        """
         self.state["limiter"][:, 2:] = twist
         self.state["steering"][:, 0] = steering_angle
+        # The integral holds what the nominal robot takes here, less what the feedforward brings by itself.
+        nominal = InverseDynamics([self._robot] * len(twist), self._rigid)
+        integral = nominal.output(twist, acceleration) - self.feedforward.output(twist, acceleration)
+        self.state["pid"][:, :2] = integral
 
     def update(self, pose: Array, twist: Array, reference: Array, reference_twist: Array, acceleration: Array) -> Array:
         """One control tick.

@@ -75,7 +75,7 @@ def pid(command, twist, gains, period, excess, state, output):  # noqa: ANN001, 
         twist: Measured twist `(2,)`.
         gains: `(2, 4)` as from `Pid.gains`.
         period: Control period, s.
-        excess: What saturation took from the last output, `(2,)`; it unwinds the integral over K_p/K_i.
+        excess: What saturation took from the last output, `(2,)`; it unwinds the integral over K_p/K_i, or a period.
         state: In and out: integrals `(2,)`, filtered derivative of the error `(2,)`, last error `(2,)`, started `(1,)`.
         output: Out: feedback in volts, `(2,)`.
     """
@@ -84,7 +84,7 @@ def pid(command, twist, gains, period, excess, state, output):  # noqa: ANN001, 
         error = command[i] - twist[i]
         slope = (error - state[4 + i]) / period if state[6] > 0 else 0.0
         state[2 + i] += period / (filtering + period) * (slope - state[2 + i])
-        unwind = k_i / k_p * excess[i] if k_p > 0 else 0.0
+        unwind = k_i / max(k_p, k_i * period) * excess[i] if k_i > 0 else 0.0
         state[i] += period * (k_i * error + unwind)
         state[4 + i] = error
         output[i] = k_p * error + state[i] + k_d * state[2 + i]

@@ -8,7 +8,7 @@ import numpy as np
 from numba import float64, guvectorize
 from pydantic import Field
 
-from mrctl.control.feedforward import Array, feature_scale, features, linear
+from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features, linear
 from mrctl.record import Record
 from mrctl.robot import Robot
 
@@ -16,11 +16,14 @@ from mrctl.robot import Robot
 class Rls(Record):
     """Settings of the `rls` feedforward."""
 
-    initial_covariance: Annotated[float, Field(gt=0, le=1e3)] = 0.05
+    step: Annotated[float, Field(gt=0, le=1)] = 0.02
+    """Largest share of the feedback that one control period moves into the feedforward, as for `fel`: beyond it the
+    adaptation is a second integral action fast enough to shake the loop."""
+    initial_covariance: Annotated[float, Field(gt=0, le=1e3)] = 0.2
     """Diagonal of the initial covariance of the coefficients, relative to the variance of the feedback."""
     drift: Annotated[float, Field(ge=0, le=1)] = 3e-5
     """Variance that every coefficient gains each control period: how fast the truth may wander."""
-    covariance_bound: Annotated[float, Field(gt=0, le=1e3)] = 0.05
+    covariance_bound: Annotated[float, Field(gt=0, le=1e3)] = 0.2
     """A diagonal element above this gains no more; without excitation it would grow for ever."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
     """Feedback below this teaches nothing, V (rad/s on a steering channel)."""
@@ -42,7 +45,7 @@ def update(x, feedback, saturated, settings, coefficients, covariance, norm):  #
         x: Scaled features `(8,)`.
         feedback: `(2,)`.
         saturated: 1 freezes everything.
-        settings: Drift, covariance bound, dead zone, `(3,)`.
+        settings: Drift, covariance bound, dead zone, share of channel two, step, `(5,)`.
         coefficients: In and out, `(8, 2)`.
         covariance: In and out, `(8, 8)`.
         norm: Out: Euclidean norm of the coefficients.
@@ -52,12 +55,13 @@ def update(x, feedback, saturated, settings, coefficients, covariance, norm):  #
         return
     n = x.shape[0]
     gain = np.empty(n)
-    total = 1.0
+    power = 0.0
     for i in range(n):
         gain[i] = 0.0
         for j in range(n):
             gain[i] += covariance[i, j] * x[j]
-        total += x[i] * gain[i]
+        power += x[i] * gain[i]
+    total = max(1.0 + power, power / settings[4])  # the measurement is taken to be as noisy as the step asks
     for i in range(n):
         for j in range(n):
             covariance[i, j] -= gain[i] * gain[j] / total
@@ -65,7 +69,8 @@ def update(x, feedback, saturated, settings, coefficients, covariance, norm):  #
             covariance[i, i] += drift
         for k in range(2):
             if abs(feedback[k]) > dead_zone:
-                coefficients[i, k] += gain[i] / total * feedback[k]
+                share = settings[3] if k == 1 else 1.0
+                coefficients[i, k] += share * gain[i] / total * feedback[k]
     norm[0] = np.sqrt((coefficients**2).sum())
 
 
@@ -77,12 +82,12 @@ class RecursiveLeastSquares:
         weight_norm: Euclidean norm of the coefficients, `(B,)`.
     """
 
-    def __init__(self, robot: Robot, settings: list[Rls]) -> None:
-        """Takes the nominal robot (for the scales alone) and settings a row."""
+    def __init__(self, robot: Robot, settings: list[Rls], rigid: bool) -> None:
+        """Takes the nominal robot (for the scales alone), settings a row, and whether channel two is steering."""
         size = len(settings)
         self._half_track = robot.half_track
         self._scale = feature_scale(robot)
-        self._settings = np.array([[s.drift, s.covariance_bound, s.dead_zone] for s in settings])
+        self._settings = np.array([[s.drift, s.covariance_bound, s.dead_zone, STEERING_SHARE if rigid else 1.0, s.step] for s in settings])
         self._features = np.zeros((size, 8))
         self.weight_norm = np.zeros(size)
         self.state = {

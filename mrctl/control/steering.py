@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mrctl.robot import Robot
 
-REST = 0.02  # m/s of the front contact; below it the fork holds its angle
+REST = 0.02  # m/s; below it the fork holds its angle
 SIGN_SPEED = 0.05  # m/s over which the smooth sign of the losses turns
 
 
@@ -75,7 +75,7 @@ def allocate(twist, acceleration, feedback, feedforward, robot, period, state, c
     forward, side = sense * v, sense * wheelbase * omega
     speed = np.hypot(forward, side)
     angle, rate = state[0], 0.0
-    if speed > REST:
+    if forward > REST:
         forward_dot, side_dot = sense * v_dot, sense * wheelbase * omega_dot
         s = sense * trail * omega / speed  # trail < wheelbase, so the arcsine exists
         static = np.arctan2(side, forward) - np.arcsin(s)
@@ -84,7 +84,7 @@ def allocate(twist, acceleration, feedback, feedforward, robot, period, state, c
         static_rate -= (sense * trail * omega_dot - s * speed_dot) / speed / np.sqrt(1 - s * s)
         lag = trail / speed
         angle = (lag * state[0] + period * static) / (lag + period)  # implicit Euler: exact on a ramp
-        rate = (lag * state[1] + period * static_rate) / (lag + period)
+        rate = (lag * state[1] + period * static_rate) / (lag + period * (1 - lag * speed_dot / speed))
         if abs(angle) > steering_max:
             angle = steering_max if angle > 0 else -steering_max
             rate = 0.0
@@ -95,7 +95,8 @@ def allocate(twist, acceleration, feedback, feedforward, robot, period, state, c
     left, right = parts[0] + parts[2], parts[1] + parts[3]
     command[0] = max(-supply, min(supply, left))
     command[1] = max(-supply, min(supply, right))
-    command[2], command[3] = angle + rate * period / 2, rate  # held for a period: aim at its middle
+    middle = angle + rate * period / 2  # the set-point is held for a period
+    command[2], command[3] = max(-steering_max, min(steering_max, middle)), rate
     lost_left, lost_right = command[0] - left, command[1] - right
     excess[0] = (lost_left + lost_right) / 2
     if not rigid > 0:

@@ -1,0 +1,159 @@
+"""The commands."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json as jsonlib
+import re
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial, wraps
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from mrctl.record import InputError
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command.
+
+    Args:
+        arguments: The command line without the program's name; `sys.argv` by default.
+
+    Returns:
+        0 on success, 2 on bad input, with one line on stderr that names the field or file.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    try:
+        _parse(arguments)
+    except InputError as error:
+        print(f"mrctl: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("mrctl: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parse(arguments: list[str]) -> None:
+    """Lets tyro turn flags into a call of one of the commands below, its complaints into one line."""
+    commands: dict[str, Callable[..., Any]] = {
+        "run": _run_with(arguments),
+        "reproduce": reproduce,
+        "suite": suite,
+        "tune": tune,
+    }
+    complaints = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaints):
+            command = tyro.extras.subcommand_cli_from_dict(
+                {name: _deferred(function) for name, function in commands.items()},
+                prog="mrctl",
+                description="A physics testbed for adaptive control of a car-like robot.",
+                args=arguments,
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise InputError(_one_line(complaints.getvalue())) from None
+    command()
+
+
+def _deferred(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
+    """The function with its call put off, so that only parsing happens while stderr is caught."""
+    @wraps(function)
+    def inner(*args: object, **kwargs: object) -> Callable[[], Any]:
+        return partial(function, *args, **kwargs)
+
+    return inner
+
+
+def _one_line(box: str) -> str:
+    """The message in one of tyro's boxes, in Unicode or ASCII; pydantic's own as `field: what is wrong`."""
+    titled = "╭" not in box  # without box characters the title is a part of its own
+    lines = [line.strip("│| ") for line in box.splitlines() if not line.startswith(("╭", "╰", "+"))]
+    parts = re.split(r"(?:^|\n)[-─]{8,}(?:\n|$)", "\n".join(lines).strip())
+    parts = [" ".join(part.split()) for part in parts if part.strip()]
+    text = parts[min(titled, len(parts) - 1)] if parts else "bad arguments"
+    pattern = r"Error parsing (\S*): \d+ validation errors? for \w+ (?:([\w.]+) (?=[A-Z]))?(.*?) \[type="
+    if not (found := re.match(pattern, text)):
+        return text
+    path = [part for part in found[1].split(".") if part not in ("__tyro-dummy-inner__", "scenario", "")]
+    field = ".".join([*path, *([found[2]] if found[2] else [])])
+    return ": ".join(part for part in (field, found[3].removeprefix("Value error, ")) if part)
+
+
+def _run_with(arguments: list[str]) -> Callable[..., None]:
+    """The `run` command, whose flags take their defaults from the scenario file, if one is given."""
+    file = next((a for a in arguments[1:] if a.endswith(".toml")), None) if arguments[0] == "run" else None
+    default = Scenario.from_toml(file) if file else Scenario()
+
+    def run(
+        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml")] = None,
+        /,
+        scenario: Annotated[Scenario, tyro.conf.arg(name="")] = default,
+        out: Path | None = None,
+        json: bool = False,
+    ) -> None:
+        """Runs one scenario and prints its metrics lap by lap.
+
+        Args:
+            file: Scenario file; flags override what it says.
+            scenario: The scenario.
+            out: Folder for the result, the figures and the learned weights.
+            json: Print JSON.
+        """
+        from mrctl.experiments import single
+
+        print(single.run(scenario, out, json))
+
+    return run
+
+
+def reproduce(out: Path = Path("reproduction")) -> None:
+    """Reproduces the paper's figures, Kanayama's table and the comparison of PID with the neural feedforward.
+
+    Args:
+        out: Folder for figures (PNG and PDF) and `table.json` with every number.
+    """
+    from mrctl.experiments import paper
+
+    print(paper.reproduce(out))
+
+
+def suite(
+    feedforward: tuple[FeedforwardName, ...] = FEEDFORWARDS, seeds: int = 10, out: Path = Path("suite")
+) -> None:
+    """Compares the feedforwards over steering arrangements and perturbations, with paired seeds.
+
+    Args:
+        feedforward: Which to compare.
+        seeds: Runs of each.
+        out: Folder for the table as Markdown and JSON.
+    """
+    from mrctl.experiments import ladder
+
+    print(ladder.suite(feedforward, seeds, out))
+
+
+def tune(world: str = "flat", time_constant: float = 0.15, delay: float = 0.0, json: bool = False) -> None:
+    """Designs the velocity PID from equation (3) and prints gains, margins and the learning condition.
+
+    Args:
+        world: World or MJCF file with the robot.
+        time_constant: Closed-loop time constant in s.
+        delay: Loop delay in s beside the hold of half a control period.
+        json: Print JSON.
+    """
+    from mrctl.experiments import tuning
+
+    table = tuning.design(world, time_constant, delay)
+    print(jsonlib.dumps(table, indent=2) if json else tuning.text(table))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,131 @@
+"""Kanayama's table: his motion controller on the kinematic plant, held against targets.
+
+The plant is equation (2) with ideal velocity tracking, integrated at 0.1 ms with a second-order step. The reference
+runs along the x axis at v_r = 0.30 m/s, the robot starts beside it with v(0) = v_r. Gains and limits are those of
+Kanayama et al. (1990); the limiter clips each of v, ω, v̇, ω̇ by itself. A residual is y over Δy when the robot has
+come 50 cm along x, an overshoot the largest excursion to the other side over Δy.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrctl.control.kanayama import kanayama
+from mrctl.control.limiter import limit
+from mrctl.kinematics import pose_rates
+
+STEP = 1e-4  # s
+SPEED = 0.30  # m/s
+K_X, K_Y, K_THETA = 10.0, 64.0, 16.0
+LIMITS = np.array([0.40, 0.8, 0.5, 5.0])  # m/s, rad/s, m/s², rad/s²
+DISTANCE = 0.50  # m
+DURATION = 5.0  # s
+
+
+class Case(NamedTuple):
+    """One entry of the table.
+
+    Attributes:
+        name: What is measured.
+        unit: `%` of Δy, or `cm`.
+        target: Computed independently by the authors of `physics.md` at 0.1 ms, not printed in the 1990 paper.
+        offset: Initial Δy in m.
+        turn: Initial Δθ in rad.
+        k_theta: K_θ in 1/m.
+        limited: Whether the limiter acts.
+        measure: `residual`, `overshoot` or `excursion`.
+    """
+
+    name: str
+    unit: str
+    target: float
+    offset: float
+    turn: float
+    k_theta: float
+    limited: bool
+    measure: str
+
+
+def _cases() -> list[Case]:
+    table = [
+        Case(f"Δy = 5 cm, residual at 50 cm, K_θ = {k:g}", "%", target, 0.05, 0.0, k, False, "residual")
+        for k, target in ((12.0, -1.8), (16.0, 9.1), (20.0, 17.9))
+    ]
+    table.append(Case("Δy = 5 cm, overshoot, ζ = 0.75", "%", 2.87, 0.05, 0.0, 12.0, False, "overshoot"))
+    for limited, residuals in ((True, (10.5, 12.1, 16.1, 30.7)), (False, (9.1, 8.8, 7.8, 4.7))):
+        how = "with the limiter" if limited else "without"
+        for offset, target in zip((0.05, 0.10, 0.20, 0.40), residuals, strict=True):
+            name = f"Δy = {100 * offset:g} cm, residual at 50 cm, {how}"
+            table.append(Case(name, "%", target, offset, 0.0, K_THETA, limited, "residual"))
+    for limited, excursions in ((False, (3.4, 5.9, 7.2)), (True, (12.3, 25.8, 16.3))):
+        how = "with the limiter" if limited else "without"
+        for degrees, target in zip((45, 90, 135), excursions, strict=True):
+            name = f"Δθ = {degrees}°, largest lateral excursion, {how}"
+            table.append(Case(name, "cm", target, 0.0, np.radians(degrees), K_THETA, limited, "excursion"))
+    return table
+
+
+CASES = _cases()
+
+
+def paths(cases: list[Case], period: float = STEP) -> NDArray[np.float64]:
+    """Postures along every case.
+
+    Args:
+        cases: The cases, B of them.
+        period: Control period in s, a multiple of `STEP`.
+
+    Returns:
+        `(steps, B, 3)` in m, m, rad, a row each `STEP`.
+    """
+    size, hold = len(cases), round(period / STEP)
+    pose = np.array([[0.0, case.offset, case.turn] for case in cases])
+    gains = np.array([[K_X, K_Y, case.k_theta] for case in cases])
+    limited = np.array([[case.limited] for case in cases])
+    state = np.tile([0.0, 0.0, SPEED, 0.0], (size, 1))
+    zero, reference_twist = np.zeros(2), np.array([SPEED, 0.0])
+    error, request = np.zeros((size, 3)), np.zeros((size, 2))
+    command, derivative = np.zeros((size, 2)), np.zeros((size, 2))
+    twist = np.zeros((size, 2))
+    steps = round(DURATION / STEP)
+    record = np.empty((steps, size, 3))
+    for k in range(steps):
+        record[k] = pose
+        if k % hold == 0:
+            reference = np.array([SPEED * STEP * k, 0.0, 0.0])
+            kanayama(pose, reference, reference_twist, gains, error, request)
+            limit(request, zero, zero, LIMITS, period, period, state, command, derivative)
+            twist = np.where(limited, command, request)
+        middle = pose + STEP / 2 * pose_rates(pose, twist)
+        pose = pose + STEP * pose_rates(middle, twist)
+    return record
+
+
+def measure(case: Case, path: NDArray[np.float64]) -> float:
+    """The number of one case, in its unit, from its path `(steps, 3)`."""
+    x, y = path[:, 0], path[:, 1]
+    if case.measure == "residual":
+        k = int(np.argmax(x >= DISTANCE))
+        at = np.interp(DISTANCE, x[k - 1 : k + 1], y[k - 1 : k + 1])
+        return float(100 * at / case.offset)
+    if case.measure == "overshoot":
+        return float(100 * np.max(-y) / case.offset)
+    return float(100 * np.abs(y).max())
+
+
+def table() -> list[dict[str, float | str]]:
+    """Every case with its target, the value at 0.1 ms (the stated convention), and the value at T_s = 10 ms."""
+    fine, coarse = paths(CASES), paths(CASES, 0.01)
+    return [
+        {
+            "case": case.name,
+            "unit": case.unit,
+            "target": case.target,
+            "value": measure(case, fine[:, i]),
+            "value_10ms": measure(case, coarse[:, i]),
+        }
+        for i, case in enumerate(CASES)
+    ]

@@ -1,0 +1,182 @@
+"""`mrctl reproduce`: the paper's figures in real physics, and the numbers behind them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from mrctl import metrics, plots
+from mrctl.experiments import kanayama
+from mrctl.experiments.tables import markdown, number, output_folder, write_json
+from mrctl.references import Lemniscate
+from mrctl.result import versions
+from mrctl.robot import PERTURBATIONS
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
+from mrctl.simulate import simulate
+
+# What the figures show: PID alone, and PID with the network, on a robot that nobody modelled.
+CASE = "all"
+FAST, SLOW = 12.0, 20.0  # s a lap
+LONG = 60  # laps, for stability of learning
+METRICS = ("v_rmse", "omega_rmse", "position_rmse")
+
+
+def scenario(feedforward: FeedforwardName, case: str, period: float = FAST, **changes: Any) -> Scenario:  # noqa: ANN401
+    """The benchmark: the lemniscate at a lap time, on the plant of a named case."""
+    name = f"{feedforward}, {case}, {period:g} s"
+    return Scenario(
+        name=name,
+        feedforward=feedforward,
+        perturbation=PERTURBATIONS[case],
+        reference=Lemniscate(period=period),
+        **changes,
+    )
+
+
+def benchmark() -> list[Scenario]:
+    """The runs of eight laps: the whole ladder, fast and slow, and the other steering arrangements."""
+    compliant = [
+        scenario(f, case, period) for period in (FAST, SLOW) for case in ("nominal", CASE) for f in FEEDFORWARDS
+    ]
+    others = [
+        scenario(f, case, steering=steering)
+        for steering in ("caster", "rigid")
+        for case in ("nominal", CASE)
+        for f in FEEDFORWARDS
+    ]
+    return [*compliant, *others]
+
+
+def reproduce(out: Path) -> str:
+    """Writes figures 2 to 6 of the paper, a learning curve, and `table.json`.
+
+    Args:
+        out: Folder to write to.
+
+    Returns:
+        What was found, as Markdown.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    output_folder(out)
+    began = time.monotonic()
+    scenarios = benchmark()
+    result = simulate(scenarios, progress=True)
+    endurance = [scenario("fel", case, laps=LONG) for case in ("nominal", CASE)]
+    endured = simulate(endurance, progress=True)
+    figures(result, scenarios, out)
+    lateral = kanayama.table()
+    rows, long_rows = compare(result, scenarios), endure(endured, endurance)
+    write_json(
+        out / "table.json",
+        {
+            "versions": versions(),
+            "seconds": time.monotonic() - began,
+            "kanayama": lateral,
+            "last_lap": rows,
+            "endurance": long_rows,
+            "scenarios": [s.model_dump(mode="json") for s in (*scenarios, *endurance)],
+        },
+    )
+    return "\n\n".join(
+        [text(rows), endurance_text(long_rows), kanayama_text(lateral), f"Figures and table.json are in {out}."]
+    )
+
+
+def figures(result: xr.Dataset, scenarios: Sequence[Scenario], out: Path) -> None:
+    """Draws and writes every figure."""
+    pair = [scenarios.index(scenario(name, CASE)) for name in ("none", "fel")]
+    both = result.isel(run=pair).assign_coords(label=("run", ["PID", "PID + network"]))
+    both = both.isel(time=slice(scenarios[pair[0]].ticks))
+    pid, network = both.isel(run=0), both.isel(run=1)
+    last, lap = scenarios[0].laps, FAST
+    drawn = {
+        "figure2_posture": plots.posture_definition(),
+        "figure3_structure": plots.control_structure(),
+        "figure4a_linear_velocity": plots.velocities(network, ("v",), lap=last),
+        "figure4b_rotation_velocity": plots.velocities(network, ("omega",), lap=last),
+        "figure4c_tracking_errors": plots.errors(network, window=(0.0, last * lap)),
+        "figure5_pid_against_network": plots.compare_errors(pid, network, lap=last),
+        "figure6_feedforward_outputs": plots.feedforward_outputs(network, window=(0.0, 3 * lap)),
+        "path": plots.path(both, lap=last),
+        "voltages": plots.voltages(both, lap=last),
+        "learning_curve": plots.learning_curve(both, ("v_rmse", "omega_rmse", "position_rmse", "feedback_share")),
+    }
+    for name, figure in drawn.items():
+        plots.save(figure, out, name)
+
+
+def compare(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
+    """Last-lap RMSE of every run, with its ratio to PID alone on the same plant, reference and seed."""
+    table = metrics.summary(result)
+    rows = []
+    for k, one in enumerate(scenarios):
+        bare = scenarios.index(one.model_copy(update={"feedforward": "none", "name": _bare(one)}))
+        row: dict[str, Any] = {
+            "steering": one.steering,
+            "plant": next(name for name, p in PERTURBATIONS.items() if p == one.perturbation),
+            "lap_time": one.reference.period,
+            "feedforward": one.feedforward,
+            "seed": one.seed,
+            "failure": str(result["failure"].values[k]),
+        }
+        for metric in METRICS:
+            row[metric] = float(table[metric].iloc[k])
+            row[f"{metric}_to_pid"] = float(table[metric].iloc[k] / table[metric].iloc[bare])
+        rows.append(row)
+    return rows
+
+
+def _bare(one: Scenario) -> str:
+    return one.name.replace(one.feedforward, "none", 1)
+
+
+def endure(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
+    """RMSE of lap 8 and of the last lap: does learning stay stable?"""
+    laps = metrics.per_lap(result)
+    rows = []
+    for k, one in enumerate(scenarios):
+        row: dict[str, Any] = {"run": one.name, "laps": one.laps}
+        for metric in METRICS:
+            values = laps[metric].values[k]
+            row[metric] = {"lap_8": float(values[7]), "last": float(values[-1])}
+        rows.append(row)
+    return rows
+
+
+def endurance_text(rows: Sequence[dict[str, Any]]) -> str:
+    """The endurance runs as Markdown."""
+    header = ["run", *(f"{name}, lap 8 → {LONG}" for name in ("V, mm/s", "θ̇, mrad/s", "position, mm"))]
+    cells = [[r["run"], *(f"{number(1e3 * r[m]['lap_8'])} → {number(1e3 * r[m]['last'])}" for m in METRICS)] for r in rows]
+    return f"The same after {LONG} laps:\n\n" + markdown(header, cells)
+
+
+def text(rows: Sequence[dict[str, Any]]) -> str:
+    """The comparison as Markdown."""
+    header = ["steering", "plant", "lap", "feedforward", "V, mm/s", "θ̇, mrad/s", "position, mm", "to PID: V", "θ̇", "position"]
+    cells = []
+    for row in rows:
+        if row["failure"]:
+            values = [row["failure"], *[""] * 5]
+        else:
+            ratios = [row[f"{m}_to_pid"] for m in METRICS]
+            values = [number(1e3 * row[m]) for m in METRICS]
+            values += [f"{r:.2f}" if math.isfinite(r) else "PID fails" for r in ratios]
+        cells.append([row["steering"], row["plant"], f"{row['lap_time']:g} s", row["feedforward"], *values])
+    return "RMSE of the last of 8 laps against the reference:\n\n" + markdown(header, cells)
+
+
+def kanayama_text(rows: Sequence[dict[str, Any]]) -> str:
+    """Kanayama's table as Markdown."""
+    cells = [
+        [str(r["case"]), f"{r['target']:.4g} {r['unit']}", f"{r['value']:.2f}", f"{r['value_10ms']:.2f}"] for r in rows
+    ]
+    return "Kanayama's controller on the kinematic plant:\n\n" + markdown(
+        ["case", "target", "at 0.1 ms", "at T_s = 10 ms"], cells
+    )

@@ -1,0 +1,86 @@
+"""`mrctl run`: one scenario, its metrics, and what is kept of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from mrctl import metrics, plots
+from mrctl.control.fel import save_weights
+from mrctl.experiments.tables import markdown, number, output_folder
+from mrctl.record import InputError
+from mrctl.result import save, versions
+from mrctl.scenario import Scenario
+from mrctl.simulate import simulate
+
+COLUMNS = {
+    "longitudinal_rmse": ("x error, mm", 1e3),
+    "lateral_rmse": ("y error, mm", 1e3),
+    "heading_rmse": ("θ error, mrad", 1e3),
+    "position_rmse": ("position, mm", 1e3),
+    "v_rmse": ("V, mm/s", 1e3),
+    "omega_rmse": ("θ̇, mrad/s", 1e3),
+    "feedback_share": ("RMS(U_fb)/RMS(U)", 1.0),
+    "saturation_time": ("saturated, s", 1.0),
+    "energy": ("energy, J", 1.0),
+}
+
+
+def run(scenario: Scenario, out: Path | None, as_json: bool) -> str:
+    """Runs a scenario.
+
+    Args:
+        scenario: What to run.
+        out: Folder for `result.zarr`, figures and learned weights, or None.
+        as_json: JSON instead of a table.
+
+    Returns:
+        The metrics, a row a lap.
+
+    Raises:
+        InputError: A bad scenario, or a folder that cannot be written or holds a result already.
+    """
+    if out is not None and (output_folder(out) / "result.zarr").exists():
+        raise InputError(f"out: {out} holds a result already; nothing was overwritten")
+    result = simulate([scenario], progress=True)
+    laps = metrics.per_lap(result)
+    if out is not None:
+        save(result, out / "result.zarr")
+        if "weights" in result:
+            save_weights(out / "weights.safetensors", result["weights"].values[0])
+        figures = {
+            "path": plots.path(result),
+            "velocities": plots.velocities(result),
+            "errors": plots.errors(result),
+            "voltages": plots.voltages(result),
+            "learning": plots.learning_curve(laps),
+        }
+        for name, figure in figures.items():
+            plots.save(figure, out, name)
+    failure = str(result["failure"].values[0])
+    row = laps.isel(run=0)
+    if as_json:
+        values = {
+            "scenario": scenario.model_dump(mode="json"),
+            "versions": versions(),
+            "failed": bool(failure),
+            "failure": failure,
+            "failure_time": float(row["failure_time"]) if failure else None,
+            "laps": [
+                {name: _number(row[name].values[k]) for name in metrics.METRICS} for k in range(row.sizes["lap"])
+            ],
+        }
+        return json.dumps(values, indent=1)
+    header = ["lap", *(title for title, _ in COLUMNS.values())]
+    rows = [
+        [str(k + 1), *(number(scale * float(row[name].values[k])) for name, (_, scale) in COLUMNS.items())]
+        for k in range(row.sizes["lap"])
+    ]
+    lines = [f"RMSE per lap against the reference, feedforward {scenario.feedforward}, steering {scenario.steering}"]
+    if failure:
+        lines.append(f"failed after {float(row['failure_time']):.2f} s: {failure}")
+    return "\n".join([*lines, markdown(header, rows)])
+
+
+def _number(value: float) -> float | None:
+    return float(value) if abs(value) < float("inf") else None

@@ -1,0 +1,53 @@
+"""Tables for terminals and Markdown, and the folders they are written to."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from mrctl.record import InputError
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table whose columns line up in a terminal too."""
+    widths = [max(len(cells[i]) for cells in (header, *rows)) for i in range(len(header))]
+    lines = [[cell.ljust(width) for cell, width in zip(cells, widths, strict=True)] for cells in (header, *rows)]
+    lines.insert(1, ["-" * width for width in widths])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def number(value: float) -> str:
+    """Three significant digits."""
+    return f"{value:#.3g}".rstrip(".")
+
+
+def output_folder(path: Path) -> Path:
+    """Makes sure that a folder can be written, before anything is computed for it.
+
+    Raises:
+        InputError: It cannot.
+    """
+    probe = path / ".writable"
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"out: {path}: cannot be written: {error.strerror}") from None
+    return path
+
+
+def write_json(path: Path, values: object) -> None:
+    """Writes JSON with NaN as null."""
+    path.write_text(json.dumps(_finite(values), indent=1, ensure_ascii=False) + "\n")
+
+
+def _finite(values: object) -> object:
+    if isinstance(values, dict):
+        return {str(key): _finite(value) for key, value in values.items()}
+    if isinstance(values, (list, tuple)):
+        return [_finite(value) for value in values]
+    if isinstance(values, float) and not abs(values) < float("inf"):
+        return None
+    return values

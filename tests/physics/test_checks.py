@@ -1,0 +1,106 @@
+"""The checks hold for the shipped robot, for other robots, and their expectations are the documented numbers."""
+
+import math
+
+import mujoco
+import numpy as np
+import pytest
+
+from mrctl.checks import CHECKS, CheckFailed, Comparison, compare
+from mrctl.model import clone, load, perturb, read_robot
+from mrctl.robot import Perturbation
+
+ON_LEVEL = [c for c in CHECKS if c.world == "flat"]
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.name)
+def test_shipped_robot(check):
+    """Every check holds, and each of them compares something."""
+    model = load(check.world, check.steering)
+    before = np.concatenate([model.body_mass, model.dof_damping, *model.pair_friction, *model.actuator_gainprm])
+    assert check.run(model, read_robot(model))
+    after = np.concatenate([model.body_mass, model.dof_damping, *model.pair_friction, *model.actuator_gainprm])
+    assert np.array_equal(before, after)  # variants are made on copies
+
+
+# The design table, its data sheets, and what follows by hand: 24/(0.0234 · 43) · 0.098 m/s and so on. The checks take
+# their expectations from the model's file; this holds the file to the design. Tolerance: the digits of that table.
+DOCUMENTED = {
+    "mass": (20.0, 0.05),
+    "yaw_inertia": (0.60, 0.005),
+    "com_offset": (0.10, 0.005),
+    "com_height": (0.12, 0.005),
+    "wheel_radius": (0.098, 0.0005),
+    "half_track": (0.188, 0.0005),
+    "wheelbase": (0.40, 0.005),
+    "trail": (0.03, 0.0005),
+    "resistance": (2.32, 0.005),
+    "torque_constant": (0.0234, 0.00005),
+    "gear_ratio": (43.0, 0.5),
+    "rotor_inertia": (1.03e-6, 0.005e-6),
+    "wheel_inertia": (3.4e-3, 0.05e-3),
+    "gear_loss": (0.10, 0.005),
+    "rolling_coefficient": (0.015, 0.0005),
+    "tyre_friction": (0.9, 0.05),
+    "supply": (24.0, 0.5),
+    "effective_inertia": (0.84, 0.005),
+    "velocity_time_constant": (0.23, 0.005),
+    "rotation_time_constant": (0.26, 0.005),
+    "velocity_gain": (0.0974, 0.00005),
+    "rotation_gain": (0.518, 0.0005),
+}
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_documented(name):
+    """The file holds the documented robot."""
+    value, digits = DOCUMENTED[name]
+    assert getattr(read_robot(load()), name) == pytest.approx(value, abs=digits)
+
+
+def test_documented_limits():
+    """No-load speed and stall torque of the design."""
+    robot = read_robot(load())
+    assert robot.velocity_gain * robot.supply == pytest.approx(2.34, abs=0.005)
+    assert robot.motor_gain * robot.supply == pytest.approx(10.4, abs=0.05)
+
+
+def heavy(model):
+    perturb(clone(model), model, Perturbation(mass_factor=1.5, drive_friction_factor=2.0))
+
+
+def weak(model):
+    perturb(clone(model), model, Perturbation(resistance_factor=1.3, motor_constant_factor=0.8))
+
+
+def large(model):
+    """Longer and wider, on larger wheels and the same loads."""
+    model.body("fork").pos[0] *= 1.2
+    for wheel in ("wheel_left", "wheel_right"):
+        model.body(wheel).pos[1] *= 1.2
+        model.geom(wheel).size[0] *= 1.1
+    model.body("fork").pos[2] -= 0.1 * 0.098
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+@pytest.mark.parametrize("change", [heavy, weak, large], ids=lambda f: f.__name__)
+@pytest.mark.parametrize("check", ON_LEVEL, ids=lambda c: c.name)
+def test_other_robots(check, change):
+    """Another robot, read from its own model, obeys the same laws: nothing here is tuned to the shipped one."""
+    model = load(check.world, check.steering)
+    change(model)
+    check.run(model, read_robot(model))
+
+
+@pytest.mark.parametrize("measured", [1.02, 0.98, math.nan, math.inf])
+def test_compare_refuses(measured):
+    """Out of tolerance, or not a number."""
+    with pytest.raises(CheckFailed, match="speed") as caught:
+        compare("speed", measured, 1.0, "m/s", relative=0.01)
+    assert isinstance(caught.value, AssertionError)
+    assert caught.value.comparison.expected == 1.0
+
+
+def test_compare_accepts():
+    """Within tolerance, the edge included."""
+    assert compare("speed", 1.5, 1.0, "m/s", absolute=0.5) == Comparison("speed", 1.5, 1.0, 0.5, "m/s")

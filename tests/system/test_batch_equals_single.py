@@ -1,0 +1,149 @@
+"""Robot i of a batch is the same scenario run alone: bit for bit, whatever runs beside it and on however many threads."""
+
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+from mrctl import Circle, Event, Fel, Kanayama, LaneChange, Lemniscate, Line, Perturbation, Pid, Scenario, StopAndGo
+from mrctl.plant import BatchPlant, PhysicsPlant
+from mrctl.simulate import Simulation, simulate
+
+COUNT = 60
+REFERENCES = (  # four seconds each, so that they share batches, but for the last two
+    Circle(period=4, radius=0.5),
+    Circle(period=4, radius=0.6, clockwise=True),
+    Line(speed=0.5, length=2.0),
+    LaneChange(length=2.4, shift=0.3, speed=0.6),
+    StopAndGo(distance=0.8, move_time=3, pause=1, reverse=False),
+    Line(speed=0.8, length=2.0),
+    Lemniscate(size=1.2, period=8),
+)
+RANGES = {
+    "mass_factor": (0.6, 2.0),
+    "inertia_factor": (0.6, 2.0),
+    "payload": (0.0, 6.0),
+    "payload_x": (0.02, 0.2),
+    "payload_y": (-0.08, 0.08),
+    "payload_z": (0.1, 0.4),
+    "left_radius_factor": (0.95, 1.05),
+    "right_radius_factor": (0.95, 1.05),
+    "drive_friction_factor": (0.0, 3.0),
+    "resistance_factor": (0.8, 1.5),
+    "motor_constant_factor": (0.8, 1.2),
+    "supply_factor": (0.7, 1.2),
+    "tyre_friction_factor": (0.3, 1.2),
+    "slope": (-0.1, 0.1),
+    "velocity_noise": (0.0, 0.02),
+    "rotation_noise": (0.0, 0.02),
+    "position_noise": (0.0, 0.01),
+    "heading_noise": (0.0, 0.01),
+}
+
+
+def perturbation(rng: np.random.Generator) -> Perturbation:
+    """A third of the fields at random, among them delays of 0 to 40 ms."""
+    values = {name: float(rng.uniform(*bounds)) for name, bounds in RANGES.items() if rng.random() < 0.35}
+    return Perturbation(**values, control_delay=int(rng.integers(5)) / 100)
+
+
+def event(rng: np.random.Generator) -> Event:
+    """One of everything that can happen."""
+    what = (
+        {"perturbation": perturbation(rng)},
+        {"push": tuple(rng.normal(0, [60, 60, 5])), "push_duration": float(rng.uniform(0.01, 0.2))},
+        {"kanayama": Kanayama(k_x=float(rng.uniform(1, 4)), k_y=20, k_theta=9)},
+        {"pid": Pid(time_constant=0.2, derivative_time=float(rng.uniform(0, 0.01)))},
+        {"learning": bool(rng.integers(2))},
+    )
+    return Event(time=float(rng.uniform(0, 4)), **what[rng.integers(len(what))])
+
+
+def scenario(seed: int) -> Scenario:
+    """A random run; a third are alike enough to share one large batch."""
+    rng = np.random.default_rng(seed)
+    alike = seed % 3 == 0
+    steering = "compliant" if alike else str(rng.choice(["compliant", "caster", "rigid"]))
+    reference = REFERENCES[rng.integers(len(REFERENCES) - 2 * alike)]
+    if steering == "rigid" and rng.random() < 0.3:
+        reference = StopAndGo(distance=0.5, move_time=1.5, pause=0.5, reverse=True)
+    return Scenario(
+        reference=reference,
+        laps=1,
+        steering=steering,
+        world="flat" if alike else str(rng.choice(["flat", "flat", "flat", "slope", "rough", "patch"])),
+        feedforward="fel" if alike else str(rng.choice(["none", "model", "oracle", "fel", "rls"])),
+        measurement=str(rng.choice(["truth", "odometry"])),
+        kanayama=Kanayama(k_x=float(rng.uniform(2, 4))),
+        fel=Fel(step=float(rng.uniform(0, 0.1))),
+        perturbation=perturbation(rng) if rng.random() < 0.8 else Perturbation(),
+        events=tuple(event(rng) for _ in range(rng.integers(4))),
+        prefilter=float(rng.uniform(0.03, 0.1)),
+        motion_period=0.01 if alike else float(rng.choice([0.01, 0.02])),
+        seed=seed,
+    )
+
+
+@pytest.fixture(scope="module")
+def scenarios():
+    """All of them."""
+    return [scenario(seed) for seed in range(COUNT)]
+
+
+@pytest.fixture(scope="module")
+def alone(scenarios):
+    """Each by itself, through dm_control."""
+    return [simulate(s) for s in scenarios]
+
+
+def equal(one, whole, run: int) -> None:
+    """Every variable of a run alone has the same bits in a batch, which goes on in NaN."""
+    row = whole.isel(run=run)
+    for name in set(one.variables) - {"run", "time", "weight"}:
+        expected, found = one[name].values, row[name].values
+        if "time" in row[name].dims:
+            found, rest = found[: len(expected)], found[len(expected) :]
+            assert np.isnan(rest).all(), name
+        same = np.array_equal(expected, found, equal_nan=expected.dtype.kind == "f")
+        assert same, f"{name} of seed {int(one.seed)}"
+    assert ("weights" in one) or "weights" not in row or row.weights.isnull().all()
+
+
+def test_plants(scenarios):
+    """One run goes through dm_control, several through the batch engine."""
+    assert isinstance(Simulation(scenarios[:1]).plant, PhysicsPlant)
+    assert isinstance(Simulation([scenarios[0], scenarios[3]]).plant, BatchPlant)
+
+
+def test_scenarios_differ(scenarios, alone):
+    """The draw covers what it should: every kind of event, failures but not too many, delays, learning, all worlds."""
+    events = [e for s in scenarios for e in s.events]
+    for field in ("perturbation", "push", "kanayama", "pid", "learning"):
+        assert any(getattr(e, field) is not None for e in events)
+    for field in ("world", "steering", "feedforward", "measurement", "motion_period"):
+        assert len({getattr(s, field) for s in scenarios}) == {"world": 4, "steering": 3, "feedforward": 5}.get(field, 2)
+    assert {s.perturbation.control_delay for s in scenarios} == {0, 0.01, 0.02, 0.03, 0.04}
+    assert 1 <= sum(bool(run.failed) for run in alone) <= COUNT // 4
+
+
+@pytest.mark.parametrize("chunk", [COUNT, 7])
+def test_equal(scenarios, alone, chunk):
+    """Shuffled, all at once and in chunks of seven."""
+    order = np.random.default_rng(chunk).permutation(COUNT)
+    for start in range(0, COUNT, chunk):
+        rows = order[start : start + chunk]
+        whole = simulate([scenarios[row] for row in rows])
+        for run, row in enumerate(rows):
+            equal(alone[row], whole, run)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_threads(scenarios, alone, threads, monkeypatch):
+    """The number of threads changes nothing; a batch of one is no special case either."""
+    loop = import_module("mrctl.simulate")
+    monkeypatch.setattr(loop, "build", lambda model, size, substeps: BatchPlant(model, size, substeps, threads))
+    rows = range(0, COUNT, 3)
+    whole = simulate([scenarios[row] for row in rows])
+    for run, row in enumerate(rows):
+        equal(alone[row], whole, run)
+    equal(alone[1], simulate([scenarios[1]]), 0)

@@ -1,0 +1,184 @@
+"""The commands: what they print and write, and how they refuse bad input."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mrctl
+from mrctl import cli
+from mrctl.control.fel import initial_weights
+
+SHORT = ["--laps", "1", "reference:circle", "--reference.radius", "0.5", "--reference.period", "5"]
+SCENARIO = """
+feedforward = "rls"
+laps = 1
+[reference]
+kind = "circle"
+radius = 0.5
+period = 5
+"""
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    file = tmp_path / "scenario.toml"
+    file.write_text(SCENARIO)
+    return file
+
+
+def refused(capsys: pytest.CaptureFixture, *arguments: str) -> str:
+    """The one line on stderr of a command that must end with status 2."""
+    assert cli.main(list(arguments)) == 2
+    captured = capsys.readouterr()
+    lines = [line for line in captured.err.splitlines() if "tick" not in line]
+    assert len(lines) == 1, captured.err
+    assert "Traceback" not in captured.err
+    return lines[0]
+
+
+def test_run_prints_a_row_per_lap(capsys: pytest.CaptureFixture) -> None:
+    """The table has the laps and says which feedforward."""
+    assert cli.main(["run", "--laps", "2", "--feedforward", "model", *SHORT[2:]]) == 0
+    out = capsys.readouterr().out
+    assert "feedforward model" in out
+    assert [line.split("|")[1].strip() for line in out.splitlines()[3:]] == ["1", "2"]
+
+
+def test_run_json_is_the_simulation(capsys: pytest.CaptureFixture, scenario: Path) -> None:
+    """`--json` holds the metrics of the same scenario run from Python."""
+    assert cli.main(["run", str(scenario), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    laps = mrctl.per_lap(mrctl.simulate([mrctl.Scenario.from_toml(scenario)]))
+    for name in ("v_rmse", "lateral_max", "energy"):
+        assert printed["laps"][0][name] == float(laps[name].values[0, 0])
+    assert mrctl.Scenario.from_dict(printed["scenario"]) == mrctl.Scenario.from_toml(scenario)
+
+
+def test_flags_override_the_file(capsys: pytest.CaptureFixture, scenario: Path) -> None:
+    """What a flag says wins over the file; what no flag says is the file's."""
+    assert cli.main(["run", str(scenario), "--feedforward", "none", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)["scenario"]
+    assert printed["feedforward"] == "none"
+    assert printed["reference"]["kind"] == "circle"
+
+
+def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """`--out` writes what is needed to look, to compare and to go on; and does not overwrite it."""
+    out = tmp_path / "out"
+    command = ["run", "--out", str(out), "--feedforward", "fel", *SHORT]
+    assert cli.main(command) == 0
+    result = mrctl.open(out / "result.zarr")
+    again = mrctl.simulate(mrctl.Scenario(feedforward="fel", laps=1, reference=mrctl.Circle(radius=0.5, period=5)))
+    np.testing.assert_array_equal(result["voltage_left"].values[0], again["voltage_left"].values)
+    for name in ("path", "velocities", "errors", "voltages", "learning"):
+        assert (out / f"{name}.png").stat().st_size > 5000
+        assert (out / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+    capsys.readouterr()
+    before = (out / "path.png").stat().st_mtime_ns
+    assert "nothing was overwritten" in refused(capsys, *command)
+    assert (out / "path.png").stat().st_mtime_ns == before
+    # The weights that were learned start the next run better than none.
+    first = float(mrctl.per_lap(result)["v_rmse"].values[0, 0])
+    carried = mrctl.Scenario(
+        laps=1,
+        reference=mrctl.Circle(radius=0.5, period=5),
+        fel=mrctl.Fel(weights=str(out / "weights.safetensors"), frozen=True),
+    )
+    assert float(mrctl.per_lap(mrctl.simulate([carried]))["v_rmse"].values[0, 0]) < first
+
+
+def test_tune_states_the_learning_condition(capsys: pytest.CaptureFixture) -> None:
+    """The ratio of the learning condition is 1 + τ/λ, from the robot's own time constants."""
+    assert cli.main(["tune", "--json"]) == 0
+    table = json.loads(capsys.readouterr().out)
+    for channel, tau in (("common", 0.234), ("differential", 0.261)):
+        assert table[channel]["ratio"] == pytest.approx(1 + tau / 0.15, rel=5e-3)
+    assert cli.main(["tune"]) == 0
+    assert "converges above 1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("feedforwar = 'fel'", "feedforwar"),
+        ("feedforward = 'magic'", "feedforward"),
+        ("laps = 0", "laps"),
+        ("[fel]\nstep = nan", "fel.step"),
+        ("[perturbation]\nmass_factor = -1", "perturbation.mass_factor"),
+        ("[perturbation]\ncontrol_delay = 0.013", "control_delay"),
+        ("control_period = 0.003", "control_period"),
+        ("[reference]\nkind = 'circle'\nradius = 0.2\nperiod = 1", "circle"),
+        ("[reference]\nkind = 'spiral'", "spiral"),
+        ("[reference]\nkind = 'stop_and_go'", "reverse"),
+        ("initial_pose = [5.0, 0.0, 0.0]", "initial_pose"),
+        ("world = 'moon'", "world"),
+        ("world = 'broken.xml'", "broken.xml"),
+        ("world = 'empty.xml'", "chassis"),
+        ("[perturbation]\npayload = 100\npayload_x = -0.9", "perturbation"),
+        ("[fel]\nweights = 'missing.safetensors'", "fel.weights"),
+        ("[fel]\nweights = 'weights.safetensors'\nhidden = 7", "fel.weights"),
+        ("this is not TOML", "scenario.toml"),
+    ],
+)
+def test_bad_scenario_is_one_line(
+    text: str, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Every kind of bad scenario ends with one line that names what is wrong."""
+    monkeypatch.chdir(tmp_path)
+    Path("scenario.toml").write_text(text)
+    Path("broken.xml").write_text("<mujoco><worldbody></mujoco>")
+    Path("empty.xml").write_text("<mujoco/>")
+    mrctl.save_weights("weights.safetensors", initial_weights(24, 0))
+    assert says in refused(capsys, "run", "scenario.toml")
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "broken.xml", "empty.xml", "scenario.toml", "weights.safetensors",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["run", "missing.toml"], "missing.toml"),
+        (["run", "--fel.step", "7"], "fel.step"),
+        (["run", "--fel.stride", "1"], "--fel.stride"),
+        (["run", "--feedforward", "magic"], "--feedforward"),
+        (["run", "--perturbation.slope", "nan"], "perturbation.slope"),
+        (["tune", "--time-constant", "-1"], "time_constant"),
+        (["tune", "--world", "moon"], "moon"),
+        (["suite", "--seeds", "0"], "seeds"),
+        (["dance"], "dance"),
+    ],
+)
+def test_bad_flags_are_one_line(arguments: list[str], says: str, capsys: pytest.CaptureFixture) -> None:
+    """Every kind of bad flag ends with one line that names it."""
+    assert says in refused(capsys, *arguments)
+
+
+@pytest.mark.parametrize("command", [["run", *SHORT], ["reproduce"], ["suite"]])
+def test_unwritable_folder_is_refused_before_the_work(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """A folder that cannot be made costs no simulation."""
+    (tmp_path / "file").write_text("kept")
+    assert "out" in refused(capsys, command[0], "--out", str(tmp_path / "file" / "out"), *command[1:])
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_installed_command_without_a_display(tmp_path: Path) -> None:
+    """The console script runs headless, its stderr is the progress bar alone."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "MUJOCO_GL")}
+    script = Path(sys.executable).with_name("mrctl")
+    done = subprocess.run(
+        [script, "run", *SHORT], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "RMSE per lap" in done.stdout
+    assert all("tick" in line for line in done.stderr.replace("\r", "\n").splitlines() if line.strip())
+    bad = subprocess.run([script, "run", "nowhere.toml"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (bad.returncode, bad.stdout) == (2, "")
+    assert bad.stderr == "mrctl: nowhere.toml: No such file or directory\n"

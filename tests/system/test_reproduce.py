@@ -1,0 +1,90 @@
+"""`mrctl reproduce` from end to end, its numbers held against the targets."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from mrctl import cli
+from mrctl.experiments import kanayama
+
+FIGURES = (
+    "figure2_posture", "figure3_structure", "figure4a_linear_velocity", "figure4b_rotation_velocity",
+    "figure4c_tracking_errors", "figure5_pid_against_network", "figure6_feedforward_outputs", "path", "voltages",
+    "learning_curve",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("reproduction")
+    assert cli.main(["reproduce", "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def table(folder: Path) -> dict:
+    return json.loads((folder / "table.json").read_text())
+
+
+def row(table: dict, **wanted: object) -> dict:
+    (found,) = [r for r in table["last_lap"] if all(r[key] == value for key, value in wanted.items())]
+    return found
+
+
+def test_every_figure_is_drawn(folder: Path) -> None:
+    """As PNG with something on it, and as PDF."""
+    for name in FIGURES:
+        image = imread(folder / f"{name}.png")[..., :3]
+        assert min(image.shape[:2]) > 300
+        assert image.std() > 0.02
+        assert (folder / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize("plant", ["nominal", "all"])
+@pytest.mark.parametrize(("lap_time", "bounds"), [(12.0, (0.45, 0.2, 0.25)), (20.0, (1.0, 0.25, 0.4))])
+def test_network_beats_pid(table: dict, plant: str, lap_time: float, bounds: tuple[float, ...]) -> None:
+    """Compliant steering, last of 8 laps: V, θ̇ and position RMSE as shares of what PID alone leaves."""
+    found = row(table, steering="compliant", plant=plant, lap_time=lap_time, feedforward="fel")
+    shares = [found[f"{metric}_to_pid"] for metric in ("v_rmse", "omega_rmse", "position_rmse")]
+    assert all(share <= bound for share, bound in zip(shares, bounds, strict=True)), shares
+
+
+@pytest.mark.parametrize("steering", ["caster", "rigid"])
+@pytest.mark.parametrize("plant", ["nominal", "all"])
+def test_network_beats_pid_in_other_arrangements(table: dict, steering: str, plant: str) -> None:
+    """At most PID on V, below it on θ̇ and position; PID that fails is beaten by not failing."""
+    found = row(table, steering=steering, plant=plant, feedforward="fel")
+    bare = row(table, steering=steering, plant=plant, feedforward="none")
+    assert not found["failure"]
+    if not bare["failure"]:
+        assert found["v_rmse"] <= bare["v_rmse"]
+        assert found["omega_rmse"] < bare["omega_rmse"]
+        assert found["position_rmse"] < bare["position_rmse"]
+
+
+def test_learning_stays_stable(table: dict) -> None:
+    """Lap 60 is at most 1.1 times lap 8."""
+    for run in table["endurance"]:
+        for metric in ("v_rmse", "omega_rmse", "position_rmse"):
+            assert run[metric]["last"] <= 1.1 * run[metric]["lap_8"]
+
+
+def test_kanayama(table: dict) -> None:
+    """Within 0.3 percentage points or 0.2 cm of every target, under the stated convention."""
+    assert len(table["kanayama"]) == len(kanayama.CASES) == 18
+    for case in table["kanayama"]:
+        assert case["value"] == pytest.approx(case["target"], abs=0.3 if case["unit"] == "%" else 0.2), case["case"]
+        assert np.isfinite(case["value_10ms"])
+    coarse = {c["case"]: c["value_10ms"] for c in table["kanayama"]}
+    assert coarse["Δy = 20 cm, residual at 50 cm, with the limiter"] == pytest.approx(15.7, abs=0.1)
+    assert coarse["Δy = 40 cm, residual at 50 cm, with the limiter"] == pytest.approx(30.3, abs=0.1)
+
+
+def test_table_says_where_it_came_from(table: dict) -> None:
+    """Seeds, versions and the scenarios that gave the numbers."""
+    assert {"mrctl", "mujoco", "dm-control", "numpy", "numba", "torch"} <= set(table["versions"])
+    assert all("seed" in entry for entry in table["last_lap"])
+    assert len(table["scenarios"]) == len(table["last_lap"]) + len(table["endurance"])

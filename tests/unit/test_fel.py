@@ -1,0 +1,351 @@
+"""Feedback-error learning: its gradient, its step, its safeguards, and its files."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from safetensors.numpy import load_file, save_file
+
+from mrctl.control.feedforward import feature_scale, features
+from mrctl.control.fel import (
+    BIAS_GAIN,
+    HIDDEN_GAIN,
+    REGULARISATION,
+    FeedbackErrorLearning,
+    Fel,
+    flatten,
+    initial_weights,
+    load_weights,
+    network,
+    save_weights,
+    shapes,
+    unflatten,
+    update,
+)
+from mrctl.control.fel_torch import Network
+from mrctl.record import InputError
+
+RNG = np.random.default_rng(7)
+HIDDEN = 6
+TARGETS = Fel().targets(rigid=False)
+
+
+def trained(hidden=HIDDEN):
+    """Weights with nothing zero in them, flat."""
+    return np.random.default_rng(hidden).normal(0, 0.5, 11 * hidden + 18)
+
+
+def torch_network(weights):
+    """The torch twin of flat weights."""
+    twin = Network(len(unflatten(weights)["hidden.bias"]))
+    twin.load_state_dict({name: torch.tensor(layer) for name, layer in unflatten(weights).items()})
+    return twin
+
+
+def step(x, feedback, weights, targets=TARGETS, steps=(0.05, 0.0, 1e4), saturated=0.0, prior=None):
+    """Weights and norm after one step of one robot."""
+    after, norm = weights.copy(), np.zeros(1)
+    prior = weights if prior is None else prior
+    update(x, np.asarray(feedback, float), saturated, targets, np.array(steps), prior, after, norm)
+    return after, norm[0]
+
+
+def taught(robot, settings=None, rigid=False, size=1):
+    """A stage that has given an output, with that command and its derivative."""
+    stage = FeedbackErrorLearning(robot, [settings or Fel(hidden=HIDDEN)] * size, list(range(size)), rigid)
+    command = RNG.uniform([-1.5, -3], [1.5, 3], (size, 2))
+    derivative = RNG.uniform([-1.5, -6], [1.5, 6], (size, 2))
+    return stage, command, derivative
+
+
+def power(stage):
+    """Squared norm of the gradient of one channel at the first step, when only what is behind tanh can move."""
+    layers, x = unflatten(stage.state["weights"][0]), stage._features[0]
+    hidden = np.tanh(layers["hidden.weight"] @ x + layers["hidden.bias"])
+    return HIDDEN_GAIN**2 * hidden @ hidden + BIAS_GAIN**2 + x @ x
+
+
+def test_network():
+    """The compiled network is its formula, and its torch twin."""
+    x, weights = RNG.normal(size=8), trained()
+    layer = unflatten(weights)
+    hidden = np.tanh(layer["hidden.weight"] @ x + layer["hidden.bias"])
+    expected = HIDDEN_GAIN * layer["output.weight"] @ hidden + BIAS_GAIN * layer["output.bias"]
+    expected = TARGETS[0] * (expected + layer["direct.weight"] @ x)
+    found = network(x, weights, TARGETS)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    twin = torch_network(weights)(torch.tensor(x)).detach().numpy()
+    np.testing.assert_allclose(found, TARGETS[0] * twin, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_gradient(rigid):
+    """The step goes along Jᵀe with the documented length, J by central differences and by autograd."""
+    x, weights, feedback = RNG.normal(size=8), trained(), np.array([1.3, -0.4])
+    targets = Fel().targets(rigid)
+    h = 1e-5
+    nudges = h * np.eye(len(weights))
+    plain = np.vstack([[1.0, 1.0], np.zeros((2, 2))])
+    ahead, behind = (network(x, weights + nudge, plain) for nudge in (nudges, -nudges))
+    numeric = (ahead - behind).T / (2 * h)
+    twin = torch_network(weights)
+    by_name = torch.func.jacrev(lambda p: torch.func.functional_call(twin, p, (torch.tensor(x),)))(
+        dict(twin.named_parameters())
+    )
+    auto = np.hstack([by_name[name].detach().numpy().reshape(2, -1) for name in shapes(HIDDEN)])
+    np.testing.assert_allclose(numeric, auto, atol=1e-8)
+    error = targets[2] * feedback / targets[0]
+    gradient = auto.T @ error
+    expected = 0.05 * gradient / (gradient @ gradient / (error @ error) + REGULARISATION)
+    after, norm = step(x, feedback, weights, targets)
+    np.testing.assert_allclose(after - weights, expected, atol=1e-14)
+    assert norm == pytest.approx(np.linalg.norm(expected))
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+@pytest.mark.parametrize("feedback", [[0.7, 0.0], [0.0, -0.4], [0.9, -1.4]])
+def test_normalised_step(robot, rigid, feedback):
+    """The first step moves the feedforward at its input by μ times the feedback; steering by a tenth of it."""
+    stage, command, derivative = taught(robot, Fel(hidden=HIDDEN, step=0.05, leak=0.0), rigid)
+    assert not stage.output(command, derivative).any()
+    size = power(stage)
+    stage.learn(np.array([feedback]), np.zeros(1))
+    moved = stage.output(command, derivative)[0]
+    share = [1, 0.1 if rigid else 1]
+    expected = 0.05 * np.multiply(share, feedback) * size / (size + REGULARISATION)
+    np.testing.assert_allclose(moved, expected, atol=1e-12)
+
+
+def test_learns(robot):
+    """Taught by what is missing to an inverse, the network finds it."""
+    stage = FeedbackErrorLearning(robot, [Fel(step=0.2, dead_zone=0.0)] * 8, list(range(8)), False)
+    gains = np.array([[6.0, 1.0, 3.0, 0.5, -1.0, 0.4, 1.0, 1.0], [0.2, 5.0, 0.1, 4.0, 2.0, 0.0, -1.0, 1.0]]).T
+    rng, missing = np.random.default_rng(0), []
+    for _ in range(600):
+        command, derivative = rng.uniform([0.2, -2], [1.2, 2], (8, 2)), rng.uniform([-1, -4], [1, 4], (8, 2))
+        given = stage.output(command, derivative)
+        error = features(command, derivative, robot.half_track, feature_scale(robot)) @ gains - given
+        stage.learn(error, np.zeros(8))
+        missing.append(np.sqrt((error**2).mean()))
+    assert np.mean(missing[-50:]) < 0.1 * np.mean(missing[:5])
+
+
+def test_frozen_while_saturated(robot):
+    """What saturated teaches nothing, and its neighbour learns on."""
+    stage, command, derivative = taught(robot, size=2)
+    stage.output(command, derivative)
+    before = stage.state["weights"].copy()
+    stage.learn(np.ones((2, 2)), np.array([1.0, 0.0]))
+    np.testing.assert_array_equal(stage.state["weights"][0], before[0])
+    assert (stage.state["weights"][1] != before[1]).any()
+    assert stage.weight_norm[0] == 0 < stage.weight_norm[1]
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_dead_zone(robot, rigid):
+    """Feedback at the dead zone teaches nothing, just beyond it does; a tenth of it on a steering channel."""
+    stage, command, derivative = taught(robot, rigid=rigid)
+    stage.output(command, derivative)
+    before = stage.state["weights"].copy()
+    edge = np.array([[0.03, 0.003 if rigid else 0.03]])
+    stage.learn(edge, np.zeros(1))
+    np.testing.assert_array_equal(stage.state["weights"], before)
+    for channel in range(2):
+        stage.learn(edge * (1 + 1e-6 * (np.arange(2) == channel)), np.zeros(1))
+        moved = unflatten(stage.state["weights"][0])["direct.weight"].any(axis=1)
+        assert moved.tolist() == [True, channel == 1]
+
+
+def test_frozen_settings(robot):
+    """`frozen` changes nothing, not even by the leak."""
+    settings = Fel(hidden=HIDDEN, frozen=True, leak=0.1)
+    stage, command, derivative = taught(robot, settings)
+    stage.state["weights"] += 0.1
+    before, given = stage.state["weights"].copy(), stage.output(command, derivative).copy()
+    for _ in range(20):
+        stage.learn(np.full((1, 2), 3.0), np.zeros(1))
+    np.testing.assert_array_equal(stage.state["weights"], before)
+    np.testing.assert_array_equal(stage.output(command, derivative), given)
+
+
+def test_leak():
+    """Each step gives back its share of the distance to the prior."""
+    x, weights = RNG.normal(size=8), trained()
+    prior = weights[::-1].copy()
+    plain, _ = step(x, [1.0, 1.0], weights, prior=prior)
+    leaky, _ = step(x, [1.0, 1.0], weights, steps=(0.05, 0.01, 1e4), prior=prior)
+    np.testing.assert_allclose(leaky - plain, -0.01 * (weights - prior), atol=1e-14)
+
+
+@given(arrays(float, (10, 8), elements=st.floats(-2, 2)), st.floats(0.01, 3), st.floats(0.01, 1))
+def test_projection(inputs, bound, rate):
+    """However long and wrongly it is taught, the weights stay within the bound of the prior."""
+    prior = trained()
+    weights, norm = prior.copy(), np.zeros(1)
+    for x in inputs:
+        update(x, np.array([50.0, -80.0]), 0.0, TARGETS, np.array([rate, 0.0, bound]), prior, weights, norm)
+        distance = np.linalg.norm(weights - prior)
+        assert distance <= bound * (1 + 1e-12)
+        assert norm[0] == pytest.approx(distance, rel=1e-9, abs=1e-12)
+
+
+def test_projection_keeps_direction():
+    """Beyond the bound the step is shortened, not turned."""
+    x, weights = RNG.normal(size=8), trained()
+    free, norm = step(x, [5.0, 5.0], weights)
+    short, bounded = step(x, [5.0, 5.0], weights, steps=(0.05, 0.0, norm / 4))
+    np.testing.assert_allclose(short - weights, (free - weights) / 4, atol=1e-15)
+    assert bounded == norm / 4
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+@given(arrays(float, (4, 8), elements=st.floats(-2, 2)), arrays(float, (4, 2), elements=st.floats(-5, 5)), st.data())
+def test_rows(x, feedback, data):
+    """Robots do not mix: a row has the same bits alone and beside others, one of which is lost."""
+    saturated = data.draw(arrays(float, 4, elements=st.sampled_from([0.0, 1.0])))
+    prior = np.stack([np.random.default_rng(i).normal(0, 0.5, 84) for i in range(4)])
+    steps = np.array([0.1, 1e-3, 0.2])
+
+    def answer(rows, lost=()):
+        inputs, weights, norm = x[rows].copy(), prior[rows] + 0.01, np.zeros(len(x[rows]))
+        inputs[list(lost)] = np.nan
+        update(inputs, feedback[rows], saturated[rows], TARGETS, steps, prior[rows], weights, norm)
+        return np.hstack([weights, norm[:, None], network(inputs, weights, TARGETS)])
+
+    together = answer(slice(None), lost=[2])
+    for i in (0, 1, 3):
+        assert together[i].tobytes() == answer(slice(i, i + 1))[0].tobytes()
+
+
+@pytest.mark.parametrize("hidden", [1, 6, 24])
+def test_flat_weights(hidden):
+    """Named and flat weights are each other's inverse, in size and order those of the torch network."""
+    weights = trained(hidden)
+    layers = unflatten(weights)
+    np.testing.assert_array_equal(flatten(layers), weights)
+    theirs = {name: tuple(value.shape) for name, value in Network(hidden).state_dict().items()}
+    assert {name: layer.shape for name, layer in layers.items()} == theirs == shapes(hidden)
+
+
+def test_initial_weights():
+    """The seed makes the hidden layer and nothing else; what is behind it is zero."""
+    layers = unflatten(initial_weights(24, 3))
+    assert layers["hidden.weight"].std() == pytest.approx(0.5, rel=0.15)
+    assert not any(layers[name].any() for name in ("output.weight", "output.bias", "direct.weight"))
+    np.testing.assert_array_equal(initial_weights(24, 3), initial_weights(24, 3))
+    assert (initial_weights(24, 3) != initial_weights(24, 4)).any()
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+def test_files(robot, tmp_path, suffix):
+    """Weights come back to the bit from either kind of file, and a stage starts from them."""
+    path, weights = tmp_path / f"weights{suffix}", trained()
+    if suffix == ".pt":
+        torch.save(torch_network(weights).state_dict(), path)
+    else:
+        save_weights(path, weights)
+    np.testing.assert_array_equal(load_weights(path, HIDDEN), weights)
+    stage, command, derivative = taught(robot, Fel(hidden=HIDDEN, weights=str(path)))
+    x = features(command, derivative, robot.half_track, feature_scale(robot))
+    np.testing.assert_array_equal(stage.output(command, derivative), network(x, weights[None], TARGETS))
+    np.testing.assert_array_equal(stage.prior, weights[None])
+
+
+def test_single_precision(tmp_path):
+    """Weights of single precision are taken as they are."""
+    layers = {name: layer.astype(np.float32) for name, layer in unflatten(trained()).items()}
+    save_file(layers, tmp_path / "single.safetensors")
+    found = load_weights(tmp_path / "single.safetensors", HIDDEN)
+    assert found.dtype == float
+    np.testing.assert_array_equal(found, flatten(layers))
+
+
+def refused(path, hidden=HIDDEN):
+    """The one line with which a file is refused."""
+    with pytest.raises(InputError) as caught:
+        load_weights(path, hidden)
+    message = str(caught.value)
+    assert message.startswith("fel.weights: ")
+    assert str(path) in message
+    assert len(message.splitlines()) == 1
+    return message
+
+
+@pytest.mark.parametrize("suffix", [".safetensors", ".pt"])
+def test_bad_files(tmp_path, suffix):
+    """A file that is not what it should be is refused in one line that names the setting and the file."""
+    good = {name: layer.copy() for name, layer in unflatten(trained()).items()}
+
+    def write(name, layers):
+        path = tmp_path / f"{name}{suffix}"
+        if suffix == ".pt":
+            torch.save({key: torch.tensor(layer) for key, layer in layers.items()}, path)
+        else:
+            save_file(layers, path)
+        return path
+
+    path = write("good", good)
+    assert "hidden.weight is (6, 8), 7 hidden units need (7, 8)" in refused(path, 7)
+    assert "unknown entry 'extra.weight'" in refused(write("extra", good | {"extra.weight": np.ones(2)}))
+    assert "output.bias is nothing" in refused(write("less", {k: v for k, v in good.items() if k != "output.bias"}))
+    for value in (np.nan, np.inf):
+        assert "non-finite" in refused(write("broken", good | {"output.bias": np.array([1.0, value])}))
+    data = path.read_bytes()
+    for length in (0, 1, 7, 8, 9, 100, len(data) // 2, len(data) - 1):
+        short = tmp_path / f"short{length}{suffix}"
+        short.write_bytes(data[:length])
+        assert "not a weights file" in refused(short)
+    assert "no file" in refused(tmp_path / f"absent{suffix}")
+    (tmp_path / f"folder{suffix}").mkdir()
+    assert "no file" in refused(tmp_path / f"folder{suffix}")
+
+
+@pytest.mark.parametrize("content", [torch.ones(3), [1, 2], {"hidden.weight": "text"}, {"hidden.weight": [1.0]}, None])
+def test_not_a_state_dict(tmp_path, content):
+    """A torch file that holds something else is refused."""
+    torch.save(content, tmp_path / "other.pt")
+    assert "not a weights file" in refused(tmp_path / "other.pt")
+
+
+class Evil:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (Path(self.path),)
+
+
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
+@pytest.mark.parametrize("writer", ["torch", "pickle"])
+def test_no_code_from_files(tmp_path, writer):
+    """A pickle that would run code is refused, and runs nothing."""
+    path, mark = tmp_path / "evil.pt", tmp_path / "mark"
+    layers = {"hidden.weight": Evil(str(mark))}
+    if writer == "torch":
+        torch.save(layers, path)
+    else:
+        path.write_bytes(pickle.dumps(layers))
+    refused(path)
+    assert not mark.exists()
+    pickle.loads(pickle.dumps(layers))  # the trap does work
+    assert mark.exists()
+
+
+def test_save_refused(tmp_path):
+    """A place that cannot be written is named."""
+    with pytest.raises(InputError, match="nowhere.*cannot write weights"):
+        save_weights(tmp_path / "nowhere" / "weights.safetensors", trained())
+
+
+def test_safetensors_names(tmp_path):
+    """The file holds the layers by their torch names, for others to read."""
+    save_weights(tmp_path / "w.safetensors", trained())
+    found = load_file(tmp_path / "w.safetensors")
+    assert {name: layer.shape for name, layer in found.items()} == shapes(HIDDEN)

@@ -1,0 +1,218 @@
+"""The two levels wired together: rates, memory a robot, switches, and what comes out when nothing is wrong."""
+
+import numpy as np
+import pytest
+
+from mrctl.control.feedforward import InverseDynamics, NoFeedforward
+from mrctl.control.fel import FeedbackErrorLearning, Fel
+from mrctl.control.hierarchy import Hierarchy, feedforward_of
+from mrctl.control.kanayama import Kanayama, kanayama
+from mrctl.control.pid import Pid
+from mrctl.control.rls import RecursiveLeastSquares
+from mrctl.dynamics import inverse_dynamics
+from mrctl.robot import Robot
+from mrctl.scenario import FEEDFORWARDS, STEERINGS, Scenario
+
+
+def build(robot: Robot, size=1, **settings):
+    """A hierarchy for B robots that differ in their seeds."""
+    scenarios = [Scenario(seed=seed, **settings) for seed in range(size)]
+    return Hierarchy(scenarios, robot, feedforward_of(scenarios, robot))
+
+
+def signals(size, ticks, seed=0):
+    """Something to track that starts at rest: postures, twists, reference and its derivatives, (ticks, B, …)."""
+    rng = np.random.default_rng(seed)
+    t = 0.01 * np.arange(ticks)[:, None]
+    phase, ones = rng.uniform(0, 1, size), np.ones(size)
+    v, v_dot = 0.4 * (1 - np.cos(t)) * ones, 0.4 * np.sin(t) * ones
+    omega, omega_dot = 0.5 * (1 - np.cos(2 * t)) * phase, np.sin(2 * t) * phase
+    reference = np.stack([t * ones, np.sin(t) * ones, t * phase], -1)
+    pose = reference + 0.05 * rng.normal(size=reference.shape)
+    twist = np.stack([v, omega], -1)
+    return pose, twist + 0.1 * rng.normal(size=twist.shape), reference, twist, np.stack([v_dot, omega_dot], -1)
+
+
+def drive(hierarchy, inputs):
+    """Outputs, errors, commands and flags of every tick, side by side."""
+    log = []
+    for arguments in zip(*inputs, strict=True):
+        hierarchy.update(*arguments)
+        log.append(
+            np.hstack([hierarchy.output, hierarchy.error, hierarchy.command, hierarchy.derivative, hierarchy.feedback])
+        )
+    return np.array(log)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("none", NoFeedforward), ("model", InverseDynamics), ("oracle", InverseDynamics),
+        ("fel", FeedbackErrorLearning), ("rls", RecursiveLeastSquares),
+    ],
+)  # fmt: skip
+def test_feedforwards(robot, name, kind):
+    """Each name is its law; `model` and `oracle` alone give something before they have learned."""
+    stage = build(robot, 2, feedforward=name).feedforward
+    assert type(stage) is kind
+    assert stage.output(np.ones((2, 2)), np.ones((2, 2))).any() == (name in ("model", "oracle"))
+
+
+@pytest.mark.parametrize("name", ["model", "oracle"])
+def test_nothing_wrong(robot, name):
+    """Where posture and twist are the reference's, the voltages are the inverse dynamics and the feedback is silent."""
+    _, _, reference, twist, acceleration = signals(1, 300)
+    hierarchy = build(robot, feedforward=name)
+    log = drive(hierarchy, (reference, twist, reference, twist, acceleration))[:, 0]
+    expected = inverse_dynamics(twist[:, 0], acceleration[:, 0], robot, sign_speed=0.05)
+    np.testing.assert_allclose(log[:, :2], expected, atol=1e-9)
+    np.testing.assert_allclose(log[:, 7:11], np.hstack([twist[:, 0], acceleration[:, 0]]), atol=1e-12)
+    np.testing.assert_allclose(log[:, 11:], 0, atol=1e-9)
+
+
+def test_slow_motion_controller(robot):
+    """A motion controller of 50 ms answers every fifth tick; between, its correction rides on the live reference."""
+    hierarchy = build(robot, 2, feedforward="none", motion_period=0.05, prefilter=0.01)
+    inputs = pose, _, reference, twist, _ = signals(2, 43)
+    log = drive(hierarchy, inputs)
+    gains = np.array([3.0, 25.0, 10.0])
+    errors, requests = kanayama(pose[::5], reference[::5], twist[::5], gains)
+    np.testing.assert_array_equal(log[:, :, 4:7], np.repeat(errors, 5, axis=0)[:43])
+    # Held for the five ticks, the prefilter (here one period) passes it wherever no limit acts.
+    correction = np.repeat(requests - twist[::5], 5, axis=0)[:43]
+    wish, command = twist + correction, log[:, :, 7:9]
+    settled = np.arange(43) % 5 == 4
+    close = np.isclose(command, wish, atol=1e-12)
+    assert close[settled].mean() > 0.3
+    step = np.abs(np.diff(command, axis=0)) / 0.01
+    limited = np.isclose(step, [1.5, 6.0])
+    assert (close[1:] | limited).all()
+
+
+@pytest.mark.parametrize("every", [1, 5])
+def test_motion_rate(robot, every):
+    """The motion controller looks at the posture at its own rate alone."""
+    hierarchy = build(robot, feedforward="none", motion_period=0.01 * every)
+    inputs = signals(1, 21)
+    log = drive(hierarchy, inputs)
+    changed = np.flatnonzero((np.diff(log[:, 0, 4:7], axis=0) != 0).any(axis=1)) + 1
+    assert changed.tolist() == list(range(every, 21, every))
+
+
+@pytest.mark.parametrize("steering", STEERINGS)
+@pytest.mark.parametrize("name", FEEDFORWARDS)
+def test_rows(robot, name, steering):
+    """Through the whole hierarchy robots keep to themselves: each has the same bits alone and among others."""
+    body = robot.model_copy(update={"trail": 0.0}) if steering == "rigid" else robot
+    inputs = signals(3, 60)
+    scenarios = [Scenario(feedforward=name, steering=steering, seed=seed) for seed in range(3)]
+
+    def answer(rows):
+        chosen = scenarios[rows]
+        hierarchy = Hierarchy(chosen, body, feedforward_of(chosen, body))
+        log = drive(hierarchy, [signal[:, rows] for signal in inputs])
+        return log, hierarchy
+
+    together, hierarchy = answer(slice(0, 3))
+    for i in range(3):
+        alone, _ = answer(slice(i, i + 1))
+        assert together[:, i].tobytes() == alone[:, 0].tobytes()
+    states = hierarchy.state | getattr(hierarchy.feedforward, "state", {})
+    assert len(states) >= 3
+    for array in states.values():
+        assert array.shape[0] == 3  # what is remembered has a leading B
+    for array in (hierarchy.output, hierarchy.parts, hierarchy.weight_norm, hierarchy.saturated):
+        assert array.shape[0] == 3
+    assert (hierarchy.weight_norm > 0).all() == (name in ("fel", "rls"))
+
+
+@pytest.mark.parametrize("name", ["fel", "rls"])
+def test_learning_switch(robot, name):
+    """Switched off, a robot keeps its weights while its neighbour learns; switched on again, it goes on."""
+    hierarchy = build(robot, 2, feedforward=name)
+    key = {"fel": "weights", "rls": "coefficients"}[name]
+    inputs = signals(2, 90)
+    early, middle, late = ([signal[part] for signal in inputs] for part in np.split(np.arange(90), 3))
+    drive(hierarchy, early)
+    learned = hierarchy.feedforward.state[key].copy()
+    norm = hierarchy.weight_norm.copy()
+    hierarchy.set_learning(0, False)
+    drive(hierarchy, middle)
+    np.testing.assert_array_equal(hierarchy.feedforward.state[key][0], learned[0])
+    assert (hierarchy.feedforward.state[key][1] != learned[1]).any()
+    assert hierarchy.weight_norm[0] == norm[0] != hierarchy.weight_norm[1]
+    hierarchy.set_learning(0, True)
+    drive(hierarchy, late)
+    assert (hierarchy.feedforward.state[key][0] != learned[0]).any()
+
+
+def test_saturation_freezes(robot):
+    """A voltage that cannot act teaches nothing, and does not wind the integral up."""
+    weak = robot.model_copy(update={"supply": 0.5})
+    hierarchy = build(weak, 1, feedforward="fel")
+    still, pose, ahead, wanted = np.zeros((1, 2)), np.zeros((1, 3)), np.array([[0.5, 0, 0]]), np.array([[0.5, 0]])
+    for _ in range(10):  # until the command has risen beyond reach
+        hierarchy.update(pose, still, ahead, wanted, still)
+    before = hierarchy.feedforward.state["weights"].copy()
+    for _ in range(400):
+        output = hierarchy.update(pose, still, ahead, wanted, still)
+        assert hierarchy.saturated[0] == 1
+    np.testing.assert_array_equal(output[0, :2], 0.5)
+    np.testing.assert_array_equal(hierarchy.feedforward.state["weights"], before)
+    # Unwinding stops where it balances the error, K_p e beyond the limit: the integral is the limit itself.
+    assert hierarchy.state["pid"][0, 0] == pytest.approx(0.5, abs=0.02)
+
+
+def test_switching_one_robot(robot):
+    """New gains reach one robot, and both kinds of gains reach it."""
+    inputs = signals(2, 10)
+    plain = drive(build(robot, 2, feedforward="none"), inputs)
+    hierarchy = build(robot, 2, feedforward="none")
+    hierarchy.set_kanayama(0, Kanayama(k_x=1.0))
+    moved = drive(hierarchy, inputs)
+    np.testing.assert_array_equal(moved[:, 1], plain[:, 1])
+    assert (moved[:, 0, 7] != plain[:, 0, 7]).any()
+    hierarchy = build(robot, 2, feedforward="none")
+    hierarchy.set_pid(1, Pid(time_constant=0.4))
+    slower = drive(hierarchy, inputs)
+    np.testing.assert_array_equal(slower[:, 0], plain[:, 0])
+    np.testing.assert_array_equal(slower[:, 1, 7:11], plain[:, 1, 7:11])  # its commands stay
+    assert (slower[1:, 1, 11:] != plain[1:, 1, 11:]).all()
+
+
+@pytest.mark.parametrize("name", FEEDFORWARDS)
+def test_rolling_start(robot, name):
+    """Reset to a motion that goes on, the first command is that motion and the voltage about its back-EMF."""
+    twist, acceleration = np.array([[0.8, 0.5]]), np.array([[0.2, -0.3]])
+    hierarchy = build(robot, feedforward=name)
+    hierarchy.reset(twist, acceleration, np.array([0.2]))
+    pose = np.array([[1.0, 2.0, 0.5]])
+    output = hierarchy.update(pose, twist, pose, twist, acceleration)
+    np.testing.assert_allclose(hierarchy.command, twist, atol=1e-12)
+    np.testing.assert_allclose(hierarchy.derivative, acceleration, atol=1e-12)
+    steady = inverse_dynamics(twist, acceleration, robot, sign_speed=0.05)
+    np.testing.assert_allclose(output[:, :2], steady, atol=2.0)
+
+
+def test_lag_of_the_fork(robot):
+    """The fork starts from the angle it has and does not jump to another."""
+    hierarchy = build(robot, feedforward="none")
+    twist, still, pose = np.array([[0.8, 0.5]]), np.zeros((1, 2)), np.zeros((1, 3))
+    hierarchy.reset(twist, still, np.array([0.4]))
+    first = hierarchy.update(pose, twist, pose, twist, still)[0, 2]
+    settled = first
+    for _ in range(200):
+        settled = hierarchy.update(pose, twist, pose, twist, still)[0, 2]
+    assert settled < first < 0.4
+    assert first > settled + 0.5 * (0.4 - settled)
+
+
+def test_other_settings(robot):
+    """Every robot has settings of its own."""
+    scenarios = [Scenario(fel=Fel(step=step), prefilter=lag) for step, lag in ((0.0, 0.05), (0.05, 0.2))]
+    hierarchy = Hierarchy(scenarios, robot, feedforward_of(scenarios, robot))
+    inputs = [np.repeat(signal, 2, axis=1) for signal in signals(1, 40)]
+    log = drive(hierarchy, inputs)
+    assert hierarchy.weight_norm[0] == 0 < hierarchy.weight_norm[1]
+    spread = np.abs(np.diff(log[:, :, 7], axis=0)).sum(axis=0)
+    assert spread[1] < spread[0]  # the slower prefilter is the calmer one

@@ -1,0 +1,182 @@
+"""The velocity feedback: its design, its closed loop, its safeguards, its margins."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy import signal
+from scipy.optimize import brentq
+
+from mrctl.control.pid import Gains, Pid, imc, margins, pid
+
+CLOSED = 0.15  # λ
+
+
+def loop(gain, tau, gains, command, period, limit=np.inf, unwinding=True):
+    """Twist and voltage (T, 2) of two plants K/(τs + 1) under the PID, exact between ticks."""
+    state, voltage, excess, twist = np.zeros(7), np.zeros(2), np.zeros(2), np.zeros(2)
+    decay = np.exp(-period / np.asarray(tau))
+    twists, voltages = [], []
+    for wanted in command:
+        pid(wanted, twist, gains, period, excess, state, voltage)
+        applied = np.clip(voltage, -limit, limit)
+        excess = applied - voltage if unwinding else excess
+        twists.append(twist)
+        voltages.append(applied)
+        twist = decay * twist + (1 - decay) * np.asarray(gain) * applied
+    return np.array(twists), np.array(voltages)
+
+
+def plants(robot):
+    return (
+        np.array([robot.velocity_gain, robot.rotation_gain]),
+        np.array([robot.velocity_time_constant, robot.rotation_time_constant]),
+    )
+
+
+def test_published_gains(robot):
+    """The IMC gains of the default robot are the documented ones (to the digits given), and those of its numbers."""
+    found = np.array(imc(robot, CLOSED))
+    assert (np.abs(found - [[15.9, 68], [3.4, 12.9]]) < [[0.1, 0.5], [0.05, 0.05]]).all()
+    # K_i = N k_M/(r λ) and K_p = M_e r R_a/(2 N k_M λ); about the yaw axis D K_i and J_e in place of M_e D.
+    emf, drive = 43 * 0.0234, 3.4e-3 + 43**2 * 1.03e-6
+    m_e = 20 + 2 * drive / 0.098**2 + 5e-4 / 0.075**2
+    j_e = 0.6 + 20 * 0.1**2 + 2 * 0.188**2 * drive / 0.098**2
+    half = 0.098 * 2.32 / (2 * emf * CLOSED)
+    integral = emf / 0.098 / CLOSED
+    np.testing.assert_allclose(found, [[m_e * half, integral], [j_e / 0.188 * half, 0.188 * integral]], rtol=1e-12)
+    gains = Pid(derivative_time=0.02, derivative_filter=0.04).gains(robot, rigid=False)
+    np.testing.assert_allclose(gains, np.hstack([found, 0.02 * found[:, :1], [[0.04], [0.04]]]), rtol=1e-12)
+    assert Pid().gains(robot, rigid=True)[1].tolist() == [0.3, 5.0, 0.0, 0.03]
+
+
+@pytest.mark.parametrize("closed", [0.05, 0.15, 0.4])
+def test_closed_loop(robot, closed):
+    """On its own design plant the loop answers a step as 1/(λs + 1)."""
+    gain, tau = plants(robot)
+    h = 2e-4
+    t = h * np.arange(4000)
+    gains = Pid(time_constant=closed).gains(robot, rigid=False)
+    twists, _ = loop(gain, tau, gains, np.ones((4000, 2)), h)
+    np.testing.assert_allclose(twists, np.tile(1 - np.exp(-t / closed), (2, 1)).T, atol=h / closed)
+
+
+def test_antiwindup(robot):
+    """After three seconds of asking for more than the supply can give, the loop recovers; without, it overshoots."""
+    gain, tau = plants(robot)
+    command = np.repeat([[3.0, 15.0], [1.0, 5.0]], 300, axis=0)
+    gains = Pid().gains(robot, rigid=False)
+    outside = []
+    for unwinding in (True, False):
+        twists, voltages = loop(gain, tau, gains, command, 0.01, 24.0, unwinding)
+        assert (voltages[290] == 24).all()
+        late = np.abs(twists[300:] - command[300:]) > 0.05 * command[300:]
+        outside.append(300 - np.argmax(late[::-1], axis=0))  # ticks until it stays within 5 %
+    assert (outside[0] < 1.0 / 0.01).all()
+    assert (outside[1] > 2 * outside[0]).all()
+
+
+def test_derivative_filter():
+    """The derivative is K_d s/(T_f s + 1) of the error by backward differences."""
+    h, k_d, lag = 0.01, 0.7, 0.04
+    error = np.append([0, 0], np.random.default_rng(0).normal(size=200))
+    numerator, denominator, _ = signal.cont2discrete(([k_d, 0], [lag, 1]), h, method="backward_diff")
+    expected = signal.lfilter(numerator.ravel(), denominator, error)
+    gains = np.array([[0, 0, k_d, lag], [2.0, 0, 0, lag]])
+    state, output = np.zeros(7), np.zeros(2)
+    for e, want in zip(error, expected, strict=True):
+        pid(np.full(2, e), np.zeros(2), gains, h, np.zeros(2), state, output)
+        np.testing.assert_allclose(output, [want, 2 * e], atol=1e-12)
+
+
+def test_no_kick_at_the_start():
+    """A loop that starts with an error does not take it for a rate."""
+    gains = np.array([[1.0, 0, 5.0, 0.01]] * 2)
+    output = np.zeros(2)
+    pid(np.ones(2), np.zeros(2), gains, 0.01, np.zeros(2), np.zeros(7), output)
+    np.testing.assert_array_equal(output, 1)
+
+
+@pytest.mark.parametrize("k_i", [5.0, 50.0])
+@pytest.mark.parametrize("k_p", [0.0, 0.01, 0.3])
+def test_antiwindup_of_any_gains(k_p, k_i):
+    """At its limit the integral stays beside it, also where K_p/K_i is shorter than a period."""
+    gains = np.array([[k_p, k_i, 0, 0.03]] * 2)
+    state, output, excess = np.zeros(7), np.zeros(2), np.zeros(2)
+    for _ in range(1000):
+        pid(np.ones(2), np.zeros(2), gains, 0.01, excess, state, output)
+        excess = np.clip(output, -0.5, 0.5) - output
+    assert (np.abs(state[:2]) < 0.5 + 3 * max(k_p, 0.01 * k_i)).all()
+
+
+@pytest.mark.parametrize("delay", [0.005, 0.02, 0.04])
+@pytest.mark.parametrize("closed", [0.1, 0.15])
+def test_margins(robot, closed, delay):
+    """Under the IMC rule L = e^(−sT)/(λs), whose margins are known in closed form."""
+    for (gain, tau), gains in zip(np.transpose(plants(robot)), imc(robot, closed), strict=True):
+        found = margins(gain, tau, gains, delay)
+        expected = {
+            "crossover": 1 / closed,
+            "phase": 90 - np.degrees(delay / closed),
+            "gain": np.pi * closed / (2 * delay),
+            "delay": np.pi / 2 * closed - delay,
+            "ratio": 1 + tau / closed,
+            "positive_to": brentq(lambda w: closed * w * np.sin(w * delay) - 1, 0, np.pi / 2 / delay),  # noqa: B023
+        }
+        assert found._asdict() == pytest.approx(expected, rel=1e-3)
+
+
+def test_documented_margins(robot):
+    """The ratios 2.6 and 2.7, and 15 to 20 rad/s behind 20 ms; without delay nothing but the crossover ends."""
+    ratios = []
+    for (gain, tau), gains in zip(np.transpose(plants(robot)), imc(robot, CLOSED), strict=True):
+        assert 15 < margins(gain, tau, gains, 0.02).positive_to < 20
+        free = margins(gain, tau, gains, 0.0)
+        assert free.phase == pytest.approx(90)
+        assert free.gain == free.positive_to == np.inf
+        ratios.append(free.ratio)
+    np.testing.assert_allclose(ratios, [2.6, 2.7], atol=0.06)
+
+
+def test_margins_of_other_gains():
+    """A PI that cancels nothing, against the roots of its magnitude and phase."""
+    gain, tau, gains, delay = 0.1, 0.25, Gains(20.0, 200.0), 0.01
+
+    def phase(w):
+        return np.arctan(w * gains.k_p / gains.k_i) - np.pi / 2 - np.arctan(w * tau) - w * delay
+
+    def size(w):
+        return gain * np.hypot(gains.k_p, gains.k_i / w) / np.hypot(1, w * tau)
+
+    crossover = brentq(lambda w: size(w) - 1, 0.1, 100)
+    inversion = brentq(lambda w: phase(w) + np.pi, 20, 1000)
+    found = margins(gain, tau, gains, delay)
+    assert found.crossover == pytest.approx(crossover, rel=1e-4)
+    assert found.phase == pytest.approx(180 + np.degrees(phase(crossover)), rel=1e-3)
+    assert found.gain == pytest.approx(1 / size(inversion), rel=1e-3)
+    # Delayed by its delay margin the loop is on the brink.
+    assert margins(gain, tau, gains, delay + found.delay).phase == pytest.approx(0, abs=0.05)
+    # M V̇ + B V = b U with M = τ, B = 1, b = K: K_p (B + b K_p) > M K_i.
+    assert found.ratio == pytest.approx(20 * (1 + 0.1 * 20) / (0.25 * 200))
+
+
+def numbers(*shape, low=-5.0, high=5.0):
+    return arrays(float, shape, elements=st.floats(low, high))
+
+
+@given(numbers(4, 2), numbers(4, 2), numbers(4, 2, 4, low=0.01), numbers(4, 2), numbers(4, 7, low=0.0))
+def test_rows(command, twist, gains, excess, state):
+    """Robots do not mix: a row has the same bits alone and beside others, one of which is lost."""
+
+    def answer(rows, lost=()):
+        wanted, measured, design, cut, memory = (a[rows].copy() for a in (command, twist, gains, excess, state))
+        for i in lost:
+            measured[i] = np.nan
+        output = np.zeros((len(wanted), 2))
+        pid(wanted, measured, design, 0.01, cut, memory, output)
+        return np.hstack([output, memory])
+
+    together = answer(slice(None), lost=[0])
+    for i in (1, 2, 3):
+        assert together[i].tobytes() == answer(slice(i, i + 1))[0].tobytes()

@@ -1,0 +1,274 @@
+"""Nonsense thrown at scenarios; files and back; what a simulation refuses before it starts; order and length of results."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mrctl import Circle, Event, Fel, Kanayama, Lemniscate, Line, Perturbation, Pid, Rls, Scenario, StopAndGo, Waypoints, simulate
+from mrctl.record import InputError
+from mrctl.references import LaneChange, RoundedSquare
+from mrctl.scenario import LONGEST, whole
+
+values = (
+    st.none() | st.booleans() | st.integers() | st.floats() | st.floats(0, 1) | st.text(max_size=5)
+    | st.sampled_from(["flat", "rigid", "fel", "truth", [], {}, [0.1, 0.2, 0.3], [{}], [{"time": 1}], {"kind": "circle"}])
+)  # fmt: skip
+parts = st.sampled_from(
+    [(name,) for name in Scenario.model_fields]
+    + [(part, name) for part, kind in (("kanayama", Kanayama), ("pid", Pid), ("fel", Fel), ("rls", Rls)) for name in kind.model_fields]
+    + [("perturbation", name) for name in Perturbation.model_fields]
+    + [("events", name) for name in Event.model_fields]
+)
+
+
+def refused(name: str, source: object) -> None:
+    """One line that names the field."""
+    with pytest.raises(InputError) as error:
+        Scenario.from_dict(source)
+    message = str(error.value)
+    assert message.startswith(name) and "\n" not in message, message
+
+
+@given(parts, values)
+@settings(max_examples=300)
+def test_nonsense(path, value):
+    """Any value anywhere is valid, or one line says where it is not."""
+    *where, name = path
+    if where == ["events"]:
+        source = {"events": [{"time": 0.0, name: value}]}
+    elif where:
+        source = {where[0]: {name: value}}
+    else:
+        source = {name: value}
+    try:
+        scenario = Scenario.from_dict(source)
+    except InputError as error:
+        message = str(error)
+        assert "\n" not in message
+        fields = {"control_period": ("motion_period", "control_period"), "physics_step": ("control_period",)}
+        expected = ".".join(path).replace("events.", "events.0.")
+        assert message.startswith((expected, *(fields.get(name, ())), "laps")), message
+    else:
+        assert 1 <= scenario.ticks <= LONGEST
+        assert Scenario.from_dict(json.loads(scenario.model_dump_json())) == scenario
+
+
+@given(st.dictionaries(st.text(max_size=8), values, min_size=1, max_size=3))
+def test_unknown(source):
+    """What is no field is refused."""
+    if source.keys() <= Scenario.model_fields.keys():
+        return
+    with pytest.raises(InputError):
+        Scenario.from_dict(source)
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("speed", {"speed": 1}),
+        ("reference.circle.size", {"reference": {"kind": "circle", "size": 1}}),
+        ("reference", {"reference": {"kind": "ellipse"}}),
+        ("reference", {"reference": {"radius": 1}}),
+        ("events.1.push", {"events": [{"time": 1}, {"time": 2, "push": [1, 2]}]}),
+        ("events.0.what", {"events": [{"time": 1, "what": 2}]}),
+        ("perturbation.mass", {"perturbation": {"mass": 2}}),
+        ("laps", {"laps": 0}),
+        ("seed", {"seed": -1}),
+        ("initial_spread.2", {"initial_spread": [0, 0, 9]}),
+        ("initial_pose.0", {"initial_pose": [float("nan"), 0, 0]}),
+        ("laps: a run of", {"reference": {"kind": "line", "length": 1e-6}, "laps": 1}),
+        ("laps: a run of", {"reference": {"kind": "circle", "period": 3600}, "laps": 10_000}),
+    ],
+)
+def test_refused(name, source):
+    """By the path of the field."""
+    refused(name, source)
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("control_period", {"control_period": 0.011}),
+        ("control_period", {"control_period": 0.01, "physics_step": 0.003}),
+        ("control_period", {"control_period": 0.001, "physics_step": 0.002}),
+        ("motion_period", {"motion_period": 0.015}),
+        ("motion_period", {"motion_period": 0.005}),
+        ("perturbation.control_delay", {"perturbation": {"control_delay": 0.015}}),
+        ("events.1.perturbation.control_delay", {"events": [{"time": 0}, {"time": 1, "perturbation": {"control_delay": 0.004}}]}),
+    ],
+)
+def test_multiples(name, source):
+    """Rates that do not divide are refused by the name of the larger."""
+    refused(name, source)
+
+
+@given(st.integers(0, 10**6), st.floats(1e-5, 1))
+def test_whole(count, unit):
+    """Counts whole multiples despite rounding, and refuses the half."""
+    assert whole(count * unit, unit, "a", "b") == count
+    with pytest.raises(ValueError, match="^a: .* whole multiple of b"):
+        whole((count + 0.5) * unit, unit, "a", "b")
+
+
+def test_rates():
+    """Multiples that decimal fractions only nearly are."""
+    scenario = Scenario(physics_step=0.001, control_period=0.007, motion_period=0.049, perturbation=Perturbation(control_delay=0.021))
+    assert scenario.ticks == round(96 / 0.007)
+
+
+# --- files ---------------------------------------------------------------------------------------------------------------
+
+
+def toml(value: object) -> str:
+    """A value as inline TOML."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {toml(item)}" for key, item in value.items() if item is not None) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(toml(item) for item in value) + "]"
+    return json.dumps(value)
+
+
+FULL = Scenario(
+    name="grünes Licht",
+    world="patch",
+    steering="rigid",
+    reference=Waypoints(points=((0, 0), (1, 0), (1, 1))),
+    laps=3,
+    feedforward="rls",
+    measurement="odometry",
+    kanayama=Kanayama(k_x=2.5),
+    pid=Pid(time_constant=0.3),
+    fel=Fel(hidden=3, weights="w.safetensors", frozen=True),
+    rls=Rls(drift=0),
+    perturbation=Perturbation(mass_factor=1.1, control_delay=0.03),
+    events=(
+        Event(time=1.25, perturbation=Perturbation(payload=3.3)),
+        Event(time=2, push=(1, 2.5, -3), push_duration=0.25),
+        Event(time=3, kanayama=Kanayama(), pid=Pid(), learning=False),
+    ),
+    initial_pose=(0.1, 0.2, 0.3),
+    initial_spread=(0, 0, 0),
+    seed=7,
+    prefilter=0.07,
+    physics_step=0.001,
+    motion_period=0.02,
+)
+KINDS = (Line(), Circle(clockwise=True), Lemniscate(size=2), LaneChange(), RoundedSquare(), StopAndGo(pause=0), Waypoints())
+
+
+@pytest.mark.parametrize("scenario", [Scenario(), FULL, *(FULL.model_copy(update={"reference": kind}) for kind in KINDS)])
+def test_toml(scenario, tmp_path):
+    """Through TOML and JSON and back, events and references included, to the last bit."""
+    file = tmp_path / "scenario.toml"
+    file.write_text("\n".join(f"{k} = {toml(v)}" for k, v in scenario.model_dump(mode="json", exclude_none=True).items()))
+    assert tomllib.loads(file.read_text())["laps"] == scenario.laps
+    assert Scenario.from_toml(file) == scenario
+    assert Scenario.from_dict(json.loads(scenario.model_dump_json())) == scenario
+
+
+def test_bad_file(tmp_path):
+    """One line that names the file and the field."""
+    file = tmp_path / "scenario.toml"
+    for text, words in (("laps = 0", "laps"), ("laps = ", "not TOML"), ("[[events]]\ntime = -1", "events.0.time")):
+        file.write_text(text)
+        with pytest.raises(InputError) as error:
+            Scenario.from_toml(file)
+        assert str(error.value).startswith(str(file)) and words in str(error.value) and "\n" not in str(error.value)
+
+
+# --- what a simulation refuses -------------------------------------------------------------------------------------------
+
+
+def test_nothing():
+    """No scenario is no result."""
+    with pytest.raises(InputError, match="^scenarios: none"):
+        simulate([])
+
+
+@pytest.mark.parametrize(
+    ("words", "changes"),
+    [
+        ("^world: no file", {"world": "moon"}),
+        ("^initial_pose: 5.00 m from the start", {"initial_pose": (3.0, 4.0, 0.0)}),
+        ("^initial_pose: there is no ground", {"world": "rough", "reference": Waypoints(points=((8, 0), (10, 0), (9, 2)))}),
+        ("^reference line: speed 2 m/s .*max_speed", {"reference": Line(speed=2)}),
+        ("^reference circle: rotation", {"reference": Circle(period=1.9, radius=0.2)}),
+        ("^reference circle: steering angle", {"reference": Circle(period=9, radius=0.1)}),
+        ("^reference stop_and_go: reverses .*rigid", {"reference": StopAndGo(reverse=True)}),
+        ("^reference stop_and_go: reverses .*rigid", {"reference": StopAndGo(reverse=True), "steering": "caster"}),
+        ("^fel.weights: no file none.safetensors", {"fel": Fel(weights="none.safetensors")}),
+        ("^perturbation.payload: .*tip over", {"perturbation": Perturbation(payload=30, payload_x=-1)}),
+    ],
+)
+def test_simulation_refuses(words, changes):
+    """Before anything is computed, also as the last of many."""
+    good = Scenario(reference=Circle(period=4, radius=0.5), laps=200, initial_spread=(0, 0, 0))
+    bad = Scenario.from_dict(good.model_dump() | {"laps": 1} | changes)
+    for scenarios in (bad, [good, bad]):
+        with pytest.raises(InputError, match=words) as error:
+            simulate(scenarios)
+        assert "\n" not in str(error.value)
+
+
+def test_mixed_rates():
+    """Runs of one result share a time axis."""
+    with pytest.raises(InputError, match="^control_period"):
+        simulate([Scenario(), Scenario(control_period=0.02, motion_period=0.02)])
+
+
+def test_reverse_if_rigid():
+    """The rigid arrangement may drive backwards."""
+    run = simulate(Scenario(reference=StopAndGo(distance=0.3, move_time=1.5, pause=0.2), laps=1, steering="rigid"))
+    assert run.v.min() < -0.1 and not run.failed
+
+
+# --- results -------------------------------------------------------------------------------------------------------------
+
+
+def test_order():
+    """Scenarios of mixed groups and lengths come back in the order given; the short end in NaN."""
+    scenarios = [
+        Scenario(
+            reference=Circle(period=period, radius=0.5), laps=1, feedforward=kind, steering=steering, seed=seed, name=f"run {seed}"
+        )
+        for seed, (kind, steering, period) in enumerate(
+            [("fel", "rigid", 4), ("none", "compliant", 5), ("rls", "compliant", 4), ("none", "compliant", 4), ("fel", "rigid", 4)]
+        )
+    ]  # fmt: skip
+    whole_result = simulate(scenarios)
+    assert whole_result.sizes == {"run": 5, "time": 500, "weight": 282}
+    assert list(whole_result.seed) == list(range(5)) == list(whole_result.run)
+    assert list(whole_result.label.values) == [s.name for s in scenarios]
+    assert list(whole_result.feedforward.values) == [s.feedforward for s in scenarios]
+    assert list(whole_result.lap_time.values) == [4, 5, 4, 4, 4]
+    for row, scenario in enumerate(scenarios):
+        run = whole_result.isel(run=row)
+        assert np.isfinite(run.v[: scenario.ticks]).all() and np.isnan(run.v[scenario.ticks :]).all()
+        assert np.array_equal(run.x[: scenario.ticks], simulate(scenario).x)
+        assert np.isfinite(run.weights).all() == (scenario.feedforward == "fel")
+
+
+def test_networks_of_different_sizes():
+    """Their weights share a table; the smaller ends in NaN."""
+    scenarios = [Scenario(reference=Circle(period=4, radius=0.5), laps=1, fel=Fel(hidden=n)) for n in (4, 8)]
+    weights = simulate(scenarios).weights
+    assert weights.notnull().sum("weight").values.tolist() == [11 * 4 + 18, 11 * 8 + 18]
+    assert np.array_equal(weights[0, : 11 * 4 + 18], simulate(scenarios[0]).weights)
+
+
+def test_label():
+    """The feedforward's name, unless the run has its own; a stage of one's own has its function's name."""
+    from mrctl.control.feedforward import NoFeedforward
+
+    scenario = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
+
+    def mine(robot, size):
+        return NoFeedforward(size)
+
+    assert str(simulate(scenario).label.item()) == "none"
+    assert str(simulate(scenario, mine).label.item()) == str(simulate(scenario, mine).feedforward.item()) == "mine"
+    assert str(simulate(scenario.model_copy(update={"name": "x"})).label.item()) == "x"

@@ -1,0 +1,202 @@
+"""Allocation: the fork against the kinematics of its contact, the voltages against the dynamics and the supply."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from mrctl import kinematics
+from mrctl.control.steering import REST, allocate, parameters
+from mrctl.dynamics import common_differential, inverse_dynamics, left_right
+from mrctl.references import Lemniscate, StopAndGo
+
+ZERO = np.zeros(2)
+
+
+@pytest.fixture(scope="module")
+def stiff(robot):
+    """The robot as `rigid` steering knows it: no trail."""
+    return robot.model_copy(update={"trail": 0.0})
+
+
+class Allocation:
+    """One robot's allocation with its memory and outputs."""
+
+    def __init__(self, robot, rigid=False, period=0.01, angle=0.0):
+        self.parameters, self.period = parameters(robot, rigid), period
+        self.state = np.array([angle, 0.0])
+        self.command, self.parts = np.zeros((2, 4))
+        self.excess, self.saturated = np.zeros(2), np.zeros(1)
+
+    def __call__(self, twist, acceleration=ZERO, feedback=ZERO, feedforward=ZERO):
+        allocate(
+            np.asarray(twist, float), np.asarray(acceleration, float), np.asarray(feedback, float),
+            np.asarray(feedforward, float), self.parameters, self.period, self.state, self.command, self.parts,
+            self.excess, self.saturated,
+        )  # fmt: skip
+        return self.command
+
+
+def fork(robot, motion, rigid=False, period=0.01):
+    """Angle and rate (T,) along a reference."""
+    allocation = Allocation(robot, rigid, period)
+    found = []
+    for twist, acceleration in zip(motion.twist, motion.acceleration, strict=True):
+        allocation(twist, acceleration)
+        found.append(allocation.state.copy())
+    return np.transpose(found)
+
+
+def numbers(shape, bound):
+    return arrays(float, shape, elements=st.floats(-bound, bound))
+
+
+@given(st.floats(0.1, 1.5), st.floats(-3, 3))
+def test_steady_turn(robot, v, omega):
+    """In a steady turn the fork settles where its wheel rolls without scrub."""
+    expected = kinematics.scrub_free_angle([v, omega], robot)
+    assume(abs(expected) < robot.steering_limit)
+    allocation = Allocation(robot)
+    for _ in range(600):
+        angle, rate = allocation([v, omega])[2:]
+    assert angle == pytest.approx(expected, abs=1e-9)
+    assert rate == 0
+
+
+@pytest.mark.parametrize(("trail", "tolerance"), [(0.0, 0.002), (0.03, 0.02)])
+def test_rate(robot, trail, tolerance):
+    """The rate set-point is the angle's derivative (the lag's own change neglected), and leads it to mid-period."""
+    h = 1e-3
+    angle, rate = fork(robot.model_copy(update={"trail": trail}), Lemniscate().sample(h * np.arange(6000)), period=h)
+    slope = (angle[2:] - angle[:-2]) / (2 * h)
+    np.testing.assert_allclose(rate[1000:-1], slope[999:], atol=tolerance * np.abs(slope[999:]).max())
+    allocation = Allocation(robot, period=0.01, angle=0.1)
+    command = allocation([0.5, 0.4], [0.3, 0.8])
+    np.testing.assert_allclose(command[2], allocation.state[0] + 0.005 * command[3], atol=1e-15)
+    assert command[3] != 0
+
+
+def test_contact_rolls(robot):
+    """Along a lemniscate the swinging contact is not dragged sideways: sin(direction − φ)·speed = t (θ̇ + φ̇)."""
+    h = 1e-3
+    motion = Lemniscate().sample(h * np.arange(12000))
+    v, omega = motion.twist.T
+
+    def drag(angle):
+        direction, speed = np.arctan2(robot.wheelbase * omega, v), np.hypot(v, robot.wheelbase * omega)
+        lateral = speed * np.sin(direction - angle) - robot.trail * (omega + np.gradient(angle, h))
+        return np.abs(lateral[1000:]).max()
+
+    angle, _ = fork(robot, motion, period=h)
+    assert drag(angle) < 1e-3
+    assert drag(kinematics.scrub_free_angle(motion.twist, robot)) > 20 * drag(angle)  # the lag is what does it
+
+
+@given(numbers(2, 3.0), numbers(2, 5.0))
+def test_rigid(stiff, twist, acceleration):
+    """Without trail the angle is atan(L θ̇/V) at once, forwards and in reverse, and its rate the derivative."""
+    v, omega = twist
+    angle = kinematics.steering_angle(twist, stiff)
+    assume(np.hypot(v, 0.4 * omega) > 2 * REST and abs(angle) < stiff.steering_limit - 1e-3)
+    allocation = Allocation(stiff, rigid=True, angle=0.7)
+    _, _, command, rate = allocation(twist, acceleration)
+    h = 1e-6
+    ahead, behind = (kinematics.steering_angle(twist + s * h * acceleration, stiff) for s in (1, -1))
+    assert allocation.state[0] == pytest.approx(angle, abs=1e-12)
+    assert rate == pytest.approx((ahead - behind) / (2 * h), rel=1e-3, abs=1e-5)
+    assert command == pytest.approx(angle + 0.005 * rate, abs=1e-12)
+
+
+def test_stop_and_go(stiff):
+    """Through rest and reverse of a straight line the wheel stays straight."""
+    angle, rate = fork(stiff, StopAndGo().sample(0.01 * np.arange(800)), rigid=True)
+    assert not angle.any()
+    assert not rate.any()
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+@given(twist=numbers(2, 0.9 * REST), acceleration=numbers(2, 3.0), angle=st.floats(-1, 1))
+def test_rest(robot, rigid, twist, acceleration, angle):
+    """At rest the fork holds its angle."""
+    command = Allocation(robot, rigid, angle=angle)(twist, acceleration)
+    assert command[2:].tolist() == [angle, 0]
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+@given(twist=numbers((8, 2), 3.0), acceleration=numbers((8, 2), 6.0), feedback=numbers((8, 2), 9.0))
+def test_steering_limit(robot, stiff, rigid, twist, acceleration, feedback):
+    """The fork stays within its stops (but for the half period that the set-point leads)."""
+    allocation = Allocation(stiff if rigid else robot, rigid)
+    for arguments in zip(twist, acceleration, feedback, strict=True):
+        allocation(*arguments)
+        assert abs(allocation.state[0]) <= robot.steering_limit
+
+
+@given(numbers(2, 40.0), numbers(2, 40.0), numbers(2, 1.0))
+def test_voltages(robot, feedback, feedforward, twist):
+    """U_r,l = U_Σ ± U_Δ limited to the supply; parts add up to what was asked, excess to what was cut."""
+    allocation = Allocation(robot)
+    voltage = allocation(twist, feedback=feedback, feedforward=feedforward)[:2]
+    asked = left_right(feedback + feedforward)
+    np.testing.assert_allclose(voltage, np.clip(asked, -24, 24), atol=1e-12)
+    np.testing.assert_allclose(allocation.parts, [*left_right(feedback), *left_right(feedforward)], atol=1e-12)
+    np.testing.assert_allclose(allocation.excess, common_differential(voltage - asked), atol=1e-12)
+    assert allocation.saturated[0] == (np.abs(allocation.parts[:2] + allocation.parts[2:]) > 24).any()
+
+
+@given(numbers(2, 40.0), numbers(2, 1.0), numbers(2, 40.0), numbers(2, 1.0))
+def test_rigid_voltages(stiff, feedback, correction, feedforward, twist):
+    """With rigid steering the model makes the differential: k_E N D θ̇/r and half the difference of the drive losses."""
+    feedback[1], feedforward[1] = 0.1 * correction
+    allocation = Allocation(stiff, rigid=True)
+    voltage = allocation(twist, feedback=feedback, feedforward=feedforward)[:2]
+    # A robot that neither rolls with losses nor has its mass off P needs just these to turn steadily.
+    light = stiff.model_copy(update={"rolling_coefficient": 0.0, "com_offset": 0.0})
+    apart = common_differential(inverse_dynamics(twist, ZERO, light, 0.05))[1]
+    expected = [feedback[0]] * 2 + [feedforward[0] - apart, feedforward[0] + apart]
+    np.testing.assert_allclose(allocation.parts, expected, atol=1e-9)
+    asked = allocation.parts[:2] + allocation.parts[2:]
+    np.testing.assert_allclose(voltage, np.clip(asked, -24, 24), atol=1e-12)
+    assert allocation.excess[0] == pytest.approx((voltage - asked).mean(), abs=1e-12)
+    at_stop = abs(allocation.state[0]) == stiff.steering_limit
+    assert allocation.saturated[0] == ((np.abs(asked) > 24).any() or at_stop)
+
+
+def test_rigid_correction(stiff):
+    """Feedback and feedforward of the second channel act through the angle; what the stop cut of them is excess."""
+    allocation = Allocation(stiff, rigid=True)
+    allocation([0.5, 0.4], feedback=[0, 0.1], feedforward=[0, -0.03])
+    assert kinematics.twist_from_front_wheel(0.5 / np.cos(allocation.state[0]), allocation.state[0], stiff)[
+        1
+    ] == pytest.approx(0.47)
+    assert allocation.excess[1] == allocation.saturated[0] == 0
+    for v in (0.3, -0.3):
+        allocation([v, 1.0], feedback=[0, 0.8], feedforward=[0, 0.1])
+        made = v * np.tan(allocation.state[0]) / 0.4  # θ̇ of the wheel at its stop
+        assert abs(allocation.state[0]) == stiff.steering_limit
+        assert allocation.excess[1] == pytest.approx(made - 1.9)
+        assert allocation.saturated[0] == 1
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+@pytest.mark.filterwarnings("ignore:invalid value")
+@given(
+    twist=numbers((4, 2), 2.0), acceleration=numbers((4, 2), 5.0), feedback=numbers((4, 2), 30.0),
+    feedforward=numbers((4, 2), 30.0), state=numbers((4, 2), 1.0),
+)  # fmt: skip
+def test_rows(robot, rigid, twist, acceleration, feedback, feedforward, state):
+    """Robots do not mix: a row has the same bits alone and beside others, one of which is lost."""
+
+    def answer(rows, lost=()):
+        inputs = [a[rows].copy() for a in (twist, acceleration, feedback, feedforward)]
+        memory, size = state[rows].copy(), len(inputs[0])
+        for i in lost:
+            inputs[2][i] = inputs[0][i] = np.nan
+        command, parts, excess, saturated = (np.zeros(shape) for shape in ((size, 4), (size, 4), (size, 2), size))
+        allocate(*inputs, parameters(robot, rigid), 0.01, memory, command, parts, excess, saturated)
+        return np.hstack([command, parts, excess, saturated[:, None], memory])
+
+    together = answer(slice(None), lost=[3])
+    for i in (0, 1, 2):
+        assert together[i].tobytes() == answer(slice(i, i + 1))[0].tobytes()
