@@ -26,7 +26,7 @@ Spread = Annotated[float, Field(ge=0, le=0.2)]
 class Event(Record):
     """Something that happens at one moment of a run. What is left out stays as it is."""
 
-    time: Annotated[float, Field(ge=0)]
+    time: Annotated[float, Field(ge=0, le=1e8)]
     """When, in s; takes effect at the first control tick that is not before."""
     perturbation: Perturbation | None = None
     """The plant's complete perturbation from now on."""

@@ -17,6 +17,6 @@ def robot() -> Robot:
         wheel_radius=0.098, front_wheel_radius=0.075, half_track=0.188,
         wheelbase=0.4, trail=0.03, steering_limit=1.0472,
         resistance=2.32, inductance=0, torque_constant=0.0234, gear_ratio=43, rotor_inertia=1.03e-6,
-        no_load_current=0.037, gear_loss=0.1, rolling_coefficient=0.015, wheel_inertia=3.4e-3, front_wheel_inertia=5e-4,
+        no_load_current=0.037, gear_loss=0.1, rolling_coefficient=0.015, wheel_inertia=3.4e-3, front_wheel_inertia=1e-3,
         supply=24, tyre_friction=0.9, max_speed=1.5, max_rotation=3, max_acceleration=1.5, max_rotation_acceleration=6,
     )  # fmt: skip

@@ -1,0 +1,153 @@
+"""What happens in the middle of a run takes effect at its tick, does what it says, and can be taken back."""
+
+import numpy as np
+import pytest
+
+from mrctl import Circle, Event, Fel, Kanayama, Line, Perturbation, Pid, Scenario, simulate
+from mrctl import model as mjcf
+from mrctl.dynamics import inverse_coefficients
+from mrctl.result import SIGNALS
+from mrctl.simulate import Simulation
+
+PERIOD = 0.01
+BASE = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="model")
+PAYLOAD = Perturbation(payload=5, payload_x=0.15, payload_y=0.05)
+
+
+def with_events(*events, base=BASE, **changes):
+    """A run with events."""
+    return base.model_copy(update={"events": events, **changes})
+
+
+def first_difference(one, other) -> int:
+    """The first tick at which any recorded signal differs, bit for bit."""
+    ticks = [np.flatnonzero(~((one[n].values == other[n].values) | (one[n].isnull() & other[n].isnull()).values)) for n in SIGNALS]
+    return min((int(t[0]) for t in ticks if t.size), default=len(one.time))
+
+
+@pytest.mark.parametrize(("time", "tick"), [(0.0, 0), (0.07, 7), (1.0, 100), (1.501, 151), (1.51, 151), (2.9999, 300)])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"perturbation": PAYLOAD},
+        {"perturbation": Perturbation(control_delay=0.02)},
+        {"perturbation": Perturbation(velocity_noise=0.01)},
+        {"push": (10, 0, 0)},
+        {"kanayama": Kanayama(k_x=1)},
+        {"pid": Pid(time_constant=0.3)},
+    ],
+    ids=lambda change: "-".join(change),
+)
+def test_tick(change, time, tick):
+    """The record is the same before, to the bit, and another from the first control tick on that is not before."""
+    pair = simulate([BASE, with_events(Event(time=time, **change))])
+    # A change of the plant shows in the state one tick after, in currents and commands at once.
+    assert tick <= first_difference(pair.isel(run=0), pair.isel(run=1)) <= tick + 1
+
+
+def test_learning_switch():
+    """Learning stops at its tick and goes on at the other; in between the weights stand still."""
+    base = BASE.model_copy(update={"feedforward": "fel"})
+    run = simulate(with_events(Event(time=1, learning=False), Event(time=2, learning=True), base=base))
+    norm = run.weight_norm.values
+    moves = np.flatnonzero(np.diff(norm)) + 1
+    assert not ((moves >= 100) & (moves < 200)).any()
+    assert (moves < 100).sum() > 50 and (moves >= 200).sum() > 50
+
+
+def test_after_the_end():
+    """An event that never comes changes nothing."""
+    pair = simulate([BASE, with_events(Event(time=4.0, push=(1e3, 0, 0)), Event(time=1e8, perturbation=PAYLOAD))])
+    assert first_difference(pair.isel(run=0), pair.isel(run=1)) == 400
+
+
+def test_same_moment():
+    """Two events at one tick happen in the order given: the last perturbation counts."""
+    both = with_events(Event(time=1, perturbation=PAYLOAD), Event(time=1, perturbation=Perturbation(mass_factor=1.2)))
+    last = with_events(Event(time=1, perturbation=Perturbation(mass_factor=1.2)))
+    pair = simulate([both, last])
+    assert first_difference(pair.isel(run=0), pair.isel(run=1)) == 400
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_payload_is_taken_off_again(size):
+    """Dropped and removed: every parameter of the plant is the nominal one again, to the bit, and so is the oracle."""
+    events = (Event(time=0.1, perturbation=PAYLOAD), Event(time=0.2, perturbation=Perturbation()))
+    simulation = Simulation([with_events(*events, feedforward="oracle")] * size)
+    nominal = mjcf.fields(mjcf.load())
+    masses = []
+    for _ in range(40):
+        simulation.step()
+        model = simulation.plant._model_of(size - 1)
+        masses.append(model.body_subtreemass[model.body("chassis").id])
+    assert masses == pytest.approx([20] * 10 + [25] * 10 + [20] * 20)
+    for name, value in nominal.items():
+        assert np.array_equal(mjcf.fields(model)[name], value), name
+    assert np.array_equal(model.dof_invweight0, mjcf.load().dof_invweight0)
+    assert simulation.plant.truth[-1] == simulation.plant.robot
+
+
+def test_oracle_follows():
+    """It is told of each change: its coefficients are those of the plant as it is."""
+    heavy = Perturbation(mass_factor=1.5, supply_factor=0.8, resistance_factor=1.3)
+    simulation = Simulation([with_events(Event(time=0.05, perturbation=heavy), feedforward="oracle"), BASE.model_copy(update={"feedforward": "oracle"})])
+    for tick in range(10):
+        simulation.step()
+        changed = tick >= 5
+        stage, truth = simulation.hierarchy.feedforward, simulation.plant.truth
+        assert (truth[0] != simulation.plant.robot) == changed and truth[1] == simulation.plant.robot
+        for row in range(2):
+            assert np.array_equal(stage._coefficients[row], inverse_coefficients(truth[row]))
+
+
+def test_oracle_is_better():
+    """After a change in the middle the oracle tracks as before; the model does not."""
+    event = Event(time=1, perturbation=Perturbation(mass_factor=1.5, supply_factor=0.7, drive_friction_factor=3))
+    runs = simulate([with_events(event, feedforward=kind, initial_spread=(0, 0, 0), laps=2) for kind in ("oracle", "model")])
+    late = runs.isel(time=slice(150, 800))
+    error = np.hypot(late.x - late.x_ref, late.y - late.y_ref).mean("time")
+    assert error[0] < error[1] / 2
+
+
+def test_push():
+    """The run's velocity jumps by the impulse over the mass that the motors move, while they cannot hold against it."""
+    base = Scenario(reference=Line(speed=0.5, length=1.5), laps=1, feedforward="model", initial_spread=(0, 0, 0))
+    runs = simulate([with_events(Event(time=1, push=(300, 0, 0), push_duration=0.02), base=base), base])
+    jump = float(runs.v[0, 102] - runs.v[1, 102])
+    assert jump == pytest.approx(300 * 0.02 / 21.3, rel=0.1)
+    sideways = simulate(with_events(Event(time=1, push=(0, 200, 0), push_duration=0.1), base=base))
+    assert sideways.y[120] > 1e-3 + sideways.y[100]
+
+
+def test_delay():
+    """Alone and in a batch: what reaches the motors is the command of d ticks before, from the tick of the event on."""
+    scenario = with_events(Event(time=0.5, perturbation=Perturbation(control_delay=0.03)))
+    for simulation in (Simulation([scenario]), Simulation([BASE, scenario])):
+        commands, applied = [], []
+        for _ in range(80):
+            simulation.step()
+            commands.append(simulation.hierarchy.output[-1, :2].copy())
+            applied.append(simulation.plant.applied[-1].copy())
+        commands, applied = np.array(commands), np.array(applied)
+        assert np.array_equal(applied[:50], commands[:50])
+        assert np.array_equal(applied[50:], commands[47:77])
+        assert len(np.unique(commands[:, 0])) > 70
+
+
+def test_gains():
+    """New gains are in use from their tick on: the same error asks for another command."""
+    simulation = Simulation([with_events(Event(time=0.02, kanayama=Kanayama(k_x=9), pid=Pid(time_constant=0.3)))])
+    hierarchy = simulation.hierarchy
+    for tick in range(4):
+        simulation.step()
+        assert hierarchy._kanayama[0, 0] == (9 if tick >= 2 else 3)
+        gains = Pid(time_constant=0.3 if tick >= 2 else 0.15).gains(simulation.plant.robot, False)
+        assert np.array_equal(hierarchy._pid[0], gains)
+
+
+def test_frozen_from_the_start():
+    """`frozen` and learning switched off at once are the same run."""
+    base = BASE.model_copy(update={"feedforward": "fel"})
+    pair = simulate([with_events(Event(time=0, learning=False), base=base), base.model_copy(update={"fel": Fel(frozen=True)})])
+    assert first_difference(pair.isel(run=0), pair.isel(run=1)) == 400
+    assert (pair.weight_norm == 0).all()
