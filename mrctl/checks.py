@@ -6,6 +6,9 @@ friction than it claims fails. Voltages, speeds and times scale with the robot: 
 accepts can be checked. `CHECKS` lists all of them with the world and the steering arrangement that each one is for.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
 from __future__ import annotations
 
 from collections.abc import Callable

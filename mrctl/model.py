@@ -1,5 +1,8 @@
 """MJCF in, compiled model out; reads a `Robot` from it, applies a `Perturbation` to it, stands it on the ground."""
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
 from __future__ import annotations
 
 import copy

@@ -4,6 +4,9 @@ Every array has a leading batch dimension. Both plants share the code below but 
 is the same scenario run alone, bit for bit. Only `qpos` and `qvel` are read: a batch's sensor data is a substep old.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
 from __future__ import annotations
 
 import warnings

@@ -153,7 +153,8 @@ class Robot(Record):
     @property
     def rotation_time_constant(self) -> float:
         """Time constant of θ̇ under U_Δ in s."""
-        return self.effective_inertia * self.wheel_radius**2 / (2 * self.half_track**2 * self.motor_gain * self.back_emf)
+        damping = 2 * self.half_track**2 * self.motor_gain * self.back_emf / self.wheel_radius**2
+        return self.effective_inertia / damping
 
 
 class Perturbation(Record):

@@ -109,6 +109,7 @@ class InverseDynamics:
         self._coefficients = np.zeros((len(robots), 8, 2))
         self._rigid = rigid
         self._scale = np.ones(8)
+        self._features, self._output = np.zeros((len(robots), 8)), np.zeros((len(robots), 2))
         for row, robot in enumerate(robots):
             self.set_robot(row, robot)
 
@@ -121,7 +122,9 @@ class InverseDynamics:
 
     def output(self, command: Array, derivative: Array) -> Array:
         """Voltages of the inverse dynamics, before the supply limit."""
-        return linear(features(command, derivative, self._half_track, self._scale), self._coefficients)
+        features(command, derivative, self._half_track, self._scale, self._features)
+        linear(self._features, self._coefficients, self._output)
+        return self._output
 
     def learn(self, feedback: Array, saturated: Array) -> None:
         """Knows already."""

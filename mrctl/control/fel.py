@@ -152,7 +152,7 @@ def load_weights(path: str | Path, hidden: int) -> Array:
 
 @guvectorize([(float64[:], float64[:], float64[:, :], float64[:])], "(f),(w),(t,u)->(u)", cache=True)
 def network(x, weights, targets, out):  # noqa: ANN001, ANN201
-    """scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x) for one robot.
+    """Scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x) for one robot.
 
     Args:
         x: Scaled features `(8,)`.
@@ -269,7 +269,7 @@ class FeedbackErrorLearning:
         self._scale = feature_scale(robot)
         self._targets = np.array([s.targets(rigid) for s in settings])
         self._steps = np.array([s.steps() for s in settings])
-        self._features = np.zeros((len(settings), INPUTS))
+        self._features, self._output = np.zeros((len(settings), INPUTS)), np.zeros((len(settings), OUTPUTS))
         self.prior = np.array(
             [
                 load_weights(s.weights, s.hidden) if s.weights else initial_weights(s.hidden, seed)
@@ -282,7 +282,8 @@ class FeedbackErrorLearning:
     def output(self, command: Array, derivative: Array) -> Array:
         """The network at the commanded motion; never at the measured one."""
         features(command, derivative, self._half_track, self._scale, self._features)
-        return network(self._features, self.state["weights"], self._targets)
+        network(self._features, self.state["weights"], self._targets, self._output)
+        return self._output
 
     def learn(self, feedback: Array, saturated: Array) -> None:
         """One step on the features of the last output."""

@@ -9,8 +9,8 @@ import torch
 from torch import nn
 from torch.func import functional_call, stack_module_state, vjp, vmap
 
-from mrctl.control.fel import BIAS_GAIN, HIDDEN_GAIN, INPUTS, OUTPUTS, REGULARISATION, Fel
 from mrctl.control.feedforward import Array, feature_scale, features
+from mrctl.control.fel import BIAS_GAIN, HIDDEN_GAIN, INPUTS, OUTPUTS, REGULARISATION, Fel
 from mrctl.robot import Robot
 
 
@@ -59,7 +59,7 @@ class ModuleLearning:
             ValueError: The module has buffers, or does not map 8 inputs to 2 outputs.
         """
         if buffers := [name for name, _ in module.named_buffers()]:
-            raise ValueError(f"module: {buffers[0]} is a buffer; a module with running state cannot be copied per robot")
+            raise ValueError(f"module: {buffers[0]} is a buffer; running state cannot be copied per robot")
         settings = settings or Fel()
         self._module = copy.deepcopy(module).double().eval()
         try:
@@ -95,25 +95,26 @@ class ModuleLearning:
         error = torch.where(fb.abs() > dead_zone, share * fb / scale, 0.0)
         power = (error**2).sum(1)
         active = (power > 0) & (torch.from_numpy(np.array(saturated)) == 0) & bool(self._step > 0)
-        _, pull = vjp(self._forward, self.state)
+        pull = vjp(self._forward, self.state)[1]
         (gradient,) = pull(error)
-        square = sum(_row(g**2).sum(1) for g in gradient.values())
+        square = _square(gradient)
         rate = torch.where(active, self._step / (square / power.clamp_min(1e-300) + REGULARISATION), 0.0)
         leak = self._leak * active.double()  # `where` of two plain numbers would be single precision
         moved = {
             name: self.state[name] + _like(rate, g) * g - _like(leak, g) * (self.state[name] - self.prior[name])
             for name, g in gradient.items()
         }
-        distance = sum(_row((moved[name] - self.prior[name]) ** 2).sum(1) for name in moved).sqrt()
+        distance = _square({name: moved[name] - self.prior[name] for name in moved}).sqrt()
         shrink = torch.where(active & (distance > self._bound), self._bound / distance.clamp_min(1e-300), 1.0)
         for name, value in moved.items():
             self.state[name] = self.prior[name] + (value - self.prior[name]) * _like(shrink, value)
-        self.weight_norm = torch.where(active, distance.clamp_max(self._bound), torch.from_numpy(self.weight_norm)).numpy()
+        norm = torch.where(active, distance.clamp_max(self._bound), torch.from_numpy(self.weight_norm))
+        self.weight_norm = norm.numpy()
 
 
-def _row(value: torch.Tensor) -> torch.Tensor:
-    """`(B, …)` to `(B, n)`."""
-    return value.reshape(len(value), -1)
+def _square(layers: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Squared Euclidean norm of everything that belongs to one robot, `(B,)`."""
+    return torch.stack([(layer**2).reshape(len(layer), -1).sum(1) for layer in layers.values()]).sum(0)
 
 
 def _like(row: torch.Tensor, value: torch.Tensor) -> torch.Tensor:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.control import steering
-from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.feedforward import Feedforward, InverseDynamics, NoFeedforward
+from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.kanayama import Kanayama, kanayama
 from mrctl.control.limiter import limit
 from mrctl.control.pid import Pid, pid
@@ -129,8 +129,8 @@ class Hierarchy:
         pid(self.command, twist, self._pid, self._period, self._excess, state["pid"], self.feedback)
         feedforward = self.feedforward.output(self.command, self.derivative)
         allocate(
-            self.command, self.derivative, self.feedback, feedforward, self._parameters, self._period, state["steering"],
-            self.output, self.parts, self._excess, self.saturated,
+            self.command, self.derivative, self.feedback, feedforward, self._parameters, self._period,
+            state["steering"], self.output, self.parts, self._excess, self.saturated,
         )  # fmt: skip
         # A robot that must not learn is treated as one whose voltage did not act.
         self.feedforward.learn(self.feedback, np.maximum(self.saturated, self._frozen))

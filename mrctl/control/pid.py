@@ -34,7 +34,8 @@ class Pid(Record):
         """
         common, differential = imc(robot, self.time_constant)
         second = Gains(self.steering_kp, self.steering_ki) if rigid else differential
-        return np.array([[g.k_p, g.k_i, g.k_p * self.derivative_time, self.derivative_filter] for g in (common, second)])
+        derivative = self.derivative_time, self.derivative_filter
+        return np.array([[g.k_p, g.k_i, g.k_p * derivative[0], derivative[1]] for g in (common, second)])
 
 
 class Gains(NamedTuple):

@@ -87,8 +87,9 @@ class RecursiveLeastSquares:
         size = len(settings)
         self._half_track = robot.half_track
         self._scale = feature_scale(robot)
-        self._settings = np.array([[s.drift, s.covariance_bound, s.dead_zone, STEERING_SHARE if rigid else 1.0, s.step] for s in settings])
-        self._features = np.zeros((size, 8))
+        share = STEERING_SHARE if rigid else 1.0
+        self._settings = np.array([[s.drift, s.covariance_bound, s.dead_zone, share, s.step] for s in settings])
+        self._features, self._output = np.zeros((size, 8)), np.zeros((size, 2))
         self.weight_norm = np.zeros(size)
         self.state = {
             "coefficients": np.zeros((size, 8, 2)),
@@ -98,7 +99,8 @@ class RecursiveLeastSquares:
     def output(self, command: Array, derivative: Array) -> Array:
         """θᵀ features of the commanded motion."""
         features(command, derivative, self._half_track, self._scale, self._features)
-        return linear(self._features, self.state["coefficients"])
+        linear(self._features, self.state["coefficients"], self._output)
+        return self._output
 
     def learn(self, feedback: Array, saturated: Array) -> None:
         """One recursive step."""

@@ -29,7 +29,7 @@ def parameters(robot: Robot, rigid: bool) -> NDArray[np.float64]:
 
 
 @guvectorize(
-    [(float64[:], float64[:], float64[:], float64[:], float64[:], float64, float64[:], float64[:], float64[:], float64[:], float64[:])],
+    [(*[float64[:]] * 5, float64, *[float64[:]] * 5)],
     "(u),(u),(u),(u),(k),(),(m),(c),(c),(u),()",
     writable_args=("state", "command", "parts", "excess", "saturated"),
     cache=True,
@@ -51,8 +51,8 @@ def allocate(twist, acceleration, feedback, feedforward, robot, period, state, c
         period: Control period in s.
         state: In and out: steering angle and rate, `(2,)`; held at rest.
         command: Out: voltages left and right in V, steering angle in rad and rate in rad/s, `(4,)`.
-        parts: Out: feedback left and right, feedforward left and right in V, `(4,)`; the differential of `rigid` steering
-            comes from the model and counts as feedforward.
+        parts: Out: feedback left and right, feedforward left and right in V, `(4,)`; the differential of `rigid`
+            steering comes from the model and counts as feedforward.
         excess: Out: what the limits took from the two channels, `(2,)`.
         saturated: Out: 1 where a limit acted, else 0.
     """

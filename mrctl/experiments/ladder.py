@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
@@ -56,23 +57,24 @@ def last_lap(feedforwards: Sequence[FeedforwardName], seeds: int, scenario: Scen
 
 
 def compare(runs: pd.DataFrame) -> pd.DataFrame:
-    """Means with 95 % bootstrap intervals and paired ratios to PID alone, a row a (steering, perturbation, feedforward).
+    """Means with 95 % bootstrap intervals and paired ratios to PID alone, a row a combination.
 
     Args:
         runs: As from `last_lap`.
     """
+    keys = ["steering", "perturbation", "feedforward"]
+    groups = {tuple(key): own for key, own in runs.groupby(keys, sort=False)}  # type: ignore[arg-type]
     rows = []
-    for (steering, case), group in runs.groupby(["steering", "perturbation"], sort=False):
-        bare = group[group["feedforward"] == "none"]
-        for feedforward, own in group.groupby("feedforward", sort=False):
-            row: dict[str, object] = {"steering": steering, "perturbation": case, "feedforward": feedforward}
-            row |= {"runs": len(own), "failed": int(own["failed"].sum())}
-            for metric in COLUMNS:
-                row[metric] = bootstrap_interval(own[metric].to_numpy())._asdict()
-                if len(bare):
-                    ratio = paired_ratio(own[metric].to_numpy(), bare[metric].to_numpy())
-                    row[f"{metric}_to_pid"] = ratio._asdict()
-            rows.append(row)
+    for (steering, case, feedforward), own in groups.items():
+        row: dict[str, object] = dict(zip(keys, (steering, case, feedforward), strict=True))
+        row |= {"runs": len(own), "failed": int(np.sum(own["failed"]))}
+        bare = groups.get((steering, case, "none"))
+        for metric in COLUMNS:
+            samples = np.asarray(own[metric])
+            row[metric] = bootstrap_interval(samples)._asdict()
+            if bare is not None:
+                row[f"{metric}_to_pid"] = paired_ratio(samples, np.asarray(bare[metric]))._asdict()
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -89,7 +91,8 @@ def suite(feedforwards: Sequence[FeedforwardName], seeds: int, out: Path) -> str
     table = compare(runs)
     text = as_markdown(table)
     (out / "table.md").write_text(text + "\n")
-    write_json(out / "table.json", {"versions": versions(), "rows": table.to_dict("records"), "runs": runs.to_dict("records")})
+    values = {"versions": versions(), "rows": table.to_dict("records"), "runs": runs.to_dict("records")}
+    write_json(out / "table.json", values)
     return text
 
 
@@ -98,10 +101,11 @@ def as_markdown(table: pd.DataFrame) -> str:
     header = ["steering", "plant", "feedforward", "failed", *COLUMNS.values()]
     rows = []
     for row in table.to_dict("records"):
-        cells = [str(row["steering"]), str(row["perturbation"]), str(row["feedforward"]), f"{row['failed']}/{row['runs']}"]
+        cells = [str(row[key]) for key in ("steering", "perturbation", "feedforward")]
+        cells.append(f"{row['failed']}/{row['runs']}")
         for metric in COLUMNS:
             mean = row[metric]
-            low, high = 1e3 * mean["low"], 1e3 * mean["high"]
-            cells.append("–" if not mean["samples"] else f"{number(1e3 * mean['value'])} [{number(low)}, {number(high)}]")
+            value, low, high = (number(1e3 * mean[key]) for key in ("value", "low", "high"))
+            cells.append(f"{value} [{low}, {high}]" if mean["samples"] else "–")
         rows.append(cells)
     return markdown(header, rows)

@@ -153,13 +153,16 @@ def endure(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str, 
 def endurance_text(rows: Sequence[dict[str, Any]]) -> str:
     """The endurance runs as Markdown."""
     header = ["run", *(f"{name}, lap 8 → {LONG}" for name in ("V, mm/s", "θ̇, mrad/s", "position, mm"))]
-    cells = [[r["run"], *(f"{number(1e3 * r[m]['lap_8'])} → {number(1e3 * r[m]['last'])}" for m in METRICS)] for r in rows]
+    cells = [
+        [r["run"], *(" → ".join(number(1e3 * r[m][lap]) for lap in ("lap_8", "last")) for m in METRICS)] for r in rows
+    ]
     return f"The same after {LONG} laps:\n\n" + markdown(header, cells)
 
 
 def text(rows: Sequence[dict[str, Any]]) -> str:
     """The comparison as Markdown."""
-    header = ["steering", "plant", "lap", "feedforward", "V, mm/s", "θ̇, mrad/s", "position, mm", "to PID: V", "θ̇", "position"]
+    header = ["steering", "plant", "lap", "feedforward", "V, mm/s", "θ̇, mrad/s", "position, mm"]
+    header += ["to PID: V", "θ̇", "position"]
     cells = []
     for row in rows:
         if row["failure"]:

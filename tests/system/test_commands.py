@@ -179,6 +179,6 @@ def test_installed_command_without_a_display(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "RMSE per lap" in done.stdout
     assert all("tick" in line for line in done.stderr.replace("\r", "\n").splitlines() if line.strip())
-    bad = subprocess.run([script, "run", "nowhere.toml"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    bad = subprocess.run([script, "run", "nowhere.toml"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (bad.returncode, bad.stdout) == (2, "")
     assert bad.stderr == "mrctl: nowhere.toml: No such file or directory\n"

@@ -1,4 +1,4 @@
-"""The physics boundary: readouts against the engine's own sensors, voltages on their way to the motors, pushes, failures."""
+"""The physics boundary: readouts against the engine's own sensors, voltages on their way, pushes, failures."""
 
 import math
 import shutil

@@ -1,4 +1,4 @@
-"""Nonsense thrown at scenarios; files and back; what a simulation refuses before it starts; order and length of results."""
+"""Nonsense thrown at scenarios; files and back; what a simulation refuses; order and length of results."""
 
 import json
 import tomllib
@@ -8,20 +8,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mrctl import Circle, Event, Fel, Kanayama, Lemniscate, Line, Perturbation, Pid, Rls, Scenario, StopAndGo, Waypoints, simulate
+from mrctl import Event, Fel, Kanayama, Perturbation, Pid, Rls, Scenario, simulate
+from mrctl.control.feedforward import NoFeedforward
 from mrctl.record import InputError
-from mrctl.references import LaneChange, RoundedSquare
+from mrctl.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
 from mrctl.scenario import LONGEST, whole
 
 values = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.floats(0, 1) | st.text(max_size=5)
-    | st.sampled_from(["flat", "rigid", "fel", "truth", [], {}, [0.1, 0.2, 0.3], [{}], [{"time": 1}], {"kind": "circle"}])
+    | st.sampled_from(["flat", "rigid", "fel", "truth", [], {}, [0.1, 0.2, 0.3], [{}], [{"time": 1}]])
 )  # fmt: skip
+PARTS = {"kanayama": Kanayama, "pid": Pid, "fel": Fel, "rls": Rls, "perturbation": Perturbation, "events": Event}
 parts = st.sampled_from(
     [(name,) for name in Scenario.model_fields]
-    + [(part, name) for part, kind in (("kanayama", Kanayama), ("pid", Pid), ("fel", Fel), ("rls", Rls)) for name in kind.model_fields]
-    + [("perturbation", name) for name in Perturbation.model_fields]
-    + [("events", name) for name in Event.model_fields]
+    + [(part, name) for part, kind in PARTS.items() for name in kind.model_fields]
 )
 
 
@@ -98,7 +98,10 @@ def test_refused(name, source):
         ("motion_period", {"motion_period": 0.015}),
         ("motion_period", {"motion_period": 0.005}),
         ("perturbation.control_delay", {"perturbation": {"control_delay": 0.015}}),
-        ("events.1.perturbation.control_delay", {"events": [{"time": 0}, {"time": 1, "perturbation": {"control_delay": 0.004}}]}),
+        (
+            "events.1.perturbation.control_delay",
+            {"events": [{"time": 0}, {"time": 1, "perturbation": {"control_delay": 0.004}}]},
+        ),
     ],
 )
 def test_multiples(name, source):
@@ -116,11 +119,12 @@ def test_whole(count, unit):
 
 def test_rates():
     """Multiples that decimal fractions only nearly are."""
-    scenario = Scenario(physics_step=0.001, control_period=0.007, motion_period=0.049, perturbation=Perturbation(control_delay=0.021))
+    late = Perturbation(control_delay=0.021)
+    scenario = Scenario(physics_step=0.001, control_period=0.007, motion_period=0.049, perturbation=late)
     assert scenario.ticks == round(96 / 0.007)
 
 
-# --- files ---------------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------------------------
 
 
 def toml(value: object) -> str:
@@ -157,14 +161,25 @@ FULL = Scenario(
     physics_step=0.001,
     motion_period=0.02,
 )
-KINDS = (Line(), Circle(clockwise=True), Lemniscate(size=2), LaneChange(), RoundedSquare(), StopAndGo(pause=0), Waypoints())
+KINDS = (
+    Line(),
+    Circle(clockwise=True),
+    Lemniscate(size=2),
+    LaneChange(),
+    RoundedSquare(),
+    StopAndGo(pause=0),
+    Waypoints(),
+)
 
 
-@pytest.mark.parametrize("scenario", [Scenario(), FULL, *(FULL.model_copy(update={"reference": kind}) for kind in KINDS)])
-def test_toml(scenario, tmp_path):
+@pytest.mark.parametrize("reference", KINDS, ids=lambda reference: reference.kind)
+@pytest.mark.parametrize("base", [Scenario(), FULL], ids=["default", "full"])
+def test_toml(base, reference, tmp_path):
     """Through TOML and JSON and back, events and references included, to the last bit."""
+    scenario = base.model_copy(update={"reference": reference})
     file = tmp_path / "scenario.toml"
-    file.write_text("\n".join(f"{k} = {toml(v)}" for k, v in scenario.model_dump(mode="json", exclude_none=True).items()))
+    values = scenario.model_dump(mode="json", exclude_none=True)
+    file.write_text("\n".join(f"{name} = {toml(value)}" for name, value in values.items()))
     assert tomllib.loads(file.read_text())["laps"] == scenario.laps
     assert Scenario.from_toml(file) == scenario
     assert Scenario.from_dict(json.loads(scenario.model_dump_json())) == scenario
@@ -180,7 +195,7 @@ def test_bad_file(tmp_path):
         assert str(error.value).startswith(str(file)) and words in str(error.value) and "\n" not in str(error.value)
 
 
-# --- what a simulation refuses -------------------------------------------------------------------------------------------
+# --- what a simulation refuses --------------------------------------------------------------------------------------
 
 
 def test_nothing():
@@ -189,12 +204,15 @@ def test_nothing():
         simulate([])
 
 
+FAR_AWAY = Waypoints(points=((8, 0), (10, 0), (9, 2)))
+
+
 @pytest.mark.parametrize(
     ("words", "changes"),
     [
         ("^world: no file", {"world": "moon"}),
         ("^initial_pose: 5.00 m from the start", {"initial_pose": (3.0, 4.0, 0.0)}),
-        ("^initial_pose: there is no ground", {"world": "rough", "reference": Waypoints(points=((8, 0), (10, 0), (9, 2)))}),
+        ("^initial_pose: there is no ground", {"world": "rough", "reference": FAR_AWAY}),
         ("^reference line: speed 2 m/s .*max_speed", {"reference": Line(speed=2)}),
         ("^reference circle: rotation", {"reference": Circle(period=1.9, radius=0.2)}),
         ("^reference circle: steering angle", {"reference": Circle(period=9, radius=0.1)}),
@@ -226,19 +244,26 @@ def test_reverse_if_rigid():
     assert run.v.min() < -0.1 and not run.failed
 
 
-# --- results -------------------------------------------------------------------------------------------------------------
+# --- results --------------------------------------------------------------------------------------------------------
 
 
 def test_order():
     """Scenarios of mixed groups and lengths come back in the order given; the short end in NaN."""
+    kinds = (
+        ("fel", "rigid", 4), ("none", "compliant", 5), ("rls", "compliant", 4), ("none", "compliant", 4),
+        ("fel", "rigid", 4),
+    )  # fmt: skip
     scenarios = [
         Scenario(
-            reference=Circle(period=period, radius=0.5), laps=1, feedforward=kind, steering=steering, seed=seed, name=f"run {seed}"
+            name=f"run {seed}",
+            reference=Circle(period=period, radius=0.5),
+            laps=1,
+            feedforward=kind,
+            steering=steering,
+            seed=seed,
         )
-        for seed, (kind, steering, period) in enumerate(
-            [("fel", "rigid", 4), ("none", "compliant", 5), ("rls", "compliant", 4), ("none", "compliant", 4), ("fel", "rigid", 4)]
-        )
-    ]  # fmt: skip
+        for seed, (kind, steering, period) in enumerate(kinds)
+    ]
     whole_result = simulate(scenarios)
     assert whole_result.sizes == {"run": 5, "time": 500, "weight": 282}
     assert list(whole_result.seed) == list(range(5)) == list(whole_result.run)
@@ -262,8 +287,6 @@ def test_networks_of_different_sizes():
 
 def test_label():
     """The feedforward's name, unless the run has its own; a stage of one's own has its function's name."""
-    from mrctl.control.feedforward import NoFeedforward
-
     scenario = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
 
     def mine(robot, size):

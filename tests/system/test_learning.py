@@ -1,0 +1,117 @@
+"""The paper's claim in the loop: the network takes work off the feedback, keeps what it learned, can be any module."""
+
+import numpy as np
+import pytest
+
+from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Scenario, save_weights, simulate
+from mrctl.control.fel import initial_weights, unflatten
+
+BASE = Scenario(
+    reference=Lemniscate(), laps=3, feedforward="fel", initial_spread=(0, 0, 0), perturbation=PERTURBATIONS["all"]
+)
+TICKS = round(BASE.reference.period / BASE.control_period)
+
+
+def variant(**changes):
+    """The base scenario with changes."""
+    return BASE.model_copy(update=changes)
+
+
+def lap(run, number):
+    """One lap of a run."""
+    return run.isel(time=slice(number * TICKS, (number + 1) * TICKS))
+
+
+def rms(values):
+    """Root mean square over a lap."""
+    return float(np.sqrt((values**2).mean()))
+
+
+def position(part):
+    """RMS distance from the reference, m."""
+    return rms(np.hypot(part.x - part.x_ref, part.y - part.y_ref))
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Learning, and the PID alone."""
+    return simulate([BASE, variant(feedforward="none")])
+
+
+def test_beats_pid(runs):
+    """By the third lap the velocity errors are a fraction of the PID's, and the path is nearer to the reference."""
+    fel, pid = (lap(runs.isel(run=run), 2) for run in range(2))
+    assert not runs.failed.any()
+    assert rms(fel.omega - fel.omega_ref) < 0.5 * rms(pid.omega - pid.omega_ref)
+    assert rms(fel.v - fel.v_ref) < 0.6 * rms(pid.v - pid.v_ref)
+    assert position(fel) < 0.5 * position(pid)
+
+
+def test_work_moves(runs):
+    """The feedback does less of the work each lap; without a learner it does all of it, every lap."""
+    share = []
+    for number in range(3):
+        part = lap(runs.isel(run=0), number)
+        share.append(rms(part.feedback_left) / rms(part.voltage_left))
+    assert share[0] > share[1] > share[2] and share[2] < 0.35
+    assert (runs.feedforward_left[1] == 0).all() and (runs.weight_norm[1] == 0).all()
+    assert float(runs.weight_norm[0, -1]) > 0.1
+
+
+def test_weights_are_kept(runs, tmp_path):
+    """What one run learned serves the next from its first lap on, frozen, to the bit what was saved."""
+    file = tmp_path / "learned.safetensors"
+    save_weights(file, runs.weights.values[0])
+    frozen = Fel(weights=str(file), frozen=True)
+    trained, untrained = (
+        simulate([variant(laps=1, fel=fel), variant(laps=1, fel=fel, seed=1)]) for fel in (frozen, Fel())
+    )
+    for seed in range(2):
+        first, fresh = (lap(run.isel(run=seed), 0) for run in (trained, untrained))
+        assert position(first) < 0.5 * position(fresh)
+        assert rms(first.omega - first.omega_ref) < rms(fresh.omega - fresh.omega_ref)
+    assert np.array_equal(trained.weights, np.tile(runs.weights[0], (2, 1)))
+    assert (trained.weight_norm == 0).all()
+
+
+def test_torch_weights(runs, tmp_path):
+    """The same weights as a torch state dict give the same run."""
+    torch = pytest.importorskip("torch")
+    from mrctl.control.fel_torch import Network
+
+    module = Network()
+    module.load_state_dict({name: torch.tensor(layer) for name, layer in unflatten(runs.weights.values[0]).items()})
+    torch.save(module.state_dict(), tmp_path / "learned.pt")
+    save_weights(tmp_path / "learned.safetensors", runs.weights.values[0])
+    one, other = (
+        simulate(variant(laps=1, fel=Fel(weights=str(tmp_path / name), frozen=True)))
+        for name in ("learned.pt", "learned.safetensors")
+    )
+    assert np.array_equal(one.x, other.x) and np.array_equal(one.feedforward_left, other.feedforward_left)
+
+
+def test_wrong_weights(tmp_path):
+    """A file for another size is refused by name."""
+    save_weights(tmp_path / "small.safetensors", initial_weights(4, 0))
+    with pytest.raises(InputError, match=r"^fel\.weights: .*24 hidden units need"):
+        simulate(variant(fel=Fel(weights=str(tmp_path / "small.safetensors"))))
+
+
+def test_torch_module(runs):
+    """Any stateless module is a stage: the twin of the built-in network gives its run, another one learns too."""
+    torch = pytest.importorskip("torch")
+    from mrctl.control.fel_torch import ModuleLearning, Network
+
+    twin = Network()
+    start = unflatten(initial_weights(24, BASE.seed))
+    twin.load_state_dict({name: torch.tensor(layer) for name, layer in start.items()})
+    short = variant(laps=1)
+    same = simulate(short, lambda robot, size: ModuleLearning(twin, robot, size))
+    for name in ("x", "omega", "feedforward_left"):
+        assert np.allclose(same[name], lap(runs.isel(run=0), 0)[name], atol=1e-6), name
+
+    torch.manual_seed(0)
+    own = torch.nn.Sequential(torch.nn.Linear(8, 16), torch.nn.Tanh(), torch.nn.Linear(16, 2))
+    learned = simulate([short, variant(laps=1, seed=1)], lambda robot, size: ModuleLearning(own, robot, size))
+    assert not learned.failed.any() and float(learned.weight_norm[0, -1]) > 0
+    assert rms(learned.feedback_left[0, TICKS // 2 :]) < rms(lap(runs.isel(run=1), 0).feedback_left[TICKS // 2 :])

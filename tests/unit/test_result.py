@@ -1,0 +1,156 @@
+"""Results on disk: what is saved comes back, nothing is overwritten or left behind, and a result can be run again."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import mrctl
+from mrctl import Circle, Event, Fel, Perturbation, Scenario, simulate
+from mrctl.record import InputError
+from mrctl.result import SIGNALS, open_result, save, scenarios_of, versions
+
+CIRCLE = Circle(period=4, radius=0.5)
+SCENARIOS = [
+    Scenario(reference=CIRCLE, laps=1, feedforward="fel", fel=Fel(hidden=4), name="gelernt ✓"),
+    Scenario(reference=Circle(period=5, radius=0.5), laps=1, feedforward="none", seed=3, measurement="odometry"),
+    Scenario(
+        reference=CIRCLE,
+        laps=1,
+        feedforward="rls",
+        steering="rigid",
+        perturbation=Perturbation(payload=2, velocity_noise=0.01, control_delay=0.01),
+        events=(Event(time=1, push=(1e4, 1e4, 0)),),
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def result():
+    """Three runs of different kinds, the last of which fails."""
+    return simulate(SCENARIOS)
+
+
+def test_labels(result):
+    """Dimensions, units, coordinates and attributes that everything else relies on."""
+    assert result.sizes == {"run": 3, "time": 500, "weight": 62}
+    for name, (unit, meaning) in SIGNALS.items():
+        assert result[name].dims == ("run", "time") and result[name].attrs == {"units": unit, "long_name": meaning}
+    assert result.time.attrs == {"units": "s"} and np.array_equal(result.time, 0.01 * np.arange(500))
+    assert {"label", "feedforward", "steering", "seed", "lap_time"} <= set(result.coords)
+    assert json.loads(result.attrs["versions"]) == versions() and result.attrs["control_period"] == 0.01
+    assert result.failed.values.tolist() == [False, False, True]
+    assert list(result.failure.values[:2]) == ["", ""] and result.failure.values[2]
+    assert np.isnan(result.failure_time[:2]).all() and 1 < result.failure_time[2] < 2
+
+
+def test_meaning(result):
+    """Signals are what their names say: power is the sum of U i, the reference is the reference, errors are errors."""
+    run = result.isel(run=0)
+    motion = CIRCLE.sample(run.time.values[:400])
+    assert np.array_equal(run.x_ref[:400], motion.pose[:, 0])
+    assert np.array_equal(run.omega_ref[:400], motion.twist[:, 1])
+    power = run.voltage_left * run.current_left + run.voltage_right * run.current_right
+    assert np.allclose(run.power, power, equal_nan=True)
+    for side in ("left", "right"):
+        total = run[f"feedback_{side}"] + run[f"feedforward_{side}"]
+        assert np.allclose(run[f"voltage_{side}"], total.clip(-24, 24), equal_nan=True)
+    back = np.hypot(run.longitudinal_error, run.lateral_error)
+    assert np.allclose(back, np.hypot(run.x_ref - run.x, run.y_ref - run.y), equal_nan=True)
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_round_trip(result, single, tmp_path):
+    """Values to the bit, texts, coordinates, attributes; a single run too, and once more from what was opened."""
+    result = result.isel(run=0) if single else result
+    save(result, tmp_path / "new" / "a.zarr")
+    opened = mrctl.open(tmp_path / "new" / "a.zarr")
+    assert opened.identical(result)
+    for name in SIGNALS:
+        assert np.array_equal(opened[name], result[name], equal_nan=True)
+    assert opened.attrs == result.attrs and list(np.atleast_1d(opened.label)) == list(np.atleast_1d(result.label))
+    save(opened, str(tmp_path / "b.zarr"))
+    assert open_result(str(tmp_path / "b.zarr")).identical(result)
+    assert sorted(p.name for p in tmp_path.rglob("*.partial")) == []
+
+
+def test_run_again(result, tmp_path):
+    """A run is a pure function of its scenario: from the file, every bit again."""
+    save(result, tmp_path / "a")
+    again = scenarios_of(open_result(tmp_path / "a"))
+    assert again == SCENARIOS
+    assert simulate(again).identical(result)
+
+
+def test_selection(result):
+    """The scenarios of a selection are those of its runs."""
+    assert scenarios_of(result.isel(run=[2, 0])) == [SCENARIOS[2], SCENARIOS[0]]
+    assert scenarios_of(result.isel(run=1)) == [SCENARIOS[1]]
+    assert scenarios_of(simulate(SCENARIOS[1])) == [SCENARIOS[1]]
+
+
+def refused(message: str, call, *arguments) -> None:
+    """One line with the path."""
+    with pytest.raises(InputError, match=message) as error:
+        call(*arguments)
+    assert "\n" not in str(error.value)
+
+
+def test_no_overwriting(result, tmp_path):
+    """Not a result, not a file, not an empty folder."""
+    save(result, tmp_path / "a")
+    (tmp_path / "b").write_text("mine")
+    (tmp_path / "c").mkdir()
+    for name in "abc":
+        refused(f"{name}: exists already", save, result.isel(run=0), tmp_path / name)
+    assert open_result(tmp_path / "a").identical(result)
+    assert (tmp_path / "b").read_text() == "mine" and not list((tmp_path / "c").iterdir())
+
+
+def test_stale_partial(result, tmp_path):
+    """What a killed run left half written is no obstacle, and no part of the result."""
+    (tmp_path / "a.partial").mkdir()
+    (tmp_path / "a.partial" / "rubbish").write_text("")
+    save(result, tmp_path / "a")
+    assert open_result(tmp_path / "a").identical(result) and not (tmp_path / "a" / "rubbish").exists()
+
+
+def test_not_a_folder(result, tmp_path):
+    """A file where the folder should be."""
+    (tmp_path / "file").write_text("")
+    refused("cannot be written", save, result, tmp_path / "file" / "a")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_read_only(result, tmp_path):
+    """A folder without permission."""
+    tmp_path.chmod(0o500)
+    refused("cannot be written: Permission denied", save, result, tmp_path / "a")
+    assert not list(tmp_path.iterdir())
+
+
+def test_disk_full(result, tmp_path, monkeypatch):
+    """Nothing is left behind when writing fails in the middle."""
+    write = xr.Dataset.to_zarr
+
+    def fail(*args, **kwargs):
+        write(*args, **kwargs)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(xr.Dataset, "to_zarr", fail)
+    refused("a: cannot be written: No space left on device", save, result, tmp_path / "a")
+    assert not list(tmp_path.iterdir())
+
+
+def test_open_nothing(result, tmp_path):
+    """Neither a missing path, nor an empty folder, a file, another store, or a broken one."""
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("hello")
+    result[["x"]].drop_attrs().to_zarr(tmp_path / "other", zarr_format=3, consolidated=False)
+    save(result, tmp_path / "broken")
+    (tmp_path / "broken" / "zarr.json").write_text("{")
+    for name in ("missing", "empty", "file", "other", "broken"):
+        refused(f"{name}: not a saved result", open_result, tmp_path / name)
