@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 import mujoco
 import numpy as np
 from mujoco import batch as mujoco_batch
-from numba import float64, guvectorize, int64
+from numba import boolean, float64, guvectorize, int64, njit
 from numpy.typing import NDArray
 
 from mrctl import model as mjcf
@@ -69,9 +69,46 @@ def read(qpos, qvel, address, reading):  # noqa: ANN001, ANN201
             reading[10] = np.nan
 
 
+_read = njit(read.__wrapped__)
+_FIELD, _OWN = float64[:, :], float64[:, ::1]  # the engine's arrays, ours
+
+
+@njit(
+    (_FIELD, int64, float64[:, :, ::1], int64[::1], float64[::1], int64[::1], boolean[::1], _OWN, _FIELD), cache=True
+)
+def _drive(command, tick, queue, delay, gain, inputs, failed, applied, ctrl):  # noqa: ANN001, ANN202
+    """Sends each robot the command of `delay` periods ago; returns whether all commands are finite."""
+    finite = True
+    for i in range(len(ctrl)):
+        queue[tick % len(queue), i] = command[i]
+        now = queue[(tick - delay[i]) % len(queue), i]
+        for k in range(4):
+            ctrl[i, inputs[k]] = now[k] * gain[i] if k < 2 else now[k]
+            finite &= np.isfinite(now[k]) or failed[i]
+        applied[i, 0], applied[i, 1] = now[0] * gain[i], now[1] * gain[i]
+    return finite
+
+
+@njit(
+    (*[_FIELD] * 3, int64[::1], int64[::1], *[_OWN] * 3, boolean[::1], _OWN, _OWN), cache=True
+)
+def _look(qpos, qvel, act, address, acts, applied, resistance, back_emf, failed, reading, current):  # noqa: ANN001, ANN202
+    """Readings and armature currents after a period; returns whether all robots are upright and sane."""
+    upright = True
+    for i in range(len(reading)):
+        _read(qpos[i], qvel[i], address, reading[i])
+        for k in range(2):
+            if len(acts):
+                current[i, k] = act[i, acts[k]]
+            else:
+                current[i, k] = (applied[i, k] - back_emf[i, k] * reading[i, RATE_LEFT + k]) / resistance[i, k]
+        upright &= reading[i, UPRIGHT] > TILT or failed[i]
+    return upright
+
+
 def addresses(model: mujoco.MjModel) -> NDArray[np.int64]:
     """Addresses in qpos and qvel of each joint in `JOINTS`, alternating, `(8,)`."""
-    return np.array([a for name in JOINTS for a in (model.joint(name).qposadr[0], model.joint(name).dofadr[0])])
+    return np.array([a for name in JOINTS for a in (model.joint(name).qposadr[0], model.joint(name).dofadr[0])], int)
 
 
 class CarPhysics(dm_mujoco.Physics):
@@ -161,8 +198,10 @@ class Plant(ABC):
         truth: The robots as perturbed, for the oracle.
         reading: Readouts `(B, 11)`, current after `reset` and `step`; columns as named in this module.
         applied: Voltages at the terminals, left and right, `(B, 2)` in V.
+        current: Armature currents left and right at the end of the last control period, `(B, 2)` in A.
         failed: Which robots have stopped, `(B,)`.
         failure: Why, one string a robot.
+        running: How many have not.
     """
 
     size: int
@@ -178,16 +217,18 @@ class Plant(ABC):
         self.robot: Robot = mjcf.read_robot(model)
         self.truth = [self.robot] * size
         self.reading = np.zeros((size, 11))
-        self.applied = np.zeros((size, 2))
+        self.applied, self.current = np.zeros((size, 2)), np.zeros((size, 2))
         self.failed = np.zeros(size, bool)
         self.failure = [""] * size
+        self.running = size
         self._nominal = model
         self._scratch = mjcf.clone(model)
         self._address = addresses(model)
-        self._inputs = _inputs(model)
-        resistance, back_emf, self._acts = _motor_parameters(model)
+        self._inputs = np.array(_inputs(model), int)
+        resistance, back_emf, acts = _motor_parameters(model)
+        self._acts = np.array(acts, int)
         self._resistance, self._back_emf = (np.repeat(a, size, axis=0) for a in (resistance, back_emf))
-        self._drive_gain = np.ones((size, 1))
+        self._drive_gain = np.ones(size)
         self._delay = np.zeros(size, int)
         # As long as any delay, so that a robot's past does not depend on the delays of the others.
         self._queue = np.zeros((1 + round(LONGEST_DELAY / (substeps * model.opt.timestep)), size, 4))
@@ -200,7 +241,7 @@ class Plant(ABC):
         """Gives one robot the parameters of `model`."""
 
     @abstractmethod
-    def _advance(self, active: NDArray[np.bool_]) -> dict[int, str]:
+    def _advance(self) -> dict[int, str]:
         """Runs the physics steps of one control period; returns the engine's complaints by robot."""
 
     def perturb(self, robot: int, perturbation: Perturbation, delay: int) -> None:
@@ -236,7 +277,7 @@ class Plant(ABC):
             state = mjcf.stand(self._model_of(i), pose[i], twist[i])
             self.qpos[i], self.qvel[i] = state
         self._queue[..., 2] = self.qpos[None, :, self._address[6]]
-        read(self.qpos, self.qvel, self._address, self.reading)
+        self._look()
 
     @abstractmethod
     def _model_of(self, robot: int) -> mujoco.MjModel:
@@ -259,27 +300,23 @@ class Plant(ABC):
         Args:
             command: Commanded voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
         """
-        depth = len(self._queue)
-        self._queue[self._tick % depth] = command
-        if self._delay.any():
-            command = self._queue[(self._tick - self._delay) % depth, np.arange(self.size)]
-        np.multiply(command[:, :2], self._drive_gain, out=self.applied)
-        self.ctrl[:, self._inputs[0]] = self.applied[:, 0]
-        self.ctrl[:, self._inputs[1]] = self.applied[:, 1]
-        self.ctrl[:, self._inputs[2]] = command[:, 2]
-        self.ctrl[:, self._inputs[3]] = command[:, 3]
-        if not np.isfinite(command.sum()):  # the engine would silently take zero volts instead
-            for robot in np.flatnonzero(~np.isfinite(command).all(axis=1)):
+        if not _drive(
+            command, self._tick, self._queue, self._delay, self._drive_gain, self._inputs, self.failed,
+            self.applied, self.ctrl,
+        ):  # fmt: skip  # the engine would silently take zero volts instead
+            sent = self._queue[(self._tick - self._delay) % len(self._queue), np.arange(self.size)]
+            for robot in np.flatnonzero(~np.isfinite(sent).all(axis=1)):
                 self.fail(int(robot), "non-finite command")
-        for robot, reason in self._advance(~self.failed).items():
-            self.fail(robot, reason)
+        if self.running:
+            for robot, reason in self._advance().items():
+                self.fail(robot, reason)
         self._tick += 1
-        for robot in [r for r, end in self._pushes.items() if end == self._tick]:
-            self.wrench[robot, self._chassis] = 0.0
-            del self._pushes[robot]
-        read(self.qpos, self.qvel, self._address, self.reading)
-        upright = self.reading[:, UPRIGHT]
-        if not (upright > TILT).all():
+        if self._pushes:
+            for robot in [r for r, end in self._pushes.items() if end == self._tick]:
+                self.wrench[robot, self._chassis] = 0.0
+                del self._pushes[robot]
+        if not self._look():
+            upright = self.reading[:, UPRIGHT]
             for robot in np.flatnonzero(~(upright > TILT)):
                 self.fail(int(robot), "tilt over 30°" if np.isfinite(upright[robot]) else "non-finite state")
 
@@ -287,11 +324,13 @@ class Plant(ABC):
         """Stops one robot for good; the first reason counts."""
         if not self.failed[robot]:
             self.failed[robot], self.failure[robot] = True, reason
+            self.running -= 1
 
-    def current(self) -> Array:
-        """Armature currents left and right in A, `(B, 2)`."""
-        rates = self.reading[:, RATE_LEFT : RATE_RIGHT + 1]
-        return motor_current(self.applied, rates, self.act, self._resistance, self._back_emf, self._acts)
+    def _look(self) -> bool:
+        return _look(
+            self.qpos, self.qvel, self.act, self._address, self._acts, self.applied, self._resistance,
+            self._back_emf, self.failed, self.reading, self.current,
+        )  # fmt: skip
 
 
 class PhysicsPlant(Plant):
@@ -316,9 +355,7 @@ class PhysicsPlant(Plant):
     def _write(self, robot: int, model: mujoco.MjModel) -> None:
         mjcf.write(self.physics.model.ptr, mjcf.fields(model))
 
-    def _advance(self, active: NDArray[np.bool_]) -> dict[int, str]:
-        if not active[0]:
-            return {}
+    def _advance(self) -> dict[int, str]:
         try:
             self.physics.step(self.substeps)
         except PhysicsError:
@@ -353,10 +390,8 @@ class BatchPlant(Plant):
                 self.batch.expand(name)[robot] = value
         self.batch.set_const(np.array([robot]))
 
-    def _advance(self, active: NDArray[np.bool_]) -> dict[int, str]:
-        ids = None if active.all() else np.flatnonzero(active)
-        if ids is not None and ids.size == 0:
-            return {}
+    def _advance(self) -> dict[int, str]:
+        ids = None if self.running == self.size else np.flatnonzero(~self.failed)
         try:
             self.batch.step(ids, self.substeps)
         except mujoco_batch.SimulationError as error:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
+from numba import boolean, float64, njit
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from mrctl import model as mjcf
 from mrctl import result
+from mrctl.control.chain import one, stamp
 from mrctl.control.feedforward import Feedforward, InverseDynamics
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.hierarchy import Hierarchy, feedforward_of
@@ -27,7 +30,52 @@ Array = NDArray[np.float64]
 Factory = Callable[[Robot, int], Feedforward]
 
 DIVERGED = 1.0  # m of lateral error
+LATERAL_ERROR = list(result.SIGNALS).index("lateral_error")
 FAR = 0.8  # m between robot and reference at the start
+
+_observe, _posture_error = one(observe), one(posture_error)
+_OWN, _ROWS = float64[:, ::1], float64[::1]
+_STATE, _REFERENCE, _ERROR = STEERING + 1, 5, 3  # how many columns of the record each takes
+
+
+def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """What the loop does for each robot beside control and physics; see `chain.stamp` for the version."""
+
+    @njit((*[_OWN] * 3, _ROWS, float64, float64, *[_OWN] * 3), cache=True)
+    def sense(reading, reference, noise, odometry, wheel_radius, period, pose, twist, record):  # noqa: ANN001, ANN202
+        """Measures, and records state, reference, true error and measured twist."""
+        _ = version
+        for i in range(len(reading)):
+            true, row = reading[i], record[i]
+            slip_free = wheel_radius * (true[RATE_LEFT] + true[RATE_RIGHT]) / 2
+            _observe(
+                true[X : THETA + 1], true[V : OMEGA + 1], noise[i], odometry[i], slip_free, period, pose[i], twist[i]
+            )
+            row[:_STATE] = true[:_STATE]
+            row[_STATE : _STATE + _REFERENCE] = reference[i, :_REFERENCE]
+            at = _STATE + _REFERENCE
+            _posture_error(true[X : THETA + 1], reference[i, :3], row[at : at + _ERROR])
+            row[at + _ERROR : at + _ERROR + 2] = twist[i]
+
+    @njit((*[_OWN] * 3, _ROWS, float64[:], *[_OWN] * 2, boolean[::1], _OWN), cache=True)
+    def record(command, parts, output, saturated, norm, applied, current, failed, row):  # noqa: ANN001, ANN202
+        """Records commands, currents and power; returns whether all robots are near their references."""
+        _ = version
+        near = True
+        at = _STATE + _REFERENCE + _ERROR + 2
+        for i in range(len(row)):
+            r = row[i, at:]
+            r[0:2], r[2:6], r[6:10] = command[i], parts[i], output[i]
+            r[10], r[11] = saturated[i], norm[i]
+            r[12:14] = current[i]
+            r[14] = applied[i, 0] * current[i, 0] + applied[i, 1] * current[i, 1]
+            near &= not abs(row[i, LATERAL_ERROR]) > DIVERGED or failed[i]
+        return near
+
+    return sense, record
+
+
+_sense, _record = _compile(stamp(observe, posture_error))
 
 
 def simulate(
@@ -119,6 +167,7 @@ class Simulation:
         self._wheel_radius = robot.wheel_radius
         self._odometry = np.array([float(s.measurement == "odometry") for s in scenarios])
         self._noise, self._noise_scale = np.zeros((2, size, 5))
+        self._noisy: list[int] = []
         self._random = [np.random.default_rng([s.seed, 2]) for s in scenarios]
         self._schedule: dict[int, list[tuple[int, Event]]] = defaultdict(list)
         for row, scenario in enumerate(scenarios):
@@ -130,68 +179,61 @@ class Simulation:
         reading = self.plant.reading
         self.hierarchy.reset(start[:, 3:5], start[:, 5:], reading[:, STEERING])
         self._pose, self._twist = reading[:, X : THETA + 1].copy(), reading[:, V : OMEGA + 1].copy()
-        self._error = np.zeros((size, 3))
-        self._log = np.full((size, self.ticks, len(result.SIGNALS)), np.nan)
+        # A tick's records side by side: the loop writes one block of memory a tick, however many robots there are.
+        self._log = np.empty((self.ticks, size, len(result.SIGNALS)))
         self._failure_time = np.full(size, np.nan)
 
     @property
     def running(self) -> bool:
         """Whether there is anything left to do."""
-        return self.tick < self.ticks and not self.plant.failed.all()
+        return self.tick < self.ticks and self.plant.running > 0
 
     @np.errstate(invalid="ignore", over="ignore")  # a robot that blew up is computed on in NaN, to no effect
     def step(self) -> None:
         """One control period: events, measurement, control, record, physics."""
         for row, event in self._schedule.get(self.tick, ()):
             self._happen(row, event)
-        plant, hierarchy, reading = self.plant, self.hierarchy, self.plant.reading
-        if self._noise_scale.any():
-            for row in np.flatnonzero(self._noise_scale.any(axis=1)):
-                self._noise[row] = self._noise_scale[row] * self._random[row].standard_normal(5)
-        observe(
-            reading[:, X : THETA + 1], reading[:, V : OMEGA + 1], self._noise, self._odometry,
-            self._wheel_radius * (reading[:, RATE_LEFT] + reading[:, RATE_RIGHT]) / 2,
-            self._period if self.tick else 0.0, self._pose, self._twist,
-        )  # fmt: skip
+        plant, hierarchy, log = self.plant, self.hierarchy, self._log[self.tick]
+        for row in self._noisy:
+            self._noise[row] = self._noise_scale[row] * self._random[row].standard_normal(5)
         reference = self._reference[self.tick]
+        _sense(
+            plant.reading, reference, self._noise, self._odometry, self._wheel_radius,
+            self._period if self.tick else 0.0, self._pose, self._twist, log,
+        )  # fmt: skip
         output = hierarchy.update(self._pose, self._twist, reference[:, :3], reference[:, 3:5], reference[:, 5:])
-        if not np.isfinite(hierarchy.parts.sum()):  # the limit would turn NaN into the full voltage
+        if not hierarchy.finite:  # the limit would turn NaN into the full voltage
             for row in np.flatnonzero(~np.isfinite(hierarchy.parts).all(axis=1)):
                 plant.fail(int(row), "non-finite voltage")
-        before = reading[:, : STEERING + 1].copy()
-        posture_error(before[:, X : THETA + 1], reference[:, :3], self._error)
         plant.step(output)
-        current = plant.current()
-        np.concatenate(  # in the order of result.SIGNALS
-            [
-                before, reference[:, :5], self._error, self._twist, hierarchy.command, hierarchy.parts, output,
-                hierarchy.saturated[:, None], hierarchy.weight_norm[:, None], current,
-                (plant.applied * current).sum(axis=1, keepdims=True),
-            ],
-            axis=1,
-            out=self._log[:, self.tick],
+        near = _record(
+            hierarchy.command, hierarchy.parts, output, hierarchy.saturated, hierarchy.weight_norm, plant.applied,
+            plant.current, plant.failed, log,
         )  # fmt: skip
-        for row in np.flatnonzero(np.abs(self._error[:, 1]) > DIVERGED):
-            plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
+        if not near:
+            for row in np.flatnonzero(np.abs(log[:, LATERAL_ERROR]) > DIVERGED):
+                plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
         self.tick += 1
-        if plant.failed.any():
+        if plant.running < plant.size:
             new = plant.failed & np.isnan(self._failure_time)
             self._failure_time[new] = self.tick * self._period
-            self._log[plant.failed, self.tick - 1] = np.nan
+            log[plant.failed] = np.nan
 
     def result(self) -> xr.Dataset:
         """What was recorded so far; the whole length, ending in NaN, once every robot has failed."""
         stage = self.hierarchy.feedforward
         weights = stage.state["weights"].copy() if isinstance(stage, FeedbackErrorLearning) else None
         labels = [self._label] * len(self.scenarios)
-        log = self._log[:, : self.tick] if self.running else self._log
-        return result.dataset(self.scenarios, labels, log, self.plant.failure, self._failure_time, weights)
+        log = self._log[: self.tick] if self.running else self._log
+        log[self.tick :] = np.nan
+        return result.dataset(self.scenarios, labels, log.transpose(1, 0, 2), self.plant.failure, self._failure_time, weights)
 
     def _perturb(self, row: int, perturbation: Perturbation) -> None:
         p = perturbation
         self.plant.perturb(row, p, round(p.control_delay / self._period))
         self._noise_scale[row] = p.position_noise, p.position_noise, p.heading_noise, p.velocity_noise, p.rotation_noise
         self._noise[row] = 0.0
+        self._noisy = np.flatnonzero(self._noise_scale.any(axis=1)).tolist()
         if self._oracle:
             self._oracle.set_robot(row, self.plant.truth[row])
 

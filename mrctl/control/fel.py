@@ -7,13 +7,15 @@ any stateless torch module.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from numba import float64, guvectorize
+from numba import float64, guvectorize, njit
 from pydantic import Field
 
+from mrctl.control.chain import one, stamp
 from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features
 from mrctl.record import InputError, Record
 from mrctl.robot import Robot
@@ -150,6 +152,41 @@ def load_weights(path: str | Path, hidden: int) -> Array:
     return weights
 
 
+@njit
+def _sizes(weights, x, m):  # noqa: ANN001, ANN202
+    """Hidden units, and where b₁, W₂, b₂ and W₃ begin in the flat weights."""
+    n = x.shape[0]
+    h = (weights.shape[0] - m * (n + 1)) // (n + 1 + m)
+    return h, h * n, h * (n + 1), h * (n + 1 + m), h * (n + 1 + m) + m
+
+
+@njit
+def _activate(x, weights, m, hidden):  # noqa: ANN001, ANN202
+    """tanh(W₁ x + b₁)."""
+    h, b1, _, _, _ = _sizes(weights, x, m)
+    for j in range(h):
+        z = weights[b1 + j]
+        for i in range(x.shape[0]):
+            z += weights[j * x.shape[0] + i] * x[i]
+        hidden[j] = np.tanh(z)
+
+
+@njit
+def _network(x, hidden, weights, targets, out):  # noqa: ANN001, ANN202
+    n, m = x.shape[0], targets.shape[1]
+    h, _, w2, b2, w3 = _sizes(weights, x, m)
+    for k in range(m):
+        out[k] = BIAS_GAIN * weights[b2 + k]
+        for i in range(n):
+            out[k] += weights[w3 + k * n + i] * x[i]
+    for j in range(h):
+        z = HIDDEN_GAIN * hidden[j]
+        for k in range(m):
+            out[k] += weights[w2 + k * h + j] * z
+    for k in range(m):
+        out[k] *= targets[0, k]
+
+
 @guvectorize([(float64[:], float64[:], float64[:, :], float64[:])], "(f),(w),(t,u)->(u)", cache=True)
 def network(x, weights, targets, out):  # noqa: ANN001, ANN201
     """Scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x) for one robot.
@@ -160,24 +197,51 @@ def network(x, weights, targets, out):  # noqa: ANN001, ANN201
         targets: As from `Fel.targets`; the first row is the scale.
         out: Out: feedforward of the two channels, `(2,)`.
     """
+    hidden = np.empty(weights.shape[0])
+    _activate(x, weights, targets.shape[1], hidden)
+    _network(x, hidden, weights, targets, out)
+
+
+@njit
+def _update(x, hidden, feedback, saturated, targets, steps, prior, error, gradient, weights, norm):  # noqa: ANN001, ANN202
+    step, leak, bound = steps[0], steps[1], steps[2]
+    if saturated > 0 or step == 0:
+        return
     n, m = x.shape[0], targets.shape[1]
-    h = (weights.shape[0] - m * (n + 1)) // (n + 1 + m)
-    b1, w2 = h * n, h * (n + 1)
-    b2 = w2 + m * h
-    w3 = b2 + m
+    power = 0.0
     for k in range(m):
-        out[k] = BIAS_GAIN * weights[b2 + k]
+        error[k] = targets[2, k] * feedback[k] / targets[0, k] if abs(feedback[k]) > targets[1, k] else 0.0
+        power += error[k] * error[k]
+    if power == 0:
+        return
+    h, b1, w2, b2, w3 = _sizes(weights, x, m)
+    for k in range(m):
+        gradient[b2 + k] = BIAS_GAIN * error[k]
         for i in range(n):
-            out[k] += weights[w3 + k * n + i] * x[i]
+            gradient[w3 + k * n + i] = error[k] * x[i]
     for j in range(h):
-        z = weights[b1 + j]
-        for i in range(n):
-            z += weights[j * n + i] * x[i]
-        z = HIDDEN_GAIN * np.tanh(z)
+        z = hidden[j]
+        back = 0.0
         for k in range(m):
-            out[k] += weights[w2 + k * h + j] * z
-    for k in range(m):
-        out[k] *= targets[0, k]
+            gradient[w2 + k * h + j] = HIDDEN_GAIN * error[k] * z
+            back += error[k] * weights[w2 + k * h + j]
+        back *= HIDDEN_GAIN * (1 - z * z)
+        gradient[b1 + j] = back
+        for i in range(n):
+            gradient[j * n + i] = back * x[i]
+    square = 0.0
+    for w in range(weights.shape[0]):
+        square += gradient[w] * gradient[w]
+    rate = step / (square / power + REGULARISATION)
+    distance = 0.0
+    for w in range(weights.shape[0]):
+        weights[w] += rate * gradient[w] - leak * (weights[w] - prior[w])
+        distance += (weights[w] - prior[w]) ** 2
+    distance = np.sqrt(distance)
+    if distance > bound:
+        for w in range(weights.shape[0]):
+            weights[w] = prior[w] + (weights[w] - prior[w]) * bound / distance
+    norm[0] = min(distance, bound)
 
 
 @guvectorize(
@@ -202,52 +266,40 @@ def update(x, feedback, saturated, targets, steps, prior, weights, norm):  # noq
         weights: In and out.
         norm: Out: Euclidean distance of the weights from the prior.
     """
-    step, leak, bound = steps[0], steps[1], steps[2]
-    if saturated > 0 or step == 0:
-        return
-    n, m = x.shape[0], targets.shape[1]
-    error = np.empty(m)
-    power = 0.0
-    for k in range(m):
-        error[k] = targets[2, k] * feedback[k] / targets[0, k] if abs(feedback[k]) > targets[1, k] else 0.0
-        power += error[k] * error[k]
-    if power == 0:
-        return
-    h = (weights.shape[0] - m * (n + 1)) // (n + 1 + m)
-    b1, w2 = h * n, h * (n + 1)
-    b2 = w2 + m * h
-    w3 = b2 + m
-    gradient = np.empty(weights.shape[0])
-    for k in range(m):
-        gradient[b2 + k] = BIAS_GAIN * error[k]
-        for i in range(n):
-            gradient[w3 + k * n + i] = error[k] * x[i]
-    for j in range(h):
-        z = weights[b1 + j]
-        for i in range(n):
-            z += weights[j * n + i] * x[i]
-        z = np.tanh(z)
-        back = 0.0
-        for k in range(m):
-            gradient[w2 + k * h + j] = HIDDEN_GAIN * error[k] * z
-            back += error[k] * weights[w2 + k * h + j]
-        back *= HIDDEN_GAIN * (1 - z * z)
-        gradient[b1 + j] = back
-        for i in range(n):
-            gradient[j * n + i] = back * x[i]
-    square = 0.0
-    for w in range(weights.shape[0]):
-        square += gradient[w] * gradient[w]
-    rate = step / (square / power + REGULARISATION)
-    distance = 0.0
-    for w in range(weights.shape[0]):
-        weights[w] += rate * gradient[w] - leak * (weights[w] - prior[w])
-        distance += (weights[w] - prior[w]) ** 2
-    distance = np.sqrt(distance)
-    if distance > bound:
-        for w in range(weights.shape[0]):
-            weights[w] = prior[w] + (weights[w] - prior[w]) * bound / distance
-    norm[0] = min(distance, bound)
+    m, size = targets.shape[1], weights.shape[0]
+    hidden = np.empty(size)
+    _activate(x, weights, m, hidden)
+    _update(x, hidden, feedback, saturated, targets, steps, prior, np.empty(m), np.empty(size), weights, norm)
+
+
+_features = one(features)
+_OWN, _EACH = float64[:, ::1], float64[:, :, ::1]
+
+
+def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Output and learning step for all robots, sharing the hidden layer; see `chain.stamp` for the version."""
+
+    @njit((float64[:, :], float64[:, :], float64, float64[::1], *[_OWN] * 2, _EACH, *[_OWN] * 2), cache=True)
+    def respond(command, derivative, half_track, scale, x, weights, targets, hidden, out):  # noqa: ANN001, ANN202
+        _ = version
+        for i in range(len(x)):
+            _features(command[i], derivative[i], half_track, scale, x[i])
+            _activate(x[i], weights[i], out.shape[1], hidden[i])
+            _network(x[i], hidden[i], weights[i], targets[i], out[i])
+
+    @njit((*[_OWN] * 2, float64[:, :], float64[:], _EACH, *[_OWN] * 3, float64[::1]), cache=True)
+    def teach(x, hidden, feedback, saturated, targets, steps, prior, weights, norm):  # noqa: ANN001, ANN202
+        error, gradient = np.empty(targets.shape[2]), np.empty(weights.shape[1])
+        for i in range(len(x)):
+            _update(
+                x[i], hidden[i], feedback[i], saturated[i], targets[i], steps[i], prior[i],
+                error, gradient, weights[i], norm[i : i + 1],
+            )  # fmt: skip
+
+    return respond, teach
+
+
+_respond, _teach = _compile(stamp(features))
 
 
 class FeedbackErrorLearning:
@@ -270,6 +322,7 @@ class FeedbackErrorLearning:
         self._targets = np.array([s.targets(rigid) for s in settings])
         self._steps = np.array([s.steps() for s in settings])
         self._features, self._output = np.zeros((len(settings), INPUTS)), np.zeros((len(settings), OUTPUTS))
+        self._hidden = np.zeros((len(settings), settings[0].hidden))
         self.prior = np.array(
             [
                 load_weights(s.weights, s.hidden) if s.weights else initial_weights(s.hidden, seed)
@@ -281,13 +334,15 @@ class FeedbackErrorLearning:
 
     def output(self, command: Array, derivative: Array) -> Array:
         """The network at the commanded motion; never at the measured one."""
-        features(command, derivative, self._half_track, self._scale, self._features)
-        network(self._features, self.state["weights"], self._targets, self._output)
+        _respond(
+            command, derivative, self._half_track, self._scale, self._features, self.state["weights"], self._targets,
+            self._hidden, self._output,
+        )  # fmt: skip
         return self._output
 
     def learn(self, feedback: Array, saturated: Array) -> None:
         """One step on the features of the last output."""
-        update(
-            self._features, feedback, saturated, self._targets, self._steps, self.prior, self.state["weights"],
-            self.weight_norm,
+        _teach(
+            self._features, self._hidden, feedback, saturated, self._targets, self._steps, self.prior,
+            self.state["weights"], self.weight_norm,
         )  # fmt: skip

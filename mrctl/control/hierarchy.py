@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
+from numba import boolean, float64, njit
 from numpy.typing import NDArray
 
 from mrctl.control import steering
+from mrctl.control.chain import one, stamp
 from mrctl.control.feedforward import Feedforward, InverseDynamics, NoFeedforward
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.kanayama import Kanayama, kanayama
@@ -19,6 +22,54 @@ from mrctl.robot import Robot
 from mrctl.scenario import Scenario
 
 Array = NDArray[np.float64]
+
+_kanayama, _limit, _pid, _allocate = one(kanayama), one(limit), one(pid), one(allocate)
+_GIVEN, _OWN, _ROWS = float64[:, :], float64[:, ::1], float64[::1]  # strided, contiguous
+
+
+def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """The laws before and after the feedforward, each chained for all robots; see `chain.stamp` for the version."""
+
+    @njit((boolean, *[_GIVEN] * 5, _OWN, _ROWS, _ROWS, float64, float64[:, :, ::1], *[_OWN] * 9), cache=True)
+    def lead(  # noqa: ANN202
+        moves, pose, twist, reference, reference_twist, acceleration, kanayama_gains, limits, prefilter, period,
+        pid_gains, excess, error, request, correction, limiter, integrals, command, derivative, feedback,
+    ):  # fmt: skip  # noqa: ANN001
+        """Posture to commanded motion and feedback: motion controller (where it moves), limiter, PID."""
+        _ = version
+        wish = np.empty(2)
+        for i in range(len(pose)):
+            v = reference_twist[i]
+            if moves:
+                _kanayama(pose[i], reference[i], v, kanayama_gains[i], error[i], request[i])
+                for k in range(2):
+                    correction[i, k] = request[i, k] - v[k]
+            for k in range(2):
+                wish[k] = v[k] + correction[i, k]
+            _limit(wish, v, acceleration[i], limits, prefilter[i], period, limiter[i], command[i], derivative[i])
+            _pid(command[i], twist[i], pid_gains[i], period, excess[i], integrals[i], feedback[i])
+
+    @njit((*[_OWN] * 3, _GIVEN, _ROWS, float64, _ROWS, *[_OWN] * 4, _ROWS, _ROWS), cache=True)
+    def follow(  # noqa: ANN202
+        command, derivative, feedback, feedforward, robot, period, frozen, fork, output, parts, excess, saturated, idle
+    ):  # noqa: ANN001
+        """Feedback and feedforward to voltages and steering; returns whether all of them are finite."""
+        _ = version
+        finite = True
+        for i in range(len(command)):
+            _allocate(
+                command[i], derivative[i], feedback[i], feedforward[i], robot, period,
+                fork[i], output[i], parts[i], excess[i], saturated[i : i + 1],
+            )  # fmt: skip
+            idle[i] = max(saturated[i], frozen[i])
+            for k in range(4):
+                finite &= np.isfinite(parts[i, k])
+        return finite
+
+    return lead, follow
+
+
+_lead, _follow = _compile(stamp(kanayama, limit, pid, allocate))
 
 
 def feedforward_of(scenarios: Sequence[Scenario], robot: Robot) -> Feedforward:
@@ -45,6 +96,7 @@ class Hierarchy:
         feedback: Output of the PID for the two channels `(B, 2)`.
         parts: Feedback left and right, feedforward left and right in V, before the limit, `(B, 4)`.
         output: Voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
+        finite: Whether all `parts` are finite numbers.
         saturated: 1 where a limit acted, `(B,)`.
     """
 
@@ -70,11 +122,12 @@ class Hierarchy:
             self.set_pid(row, scenario.pid)
         self.state = {"limiter": np.zeros((size, 4)), "pid": np.zeros((size, 7)), "steering": np.zeros((size, 2))}
         self._request, self._correction = np.zeros((size, 2)), np.zeros((size, 2))
-        self._excess = np.zeros((size, 2))
+        self._excess, self._idle = np.zeros((size, 2)), np.zeros(size)
         self.error = np.zeros((size, 3))
         self.command, self.derivative = np.zeros((size, 2)), np.zeros((size, 2))
         self.feedback, self.parts = np.zeros((size, 2)), np.zeros((size, 4))
         self.output, self.saturated = np.zeros((size, 4)), np.zeros(size)
+        self.finite = True
         self._no_weights = np.zeros(size)
 
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
@@ -118,22 +171,19 @@ class Hierarchy:
             `output`, `(B, 4)`.
         """
         state = self.state
-        if self._tick % self._every == 0:
-            kanayama(pose, reference, reference_twist, self._kanayama, self.error, self._request)
-            np.subtract(self._request, reference_twist, out=self._correction)
-        self._tick += 1
-        limit(
-            reference_twist + self._correction, reference_twist, acceleration, self._limits, self._prefilter,
-            self._period, state["limiter"], self.command, self.derivative,
+        _lead(
+            self._tick % self._every == 0, pose, twist, reference, reference_twist, acceleration, self._kanayama,
+            self._limits, self._prefilter, self._period, self._pid, self._excess, self.error, self._request,
+            self._correction, state["limiter"], state["pid"], self.command, self.derivative, self.feedback,
         )  # fmt: skip
-        pid(self.command, twist, self._pid, self._period, self._excess, state["pid"], self.feedback)
+        self._tick += 1
         feedforward = self.feedforward.output(self.command, self.derivative)
-        allocate(
-            self.command, self.derivative, self.feedback, feedforward, self._parameters, self._period,
-            state["steering"], self.output, self.parts, self._excess, self.saturated,
+        self.finite = _follow(
+            self.command, self.derivative, self.feedback, feedforward, self._parameters, self._period, self._frozen,
+            state["steering"], self.output, self.parts, self._excess, self.saturated, self._idle,
         )  # fmt: skip
         # A robot that must not learn is treated as one whose voltage did not act.
-        self.feedforward.learn(self.feedback, np.maximum(self.saturated, self._frozen))
+        self.feedforward.learn(self.feedback, self._idle)
         return self.output
 
     @property
