@@ -46,6 +46,7 @@ def _parse(arguments: list[str]) -> None:
         "reproduce": reproduce,
         "suite": suite,
         "tune": tune,
+        "bench": bench,
     }
     complaints = io.StringIO()
     try:
@@ -153,6 +154,18 @@ def tune(world: str = "flat", time_constant: float = 0.15, delay: float = 0.0, j
 
     table = tuning.design(world, time_constant, delay)
     print(jsonlib.dumps(table, indent=2) if json else tuning.text(table))
+
+
+def bench(json: bool = False) -> None:
+    """Measures the closed loop with on-line learning beside the engine's own speed on this machine; under two minutes.
+
+    Args:
+        json: Print JSON.
+    """
+    from mrctl.experiments import bench as benchmark
+
+    figures = benchmark.run()
+    print(jsonlib.dumps(figures, indent=2, ensure_ascii=False) if json else benchmark.text(figures))
 
 
 if __name__ == "__main__":

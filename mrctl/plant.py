@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 import mujoco
 import numpy as np
 from mujoco import batch as mujoco_batch
-from numba import boolean, float64, guvectorize, int64, njit
+from numba import boolean, float64, guvectorize, int64, njit, types
 from numpy.typing import NDArray
 
 from mrctl import model as mjcf
@@ -70,11 +70,11 @@ def read(qpos, qvel, address, reading):  # noqa: ANN001, ANN201
 
 
 _read = njit(read.__wrapped__)
-_FIELD, _OWN = float64[:, :], float64[:, ::1]  # the engine's arrays, ours
+_FIELD, _GIVEN, _OWN = float64[:, :], types.Array(float64, 2, "A", readonly=True), float64[:, ::1]
 
 
 @njit(
-    (_FIELD, int64, float64[:, :, ::1], int64[::1], float64[::1], int64[::1], boolean[::1], _OWN, _FIELD), cache=True
+    (_GIVEN, int64, float64[:, :, ::1], int64[::1], float64[::1], int64[::1], boolean[::1], _OWN, _FIELD), cache=True
 )
 def _drive(command, tick, queue, delay, gain, inputs, failed, applied, ctrl):  # noqa: ANN001, ANN202
     """Sends each robot the command of `delay` periods ago; returns whether all commands are finite."""

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numba import boolean, float64, njit
+from numba import boolean, float64, njit, types
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from mrctl import model as mjcf
 from mrctl import result
-from mrctl.control.chain import one, stamp
+from mrctl.control.chain import EACH, GIVEN, OWN, one, stamp
 from mrctl.control.feedforward import Feedforward, InverseDynamics
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.hierarchy import Hierarchy, feedforward_of
@@ -34,14 +34,13 @@ LATERAL_ERROR = list(result.SIGNALS).index("lateral_error")
 FAR = 0.8  # m between robot and reference at the start
 
 _observe, _posture_error = one(observe), one(posture_error)
-_OWN, _ROWS = float64[:, ::1], float64[::1]
 _STATE, _REFERENCE, _ERROR = STEERING + 1, 5, 3  # how many columns of the record each takes
 
 
 def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """What the loop does for each robot beside control and physics; see `chain.stamp` for the version."""
 
-    @njit((*[_OWN] * 3, _ROWS, float64, float64, *[_OWN] * 3), cache=True)
+    @njit((OWN, GIVEN, OWN, EACH, float64, float64, *[OWN] * 3), cache=True)
     def sense(reading, reference, noise, odometry, wheel_radius, period, pose, twist, record):  # noqa: ANN001, ANN202
         """Measures, and records state, reference, true error and measured twist."""
         _ = version
@@ -57,7 +56,7 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
             _posture_error(true[X : THETA + 1], reference[i, :3], row[at : at + _ERROR])
             row[at + _ERROR : at + _ERROR + 2] = twist[i]
 
-    @njit((*[_OWN] * 3, _ROWS, float64[:], *[_OWN] * 2, boolean[::1], _OWN), cache=True)
+    @njit((*[OWN] * 3, EACH, types.Array(float64, 1, "A", readonly=True), *[OWN] * 2, boolean[::1], OWN), cache=True)
     def record(command, parts, output, saturated, norm, applied, current, failed, row):  # noqa: ANN001, ANN202
         """Records commands, currents and power; returns whether all robots are near their references."""
         _ = version
@@ -135,6 +134,7 @@ class Simulation:
         hierarchy: The controllers.
         tick: Control periods done.
         ticks: Control periods in the whole run.
+        log: What was recorded, `(ticks, B, signals)`; nothing yet from `tick` on.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], feedforward: Factory | None = None) -> None:
@@ -162,8 +162,14 @@ class Simulation:
         self.plant: Plant = build(compiled, size, round(first.control_period / first.physics_step))
         self.hierarchy = Hierarchy(scenarios, robot, stage)
         times = self._period * np.arange(self.ticks, dtype=float)
-        motions = [s.reference.sample(times) for s in scenarios]
-        self._reference = np.stack([np.hstack(motion) for motion in motions], axis=1)  # (ticks, B, 7)
+        # Robots that follow the same reference share its samples, (ticks, references, 7).
+        names = [s.reference.model_dump_json() for s in scenarios]
+        different = {name: s.reference for name, s in zip(names, scenarios, strict=True)}
+        order = list(different)
+        samples = np.stack([np.hstack(r.sample(times)) for r in different.values()], axis=1)
+        self._which = np.array([order.index(name) for name in names]) if 1 < len(order) < size else None
+        shared = self._which is None and len(order) < size
+        self._reference = np.broadcast_to(samples, (self.ticks, size, 7)) if shared else samples
         self._wheel_radius = robot.wheel_radius
         self._odometry = np.array([float(s.measurement == "odometry") for s in scenarios])
         self._noise, self._noise_scale = np.zeros((2, size, 5))
@@ -174,13 +180,13 @@ class Simulation:
             self._perturb(row, scenario.perturbation)
             for event in sorted(scenario.events, key=lambda e: e.time):
                 self._schedule[int(np.ceil(event.time / self._period - 1e-9))].append((row, event))
-        start = self._reference[0]
+        start = self._reference_now()
         self.plant.reset(np.stack([_start(s, start[i, :3]) for i, s in enumerate(scenarios)]), start[:, 3:5])
         reading = self.plant.reading
         self.hierarchy.reset(start[:, 3:5], start[:, 5:], reading[:, STEERING])
         self._pose, self._twist = reading[:, X : THETA + 1].copy(), reading[:, V : OMEGA + 1].copy()
         # A tick's records side by side: the loop writes one block of memory a tick, however many robots there are.
-        self._log = np.empty((self.ticks, size, len(result.SIGNALS)))
+        self.log = np.empty((self.ticks, size, len(result.SIGNALS)))
         self._failure_time = np.full(size, np.nan)
 
     @property
@@ -193,10 +199,10 @@ class Simulation:
         """One control period: events, measurement, control, record, physics."""
         for row, event in self._schedule.get(self.tick, ()):
             self._happen(row, event)
-        plant, hierarchy, log = self.plant, self.hierarchy, self._log[self.tick]
+        plant, hierarchy, log = self.plant, self.hierarchy, self.log[self.tick]
         for row in self._noisy:
             self._noise[row] = self._noise_scale[row] * self._random[row].standard_normal(5)
-        reference = self._reference[self.tick]
+        reference = self._reference_now()
         _sense(
             plant.reading, reference, self._noise, self._odometry, self._wheel_radius,
             self._period if self.tick else 0.0, self._pose, self._twist, log,
@@ -219,12 +225,16 @@ class Simulation:
             self._failure_time[new] = self.tick * self._period
             log[plant.failed] = np.nan
 
+    def _reference_now(self) -> Array:
+        now = self._reference[self.tick]
+        return now if self._which is None else now[self._which]
+
     def result(self) -> xr.Dataset:
         """What was recorded so far; the whole length, ending in NaN, once every robot has failed."""
         stage = self.hierarchy.feedforward
         weights = stage.state["weights"].copy() if isinstance(stage, FeedbackErrorLearning) else None
         labels = [self._label] * len(self.scenarios)
-        log = self._log[: self.tick] if self.running else self._log
+        log = self.log[: self.tick] if self.running else self.log
         log[self.tick :] = np.nan
         return result.dataset(self.scenarios, labels, log.transpose(1, 0, 2), self.plant.failure, self._failure_time, weights)
 

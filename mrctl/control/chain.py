@@ -11,7 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+from numba import float64, njit, types
+
+GIVEN = types.Array(float64, 2, "A", readonly=True)  # an input that may be a view, `(B, n)`
+OWN, EACH = float64[:, ::1], float64[::1]  # arrays of ours, `(B, n)` and `(B,)`
 
 
 def one(law: Callable[..., Any]) -> Callable[..., Any]:

@@ -15,7 +15,7 @@ import numpy as np
 from numba import float64, guvectorize, njit
 from pydantic import Field
 
-from mrctl.control.chain import one, stamp
+from mrctl.control.chain import EACH, GIVEN, OWN, one, stamp
 from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features
 from mrctl.record import InputError, Record
 from mrctl.robot import Robot
@@ -273,13 +273,13 @@ def update(x, feedback, saturated, targets, steps, prior, weights, norm):  # noq
 
 
 _features = one(features)
-_OWN, _EACH = float64[:, ::1], float64[:, :, ::1]
+_TARGETS = float64[:, :, ::1]
 
 
 def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Output and learning step for all robots, sharing the hidden layer; see `chain.stamp` for the version."""
 
-    @njit((float64[:, :], float64[:, :], float64, float64[::1], *[_OWN] * 2, _EACH, *[_OWN] * 2), cache=True)
+    @njit((GIVEN, GIVEN, float64, EACH, OWN, OWN, _TARGETS, OWN, OWN), cache=True)
     def respond(command, derivative, half_track, scale, x, weights, targets, hidden, out):  # noqa: ANN001, ANN202
         _ = version
         for i in range(len(x)):
@@ -287,7 +287,7 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
             _activate(x[i], weights[i], out.shape[1], hidden[i])
             _network(x[i], hidden[i], weights[i], targets[i], out[i])
 
-    @njit((*[_OWN] * 2, float64[:, :], float64[:], _EACH, *[_OWN] * 3, float64[::1]), cache=True)
+    @njit((OWN, OWN, GIVEN, EACH, _TARGETS, *[OWN] * 3, EACH), cache=True)
     def teach(x, hidden, feedback, saturated, targets, steps, prior, weights, norm):  # noqa: ANN001, ANN202
         error, gradient = np.empty(targets.shape[2]), np.empty(weights.shape[1])
         for i in range(len(x)):

@@ -10,7 +10,7 @@ from numba import boolean, float64, njit
 from numpy.typing import NDArray
 
 from mrctl.control import steering
-from mrctl.control.chain import one, stamp
+from mrctl.control.chain import EACH, GIVEN, OWN, one, stamp
 from mrctl.control.feedforward import Feedforward, InverseDynamics, NoFeedforward
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.kanayama import Kanayama, kanayama
@@ -24,13 +24,12 @@ from mrctl.scenario import Scenario
 Array = NDArray[np.float64]
 
 _kanayama, _limit, _pid, _allocate = one(kanayama), one(limit), one(pid), one(allocate)
-_GIVEN, _OWN, _ROWS = float64[:, :], float64[:, ::1], float64[::1]  # strided, contiguous
 
 
 def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The laws before and after the feedforward, each chained for all robots; see `chain.stamp` for the version."""
 
-    @njit((boolean, *[_GIVEN] * 5, _OWN, _ROWS, _ROWS, float64, float64[:, :, ::1], *[_OWN] * 9), cache=True)
+    @njit((boolean, *[GIVEN] * 5, OWN, EACH, EACH, float64, float64[:, :, ::1], *[OWN] * 9), cache=True)
     def lead(  # noqa: ANN202
         moves, pose, twist, reference, reference_twist, acceleration, kanayama_gains, limits, prefilter, period,
         pid_gains, excess, error, request, correction, limiter, integrals, command, derivative, feedback,
@@ -49,7 +48,7 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
             _limit(wish, v, acceleration[i], limits, prefilter[i], period, limiter[i], command[i], derivative[i])
             _pid(command[i], twist[i], pid_gains[i], period, excess[i], integrals[i], feedback[i])
 
-    @njit((*[_OWN] * 3, _GIVEN, _ROWS, float64, _ROWS, *[_OWN] * 4, _ROWS, _ROWS), cache=True)
+    @njit((*[OWN] * 3, GIVEN, EACH, float64, EACH, *[OWN] * 4, EACH, EACH), cache=True)
     def follow(  # noqa: ANN202
         command, derivative, feedback, feedforward, robot, period, frozen, fork, output, parts, excess, saturated, idle
     ):  # noqa: ANN001

@@ -1,0 +1,324 @@
+"""How fast is the closed loop? Beside the engine alone, and beside what people write today."""
+
+from __future__ import annotations
+
+import gc
+import math
+import os
+import platform
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from importlib import import_module
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import torch
+
+from mrctl import plant
+from mrctl.angles import wrap
+from mrctl.control import fel, hierarchy
+from mrctl.control.feedforward import feature_scale
+from mrctl.experiments.tables import markdown, number
+from mrctl.kinematics import steering_angle
+from mrctl.model import load, read_robot
+from mrctl.plant import BatchPlant, CarPhysics
+from mrctl.result import SIGNALS, versions
+from mrctl.scenario import Scenario
+from mrctl.simulate import Simulation
+
+loop = import_module("mrctl.simulate")  # `mrctl.simulate` itself is the function of that name
+
+SIZES = (1, 16, 64, 256, 1024)
+REPETITIONS = 15
+CHUNK = 6000  # control periods of robots in one repetition: a fifth of a second
+WARM = 20  # control periods before the clock starts
+CONTROLS = [list(SIGNALS).index(n) for n in ("voltage_left", "voltage_right", "steering_command")]
+CONTROLS.append(list(SIGNALS).index("steering_rate_command"))
+PARTS: dict[str, tuple[Any, str]] = {
+    "physics": (BatchPlant, "_advance"),
+    "actuation (delay, supply)": (plant, "_drive"),
+    "readout, currents": (plant, "_look"),
+    "measurement, true error": (loop, "_sense"),
+    "motion controller, limiter, PID": (hierarchy, "_lead"),
+    "feedforward (fel)": (fel, "_respond"),
+    "allocation": (hierarchy, "_follow"),
+    "learning (fel)": (fel, "_teach"),
+    "record": (loop, "_record"),
+}
+
+
+def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int = CHUNK) -> dict[str, Any]:
+    """Measures everything; below two minutes on two cores.
+
+    Closed loop (Kanayama, PID, `fel` learning in every robot, record) and limit (open-loop `Batch.rollout` of the
+    controls just recorded, from the same state, recording nothing) take turns in one process on one model. A ratio is
+    the median of the ratios of neighbours, so that a machine with other work on it slows both.
+
+    Args:
+        sizes: Numbers of robots.
+        repetitions: Turns of each.
+        chunk: Control periods of one turn, summed over the robots.
+
+    Returns:
+        `machine`; `robots`, a row a size on one thread; `threads`, rows on one and on two; `parts`, µs a control
+        period by component for the smallest and the largest size; `today`, the dm_control and autograd loop.
+    """
+    threads = [1, 2] if (os.cpu_count() or 1) > 1 else [1]
+    middle = sizes[len(sizes) // 2]
+    rows = [_compare(size, 1, repetitions, chunk) for size in sizes]
+    today = autograd_loop(max(chunk // 20, 20), repetitions)
+    return {
+        "machine": {"processor": _processor(), "cores": os.cpu_count(), **versions()},
+        "robots": rows,
+        "threads": [_compare(middle, count, repetitions, chunk) for count in threads],
+        "parts": {str(size): _parts(size, chunk) for size in (sizes[0], sizes[-1])},
+        "today": today | {"closed_loop_is_faster_by": rows[0]["steps_per_second"] / today["steps_per_second"]},
+    }
+
+
+def text(figures: dict[str, Any]) -> str:
+    """The figures of `run` as Markdown."""
+    machine, today = figures["machine"], figures["today"]
+
+    def table(rows: list[dict[str, Any]]) -> str:
+        header = ("robots", "threads", "steps/s", "× real time", "engine alone, steps/s", "ratio", "µs a tick", "MiB")
+        return markdown(
+            header,
+            [
+                [
+                    str(r["robots"]), str(r["threads"]), f"{r['steps_per_second']:,.0f}",
+                    f"{r['real_time_factor']:,.0f}", f"{r['limit_steps_per_second']:,.0f}", f"{r['ratio']:.3f}",
+                    number(r["overhead_us_per_tick"]), f"{r['memory_mib']:.0f}",
+                ]
+                for r in rows
+            ],
+        )  # fmt: skip
+
+    sizes = list(figures["parts"])
+    parts = [
+        [name, *(f"{figures['parts'][size][name]:.2f}" for size in sizes)] for name in figures["parts"][sizes[0]]
+    ]
+    exact = all(r["replayed_exactly"] for r in figures["robots"] + figures["threads"])
+    return "\n\n".join(
+        [
+            f"{machine['processor']}, {machine['cores']} cores, mujoco {machine['mujoco']}",
+            "Closed loop (Kanayama, PID, fel learning in every robot, everything recorded) on the batch engine, beside\n"
+            "open-loop rollouts of the same controls; µs a tick: what the closed loop takes longer.",
+            table(figures["robots"]),
+            table(figures["threads"]),
+            f"The rollouts came to the same bits: {'yes' if exact else 'NO'}",
+            f"One dm_control physics, NumPy laws and torch autograd: {today['steps_per_second']:,.0f} steps/s; "
+            f"the closed loop with one robot is {today['closed_loop_is_faster_by']:.1f} times as fast.",
+            "µs a control period:",
+            markdown(["part", *(f"{size} robot{'s' * (size != '1')}" for size in sizes)], parts),
+        ]
+    )
+
+
+def build(size: int, ticks: int, threads: int = 1) -> Simulation:
+    """A closed loop with `fel` in every robot on the batch engine, also for one robot, past its first moments.
+
+    Args:
+        size: Number of robots, which differ in their seeds.
+        ticks: Control periods that will be asked of it.
+        threads: Threads of the batch engine.
+    """
+    laps = math.ceil((WARM + ticks) / Scenario(laps=1).ticks)
+    with mock.patch.object(loop, "build", lambda model, size, steps: BatchPlant(model, size, steps, threads)):
+        simulation = Simulation([Scenario(seed=seed, laps=laps) for seed in range(size)])
+    for _ in range(WARM):
+        simulation.step()
+    return simulation
+
+
+def turn(simulation: Simulation, ticks: int) -> tuple[float, float, bool]:
+    """Drives on in closed loop, then replays the same stretch open loop.
+
+    Args:
+        simulation: On a `BatchPlant`, with nominal robots.
+        ticks: Control periods.
+
+    Returns:
+        Seconds in closed loop, seconds of the rollout, and whether it came to the same bits of `qpos`.
+    """
+    physics = simulation.plant
+    assert isinstance(physics, BatchPlant)
+    batch, first = physics.batch, simulation.tick
+    before = batch.state.copy()
+    start = time.perf_counter()
+    for _ in range(ticks):
+        simulation.step()
+    closed = time.perf_counter() - start
+    after, qpos = batch.state.copy(), physics.qpos.copy()
+    controls = simulation.log[first : first + ticks, :, CONTROLS].transpose(1, 0, 2)
+    held = np.repeat(controls, physics.substeps, axis=1)
+    batch.state[:] = before
+    start = time.perf_counter()
+    batch.rollout(held.shape[1], held, record=())
+    limit = time.perf_counter() - start
+    same = np.array_equal(physics.qpos, qpos)
+    batch.state[:] = after
+    return closed, limit, same
+
+
+def _compare(size: int, threads: int, repetitions: int, chunk: int) -> dict[str, Any]:
+    gc.collect()
+    memory = _resident()
+    ticks = max(2, chunk // size)
+    simulation = build(size, ticks * repetitions, threads)
+    turns = []
+    for _ in range(repetitions):
+        gc.collect()
+        turns.append(turn(simulation, ticks))
+    closed, limit = (statistics.median(column) / ticks for column in list(zip(*turns, strict=True))[:2])
+    steps = size * simulation.plant.substeps
+    return {
+        "robots": size,
+        "threads": threads,
+        "steps_per_second": steps / closed,
+        "limit_steps_per_second": steps / limit,
+        "real_time_factor": size * simulation.scenarios[0].control_period / closed,
+        "ratio": statistics.median(limit / closed for closed, limit, _ in turns),
+        "overhead_us_per_tick": 1e6 * statistics.median(c - limit for c, limit, _ in turns) / ticks,
+        "replayed_exactly": all(same for _, _, same in turns),
+        "memory_mib": (_resident() - memory) / 2**20,
+        "ticks": simulation.tick,
+    }
+
+
+def _parts(size: int, chunk: int) -> dict[str, float]:
+    """µs a control period by component, as they run in the loop."""
+    ticks = max(2, chunk // size)
+    simulation = build(size, ticks)
+    with _stopwatches() as seconds:
+        start = time.perf_counter()
+        for _ in range(ticks):
+            simulation.step()
+        seconds["the rest"] = [time.perf_counter() - start - sum(sum(spent) for spent in seconds.values())]
+    medians = {name: statistics.median(spent) for name, spent in seconds.items()}
+    medians["the rest"] /= ticks
+    return {name: 1e6 * value for name, value in medians.items()}
+
+
+@contextmanager
+def _stopwatches() -> Iterator[dict[str, list[float]]]:
+    seconds: dict[str, list[float]] = {name: [] for name in PARTS}
+
+    def watched(function: Callable[..., Any], spent: list[float]) -> Callable[..., Any]:
+        def watch(*arguments: object) -> object:
+            start = time.perf_counter()
+            answer = function(*arguments)
+            spent.append(time.perf_counter() - start)
+            return answer
+
+        return watch
+
+    with ExitStack() as stack:
+        for name, (owner, attribute) in PARTS.items():
+            stack.enter_context(
+                mock.patch.object(owner, attribute, watched(getattr(owner, attribute), seconds[name]))
+            )
+        yield seconds
+
+
+def autograd_loop(ticks: int, repetitions: int = 1) -> dict[str, float]:
+    """What people write today: one dm_control physics, laws in NumPy, a torch network trained by autograd each tick.
+
+    The same robot, reference, rates and laws (without the limits on acceleration, which never act here), the same
+    network of 8, 24 and 2 units, plain gradient descent on the feedback voltage.
+
+    Args:
+        ticks: Control periods of one repetition.
+        repetitions: How many follow one another.
+
+    Returns:
+        `steps_per_second` of the physics, by the median repetition; `position_rmse` in m over all but the first 2 s.
+    """
+    scenario = Scenario()
+    period, substeps = scenario.control_period, round(scenario.control_period / scenario.physics_step)
+    physics = CarPhysics.from_world(scenario.world)
+    robot = read_robot(load(scenario.world))
+    motion = scenario.reference.sample(period * np.arange(ticks * repetitions + 1, dtype=float))
+    reference = np.hstack(motion)
+    gains, (k_x, k_y, k_theta) = scenario.pid.gains(robot, False), scenario.kanayama.model_dump().values()
+    smooth = period / scenario.prefilter
+    scale = feature_scale(robot)
+    network = torch.nn.Sequential(torch.nn.Linear(8, 24), torch.nn.Tanh(), torch.nn.Linear(24, 2))
+    torch.nn.init.zeros_(network[2].weight)
+    torch.nn.init.zeros_(network[2].bias)
+    optimizer = torch.optim.SGD(network.parameters(), lr=1e-3)
+    start = plant.mjcf.stand(physics.model.ptr, reference[0, :3], reference[0, 3:5])
+    with physics.reset_context():
+        physics.data.qpos[:], physics.data.qvel[:] = start
+    correction, integral, last_angle = np.zeros(2), np.zeros(2), physics.steering_angle()
+    seconds, squares = [], []
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # faster for a network this small
+    try:
+        for tick in range(ticks * repetitions):
+            if tick % ticks == 0:
+                begin = time.perf_counter()
+            reading = physics.reading()
+            pose, twist = reading[:3], reading[3:5]
+            goal, wanted, acceleration = reference[tick, :3], reference[tick, 3:5], reference[tick, 5:]
+            c, s = np.cos(pose[2]), np.sin(pose[2])
+            error = np.array([[c, s], [-s, c]]) @ (goal[:2] - pose[:2])
+            turn = wrap(goal[2] - pose[2])
+            request = np.array(
+                [
+                    wanted[0] * np.cos(turn) + k_x * error[0],
+                    wanted[1] + wanted[0] * (k_y * error[1] + k_theta * np.sin(turn)),
+                ]
+            )
+            rate = (request - wanted - correction) / scenario.prefilter
+            correction = correction + smooth * (request - wanted - correction)
+            command, derivative = wanted + correction, acceleration + rate
+            deviation = command - twist
+            integral = integral + period * gains[:, 1] * deviation
+            feedback = gains[:, 0] * deviation + integral
+            v, omega = command
+            wheels = np.tanh((v + np.array([-1, 1]) * robot.half_track * omega) / 0.05)
+            features = np.array([v, omega, *derivative, v * omega, omega**2, *wheels]) / scale
+            output = network(torch.from_numpy(features.astype(np.float32)))
+            feedforward = 6.0 * output.detach().numpy()
+            common, apart = feedback + feedforward
+            voltage = np.clip([common - apart, common + apart], -robot.supply, robot.supply)
+            angle = steering_angle(command, robot)
+            physics.set_control([*voltage, angle, (angle - last_angle) / period])
+            last_angle = angle
+            loss = -torch.dot(output, torch.from_numpy(feedback.astype(np.float32)))
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            physics.step(substeps)
+            squares.append(error @ error)
+            if tick % ticks == ticks - 1:
+                seconds.append(time.perf_counter() - begin)
+    finally:
+        torch.set_num_threads(threads)
+    return {
+        "steps_per_second": ticks * substeps / statistics.median(seconds),
+        "position_rmse": float(np.sqrt(np.mean(squares[round(2 / period) :] or squares))),
+    }
+
+
+def _resident() -> float:
+    """Memory of this process in bytes: what it holds now on Linux, elsewhere the most it held."""
+    try:
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[1]) * resource.getpagesize()
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def _processor() -> str:
+    try:
+        with open("/proc/cpuinfo") as file:
+            return next(line.partition(":")[2].strip() for line in file if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
