@@ -15,10 +15,11 @@ from abc import ABC, abstractmethod
 import mujoco
 import numpy as np
 from mujoco import batch as mujoco_batch
-from numba import boolean, float64, guvectorize, int64, njit, types
+from numba import boolean, float64, guvectorize, int64, njit
 from numpy.typing import NDArray
 
 from mrctl import model as mjcf
+from mrctl.control.chain import EACH, GIVEN, OWN, one
 from mrctl.robot import Perturbation, Robot
 
 with warnings.catch_warnings():  # on a machine without a display dm_control tries GLFW first, which complains
@@ -69,13 +70,11 @@ def read(qpos, qvel, address, reading):  # noqa: ANN001, ANN201
             reading[10] = np.nan
 
 
-_read = njit(read.__wrapped__)
-_FIELD, _GIVEN, _OWN = float64[:, :], types.Array(float64, 2, "A", readonly=True), float64[:, ::1]
+_read = one(read)
+_FIELD = float64[:, :]  # an array of the engine's
 
 
-@njit(
-    (_GIVEN, int64, float64[:, :, ::1], int64[::1], float64[::1], int64[::1], boolean[::1], _OWN, _FIELD), cache=True
-)
+@njit((GIVEN, int64, float64[:, :, ::1], int64[::1], EACH, int64[::1], boolean[::1], OWN, _FIELD), cache=True)
 def _drive(command, tick, queue, delay, gain, inputs, failed, applied, ctrl):  # noqa: ANN001, ANN202
     """Sends each robot the command of `delay` periods ago; returns whether all commands are finite."""
     finite = True
@@ -89,9 +88,7 @@ def _drive(command, tick, queue, delay, gain, inputs, failed, applied, ctrl):  #
     return finite
 
 
-@njit(
-    (*[_FIELD] * 3, int64[::1], int64[::1], *[_OWN] * 3, boolean[::1], _OWN, _OWN), cache=True
-)
+@njit((*[_FIELD] * 3, int64[::1], int64[::1], *[OWN] * 3, boolean[::1], OWN, OWN), cache=True)
 def _look(qpos, qvel, act, address, acts, applied, resistance, back_emf, failed, reading, current):  # noqa: ANN001, ANN202
     """Readings and armature currents after a period; returns whether all robots are upright and sane."""
     upright = True

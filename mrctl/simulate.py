@@ -236,7 +236,8 @@ class Simulation:
         labels = [self._label] * len(self.scenarios)
         log = self.log[: self.tick] if self.running else self.log
         log[self.tick :] = np.nan
-        return result.dataset(self.scenarios, labels, log.transpose(1, 0, 2), self.plant.failure, self._failure_time, weights)
+        by_run = log.transpose(1, 0, 2)
+        return result.dataset(self.scenarios, labels, by_run, self.plant.failure, self._failure_time, weights)
 
     def _perturb(self, row: int, perturbation: Perturbation) -> None:
         p = perturbation

@@ -31,9 +31,10 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
     @njit((boolean, *[GIVEN] * 5, OWN, EACH, EACH, float64, float64[:, :, ::1], *[OWN] * 9), cache=True)
     def lead(  # noqa: ANN202
-        moves, pose, twist, reference, reference_twist, acceleration, kanayama_gains, limits, prefilter, period,
-        pid_gains, excess, error, request, correction, limiter, integrals, command, derivative, feedback,
-    ):  # fmt: skip  # noqa: ANN001
+        moves, pose, twist, reference, reference_twist, acceleration, kanayama_gains, limits,  # noqa: ANN001
+        prefilter, period, pid_gains, excess, error, request, correction, limiter, integrals,  # noqa: ANN001
+        command, derivative, feedback,  # noqa: ANN001
+    ):  # fmt: skip
         """Posture to commanded motion and feedback: motion controller (where it moves), limiter, PID."""
         _ = version
         wish = np.empty(2)
@@ -50,8 +51,9 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
     @njit((*[OWN] * 3, GIVEN, EACH, float64, EACH, *[OWN] * 4, EACH, EACH), cache=True)
     def follow(  # noqa: ANN202
-        command, derivative, feedback, feedforward, robot, period, frozen, fork, output, parts, excess, saturated, idle
-    ):  # noqa: ANN001
+        command, derivative, feedback, feedforward, robot, period, frozen,  # noqa: ANN001
+        fork, output, parts, excess, saturated, idle,  # noqa: ANN001
+    ):  # fmt: skip
         """Feedback and feedforward to voltages and steering; returns whether all of them are finite."""
         _ = version
         finite = True

@@ -1,0 +1,90 @@
+"""The benchmark measures what it says; how fast it is, is for a quiet machine to say.
+
+To repeat the figures of the README on yours, with nothing else running: `mrctl bench`, or `mrctl bench --json`.
+"""
+
+import json
+from unittest import mock
+
+import numpy as np
+import pytest
+
+from mrctl import cli
+from mrctl.experiments import bench
+
+
+@pytest.fixture(scope="module")
+def figures():
+    """Everything, in a form of a few seconds."""
+    return bench.run(sizes=(1, 3), repetitions=2, chunk=30)
+
+
+@pytest.mark.parametrize(("size", "threads"), [(1, 1), (3, 1), (5, 2)])
+def test_replay(size, threads):
+    """Limit and closed loop do the same work: the rollout of the recorded controls ends in the same bits."""
+    simulation = bench.build(size, 60, threads)
+    start = simulation.plant.qpos.copy()
+    for _ in range(2):
+        closed, limit, same = bench.turn(simulation, 30)
+        assert same
+        assert closed > 0 < limit
+    assert simulation.tick == bench.WARM + 60
+    assert (np.abs(simulation.plant.qpos[:, :2] - start[:, :2]).max(axis=1) > 0.05).all()  # they drive
+    assert (simulation.hierarchy.weight_norm > 0).all()  # and learn
+    assert not simulation.plant.failed.any()
+
+
+def test_replay_can_fail():
+    """Other controls come to other bits."""
+    simulation = bench.build(2, 30)
+    wrong = [bench.CONTROLS[1], bench.CONTROLS[0], *bench.CONTROLS[2:]]
+    with mock.patch.object(bench, "CONTROLS", wrong):
+        assert not bench.turn(simulation, 30)[2]
+
+
+def test_replay_leaves_no_trace():
+    """A run that was replayed in between goes on as one that was not."""
+    replayed, straight = bench.build(2, 40), bench.build(2, 40)
+    bench.turn(replayed, 20)
+    for _ in range(20):
+        replayed.step()
+    for _ in range(40):
+        straight.step()
+    assert replayed.log[: replayed.tick].tobytes() == straight.log[: straight.tick].tobytes()
+
+
+def test_figures(figures):
+    """Rates, ratios and memory belong together."""
+    assert [row["robots"] for row in figures["robots"]] == [1, 3]
+    assert figures["threads"][0]["threads"] == 1
+    for row in figures["robots"] + figures["threads"]:
+        assert row["replayed_exactly"]
+        assert row["ticks"] == bench.WARM + 2 * max(2, 30 // row["robots"])
+        assert row["real_time_factor"] == pytest.approx(row["steps_per_second"] * 0.002)
+        assert 0 < row["ratio"] < 1.5
+    assert figures["today"]["steps_per_second"] > 0
+
+
+def test_parts(figures):
+    """All components were measured; the physics is the largest."""
+    for parts in figures["parts"].values():
+        assert set(parts) == {*bench.PARTS, "the rest"}
+        assert all(value > 0 for value in parts.values())
+        assert max(parts, key=parts.__getitem__) == "physics"
+
+
+def test_autograd_loop_does_the_same_job():
+    """What we compare with is no straw man: it follows the lemniscate within centimetres."""
+    *_, last = (rmse for _, rmse in bench.autograd_loop(200, 5))
+    assert last < 0.02
+
+
+def test_command(figures, capsys):
+    """The command prints tables, or the figures as JSON."""
+    with mock.patch.object(bench, "run", lambda: figures):
+        assert cli.main(["bench", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == figures
+        assert cli.main(["bench"]) == 0
+    text = capsys.readouterr().out
+    assert f"| {figures['robots'][1]['ratio']:.3f} |" in text
+    assert "NO" not in text
