@@ -195,7 +195,6 @@ class Plant(ABC):
         truth: The robots as perturbed, for the oracle.
         reading: Readouts `(B, 11)`, current after `reset` and `step`; columns as named in this module.
         applied: Voltages at the terminals, left and right, `(B, 2)` in V.
-        current: Armature currents left and right at the end of the last control period, `(B, 2)` in A.
         failed: Which robots have stopped, `(B,)`.
         failure: Why, one string a robot.
         running: How many have not.
@@ -214,7 +213,7 @@ class Plant(ABC):
         self.robot: Robot = mjcf.read_robot(model)
         self.truth = [self.robot] * size
         self.reading = np.zeros((size, 11))
-        self.applied, self.current = np.zeros((size, 2)), np.zeros((size, 2))
+        self.applied, self._current = np.zeros((size, 2)), np.zeros((size, 2))
         self.failed = np.zeros(size, bool)
         self.failure = [""] * size
         self.running = size
@@ -323,10 +322,14 @@ class Plant(ABC):
             self.failed[robot], self.failure[robot] = True, reason
             self.running -= 1
 
+    def current(self) -> Array:
+        """Armature currents left and right at the end of the last control period in A, `(B, 2)`."""
+        return self._current
+
     def _look(self) -> bool:
         return _look(
             self.qpos, self.qvel, self.act, self._address, self._acts, self.applied, self._resistance,
-            self._back_emf, self.failed, self.reading, self.current,
+            self._back_emf, self.failed, self.reading, self._current,
         )  # fmt: skip
 
 

@@ -214,7 +214,7 @@ class Simulation:
         plant.step(output)
         near = _record(
             hierarchy.command, hierarchy.parts, output, hierarchy.saturated, hierarchy.weight_norm, plant.applied,
-            plant.current, plant.failed, log,
+            plant.current(), plant.failed, log,
         )  # fmt: skip
         if not near:
             for row in np.flatnonzero(np.abs(log[:, LATERAL_ERROR]) > DIVERGED):
