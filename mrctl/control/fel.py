@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numba import float64, guvectorize
+from numba import float64, guvectorize, njit
 from pydantic import Field
 
 from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features
@@ -32,7 +32,7 @@ class Fel(Record):
 
     hidden: Annotated[int, Field(ge=1, le=256)] = 24
     """Hidden tanh units."""
-    step: Annotated[float, Field(ge=0, le=1)] = 0.05
+    step: Annotated[float, Field(ge=0, le=1)] = 0.1
     """Normalised step μ: the share of the feedback voltage that one control period moves into the feedforward."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.03
     """Feedback below this teaches nothing, V (a tenth of it in rad/s on a steering channel)."""
@@ -150,16 +150,8 @@ def load_weights(path: str | Path, hidden: int) -> Array:
     return weights
 
 
-@guvectorize([(float64[:], float64[:], float64[:, :], float64[:])], "(f),(w),(t,u)->(u)", cache=True)
-def network(x, weights, targets, out):  # noqa: ANN001, ANN201
-    """Scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x) for one robot.
-
-    Args:
-        x: Scaled features `(8,)`.
-        weights: Flat weights, in the order of `shapes`.
-        targets: As from `Fel.targets`; the first row is the scale.
-        out: Out: feedforward of the two channels, `(2,)`.
-    """
+@njit(cache=True)
+def _forward(x, weights, targets, out):  # noqa: ANN001, ANN202
     n, m = x.shape[0], targets.shape[1]
     h = (weights.shape[0] - m * (n + 1)) // (n + 1 + m)
     b1, w2 = h * n, h * (n + 1)
@@ -180,13 +172,26 @@ def network(x, weights, targets, out):  # noqa: ANN001, ANN201
         out[k] *= targets[0, k]
 
 
+@guvectorize([(float64[:], float64[:], float64[:, :], float64[:])], "(f),(w),(t,u)->(u)", cache=True)
+def network(x, weights, targets, out):  # noqa: ANN001, ANN201
+    """Scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x) for one robot.
+
+    Args:
+        x: Scaled features `(8,)`.
+        weights: Flat weights, in the order of `shapes`.
+        targets: As from `Fel.targets`; the first row is the scale.
+        out: Out: feedforward of the two channels, `(2,)`.
+    """
+    _forward(x, weights, targets, out)
+
+
 @guvectorize(
-    [(float64[:], float64[:], float64, float64[:, :], float64[:], float64[:], float64[:], float64[:])],
-    "(f),(u),(),(t,u),(s),(w),(w),()",
-    writable_args=("weights", "norm"),
+    [(float64[:], float64[:], float64, float64[:, :], float64[:], float64[:], float64[:], float64[:], float64[:])],
+    "(f),(u),(),(t,u),(s),(w),(w),(),(u)",
+    writable_args=("weights", "norm", "output"),
     cache=True,
 )
-def update(x, feedback, saturated, targets, steps, prior, weights, norm):  # noqa: ANN001, ANN201
+def update(x, feedback, saturated, targets, steps, prior, weights, norm, output):  # noqa: ANN001, ANN201
     """One normalised step of feedback-error learning for one robot, with its safeguards.
 
     ΔW = μ Jᵀe / (‖Jᵀe‖²/‖e‖² + ε), e the scaled feedback and J = ∂f/∂W: with one output this is normalised LMS, and the
@@ -201,6 +206,7 @@ def update(x, feedback, saturated, targets, steps, prior, weights, norm):  # noq
         prior: Weights that the leak and the projection refer to.
         weights: In and out.
         norm: Out: Euclidean distance of the weights from the prior.
+        output: In and out: feedforward at these features, `(2,)`.
     """
     step, leak, bound = steps[0], steps[1], steps[2]
     if saturated > 0 or step == 0:
@@ -248,6 +254,7 @@ def update(x, feedback, saturated, targets, steps, prior, weights, norm):  # noq
         for w in range(weights.shape[0]):
             weights[w] = prior[w] + (weights[w] - prior[w]) * bound / distance
     norm[0] = min(distance, bound)
+    _forward(x, weights, targets, output)
 
 
 class FeedbackErrorLearning:
@@ -285,9 +292,11 @@ class FeedbackErrorLearning:
         network(self._features, self.state["weights"], self._targets, self._output)
         return self._output
 
-    def learn(self, feedback: Array, saturated: Array) -> None:
-        """One step on the features of the last output."""
+    def learn(self, feedback: Array, saturated: Array) -> Array:
+        """One step on the features of the last output; returns what it added to that output."""
+        before = self._output.copy()
         update(
             self._features, feedback, saturated, self._targets, self._steps, self.prior, self.state["weights"],
-            self.weight_norm,
+            self.weight_norm, self._output,
         )  # fmt: skip
+        return self._output - before

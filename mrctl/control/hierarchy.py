@@ -34,6 +34,12 @@ def feedforward_of(scenarios: Sequence[Scenario], robot: Robot) -> Feedforward:
     return FeedbackErrorLearning(robot, [s.fel for s in scenarios], [s.seed for s in scenarios], rigid)
 
 
+# Share of what learning adds to the feedforward that the PID's integral gives up at once. With none, both hold the same
+# voltage until the error has unwound the integral: the first lap overshoots, and the loop has one fast integrator too
+# many. With all of it, learning has no integral action of its own, and tracks the position less well.
+TAKE_OVER = 0.5
+
+
 class Hierarchy:
     """Both controllers for B robots that share steering arrangement and rates.
 
@@ -133,7 +139,9 @@ class Hierarchy:
             state["steering"], self.output, self.parts, self._excess, self.saturated,
         )  # fmt: skip
         # A robot that must not learn is treated as one whose voltage did not act.
-        self.feedforward.learn(self.feedback, np.maximum(self.saturated, self._frozen))
+        taken = self.feedforward.learn(self.feedback, np.maximum(self.saturated, self._frozen))
+        if taken is not None:
+            state["pid"][:, :2] -= TAKE_OVER * taken
         return self.output
 
     @property
