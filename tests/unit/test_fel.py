@@ -189,7 +189,8 @@ def test_projection(inputs, bound, rate):
     prior = trained()
     weights, norm = prior.copy(), np.zeros(1)
     for x in inputs:
-        update(x, np.array([50.0, -80.0]), 0.0, TARGETS, np.array([rate, 0.0, bound]), prior, weights, norm, np.zeros(2))
+        steps, output = np.array([rate, 0.0, bound]), np.zeros(2)
+        update(x, np.array([50.0, -80.0]), 0.0, TARGETS, steps, prior, weights, norm, output)
         distance = np.linalg.norm(weights - prior)
         assert distance <= bound * (1 + 1e-12)
         assert norm[0] == pytest.approx(distance, rel=1e-9, abs=1e-12)
