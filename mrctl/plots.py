@@ -190,13 +190,18 @@ def voltages(result: xr.Dataset, window: tuple[float, float] | None = None, lap:
     count = len(curves)
     width = COLUMN if count == 1 else max(PAGE, 60 / 25.4 * count)
     figure, axes = _figure(width, 0.95 * COLUMN, rows=2, columns=count, sharey=True)
-    parts = (("feedback", 1), ("feedforward", 2), ("voltage", 0))
+    # The total lies wide and pale under whichever part makes it up.
+    parts = (
+        ("voltage", {"color": "0.75", "lw": 3.0}),
+        ("feedback", {"color": COLOURS[1]}),
+        ("feedforward", {"color": COLOURS[2]}),
+    )
     for column, (data, label, _) in enumerate(curves):
         for row, wheel in enumerate(("left", "right")):
             one = axes[row * count + column]
-            for name, colour in parts:
+            for name, style in parts:
                 signal = data[f"{name}_{wheel}"].values
-                one.plot(data["time"].values, signal, color=COLOURS[colour])
+                one.plot(data["time"].values, signal, **style)
                 _cross(one, data, data["time"].values, signal)
             if column == 0:
                 one.set_ylabel(f"$U_{wheel[0]}$ (V)")
@@ -204,8 +209,8 @@ def voltages(result: xr.Dataset, window: tuple[float, float] | None = None, lap:
                 one.set_title(label)
             if row == 1:
                 one.set_xlabel("time (s)")
-    handles = [Line2D([], [], color=COLOURS[colour]) for _, colour in parts]
-    figure.legend(handles, ["feedback", "feedforward", "total"], loc="outside upper center", ncols=3)
+    handles = [Line2D([], [], **style) for _, style in parts]
+    figure.legend(handles, ["total", "feedback", "feedforward"], loc="outside upper center", ncols=3)
     return figure
 
 

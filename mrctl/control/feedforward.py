@@ -36,12 +36,15 @@ class Feedforward(Protocol):
         """
         ...
 
-    def learn(self, feedback: Array, saturated: Array) -> None:
+    def learn(self, feedback: Array, saturated: Array) -> Array | None:
         """Learns from what the feedback still had to do after the last `output`.
 
         Args:
             feedback: Feedback of the two channels `(B, 2)`, units as `output`.
             saturated: 1 where a limit acted, `(B,)`.
+
+        Returns:
+            How much this added to the output for the same command, `(B, 2)`, so that the PID can hand it over; or None.
         """
         ...
 

@@ -34,7 +34,7 @@ class Fel(Record):
 
     hidden: Annotated[int, Field(ge=1, le=256)] = 24
     """Hidden tanh units."""
-    step: Annotated[float, Field(ge=0, le=1)] = 0.05
+    step: Annotated[float, Field(ge=0, le=1)] = 0.1
     """Normalised step μ: the share of the feedback voltage that one control period moves into the feedforward."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.03
     """Feedback below this teaches nothing, V (a tenth of it in rad/s on a steering channel)."""
@@ -203,7 +203,9 @@ def network(x, weights, targets, out):  # noqa: ANN001, ANN201
 
 
 @njit
-def _update(x, hidden, feedback, saturated, targets, steps, prior, error, gradient, weights, norm):  # noqa: ANN001, ANN202
+def _update(  # noqa: ANN202
+    x, hidden, feedback, saturated, targets, steps, prior, error, gradient, weights, norm, output  # noqa: ANN001
+):  # fmt: skip
     step, leak, bound = steps[0], steps[1], steps[2]
     if saturated > 0 or step == 0:
         return
@@ -242,15 +244,17 @@ def _update(x, hidden, feedback, saturated, targets, steps, prior, error, gradie
         for w in range(weights.shape[0]):
             weights[w] = prior[w] + (weights[w] - prior[w]) * bound / distance
     norm[0] = min(distance, bound)
+    _activate(x, weights, m, hidden)
+    _network(x, hidden, weights, targets, output)
 
 
 @guvectorize(
-    [(float64[:], float64[:], float64, float64[:, :], float64[:], float64[:], float64[:], float64[:])],
-    "(f),(u),(),(t,u),(s),(w),(w),()",
-    writable_args=("weights", "norm"),
+    [(float64[:], float64[:], float64, float64[:, :], float64[:], float64[:], float64[:], float64[:], float64[:])],
+    "(f),(u),(),(t,u),(s),(w),(w),(),(u)",
+    writable_args=("weights", "norm", "output"),
     cache=True,
 )
-def update(x, feedback, saturated, targets, steps, prior, weights, norm):  # noqa: ANN001, ANN201
+def update(x, feedback, saturated, targets, steps, prior, weights, norm, output):  # noqa: ANN001, ANN201
     """One normalised step of feedback-error learning for one robot, with its safeguards.
 
     ΔW = μ Jᵀe / (‖Jᵀe‖²/‖e‖² + ε), e the scaled feedback and J = ∂f/∂W: with one output this is normalised LMS, and the
@@ -265,11 +269,13 @@ def update(x, feedback, saturated, targets, steps, prior, weights, norm):  # noq
         prior: Weights that the leak and the projection refer to.
         weights: In and out.
         norm: Out: Euclidean distance of the weights from the prior.
+        output: In and out: feedforward at these features, `(2,)`.
     """
     m, size = targets.shape[1], weights.shape[0]
     hidden = np.empty(size)
     _activate(x, weights, m, hidden)
-    _update(x, hidden, feedback, saturated, targets, steps, prior, np.empty(m), np.empty(size), weights, norm)
+    error, gradient = np.empty(m), np.empty(size)
+    _update(x, hidden, feedback, saturated, targets, steps, prior, error, gradient, weights, norm, output)
 
 
 _features = one(features)
@@ -287,14 +293,19 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
             _activate(x[i], weights[i], out.shape[1], hidden[i])
             _network(x[i], hidden[i], weights[i], targets[i], out[i])
 
-    @njit((OWN, OWN, GIVEN, EACH, _TARGETS, *[OWN] * 3, EACH), cache=True)
-    def teach(x, hidden, feedback, saturated, targets, steps, prior, weights, norm):  # noqa: ANN001, ANN202
+    @njit((OWN, OWN, GIVEN, EACH, _TARGETS, *[OWN] * 3, EACH, OWN, OWN), cache=True)
+    def teach(  # noqa: ANN202
+        x, hidden, feedback, saturated, targets, steps, prior, weights, norm, output, added  # noqa: ANN001
+    ):  # fmt: skip
         error, gradient = np.empty(targets.shape[2]), np.empty(weights.shape[1])
         for i in range(len(x)):
+            added[i] = output[i]
             _update(
                 x[i], hidden[i], feedback[i], saturated[i], targets[i], steps[i], prior[i],
-                error, gradient, weights[i], norm[i : i + 1],
+                error, gradient, weights[i], norm[i : i + 1], output[i],
             )  # fmt: skip
+            for k in range(added.shape[1]):
+                added[i, k] = output[i, k] - added[i, k]
 
     return respond, teach
 
@@ -322,7 +333,7 @@ class FeedbackErrorLearning:
         self._targets = np.array([s.targets(rigid) for s in settings])
         self._steps = np.array([s.steps() for s in settings])
         self._features, self._output = np.zeros((len(settings), INPUTS)), np.zeros((len(settings), OUTPUTS))
-        self._hidden = np.zeros((len(settings), settings[0].hidden))
+        self._hidden, self._added = np.zeros((len(settings), settings[0].hidden)), np.zeros((len(settings), OUTPUTS))
         self.prior = np.array(
             [
                 load_weights(s.weights, s.hidden) if s.weights else initial_weights(s.hidden, seed)
@@ -340,9 +351,10 @@ class FeedbackErrorLearning:
         )  # fmt: skip
         return self._output
 
-    def learn(self, feedback: Array, saturated: Array) -> None:
-        """One step on the features of the last output."""
+    def learn(self, feedback: Array, saturated: Array) -> Array:
+        """One step on the features of the last output; returns what it added to that output."""
         _teach(
             self._features, self._hidden, feedback, saturated, self._targets, self._steps, self.prior,
-            self.state["weights"], self.weight_norm,
+            self.state["weights"], self.weight_norm, self._output, self._added,
         )  # fmt: skip
+        return self._added

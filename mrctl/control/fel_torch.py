@@ -88,14 +88,14 @@ class ModuleLearning:
         with torch.no_grad():
             return (self._targets[0] * (self._forward(self.state) - self._forward(self.prior))).numpy()
 
-    def learn(self, feedback: Array, saturated: Array) -> None:
+    def learn(self, feedback: Array, saturated: Array) -> Array:
         """One normalised step, by a vector-Jacobian product; see `fel.update`."""
         scale, dead_zone, share = self._targets
         fb = torch.from_numpy(np.array(feedback))
         error = torch.where(fb.abs() > dead_zone, share * fb / scale, 0.0)
         power = (error**2).sum(1)
         active = (power > 0) & (torch.from_numpy(np.array(saturated)) == 0) & bool(self._step > 0)
-        pull = vjp(self._forward, self.state)[1]
+        before, pull = vjp(self._forward, self.state)[:2]
         (gradient,) = pull(error)
         square = _square(gradient)
         rate = torch.where(active, self._step / (square / power.clamp_min(1e-300) + REGULARISATION), 0.0)
@@ -110,6 +110,8 @@ class ModuleLearning:
             self.state[name] = self.prior[name] + (value - self.prior[name]) * _like(shrink, value)
         norm = torch.where(active, distance.clamp_max(self._bound), torch.from_numpy(self.weight_norm))
         self.weight_norm = norm.numpy()
+        with torch.no_grad():
+            return (scale * (self._forward(self.state) - before)).numpy()
 
 
 def _square(layers: dict[str, torch.Tensor]) -> torch.Tensor:

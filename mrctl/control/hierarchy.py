@@ -86,6 +86,19 @@ def feedforward_of(scenarios: Sequence[Scenario], robot: Robot) -> Feedforward:
     return FeedbackErrorLearning(robot, [s.fel for s in scenarios], [s.seed for s in scenarios], rigid)
 
 
+# Share of what learning adds to the feedforward that the PID's integral gives up at once. With none, both hold the same
+# voltage until the error has unwound the integral: the first lap overshoots, and the loop has one fast integrator too
+# many. With all of it, learning has no integral action of its own, and tracks the position less well.
+TAKE_OVER = 0.5
+
+
+@njit((GIVEN, OWN), cache=True)
+def _hand_over(taken, integrals):  # noqa: ANN001, ANN202
+    for i in range(len(integrals)):
+        for k in range(2):
+            integrals[i, k] -= TAKE_OVER * taken[i, k]
+
+
 class Hierarchy:
     """Both controllers for B robots that share steering arrangement and rates.
 
@@ -184,7 +197,9 @@ class Hierarchy:
             state["steering"], self.output, self.parts, self._excess, self.saturated, self._idle,
         )  # fmt: skip
         # A robot that must not learn is treated as one whose voltage did not act.
-        self.feedforward.learn(self.feedback, self._idle)
+        taken = self.feedforward.learn(self.feedback, self._idle)
+        if taken is not None:
+            _hand_over(taken, state["pid"])
         return self.output
 
     @property

@@ -102,10 +102,13 @@ class RecursiveLeastSquares:
         linear(self._features, self.state["coefficients"], self._output)
         return self._output
 
-    def learn(self, feedback: Array, saturated: Array) -> None:
-        """One recursive step."""
+    def learn(self, feedback: Array, saturated: Array) -> Array:
+        """One recursive step; returns what it added to the last output."""
         state = self.state
         update(
             self._features, feedback, saturated, self._settings, state["coefficients"], state["covariance"],
             self.weight_norm,
         )  # fmt: skip
+        before = self._output.copy()
+        linear(self._features, state["coefficients"], self._output)
+        return self._output - before

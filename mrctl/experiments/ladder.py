@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -64,8 +65,10 @@ def compare(runs: pd.DataFrame) -> pd.DataFrame:
     """
     keys = ["steering", "perturbation", "feedforward"]
     groups = {tuple(key): own for key, own in runs.groupby(keys, sort=False)}  # type: ignore[arg-type]
+    names = [list(dict.fromkeys(runs[key])) for key in keys]
     rows = []
-    for (steering, case, feedforward), own in groups.items():
+    for steering, case, feedforward in product(*names):
+        own = groups[steering, case, feedforward]
         row: dict[str, object] = dict(zip(keys, (steering, case, feedforward), strict=True))
         row |= {"runs": len(own), "failed": int(np.sum(own["failed"]))}
         bare = groups.get((steering, case, "none"))

@@ -51,7 +51,7 @@ def step(x, feedback, weights, targets=TARGETS, steps=(0.05, 0.0, 1e4), saturate
     """Weights and norm after one step of one robot."""
     after, norm = weights.copy(), np.zeros(1)
     prior = weights if prior is None else prior
-    update(x, np.asarray(feedback, float), saturated, targets, np.array(steps), prior, after, norm)
+    update(x, np.asarray(feedback, float), saturated, targets, np.array(steps), prior, after, norm, np.zeros(2))
     return after, norm[0]
 
 
@@ -114,8 +114,9 @@ def test_normalised_step(robot, rigid, feedback):
     stage, command, derivative = taught(robot, Fel(hidden=HIDDEN, step=0.05, leak=0.0), rigid)
     assert not stage.output(command, derivative).any()
     size = power(stage)
-    stage.learn(np.array([feedback]), np.zeros(1))
+    taken = stage.learn(np.array([feedback]), np.zeros(1))
     moved = stage.output(command, derivative)[0]
+    np.testing.assert_allclose(taken[0], moved, atol=1e-14)  # what it says it added is what it added
     share = [1, 0.1 if rigid else 1]
     expected = 0.05 * np.multiply(share, feedback) * size / (size + REGULARISATION)
     np.testing.assert_allclose(moved, expected, atol=1e-12)
@@ -188,7 +189,8 @@ def test_projection(inputs, bound, rate):
     prior = trained()
     weights, norm = prior.copy(), np.zeros(1)
     for x in inputs:
-        update(x, np.array([50.0, -80.0]), 0.0, TARGETS, np.array([rate, 0.0, bound]), prior, weights, norm)
+        steps, output = np.array([rate, 0.0, bound]), np.zeros(2)
+        update(x, np.array([50.0, -80.0]), 0.0, TARGETS, steps, prior, weights, norm, output)
         distance = np.linalg.norm(weights - prior)
         assert distance <= bound * (1 + 1e-12)
         assert norm[0] == pytest.approx(distance, rel=1e-9, abs=1e-12)
@@ -214,8 +216,9 @@ def test_rows(x, feedback, data):
     def answer(rows, lost=()):
         inputs, weights, norm = x[rows].copy(), prior[rows] + 0.01, np.zeros(len(x[rows]))
         inputs[list(lost)] = np.nan
-        update(inputs, feedback[rows], saturated[rows], TARGETS, steps, prior[rows], weights, norm)
-        return np.hstack([weights, norm[:, None], network(inputs, weights, TARGETS)])
+        output = network(inputs, weights, TARGETS)
+        update(inputs, feedback[rows], saturated[rows], TARGETS, steps, prior[rows], weights, norm, output)
+        return np.hstack([weights, norm[:, None], output])
 
     together = answer(slice(None), lost=[2])
     for i in (0, 1, 3):

@@ -48,8 +48,8 @@ def test_twins(robot, settings, rigid, ticks):
         np.testing.assert_allclose(found, expected, atol=1e-12)
         feedback = rng.normal(size=(SIZE, 2)) * [1.5, 0.15 if rigid else 1.5] - expected / 3
         saturated = (rng.random(SIZE) < 0.2).astype(float)
-        for stage in (general, compiled):
-            stage.learn(feedback, saturated)
+        added = [stage.learn(feedback, saturated) for stage in (general, compiled)]
+        np.testing.assert_allclose(*added, atol=1e-12)
         np.testing.assert_allclose(rows(general.state), compiled.state["weights"], atol=1e-12)
         np.testing.assert_allclose(general.weight_norm, compiled.weight_norm, atol=1e-12)
         largest = max(largest, compiled.weight_norm.max())

@@ -5,7 +5,7 @@ import pytest
 
 from mrctl.control.feedforward import InverseDynamics, NoFeedforward
 from mrctl.control.fel import FeedbackErrorLearning, Fel
-from mrctl.control.hierarchy import Hierarchy, feedforward_of
+from mrctl.control.hierarchy import TAKE_OVER, Hierarchy, feedforward_of
 from mrctl.control.kanayama import Kanayama, kanayama
 from mrctl.control.pid import Pid
 from mrctl.control.rls import RecursiveLeastSquares
@@ -182,7 +182,7 @@ def test_switching_one_robot(robot):
 
 @pytest.mark.parametrize("name", FEEDFORWARDS)
 def test_rolling_start(robot, name):
-    """Reset to a motion that goes on, the first command is that motion and the voltage about its back-EMF."""
+    """Reset to a motion that goes on, the first command is that motion and the voltage what the model takes for it."""
     twist, acceleration = np.array([[0.8, 0.5]]), np.array([[0.2, -0.3]])
     hierarchy = build(robot, feedforward=name)
     hierarchy.reset(twist, acceleration, np.array([0.2]))
@@ -191,7 +191,24 @@ def test_rolling_start(robot, name):
     np.testing.assert_allclose(hierarchy.command, twist, atol=1e-12)
     np.testing.assert_allclose(hierarchy.derivative, acceleration, atol=1e-12)
     steady = inverse_dynamics(twist, acceleration, robot, sign_speed=0.05)
-    np.testing.assert_allclose(output[:, :2], steady, atol=2.0)
+    np.testing.assert_allclose(output[:, :2], steady, atol=1e-9)
+
+
+def test_take_over(robot):
+    """What learning adds to the feedforward, the integral gives up in part; a stage that does not say is left alone."""
+
+    class Learner(NoFeedforward):
+        taken = np.array([[0.6, -0.2]])
+
+        def learn(self, feedback, saturated):
+            return self.taken
+
+    integrals = []
+    for stage in (Learner(1), NoFeedforward(1)):
+        hierarchy = Hierarchy([Scenario(feedforward="none")], robot, stage)
+        hierarchy.update(np.zeros((1, 3)), np.zeros((1, 2)), np.zeros((1, 3)), np.ones((1, 2)), np.zeros((1, 2)))
+        integrals.append(hierarchy.state["pid"][:, :2].copy())
+    np.testing.assert_allclose(integrals[1] - integrals[0], TAKE_OVER * Learner.taken, atol=1e-14)
 
 
 def test_lag_of_the_fork(robot):

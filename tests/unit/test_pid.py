@@ -38,10 +38,11 @@ def plants(robot):
 def test_published_gains(robot):
     """The IMC gains of the default robot are the documented ones (to the digits given), and those of its numbers."""
     found = np.array(imc(robot, CLOSED))
-    assert (np.abs(found - [[15.9, 68], [3.4, 12.9]]) < [[0.1, 0.5], [0.05, 0.05]]).all()
+    # M_e is published without the front wheel, 0.8 %.
+    assert (np.abs(found - [[15.9, 68], [3.4, 12.9]]) < [[0.15, 0.5], [0.05, 0.05]]).all()
     # K_i = N k_M/(r λ) and K_p = M_e r R_a/(2 N k_M λ); about the yaw axis D K_i and J_e in place of M_e D.
     emf, drive = 43 * 0.0234, 3.4e-3 + 43**2 * 1.03e-6
-    m_e = 20 + 2 * drive / 0.098**2 + 5e-4 / 0.075**2
+    m_e = 20 + 2 * drive / 0.098**2 + 1e-3 / 0.075**2
     j_e = 0.6 + 20 * 0.1**2 + 2 * 0.188**2 * drive / 0.098**2
     half = 0.098 * 2.32 / (2 * emf * CLOSED)
     integral = emf / 0.098 / CLOSED
