@@ -296,6 +296,8 @@ class Plant(ABC):
         Args:
             command: Commanded voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
         """
+        if command.shape != (self.size, 4):
+            raise ValueError(f"command: shape {command.shape}, expected {(self.size, 4)}")
         if not _drive(
             command, self._tick, self._queue, self._delay, self._drive_gain, self._inputs, self.failed,
             self.applied, self.ctrl,

@@ -99,6 +99,12 @@ def _hand_over(taken, integrals):  # noqa: ANN001, ANN202
             integrals[i, k] -= TAKE_OVER * taken[i, k]
 
 
+def _rows(values: Array, like: Array) -> Array:
+    """What somebody's own stage returned, in the shape and type that compiled loops rely on."""
+    fits = isinstance(values, np.ndarray) and values.shape == like.shape and values.dtype == like.dtype
+    return values if fits else np.broadcast_to(np.asarray(values, float), like.shape)
+
+
 class Hierarchy:
     """Both controllers for B robots that share steering arrangement and rates.
 
@@ -191,7 +197,7 @@ class Hierarchy:
             self._correction, state["limiter"], state["pid"], self.command, self.derivative, self.feedback,
         )  # fmt: skip
         self._tick += 1
-        feedforward = self.feedforward.output(self.command, self.derivative)
+        feedforward = _rows(self.feedforward.output(self.command, self.derivative), self.feedback)
         self.finite = _follow(
             self.command, self.derivative, self.feedback, feedforward, self._parameters, self._period, self._frozen,
             state["steering"], self.output, self.parts, self._excess, self.saturated, self._idle,
@@ -199,7 +205,7 @@ class Hierarchy:
         # A robot that must not learn is treated as one whose voltage did not act.
         taken = self.feedforward.learn(self.feedback, self._idle)
         if taken is not None:
-            _hand_over(taken, state["pid"])
+            _hand_over(_rows(taken, self.feedback), state["pid"])
         return self.output
 
     @property
