@@ -34,8 +34,8 @@ from mrctl.simulate import Simulation
 loop = import_module("mrctl.simulate")  # `mrctl.simulate` itself is the function of that name
 
 SIZES = (1, 16, 64, 256, 1024)
-REPETITIONS = 11
-CHUNK = 5000  # control periods of one repetition, summed over the robots: a fifth of a second
+REPETITIONS = 41  # many short turns: neighbours share what else the machine does
+CHUNK = 1500  # control periods of one turn, summed over the robots: a twentieth of a second
 WARM = 20  # control periods before the clock starts
 CONTROLS = [list(SIGNALS).index(n) for n in ("voltage_left", "voltage_right", "steering_command")]
 CONTROLS.append(list(SIGNALS).index("steering_rate_command"))
@@ -75,7 +75,7 @@ def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int
         "machine": {"processor": _processor(), "cores": os.cpu_count(), **versions()},
         "robots": rows,
         "threads": [_compare(middle, count, repetitions, chunk) for count in threads],
-        "parts": {str(size): _parts(size, chunk) for size in (sizes[0], sizes[-1])},
+        "parts": {str(size): _parts(size, 10 * chunk) for size in (sizes[0], sizes[-1])},
         "today": _today(repetitions, chunk),
     }
 
@@ -192,7 +192,7 @@ def _compare(size: int, threads: int, repetitions: int, chunk: int) -> dict[str,
 
 def _today(repetitions: int, chunk: int) -> dict[str, float]:
     """The closed loop with one robot and the autograd loop, taking turns."""
-    ticks = max(chunk // 20, 20)
+    ticks = max(chunk // 15, 20)
     simulation = build(1, ticks * repetitions)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # faster for a network this small
