@@ -12,7 +12,7 @@ PACKAGE = Path(mrctl.__file__).parent
 # From the bottom up: a module imports from its own layer and from those above it in this list. `laws` stands for
 # everything in `control` but the wiring.
 LAYERS = (
-    {"record", "angles", "robot", "kinematics", "dynamics"},
+    {"record", "robot", "kinematics", "dynamics"},
     {"laws", "references"},
     {"scenario"},
     {"control.hierarchy", "measurement", "metrics", "plots", "result"},
