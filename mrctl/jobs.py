@@ -142,7 +142,8 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
         "size": sweep.size,
         "chunk": sweep.chunk_size,
         "samples": sweep.samples,
-        "period": sweep.base.control_period * sweep.stride,
+        "stride": sweep.stride,
+        "control_period": sweep.base.control_period,
     }
 
 
@@ -277,6 +278,6 @@ def repeat(out: str | Path, run: int) -> Repeat:
         return Repeat(f"within tolerance ({TOLERANCE:g} of each signal's and metric's size)", True)
     name = min((name for name in off if off[name].any()), key=lambda name: (len(off[name]) == 1, off[name].argmax()))
     place = int(off[name].argmax())
-    when = f" at t = {place * store.manifest['period']:g} s" if name.startswith("signal") else ""
+    when = f" at t = {store.times[place]:g} s" if name.startswith("signal") else ""
     new, old = (float(one[place]) for one in pairs[name])
     return Repeat(f"departs: {name} is {new!r}{when}, in the store {old!r}", False)

@@ -48,8 +48,8 @@ class Store:
 
     Attributes:
         path: The folder.
-        manifest: What `sweep.json` holds: `sweep`, `versions`, `models`, `size`, `chunk`, `samples`, `period` (s
-            between samples).
+        manifest: What `sweep.json` holds: `sweep`, `versions`, `models`, `size`, `chunk`, `samples`,
+            `stride` (control periods between samples), `control_period`.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -136,6 +136,11 @@ class Store:
     def samples(self) -> int:
         """Samples of each signal a run."""
         return self.manifest["samples"]
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Times of the samples in s."""
+        return self.manifest["control_period"] * (self.manifest["stride"] * np.arange(self.samples))
 
     @property
     def jobs(self) -> int:
@@ -251,15 +256,15 @@ class Store:
         coords = columns(["run", *axes, "label", "feedforward", "steering", "seed", "lap_time"])
         outcome = columns(["failed", "failure", "failure_time"])
         attrs = {name: json.dumps(self.manifest[name]) for name in ("sweep", "versions")}
-        attrs |= {"control_period": self.manifest["period"], "unfinished": self.size - len(frame)}
+        period = self.manifest["control_period"] * self.manifest["stride"]
+        attrs |= {"control_period": period, "unfinished": self.size - len(frame)}
         if not self.samples:
             return xr.Dataset(outcome | columns(METRICS), coords, attrs)
         whole = xr.open_zarr(self.path / "signals.zarr", chunks=None, consolidated=False)["signals"]
         signals = whole.isel(run=frame["run"].to_numpy()).assign_coords(signal=list(SIGNALS)).to_dataset("signal")
         for name, (unit, meaning) in SIGNALS.items():
             signals[name].attrs = {"units": unit, "long_name": meaning}
-        time = self.manifest["period"] * np.arange(self.samples)
-        coords["time"] = ("time", time, {"units": "s"})
+        coords["time"] = ("time", self.times, {"units": "s"})
         return signals.assign(outcome).assign_coords(coords).assign_attrs(attrs)
 
 

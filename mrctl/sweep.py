@@ -237,6 +237,8 @@ class Sweep(Record):
         data = copy.deepcopy(self._plain)
         for field, value in values.items():
             _put(data, field, value)
+            if isinstance(value, dict):  # a table, completed so that later axes find its fields
+                data = Scenario.from_dict(data, source).model_dump(mode="json")
         return Scenario.from_dict(data, source)
 
     @cached_property
