@@ -8,8 +8,10 @@ import os
 import signal
 import threading
 from collections.abc import Callable
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple, Protocol
 
 from mrctl.record import InputError
@@ -155,6 +157,8 @@ class Cluster:
             raise InputError("scheduler: needs Dask: pip install 'mrctl[dask]'") from None
         self._distributed, self._work, self._path, self._address = distributed, work, path, address
         self._jobs: dict[Any, int] = {}
+        self._ended: SimpleQueue[Any] = SimpleQueue()
+        self._thread = ThreadPoolExecutor(1)
         try:
             self._client = distributed.Client(address, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -165,44 +169,50 @@ class Cluster:
             self.close()
             raise InputError(f"scheduler: {address}: has no workers") from None
 
+    def _call(self, function: Callable[..., Any], *args: object) -> Any:  # noqa: ANN401
+        """Asks the cluster from another thread, for Dask takes an interruption of its own waiting badly.
+
+        Raises:
+            InputError: The scheduler is gone.
+        """
+        try:
+            return self._thread.submit(function, *args).result()
+        except (OSError, CancelledError):
+            raise InputError(f"scheduler: {self._address}: the connection is lost; what was done is kept") from None
+
     def room(self) -> int:
         """The threads of all workers there are now."""
-        threads: Any = self._client.nthreads()
-        return max(1, sum(threads.values()))
+        return max(1, sum(self._call(self._client.nthreads).values()))
 
     def submit(self, job: int) -> None:
         """Hands a job to the scheduler, which gives it to another worker when one dies."""
         future = self._client.submit(self._work, self._path, job, pure=False)
         self._jobs[future] = job
+        future.add_done_callback(self._ended.put)
 
     def wait(self) -> list[Outcome]:
-        """Waits for a future.
-
-        Raises:
-            InputError: The scheduler is gone.
-        """
+        """Waits for a future."""
         while True:
-            with contextlib.suppress(TimeoutError):
-                done = self._distributed.wait(list(self._jobs), timeout=5, return_when="FIRST_COMPLETED").done
-                return [self._outcome(future, self._jobs.pop(future)) for future in done]
-            if self._client.status != "running":
-                raise InputError(f"scheduler: {self._address}: the connection is lost; what was done is kept")
+            with contextlib.suppress(Empty):
+                future = self._ended.get(timeout=5)
+                return [self._call(self._outcome, future, self._jobs.pop(future))]
+            self.room()  # there is still somebody
 
     def _outcome(self, future: Any, job: int) -> Outcome:  # noqa: ANN401
-        if future.status == "finished":
-            return future.result()
-        if future.status != "error":
-            raise InputError(f"scheduler: {self._address}: dropped job {job}; what was done is kept")
+        if future.status == "cancelled":
+            raise CancelledError
         error = future.exception()
+        if error is None:
+            return future.result()
         if isinstance(error, self._distributed.KilledWorker):
             return Outcome(job, error="its worker died, again and again")
-        return Outcome(job, error=f"{type(error).__name__}: {error}")
+        return Outcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))
 
     def close(self) -> None:
         """Gives up what is under way and disconnects; the cluster lives on."""
-        for future in self._jobs:
-            with contextlib.suppress(Exception):
-                future.cancel(force=True)
-        self._jobs = {}
+        jobs, self._jobs = list(self._jobs), {}
+        with contextlib.suppress(Exception):
+            self._client.cancel(jobs, force=True)
         with contextlib.suppress(Exception):
             self._client.close()
+        self._thread.shutdown(wait=False)
