@@ -126,32 +126,48 @@ def test_distributions(kind, parameters, expected):
 # --- what is refused ------------------------------------------------------------------------------
 
 
+def axis(field, **kind):
+    return {"field": field, **kind}
+
+
+def grid(start, stop, count):
+    return {"start": start, "stop": stop, "count": count}
+
+
 @pytest.mark.parametrize(
     ("message", "axes", "changes"),
     [
-        ("perturbation.mas: no 'mas' in perturbation, which has mass_factor", [{"field": "perturbation.mas", "values": [1]}], {}),
-        ("events.0.time: no '0' in events", [{"field": "events.0.time", "values": [1]}], {}),
-        ("laps.x: no 'x' in laps", [{"field": "laps.x", "values": [1]}], {}),
-        ("perturbation.mass_factor: .* greater than", [{"field": MASS["field"], "uniform": [0, 1]}], {}),
-        ("perturbation.mass_factor: .* less than", [{"field": MASS["field"], "grid": {"start": 1, "stop": 99, "count": 3}}], {}),
-        ("feedforward: Input should be 'none', 'model'", [{"field": "feedforward", "values": ["none", "magic"]}], {}),
-        ("run 0: perturbation.control_delay: .* whole multiple", [{"field": "perturbation.control_delay", "uniform": [0.02, 0.04]}], {}),
+        ("perturbation.mas: no 'mas' in perturbation, which has mass", [axis("perturbation.mas", values=[1])], {}),
+        ("events.0.time: no '0' in events", [axis("events.0.time", values=[1])], {}),
+        ("laps.x: no 'x' in laps", [axis("laps.x", values=[1])], {}),
+        ("perturbation.mass_factor: .* greater than", [axis(MASS["field"], uniform=[0, 1])], {}),
+        ("perturbation.mass_factor: .* less than", [axis(MASS["field"], grid=grid(1, 99, 3))], {}),
+        ("feedforward: Input should be 'none', 'model'", [axis("feedforward", values=["none", "magic"])], {}),
+        (
+            "run 0: perturbation.control_delay: .* whole multiple",
+            [axis("perturbation.control_delay", uniform=[0.02, 0.04])],
+            {},
+        ),
         ("needs exactly one of values, grid, uniform", [{**MASS, "values": [1]}], {}),
-        ("needs exactly one of values, grid, uniform", [{"field": "laps"}], {}),
-        ("1.5 is not below 0.8", [{"field": MASS["field"], "uniform": [1.5, 0.8]}], {}),
-        ("axes.0.normal.1: .* greater than 0", [{"field": MASS["field"], "normal": [1, 0]}], {}),
+        ("needs exactly one of values, grid, uniform", [axis("laps")], {}),
+        ("1.5 is not below 0.8", [axis(MASS["field"], uniform=[1.5, 0.8])], {}),
+        ("axes.0.normal.1: .* greater than 0", [axis(MASS["field"], normal=[1, 0])], {}),
         ("only values and grids can be paired", [{**MASS, "paired": True}], {}),
-        ("laps is there twice", [{"field": "laps", "values": [1]}, {"field": "laps", "values": [2]}], {}),
-        ("feedforward, laps are zipped, but differ", [{**LAWS, "zip": "a"}, {"field": "laps", "values": [1], "zip": "a"}], {}),
-        ("axes.0.values: .* at least 1", [{"field": "laps", "values": []}], {}),
+        ("laps is there twice", [axis("laps", values=[1]), axis("laps", values=[2])], {}),
+        ("feedforward, laps are zipped, but differ", [{**LAWS, "zip": "a"}, axis("laps", values=[1], zip="a")], {}),
+        ("axes.0.values: .* at least 1", [axis("laps", values=[])], {}),
         ("axes.0.stdev: Extra inputs", [{**MASS, "stdev": 1}], {}),
         ("every: only where record", [], {"every": 5}),
-        ("runs: .* at most 100,000,000", [{"field": "laps", "grid": {"start": 1, "stop": 10000, "count": 10000}}], {"runs": 99999999}),
-        ("control_period: signals share", [{"field": "control_period", "values": [0.01, 0.02]}], {"record": "full", "base": {**BASE, "motion_period": 0.02}}),
+        ("runs: .* at most 100,000,000", [axis("laps", grid=grid(1, 10000, 10000))], {"runs": 99999999}),
+        (
+            "control_period: signals share",
+            [axis("control_period", values=[0.01, 0.02])],
+            {"record": "full", "base": {**BASE, "motion_period": 0.02}},
+        ),
         ("base.laps", [], {"base": {"laps": 0}}),
         ("record: Input should be", [], {"record": "some"}),
     ],
-)  # fmt: skip
+)
 def test_refused(message, axes, changes):
     """One line that names the file and the field."""
     with pytest.raises(InputError, match=f"^s.toml: .*{message}") as error:
@@ -199,8 +215,8 @@ def test_columns():
         {"field": "laps", "values": [1, 2]}, {"field": "perturbation.slope", "values": [0, 0.1]}, LAWS, MASS,
         {"field": "perturbation", "values": [{"slope": 0.1}]},
     )  # fmt: skip
-    kinds = {name: one.columns.field(name).type for name in ("laps", "perturbation.slope", "feedforward", MASS["field"])}
-    assert list(kinds.values()) == [pa.int64(), pa.float64(), pa.string(), pa.float64()]
+    kinds = [one.columns.field(name).type for name in ("laps", "perturbation.slope", "feedforward", MASS["field"])]
+    assert kinds == [pa.int64(), pa.float64(), pa.string(), pa.float64()]
     assert one.axes[-1].cell({"slope": 0.1}) == '{"slope": 0.1}' and one.axes[2].cell("fel") == "fel"
     assert one.columns.names.count("laps") == 1 and one.columns.field("energy").metadata == {b"units": b"J"}
 
