@@ -18,7 +18,7 @@ LAYERS = (
     {"control.hierarchy", "measurement", "metrics", "plots", "result"},
     {"model", "plant"},
     {"simulate", "checks"},
-    {"experiments", "sweep", "viewer", "environment"},
+    {"experiments", "sweep", "store", "pool", "jobs", "viewer", "environment"},
     {"cli"},
 )
 ENGINE = {"model", "plant", "checks", "viewer", "environment", "experiments"}
