@@ -7,14 +7,16 @@ from mrctl.control.rls import Rls
 from mrctl.metrics import per_lap, summary
 from mrctl.record import InputError
 from mrctl.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
-from mrctl.result import open_result as open
 from mrctl.result import save
 from mrctl.robot import PERTURBATIONS, Perturbation, Robot
 from mrctl.scenario import Event, Scenario
 from mrctl.simulate import Simulation, simulate
+from mrctl.store import open_store as open
+from mrctl.sweep import Axis, Sweep
 
 __all__ = [
     "PERTURBATIONS",
+    "Axis",
     "Circle",
     "Event",
     "Fel",
@@ -31,6 +33,7 @@ __all__ = [
     "Scenario",
     "Simulation",
     "StopAndGo",
+    "Sweep",
     "Waypoints",
     "open",
     "per_lap",

@@ -25,7 +25,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The command line without the program's name; `sys.argv` by default.
 
     Returns:
-        0 on success, 2 on bad input, with one line on stderr that names the field or file.
+        0 on success, 2 on bad input, with one line on stderr that names the field or file; 1 if a sweep ends with
+        jobs set aside or a run of it does not repeat; 130 on Ctrl-C.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
@@ -33,10 +34,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"mrctl: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("mrctl: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(": ".join(["mrctl: interrupted", *map(str, stop.args)]), file=sys.stderr)
         return 130
+    except _Incomplete as left:
+        print(f"mrctl: {left}", file=sys.stderr)
+        return 1
     return 0
+
+
+class _Incomplete(Exception):
+    """Done, but not all of it, or not as it should have come out."""
 
 
 def _parse(arguments: list[str]) -> None:
@@ -44,6 +52,7 @@ def _parse(arguments: list[str]) -> None:
     commands: dict[str, Callable[..., Any]] = {
         "run": _run_with(arguments),
         "reproduce": reproduce,
+        "sweep": sweep,
         "suite": suite,
         "tune": tune,
         "bench": bench,
@@ -94,25 +103,72 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
     default = Scenario.from_toml(file) if file else Scenario()
 
     def run(
-        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml")] = None,
+        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml|STORE")] = None,
         /,
         scenario: Annotated[Scenario, tyro.conf.arg(name="")] = default,
         out: Path | None = None,
         json: bool = False,
+        number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
     ) -> None:
         """Runs one scenario and prints its metrics lap by lap.
 
         Args:
-            file: Scenario file; flags override what it says.
+            file: Scenario file; flags override what it says. Or the store of a sweep, with --run.
             scenario: The scenario.
             out: Folder for the result, the figures and the learned weights.
             json: Print JSON.
+            number: Run of the sweep to run again and to compare with the store.
         """
+        if number is not None:
+            return _repeat(file, number, out, json)
+        if file is not None and file.is_dir():
+            raise InputError(f"run: which one of {file}? give its number with --run")
         from mrctl.experiments import single
 
         print(single.run(scenario, out, json))
 
     return run
+
+
+def _repeat(store: Path | None, number: int, out: Path | None, json: bool) -> None:
+    """`mrctl run STORE --run K`."""
+    from mrctl import jobs
+    from mrctl.experiments import single
+
+    if store is None:
+        raise InputError("run: needs the store of a sweep in front of it")
+    if out is not None or json:
+        print(single.run(jobs.scenario_of(store, number), out, json))
+    repeated = jobs.repeat(store, number)
+    verdict = f"run {number}: {repeated.verdict}"
+    if not repeated.same:
+        raise _Incomplete(verdict)
+    print(verdict, file=sys.stderr if json else sys.stdout)
+
+
+def sweep(
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SWEEP.toml")],
+    /,
+    out: Path,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> None:
+    """Runs the many runs of a sweep file; the same command again goes on where it stopped.
+
+    Args:
+        file: Sweep file.
+        out: Folder of the store, which `mrctl.open` opens.
+        workers: Processes on this machine; by default one a core.
+        scheduler: Address of a Dask scheduler to use instead, such as tcp://127.0.0.1:8786.
+    """
+    from mrctl import jobs
+    from mrctl.sweep import Sweep
+
+    report = jobs.run(Sweep.from_toml(file), out, workers, scheduler, progress=True)
+    print(f"{report.runs} runs, {report.failed} failed; table: {out / 'runs.parquet'}")
+    if report.aside:
+        lost = "; ".join(f"runs {runs[0]} to {runs[-1]} ({why})" for runs, why in list(report.aside.items())[:5])
+        raise _Incomplete(f"{len(report.aside)} jobs set aside: {lost}; the same command tries them again")
 
 
 def reproduce(out: Path = Path("reproduction")) -> None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -445,3 +446,10 @@ def _ground(model: mujoco.MjModel, data: mujoco.MjData, x: float, y: float) -> N
 def clone(model: mujoco.MjModel) -> mujoco.MjModel:
     """A copy that can be perturbed."""
     return copy.copy(model)
+
+
+def digest(model: mujoco.MjModel) -> str:
+    """Tells whether two compiled models are the same, byte for byte."""
+    buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return hashlib.sha256(buffer.tobytes()).hexdigest()

@@ -401,6 +401,6 @@ class BatchPlant(Plant):
         return {}
 
 
-def build(model: mujoco.MjModel, size: int, substeps: int) -> Plant:
+def build(model: mujoco.MjModel, size: int, substeps: int, threads: int = 0) -> Plant:
     """The plant for a number of robots: dm_control for one, the batch engine for more."""
-    return PhysicsPlant(model, substeps) if size == 1 else BatchPlant(model, size, substeps)
+    return PhysicsPlant(model, substeps) if size == 1 else BatchPlant(model, size, substeps, threads)

@@ -191,17 +191,13 @@ def voltages(result: xr.Dataset, window: tuple[float, float] | None = None, lap:
     width = COLUMN if count == 1 else max(PAGE, 60 / 25.4 * count)
     figure, axes = _figure(width, 0.95 * COLUMN, rows=2, columns=count, sharey=True)
     # The total lies wide and pale under whichever part makes it up.
-    parts = (
-        ("voltage", {"color": "0.75", "lw": 3.0}),
-        ("feedback", {"color": COLOURS[1]}),
-        ("feedforward", {"color": COLOURS[2]}),
-    )
+    parts = (("voltage", "0.75", 3.0), ("feedback", COLOURS[1], 1.0), ("feedforward", COLOURS[2], 1.0))
     for column, (data, label, _) in enumerate(curves):
         for row, wheel in enumerate(("left", "right")):
             one = axes[row * count + column]
-            for name, style in parts:
+            for name, colour, line in parts:
                 signal = data[f"{name}_{wheel}"].values
-                one.plot(data["time"].values, signal, **style)
+                one.plot(data["time"].values, signal, color=colour, lw=line)
                 _cross(one, data, data["time"].values, signal)
             if column == 0:
                 one.set_ylabel(f"$U_{wheel[0]}$ (V)")
@@ -209,7 +205,7 @@ def voltages(result: xr.Dataset, window: tuple[float, float] | None = None, lap:
                 one.set_title(label)
             if row == 1:
                 one.set_xlabel("time (s)")
-    handles = [Line2D([], [], **style) for _, style in parts]
+    handles = [Line2D([], [], color=colour, lw=line) for _, colour, line in parts]
     figure.legend(handles, ["total", "feedback", "feedforward"], loc="outside upper center", ncols=3)
     return figure
 

@@ -78,7 +78,10 @@ _sense, _record = _compile(stamp(observe, posture_error))
 
 
 def simulate(
-    scenarios: Scenario | Sequence[Scenario], feedforward: Factory | None = None, progress: bool = False
+    scenarios: Scenario | Sequence[Scenario],
+    feedforward: Factory | None = None,
+    progress: bool = False,
+    threads: int = 0,
 ) -> xr.Dataset:
     """Runs scenarios in closed loop.
 
@@ -89,6 +92,7 @@ def simulate(
         feedforward: A stage of your own instead of the named one: called with the nominal robot and the number of
             robots, returns an object with the two methods of `mrctl.control.feedforward.Feedforward`.
         progress: Shows a progress bar.
+        threads: Of the batch engine, which change no bit; 0 for all cores.
 
     Returns:
         The signals of `mrctl.result.SIGNALS` with dimensions run and time (time alone for one scenario), with units;
@@ -106,7 +110,7 @@ def simulate(
     for row, scenario in enumerate(several):
         groups[_group(scenario)].append(row)
     # Built first, so that bad input is refused before anything is computed.
-    simulations = [(rows, Simulation([several[r] for r in rows], feedforward)) for rows in groups.values()]
+    simulations = [(rows, Simulation([several[r] for r in rows], feedforward, threads)) for rows in groups.values()]
     total = sum(simulation.ticks * len(rows) for rows, simulation in simulations)
     parts = []
     with tqdm(total=total, unit="tick", unit_scale=True, disable=not progress) as bar:
@@ -137,12 +141,13 @@ class Simulation:
         log: What was recorded, `(ticks, B, signals)`; nothing yet from `tick` on.
     """
 
-    def __init__(self, scenarios: Sequence[Scenario], feedforward: Factory | None = None) -> None:
+    def __init__(self, scenarios: Sequence[Scenario], feedforward: Factory | None = None, threads: int = 0) -> None:
         """Compiles the world, stands the robots on their references, rolling.
 
         Args:
             scenarios: Scenarios that `simulate` would run together.
             feedforward: As in `simulate`.
+            threads: As in `simulate`.
 
         Raises:
             InputError: As `simulate`.
@@ -159,7 +164,7 @@ class Simulation:
         stage = feedforward(robot, size) if feedforward else feedforward_of(scenarios, robot)
         self._label = getattr(feedforward, "__name__", "custom") if feedforward else first.feedforward
         self._oracle = stage if first.feedforward == "oracle" and isinstance(stage, InverseDynamics) else None
-        self.plant: Plant = build(compiled, size, round(first.control_period / first.physics_step))
+        self.plant: Plant = build(compiled, size, round(first.control_period / first.physics_step), threads)
         self.hierarchy = Hierarchy(scenarios, robot, stage)
         times = self._period * np.arange(self.ticks, dtype=float)
         # Robots that follow the same reference share its samples, (ticks, references, 7).

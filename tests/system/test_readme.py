@@ -7,6 +7,7 @@ import pytest
 
 from mrctl import cli
 from mrctl.scenario import Scenario
+from mrctl.sweep import Sweep
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", README.read_text(), re.MULTILINE | re.DOTALL)
@@ -25,29 +26,42 @@ def test_there_are_snippets() -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder, with the README's scenario file in it."""
+    """An empty folder with the README's scenario and sweep in it, the sweep with one draw instead of hundreds."""
     monkeypatch.chdir(tmp_path)
-    Path("scenario.toml").write_text(blocks("toml")[0])
+    scenario, sweep = blocks("toml")
+    Path("scenario.toml").write_text(scenario)
+    Path("sweep.toml").write_text(re.sub(r"^runs = \d+", "runs = 1", sweep, flags=re.MULTILINE))
     return tmp_path
+
+
+def with_store(code: str) -> None:
+    """Makes the store that a snippet opens."""
+    if re.search(r"run store|\"store\"", code):
+        assert cli.main(["sweep", "sweep.toml", "--out", "store", "--workers", "1"]) == 0
 
 
 @pytest.mark.parametrize("code", blocks("python"))
 def test_python(code: str, folder: Path) -> None:
     """Python snippets run on their own, in an empty folder."""
+    with_store(code)
     exec(compile(code, str(README), "exec"), {"__name__": "__main__"})
 
 
 @pytest.mark.parametrize("text", blocks("toml"))
 def test_toml(text: str, folder: Path) -> None:
-    """TOML snippets are valid scenarios."""
+    """TOML snippets are valid scenarios, or valid sweeps."""
     Path("snippet.toml").write_text(text)
-    assert Scenario.from_toml("snippet.toml") != Scenario()
+    if "sweep.toml" in text:
+        assert len(Sweep.from_toml("snippet.toml").axes) == text.count("[[axes]]")
+    else:
+        assert Scenario.from_toml("snippet.toml") != Scenario()
 
 
 @pytest.mark.parametrize("line", [line for text in blocks("bash") for line in text.splitlines() if line.strip()])
 def test_bash(line: str, folder: Path, capsys: pytest.CaptureFixture) -> None:
     """Command lines run; those that other tests run are at least known commands."""
     command = line.split("#")[0].strip()
+    with_store(command)
     if command.startswith("mrctl") and not command.startswith(ELSEWHERE):
         assert cli.main(command.split()[1:]) == 0, capsys.readouterr().err
     else:

@@ -12,13 +12,13 @@ PACKAGE = Path(mrctl.__file__).parent
 # From the bottom up: a module imports from its own layer and from those above it in this list. `laws` stands for
 # everything in `control` but the wiring.
 LAYERS = (
-    {"record", "angles", "robot", "kinematics", "dynamics"},
+    {"record", "robot", "kinematics", "dynamics"},
     {"laws", "references"},
     {"scenario"},
     {"control.hierarchy", "measurement", "metrics", "plots", "result"},
     {"model", "plant"},
     {"simulate", "checks"},
-    {"experiments", "sweep", "viewer", "environment"},
+    {"experiments", "sweep", "store", "pool", "jobs", "viewer", "environment"},
     {"cli"},
 )
 ENGINE = {"model", "plant", "checks", "viewer", "environment", "experiments"}

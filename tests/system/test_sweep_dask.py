@@ -1,0 +1,135 @@
+"""A sweep on a Dask cluster: a real scheduler and two worker processes on loopback, some of which are killed."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from test_sweeps import FILE, children, content, failures, poisoned, refused, until
+
+from mrctl import Sweep, cli, jobs
+from mrctl.store import Store
+
+pytest.importorskip("distributed")
+pytestmark = pytest.mark.xdist_group("sweeps")
+LONG = FILE.replace("runs = 12", "runs = 40").replace("chunk = 5", "chunk = 2").replace("length = 0.8", "length = 1.6")
+
+
+def dask(*arguments):
+    """A Dask command, on loopback, in a process group of its own; workers find the tests' functions."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    command = [sys.executable, "-m", "dask", *arguments, "--host", "127.0.0.1", "--no-dashboard"]
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    return subprocess.Popen(command, start_new_session=True, env=environment, **silent)
+
+
+@contextlib.contextmanager
+def started(tmp_path_factory, count):
+    """Address of a scheduler, the processes (nannies) that keep its workers alive, and its own."""
+    file = tmp_path_factory.mktemp("dask") / "scheduler.json"
+    nannies = []
+    scheduler = dask("scheduler", "--port", "0", "--scheduler-file", str(file))
+    try:
+        until(file.exists)
+        where = ("--scheduler-file", str(file), "--nthreads", "1", "--local-directory", str(file.parent))
+        nannies += [dask("worker", *where) for _ in range(count)]
+        yield json.loads(file.read_text())["address"], nannies, scheduler
+    finally:
+        for process in (*nannies, scheduler):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """A scheduler and two workers."""
+    with started(tmp_path_factory, 2) as (address, nannies, _):
+        yield address, nannies
+
+
+def sent(file, store, address):
+    """`mrctl sweep` on a cluster."""
+    command = [sys.executable, "-m", "mrctl.cli", "sweep", str(file), "--out", str(store), "--scheduler", address]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+
+
+def worker_of(nanny):
+    """The process of a nanny that computes: the one with the most memory."""
+    pages = {pid: int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in children(nanny.pid)}
+    return max(pages, key=pages.__getitem__)
+
+
+def test_killed_worker(cluster, tmp_path):
+    """The scheduler gives the job to the other worker; the store is the one that local processes make."""
+    address, nannies = cluster
+    assert address.startswith("tcp://127.0.0.1:")
+    file, store = tmp_path / "sweep.toml", tmp_path / "store"
+    file.write_text(LONG)
+    process = sent(file, store, address)
+    until(lambda: len(list(store.glob("parts/*.parquet"))) > 3)
+    done = len(Store(store).done())
+    victim = worker_of(nannies[0])
+    os.kill(victim, signal.SIGKILL)
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 0 and done < 40, stderr
+    assert not Path(f"/proc/{victim}").exists()
+    jobs.run(Sweep.from_toml(file), tmp_path / "local", 2)
+    assert content(store) == content(tmp_path / "local")
+
+
+def test_interrupted_on_a_cluster_resumed_at_home(cluster, tmp_path):
+    """Ctrl-C keeps what was done, leaves the cluster alone, and the sweep goes on anywhere."""
+    address, _ = cluster
+    file, store = tmp_path / "sweep.toml", tmp_path / "store"
+    file.write_text(LONG)
+    process = sent(file, store, address)
+    until(lambda: len(list(store.glob("parts/*.parquet"))) > 3)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=30)
+    assert process.returncode == 130 and "Traceback" not in stderr, stderr
+    assert "the same command goes on" in stderr.strip().splitlines()[-1]
+    assert 4 <= len(Store(store).done()) < 40
+    sweep = Sweep.from_toml(file)
+    jobs.run(sweep, store, 2)
+    jobs.run(sweep, tmp_path / "cluster", scheduler=address)
+    assert content(store) == content(tmp_path / "cluster")
+
+
+def test_poison(cluster, tmp_path):
+    """A job that kills every worker that takes it is set aside; the others finish."""
+    address, _ = cluster
+    sweep = Sweep.from_dict(tomllib.loads(FILE))
+    report = jobs.run(sweep, tmp_path / "store", scheduler=address, work=poisoned)
+    assert report.aside == {range(5, 10): "its worker died, again and again"}
+    assert report.failed == len({*failures(sweep), *range(5, 10)})
+
+
+def test_lost_scheduler(tmp_path_factory, tmp_path):
+    """One line, what was done is kept, and the sweep goes on without."""
+    with started(tmp_path_factory, 1) as (address, _, scheduler):
+        file, store = tmp_path / "sweep.toml", tmp_path / "store"
+        file.write_text(LONG)
+        process = sent(file, store, address)
+        until(lambda: len(list(store.glob("parts/*.parquet"))) > 3)
+        os.killpg(scheduler.pid, signal.SIGKILL)
+        _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 2 and "Traceback" not in stderr, stderr
+    assert "scheduler: tcp://127.0.0.1" in stderr and "what was done is kept" in stderr.splitlines()[-1]
+    assert 4 <= len(Store(store).done()) < 40
+    assert jobs.run(Sweep.from_toml(file), store, 2).runs == 80 and Store(store).complete
+
+
+def test_no_scheduler(tmp_path, capsys, monkeypatch):
+    """One line that names the address."""
+    monkeypatch.setattr("mrctl.pool.PATIENCE", 1.0)
+    file = tmp_path / "sweep.toml"
+    file.write_text(FILE)
+    for address in ("tcp://127.0.0.1:1", "nonsense://x"):
+        assert address in refused(capsys, "sweep", file, "--out", tmp_path / "store", "--scheduler", address)
+    assert cli.main(["sweep", str(file), "--out", str(tmp_path / "store"), "--workers", "1"]) == 0

@@ -1,0 +1,469 @@
+"""Sweeps, whatever befalls them: same bytes for any workers and any interruptions, clear refusals, nothing lost."""
+
+import contextlib
+import errno
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import mrctl
+from mrctl import InputError, Sweep, cli, jobs, simulate
+from mrctl.jobs import compute
+from mrctl.pool import Outcome
+from mrctl.result import SIGNALS
+from mrctl.store import Store
+
+pytestmark = pytest.mark.xdist_group("sweeps")  # one after another: they start processes of their own
+KILLS = int(os.environ.get("MRCTL_KILLS", "2"))  # random moments for each victim; 20 in a release
+FILE = """
+runs = 12
+chunk = 5
+record = "decimated"
+[base]
+laps = 1
+feedforward = "none"
+reference = { kind = "line", length = 0.8 }
+[[axes]]
+field = "feedforward"
+values = ["none", "fel"]
+paired = true
+[[axes]]
+field = "perturbation.mass_factor"
+normal = [0.5, 0.3]
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "sweep.toml"
+    path.write_text(FILE)
+    return path
+
+
+@pytest.fixture
+def sweep(file):
+    return Sweep.from_toml(file)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The bytes of the sweep, run without incident."""
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "sweep.toml").write_text(FILE)
+    jobs.run(Sweep.from_toml(folder / "sweep.toml"), folder / "store", workers=1)
+    return content(folder / "store")
+
+
+def content(store):
+    """Every file of a store, the lock left out."""
+    return {str(f.relative_to(store)): f.read_bytes() for f in store.rglob("*") if f.is_file() and f.name != "lock"}
+
+
+def refused(capsys, *arguments, status=2):
+    """The one line that a command ends with."""
+    assert cli.main([str(a) for a in arguments]) == status
+    lines = [line for line in capsys.readouterr().err.replace("\r", "\n").splitlines() if "run/s" not in line and line]
+    assert len(lines) == 1 and "Traceback" not in lines[0], lines
+    return lines[0]
+
+
+# --- what comes out -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("workers", [2, 7])
+def test_workers_change_nothing(sweep, tmp_path, whole, workers):
+    """1, 2, 7 workers: the same files, byte for byte."""
+    report = jobs.run(sweep, tmp_path / "store", workers)
+    assert content(tmp_path / "store") == whole
+    assert report.runs == 24 and not report.aside and report.failed == len(failures(sweep))
+
+
+def failures(sweep):
+    return [run for run in range(sweep.size) if sweep.valid(run) is None]
+
+
+def test_open(sweep, tmp_path):
+    """One labelled dataset and one table, which hold what `simulate` and `summary` return for the same scenarios."""
+    jobs.run(sweep, tmp_path / "store", 2)
+    table = pd.read_parquet(tmp_path / "store" / "runs.parquet")
+    runs, lost = [run for run in range(24) if run not in failures(sweep)], failures(sweep)
+    assert 0 < len(lost) < 12 and list(table["run"]) == list(range(24))
+    direct = simulate([sweep.scenario(run) for run in runs]).assign_coords(run=runs)
+    opened = mrctl.open(tmp_path / "store")
+    for name in SIGNALS:
+        assert opened[name].dims == ("run", "time") and opened[name].attrs["units"] == SIGNALS[name][0]
+        np.testing.assert_array_equal(opened[name].sel(run=runs), direct[name][:, ::10])
+        assert np.isnan(opened[name].sel(run=lost)).all()
+    np.testing.assert_array_equal(opened["time"], direct["time"][::10])
+    for name in ("label", "feedforward", "steering", "seed", "lap_time"):
+        np.testing.assert_array_equal(opened[name].sel(run=runs), direct[name])
+    mass = [sweep.values(run)["perturbation.mass_factor"] for run in range(24)]
+    np.testing.assert_array_equal(opened["perturbation.mass_factor"], mass)
+    summary = mrctl.summary(direct)
+    for name in ("energy", "v_rmse", "lateral_max", "weight_norm", "laps"):
+        np.testing.assert_array_equal(table.set_index("run").loc[runs, name], summary[name])
+    assert set(table.loc[lost, "failure"]) == {
+        "perturbation.mass_factor: Input should be greater than or equal to 0.05"
+    }
+    assert table.loc[lost, "failed"].all() and (table.loc[lost, "failure_time"] == 0).all()
+    assert mrctl.summary(opened).attrs["failed"] == len(lost)
+
+
+def test_metrics_only(file, tmp_path):
+    """Without signals the dataset has the metrics; runs that differ in control period are welcome."""
+    file.write_text(
+        'runs = 3\n[base]\nmotion_period = 0.02\nlaps = 1\nreference = { kind = "line", length = 0.8 }\n'
+        '[[axes]]\nfield = "control_period"\nvalues = [0.02, 0.01]\n'
+    )
+    sweep = Sweep.from_toml(file)
+    jobs.run(sweep, tmp_path / "store", 1)
+    opened = mrctl.open(tmp_path / "store")
+    assert opened["energy"].dims == ("run",) and opened["energy"].attrs["units"] == "J" and "time" not in opened.dims
+    alone = [float(mrctl.summary(simulate([sweep.scenario(run)]))["energy"].iloc[0]) for run in range(6)]
+    np.testing.assert_array_equal(opened["energy"], alone)
+    assert not (tmp_path / "store" / "signals.zarr").exists()
+
+
+def test_full_with_runs_of_different_length(tmp_path):
+    """Shorter runs end in NaN; a run that diverges says when and why and costs only itself."""
+    push = {"time": 0.5, "push": [4000.0, 4000.0, 0.0]}
+    axes = [{"field": "laps", "values": [1, 2]}, {"field": "events", "values": [[], [push]]}]
+    base = {"feedforward": "none", "reference": {"kind": "line", "length": 0.8}}
+    sweep = Sweep.from_dict({"base": base, "axes": axes, "record": "full", "chunk": 3})
+    report = jobs.run(sweep, tmp_path / "store", 1)
+    opened = mrctl.open(tmp_path / "store")
+    assert report.failed == 2 and opened["failed"].values.tolist() == [False, True, False, True]
+    assert opened["failure"].values.tolist() == ["", "lateral error over 1 m"] * 2
+    finite = np.isfinite(opened["x"]).sum("time").values
+    assert finite[0] == 100 and finite[2] == 200
+    for run in (1, 3):
+        assert finite[run] == round(float(opened["failure_time"][run]) * 100) - 1 > 50
+
+
+# --- one run again --------------------------------------------------------------------------------
+
+
+def test_run_again(sweep, tmp_path, capsys):
+    """Bit-identical as it is, within tolerance when a bit is off, and where it departs when more is."""
+    store = tmp_path / "store"
+    jobs.run(sweep, store, 2)
+    for run in (0, 14, failures(sweep)[0]):
+        assert cli.main(["run", str(store), "--run", str(run)]) == 0
+        assert capsys.readouterr().out == f"run {run}: bit-identical\n"
+    array = Store(store)._signals
+    column = list(SIGNALS).index("v")
+    array[14, 7, column] = np.nextafter(array[14, 7, column], 9)
+    assert cli.main(["run", str(store), "--run", "14"]) == 0
+    assert "run 14: within tolerance" in capsys.readouterr().out
+    array[14, 7, column] = 3.0
+    assert "run 14: departs: signal v is" in (line := refused(capsys, "run", store, "--run", 14, status=1))
+    assert line.endswith("at t = 0.7 s, in the store 3.0")
+    assert "run: 24 is not in 0 to 23" in refused(capsys, "run", store, "--run", 24)
+    assert "which one" in refused(capsys, "run", store)
+    assert "not a sweep's store" in refused(capsys, "run", tmp_path, "--run", 1)
+
+
+# --- refusals -------------------------------------------------------------------------------------
+
+
+def test_changed_sweep(file, sweep, tmp_path, capsys, whole):
+    """A store goes on only with the file and the versions that began it."""
+    store = tmp_path / "store"
+    jobs.run(sweep, store, 1)
+    file.write_text(FILE.replace("runs = 12", "runs = 13"))
+    assert "begun with another sweep.runs (12, now 13)" in refused(capsys, "sweep", file, "--out", store)
+    file.write_text("# a remark changes nothing\n" + FILE)
+    assert cli.main(["sweep", str(file), "--out", str(store)]) == 0
+    with mock.patch("mrctl.jobs.versions", lambda: {**mrctl.result.versions(), "mujoco": "9"}):
+        assert 'versions.mujoco ("3.17.0", now "9")' in refused(capsys, "sweep", file, "--out", store)
+    with mock.patch("mrctl.model.digest", lambda model: "another"):
+        assert "models.flat, compliant" in refused(capsys, "sweep", file, "--out", store)
+    assert content(store) == whole
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "sweep.json", "signals.zarr"])
+def test_foreign_folder(file, tmp_path, capsys, name):
+    """Nothing is written into a folder, or over a file, of somebody else's."""
+    store = tmp_path / "store"
+    store.mkdir()
+    (store / name).write_text("mine")
+    assert "not a sweep's store" in refused(capsys, "sweep", file, "--out", store)
+    assert "not a sweep's store" in refused(capsys, "sweep", file, "--out", store / name)
+    assert content(store) == {name: b"mine"} and len(list(store.iterdir())) == 1
+
+
+def test_bad_input(file, tmp_path, capsys):
+    """What cannot be run is refused before a folder is filled."""
+    store = tmp_path / "store"
+    assert "no such file" in refused(capsys, "sweep", tmp_path / "none.toml", "--out", store).lower()
+    assert "workers: 0" in refused(capsys, "sweep", file, "--out", store, "--workers", 0)
+    assert "workers: not together" in refused(
+        capsys, "sweep", file, "--out", store, "--workers", 1, "--scheduler", "tcp://127.0.0.1:1"
+    )
+    file.write_text('[base.reference]\nkind = "line"\nspeed = 9\n')
+    assert "max_speed" in refused(capsys, "sweep", file, "--out", store)
+    file.write_text('[base]\nworld = "moon"\n')
+    assert "world" in refused(capsys, "sweep", file, "--out", store)
+    assert not (store / "sweep.json").exists()
+
+
+def test_two_at_once(file, sweep, tmp_path, capsys):
+    """The second is told who is first; a killed process leaves no lock behind."""
+    store = tmp_path / "store"
+    store.mkdir()
+    with Store.locked(store):
+        message = refused(capsys, "sweep", file, "--out", store)
+    assert f"process {os.getpid()} on" in message and "is running this sweep" in message
+    code = f"""
+import os, pathlib
+from mrctl.store import Store
+with Store.locked(pathlib.Path({str(store)!r})):
+    os.kill(os.getpid(), 9)
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
+    assert jobs.run(sweep, store, 1).runs == 24
+
+
+# --- workers that die, disks that fill ------------------------------------------------------------
+
+
+def poisoned(path, job):
+    """Job 1 kills its worker, in one of three ways."""
+    if job == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return compute(path, job)
+
+
+def shaky(path, job):
+    """Every job kills its first worker and raises in its second."""
+    marks = [Path(path).parent / f"{job}.{k}" for k in range(2)]
+    for mark, harm in zip(marks, (lambda: os._exit(3), lambda: [][1]), strict=True):
+        if not mark.exists():
+            mark.touch()
+            harm()
+    return compute(path, job)
+
+
+def test_poison(file, sweep, tmp_path, whole, capsys):
+    """A job that kills its worker is set aside and reported; its runs count as failed; the others are as ever."""
+    store = tmp_path / "store"
+    report = jobs.run(sweep, store, 2, work=poisoned)
+    assert report.aside == {range(5, 10): "its worker died (signal 9)"}
+    assert report.failed == len({*failures(sweep), *range(5, 10)})
+    with mock.patch("mrctl.jobs.compute", poisoned):
+        message = refused(capsys, "sweep", file, "--out", store, status=1)
+    assert "1 jobs set aside: runs 5 to 9 (its worker died (signal 9))" in message
+    table = pd.read_parquet(store / "runs.parquet")
+    assert set(table["failure"][5:10]) == {"set aside: its worker died (signal 9)"} and table["failed"][5:10].all()
+    opened = mrctl.open(store)
+    assert opened.sizes["run"] == 24 and np.isnan(opened["x"][5:10]).all()
+    assert "set aside" in refused(capsys, "run", store, "--run", 7)
+    assert not jobs.run(sweep, store, 2).aside, "the cause is gone: the same command does what is left"
+    assert content(store) == whole
+
+
+def test_shaky(sweep, tmp_path, whole):
+    """Two deaths or errors are forgiven."""
+    assert not jobs.run(sweep, tmp_path / "store", 2, work=shaky).aside
+    assert content(tmp_path / "store") == whole
+
+
+def full_disk(path, job):
+    """From job 2 on nothing reaches the disk."""
+    error = OSError(errno.ENOSPC, "No space left on device")
+    with mock.patch("mrctl.store.os.fsync", side_effect=error if job >= 2 else None):
+        return compute(path, job)
+
+
+def small_files(path, job):
+    """The system itself cuts what is written."""
+    if job >= 2:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (500, resource.RLIM_INFINITY))
+    return compute(path, job)
+
+
+@pytest.mark.parametrize(
+    ("work", "reason"), [(full_disk, "No space left on device"), (small_files, "File too large")]
+)
+def test_disk_full(file, sweep, tmp_path, whole, capsys, work, reason):
+    """One line; what was done is kept, nothing half-written counts, and the sweep goes on when there is space."""
+    store = tmp_path / "store"
+    with mock.patch("mrctl.jobs.compute", work):
+        assert f"{reason}; what was done is kept" in refused(capsys, "sweep", file, "--out", store, "--workers", 1)
+    assert Store(store).done() == {0, 1}
+    assert mrctl.open(store).sizes["run"] == 10 and mrctl.open(store).attrs["unfinished"] == 14
+    with mock.patch("mrctl.store.os.fsync", side_effect=OSError(errno.ENOSPC, "No space left on device")):
+        refused(capsys, "sweep", file, "--out", store, "--workers", 1)
+    jobs.run(sweep, store, 1)
+    assert content(store) == whole
+
+
+def test_disk_full_at_the_start_and_the_end(file, sweep, tmp_path, whole, capsys):
+    """Neither a store that could not be begun nor a table that could not be written is in the way later."""
+    store, full = tmp_path / "store", OSError(errno.ENOSPC, "No space left on device")
+    with mock.patch("mrctl.store.os.fsync", side_effect=full):
+        assert "No space left" in refused(capsys, "sweep", file, "--out", store)
+    with mock.patch("mrctl.store.pq.ParquetWriter", side_effect=full):
+        assert "No space left" in refused(capsys, "sweep", file, "--out", store)
+    assert len(Store(store).done()) == 5 and not Store(store).table.exists()
+    jobs.run(sweep, store, 1)
+    assert content(store) == whole
+
+
+# --- interruptions --------------------------------------------------------------------------------
+
+# Long enough to be hit: 60 jobs.
+LONG = FILE.replace("runs = 12", "runs = 60").replace("chunk = 5", "chunk = 2").replace("length = 0.8", "length = 1.6")
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory):
+    """A sweep file of some seconds, and the bytes of its store."""
+    folder = tmp_path_factory.mktemp("long")
+    (folder / "sweep.toml").write_text(LONG)
+    jobs.run(Sweep.from_toml(folder / "sweep.toml"), folder / "store", 2)
+    return folder / "sweep.toml", content(folder / "store")
+
+
+def start(file, store):
+    command = [sys.executable, "-m", "mrctl.cli", "sweep", str(file), "--out", str(store), "--workers", "2"]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def children(pid):
+    """Processes that one has started and that live."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            state, parent = status.read_text().rpartition(")")[2].split()[:2]
+            if int(parent) == pid and state != "Z":
+                found.append(int(status.parent.name))
+    return found
+
+
+def until(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not (value := condition()) and time.monotonic() < end:
+        time.sleep(0.01)
+    assert value
+    return value
+
+
+@pytest.mark.parametrize("moment", range(KILLS))
+@pytest.mark.parametrize("victim", ["sweep", "worker"])
+def test_kill(long, tmp_path, moment, victim):
+    """Kill −9 at a random moment: all runs are there in the end, with the same bytes."""
+    file, expected = long
+    store, chance = tmp_path / "store", random.Random(f"{victim} {moment}")
+    process, enough = start(file, store), chance.randrange(55)
+    until(lambda: (store / "parts").exists() and len(Store(store).done()) >= enough)
+    time.sleep(chance.uniform(0, 0.1))
+    done = len(Store(store).done())
+    if victim == "sweep":
+        below = [pid for one in children(process.pid) for pid in (one, *children(one))]
+        process.kill()
+        process.communicate()
+        until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in below), 10)  # nobody works on for a dead sweep
+        jobs.run(Sweep.from_toml(file), store, 2)
+    else:
+        helpers = children(process.pid)
+        os.kill(chance.choice([worker for one in helpers for worker in children(one)]), signal.SIGKILL)
+        _, stderr = process.communicate(timeout=120)
+        assert process.returncode == 0 and "Traceback" not in stderr, stderr
+    assert content(store) == expected
+    print(f"killed the {victim} after {done} of 60 jobs")
+
+
+def test_ctrl_c(long, tmp_path):
+    """One line, status 130, and the same command goes on."""
+    file, expected = long
+    store = tmp_path / "store"
+    process = start(file, store)
+    until(lambda: len(list(store.glob("parts/*.parquet"))) > 2)
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=20)
+    assert process.returncode == 130 and "Traceback" not in stderr
+    done = len(Store(store).done())
+    last = stderr.strip().splitlines()[-1]
+    assert last == f"mrctl: interrupted: {2 * done} of 120 runs are done; the same command goes on", stderr
+    assert mrctl.open(store).sizes["run"] == 2 * done < 120
+    kept = content(store)
+    jobs.run(Sweep.from_toml(file), store, 2)
+    assert content(store) == expected
+    assert {k: v for k, v in kept.items() if "signals" in k} == {k: expected[k] for k in kept if "signals" in k}
+
+
+def test_finished_jobs_are_kept(sweep, tmp_path, whole):
+    """A job that is done is not computed again, nor is a sweep."""
+    store = tmp_path / "store"
+    with pytest.raises(InputError, match="worker 3 is tired"):
+        jobs.run(sweep, store, 1, work=tired)
+    parts = {part: part.stat().st_mtime_ns for part in store.glob("parts/*")}
+    assert len(parts) == 3
+    with pytest.raises(InputError, match="worker 4 is tired"):
+        jobs.run(sweep, store, 1, work=only_rest)
+    assert {part: part.stat().st_mtime_ns for part in parts} == parts
+    jobs.run(sweep, store, 1)
+    assert content(store) == whole
+    jobs.run(sweep, store, 1, work=only_rest)
+
+
+def tired(path, job):
+    return Outcome(job, error=f"worker {job} is tired", fatal=True) if job == 3 else compute(path, job)
+
+
+def only_rest(path, job):
+    assert job >= 3
+    return Outcome(job, error=f"worker {job} is tired", fatal=True) if job == 4 else compute(path, job)
+
+
+# --- memory ---------------------------------------------------------------------------------------
+
+
+def instantly(path, job):
+    """Rows without runs, so that there can be many."""
+    store = Store(path)
+    runs = store.runs(job)
+    columns = jobs._agreed((store.path / "sweep.json").read_text()).columns
+    empty = pa.Table.from_pylist([{"failed": False}] * len(runs), columns)
+    store.write(job, empty.set_column(0, columns.field(0), pa.array(runs)), None)
+    return Outcome(job)
+
+
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def test_memory_of_the_sweep_is_flat(tmp_path):
+    """A million rows, 130 MB of numbers, leave no more behind in the process that gathers them than a hundredth."""
+    used = []
+    for runs in (10_000, 10_000, 1_000_000):
+        jobs.run(Sweep.from_dict({"runs": runs, "chunk": 10_000}), tmp_path / str(len(used)), 1, work=instantly)
+        used.append(resident())
+    assert used[2] - used[1] < 30, used
+    assert pq.read_metadata(tmp_path / "2" / "runs.parquet").num_rows == 1_000_000
+
+
+def test_memory_of_a_worker_is_flat(file, tmp_path):
+    """Five times the runs take no more memory."""
+    file.write_text(FILE.replace("runs = 12", "runs = 150"))
+    sweep = Sweep.from_toml(file)
+    used = []
+    store = Store.begin(tmp_path, jobs._manifest(sweep))
+    for some in (range(10), range(10, 60)):
+        for job in some:
+            assert not compute(str(store.path), job).error
+        used.append(resident())
+    assert used[1] - used[0] < 10, used

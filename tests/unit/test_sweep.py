@@ -1,0 +1,272 @@
+"""What a sweep file means: axes, draws, pairs; what is refused; files that appear whole or not at all."""
+
+import itertools
+import tomllib
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from mrctl import Circle, InputError, Perturbation, Scenario, Sweep
+from mrctl import store as folder
+from mrctl.result import SIGNALS
+
+BASE = {"laps": 1, "feedforward": "none", "reference": {"kind": "line", "length": 0.4}}
+MASS = {"field": "perturbation.mass_factor", "uniform": [0.8, 1.5]}
+LAWS = {"field": "feedforward", "values": ["none", "model", "fel"]}
+
+
+def sweep(*axes, **changes):
+    return Sweep.from_dict({"base": BASE, "axes": axes, **changes}, "s.toml")
+
+
+def drawn(one):
+    return [one.values(run) for run in range(one.size)]
+
+
+# --- axes -----------------------------------------------------------------------------------------
+
+
+def test_product_in_the_order_of_the_file():
+    """The first axis is slowest, draws are fastest."""
+    slopes = {"field": "perturbation.slope", "grid": {"start": -0.1, "stop": 0.1, "count": 3}}
+    one = sweep(LAWS, slopes, runs=2)
+    expected = itertools.product(LAWS["values"], [-0.1, 0.0, 0.1], range(2))
+    found = [(v["feedforward"], v["perturbation.slope"]) for v in drawn(one)]
+    assert found == [(law, slope) for law, slope, _ in expected] and one.size == 18
+
+
+def test_scenario_is_the_base_with_the_values():
+    """Dotted paths, whole tables, later axes on top of earlier ones; the base is left alone."""
+    one = sweep(
+        {"field": "perturbation", "values": [{"payload": 2.0}, {"slope": 0.1}]},
+        {"field": "perturbation.mass_factor", "values": [1.2]},
+        {"field": "reference", "values": [{"kind": "circle", "period": 4, "radius": 0.5}]},
+        {"field": "initial_spread.1", "values": [0.0]},
+    )
+    expected = one.base.model_copy(
+        update={
+            "perturbation": Perturbation(payload=2, mass_factor=1.2),
+            "reference": Circle(period=4, radius=0.5),
+            "initial_spread": (0.02, 0.0, 0.03),
+            "seed": one.values(0)["seed"],
+        }
+    )
+    assert one.scenario(0) == expected
+    assert one.scenario(1).perturbation == Perturbation(slope=0.1, mass_factor=1.2)
+
+
+def test_zip():
+    """Zipped axes move together."""
+    one = sweep(
+        {"field": "laps", "values": [1, 2], "zip": "a"}, LAWS,
+        {"field": "perturbation.slope", "values": [0.0, 0.1], "zip": "a"},
+    )  # fmt: skip
+    assert one.size == 6
+    assert {(v["laps"], v["perturbation.slope"]) for v in drawn(one)} == {(1, 0.0), (2, 0.1)}
+
+
+def test_seed_may_be_an_axis():
+    """Then it is not drawn."""
+    assert [sweep({"field": "seed", "values": [7, 8]}).scenario(run).seed for run in range(2)] == [7, 8]
+
+
+# --- draws ----------------------------------------------------------------------------------------
+
+
+@given(seed=st.integers(0, 2**63 - 1), run=st.integers(0, 9_999_999))
+def test_run_is_a_function_of_file_and_number(seed, run):
+    """Two readings of one file agree, whatever was asked before."""
+    one, other = (sweep(MASS, LAWS, runs=5_000_000, seed=seed) for _ in range(2))
+    other.values(0)
+    assert one.values(run) == other.values(run) and one.scenario(run) == other.scenario(run)
+
+
+def test_draws_differ():
+    """No two runs, seeds or axes share a stream."""
+    other = {"field": "perturbation.resistance_factor", "uniform": [0.8, 1.5]}
+    values = [tuple(v.values()) for one in (sweep(MASS, other, runs=200, seed=s) for s in (0, 1)) for v in drawn(one)]
+    for column in zip(*values, strict=True):
+        assert len(set(column)) == 400
+    assert all(mass != resistance for _, mass, resistance in values)
+
+
+def test_more_runs_of_a_sweep_without_lists_begin_with_the_same():
+    """The number of draws does not enter the draws."""
+    assert drawn(sweep(MASS, runs=5)) == drawn(sweep(MASS, runs=9))[:5]
+
+
+@pytest.mark.parametrize("paired", [True, False])
+def test_paired(paired):
+    """Paired values see the same seeds and draws; others see their own; combinations of other axes see their own."""
+    slopes = {"field": "perturbation.slope", "values": [0.0, 0.1]}
+    rows = drawn(sweep({**LAWS, "paired": paired}, slopes, MASS, runs=4))
+    seen = {law: [(v["seed"], v[MASS["field"]]) for v in rows if v["feedforward"] == law] for law in LAWS["values"]}
+    assert (seen["none"] == seen["fel"] == seen["model"]) is paired
+    assert len(set(itertools.chain(*seen.values()))) == (8 if paired else 24)
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "expected"),
+    [
+        ("uniform", [0.8, 1.5], stats.uniform(0.8, 0.7)),
+        ("normal", [1.0, 0.1], stats.norm(1.0, 0.1)),
+        ("loguniform", [0.5, 2.0], stats.loguniform(0.5, 2.0)),
+    ],
+)
+def test_distributions(kind, parameters, expected):
+    """Draws follow the distribution (Kolmogorov and Smirnov)."""
+    one = sweep({"field": MASS["field"], kind: parameters}, runs=1000)
+    assert stats.kstest([v[MASS["field"]] for v in drawn(one)], expected.cdf).pvalue > 0.01
+
+
+# --- what is refused ------------------------------------------------------------------------------
+
+
+def axis(field, **kind):
+    return {"field": field, **kind}
+
+
+def grid(start, stop, count):
+    return {"start": start, "stop": stop, "count": count}
+
+
+@pytest.mark.parametrize(
+    ("message", "axes", "changes"),
+    [
+        ("perturbation.mas: no 'mas' in perturbation, which has mass", [axis("perturbation.mas", values=[1])], {}),
+        ("events.0.time: no '0' in events", [axis("events.0.time", values=[1])], {}),
+        ("laps.x: no 'x' in laps", [axis("laps.x", values=[1])], {}),
+        ("perturbation.mass_factor: .* greater than", [axis(MASS["field"], uniform=[0, 1])], {}),
+        ("perturbation.mass_factor: .* less than", [axis(MASS["field"], grid=grid(1, 99, 3))], {}),
+        ("feedforward: Input should be 'none', 'model'", [axis("feedforward", values=["none", "magic"])], {}),
+        (
+            "run 0: perturbation.control_delay: .* whole multiple",
+            [axis("perturbation.control_delay", uniform=[0.02, 0.04])],
+            {},
+        ),
+        ("needs exactly one of values, grid, uniform", [{**MASS, "values": [1]}], {}),
+        ("needs exactly one of values, grid, uniform", [axis("laps")], {}),
+        ("1.5 is not below 0.8", [axis(MASS["field"], uniform=[1.5, 0.8])], {}),
+        ("axes.0.normal.1: .* greater than 0", [axis(MASS["field"], normal=[1, 0])], {}),
+        ("only values and grids can be paired", [{**MASS, "paired": True}], {}),
+        ("laps is there twice", [axis("laps", values=[1]), axis("laps", values=[2])], {}),
+        ("feedforward, laps are zipped, but differ", [{**LAWS, "zip": "a"}, axis("laps", values=[1], zip="a")], {}),
+        ("axes.0.values: .* at least 1", [axis("laps", values=[])], {}),
+        ("axes.0.stdev: Extra inputs", [{**MASS, "stdev": 1}], {}),
+        ("every: only where record", [], {"every": 5}),
+        ("runs: .* at most 100,000,000", [axis("laps", grid=grid(1, 10000, 10000))], {"runs": 99999999}),
+        (
+            "control_period: signals share",
+            [axis("control_period", values=[0.01, 0.02])],
+            {"record": "full", "base": {**BASE, "motion_period": 0.02}},
+        ),
+        ("base.laps", [], {"base": {"laps": 0}}),
+        ("record: Input should be", [], {"record": "some"}),
+    ],
+)
+def test_refused(message, axes, changes):
+    """One line that names the file and the field."""
+    with pytest.raises(InputError, match=f"^s.toml: .*{message}") as error:
+        sweep(*axes, **changes)
+    assert "\n" not in str(error.value)
+
+
+def test_no_such_run():
+    """Runs have numbers from 0."""
+    for run in (-1, 3):
+        with pytest.raises(InputError, match="not in 0 to 2"):
+            sweep(LAWS).scenario(run)
+
+
+def test_draws_beyond_the_range_are_that_run_s_own():
+    """A normal distribution has tails; the sweep is not refused for them, and the other runs are as they are."""
+    one = sweep({"field": MASS["field"], "normal": [0.3, 0.2]}, runs=100)
+    bad = [run for run in range(100) if one.valid(run) is None]
+    assert 3 < len(bad) < 30 and all(one.values(run)[MASS["field"]] < 0.05 for run in bad)
+
+
+# --- jobs and columns -----------------------------------------------------------------------------
+
+
+def test_chunk_is_a_function_of_the_file():
+    """64 runs, fewer where their signals would not fit in memory, or what the file says."""
+    assert sweep().chunk_size == 64
+    assert sweep(base={**BASE, "laps": 4000}).chunk_size < 4
+    assert sweep(chunk=5).chunk_size == 5
+    long = sweep(base={"laps": 100})
+    assert long.chunk_size * long.base.ticks * len(SIGNALS) * 8 <= 2**27
+
+
+@pytest.mark.parametrize(
+    ("record", "samples"), [({}, 0), ({"record": "full"}, 100), ({"record": "decimated", "every": 30}, 4)]
+)
+def test_samples(record, samples):
+    """As many as the longest run needs, the first one included."""
+    assert sweep({"field": "laps", "values": [2, 1]}, **record).samples == samples
+
+
+def test_columns():
+    """An axis keeps its kind in the table; tables are JSON."""
+    one = sweep(
+        {"field": "laps", "values": [1, 2]}, {"field": "perturbation.slope", "values": [0, 0.1]}, LAWS, MASS,
+        {"field": "perturbation", "values": [{"slope": 0.1}]},
+    )  # fmt: skip
+    kinds = [one.columns.field(name).type for name in ("laps", "perturbation.slope", "feedforward", MASS["field"])]
+    assert kinds == [pa.int64(), pa.float64(), pa.string(), pa.float64()]
+    assert one.axes[-1].cell({"slope": 0.1}) == '{"slope": 0.1}' and one.axes[2].cell("fel") == "fel"
+    assert one.columns.names.count("laps") == 1 and one.columns.field("energy").metadata == {b"units": b"J"}
+
+
+def test_toml(tmp_path):
+    """A file, and what is written in a store, read back as the same sweep."""
+    text = '[base]\nlaps = 2\n[[axes]]\nfield = "perturbation.slope"\ngrid = {start = -0.1, stop = 0.1, count = 5}\n'
+    (tmp_path / "s.toml").write_text(text)
+    one = Sweep.from_toml(tmp_path / "s.toml")
+    assert one == Sweep.from_dict(tomllib.loads(text)) == Sweep.from_dict(one.model_dump(mode="json"))
+    assert one.base == Scenario(laps=2)
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def test_a_file_is_whole_or_absent(tmp_path):
+    """What fails half-way leaves the old file and nothing else."""
+    path = tmp_path / "file"
+    path.write_bytes(b"old")
+    with pytest.raises(OSError), folder._whole(path) as file:
+        file.write(b"half")
+        raise OSError
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+    with folder._whole(path) as file:
+        file.write(b"new")
+    assert path.read_bytes() == b"new" and list(tmp_path.iterdir()) == [path]
+
+
+@given(st.lists(st.integers(0, 7), max_size=20))
+def test_regroup(sizes):
+    """The same rows in the same order, in groups that do not depend on the jobs."""
+    column = np.arange(sum(sizes))
+    tables = [pa.table({"a": part}) for part in np.split(column, np.cumsum(sizes))[:-1]]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(folder, "ROW_GROUP", 4)
+        groups = [group["a"].to_pylist() for group in folder._regroup(tables)]
+    assert list(itertools.chain(*groups)) == column.tolist()
+    assert all(len(group) == 4 for group in groups[:-1])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ({"a": {"b": [1, 2]}}, {"a": {"b": [1, 2]}}, ""),
+        ({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}, "a.b.1 (2, now 3)"),
+        ({"a": 1}, {"a": 1, "b": 2}, "b (null, now 2)"),
+        ({"a": [1]}, {"a": [1, 2]}, "a ([1], now [1, 2])"),
+    ],
+)
+def test_difference(old, new, expected):
+    """The first place where two descriptions differ."""
+    assert folder._difference(old, new) == expected
