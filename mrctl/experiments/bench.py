@@ -20,7 +20,6 @@ import numpy as np
 import torch
 
 from mrctl import plant
-from mrctl.angles import wrap
 from mrctl.control import fel, hierarchy
 from mrctl.control.feedforward import feature_scale
 from mrctl.experiments.tables import markdown, number
@@ -287,7 +286,7 @@ def autograd_loop(ticks: int, stretches: int) -> Iterator[tuple[float, float]]:
         goal, wanted, acceleration = reference[tick, :3], reference[tick, 3:5], reference[tick, 5:]
         c, s = np.cos(pose[2]), np.sin(pose[2])
         error = np.array([[c, s], [-s, c]]) @ (goal[:2] - pose[:2])
-        turn = wrap(goal[2] - pose[2])
+        turn = (goal[2] - pose[2] + np.pi) % (2 * np.pi) - np.pi
         request = np.array(
             [
                 wanted[0] * np.cos(turn) + k_x * error[0],
