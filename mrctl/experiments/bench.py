@@ -127,8 +127,8 @@ def build(size: int, ticks: int, threads: int = 1) -> Simulation:
         threads: Threads of the batch engine.
     """
     laps = math.ceil((WARM + ticks) / Scenario(laps=1).ticks)
-    with mock.patch.object(loop, "build", lambda model, size, steps: BatchPlant(model, size, steps, threads)):
-        simulation = Simulation([Scenario(seed=seed, laps=laps) for seed in range(size)])
+    with mock.patch.object(loop, "build", BatchPlant):
+        simulation = Simulation([Scenario(seed=seed, laps=laps) for seed in range(size)], threads=threads)
     for _ in range(WARM):
         simulation.step()
     return simulation

@@ -141,7 +141,7 @@ def test_equal(scenarios, alone, chunk):
 def test_threads(scenarios, alone, threads, monkeypatch):
     """The number of threads changes nothing; a batch of one is no special case either."""
     loop = import_module("mrctl.simulate")
-    monkeypatch.setattr(loop, "build", lambda model, size, substeps: BatchPlant(model, size, substeps, threads))
+    monkeypatch.setattr(loop, "build", lambda model, size, substeps, _: BatchPlant(model, size, substeps, threads))
     rows = range(0, COUNT, 3)
     whole = simulate([scenarios[row] for row in rows])
     for run, row in enumerate(rows):
