@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import multiprocessing
 import os
 import signal
@@ -155,6 +156,9 @@ class Cluster:
             import distributed
         except ImportError:
             raise InputError("scheduler: needs Dask: pip install 'mrctl[dask]'") from None
+        for name in [*logging.root.manager.loggerDict]:  # what matters of it arrives as an exception
+            if name.startswith(("distributed", "tornado", "asyncio")):
+                logging.getLogger(name).setLevel(logging.CRITICAL)
         self._distributed, self._work, self._path, self._address = distributed, work, path, address
         self._jobs: dict[Any, int] = {}
         self._ended: SimpleQueue[Any] = SimpleQueue()
