@@ -240,7 +240,7 @@ def perturb(nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Pertur
     Supply, delay and noise are no fields of a model; `mrctl.plant` and `mrctl.measurement` apply them.
 
     Raises:
-        InputError: The perturbed robot could not stand (centre of mass outside its wheels).
+        InputError: The perturbed robot could not stand (centre of mass outside its wheels or below the ground).
     """
     p = perturbation
     base = read_robot(nominal)
@@ -280,6 +280,9 @@ def perturb(nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Pertur
     before, after = _load_torques(nominal), _load_torques(model)
     if min(after.values()) <= 0:
         raise InputError("perturbation.payload: the centre of mass lies outside the wheels, the robot would tip over")
+    height = _at_rest(model)[1][2] + np.mean([model.geom(wheel).size[0] for wheel in REAR])
+    if height < 0:
+        raise InputError("perturbation.payload_z: the centre of mass lies below the ground")
     for wheel in after:
         dof = nominal.joint(wheel).dofadr[0]
         drive = 0.0 if wheel == "front_wheel" else base.drive_loss * (p.drive_friction_factor - 1)

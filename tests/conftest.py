@@ -5,7 +5,9 @@ from hypothesis import settings
 
 from mrctl.robot import Robot
 
-settings.register_profile("mrctl", deadline=None)  # a shared machine stalls
+# The same examples for everyone, and no deadline: a shared machine stalls. `--hypothesis-profile=explore` looks further.
+settings.register_profile("mrctl", deadline=None, derandomize=True)
+settings.register_profile("explore", deadline=None, print_blob=True)
 settings.load_profile("mrctl")
 
 

@@ -16,7 +16,6 @@ from mrctl import Sweep, cli, jobs
 from mrctl.store import Store
 
 pytest.importorskip("distributed")
-pytestmark = pytest.mark.xdist_group("sweeps")
 LONG = FILE.replace("runs = 12", "runs = 40").replace("chunk = 5", "chunk = 2").replace("length = 0.8", "length = 1.6")
 
 

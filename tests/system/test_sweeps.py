@@ -25,7 +25,6 @@ from mrctl.pool import Outcome
 from mrctl.result import SIGNALS
 from mrctl.store import Store
 
-pytestmark = pytest.mark.xdist_group("sweeps")  # one after another: they start processes of their own
 KILLS = int(os.environ.get("MRCTL_KILLS", "2"))  # random moments for each victim; 20 in a release
 FILE = """
 runs = 12

@@ -344,6 +344,12 @@ def test_payload_tips():
             perturbed(payload=20, **where)
 
 
+def test_payload_below_ground():
+    """Small wheels let a heavy payload at the height of the floor down through it."""
+    with pytest.raises(InputError, match=r"^perturbation.payload_z: .*below the ground$"):
+        perturbed(mass_factor=0.5, payload=121, payload_z=0, right_radius_factor=0.8125)
+
+
 def test_radii():
     """One radius alone: the geom, its bounds, the mean; the other wheel and the front wheel stay."""
     model = perturbed(left_radius_factor=1.05)
@@ -381,11 +387,11 @@ FIELDS = {
 @given(st.fixed_dictionaries({}, optional={name: st.floats(*bounds) for name, bounds in FIELDS.items()}))
 @settings(max_examples=60)
 def test_any_perturbation(values):
-    """Whatever the ranges allow gives a robot, or is refused because it would tip over."""
+    """Whatever the ranges allow gives a robot, or is refused because it could not stand."""
     try:
         model = perturbed(**values)
     except InputError as error:
-        assert "tip over" in str(error)
+        assert "tip over" in str(error) or "below the ground" in str(error)
         return
     robot = mjcf.read_robot(model, values.get("supply_factor", 1.0))
     assert isinstance(robot, Robot)
