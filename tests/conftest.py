@@ -5,7 +5,7 @@ from hypothesis import settings
 
 from mrctl.robot import Robot
 
-# The same examples for everyone, and no deadline: a shared machine stalls. `--hypothesis-profile=explore` looks further.
+# The same examples for everyone, no deadline (shared machines stall); `--hypothesis-profile=explore` looks further.
 settings.register_profile("mrctl", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None, print_blob=True)
 settings.load_profile("mrctl")
