@@ -18,6 +18,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from mrctl.control.guard import ACTIONS, LIMIT, NONE, REASONS
 from mrctl.record import InputError
 
 Array = NDArray[np.float64]
@@ -41,6 +42,7 @@ METRICS: dict[str, tuple[str, str]] = {
     "saturation_time": ("s", "time in saturation"),
     "energy": ("J", "electrical energy"),
     "weight_norm": ("1", "norm of the learner's weights at the end of the lap"),
+    "guard_actions": ("1", "times the guard on the learner stepped in, or took a stronger measure"),
 }
 """Name of a metric -> (unit, description)."""
 
@@ -48,7 +50,7 @@ PER_RUN = ("label", "feedforward", "steering", "seed", "lap_time")
 SAMPLED = (
     "x", "y", "x_ref", "y_ref", "v", "omega", "v_ref", "omega_ref", "longitudinal_error", "lateral_error",
     "heading_error", "feedback_left", "feedback_right", "voltage_left", "voltage_right", "saturated", "power",
-    "weight_norm",
+    "weight_norm", "guard",
 )  # fmt: skip
 
 
@@ -176,7 +178,8 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
         for lap, (start, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
             rates = {name: data[name][rows, start:end] for name in SAMPLED}
             # The step into a lap belongs to it, so that the variation of all laps adds up to that of the run.
-            steps = {name: data[name][rows, max(start - 1, 0) : end] for name in ("voltage_left", "voltage_right")}
+            stepping = ("voltage_left", "voltage_right", "guard")
+            steps = {name: data[name][rows, max(start - 1, 0) : end] for name in stepping}
             for name, value in _lap_metrics(rates, steps, period).items():
                 values[name][rows, lap] = value
     for row, laps in enumerate(divisions):
@@ -195,7 +198,7 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(variables, {**coords, "lap": np.arange(1, max(counts, default=0) + 1)}, dict(result.attrs))
 
 
-def _lap_metrics(data: dict[str, Array], voltages: dict[str, Array], period: float) -> dict[str, Array]:
+def _lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float) -> dict[str, Array]:
     """The metrics (rows,) of one lap, from its samples (rows, n)."""
     found: dict[str, Array] = {}
     for name in ("longitudinal", "lateral", "heading"):
@@ -213,16 +216,41 @@ def _lap_metrics(data: dict[str, Array], voltages: dict[str, Array], period: flo
     voltage = np.hypot(_rms(data["voltage_left"]), _rms(data["voltage_right"]))
     with np.errstate(divide="ignore", invalid="ignore"):
         found["feedback_share"] = np.where(feedback == 0, 0.0, feedback / voltage)  # at rest nobody works
-    found["voltage_variation"] = sum((np.abs(np.diff(u)).sum(-1) for u in voltages.values()), np.zeros(len(voltage)))
+    variations = [np.abs(np.diff(steps[name])).sum(-1) for name in ("voltage_left", "voltage_right")]
+    found["voltage_variation"] = variations[0] + variations[1]
     found["saturation_time"] = data["saturated"].sum(-1) * period
     found["energy"] = data["power"].sum(-1) * period
     found["weight_norm"] = data["weight_norm"][:, -1]
+    found["guard_actions"] = (np.diff(steps["guard"]) > 0).sum(-1).astype(float)
     return found
 
 
 def _rms(signal: Array) -> Array:
     """Root of the mean square along the last axis."""
     return np.sqrt(np.mean(np.square(signal), axis=-1))
+
+
+def guard_events(result: xr.Dataset) -> pd.DataFrame:
+    """What the guard on the learner did, in order of time, run by run.
+
+    Args:
+        result: What `simulate` returns, or one run of it.
+
+    Returns:
+        A row an event: run, time in s, action (limit, freeze, fallback, or resume after the last two), and the reason
+        in words.
+    """
+    runs = as_runs(result)
+    rows = []
+    for row, number in enumerate(runs["run"].values):
+        action, reason = (np.nan_to_num(runs[name].values[row]).astype(int) for name in ("guard", "guard_reason"))
+        for k in np.flatnonzero(np.diff(action, prepend=0)):
+            before = action[k - 1] if k else 0
+            if action[k] == NONE and before == LIMIT or np.isnan(runs["guard"].values[row, k]):
+                continue  # a limit ends by itself, a run that failed has no guard
+            name = ACTIONS[action[k]] if action[k] != NONE else "resume"
+            rows.append((number, float(runs["time"][k]), name, REASONS[reason[k]]))
+    return pd.DataFrame(rows, columns=["run", "time", "action", "reason"])
 
 
 def laps_to_converge(laps: xr.Dataset, metric: str, factor: float = 1.2) -> xr.DataArray:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from mrctl.control.fel import Fel
+from mrctl.control.guard import Guard
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
@@ -67,6 +68,8 @@ class Scenario(Record):
     """Settings of the `fel` feedforward."""
     rls: Rls = Rls()
     """Settings of the `rls` feedforward."""
+    guard: Guard = Guard()
+    """Watchdog on a feedforward that learns."""
     perturbation: Perturbation = Perturbation()
     """How the plant differs from the model, from the start."""
     events: tuple[Event, ...] = ()

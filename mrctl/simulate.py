@@ -72,6 +72,7 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
             r[10], r[11] = c.saturated[0], norm[i]
             r[12:14] = p.current
             r[14] = p.applied[0] * p.current[0] + p.applied[1] * p.current[1]
+            r[15], r[16] = c.guard.action, c.guard.reason
             near &= not abs(row[i, LATERAL_ERROR]) > DIVERGED or p.failed
         return near
 
