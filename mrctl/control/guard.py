@@ -22,22 +22,22 @@ REASONS = (
     "output beyond its share of the supply",
     "output beyond its share of the supply for most of a second",
     "weights beyond what the supply can mean",
-    "saturated for most of a second",
+    "saturated for most of two seconds",
     "growing oscillation",
     "far from the reference",
     "output not finite",
 )
 _, CLIPPED, OVERDONE, WEIGHTS, SATURATION, OSCILLATION, FAR, BROKEN = range(8)
 
-# An oscillation of the loop changes its sign at least twice a second about its own slow mean. A step or a push is over
+# An oscillation of the loop changes its sign at least once a second about its own slow mean. A step or a push is over
 # after one or two half-waves, and what a lap asks for is slower.
-SMOOTH, DRIFT = 0.02, 0.15  # s, time constants that take noise and slow motion out of a signal
-SLOWEST = 0.5  # s, longest half-wave
+SMOOTH, DRIFT = 0.02, 0.3  # s, time constants that take noise and slow motion out of a signal
+SLOWEST = 1.0  # s, longest half-wave
 SUSTAINED = 4  # half-waves above the threshold, the last not below the first
 LARGEST = 0.1  # share of the supply beyond which an oscillation is no baseline to compare with
 MEMORY = 10.0  # s over which the baselines run
 MEAN = 0.5  # s over which voltages are averaged for the integral to take over; a few periods of an oscillation
-BUSY = 1.0  # s over which saturation and limit are averaged
+BUSY, STUCK = 1.0, 2.0  # s over which limit and saturation are averaged
 RETURN = 10.0  # s over which a learner that resumes gets its authority back
 APART = 0.2  # m to the reference that are always tolerated; a run fails at 1 m
 BACK_OFF = 3.0  # each attempt learns that much more slowly, and waits that much longer
@@ -173,9 +173,9 @@ def _limit(g, values):  # noqa: ANN001, ANN202
 
 @njit
 def _quiet(g):  # noqa: ANN001, ANN202
-    """Whether no signal is above its threshold."""
+    """Whether no signal is above its threshold for longer than a step takes."""
     for k in range(4):
-        if g.waves[k] > 0:
+        if g.waves[k] > 1:
             return False
     return True
 
@@ -206,7 +206,7 @@ def _step_in(g, trouble, large, nominal, integral, feedback):  # noqa: ANN001, A
         integral[k] = target
 
 
-@njit
+@njit(cache=True)
 def guard(g, feedforward, nominal, error, norm, saturated, voltage, period, integral, feedback):  # noqa: ANN001, ANN201
     """One tick of the guard of one robot, between the feedforward stage and the allocation.
 
@@ -255,11 +255,11 @@ def guard(g, feedforward, nominal, error, norm, saturated, voltage, period, inte
     clipped = _limit(g, g.output)
     used = 1.0 if clipped and g.action != FALLBACK else 0.0
     g.clipped += period / (BUSY + period) * (used - g.clipped)
-    g.saturated += period / (BUSY + period) * (saturated - g.saturated)
+    g.saturated += period / (STUCK + period) * (saturated - g.saturated)
     distance = np.hypot(error[0], error[1])
-    trouble = _trouble(g, broken, growing, distance, norm)
     g.watched = min(g.watched + period, MEMORY)
     g.distance += period / g.watched * (min(distance, APART) - g.distance)
+    trouble = _trouble(g, broken, growing, distance, norm)
 
     g.left -= period
     if g.action == FALLBACK:
