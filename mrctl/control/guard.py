@@ -33,13 +33,13 @@ _, CLIPPED, OVERDONE, WEIGHTS, SATURATION, OSCILLATION, FAR, BROKEN = range(8)
 # after one or two half-waves, and what a lap asks for is slower.
 SMOOTH, DRIFT = 0.02, 0.3  # s, time constants that take noise and slow motion out of a signal
 SLOWEST = 1.0  # s, longest half-wave
-SUSTAINED = 4  # half-waves above the threshold, the last not below the first
+SUSTAINED = 3  # half-waves above the threshold, the last not below the first; two, if it is twice the first
 LARGEST = 0.1  # share of the supply beyond which an oscillation is no baseline to compare with
 MEMORY = 10.0  # s over which the baselines run
 MEAN = 0.5  # s over which voltages are averaged for the integral to take over; a few periods of an oscillation
 BUSY, STUCK = 1.0, 2.0  # s over which limit and saturation are averaged
 RETURN = 10.0  # s over which a learner that resumes gets its authority back
-APART = 0.2  # m to the reference that are always tolerated; a run fails at 1 m
+APART = 0.15  # m to the reference that are always tolerated; a run fails at 1 m
 BACK_OFF = 3.0  # each attempt learns that much more slowly, and waits that much longer
 UNSURE = 0.1  # further factor on the learning gain of a stage that cannot forget what it learned
 
@@ -119,7 +119,7 @@ def _grows(g, k, value, period):  # noqa: ANN001, ANN202
             g.waves[k] += 1.0
             if g.waves[k] == 1.0:
                 g.first[k] = peak
-            if g.waves[k] >= SUSTAINED and peak >= g.first[k]:
+            if peak >= (g.first[k] if g.waves[k] >= SUSTAINED else 2.0 * g.first[k]):
                 grown = peak
                 g.waves[k] = 0.0
         else:
@@ -258,7 +258,7 @@ def guard(g, feedforward, nominal, error, norm, saturated, voltage, period, inte
     g.saturated += period / (STUCK + period) * (saturated - g.saturated)
     distance = np.hypot(error[0], error[1])
     g.watched = min(g.watched + period, MEMORY)
-    g.distance += period / g.watched * (min(distance, APART) - g.distance)
+    g.distance += period / g.watched * (distance - g.distance)
     trouble = _trouble(g, broken, growing, distance, norm)
 
     g.left -= period
