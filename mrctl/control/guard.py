@@ -38,7 +38,7 @@ LARGEST = 0.1  # share of the supply beyond which an oscillation is no baseline 
 MEMORY = 10.0  # s over which the baselines run
 MEAN = 0.5  # s over which voltages are averaged for the integral to take over; a few periods of an oscillation
 BUSY, STUCK = 1.0, 2.0  # s over which limit and saturation are averaged
-RETURN = 10.0  # s over which a learner that resumes gets its authority back
+RETURN = 5.0  # s over which a learner that resumes would get its authority back at full gain
 APART = 0.15  # m to the reference that are always tolerated; a run fails at 1 m
 BACK_OFF = 3.0  # each attempt learns that much more slowly, and waits that much longer
 UNSURE = 0.1  # further factor on the learning gain of a stage that cannot forget what it learned
@@ -216,8 +216,8 @@ def guard(g, feedforward, nominal, error, norm, saturated, voltage, period, inte
       starts from what the model lacked on average, what is left of the old voltage fades, and the learner goes back to
       what it began with (`restore`).
     - resume: after the hold, once nothing is wrong, with less gain each time and after a longer hold. After a fallback
-      the learner's share of the output grows from 0 to 1 over `RETURN`, so that it learns with the fallback to lean on;
-      after `retries` the fallback stays.
+      the learner's share of the output grows from 0 to 1 as slowly as it learns, with the fallback to lean on; after
+      `retries` the fallback stays.
 
     Args:
         g: In and out: a record of `WATCH`. `output` and `teaching` are the feedforward to apply and the feedback to
@@ -275,7 +275,7 @@ def guard(g, feedforward, nominal, error, norm, saturated, voltage, period, inte
         g.action, g.reason, g.left = LIMIT, CLIPPED, BUSY
 
     if g.action != FALLBACK:
-        g.authority = min(1.0, g.authority + period / RETURN)
+        g.authority = min(1.0, g.authority + period * g.gain / RETURN)
     g.idle = 1.0 if clipped or g.action >= FREEZE else 0.0
     for k in range(2):
         g.teaching[k] = g.gain * feedback[k]
