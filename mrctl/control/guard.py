@@ -78,7 +78,8 @@ WATCH = np.dtype(
         ("baseline", "f8", 4), ("seen", "f8", 4), ("waves", "f8", 4), ("first", "f8", 4),
         ("distance", "f8"), ("watched", "f8"), ("clipped", "f8"), ("saturated", "f8"), ("lacking", "f8", 2),
         ("bump", "f8", 2), ("action", "f8"), ("reason", "f8"), ("left", "f8"), ("strikes", "f8"), ("gain", "f8"),
-        ("authority", "f8"), ("restore", "f8"), ("idle", "f8"), ("output", "f8", 2), ("teaching", "f8", 2),
+        ("authority", "f8"), ("restore", "f8"), ("idle", "f8"), ("own", "f8", 2), ("output", "f8", 2),
+        ("teaching", "f8", 2),
     ],
     align=True,
 )  # fmt: skip
@@ -196,7 +197,7 @@ def _step_in(g, trouble, large, nominal, integral, feedback):  # noqa: ANN001, A
     if mild and not hopeless:
         g.action = FREEZE
         return
-    g.action, g.authority, g.restore = FALLBACK, 0.0, 1.0
+    g.action, g.authority, g.restore, g.clipped = FALLBACK, 0.0, 1.0, 0.0
     for k in range(2):
         given = nominal[k] if g.model > 0 else 0.0
         target = g.lacking[k] + nominal[k] - given
@@ -241,20 +242,21 @@ def guard(g, feedforward, nominal, error, norm, saturated, voltage, period, inte
     for k in range(2):
         broken |= not np.isfinite(feedforward[k])
     growing = 0.0
+    clipped = False
+    if not broken:  # else the last output, for the fallback to start from
+        for k in range(2):
+            g.own[k] = feedforward[k]
+        clipped = _limit(g, g.own)
     for k in range(2):
-        g.lacking[k] += period / (MEAN + period) * (voltage[k] - nominal[k] - g.lacking[k])
+        g.output[k] = g.own[k]
         if g.authority < 1.0:
             given = nominal[k] if g.model > 0 else 0.0
-            own = 0.0 if broken else g.authority * (feedforward[k] - given)
             g.bump[k] *= g.fade / (g.fade + period)
-            g.output[k] = given + own + g.bump[k]
-        elif not broken:  # else the last output, for the fallback to start from
-            g.output[k] = feedforward[k]
-        growing = max(growing, _grows(g, k, g.output[k] / g.range[k], period))
+            g.output[k] = given + g.authority * (g.own[k] - given) + g.bump[k]
+        g.lacking[k] += period / (MEAN + period) * (voltage[k] - nominal[k] - g.lacking[k])
+        growing = max(growing, _grows(g, k, g.own[k] / g.range[k], period))
         growing = max(growing, _grows(g, 2 + k, feedback[k] / g.range[k], period))
-    clipped = _limit(g, g.output)
-    used = 1.0 if clipped and g.action != FALLBACK else 0.0
-    g.clipped += period / (BUSY + period) * (used - g.clipped)
+    g.clipped += period / (BUSY + period) * ((1.0 if clipped else 0.0) - g.clipped)
     g.saturated += period / (STUCK + period) * (saturated - g.saturated)
     distance = np.hypot(error[0], error[1])
     g.watched = min(g.watched + period, MEMORY)
@@ -266,7 +268,7 @@ def guard(g, feedforward, nominal, error, norm, saturated, voltage, period, inte
         if trouble > 0:
             g.left = max(g.left, g.hold)
         elif g.left <= 0 and _quiet(g):
-            g.action, g.reason, g.clipped = NONE, 0.0, 0.0
+            g.action, g.reason = NONE, 0.0
     elif trouble > 0:
         _step_in(g, trouble, growing > LARGEST * g.growth, nominal, integral, feedback)
     elif g.left <= 0 and _quiet(g):
