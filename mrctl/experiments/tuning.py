@@ -1,59 +1,80 @@
-"""`mrctl tune`: the velocity PID of a robot, its margins, and where learning is safe."""
+"""`mrctl tune`: the velocity PID of a robot, its margins, and where learning is safe; designed and measured."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from mrctl import model as mjcf
-from mrctl.control.pid import Pid, imc, margins
+from mrctl import plots
+from mrctl.control.kanayama import Kanayama
+from mrctl.control.pid import Gains, Pid, learning_ratio, margins, sampled_loop
+from mrctl.experiments.response import measure, refine, safety
+from mrctl.experiments.tables import markdown, number, output_folder, write_json
 from mrctl.record import InputError
+from mrctl.robot import Perturbation
 from mrctl.scenario import Scenario
 
 CHANNELS = (("common", "V/(m/s)", "V/m"), ("differential", "V/(rad/s)", "V/rad"))
+LOOPS = (("compliant", 0), ("compliant", 1), ("caster", 1), ("rigid", 1))
+"""Steering arrangement and channel; the common channel is the same for all three."""
+RESPONSES = {"design": "equation (3)", "measured": "velocity loop", "hierarchy": "with motion controller"}
 
 
-def design(world: str, time_constant: float, delay: float) -> dict[str, Any]:
-    """PID design of the robot in a world.
+def design(world: str, time_constant: float, delays: Sequence[float]) -> dict[str, Any]:
+    """PID design of the robot in a world, and the loops that come of it, on paper and on the physics.
 
     Args:
         world: World or MJCF file.
         time_constant: λ in s.
-        delay: Loop delay in s beside half a control period of hold.
+        delays: Loop delays in s, whole control periods, beside the hold.
 
     Returns:
-        Per channel: static gain, time constant, gains and `Margins`.
+        Per channel static gain, time constant, PI gains and the ratio of the learning condition; `loops`, a row for
+        every one of `LOOPS` and every delay, with `Margins` and `Safety` for each of `RESPONSES`; `frequency` and
+        `responses`, T of the same rows as they were measured.
 
     Raises:
-        InputError: A bad world, time constant or delay.
+        InputError: A bad world, time constant or delay, or one that the robot does not survive.
     """
-    Pid.from_dict({"time_constant": time_constant})
-    if not 0 <= delay <= 0.5:
-        raise InputError("delay: must be between 0 and 0.5 s")
+    base = Pid.from_dict({"time_constant": time_constant})
+    pid = Pid().faster(Pid().time_constant / base.time_constant)
+    perturbations = [Perturbation.from_dict({"control_delay": delay}) for delay in delays]
+    scenarios = [
+        Scenario.from_dict({"world": world, "pid": pid.model_dump(), "perturbation": p.model_dump(), "kanayama": gains})
+        for gains in ({"k_x": 0.0, "k_y": 0.0, "k_theta": 0.0}, Kanayama().model_dump())
+        for p in perturbations
+    ]
     robot = mjcf.read_robot(mjcf.load(world))
-    hold = Scenario().control_period / 2
+    period = scenarios[0].control_period
     plants = (
         (robot.velocity_gain, robot.velocity_time_constant),
         (robot.rotation_gain, robot.rotation_time_constant),
     )
-    table: dict[str, Any] = {"time_constant": time_constant, "delay": delay + hold}
-    for (name, *_), (gain, tau), gains in zip(CHANNELS, plants, imc(robot, time_constant), strict=True):
-        found = margins(gain, tau, gains, delay + hold)
-        table[name] = {"static_gain": gain, "plant_time_constant": tau, **gains._asdict(), **found._asdict()}
+    table: dict[str, Any] = {"time_constant": time_constant, "loops": [], "responses": []}
+    for (name, *_), (gain, tau), row in zip(CHANNELS, plants, pid.gains(robot, rigid=False), strict=True):
+        gains = Gains(*row[:2])
+        table[name] = {"static_gain": gain, "plant_time_constant": tau, **gains._asdict()}
+        table[name]["ratio"] = learning_ratio(gain, tau, gains)
+    for steering, channel in LOOPS:
+        frequency, measured = measure([s.model_copy(update={"steering": steering}) for s in scenarios], channel)
+        rigid = steering == "rigid"
+        plant = (1.0, 0.0) if rigid else plants[channel]  # the steering is taken to do what it is asked to
+        gains = Gains(*pid.gains(robot, rigid)[channel, :2])
+        for k, delay in enumerate(delays):
+            loop = sampled_loop(frequency, *plant, gains, period, delay)
+            found = dict(zip(RESPONSES, (loop / (1 + loop), measured[k], measured[len(delays) + k]), strict=True))
+            row = {"steering": steering, "channel": channel, "delay": delay}
+            table["loops"].append(row | {name: _judge(frequency, found[name], period) for name in RESPONSES})
+            table["responses"].append(row | {n: {"real": t.real, "imaginary": t.imag} for n, t in found.items()})
+        table["frequency"] = frequency
     return table
 
 
-def text(table: dict[str, Any]) -> str:
-    """The design in words and numbers."""
-    lines = [f"closed-loop time constant {table['time_constant']:g} s, delay with hold {1e3 * table['delay']:g} ms"]
-    for name, unit_p, unit_i in CHANNELS:
-        c = table[name]
-        verdict = "converges" if c["ratio"] > 1 else "does not converge"
-        lines += [
-            f"{name}: plant gain {c['static_gain']:.4g}, time constant {c['plant_time_constant']:.3f} s",
-            f"  K_p {c['k_p']:.3g} {unit_p}, K_i {c['k_i']:.3g} {unit_i}",
-            f"  crossover {c['crossover']:.2f} rad/s, phase margin {c['phase']:.1f}°, gain margin {c['gain']:.3g}, "
-            f"delay margin {1e3 * c['delay']:.0f} ms",
-            f"  learning without delay: K_p (B + b K_p) / (M K_i) = {c['ratio']:.2f}, {verdict} above 1",
-            f"  learning with delay: Re T(jω) > 0 up to {c['positive_to']:.1f} rad/s",
-        ]
-    return "\n".join(lines)
+def _judge(frequency: np.ndarray, response: np.ndarray, period: float) -> dict[str, float]:
+    fine, t = refine(frequency, response)
+    return margins(fine, t / (1 - t))._asdict() | safety(fine, t, period)._asdict()
