@@ -125,7 +125,8 @@ def sampled_loop(
     z = np.exp(1j * frequency * period)
     decay = np.exp(-period / time_constant) if time_constant > 0 else 0.0
     plant = gain * (1 - decay) / (z - decay)
-    return (gains.k_p + gains.k_i * period * z / (z - 1)) * plant * np.exp(-1j * frequency * delay)
+    control = gains.k_p + gains.k_i * period * z / (z - 1)
+    return np.asarray(control * plant * np.exp(-1j * frequency * delay), complex)
 
 
 class Margins(NamedTuple):
@@ -162,7 +163,7 @@ def margins(frequency: NDArray[np.float64], loop: NDArray[np.complex128]) -> Mar
     passed = np.abs(loop / (1 + loop)) < np.sqrt(0.5)
     if passed.any() and not passed[0]:
         bandwidth = frequency[int(np.argmax(passed))]
-    inverted = np.flatnonzero(phase < -np.pi)
+    inverted = np.flatnonzero((phase < -np.pi) & (magnitude < 1))
     return Margins(
         crossover=float(crossover),
         phase=float(np.degrees(phase_margin)),

@@ -25,15 +25,12 @@ Array = NDArray[np.float64]
 Response = NDArray[np.complex128]
 
 SAMPLES = 1000  # control periods in a period of the excitation
-AMPLITUDE = 0.1  # V a line, a tenth of that in rad/s on a steering channel: no tyre slides, no wheel turns back
+AMPLITUDE = 0.03  # V a line, a tenth of that in rad/s on a steering channel: no tyre slides, no wheel turns back
 
 
-def lines(samples: int, count: int = 40) -> NDArray[np.intp]:
-    """Odd harmonics from the first to the last below Nyquist, evenly on a logarithmic scale; at most `count`.
-
-    A quadratic nonlinearity answers at even ones, where it does no harm.
-    """
-    return 1 + 2 * np.unique(np.round((np.geomspace(1, samples // 2 - 1, count) - 1) / 2).astype(np.intp))
+def lines(samples: int) -> NDArray[np.intp]:
+    """The odd harmonics below Nyquist: a quadratic nonlinearity answers at the even ones, where it does no harm."""
+    return np.arange(1, samples // 2, 2)
 
 
 def multisine(samples: int, harmonics: NDArray[np.intp]) -> Array:
@@ -78,14 +75,14 @@ class Shaker:
         """The signal now."""
         return self._signal[self._tick % len(self._signal)]
 
-    def learn(self, feedback: Array, *_: Array) -> None:
+    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> None:
         """Notes the feedback."""
         self.feedback[self._tick] = feedback
         self._tick += 1
 
 
 def measure(scenarios: Sequence[Scenario], channel: int) -> tuple[Array, Response]:
-    """Measures T of one channel while the robots drive straight on, with all that is in their loops: hold, delay, tyres.
+    """Measures T of one channel on robots that drive straight on, with all that is in the loop: hold, delay, tyres.
 
     With the motion controller's gains at zero this is the velocity loop; with its own, the loop that learning works in.
 
@@ -115,14 +112,13 @@ def measure(scenarios: Sequence[Scenario], channel: int) -> tuple[Array, Respons
     for row in np.flatnonzero(simulation.plant.failed):
         raise InputError(f"world: no response on {line.length:g} m of it: {simulation.plant.failure[row]}")
     response = -estimate(signal[:, channel], shaker.feedback[SAMPLES:, :, channel], harmonics)
-    return 2 * np.pi * harmonics / (SAMPLES * first.control_period), response
+    return 2 * np.pi / (SAMPLES * first.control_period) * harmonics.astype(float), response
 
 
-def refine(frequency: Array, response: Response, count: int = 4000) -> tuple[Array, Response]:
-    """A response on a fine grid, by cubic splines over the logarithm of the frequency."""
-    fine = np.geomspace(frequency[0], frequency[-1], count)
-    spline = CubicSpline(np.log(frequency), np.stack([response.real, response.imag]), axis=1)
-    real, imaginary = spline(np.log(fine))
+def refine(frequency: Array, response: Response) -> tuple[Array, Response]:
+    """A response between the lines, by cubic splines, on a grid fine and even on a logarithmic scale."""
+    fine = np.geomspace(frequency[0], frequency[-1], 4000)
+    real, imaginary = CubicSpline(frequency, np.stack([response.real, response.imag]), axis=1)(fine)
     return fine, real + 1j * imaginary
 
 

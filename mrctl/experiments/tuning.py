@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from mrctl import model as mjcf
 from mrctl import plots
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.pid import Gains, Pid, learning_ratio, margins, sampled_loop
-from mrctl.experiments.response import measure, refine, safety
-from mrctl.experiments.tables import markdown, number, output_folder, write_json
+from mrctl.experiments.response import Array, Response, measure, refine, safety
+from mrctl.experiments.tables import json_text, markdown, number, output_folder
 from mrctl.record import InputError
 from mrctl.robot import Perturbation
 from mrctl.scenario import Scenario
@@ -22,7 +23,34 @@ from mrctl.scenario import Scenario
 CHANNELS = (("common", "V/(m/s)", "V/m"), ("differential", "V/(rad/s)", "V/rad"))
 LOOPS = (("compliant", 0), ("compliant", 1), ("caster", 1), ("rigid", 1))
 """Steering arrangement and channel; the common channel is the same for all three."""
-RESPONSES = {"design": "equation (3)", "measured": "velocity loop", "hierarchy": "with motion controller"}
+RESPONSES = {"design": "equation (3)", "measured": "measured", "hierarchy": "measured with motion controller"}
+STYLES: dict[str, dict[str, Any]] = {
+    "design": {"lw": 0.8},
+    "measured": {"ls": "", "marker": ".", "ms": 4},
+    "hierarchy": {"lw": 0.8, "ls": "--"},
+}
+MARGINS = {
+    "crossover": "crossover, rad/s",
+    "bandwidth": "bandwidth, rad/s",
+    "phase": "phase margin, °",
+    "gain": "gain margin",
+}
+SAFETY = {"positive_to": "Re T > 0 to, rad/s", "lowest": "least Re T", "step": "largest step"}
+
+
+def tune(world: str, time_constant: float, delays: Sequence[float], out: Path | None, json: bool) -> str:
+    """The command: designs, measures, and writes `table.json` and `sensitivity` as a figure where asked to.
+
+    Raises:
+        InputError: As `design`; or a folder that cannot be written.
+    """
+    if out is not None:
+        output_folder(out)
+    table = design(world, time_constant, delays)
+    if out is not None:
+        (out / "table.json").write_text(json_text(table) + "\n")
+        plots.save(figure(table), out, "sensitivity")
+    return json_text(table) if json else text(table)
 
 
 def design(world: str, time_constant: float, delays: Sequence[float]) -> dict[str, Any]:
@@ -41,13 +69,14 @@ def design(world: str, time_constant: float, delays: Sequence[float]) -> dict[st
     Raises:
         InputError: A bad world, time constant or delay, or one that the robot does not survive.
     """
-    base = Pid.from_dict({"time_constant": time_constant})
-    pid = Pid().faster(Pid().time_constant / base.time_constant)
-    perturbations = [Perturbation.from_dict({"control_delay": delay}) for delay in delays]
+    if not delays:
+        raise InputError("delay: none given")
+    asked = Pid.from_dict({"time_constant": time_constant})
+    pid = Pid().faster(Pid().time_constant / asked.time_constant)  # the steering's gains go with it
     scenarios = [
-        Scenario.from_dict({"world": world, "pid": pid.model_dump(), "perturbation": p.model_dump(), "kanayama": gains})
-        for gains in ({"k_x": 0.0, "k_y": 0.0, "k_theta": 0.0}, Kanayama().model_dump())
-        for p in perturbations
+        Scenario(world=world, pid=pid, kanayama=gains, perturbation=Perturbation(control_delay=delay))
+        for gains in (Kanayama(k_x=0, k_y=0, k_theta=0), Kanayama())
+        for delay in delays
     ]
     robot = mjcf.read_robot(mjcf.load(world))
     period = scenarios[0].control_period
@@ -70,11 +99,73 @@ def design(world: str, time_constant: float, delays: Sequence[float]) -> dict[st
             found = dict(zip(RESPONSES, (loop / (1 + loop), measured[k], measured[len(delays) + k]), strict=True))
             row = {"steering": steering, "channel": channel, "delay": delay}
             table["loops"].append(row | {name: _judge(frequency, found[name], period) for name in RESPONSES})
-            table["responses"].append(row | {n: {"real": t.real, "imaginary": t.imag} for n, t in found.items()})
-        table["frequency"] = frequency
+            table["responses"].append(row | {n: _parts(t) for n, t in found.items()})
+        table["frequency"] = frequency.tolist()
     return table
 
 
-def _judge(frequency: np.ndarray, response: np.ndarray, period: float) -> dict[str, float]:
+def _parts(response: Response) -> dict[str, list[float]]:
+    return {"real": response.real.tolist(), "imaginary": response.imag.tolist()}
+
+
+def _judge(frequency: Array, response: Response, period: float) -> dict[str, float]:
     fine, t = refine(frequency, response)
     return margins(fine, t / (1 - t))._asdict() | safety(fine, t, period)._asdict()
+
+
+def text(table: dict[str, Any]) -> str:
+    """The design in words and numbers."""
+    lines = [f"closed-loop time constant {table['time_constant']:g} s"]
+    for name, unit_p, unit_i in CHANNELS:
+        c = table[name]
+        verdict = "converges" if c["ratio"] > 1 else "does not converge"
+        lines += [
+            f"{name}: plant gain {c['static_gain']:.4g}, time constant {c['plant_time_constant']:.3f} s, "
+            f"K_p {c['k_p']:.3g} {unit_p}, K_i {c['k_i']:.3g} {unit_i}",
+            f"  learning without delay and hold: K_p (B + b K_p) / (M K_i) = {c['ratio']:.2f}, {verdict} above 1",
+        ]
+    rows = [
+        [
+            _name(row),
+            f"{1e3 * row['delay']:g}",
+            *(" / ".join(_cell(row[kind][name]) for kind in list(RESPONSES)[:2]) for name in MARGINS),
+            *(" / ".join(_cell(row[kind][name]) for kind in RESPONSES) for name in SAFETY),
+        ]
+        for row in table["loops"]
+    ]
+    header = ["loop", "delay, ms", *MARGINS.values(), *SAFETY.values()]
+    return "\n".join([*lines, "", f"{' / '.join(RESPONSES.values())}:", "", markdown(header, rows)])
+
+
+def _name(row: dict[str, Any]) -> str:
+    return "common" if row["channel"] == 0 else f"{row['steering']}, second"
+
+
+def _cell(value: float) -> str:
+    return number(value) if np.isfinite(value) else "–"
+
+
+@plots.styled
+def figure(table: dict[str, Any]) -> Figure:
+    """Re T(jω) on paper, measured, and in the whole hierarchy; below zero, learning by feedback error is not safe."""
+    drawn = Figure(figsize=(plots.PAGE, 0.7 * plots.PAGE), layout="constrained")
+    panels = list(drawn.subplots(2, 2, sharex=True, sharey=True).flat)
+    frequency = table["frequency"]
+    marks = np.unique(np.geomspace(1, len(frequency), 30).astype(int) - 1).tolist()  # dots evenly spread
+    rows, loops = table["responses"], list(dict.fromkeys(map(_name, table["responses"])))
+    for axes, name in zip(panels, loops, strict=True):
+        axes.axhspan(-2, 0, color="0.93", zorder=0)
+        for k, row in enumerate(r for r in rows if _name(r) == name):
+            for kind, style in STYLES.items():
+                colour = plots.COLOURS[k % len(plots.COLOURS)]
+                axes.plot(frequency, row[kind]["real"], color=colour, markevery=marks, **style)
+        axes.set(xscale="log", ylim=(-0.8, 1.6), title=name)
+    for axes in panels[2:]:
+        axes.set_xlabel("ω (rad/s)")
+    for axes in panels[::2]:
+        axes.set_ylabel(r"Re $T(\mathrm{j}\omega)$")
+    delays = [1e3 * row["delay"] for row in rows if _name(row) == loops[0]]
+    handles = [Line2D([], [], color=c, label=f"{d:g} ms") for d, c in zip(delays, plots.COLOURS, strict=False)]
+    handles += [Line2D([], [], color="0.3", label=RESPONSES[kind], **style) for kind, style in STYLES.items()]
+    drawn.legend(handles=handles, loc="outside upper center", ncols=3)
+    return drawn
