@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 
 from mrctl import model as mjcf
 from mrctl import plots
+from mrctl.control.hierarchy import TAKE_OVER
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.pid import Gains, Pid, learning_ratio, margins, sampled_loop
 from mrctl.experiments.response import Array, Response, measure, refine, safety
@@ -36,6 +37,11 @@ MARGINS = {
     "gain": "gain margin",
 }
 SAFETY = {"positive_to": "Re T > 0 to, rad/s", "lowest": "least Re T", "step": "largest step"}
+ADVICE = f"""\
+Learning by feedback error is safe at frequencies where Re T > 0; with the hand-over of the built-in learners, where
+Re T > {-TAKE_OVER / (1 - TAKE_OVER):g}. Both hold for commands that do not depend on what the robot does: a fast motion
+controller behind a delay takes from them. Above the largest step a learner of one constant oscillates without
+hand-over: stay below half of it."""
 
 
 def tune(world: str, time_constant: float, delays: Sequence[float], out: Path | None, json: bool) -> str:
@@ -46,19 +52,21 @@ def tune(world: str, time_constant: float, delays: Sequence[float], out: Path | 
     """
     if out is not None:
         output_folder(out)
-    table = design(world, time_constant, delays)
+    asked = Pid.from_dict({"time_constant": time_constant})
+    # `faster`, because the steering's gains go with the time constant.
+    table = design(world, Pid().faster(Pid().time_constant / asked.time_constant), delays)
     if out is not None:
         (out / "table.json").write_text(json_text(table) + "\n")
         plots.save(figure(table), out, "sensitivity")
     return json_text(table) if json else text(table)
 
 
-def design(world: str, time_constant: float, delays: Sequence[float]) -> dict[str, Any]:
-    """PID design of the robot in a world, and the loops that come of it, on paper and on the physics.
+def design(world: str, pid: Pid, delays: Sequence[float]) -> dict[str, Any]:
+    """The loops that come of a PID design, on paper and on the physics.
 
     Args:
         world: World or MJCF file.
-        time_constant: λ in s.
+        pid: The design; on paper without its derivative part.
         delays: Loop delays in s, whole control periods, beside the hold.
 
     Returns:
@@ -67,12 +75,10 @@ def design(world: str, time_constant: float, delays: Sequence[float]) -> dict[st
         `responses`, T of the same rows as they were measured.
 
     Raises:
-        InputError: A bad world, time constant or delay, or one that the robot does not survive.
+        InputError: A bad world or delay, or one that the robot does not survive.
     """
     if not delays:
         raise InputError("delay: none given")
-    asked = Pid.from_dict({"time_constant": time_constant})
-    pid = Pid().faster(Pid().time_constant / asked.time_constant)  # the steering's gains go with it
     scenarios = [
         Scenario(world=world, pid=pid, kanayama=gains, perturbation=Perturbation(control_delay=delay))
         for gains in (Kanayama(k_x=0, k_y=0, k_theta=0), Kanayama())
@@ -84,7 +90,7 @@ def design(world: str, time_constant: float, delays: Sequence[float]) -> dict[st
         (robot.velocity_gain, robot.velocity_time_constant),
         (robot.rotation_gain, robot.rotation_time_constant),
     )
-    table: dict[str, Any] = {"time_constant": time_constant, "loops": [], "responses": []}
+    table: dict[str, Any] = {"time_constant": pid.time_constant, "loops": [], "responses": []}
     for (name, *_), (gain, tau), row in zip(CHANNELS, plants, pid.gains(robot, rigid=False), strict=True):
         gains = Gains(*row[:2])
         table[name] = {"static_gain": gain, "plant_time_constant": tau, **gains._asdict()}
@@ -134,7 +140,20 @@ def text(table: dict[str, Any]) -> str:
         for row in table["loops"]
     ]
     header = ["loop", "delay, ms", *MARGINS.values(), *SAFETY.values()]
-    return "\n".join([*lines, "", f"{' / '.join(RESPONSES.values())}:", "", markdown(header, rows)])
+    return "\n".join([*lines, "", f"{' / '.join(RESPONSES.values())}:", "", markdown(header, rows), "", ADVICE])
+
+
+def statement(table: dict[str, Any]) -> str:
+    """Bandwidth and margins as measured without delay, in a line, to stand beside a comparison."""
+    loops = [
+        f"{_name(row)} {' / '.join(_cell(row['measured'][name]) for name in ('bandwidth', 'phase', 'gain'))}"
+        for row in table["loops"]
+        if row["delay"] == 0
+    ]
+    return (
+        f"PID by the IMC rule with λ = {table['time_constant']:g} s; bandwidth in rad/s / phase margin in degrees / "
+        f"gain margin as measured: {'; '.join(loops)}"
+    )
 
 
 def _name(row: dict[str, Any]) -> str:

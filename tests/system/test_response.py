@@ -5,10 +5,13 @@ import pytest
 from scipy import signal
 
 import mrctl
+from mrctl.control.hierarchy import TAKE_OVER
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.pid import PIDS, Gains, sampled_loop
-from mrctl.experiments.response import estimate, lines, measure, multisine, refine, safety
+from mrctl.experiments.response import SAMPLES, Shaker, estimate, lines, measure, multisine, refine, safety
+from mrctl.experiments.tuning import design, statement
 from mrctl.model import load, read_robot
+from mrctl.simulate import Simulation
 
 H = 0.01
 NO_MOTION_CONTROLLER = Kanayama(k_x=0, k_y=0, k_theta=0)
@@ -104,12 +107,47 @@ def test_safety_of_a_known_loop():
     assert safety(w, 1 / (1j * w * closed + 1), H).positive_to == np.inf
 
 
+def test_hand_over_turns_the_condition():
+    """A stage whose shaking is handed over from the integral is answered by a + (1 − a) T."""
+
+    class HandedOver(Shaker):
+        def learn(self, *given):
+            before = self.output(None, None)
+            super().learn(*given)
+            return self.output(None, None) - before
+
+    frequency, (t,) = measure(scenarios(), 0)
+    harmonics = lines(SAMPLES)
+    wave = 0.03 * np.stack([multisine(SAMPLES, harmonics), np.zeros(SAMPLES)], axis=1)
+    shaker = HandedOver(wave, 2 * SAMPLES, 1)
+    line = mrctl.Line(length=16)
+    simulation = Simulation(
+        [scenarios(reference=line, laps=1, initial_spread=(0, 0, 0))[0]], lambda robot, size: shaker
+    )
+    while simulation.running:
+        simulation.step()
+    answer = -estimate(wave[:, 0], shaker.feedback[SAMPLES:, 0, 0], harmonics)
+    np.testing.assert_allclose(answer, TAKE_OVER + (1 - TAKE_OVER) * t, atol=5e-3)
+
+
 def test_refine():
     """A smooth response between the lines is found to a thousandth."""
     w = 2 * np.pi / 10 * lines(1000)
     fine, found = refine(w, np.exp(-0.02j * w) / (0.15j * w + 1))
     near = fine < 60
     np.testing.assert_allclose(found[near], (np.exp(-0.02j * fine) / (0.15j * fine + 1))[near], atol=3e-3)
+
+
+def test_twice_as_fast():
+    """Half the λ is about twice the bandwidth and crossover on the physics too, and leaves every loop its margin."""
+    normal, fast = (design("flat", pid, (0.0,)) for pid in PIDS.values())
+    for slow_loop, fast_loop in zip(normal["loops"], fast["loops"], strict=True):
+        for name in ("bandwidth", "crossover"):
+            ratio = fast_loop["measured"][name] / slow_loop["measured"][name]
+            assert 1.85 < ratio < 2.7, (slow_loop["steering"], name)
+        assert fast_loop["measured"]["phase"] > 60
+    assert "λ = 0.075 s" in statement(fast)
+    assert f"common {fast['loops'][0]['measured']['bandwidth']:.1f} / " in statement(fast)
 
 
 class Integrator:
