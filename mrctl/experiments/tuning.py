@@ -18,7 +18,6 @@ from mrctl.control.pid import Gains, Pid, learning_ratio, margins, sampled_loop
 from mrctl.experiments.response import Array, Response, measure, refine, safety
 from mrctl.experiments.tables import json_text, markdown, number, output_folder
 from mrctl.record import InputError
-from mrctl.robot import Perturbation
 from mrctl.scenario import Scenario
 
 CHANNELS = (("common", "V/(m/s)", "V/m"), ("differential", "V/(rad/s)", "V/rad"))
@@ -80,8 +79,15 @@ def design(world: str, pid: Pid, delays: Sequence[float]) -> dict[str, Any]:
     if not delays:
         raise InputError("delay: none given")
     scenarios = [
-        Scenario(world=world, pid=pid, kanayama=gains, perturbation=Perturbation(control_delay=delay))
-        for gains in (Kanayama(k_x=0, k_y=0, k_theta=0), Kanayama())
+        Scenario.from_dict(
+            {
+                "world": world,
+                "pid": pid.model_dump(),
+                "kanayama": motion.model_dump(),
+                "perturbation": {"control_delay": delay},
+            }
+        )
+        for motion in (Kanayama(k_x=0, k_y=0, k_theta=0), Kanayama())
         for delay in delays
     ]
     robot = mjcf.read_robot(mjcf.load(world))
