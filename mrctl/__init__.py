@@ -1,7 +1,9 @@
 """A physics testbed for adaptive control of a car-like robot."""
 
+from mrctl.control.composite import Composite
 from mrctl.control.fel import Fel, save_weights
 from mrctl.control.kanayama import Kanayama
+from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
 from mrctl.metrics import per_lap, summary
@@ -18,6 +20,7 @@ __all__ = [
     "PERTURBATIONS",
     "Axis",
     "Circle",
+    "Composite",
     "Event",
     "Fel",
     "InputError",
@@ -25,6 +28,7 @@ __all__ = [
     "LaneChange",
     "Lemniscate",
     "Line",
+    "Observer",
     "Perturbation",
     "Pid",
     "Rls",

@@ -75,6 +75,7 @@ def _parse(arguments: list[str]) -> None:
 
 def _deferred(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
     """The function with its call put off, so that only parsing happens while stderr is caught."""
+
     @wraps(function)
     def inner(*args: object, **kwargs: object) -> Callable[[], Any]:
         return partial(function, *args, **kwargs)
@@ -182,9 +183,7 @@ def reproduce(out: Path = Path("reproduction")) -> None:
     print(paper.reproduce(out))
 
 
-def suite(
-    feedforward: tuple[FeedforwardName, ...] = FEEDFORWARDS, seeds: int = 10, out: Path = Path("suite")
-) -> None:
+def suite(feedforward: tuple[FeedforwardName, ...] = FEEDFORWARDS, seeds: int = 10, out: Path = Path("suite")) -> None:
     """Compares the feedforwards over steering arrangements and perturbations, with paired seeds.
 
     Args:

@@ -66,9 +66,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool) -> str:
             "failed": bool(failure),
             "failure": failure,
             "failure_time": float(row["failure_time"]) if failure else None,
-            "laps": [
-                {name: _number(row[name].values[k]) for name in metrics.METRICS} for k in range(row.sizes["lap"])
-            ],
+            "laps": [{name: _number(row[name].values[k]) for name in metrics.METRICS} for k in range(row.sizes["lap"])],
         }
         return json.dumps(values, indent=1)
     header = ["lap", *(title for title, _ in COLUMNS.values())]
