@@ -35,12 +35,13 @@ from mrctl.record import InputError, Record
 from mrctl.robot import Robot
 
 INPUTS, UNITS, CHANNELS = 8, 16, 2
-FEATURES = INPUTS + UNITS
+PHYSICAL = INPUTS + 2  # and gravity on a slope
+FEATURES = PHYSICAL + UNITS
 STEERING_SCALE = 0.1  # rad/s that count on a steering channel as one volt does on the others
 STEERING_DISTURBANCE = 0.3  # and less of that is disturbance: the geometry holds without a motor
 OUTLIER = 3.0  # standard deviations beyond which a sample pulls no harder: a tyre slips, a wheel lost its load
 SLOW = 0.1  # m/s of the faster wheel; below it stiction, not the motion, decides about the voltage
-SETTLED = 5.0  # time constants until the filters have forgotten how they began
+SETTLED = 8.0  # time constants until the filters have forgotten how they began
 SHIPPED = Path(__file__).with_suffix(".safetensors")
 
 
@@ -55,7 +56,7 @@ class Composite(Record):
     """Standard deviation of the disturbance, V (as for `noise`)."""
     disturbance_memory: Annotated[float, Field(ge=0.01, le=1e6)] = 0.5
     """Time in which the disturbance wanders by that, s."""
-    filter: Annotated[float, Field(ge=0.01, le=2)] = 0.15
+    filter: Annotated[float, Field(ge=0.01, le=2)] = 0.07
     """Time constant τ of the filter on voltage and motion, s."""
     step: Annotated[float, Field(ge=0, le=1)] = 0.02
     """Share of the feedback that the tracking term moves into the feedforward each control period, as for `rls`."""
@@ -118,19 +119,19 @@ def load_training(path: str | Path = SHIPPED) -> Training:
 
 @guvectorize([(float64[:], float64[:, :], float64[:])], "(f),(w,i),(n)", writable_args=("phi",), cache=True)
 def basis(x, units, phi):  # noqa: ANN001, ANN201
-    """φ for one robot: the scaled features, and tanh(W x + b).
+    """φ for one robot: the physical features, and tanh(W x + b) of the first 8.
 
     Args:
-        x: Scaled features `(8,)`.
+        x: Scaled features and the cosine and sine of the heading, `(10,)`.
         units: W and b side by side, `(16, 9)`.
-        phi: Out, `(24,)`.
+        phi: Out, `(26,)`.
     """
-    n = x.shape[0]
+    n, m = x.shape[0], units.shape[1] - 1
     for i in range(n):
         phi[i] = x[i]
     for j in range(units.shape[0]):
-        z = units[j, n]
-        for i in range(n):
+        z = units[j, m]
+        for i in range(m):
             z += units[j, i] * x[i]
         phi[n + j] = z
     for j in range(n, phi.shape[0]):
@@ -207,12 +208,16 @@ def adapt(measured, residual, commanded, feedback, settings, prior, weights, cov
 
 _features, _basis, _adapt = one(features), one(basis), one(adapt)
 
-# What is kept of one robot. `sent` and `voltage` are the last voltage and its filtered value, `motion` the filtered twist.
+# The signals that pass the filters: what was sent in the two channels, the twist, cosine and sine of the heading.
+SENT, TWIST, HEADING = slice(0, 2), slice(2, 4), slice(4, 6)
+SIGNALS = 6
+
+# What is kept of one robot; `once` and `twice` are the filtered signals.
 STATE = np.dtype(
     [
         ("settings", "f8", (CHANNELS, 6)), ("share", "f8"), ("rigid", "f8"),
         ("command", "f8", CHANNELS), ("phi", "f8", FEATURES), ("output", "f8", CHANNELS), ("added", "f8", CHANNELS),
-        ("age", "f8"), ("sent", "f8", CHANNELS), ("voltage", "f8", CHANNELS), ("motion", "f8", CHANNELS),
+        ("age", "f8"), ("heading", "f8"), ("signals", "f8", SIGNALS), ("once", "f8", SIGNALS), ("twice", "f8", SIGNALS),
         ("weights", "f8", (CHANNELS, FEATURES + 1)),
         ("covariance", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)), ("norm", "f8", (1,)),
     ],
@@ -221,9 +226,9 @@ STATE = np.dtype(
 
 
 @njit
-def _adaptive(weights, phi):  # noqa: ANN001, ANN202
-    """φ a + d."""
-    total = weights[phi.shape[0]]
+def _learned(weights, phi):  # noqa: ANN001, ANN202
+    """φ a."""
+    total = 0.0
     for i in range(phi.shape[0]):
         total += weights[i] * phi[i]
     return total
@@ -235,14 +240,15 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     @njit((GIVEN, GIVEN, float64, EACH, OWN, OWN, rows(STATE)), cache=True)
     def respond(command, derivative, half_track, scale, model, units, state):  # noqa: ANN001, ANN202
         _ = version
-        x = np.empty(INPUTS)
+        x = np.empty(PHYSICAL)
         for i in range(len(state)):
             s = state[i]
             _features(command[i], derivative[i], half_track, scale, x)
+            x[8], x[9] = np.cos(s.heading), np.sin(s.heading)
             _basis(x, units, s.phi)
             for k in range(CHANNELS):
                 s.command[k] = command[i, k]
-                s.output[k] = _adaptive(s.weights[k], s.phi)
+                s.output[k] = _learned(s.weights[k], s.phi) + s.weights[k, FEATURES]
                 for j in range(INPUTS):
                     s.output[k] += model[k, j] * x[j]
             s.output[1] -= s.rigid * s.command[1]
@@ -251,37 +257,40 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     def teach(  # noqa: ANN202
         feedback, twist, voltage, idle, half_track, period, scale, model, units, priors, state  # noqa: ANN001
     ):  # fmt: skip
-        x, phi, rate = np.empty(INPUTS), np.empty(FEATURES), np.empty(CHANNELS)
+        x, phi, rate = np.empty(PHYSICAL), np.empty(FEATURES), np.empty(CHANNELS)
         for i in range(len(state)):
             s = state[i]
-            for k in range(CHANNELS):  # implicit Euler, so that the filtered difference quotient is the filter's own
+            s.heading += period * twist[i, 1]
+            s.signals[2], s.signals[3] = twist[i]
+            s.signals[4], s.signals[5] = np.cos(s.heading), np.sin(s.heading)
+            for j in range(SIGNALS):
                 if s.age == 0:
-                    s.voltage[k], s.motion[k] = voltage[i, k], twist[i, k]
-                else:
-                    s.voltage[k] += s.share * (s.sent[k] - s.voltage[k])
-                    s.motion[k] += s.share * (twist[i, k] - s.motion[k])
-                rate[k] = (twist[i, k] - s.motion[k]) * s.share / (1 - s.share) / period
-                s.sent[k] = voltage[i, k]
-            s.sent[1] += s.rigid * s.command[1]
-            if s.age == 0:
-                s.voltage[1] = s.sent[1]
-            s.age += s.share
-            fit = s.age > SETTLED and abs(s.motion[0]) + half_track * abs(s.motion[1]) > SLOW
-            if fit and idle[i] == 0:
-                _features(s.motion, rate, half_track, scale, x)
-                _basis(x, units, phi)
+                    s.once[j] = s.twice[j] = s.signals[j]
+                s.once[j] += s.share * (s.signals[j] - s.once[j])
+                s.twice[j] += s.share * (s.once[j] - s.twice[j])
             for k in range(CHANNELS):
-                before = _adaptive(s.weights[k], s.phi)
-                if fit and idle[i] == 0:
-                    residual = s.voltage[k]
+                rate[k] = (s.once[2 + k] - s.twice[2 + k]) * s.share / (1 - s.share) / period
+                s.signals[k] = voltage[i, k]
+            s.signals[1] += s.rigid * s.command[1]
+            s.age += s.share
+            fast = abs(s.twice[2]) + half_track * abs(s.twice[3]) > SLOW
+            if fast and s.age > SETTLED and idle[i] == 0:
+                _features(s.twice[2:4], rate, half_track, scale, x)
+                x[8], x[9] = s.twice[4], s.twice[5]
+                _basis(x, units, phi)
+                for k in range(CHANNELS):
+                    residual = s.twice[k]
                     for j in range(INPUTS):
                         residual -= model[k, j] * x[j]
+                    before = _learned(s.weights[k], s.phi)
                     _adapt(
                         phi, residual, s.phi, feedback[i, k], s.settings[k], priors[k], s.weights[k], s.covariance[k]
                     )
-                else:
+                    s.added[k] = _learned(s.weights[k], s.phi) - before
+            else:  # only the disturbance fades
+                for k in range(CHANNELS):
                     s.weights[k, FEATURES] *= s.settings[k, 2]
-                s.added[k] = _adaptive(s.weights[k], s.phi) - before
+                    s.added[k] = 0.0
             s.norm[0] = np.sqrt((s.weights[:, :FEATURES] ** 2).sum())
 
     return respond, teach
