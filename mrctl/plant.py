@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mrctl import model as mjcf
 from mrctl.control.chain import GIVEN, one, rows
-from mrctl.robot import Perturbation, Robot
+from mrctl.robot import LONGEST_DELAY, Perturbation, Robot
 
 with warnings.catch_warnings():  # on a machine without a display dm_control tries GLFW first, which complains
     warnings.simplefilter("ignore")
@@ -34,7 +34,6 @@ Array = NDArray[np.float64]
 X, Y, THETA, V, OMEGA, V_LATERAL, RATE_LEFT, RATE_RIGHT, STEERING, STEERING_RATE, UPRIGHT = range(11)
 HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) on a sane state
 TILT = float(np.cos(np.radians(30)))
-LONGEST_DELAY = 0.5  # s, the most that `Perturbation.control_delay` may be
 JOINTS = ("chassis", "wheel_left", "wheel_right", "steering")
 
 
