@@ -1,21 +1,26 @@
-"""Composite adaptation: the model and features whose weights follow prediction and tracking errors at once.
+"""Composite adaptation: the model, and features whose weights follow prediction and tracking errors at once.
 
 Slotine and Li (1989) combine the two errors; Neural-Fly (O'Connell et al. 2022) and MAGIC-VFM (Lupu et al. 2024) adapt
 with them the last layer alone of a network that was trained off-line on many plants. Here
 
-    U = model(x) + φ(x) a + d,      φ = the 8 physical features and 16 tanh units of them,      a(0) = 0, d(0) = 0
+    U = model(x) + φ(x) a + d,      φ = 8 physical features, gravity on a slope, 16 tanh units,      a(0) = 0, d(0) = 0
 
 and a and the disturbance d are what a Kalman filter makes of the voltage that acted, at the motion that came of it:
 
-    U_f − model(x_f) = φ(x_f) a + d + noise,      x_f = (V_f, V̇_f),      V̇_f = (V − V_f)/τ
+    U_f − model(x_f) = φ(x_f) a + d + noise,      x_f = (V_f, V̇_f)
 
-Voltage and motion pass the same first-order filter, so nothing is differentiated. The weights a are taken to wander as an
-Ornstein-Uhlenbeck process whose stationary covariance P₀ is how they scatter over the plants of the training: it tells
-the filter what plants differ in, and P ≤ P₀ whatever is not excited. d does the same, fast: what is no function of the
-motion, such as a slope, goes there. The tracking term moves a along P φ(x) by a share of the feedback voltage, as `rls`.
+Voltage and motion pass the same two first-order filters, and V̇_f is the difference of what enters and leaves the second
+over its time constant: nothing is differentiated. With one filter V̇_f would carry the noise of V unfiltered, and noise
+on a regressor biases its weight toward zero.
 
-Under `rigid` steering the second channel is treated alike: what is asked of the steering is the voltage, its nominal
-inverse is the rotation itself, and U is what has to be added to the command.
+The weights are taken to wander as an Ornstein-Uhlenbeck process whose stationary covariance P₀ is how they scatter over
+the plants of the training: it tells the filter what plants differ in, and P stays below P₀ where nothing is excited. d
+does the same, fast: what is no function of the motion, such as a push, goes there. The heading that slope features need
+is dead reckoning; from where it counts does not matter. The tracking term moves a along P φ(x) by a share of the
+feedback voltage, like `rls`.
+
+Under `rigid` steering the second channel is treated alike: what is asked of the steering stands for the voltage, its
+nominal inverse is the rotation itself, and U is what has to be added to the command.
 """
 
 from __future__ import annotations
@@ -29,7 +34,7 @@ from numba import float64, guvectorize, njit
 from pydantic import Field
 
 from mrctl.control.chain import ANY, EACH, GIVEN, OWN, one, rows, stamp
-from mrctl.control.feedforward import Array, feature_scale, features
+from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features
 from mrctl.dynamics import inverse_coefficients
 from mrctl.record import InputError, Record
 from mrctl.robot import Robot
@@ -38,26 +43,26 @@ INPUTS, UNITS, CHANNELS = 8, 16, 2
 PHYSICAL = INPUTS + 2  # and gravity on a slope
 FEATURES = PHYSICAL + UNITS
 STEERING_SCALE = 0.1  # rad/s that count on a steering channel as one volt does on the others
-STEERING_DISTURBANCE = 0.3  # and less of that is disturbance: the geometry holds without a motor
+STEERING_DISTURBANCE = 0.03  # rad/s of disturbance per volt: less, since the geometry holds without a motor
 OUTLIER = 3.0  # standard deviations beyond which a sample pulls no harder: a tyre slips, a wheel lost its load
 SLOW = 0.1  # m/s of the faster wheel; below it stiction, not the motion, decides about the voltage
-SETTLED = 8.0  # time constants until the filters have forgotten how they began
+SETTLED = 6.0  # time constants until two filters have forgotten how they began
 SHIPPED = Path(__file__).with_suffix(".safetensors")
 
 
 class Composite(Record):
-    """Settings of the `composite` feedforward; one setting serves every robot, steering arrangement and perturbation."""
+    """Settings of the `composite` feedforward; one setting serves every robot, steering and perturbation."""
 
-    noise: Annotated[float, Field(gt=0, le=100)] = 0.5
+    noise: Annotated[float, Field(gt=0, le=100)] = 0.7
     """Standard deviation of one sample of the regression, V (a tenth of it in rad/s on a steering channel)."""
     memory: Annotated[float, Field(ge=1, le=1e6)] = 1000.0
     """Time in which the weights are taken to wander by as much as plants differ, s."""
-    disturbance: Annotated[float, Field(ge=0, le=100)] = 0.5
+    disturbance: Annotated[float, Field(ge=0, le=100)] = 0.3
     """Standard deviation of the disturbance, V (as for `noise`)."""
     disturbance_memory: Annotated[float, Field(ge=0.01, le=1e6)] = 0.5
     """Time in which the disturbance wanders by that, s."""
     filter: Annotated[float, Field(ge=0.01, le=2)] = 0.07
-    """Time constant τ of the filter on voltage and motion, s."""
+    """Time constant of each of the two filters on voltage and motion, s."""
     step: Annotated[float, Field(ge=0, le=1)] = 0.02
     """Share of the feedback that the tracking term moves into the feedforward each control period, as for `rls`."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
@@ -303,7 +308,7 @@ class CompositeAdaptation:
     """`composite` for B robots.
 
     Attributes:
-        state: A `STATE` a robot: among others `weights` `(2, 25)`, a and d of both channels, and their `covariance`.
+        state: `weights` `(B, 2, 27)`, a and d of both channels, and their `covariance` `(B, 2, 27, 27)`.
         weight_norm: Euclidean norm of a, `(B,)`.
     """
 
@@ -322,29 +327,33 @@ class CompositeAdaptation:
         if rigid:  # the nominal steering makes the rotation that is asked of it
             self._model[1] = 0.0
             self._model[1, 1] = self._scale[1]
-        self.state = state = np.zeros(len(settings), STATE)
+        self._rows = state = np.zeros(len(settings), STATE)
+        self.state = {"weights": state["weights"], "covariance": state["covariance"]}
         state["rigid"] = float(rigid)
         state["share"] = [period / (period + s.filter) for s in settings]
         for row, s in enumerate(settings):
             memories = np.exp(-period / np.array([s.memory, s.disturbance_memory]))
-            for channel, (unit, calm) in enumerate(
-                ((1.0, 1.0), (STEERING_SCALE, STEERING_DISTURBANCE) if rigid else (1.0, 1.0))
-            ):
-                noise, disturbance, dead_zone = unit * s.noise, unit * calm * s.disturbance, unit * s.dead_zone
-                state["settings"][row, channel] = noise, *memories, disturbance, s.step, dead_zone
-                state["covariance"][row, channel, :FEATURES, :FEATURES] = self._priors[channel]
-                state["covariance"][row, channel, FEATURES, FEATURES] = disturbance**2
+            common = np.array([s.noise, *memories, s.disturbance, s.step, s.dead_zone])
+            second = common * [STEERING_SCALE, 1, 1, STEERING_DISTURBANCE, STEERING_SHARE, STEERING_SCALE]
+            state["settings"][row] = common, second if rigid else common
+            state["covariance"][row, :, :FEATURES, :FEATURES] = self._priors
+            state["covariance"][row, :, FEATURES, FEATURES] = state["settings"][row, :, 3] ** 2
         self._output, self._added, self.weight_norm = state["output"], state["added"], state["norm"][:, 0]
 
     def output(self, command: Array, derivative: Array) -> Array:
         """The model, what is adapted at the commanded motion, and the disturbance."""
-        _respond(command, derivative, self._half_track, self._scale, self._model, self._units, self.state)
+        _respond(command, derivative, self._half_track, self._scale, self._model, self._units, self._rows)
         return self._output
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
-        """One composite step; returns what it added to the last output. Only the filters run where it must not learn."""
+        """One composite step; where it must not learn the filters run on and the disturbance fades.
+
+        Returns:
+            What the weights added to the last output. The disturbance is left out: the PID's integral may keep what it
+            holds, as beside `observer`.
+        """
         _teach(
             feedback, twist, voltage, saturated, self._half_track, self._period, self._scale, self._model, self._units,
-            self._priors, self.state,
+            self._priors, self._rows,
         )  # fmt: skip
         return self._added

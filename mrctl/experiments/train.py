@@ -1,10 +1,11 @@
 """`mrctl train`: what `composite` knows before it drives, learned off-line on randomised plants.
 
-As in Neural-Fly (O'Connell et al. 2022), a network φ is trained so that its last layer, solved anew for each plant, says
-what the model leaves unexplained: per plant the weights are the maximum a posteriori of a linear regression on what was
-seen, and the loss is the residual on what was not, half of it the rest of the same drive, half a drive along another
-reference. The prior P₀ of the weights is not a ridge that somebody chose but how they scatter over the plants, by
-expectation maximisation (empirical Bayes; Minka 2000), and goes into the file with φ: the Kalman filter starts from it.
+As in Neural-Fly (O'Connell et al. 2022), a network φ is trained so that its last layer, solved anew for each plant,
+says what the model leaves unexplained. A plant's weights are the maximum a posteriori of a linear regression on what
+was seen, and the loss is the residual on what was not: on the rest of the same drive, and on a drive along another
+reference. The prior P₀ of the weights is no ridge that somebody chose but how they scatter over the plants, by
+expectation maximisation (empirical Bayes; Dempster, Laird and Rubin 1977), and goes into the file with φ: the Kalman
+filter starts from it.
 """
 
 from __future__ import annotations
@@ -83,8 +84,11 @@ def train(out: Path, plants: int, seed: int) -> str:
     """
     if not 12 <= plants <= 100_000:
         raise InputError("plants: must be between 12 and 100,000")
+    if out.is_dir():
+        raise InputError(f"out: {out} is a folder, not a file")
     output_folder(out.parent)
     start = time.perf_counter()
+    torch.set_num_threads(1)  # the matrices are small, and one thread adds up in one order
     robot = mjcf.read_robot(mjcf.load("flat"))
     seen, unseen = (drive(draw(robot, n, [seed, k]), robot) for k, n in enumerate((plants, plants // 3)))
     units = fit(seen, seed)
@@ -101,13 +105,12 @@ def train(out: Path, plants: int, seed: int) -> str:
         [f"{name}, {where}", *(number(1e3 * table[name][where]) for table in (plain, found))]
         for name in plain for where in plain[name]
     ]  # fmt: skip
-    return "\n".join(
-        [
-            f"Residual on {len(unseen.steering)} plants held out, mV (mrad/s for steering), geometric mean of the RMS",
-            markdown(["channel, predicted", "physical features", f"and {UNITS} units"], rows),
-            f"{len(seen.steering)} of {plants} plants kept in training, {time.perf_counter() - start:.0f} s; {out}",
-        ]
+    lines = (
+        f"Residual on {len(unseen.steering)} plants held out, mV (mrad/s for steering), geometric mean of the RMS",
+        markdown(["channel, predicted", "physical features", f"and {UNITS} units"], rows),
+        f"{len(seen.steering)} of {plants} plants kept in training, {time.perf_counter() - start:.0f} s; {out}",
     )
+    return "\n".join(lines)
 
 
 def draw(robot: Robot, plants: int, seed: Sequence[int]) -> list[Scenario]:
@@ -139,7 +142,7 @@ def _perturbation(rng: np.random.Generator) -> Perturbation:
         drive_friction_factor=factor(0.4, 4), resistance_factor=factor(0.75, 1.4),
         motor_constant_factor=factor(0.85, 1.15), supply_factor=factor(0.75, 1.1),
         tyre_friction_factor=factor(0.25, 1.3), slope=float(rng.choice([0.0, rng.uniform(-0.17, 0.17)])),
-        control_delay=0.01 * int(rng.choice([0, 0, rng.integers(1, 4)])),
+control_delay=0.01 * max(0, int(rng.integers(-3, 4))),
     )  # fmt: skip
 
 
@@ -178,7 +181,7 @@ def _timed(reference: RoundedSquare | Waypoints, period: float) -> RoundedSquare
 def drive(scenarios: Sequence[Scenario], robot: Robot) -> Drives:
     """Drives with the model as feedforward, filtered as `composite` does; plants that failed are left out."""
     result = simulate(scenarios, progress=True)
-    kept = ~result["failed"].values.reshape(-1, 2).any(axis=1)
+    kept = np.logical_not(np.asarray(result["failed"]).reshape(-1, 2).any(axis=1))
     period, time_constant = scenarios[0].control_period, Composite().filter
 
     def column(name: str) -> Array:
@@ -194,13 +197,16 @@ def drive(scenarios: Sequence[Scenario], robot: Robot) -> Drives:
     # Nobody knows the direction of a slope: each plant sees another one.
     heading = column("theta") + 2 * np.pi * np.arange(len(steering))[:, None, None] * 0.618
     share = period / (period + time_constant)
-    once = lfilter([share], [1, share - 1], np.stack([*sent, v, omega, np.cos(heading), np.sin(heading)]))
-    twice = lfilter([share], [1, share - 1], once)
+    signals = np.stack([*sent, v, omega, np.cos(heading), np.sin(heading)])
+    once = np.asarray(lfilter([share], [1, share - 1], signals))
+    twice = np.asarray(lfilter([share], [1, share - 1], once))
     rate = (once[2:4] - twice[2:4]) / time_constant
     settled = slice(round(1 / period), None, EVERY)
     signals, rate = twice[..., settled], rate[..., settled]
     scale = feature_scale(robot)
-    x = features(np.moveaxis(signals[2:4], 0, -1), np.moveaxis(rate, 0, -1), robot.half_track, scale)
+    twist, rate = np.moveaxis(signals[2:4], 0, -1), np.moveaxis(rate, 0, -1)
+    x = np.empty((*twist.shape[:-1], INPUTS))
+    features(twist, rate, robot.half_track, scale, x)
     model = inverse_coefficients(robot) * scale[:, None]
     steers = model.copy()
     steers[:, 1] = 0.0
@@ -283,7 +289,7 @@ def priors(drives: Drives, units: Array) -> Array:
 def _queries(
     drives: Drives, units: Tensor, scatters: dict[str, tuple[Tensor, Tensor]]
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Mean square residual a plant and drive: of its second half by its first, and by the other drive, each `(P, 2)`."""
+    """Mean square residual a drive: of its second half by its first, and of all by the other drive, each `(P, 2)`."""
     samples = _samples(drives)
     found = {}
     for name, m in _moments(drives, units).items():
