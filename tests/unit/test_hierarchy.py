@@ -110,7 +110,7 @@ def test_motion_rate(robot, every):
 def test_rows(robot, name, steering):
     """Through the whole hierarchy robots keep to themselves: each has the same bits alone and among others."""
     body = robot.model_copy(update={"trail": 0.0}) if steering == "rigid" else robot
-    inputs = signals(3, 60)
+    inputs = signals(3, 120)
     scenarios = [Scenario(feedforward=name, steering=steering, seed=seed) for seed in range(3)]
 
     def answer(rows):
@@ -136,8 +136,8 @@ def test_learning_switch(robot, name):
     hierarchy = build(robot, 2, feedforward=name)
     key = "coefficients" if name == "rls" else "weights"
     kept = slice(26) if name == "composite" else slice(None)  # a disturbance fades, the weights stay
-    inputs = signals(2, 90)
-    early, middle, late = ([signal[part] for signal in inputs] for part in np.split(np.arange(90), 3))
+    inputs = signals(2, 360)
+    early, middle, late = ([signal[part] for signal in inputs] for part in np.split(np.arange(360), 3))
     drive(hierarchy, early)
     learned = hierarchy.feedforward.state[key].copy()
     norm = hierarchy.weight_norm.copy()
