@@ -1,8 +1,10 @@
 """A physics testbed for adaptive control of a car-like robot."""
 
+from mrctl.control.composite import Composite
 from mrctl.control.fel import Fel, save_weights
 from mrctl.control.guard import Guard
 from mrctl.control.kanayama import Kanayama
+from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
 from mrctl.metrics import guard_events, per_lap, summary
@@ -19,6 +21,7 @@ __all__ = [
     "PERTURBATIONS",
     "Axis",
     "Circle",
+    "Composite",
     "Event",
     "Fel",
     "Guard",
@@ -27,6 +30,7 @@ __all__ = [
     "LaneChange",
     "Lemniscate",
     "Line",
+    "Observer",
     "Perturbation",
     "Pid",
     "Rls",

@@ -134,7 +134,16 @@ def simulate(
 def _group(scenario: Scenario) -> Hashable:
     """Scenarios with equal keys run in one batch."""
     s = scenario
-    return s.world, s.steering, s.feedforward, s.ticks, s.physics_step, s.motion_period, s.fel.hidden
+    return (
+        s.world,
+        s.steering,
+        s.feedforward,
+        s.ticks,
+        s.physics_step,
+        s.motion_period,
+        s.fel.hidden,
+        s.composite.weights,
+    )
 
 
 class Simulation:

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from mrctl.control import steering
 from mrctl.control.chain import ANY, EACH, GIVEN, OWN, one, rows, stamp
+from mrctl.control.composite import CompositeAdaptation
 from mrctl.control.feedforward import Feedforward, InverseDynamics, NoFeedforward, features, linear
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.guard import UNSURE, WATCH, guard, watches
 from mrctl.control.kanayama import Kanayama, kanayama
 from mrctl.control.limiter import limit
+from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import Pid, pid
 from mrctl.control.rls import RecursiveLeastSquares
 from mrctl.control.steering import allocate
@@ -105,6 +107,10 @@ def feedforward_of(scenarios: Sequence[Scenario], robot: Robot) -> Feedforward:
         return NoFeedforward(len(scenarios))
     if first.feedforward in ("model", "oracle"):  # the loop tells the oracle the truth
         return InverseDynamics([robot] * len(scenarios), rigid)
+    if first.feedforward == "observer":
+        return DisturbanceObserver(robot, [s.observer for s in scenarios], rigid, first.control_period)
+    if first.feedforward == "composite":
+        return CompositeAdaptation(robot, [s.composite for s in scenarios], rigid, first.control_period)
     if first.feedforward == "rls":
         return RecursiveLeastSquares(robot, [s.rls for s in scenarios], rigid)
     return FeedbackErrorLearning(robot, [s.fel for s in scenarios], [s.seed for s in scenarios], rigid)

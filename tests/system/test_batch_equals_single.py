@@ -72,7 +72,9 @@ def scenario(seed: int) -> Scenario:
         laps=1,
         steering=steering,
         world="flat" if alike else str(rng.choice(["flat", "flat", "flat", "slope", "rough", "patch"])),
-        feedforward="fel" if alike else str(rng.choice(["none", "model", "oracle", "fel", "rls"])),
+        feedforward="fel"
+        if alike
+        else str(rng.choice(["none", "model", "oracle", "observer", "fel", "rls", "composite"])),
         measurement=str(rng.choice(["truth", "odometry"])),
         kanayama=Kanayama(k_x=float(rng.uniform(2, 4))),
         fel=Fel(step=float(rng.uniform(0, 0.1))),

@@ -293,9 +293,7 @@ def small_files(path, job):
     return compute(path, job)
 
 
-@pytest.mark.parametrize(
-    ("work", "reason"), [(full_disk, "No space left on device"), (small_files, "File too large")]
-)
+@pytest.mark.parametrize(("work", "reason"), [(full_disk, "No space left on device"), (small_files, "File too large")])
 def test_disk_full(file, sweep, tmp_path, whole, capsys, work, reason):
     """One line; what was done is kept, nothing half-written counts, and the sweep goes on when there is space."""
     store = tmp_path / "store"
