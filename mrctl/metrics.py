@@ -277,6 +277,34 @@ def recovery_time(
     return xr.DataArray(seconds, {"run": runs["run"].values}, ("run",), "recovery_time", attrs)
 
 
+def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor: float = 1.2) -> xr.DataArray:
+    """Laps after a change until the metric of whole laps is back, to stay, within `factor` of the lap before it.
+
+    Args:
+        laps: What `per_lap` returns.
+        metric: One of `METRICS`.
+        change: The number of the lap in whose beginning the change came, from 2.
+        until: Number of the last lap to look at, before the next change.
+        factor: How close counts as recovered.
+
+    Returns:
+        Laps (run,): 0 if the lap of the change itself is within, infinite if the last one is not, NaN if the run failed.
+
+    Raises:
+        InputError: No such metric, or laps that are not there.
+    """
+    known(metric)
+    if not 2 <= change <= until <= laps.sizes["lap"]:
+        raise InputError(f"change: lap {change} and lap {until} are not in order within 2 to {laps.sizes['lap']}")
+    values = laps[metric].transpose("run", "lap").values[:, change - 2 : until]
+    outside = ~(values[:, 1:] <= factor * values[:, :1])
+    last = outside.shape[1] - np.argmax(outside[:, ::-1], axis=1)
+    back = np.where(outside[:, -1], np.inf, np.where(outside.any(axis=1), last, 0))
+    number = np.where(np.isfinite(values).all(axis=1), back, np.nan)
+    attrs = {"units": "1", "long_name": f"laps until {METRICS[metric][1]} is back within {factor:g}×"}
+    return xr.DataArray(number, {"run": laps["run"].values}, ("run",), "recovery_laps", attrs)
+
+
 def error_on_return(
     result: xr.Dataset,
     event_time: float,
