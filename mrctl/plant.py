@@ -15,12 +15,12 @@ from abc import ABC, abstractmethod
 import mujoco
 import numpy as np
 from mujoco import batch as mujoco_batch
-from numba import boolean, float64, guvectorize, int64, njit
+from numba import float64, guvectorize, int64, njit
 from numpy.typing import NDArray
 
 from mrctl import model as mjcf
-from mrctl.control.chain import EACH, GIVEN, OWN, one
-from mrctl.robot import Perturbation, Robot
+from mrctl.control.chain import GIVEN, one, rows
+from mrctl.robot import LONGEST_DELAY, Perturbation, Robot
 
 with warnings.catch_warnings():  # on a machine without a display dm_control tries GLFW first, which complains
     warnings.simplefilter("ignore")
@@ -34,7 +34,6 @@ Array = NDArray[np.float64]
 X, Y, THETA, V, OMEGA, V_LATERAL, RATE_LEFT, RATE_RIGHT, STEERING, STEERING_RATE, UPRIGHT = range(11)
 HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) on a sane state
 TILT = float(np.cos(np.radians(30)))
-LONGEST_DELAY = 0.5  # s, the most that `Perturbation.control_delay` may be
 JOINTS = ("chassis", "wheel_left", "wheel_right", "steering")
 
 
@@ -74,32 +73,45 @@ _read = one(read)
 _FIELD = float64[:, :]  # an array of the engine's
 
 
-@njit((GIVEN, int64, float64[:, :, ::1], int64[::1], EACH, int64[::1], boolean[::1], OWN, _FIELD), cache=True)
-def _drive(command, tick, queue, delay, gain, inputs, failed, applied, ctrl):  # noqa: ANN001, ANN202
+# What the plant keeps of one robot beside the engine's state.
+STATE = np.dtype(
+    [
+        ("delay", "i8"), ("drive_gain", "f8"), ("resistance", "f8", 2), ("back_emf", "f8", 2),
+        ("reading", "f8", UPRIGHT + 1), ("applied", "f8", 2), ("current", "f8", 2), ("failed", "?"),
+    ],
+    align=True,
+)  # fmt: skip
+
+
+@njit((GIVEN, int64, float64[:, :, ::1], int64[::1], rows(STATE), _FIELD), cache=True)
+def _drive(command, tick, queue, inputs, state, ctrl):  # noqa: ANN001, ANN202
     """Sends each robot the command of `delay` periods ago; returns whether all commands are finite."""
     finite = True
-    for i in range(len(ctrl)):
+    for i in range(len(state)):
+        s = state[i]
         queue[tick % len(queue), i] = command[i]
-        now = queue[(tick - delay[i]) % len(queue), i]
+        now = queue[(tick - s.delay) % len(queue), i]
         for k in range(4):
-            ctrl[i, inputs[k]] = now[k] * gain[i] if k < 2 else now[k]
-            finite &= np.isfinite(now[k]) or failed[i]
-        applied[i, 0], applied[i, 1] = now[0] * gain[i], now[1] * gain[i]
+            ctrl[i, inputs[k]] = now[k] * s.drive_gain if k < 2 else now[k]
+            finite &= np.isfinite(now[k]) or s.failed
+        for k in range(2):
+            s.applied[k] = now[k] * s.drive_gain
     return finite
 
 
-@njit((*[_FIELD] * 3, int64[::1], int64[::1], *[OWN] * 3, boolean[::1], OWN, OWN), cache=True)
-def _look(qpos, qvel, act, address, acts, applied, resistance, back_emf, failed, reading, current):  # noqa: ANN001, ANN202
+@njit((*[_FIELD] * 3, int64[::1], int64[::1], rows(STATE)), cache=True)
+def _look(qpos, qvel, act, address, acts, state):  # noqa: ANN001, ANN202
     """Readings and armature currents after a period; returns whether all robots are upright and sane."""
     upright = True
-    for i in range(len(reading)):
-        _read(qpos[i], qvel[i], address, reading[i])
+    for i in range(len(state)):
+        s = state[i]
+        _read(qpos[i], qvel[i], address, s.reading)
         for k in range(2):
             if len(acts):
-                current[i, k] = act[i, acts[k]]
+                s.current[k] = act[i, acts[k]]
             else:
-                current[i, k] = (applied[i, k] - back_emf[i, k] * reading[i, RATE_LEFT + k]) / resistance[i, k]
-        upright &= reading[i, UPRIGHT] > TILT or failed[i]
+                s.current[k] = (s.applied[k] - s.back_emf[k] * s.reading[RATE_LEFT + k]) / s.resistance[k]
+        upright &= s.reading[UPRIGHT] > TILT or s.failed
     return upright
 
 
@@ -191,6 +203,7 @@ class Plant(ABC):
     """B robots in physics. Robots that fail stop alone; their state stays as it was found.
 
     Attributes:
+        state: One `STATE` a robot; `reading`, `applied` and `failed` are views of it.
         robot: The nominal robot, which is all that a controller may know.
         truth: The robots as perturbed, for the oracle.
         reading: Readouts `(B, 11)`, current after `reset` and `step`; columns as named in this module.
@@ -212,9 +225,8 @@ class Plant(ABC):
         self.size, self.substeps = size, substeps
         self.robot: Robot = mjcf.read_robot(model)
         self.truth = [self.robot] * size
-        self.reading = np.zeros((size, 11))
-        self.applied, self._current = np.zeros((size, 2)), np.zeros((size, 2))
-        self.failed = np.zeros(size, bool)
+        self.state = state = np.zeros(size, STATE)
+        self.reading, self.applied, self.failed = state["reading"], state["applied"], state["failed"]
         self.failure = [""] * size
         self.running = size
         self._nominal = model
@@ -223,9 +235,7 @@ class Plant(ABC):
         self._inputs = np.array(_inputs(model), int)
         resistance, back_emf, acts = _motor_parameters(model)
         self._acts = np.array(acts, int)
-        self._resistance, self._back_emf = (np.repeat(a, size, axis=0) for a in (resistance, back_emf))
-        self._drive_gain = np.ones(size)
-        self._delay = np.zeros(size, int)
+        state["resistance"], state["back_emf"], state["drive_gain"] = resistance, back_emf, 1.0
         # As long as any delay, so that a robot's past does not depend on the delays of the others.
         self._queue = np.zeros((1 + round(LONGEST_DELAY / (substeps * model.opt.timestep)), size, 4))
         self._tick = 0
@@ -255,9 +265,8 @@ class Plant(ABC):
         self._write(robot, self._scratch)
         self.truth[robot] = mjcf.read_robot(self._scratch, perturbation.supply_factor)
         resistance, back_emf, _ = _motor_parameters(self._scratch)
-        self._resistance[robot], self._back_emf[robot] = resistance[0], back_emf[0]
-        self._drive_gain[robot] = perturbation.supply_factor
-        self._delay[robot] = delay
+        self.state["resistance"][robot], self.state["back_emf"][robot] = resistance[0], back_emf[0]
+        self.state["drive_gain"][robot], self.state["delay"][robot] = perturbation.supply_factor, delay
 
     def reset(self, pose: Array, twist: Array) -> None:
         """Stands every robot on the ground, rolling.
@@ -298,11 +307,9 @@ class Plant(ABC):
         """
         if command.shape != (self.size, 4):
             raise ValueError(f"command: shape {command.shape}, expected {(self.size, 4)}")
-        if not _drive(
-            command, self._tick, self._queue, self._delay, self._drive_gain, self._inputs, self.failed,
-            self.applied, self.ctrl,
-        ):  # fmt: skip  # the engine would silently take zero volts instead
-            sent = self._queue[(self._tick - self._delay) % len(self._queue), np.arange(self.size)]
+        # The engine would silently take zero volts instead of what is no number.
+        if not _drive(command, self._tick, self._queue, self._inputs, self.state, self.ctrl):
+            sent = self._queue[(self._tick - self.state["delay"]) % len(self._queue), np.arange(self.size)]
             for robot in np.flatnonzero(~np.isfinite(sent).all(axis=1)):
                 self.fail(int(robot), "non-finite command")
         if self.running:
@@ -326,13 +333,10 @@ class Plant(ABC):
 
     def current(self) -> Array:
         """Armature currents left and right at the end of the last control period in A, `(B, 2)`."""
-        return self._current
+        return self.state["current"]
 
     def _look(self) -> bool:
-        return _look(
-            self.qpos, self.qvel, self.act, self._address, self._acts, self.applied, self._resistance,
-            self._back_emf, self.failed, self.reading, self._current,
-        )  # fmt: skip
+        return _look(self.qpos, self.qvel, self.act, self._address, self._acts, self.state)
 
 
 class PhysicsPlant(Plant):

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from mrctl.record import Record
 
 GRAVITY = 9.81  # m/s²
+LONGEST_DELAY = 0.5  # s, of a command on its way to the motors
 
 Positive = Annotated[float, Field(ge=1e-9, le=1e9)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9)]
@@ -193,7 +194,7 @@ class Perturbation(Record):
     """Friction of the rear left tyre on the floor, beside the factor of all."""
     slope: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     """Inclination in rad, uphill along the world's +x, as gravity seen in the slope's own frame."""
-    control_delay: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    control_delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] = 0.0
     """Delay of voltages and steering in s, in whole control periods."""
     velocity_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Standard deviation of the measured V in m/s."""

@@ -8,19 +8,21 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numba import boolean, float64, njit, types
+from numba import float64, njit
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from mrctl import model as mjcf
 from mrctl import result
-from mrctl.control.chain import EACH, GIVEN, OWN, one, stamp
+from mrctl.control.chain import ANY, GIVEN, OWN, one, rows, stamp
 from mrctl.control.feedforward import Feedforward, InverseDynamics
 from mrctl.control.fel import FeedbackErrorLearning
+from mrctl.control.hierarchy import STATE as CONTROLLER
 from mrctl.control.hierarchy import Hierarchy, feedforward_of
 from mrctl.control.kanayama import posture_error
 from mrctl.measurement import observe
 from mrctl.plant import OMEGA, RATE_LEFT, RATE_RIGHT, STEERING, THETA, Plant, V, X, build
+from mrctl.plant import STATE as ROBOT
 from mrctl.record import InputError
 from mrctl.references import check
 from mrctl.robot import Perturbation, Robot
@@ -37,38 +39,40 @@ _observe, _posture_error = one(observe), one(posture_error)
 _STATE, _REFERENCE, _ERROR = STEERING + 1, 5, 3  # how many columns of the record each takes
 
 
+# What is measured of one robot: the last measurement, this tick's noise, and whether by odometry.
+SENSORS = np.dtype([("pose", "f8", 3), ("twist", "f8", 2), ("noise", "f8", 5), ("odometry", "f8")], align=True)
+
+
 def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """What the loop does for each robot beside control and physics; see `chain.stamp` for the version."""
 
-    @njit((OWN, GIVEN, OWN, EACH, float64, float64, *[OWN] * 3), cache=True)
-    def sense(reading, reference, noise, odometry, wheel_radius, period, pose, twist, record):  # noqa: ANN001, ANN202
+    @njit((rows(ROBOT), GIVEN, rows(SENSORS), float64, float64, OWN), cache=True)
+    def sense(robots, reference, sensors, wheel_radius, period, record):  # noqa: ANN001, ANN202
         """Measures, and records state, reference, true error and measured twist."""
         _ = version
-        for i in range(len(reading)):
-            true, row = reading[i], record[i]
+        for i in range(len(robots)):
+            true, s, row = robots[i].reading, sensors[i], record[i]
             slip_free = wheel_radius * (true[RATE_LEFT] + true[RATE_RIGHT]) / 2
-            _observe(
-                true[X : THETA + 1], true[V : OMEGA + 1], noise[i], odometry[i], slip_free, period, pose[i], twist[i]
-            )
+            _observe(true[X : THETA + 1], true[V : OMEGA + 1], s.noise, s.odometry, slip_free, period, s.pose, s.twist)
             row[:_STATE] = true[:_STATE]
             row[_STATE : _STATE + _REFERENCE] = reference[i, :_REFERENCE]
             at = _STATE + _REFERENCE
             _posture_error(true[X : THETA + 1], reference[i, :3], row[at : at + _ERROR])
-            row[at + _ERROR : at + _ERROR + 2] = twist[i]
+            row[at + _ERROR : at + _ERROR + 2] = s.twist
 
-    @njit((*[OWN] * 3, EACH, types.Array(float64, 1, "A", readonly=True), *[OWN] * 2, boolean[::1], OWN), cache=True)
-    def record(command, parts, output, saturated, norm, applied, current, failed, row):  # noqa: ANN001, ANN202
+    @njit((rows(CONTROLLER), ANY, rows(ROBOT), OWN), cache=True)
+    def record(controllers, norm, robots, row):  # noqa: ANN001, ANN202
         """Records commands, currents and power; returns whether all robots are near their references."""
         _ = version
         near = True
         at = _STATE + _REFERENCE + _ERROR + 2
         for i in range(len(row)):
-            r = row[i, at:]
-            r[0:2], r[2:6], r[6:10] = command[i], parts[i], output[i]
-            r[10], r[11] = saturated[i], norm[i]
-            r[12:14] = current[i]
-            r[14] = applied[i, 0] * current[i, 0] + applied[i, 1] * current[i, 1]
-            near &= not abs(row[i, LATERAL_ERROR]) > DIVERGED or failed[i]
+            r, c, p = row[i, at:], controllers[i], robots[i]
+            r[0:2], r[2:6], r[6:10] = c.command, c.parts, c.output
+            r[10], r[11] = c.saturated[0], norm[i]
+            r[12:14] = p.current
+            r[14] = p.applied[0] * p.current[0] + p.applied[1] * p.current[1]
+            near &= not abs(row[i, LATERAL_ERROR]) > DIVERGED or p.failed
         return near
 
     return sense, record
@@ -115,9 +119,12 @@ def simulate(
     parts = []
     with tqdm(total=total, unit="tick", unit_scale=True, disable=not progress) as bar:
         for rows, simulation in simulations:
-            while simulation.running:
-                simulation.step()
-                bar.update(len(rows))
+            with np.errstate(
+                invalid="ignore", over="ignore"
+            ):  # a robot that blew up is computed on in NaN, to no effect
+                while simulation.running:
+                    simulation.step()
+                    bar.update(len(rows))
             parts.append((rows, simulation.result()))
     whole = result.combine(parts, several)
     return whole.isel(run=0) if isinstance(scenarios, Scenario) else whole
@@ -177,8 +184,10 @@ class Simulation:
         shared = self._which is None and len(order) < size
         self._reference = np.broadcast_to(samples, (self.ticks, size, 7)) if shared else samples
         self._wheel_radius = robot.wheel_radius
-        self._odometry = np.array([float(s.measurement == "odometry") for s in scenarios])
-        self._noise, self._noise_scale = np.zeros((2, size, 5))
+        self._sensors = np.zeros(size, SENSORS)
+        self._sensors["odometry"] = [s.measurement == "odometry" for s in scenarios]
+        self._pose, self._twist, self._noise = (self._sensors[name] for name in ("pose", "twist", "noise"))
+        self._noise_scale = np.zeros((size, 5))
         self._noisy: list[int] = []
         self._random = [np.random.default_rng([s.seed, 2]) for s in scenarios]
         self._schedule: dict[int, list[tuple[int, Event]]] = defaultdict(list)
@@ -190,7 +199,7 @@ class Simulation:
         self.plant.reset(np.stack([_start(s, start[i, :3]) for i, s in enumerate(scenarios)]), start[:, 3:5])
         reading = self.plant.reading
         self.hierarchy.reset(start[:, 3:5], start[:, 5:], reading[:, STEERING])
-        self._pose, self._twist = reading[:, X : THETA + 1].copy(), reading[:, V : OMEGA + 1].copy()
+        self._pose[:], self._twist[:] = reading[:, X : THETA + 1], reading[:, V : OMEGA + 1]
         # A tick's records side by side: the loop writes one block of memory a tick, however many robots there are.
         self.log = np.empty((self.ticks, size, len(result.SIGNALS)))
         self._failure_time = np.full(size, np.nan)
@@ -200,7 +209,6 @@ class Simulation:
         """Whether there is anything left to do."""
         return self.tick < self.ticks and self.plant.running > 0
 
-    @np.errstate(invalid="ignore", over="ignore")  # a robot that blew up is computed on in NaN, to no effect
     def step(self) -> None:
         """One control period: events, measurement, control, record, physics."""
         for row, event in self._schedule.get(self.tick, ()):
@@ -209,19 +217,13 @@ class Simulation:
         for row in self._noisy:
             self._noise[row] = self._noise_scale[row] * self._random[row].standard_normal(5)
         reference = self._reference_now()
-        _sense(
-            plant.reading, reference, self._noise, self._odometry, self._wheel_radius,
-            self._period if self.tick else 0.0, self._pose, self._twist, log,
-        )  # fmt: skip
-        output = hierarchy.update(self._pose, self._twist, reference[:, :3], reference[:, 3:5], reference[:, 5:])
+        _sense(plant.state, reference, self._sensors, self._wheel_radius, self._period if self.tick else 0.0, log)
+        output = hierarchy.update(self._pose, self._twist, reference)
         if not hierarchy.finite:  # the limit would turn NaN into the full voltage
             for row in np.flatnonzero(~np.isfinite(hierarchy.parts).all(axis=1)):
                 plant.fail(int(row), "non-finite voltage")
         plant.step(output)
-        near = _record(
-            hierarchy.command, hierarchy.parts, output, hierarchy.saturated, hierarchy.weight_norm, plant.applied,
-            plant.current(), plant.failed, log,
-        )  # fmt: skip
+        near = _record(hierarchy.state, hierarchy.weight_norm, plant.state, log)
         if not near:
             for row in np.flatnonzero(np.abs(log[:, LATERAL_ERROR]) > DIVERGED):
                 plant.fail(int(row), f"lateral error over {DIVERGED:g} m")

@@ -11,10 +11,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from numba import float64, njit, types
+import numpy as np
+from numba import float64, from_dtype, njit, types
 
 GIVEN = types.Array(float64, 2, "A", readonly=True)  # an input that may be a view, `(B, n)`
+ANY = types.Array(float64, 1, "A", readonly=True)  # the same, `(B,)`
 OWN, EACH = float64[:, ::1], float64[::1]  # arrays of ours, `(B, n)` and `(B,)`
+
+
+def rows(dtype: np.dtype) -> types.Array:
+    """The type of an array with one record of `dtype` a robot, `(B,)`."""
+    return types.Array(from_dtype(dtype), 1, "C")
 
 
 def one(law: Callable[..., Any]) -> Callable[..., Any]:

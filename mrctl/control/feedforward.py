@@ -36,12 +36,14 @@ class Feedforward(Protocol):
         """
         ...
 
-    def learn(self, feedback: Array, saturated: Array) -> Array | None:
-        """Learns from what the feedback still had to do after the last `output`.
+    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array | None:
+        """Learns from what the feedback still had to do after the last `output`, and from how the robot moves.
 
         Args:
             feedback: Feedback of the two channels `(B, 2)`, units as `output`.
-            saturated: 1 where a limit acted, `(B,)`.
+            saturated: 1 where a limit acted, or where this robot must not learn, `(B,)`.
+            twist: Measured V in m/s and θ̇ in rad/s, on which `voltage` has not acted yet, `(B, 2)`.
+            voltage: What is sent from now on, after the limits, in the channels and units of `output`, `(B, 2)`.
 
         Returns:
             How much this added to the output for the same command, `(B, 2)`, so that the PID can hand it over; or None.
@@ -99,7 +101,7 @@ class NoFeedforward:
         """Zero volts."""
         return self._zero
 
-    def learn(self, feedback: Array, saturated: Array) -> None:
+    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> None:
         """Nothing to learn."""
 
 
@@ -129,5 +131,5 @@ class InverseDynamics:
         linear(self._features, self._coefficients, self._output)
         return self._output
 
-    def learn(self, feedback: Array, saturated: Array) -> None:
+    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> None:
         """Knows already."""

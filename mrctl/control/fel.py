@@ -15,7 +15,7 @@ import numpy as np
 from numba import float64, guvectorize, njit
 from pydantic import Field
 
-from mrctl.control.chain import EACH, GIVEN, OWN, one, stamp
+from mrctl.control.chain import ANY, EACH, GIVEN, OWN, one, rows, stamp
 from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features
 from mrctl.record import InputError, Record
 from mrctl.robot import Robot
@@ -292,33 +292,40 @@ def update(x, feedback, saturated, targets, steps, prior, weights, norm, output)
 
 
 _features = one(features)
-_TARGETS = float64[:, :, ::1]
+
+# What is kept of one robot beside its weights; shapes as in `update`.
+STATE = np.dtype(
+    [("targets", "f8", (3, OUTPUTS)), ("steps", "f8", 3), ("features", "f8", INPUTS), ("output", "f8", OUTPUTS),
+     ("added", "f8", OUTPUTS), ("norm", "f8", (1,))],
+    align=True,
+)  # fmt: skip
 
 
 def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Output and learning step for all robots, sharing the hidden layer; see `chain.stamp` for the version."""
 
-    @njit((GIVEN, GIVEN, float64, EACH, OWN, OWN, _TARGETS, OWN, OWN), cache=True)
-    def respond(command, derivative, half_track, scale, x, weights, targets, hidden, out):  # noqa: ANN001, ANN202
+    @njit((GIVEN, GIVEN, float64, EACH, rows(STATE), OWN, OWN), cache=True)
+    def respond(command, derivative, half_track, scale, state, weights, hidden):  # noqa: ANN001, ANN202
         _ = version
-        for i in range(len(x)):
-            _features(command[i], derivative[i], half_track, scale, x[i])
-            _activate(x[i], weights[i], out.shape[1], hidden[i])
-            _network(x[i], hidden[i], weights[i], targets[i], out[i])
+        for i in range(len(state)):
+            s = state[i]
+            _features(command[i], derivative[i], half_track, scale, s.features)
+            _activate(s.features, weights[i], OUTPUTS, hidden[i])
+            _network(s.features, hidden[i], weights[i], s.targets, s.output)
 
-    @njit((OWN, OWN, GIVEN, EACH, _TARGETS, *[OWN] * 3, EACH, OWN, OWN), cache=True)
-    def teach(  # noqa: ANN202
-        x, hidden, feedback, saturated, targets, steps, prior, weights, norm, output, added  # noqa: ANN001
-    ):  # fmt: skip
-        error, gradient = np.empty(targets.shape[2]), np.empty(weights.shape[1])
-        for i in range(len(x)):
-            added[i] = output[i]
+    @njit((GIVEN, ANY, rows(STATE), *[OWN] * 3), cache=True)
+    def teach(feedback, saturated, state, prior, weights, hidden):  # noqa: ANN001, ANN202
+        error, gradient = np.empty(OUTPUTS), np.empty(weights.shape[1])
+        for i in range(len(state)):
+            s = state[i]
+            for k in range(OUTPUTS):
+                s.added[k] = s.output[k]
             _update(
-                x[i], hidden[i], feedback[i], saturated[i], targets[i], steps[i], prior[i],
-                error, gradient, weights[i], norm[i : i + 1], output[i],
+                s.features, hidden[i], feedback[i], saturated[i], s.targets, s.steps, prior[i], error, gradient,
+                weights[i], s.norm, s.output,
             )  # fmt: skip
-            for k in range(added.shape[1]):
-                added[i, k] = output[i, k] - added[i, k]
+            for k in range(OUTPUTS):
+                s.added[k] = s.output[k] - s.added[k]
 
     return respond, teach
 
@@ -343,10 +350,11 @@ class FeedbackErrorLearning:
         """
         self._half_track = robot.half_track
         self._scale = feature_scale(robot)
-        self._targets = np.array([s.targets(rigid) for s in settings])
-        self._steps = np.array([s.steps() for s in settings])
-        self._features, self._output = np.zeros((len(settings), INPUTS)), np.zeros((len(settings), OUTPUTS))
-        self._hidden, self._added = np.zeros((len(settings), settings[0].hidden)), np.zeros((len(settings), OUTPUTS))
+        self._rows = np.zeros(len(settings), STATE)
+        self._rows["targets"] = [s.targets(rigid) for s in settings]
+        self._rows["steps"] = [s.steps() for s in settings]
+        self._hidden = np.zeros((len(settings), settings[0].hidden))
+        self._output, self._added = self._rows["output"], self._rows["added"]
         self.prior = np.array(
             [
                 load_weights(s.weights, s.hidden) if s.weights else initial_weights(s.hidden, seed)
@@ -354,20 +362,16 @@ class FeedbackErrorLearning:
             ]
         )
         self.state = {"weights": self.prior.copy()}
-        self.weight_norm = np.zeros(len(settings))
+        self.weight_norm = self._rows["norm"][:, 0]
 
     def output(self, command: Array, derivative: Array) -> Array:
         """The network at the commanded motion; never at the measured one."""
         _respond(
-            command, derivative, self._half_track, self._scale, self._features, self.state["weights"], self._targets,
-            self._hidden, self._output,
+            command, derivative, self._half_track, self._scale, self._rows, self.state["weights"], self._hidden
         )  # fmt: skip
         return self._output
 
-    def learn(self, feedback: Array, saturated: Array) -> Array:
+    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
         """One step on the features of the last output; returns what it added to that output."""
-        _teach(
-            self._features, self._hidden, feedback, saturated, self._targets, self._steps, self.prior,
-            self.state["weights"], self.weight_norm, self._output, self._added,
-        )  # fmt: skip
+        _teach(feedback, saturated, self._rows, self.prior, self.state["weights"], self._hidden)
         return self._added

@@ -88,7 +88,7 @@ class ModuleLearning:
         with torch.no_grad():
             return (self._targets[0] * (self._forward(self.state) - self._forward(self.prior))).numpy()
 
-    def learn(self, feedback: Array, saturated: Array) -> Array:
+    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
         """One normalised step, by a vector-Jacobian product; see `fel.update`."""
         scale, dead_zone, share = self._targets
         fb = torch.from_numpy(np.array(feedback))

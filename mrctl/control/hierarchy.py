@@ -10,7 +10,7 @@ from numba import boolean, float64, njit
 from numpy.typing import NDArray
 
 from mrctl.control import steering
-from mrctl.control.chain import EACH, GIVEN, OWN, one, stamp
+from mrctl.control.chain import EACH, GIVEN, one, rows, stamp
 from mrctl.control.feedforward import Feedforward, InverseDynamics, NoFeedforward
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.kanayama import Kanayama, kanayama
@@ -26,45 +26,55 @@ Array = NDArray[np.float64]
 _kanayama, _limit, _pid, _allocate = one(kanayama), one(limit), one(pid), one(allocate)
 
 
+# All that the hierarchy keeps of one robot: settings, memory, and what it computed last; shapes as in the laws.
+# One array of these is one argument of a compiled loop, and a call costs by the argument.
+STATE = np.dtype(
+    [
+        ("kanayama", "f8", 3), ("prefilter", "f8"), ("pid_gains", "f8", (2, 4)), ("frozen", "f8"),
+        ("correction", "f8", 2), ("limiter", "f8", 4), ("pid", "f8", 7), ("steering", "f8", 2), ("excess", "f8", 2),
+        ("error", "f8", 3), ("request", "f8", 2), ("command", "f8", 2), ("derivative", "f8", 2),
+        ("feedback", "f8", 2), ("parts", "f8", 4), ("output", "f8", 4), ("voltage", "f8", 2),
+        ("saturated", "f8", (1,)), ("idle", "f8"),
+    ],
+    align=True,
+)  # fmt: skip
+
+
 def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The laws before and after the feedforward, each chained for all robots; see `chain.stamp` for the version."""
 
-    @njit((boolean, *[GIVEN] * 5, OWN, EACH, EACH, float64, float64[:, :, ::1], *[OWN] * 9), cache=True)
-    def lead(  # noqa: ANN202
-        moves, pose, twist, reference, reference_twist, acceleration, kanayama_gains, limits,  # noqa: ANN001
-        prefilter, period, pid_gains, excess, error, request, correction, limiter, integrals,  # noqa: ANN001
-        command, derivative, feedback,  # noqa: ANN001
-    ):  # fmt: skip
+    @njit((boolean, *[GIVEN] * 3, EACH, float64, rows(STATE)), cache=True)
+    def lead(moves, pose, twist, reference, limits, period, state):  # noqa: ANN001, ANN202
         """Posture to commanded motion and feedback: motion controller (where it moves), limiter, PID."""
         _ = version
         wish = np.empty(2)
-        for i in range(len(pose)):
-            v = reference_twist[i]
+        for i in range(len(state)):
+            s, v, acceleration = state[i], reference[i, 3:5], reference[i, 5:]
             if moves:
-                _kanayama(pose[i], reference[i], v, kanayama_gains[i], error[i], request[i])
+                _kanayama(pose[i], reference[i, :3], v, s.kanayama, s.error, s.request)
                 for k in range(2):
-                    correction[i, k] = request[i, k] - v[k]
+                    s.correction[k] = s.request[k] - v[k]
             for k in range(2):
-                wish[k] = v[k] + correction[i, k]
-            _limit(wish, v, acceleration[i], limits, prefilter[i], period, limiter[i], command[i], derivative[i])
-            _pid(command[i], twist[i], pid_gains[i], period, excess[i], integrals[i], feedback[i])
+                wish[k] = v[k] + s.correction[k]
+            _limit(wish, v, acceleration, limits, s.prefilter, period, s.limiter, s.command, s.derivative)
+            _pid(s.command, twist[i], s.pid_gains, period, s.excess, s.pid, s.feedback)
 
-    @njit((*[OWN] * 3, GIVEN, EACH, float64, EACH, *[OWN] * 4, EACH, EACH), cache=True)
-    def follow(  # noqa: ANN202
-        command, derivative, feedback, feedforward, robot, period, frozen,  # noqa: ANN001
-        fork, output, parts, excess, saturated, idle,  # noqa: ANN001
-    ):  # fmt: skip
+    @njit((GIVEN, EACH, float64, rows(STATE)), cache=True)
+    def follow(feedforward, robot, period, state):  # noqa: ANN001, ANN202
         """Feedback and feedforward to voltages and steering; returns whether all of them are finite."""
         _ = version
         finite = True
-        for i in range(len(command)):
+        for i in range(len(state)):
+            s = state[i]
             _allocate(
-                command[i], derivative[i], feedback[i], feedforward[i], robot, period,
-                fork[i], output[i], parts[i], excess[i], saturated[i : i + 1],
+                s.command, s.derivative, s.feedback, feedforward[i], robot, period,
+                s.steering, s.output, s.parts, s.excess, s.saturated,
             )  # fmt: skip
-            idle[i] = max(saturated[i], frozen[i])
+            for k in range(2):
+                s.voltage[k] = s.feedback[k] + feedforward[i, k] + s.excess[k]
+            s.idle = max(s.saturated[0], s.frozen)
             for k in range(4):
-                finite &= np.isfinite(parts[i, k])
+                finite &= np.isfinite(s.parts[k])
         return finite
 
     return lead, follow
@@ -92,14 +102,14 @@ def feedforward_of(scenarios: Sequence[Scenario], robot: Robot) -> Feedforward:
 TAKE_OVER = 0.5
 
 
-@njit((GIVEN, OWN), cache=True)
-def _hand_over(taken, integrals):  # noqa: ANN001, ANN202
-    for i in range(len(integrals)):
+@njit((GIVEN, rows(STATE)), cache=True)
+def _hand_over(taken, state):  # noqa: ANN001, ANN202
+    for i in range(len(state)):
         for k in range(2):
-            integrals[i, k] -= TAKE_OVER * taken[i, k]
+            state[i].pid[k] -= TAKE_OVER * taken[i, k]
 
 
-def _rows(values: Array, like: Array) -> Array:
+def _fitting(values: Array, like: Array) -> Array:
     """What somebody's own stage returned, in the shape and type that compiled loops rely on."""
     fits = isinstance(values, np.ndarray) and values.shape == like.shape and values.dtype == like.dtype
     return values if fits else np.broadcast_to(np.asarray(values, float), like.shape)
@@ -110,6 +120,7 @@ class Hierarchy:
 
     Attributes:
         feedforward: The feedforward stage.
+        state: Everything else that is kept, one `STATE` a robot; what follows are views of it.
         error: Measured posture error in the robot's frame, as of the motion controller's last tick, `(B, 3)`.
         command: Prefiltered twist command `(B, 2)`.
         derivative: Its derivative `(B, 2)`.
@@ -129,38 +140,32 @@ class Hierarchy:
         self._period = first.control_period
         self._every = round(first.motion_period / first.control_period)
         self._tick = 0
-        self._prefilter = np.array([max(s.prefilter, s.control_period) for s in scenarios])
         self._limits = np.array(
             [robot.max_speed, robot.max_rotation, robot.max_acceleration, robot.max_rotation_acceleration]
         )
         self._parameters = steering.parameters(robot, self._rigid)
-        self._kanayama = np.zeros((size, 3))
-        self._pid = np.zeros((size, 2, 4))
-        self._frozen = np.zeros(size)
+        self.state = state = np.zeros(size, STATE)
+        state["prefilter"] = [max(s.prefilter, s.control_period) for s in scenarios]
         for row, scenario in enumerate(scenarios):
             self.set_kanayama(row, scenario.kanayama)
             self.set_pid(row, scenario.pid)
-        self.state = {"limiter": np.zeros((size, 4)), "pid": np.zeros((size, 7)), "steering": np.zeros((size, 2))}
-        self._request, self._correction = np.zeros((size, 2)), np.zeros((size, 2))
-        self._excess, self._idle = np.zeros((size, 2)), np.zeros(size)
-        self.error = np.zeros((size, 3))
-        self.command, self.derivative = np.zeros((size, 2)), np.zeros((size, 2))
-        self.feedback, self.parts = np.zeros((size, 2)), np.zeros((size, 4))
-        self.output, self.saturated = np.zeros((size, 4)), np.zeros(size)
+        self.error, self.command, self.derivative = state["error"], state["command"], state["derivative"]
+        self.feedback, self.parts, self.output = state["feedback"], state["parts"], state["output"]
+        self.saturated, self._idle, self._voltage = state["saturated"][:, 0], state["idle"], state["voltage"]
         self.finite = True
         self._no_weights = np.zeros(size)
 
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
         """Changes the motion controller of one robot."""
-        self._kanayama[row] = gains.k_x, gains.k_y, gains.k_theta
+        self.state["kanayama"][row] = gains.k_x, gains.k_y, gains.k_theta
 
     def set_pid(self, row: int, design: Pid) -> None:
         """Changes the velocity feedback of one robot."""
-        self._pid[row] = design.gains(self._robot, self._rigid)
+        self.state["pid_gains"][row] = design.gains(self._robot, self._rigid)
 
     def set_learning(self, row: int, on: bool) -> None:
         """Lets the feedforward of one robot learn, or not."""
-        self._frozen[row] = float(not on)
+        self.state["frozen"][row] = float(not on)
 
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array) -> None:
         """Starts without a bump, as if the nominal robot had been driven here steadily.
@@ -177,35 +182,26 @@ class Hierarchy:
         integral = nominal.output(twist, acceleration) - self.feedforward.output(twist, acceleration)
         self.state["pid"][:, :2] = integral
 
-    def update(self, pose: Array, twist: Array, reference: Array, reference_twist: Array, acceleration: Array) -> Array:
+    def update(self, pose: Array, twist: Array, reference: Array) -> Array:
         """One control tick.
 
         Args:
             pose: Measured posture `(B, 3)`.
             twist: Measured twist `(B, 2)`.
-            reference: Reference posture `(B, 3)`.
-            reference_twist: Reference twist `(B, 2)`.
-            acceleration: Its derivative `(B, 2)`.
+            reference: Reference posture, twist and its derivative side by side, `(B, 7)`.
 
         Returns:
             `output`, `(B, 4)`.
         """
-        state = self.state
-        _lead(
-            self._tick % self._every == 0, pose, twist, reference, reference_twist, acceleration, self._kanayama,
-            self._limits, self._prefilter, self._period, self._pid, self._excess, self.error, self._request,
-            self._correction, state["limiter"], state["pid"], self.command, self.derivative, self.feedback,
-        )  # fmt: skip
+        state, stage = self.state, self.feedforward
+        _lead(self._tick % self._every == 0, pose, twist, reference, self._limits, self._period, state)
         self._tick += 1
-        feedforward = _rows(self.feedforward.output(self.command, self.derivative), self.feedback)
-        self.finite = _follow(
-            self.command, self.derivative, self.feedback, feedforward, self._parameters, self._period, self._frozen,
-            state["steering"], self.output, self.parts, self._excess, self.saturated, self._idle,
-        )  # fmt: skip
+        feedforward = _fitting(stage.output(self.command, self.derivative), self.feedback)
+        self.finite = _follow(feedforward, self._parameters, self._period, state)
         # A robot that must not learn is treated as one whose voltage did not act.
-        taken = self.feedforward.learn(self.feedback, self._idle)
+        taken = stage.learn(self.feedback, self._idle, twist, self._voltage)
         if taken is not None:
-            _hand_over(_rows(taken, self.feedback), state["pid"])
+            _hand_over(_fitting(taken, self.feedback), state)
         return self.output
 
     @property

@@ -102,7 +102,7 @@ class RecursiveLeastSquares:
         linear(self._features, self.state["coefficients"], self._output)
         return self._output
 
-    def learn(self, feedback: Array, saturated: Array) -> Array:
+    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
         """One recursive step; returns what it added to the last output."""
         state = self.state
         update(

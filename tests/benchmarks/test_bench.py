@@ -4,6 +4,8 @@ To repeat the figures of the README on yours, with nothing else running: `mrctl 
 """
 
 import json
+import sys
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -11,6 +13,9 @@ import pytest
 
 from mrctl import cli
 from mrctl.experiments import bench
+
+sys.path.append(str(Path(__file__).parent))
+import long_sweep  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +73,8 @@ def test_figures(figures):
 def test_parts(figures):
     """All components were measured; the physics is the largest."""
     for parts in figures["parts"].values():
-        assert set(parts) == {*bench.PARTS, "the rest"}
+        laws = {f"· {law} alone" for law in ("motion controller", "limiter", "PID")}
+        assert set(parts) == {*bench.PARTS, "the rest", *laws}
         assert all(value > 0 for value in parts.values())
         assert max(parts, key=parts.__getitem__) == "physics"
 
@@ -88,3 +94,11 @@ def test_command(figures, capsys):
     text = capsys.readouterr().out
     assert f"| {figures['robots'][1]['ratio']:.3f} |" in text
     assert "NO" not in text
+
+
+def test_long_sweep(tmp_path):
+    """The script behind the README's figures of 10,000 runs does them all, and sees the memory of workers too."""
+    curve, seconds, table = long_sweep.watch(tmp_path, runs=2, workers=1, every=0.2)
+    assert len(table) == 2 and not table["failed"].any()
+    assert curve[-1, 0] <= seconds and (np.diff(curve[:, 0]) > 0).all()
+    assert curve[:, 1].max() > 150  # MiB: an interpreter that has imported the engine

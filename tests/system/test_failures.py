@@ -24,7 +24,7 @@ class BreaksAfter:
             self.out[1:2, self.calls % 2] = np.nan
         return self.out
 
-    def learn(self, feedback, saturated):
+    def learn(self, feedback, saturated, twist, voltage):
         pass
 
 

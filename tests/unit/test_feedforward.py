@@ -67,7 +67,7 @@ def test_set_robot(robot):
     slow, derivative = 0.05 * COMMANDS[:4], DERIVATIVES[:4]  # where the half track shows in the smooth signs
     before = stage.output(slow, derivative).copy()
     stage.set_robot(2, heavy)
-    stage.learn(np.ones((4, 2)), np.zeros(4))
+    stage.learn(np.ones((4, 2)), np.zeros(4), None, None)
     after = stage.output(slow, derivative)
     np.testing.assert_array_equal(np.delete(after, 2, 0), np.delete(before, 2, 0))
     alone = InverseDynamics([heavy], rigid=False).output(slow[2:3], derivative[2:3])
@@ -78,7 +78,7 @@ def test_set_robot(robot):
 def test_none():
     """`none` gives nothing and learns nothing."""
     stage = NoFeedforward(50)
-    stage.learn(np.ones((50, 2)), np.zeros(50))
+    stage.learn(np.ones((50, 2)), np.zeros(50), None, None)
     np.testing.assert_array_equal(stage.output(COMMANDS, DERIVATIVES), np.zeros((50, 2)))
 
 

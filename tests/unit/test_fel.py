@@ -65,7 +65,7 @@ def taught(robot, settings=None, rigid=False, size=1):
 
 def power(stage):
     """Squared norm of the gradient of one channel at the first step, when only what is behind tanh can move."""
-    layers, x = unflatten(stage.state["weights"][0]), stage._features[0]
+    layers, x = unflatten(stage.state["weights"][0]), stage._rows["features"][0]
     hidden = np.tanh(layers["hidden.weight"] @ x + layers["hidden.bias"])
     return HIDDEN_GAIN**2 * hidden @ hidden + BIAS_GAIN**2 + x @ x
 
@@ -114,7 +114,7 @@ def test_normalised_step(robot, rigid, feedback):
     stage, command, derivative = taught(robot, Fel(hidden=HIDDEN, step=0.05, leak=0.0), rigid)
     assert not stage.output(command, derivative).any()
     size = power(stage)
-    taken = stage.learn(np.array([feedback]), np.zeros(1))
+    taken = stage.learn(np.array([feedback]), np.zeros(1), None, None)
     moved = stage.output(command, derivative)[0]
     np.testing.assert_allclose(taken[0], moved, atol=1e-14)  # what it says it added is what it added
     share = [1, 0.1 if rigid else 1]
@@ -131,7 +131,7 @@ def test_learns(robot):
         command, derivative = rng.uniform([0.2, -2], [1.2, 2], (8, 2)), rng.uniform([-1, -4], [1, 4], (8, 2))
         given = stage.output(command, derivative)
         error = features(command, derivative, robot.half_track, feature_scale(robot)) @ gains - given
-        stage.learn(error, np.zeros(8))
+        stage.learn(error, np.zeros(8), None, None)
         missing.append(np.sqrt((error**2).mean()))
     assert np.mean(missing[-50:]) < 0.1 * np.mean(missing[:5])
 
@@ -141,7 +141,7 @@ def test_frozen_while_saturated(robot):
     stage, command, derivative = taught(robot, size=2)
     stage.output(command, derivative)
     before = stage.state["weights"].copy()
-    stage.learn(np.ones((2, 2)), np.array([1.0, 0.0]))
+    stage.learn(np.ones((2, 2)), np.array([1.0, 0.0]), None, None)
     np.testing.assert_array_equal(stage.state["weights"][0], before[0])
     assert (stage.state["weights"][1] != before[1]).any()
     assert stage.weight_norm[0] == 0 < stage.weight_norm[1]
@@ -154,10 +154,10 @@ def test_dead_zone(robot, rigid):
     stage.output(command, derivative)
     before = stage.state["weights"].copy()
     edge = np.array([[0.03, 0.003 if rigid else 0.03]])
-    stage.learn(edge, np.zeros(1))
+    stage.learn(edge, np.zeros(1), None, None)
     np.testing.assert_array_equal(stage.state["weights"], before)
     for channel in range(2):
-        stage.learn(edge * (1 + 1e-6 * (np.arange(2) == channel)), np.zeros(1))
+        stage.learn(edge * (1 + 1e-6 * (np.arange(2) == channel)), np.zeros(1), None, None)
         moved = unflatten(stage.state["weights"][0])["direct.weight"].any(axis=1)
         assert moved.tolist() == [True, channel == 1]
 
@@ -169,7 +169,7 @@ def test_frozen_settings(robot):
     stage.state["weights"] += 0.1
     before, given = stage.state["weights"].copy(), stage.output(command, derivative).copy()
     for _ in range(20):
-        stage.learn(np.full((1, 2), 3.0), np.zeros(1))
+        stage.learn(np.full((1, 2), 3.0), np.zeros(1), None, None)
     np.testing.assert_array_equal(stage.state["weights"], before)
     np.testing.assert_array_equal(stage.output(command, derivative), given)
 

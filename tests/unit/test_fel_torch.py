@@ -48,7 +48,7 @@ def test_twins(robot, settings, rigid, ticks):
         np.testing.assert_allclose(found, expected, atol=1e-12)
         feedback = rng.normal(size=(SIZE, 2)) * [1.5, 0.15 if rigid else 1.5] - expected / 3
         saturated = (rng.random(SIZE) < 0.2).astype(float)
-        added = [stage.learn(feedback, saturated) for stage in (general, compiled)]
+        added = [stage.learn(feedback, saturated, None, None) for stage in (general, compiled)]
         np.testing.assert_allclose(*added, atol=1e-12)
         np.testing.assert_allclose(rows(general.state), compiled.state["weights"], atol=1e-12)
         np.testing.assert_allclose(general.weight_norm, compiled.weight_norm, atol=1e-12)
@@ -88,7 +88,7 @@ def test_any_module(robot):
             np.testing.assert_array_equal(given, np.zeros((8, 2)))
         target = np.stack([5 * command[:, 0] + derivative[:, 0], 2 * command[:, 1] - 0.3 * derivative[:, 1]], -1)
         missing.append(np.sqrt(((target - given) ** 2).mean()))
-        stage.learn(target - given, np.zeros(8))
+        stage.learn(target - given, np.zeros(8), None, None)
     assert np.mean(missing[-50:]) < 0.2 * np.mean(missing[:5])
     for name, value in module.state_dict().items():
         assert value.dtype == torch.float32
@@ -108,8 +108,8 @@ def test_copies(robot):
         for row, stage in enumerate(alone):
             cut = slice(row, row + 1)
             np.testing.assert_allclose(stage.output(command[cut], derivative[cut]), given[cut], atol=1e-9)
-            stage.learn(feedback[cut], saturated[cut])
-        together.learn(feedback, saturated)
+            stage.learn(feedback[cut], saturated[cut], None, None)
+        together.learn(feedback, saturated, None, None)
     for name, value in together.state.items():
         single = torch.cat([stage.state[name] for stage in alone])
         torch.testing.assert_close(value, single, atol=1e-9, rtol=0)

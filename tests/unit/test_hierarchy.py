@@ -30,7 +30,8 @@ def signals(size, ticks, seed=0):
     reference = np.stack([t * ones, np.sin(t) * ones, t * phase], -1)
     pose = reference + 0.05 * rng.normal(size=reference.shape)
     twist = np.stack([v, omega], -1)
-    return pose, twist + 0.1 * rng.normal(size=twist.shape), reference, twist, np.stack([v_dot, omega_dot], -1)
+    motion = np.concatenate([reference, twist, np.stack([v_dot, omega_dot], -1)], axis=-1)
+    return pose, twist + 0.1 * rng.normal(size=twist.shape), motion
 
 
 def drive(hierarchy, inputs):
@@ -61,9 +62,10 @@ def test_feedforwards(robot, name, kind):
 @pytest.mark.parametrize("name", ["model", "oracle"])
 def test_nothing_wrong(robot, name):
     """Where posture and twist are the reference's, the voltages are the inverse dynamics and the feedback is silent."""
-    _, _, reference, twist, acceleration = signals(1, 300)
+    _, _, motion = signals(1, 300)
+    reference, twist, acceleration = np.split(motion, [3, 5], axis=-1)
     hierarchy = build(robot, feedforward=name)
-    log = drive(hierarchy, (reference, twist, reference, twist, acceleration))[:, 0]
+    log = drive(hierarchy, (reference, twist, motion))[:, 0]
     expected = inverse_dynamics(twist[:, 0], acceleration[:, 0], robot, sign_speed=0.05)
     np.testing.assert_allclose(log[:, :2], expected, atol=1e-9)
     np.testing.assert_allclose(log[:, 7:11], np.hstack([twist[:, 0], acceleration[:, 0]]), atol=1e-12)
@@ -73,7 +75,8 @@ def test_nothing_wrong(robot, name):
 def test_slow_motion_controller(robot):
     """A motion controller of 50 ms answers every fifth tick; between, its correction rides on the live reference."""
     hierarchy = build(robot, 2, feedforward="none", motion_period=0.05, prefilter=0.01)
-    inputs = pose, _, reference, twist, _ = signals(2, 43)
+    inputs = pose, _, motion = signals(2, 43)
+    reference, twist = motion[..., :3], motion[..., 3:5]
     log = drive(hierarchy, inputs)
     gains = np.array([3.0, 25.0, 10.0])
     errors, requests = kanayama(pose[::5], reference[::5], twist[::5], gains)
@@ -117,9 +120,7 @@ def test_rows(robot, name, steering):
     for i in range(3):
         alone, _ = answer(slice(i, i + 1))
         assert together[:, i].tobytes() == alone[:, 0].tobytes()
-    states = hierarchy.state | getattr(hierarchy.feedforward, "state", {})
-    assert len(states) >= 3
-    for array in states.values():
+    for array in (hierarchy.state, *getattr(hierarchy.feedforward, "state", {}).values()):
         assert array.shape[0] == 3  # what is remembered has a leading B
     for array in (hierarchy.output, hierarchy.parts, hierarchy.weight_norm, hierarchy.saturated):
         assert array.shape[0] == 3
@@ -152,10 +153,10 @@ def test_saturation_freezes(robot):
     hierarchy = build(weak, 1, feedforward="fel")
     still, pose, ahead, wanted = np.zeros((1, 2)), np.zeros((1, 3)), np.array([[0.5, 0, 0]]), np.array([[0.5, 0]])
     for _ in range(10):  # until the command has risen beyond reach
-        hierarchy.update(pose, still, ahead, wanted, still)
+        hierarchy.update(pose, still, np.hstack([ahead, wanted, still]))
     before = hierarchy.feedforward.state["weights"].copy()
     for _ in range(400):
-        output = hierarchy.update(pose, still, ahead, wanted, still)
+        output = hierarchy.update(pose, still, np.hstack([ahead, wanted, still]))
         assert hierarchy.saturated[0] == 1
     np.testing.assert_array_equal(output[0, :2], 0.5)
     np.testing.assert_array_equal(hierarchy.feedforward.state["weights"], before)
@@ -187,7 +188,7 @@ def test_rolling_start(robot, name):
     hierarchy = build(robot, feedforward=name)
     hierarchy.reset(twist, acceleration, np.array([0.2]))
     pose = np.array([[1.0, 2.0, 0.5]])
-    output = hierarchy.update(pose, twist, pose, twist, acceleration)
+    output = hierarchy.update(pose, twist, np.hstack([pose, twist, acceleration]))
     np.testing.assert_allclose(hierarchy.command, twist, atol=1e-12)
     np.testing.assert_allclose(hierarchy.derivative, acceleration, atol=1e-12)
     steady = inverse_dynamics(twist, acceleration, robot, sign_speed=0.05)
@@ -200,13 +201,13 @@ def test_take_over(robot):
     class Learner(NoFeedforward):
         taken = np.array([[0.6, -0.2]])
 
-        def learn(self, feedback, saturated):
+        def learn(self, feedback, saturated, twist, voltage):
             return self.taken
 
     integrals = []
     for stage in (Learner(1), NoFeedforward(1)):
         hierarchy = Hierarchy([Scenario(feedforward="none")], robot, stage)
-        hierarchy.update(np.zeros((1, 3)), np.zeros((1, 2)), np.zeros((1, 3)), np.ones((1, 2)), np.zeros((1, 2)))
+        hierarchy.update(np.zeros((1, 3)), np.zeros((1, 2)), np.array([[0, 0, 0, 1.0, 1.0, 0, 0]]))
         integrals.append(hierarchy.state["pid"][:, :2].copy())
     np.testing.assert_allclose(integrals[1] - integrals[0], TAKE_OVER * Learner.taken, atol=1e-14)
 
@@ -216,10 +217,10 @@ def test_lag_of_the_fork(robot):
     hierarchy = build(robot, feedforward="none")
     twist, still, pose = np.array([[0.8, 0.5]]), np.zeros((1, 2)), np.zeros((1, 3))
     hierarchy.reset(twist, still, np.array([0.4]))
-    first = hierarchy.update(pose, twist, pose, twist, still)[0, 2]
+    first = hierarchy.update(pose, twist, np.hstack([pose, twist, still]))[0, 2]
     settled = first
     for _ in range(200):
-        settled = hierarchy.update(pose, twist, pose, twist, still)[0, 2]
+        settled = hierarchy.update(pose, twist, np.hstack([pose, twist, still]))[0, 2]
     assert settled < first < 0.4
     assert first > settled + 0.5 * (0.4 - settled)
 

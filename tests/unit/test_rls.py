@@ -63,7 +63,7 @@ def test_learns_physics(robot):
         command, derivative = draw(2)
         missing = teacher.output(command, derivative) - pupil.output(command, derivative)
         first = np.abs(missing).max() if first is None else first
-        pupil.learn(missing, np.zeros(2))
+        pupil.learn(missing, np.zeros(2), None, None)
     assert first > 1
     expected = inverse_coefficients(robot) * feature_scale(robot)[:, None]
     np.testing.assert_allclose(pupil.state["coefficients"], [expected] * 2, atol=2e-3)
@@ -103,7 +103,7 @@ def test_steering_learns_slower(robot):
     for rigid in (False, True):
         stage = RecursiveLeastSquares(robot, [Rls()], rigid)
         stage.output(command, derivative)
-        stage.learn(np.array([[1.0, 2.0]]), np.zeros(1))
+        stage.learn(np.array([[1.0, 2.0]]), np.zeros(1), None, None)
         found.append(stage.output(command, derivative)[0])
     np.testing.assert_allclose(found[1], found[0] * [1, 0.1], rtol=1e-12)
     assert (found[0] > 0).all()
@@ -114,7 +114,7 @@ def test_step(robot, command, derivative, share, initial):
     """However uncertain it is, one step moves the feedforward by no more than its share of the feedback."""
     stage = RecursiveLeastSquares(robot, [Rls(step=share, initial_covariance=initial)], rigid=False)
     stage.output(command, derivative)
-    stage.learn(np.array([[4.0, -2.0]]), np.zeros(1))
+    stage.learn(np.array([[4.0, -2.0]]), np.zeros(1), None, None)
     moved = stage.output(command, derivative)[0] / [4, -2]
     assert (moved >= 0).all()
     assert (moved <= share * (1 + 1e-9)).all()
