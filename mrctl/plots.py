@@ -295,7 +295,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
             if some.any():
                 low, mean, high = (f(values[:, some], 0) for f in (np.nanmin, np.nanmean, np.nanmax))
                 one.fill_between(number[some], low, high, color=line["color"], alpha=0.15, lw=0)
-                one.plot(number[some], mean, ".-", ms=3, **line)
+                one.plot(number[some], mean, marker=".", ms=3, **line)
         for lap in changes:
             one.axvline(lap - 0.5, color="0.4", lw=0.8, ls=":")
         one.set(title=title, yscale="log")

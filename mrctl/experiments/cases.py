@@ -18,7 +18,7 @@ STEPS = (
     "mass +50 %", "payload ahead", "payload aside", "left wheel +5 %", "drive friction x3", "resistance +30 %",
     "motor constant -15 %", "supply -20 %", "delay 20 ms", "tyre friction 0.2", "left tyre on ice", "slope 10°", "all",
 )  # fmt: skip
-SHORT, LONG = 12.0, 24.0  # s a lap: the benchmark's, and a slow one to learn on
+SHORT, LONG = 12.0, 18.0  # s a lap: the benchmark's, and a slower one to learn on
 LAP_TIMES = (12.0, 16.0, 20.0, 24.0, 30.0)  # s, of random splines: few, so that many run in one batch
 RANDOM_LAPS = 4
 MARGIN = 0.8  # of its limits that a random spline may ask of the robot
@@ -75,7 +75,7 @@ def cases(seeds: int, random: int, quick: bool) -> list[Case]:
         frozen = Event(time=third * LONG, learning=False, reference=Lemniscate(period=SHORT))
         slow = Lemniscate(period=LONG)
         case = {"reference": slow, "laps": third + 2, "events": (frozen,), "perturbation": PERTURBATIONS[name]}
-        add("learning", f"{name}, frozen on a lap twice as fast", third + 1, **case)
+        add("learning", f"{name}, frozen on laps half as fast again", third + 1, **case)
         half = laps // 2
         events = (Event(time=0.0, learning=False), Event(time=half * SHORT, learning=True))
         add("learning", f"{name}, learning from half time", half + 1, perturbation=PERTURBATIONS[name], events=events)

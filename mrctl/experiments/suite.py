@@ -32,8 +32,11 @@ Laps = Mapping[str, xr.Dataset]
 class Outcome(NamedTuple):
     """What a suite found."""
 
+    quick: bool
     cases: Sequence[Case]
     laps: Laps
+    runs: Mapping[str, Laps]
+    """The laps of each case."""
     rows: Sequence[dict[str, Any]]
     """A case and feedforward each; see `compare`."""
     aside: str
@@ -77,11 +80,12 @@ def suite(
     output_folder(out)
     chosen = cases(seeds, random, quick)
     laps, aside = run(chosen, who, workers, out / "runs")
-    rows = compare(chosen, laps)
-    found = Outcome(chosen, laps, rows, aside)
+    runs = runs_of(chosen, laps)
+    rows = compare(chosen, runs)
+    found = Outcome(quick, chosen, laps, runs, rows, aside)
     tables = as_markdown(rows)
     (out / "table.md").write_text("\n\n".join(f"## {title}\n\n{text}" for title, text in tables.items()) + "\n")
-    write_json(out / "table.json", {"versions": versions(), "rows": rows, "runs": each_run(chosen, laps)})
+    write_json(out / "table.json", {"versions": versions(), "rows": rows, "runs": each_run(runs)})
     report.write(found, who, tables, out)
     return found
 
@@ -107,7 +111,7 @@ def run(chosen: Sequence[Case], who: Mapping[str, dict[str, Any]], workers: int 
     return laps, "; ".join(aside)
 
 
-def parts_of(chosen: Sequence[Case], laps: Laps) -> dict[str, dict[str, xr.Dataset]]:
+def runs_of(chosen: Sequence[Case], laps: Laps) -> dict[str, dict[str, xr.Dataset]]:
     """The runs of each case, by feedforward."""
     ends = np.cumsum([len(case.scenarios) for case in chosen])
     return {
@@ -119,14 +123,13 @@ def parts_of(chosen: Sequence[Case], laps: Laps) -> dict[str, dict[str, xr.Datas
     }
 
 
-def compare(chosen: Sequence[Case], laps: Laps) -> list[dict[str, Any]]:
+def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str, Any]]:
     """What the tables show: a row a case and feedforward, in the order of `PARTS`.
 
     Of the last lap: mean with 95 % bootstrap interval, the worst 5 % (infinite where a run failed), ratio to and
     probability of beating PID and `model` in the same run. Of a step: see `_step`.
     """
     rows = []
-    found = parts_of(chosen, laps)
     for case in sorted(chosen, key=lambda case: [*PARTS].index(case.part)):
         ends = {name: metrics.summary(own) for name, own in found[case.name].items()}
         for name, own in ends.items():
@@ -163,10 +166,10 @@ def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:
     return found | worst | {"recovery_laps": needed.tolist(), "recovered_within_one_lap": float(np.mean(needed <= 1))}
 
 
-def each_run(chosen: Sequence[Case], laps: Laps) -> list[dict[str, Any]]:
+def each_run(found: Mapping[str, Laps]) -> list[dict[str, Any]]:
     """What became of every run, for statistics of your own."""
     rows = []
-    for case, runs in parts_of(chosen, laps).items():
+    for case, runs in found.items():
         for name, own in runs.items():
             reasons = zip(own["failure"].values, own["failure_time"].values, strict=True)
             for k, (reason, time) in enumerate(reasons):
