@@ -245,6 +245,7 @@ class Repeat(NamedTuple):
     same: bool
     """Whether it does not depart."""
 
+
 def scenario_of(out: str | Path, run: int) -> Scenario:
     """The scenario of one run of a stored sweep.
 

@@ -16,8 +16,8 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from mrctl.record import InputError
 from mrctl.comparison import Interval, bootstrap_interval
+from mrctl.record import InputError
 
 Array = NDArray[np.float64]
 
@@ -288,7 +288,7 @@ def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor
         factor: How close counts as recovered.
 
     Returns:
-        Laps (run,): 0 if the lap of the change itself is within, infinite if the last one is not, NaN if the run failed.
+        Laps (run,): 0 if the lap of the change itself is within, infinite if the last one is not, NaN if it failed.
 
     Raises:
         InputError: No such metric, or laps that are not there.

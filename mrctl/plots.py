@@ -281,7 +281,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
     unit, text = METRICS[known(metric)]
     if not cases:
         raise InputError("cases: none given")
-    columns = min(3, len(cases))
+    columns = 2 if len(cases) in (2, 4) else min(3, len(cases))
     rows = -(-len(cases) // columns)
     figure, axes = _figure(PAGE, (0.12 + 0.55 * rows) * COLUMN, rows=rows, columns=columns, sharey=True)
     order: list[str] = []
@@ -368,7 +368,8 @@ def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
             for column, (values, what, colours) in enumerate(columns):
                 panel = axes[6 * row + 3 * channel + column]
                 limit = bound / (4 if what == "error" else 1)
-                image = panel.pcolormesh(one.v, one.omega, values, cmap=colours, vmin=-limit, vmax=limit, rasterized=True)
+                look: dict[str, Any] = {"cmap": colours, "vmin": -limit, "vmax": limit, "rasterized": True}
+                image = panel.pcolormesh(one.v, one.omega, values, **look)
                 panel.plot(*one.path.T, color="white", lw=0.5)
                 panel.grid(False)
                 panel.set(xlim=one.v[[0, -1]], ylim=one.omega[[0, -1]])

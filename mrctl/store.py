@@ -261,9 +261,12 @@ class Store:
         if self.manifest["sweep"]["record"] == "laps":
             counts = frame["laps"].to_numpy()
             number = np.arange(1, counts.max(initial=0) + 1)
-            laps = {n: [np.pad(row, (0, len(number) - len(row)), constant_values=np.nan) for row in frame[f"{n}_per_lap"]]
-                    for n in METRICS}  # fmt: skip
-            found = {name: (("run", "lap"), np.array(laps[name]), {"units": units[name]}) for name in METRICS}
+            found = {}
+            for name in METRICS:
+                values = np.full((len(frame), len(number)), np.nan)
+                for row, laps in enumerate(frame[f"{name}_per_lap"]):
+                    values[row, : len(laps)] = laps
+                found[name] = (("run", "lap"), values, {"units": units[name]})
             return xr.Dataset(outcome | columns(["laps"]) | found, coords | {"lap": number}, attrs)
         if not self.samples:
             return xr.Dataset(outcome | columns(METRICS), coords, attrs)
@@ -279,7 +282,8 @@ def open_store(path: str | Path) -> xr.Dataset:
     """Opens what `mrctl sweep` or `mrctl.save` wrote.
 
     A sweep opens as one dataset of the runs that are done, axes as coordinates on `run`: with its signals (run, time)
-    where they were recorded, as what `per_lap` returns (run, lap) where laps were, else with the metrics of the last lap. The table is `runs.parquet` in it.
+    where they were recorded, as what `per_lap` returns (run, lap) where laps were, and else with the metrics of the
+    last lap (run,). The table is `runs.parquet` in it.
 
     Raises:
         InputError: There is neither at this path.

@@ -264,7 +264,7 @@ class Sweep(Record):
         return self.base.model_dump(mode="json")
 
     @cached_property
-    def worlds(self) -> list[tuple[str, str]]:
+    def worlds(self) -> list[tuple[str, Any]]:
         """Worlds and steering arrangements that the runs may combine."""
         listed = {axis.field: axis.listed for axis in self.axes}
         names = ("world", "steering")
@@ -275,7 +275,7 @@ class Sweep(Record):
 
     @cached_property
     def columns(self) -> pa.Schema:
-        """Columns of the table: the run, its axes, what became of it, its metrics in the last lap, those of all laps."""
+        """Columns of the table: the run, its axes, what became of it, and its metrics, lap by lap too."""
         columns: dict[str, tuple[pa.DataType, str]] = {"run": (pa.int64(), "1")}
         columns |= {axis.field: (axis.type, "") for axis in self.axes}
         for name, kind, unit in (

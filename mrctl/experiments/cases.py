@@ -25,6 +25,9 @@ MARGIN = 0.8  # of its limits that a random spline may ask of the robot
 GRIP = 0.3  # tyre friction that it relies on
 
 
+BAND = 1.2  # times the error before a step, within which a robot has recovered
+
+
 class Case(NamedTuple):
     """Runs that belong together."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +16,10 @@ from mrctl import controller, metrics, plots
 from mrctl.comparison import superiority
 from mrctl.control.feedforward import InverseDynamics
 from mrctl.experiments import tuning
+from mrctl.experiments.cases import BAND
 from mrctl.experiments.tables import number
 from mrctl.plots import InverseMap
 from mrctl.result import SIGNALS, versions
-from mrctl.robot import PERTURBATIONS
 from mrctl.scenario import Scenario
 from mrctl.simulate import Simulation
 
@@ -39,7 +39,8 @@ th, td { padding: 3px 9px; text-align: right; white-space: nowrap; border-bottom
 th { text-align: right; position: sticky; top: 0; background: #fff; border-bottom: 1px solid #999; }
 th:first-child, td:first-child { text-align: left; } .text td:nth-child(2), .text th:nth-child(2) { text-align: left; }
 tr.new td { border-top: 1px solid #999; } td.best { font-weight: 700; }
-summary { cursor: pointer; font-weight: 600; margin: 1em 0; } pre { background: #f5f5f5; padding: 1em; overflow-x: auto; }
+summary { cursor: pointer; font-weight: 600; margin: 1em 0; } 
+pre { background: #f5f5f5; padding: 1em; overflow-x: auto; }
 """
 
 
@@ -74,44 +75,39 @@ def figures(outcome: Outcome, who: Mapping[str, dict[str, Any]]) -> dict[str, tu
         plots.laps_by_case(steady, "position_rmse"),
         f"Position error lap by lap, on the nominal robot and with everything wrong at once. {mean}",
     )
-    steps = {name: _labelled(found[name]) for name, case in runs.items() if case.part == "step"}
-    if steps:
-        first = next(case for case in outcome.cases if case.part == "step")
-        changes = (first.change, first.back)
-        drawn["recovery"] = (
-            plots.laps_by_case(steps, "position_rmse", changes),
-            f"A change at the first dotted line, taken back at the second: position error lap by lap. {mean}",
-        )
-    share = {**steady, **dict([*steps.items()][-1:])}
+    stepped = [case for case in outcome.cases if case.part == "step"]
+    steps = {case.name: _labelled(found[case.name]) for case in stepped}
+    drawn["recovery"] = (
+        plots.laps_by_case(steps, "position_rmse", (stepped[0].change, stepped[0].back)),
+        f"A change at the first dotted line, taken back at the second: position error lap by lap. {mean}",
+    )
+    share = {**steady, stepped[-1].name: steps[stepped[-1].name]}
     drawn["feedback_share"] = (
         plots.laps_by_case(share, "feedback_share"),
         f"Share of the work that feedback still does, RMS(U_fb)/RMS(U), lap by lap. {mean}",
     )
-    switched = {name: _labelled(found[name]) for name, case in runs.items() if case.part == "learning"}
-    change = next(case.change for case in outcome.cases if case.part == "learning")
+    switched = [case for case in outcome.cases if case.part == "learning"]
+    panels = {case.name: _labelled(found[case.name]) for case in switched}
     drawn["learning"] = (
-        plots.laps_by_case(switched, "position_rmse", (change,)),
-        "Learning off until the dotted line and on from there; or on until there, then frozen on laps half as fast again, of "
-        f"which three count as two. {mean}",
+        plots.laps_by_case(panels, "position_rmse", (switched[0].change,)),
+        "Learning off until the dotted line and on from there; or on until there, then frozen on laps half as fast "
+        f"again, of which three count as two. {mean}",
     )
     if "random" in found and "none" in found["random"]:
-        bare = metrics.summary(found["random"]["none"])["position_rmse"].to_numpy()
-        ratios = {
-            name: metrics.summary(own)["position_rmse"].to_numpy() / bare
-            for name, own in found["random"].items()
-            if name != "none"
-        }
+        ends = {name: metrics.summary(own)["position_rmse"].to_numpy() for name, own in found["random"].items()}
+        ratios = {name: end / ends["none"] for name, end in ends.items()}
         drawn["random"] = (
             plots.distributions(ratios, "position error over that of PID, same run"),
-            "Random scenarios: the share of runs in which the error is below so many times that of PID alone. What does "
-            "not reach 1 has failed.",
+            "Random scenarios: the share of runs in which the error is below so many times that of PID alone. What "
+            "does not reach 1 has failed.",
         )
     learners = [name for name in who if name not in KNOWING]
     if learners:
         drawn["inverse_dynamics"] = (
             plots.inverse_dynamics({name: learned(who[name], runs["all"].scenarios[0]) for name in learners}),
-            "What was learned with everything wrong at once, against the true inverse dynamics, in steady motion: voltage "
-            "of both motors and difference between them over V and θ̇. The line is where the robot drove.",
+            "What was learned with everything wrong at once, against the true inverse dynamics, in steady motion: the "
+            "voltage that the motors share and the one in which they differ, over V and θ̇. The line is where the robot "
+            "drove.",
         )
     return drawn
 
@@ -132,13 +128,13 @@ def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
     names = list(SIGNALS)
     columns = [names.index(name) for name in ("v_command", "omega_command")]
     path = simulation.log[-round(scenario.reference.period / scenario.control_period) :, 0, columns]
-    v, omega = np.linspace(0, 1.2, GRID), np.linspace(-2, 2, GRID)
+    v, omega, shape = np.linspace(0, 1.2, GRID), np.linspace(-2, 2, GRID), (GRID, GRID, 2)
     truth = InverseDynamics([simulation.plant.truth[0]], rigid=scenario.steering == "rigid")
-    maps = []
-    for stage in (simulation.hierarchy.feedforward, truth):
-        ask = [np.array(stage.output(np.array([[x, y]]), np.zeros((1, 2))), float)[0] for y in omega for x in v]
-        maps.append(np.reshape(ask, (GRID, GRID, 2)))
-    return InverseMap(v, omega, *maps, path)
+    mine, true = (
+        np.reshape([np.array(stage.output(np.array([[x, y]]), np.zeros((1, 2))))[0] for y in omega for x in v], shape)
+        for stage in (simulation.hierarchy.feedforward, truth)
+    )
+    return InverseMap(v, omega, mine, true, path)
 
 
 def page(
@@ -161,8 +157,16 @@ def page(
         f"<p><strong>{html.escape(outcome.aside)}</strong></p>" if outcome.aside else "",
         "<h2>Position error of the last lap, mm</h2>",
         "<p>Mean over the seeds of a case; bold is the best but <code>oracle</code>, which knows the plant. Colour: "
-        "green is less than PID alone, red is more. “3 failed” counts runs that diverged; the mean is of the others.</p>",
+        "green is less than PID alone, red is more. “3 failed” counts runs that diverged; the mean is of the "
+        "others.</p>",
         f"<div class=wide>{scorecard(outcome)}</div>",
+    ]
+    body += [
+        "<h2>A step, and the return</h2>",
+        "<p>Mean position error in the last lap before the return, mm; geometric mean of the error one lap after "
+        f"the change over that before it; the same after the return. Bold: every run was back within {BAND:g} times "
+        "its error before, to stay, one lap after the change. The better the error before, the harder that is.</p>",
+        f"<div class=wide>{recoveries(outcome)}</div>",
     ]
     for data, caption in images.values():
         image = f'<img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
@@ -215,28 +219,56 @@ def command(outcome: Outcome, who: Mapping[str, dict[str, Any]]) -> str:
 
 def scorecard(outcome: Outcome) -> str:
     """The position error of every case under every feedforward, coloured by its ratio to that of PID alone."""
-    cases = list(dict.fromkeys(row["case"] for row in outcome.rows))
-    names = list(outcome.laps)
-    found = {(row["case"], row["feedforward"]): row for row in outcome.rows}
-    lines, part = [], ""
-    for case in cases:
-        rows = [found[case, name] for name in names]
-        means = [row["position_rmse"]["value"] if not row["failed"] else np.inf for row in rows]
-        best = min((mean for mean, name in zip(means, names, strict=True) if name != "oracle"), default=np.inf)
-        cells = [f"<td>{html.escape(case)}</td>"]
-        for row, mean, name in zip(rows, means, names, strict=True):
-            text = number(1e3 * row["position_rmse"]["value"]) if row["position_rmse"]["samples"] else ""
+    table: dict[str, dict[str, str]] = {}
+    for case, rows in _by_case(outcome, steps=False).items():
+        best = min((_mean(row) for row in rows if row["feedforward"] != "oracle"), default=np.inf)
+        for row in rows:
+            error = row["position_rmse"]
+            text = number(1e3 * error["value"]) if error["samples"] else ""
             lost = f"{row['failed']} failed" if row["failed"] else ""
-            look = " class=best" if mean <= best < np.inf and name != "oracle" else ""
-            title = f"{row['runs']} runs; worst 5 %: {number(1e3 * row['position_rmse']['worst'])} mm"
-            ratio = row["position_rmse"].get("to_PID", {"value": 1.0})["value"]
-            cell = ", ".join(filter(None, (text, lost)))
-            cells.append(f'<td{look} style="background:{_shade(ratio)}" title="{title}">{cell}</td>')
-        new = " class=new" if part not in ("", rows[0]["part"]) else ""
-        part = rows[0]["part"]
-        lines.append(f"<tr{new}>{''.join(cells)}</tr>")
+            look = " class=best" if _mean(row) <= best < np.inf and row["feedforward"] != "oracle" else ""
+            hint = f"{row['runs']} runs; worst 5 %: {number(1e3 * error['worst'])} mm"
+            shade = _shade(error.get("to_PID", {"value": 1.0})["value"])
+            cell = f'<td{look} style="background:{shade}" title="{hint}">{", ".join(filter(None, (text, lost)))}</td>'
+            table.setdefault(case, {})[row["feedforward"]] = cell
+    return _grid(table, outcome.laps)
+
+
+def recoveries(outcome: Outcome) -> str:
+    """Position error at the end of a step, one lap after it and after the return over the error before."""
+    table: dict[str, dict[str, str]] = {}
+    for case, rows in _by_case(outcome, steps=True).items():
+        for row in rows:
+            error = row["position_rmse"]
+            after, back = (error[name]["value"] for name in ("after_one_lap", "return_after_one_lap"))
+            mean = f"{number(1e3 * error['during']['value'])}: " if error["during"]["samples"] else ""
+            lost = f", {row['failed']} failed" if row["failed"] else ""
+            look = " class=best" if error["recovered_within_one_lap"] == 1 else ""
+            cell = f"{mean}{number(after)}×, {number(back)}×{lost}"
+            cell = f'<td{look} style="background:{_shade(after / BAND)}">{cell}</td>'
+            table.setdefault(case, {})[row["feedforward"]] = cell
+    return _grid(table, outcome.laps)
+
+
+def _by_case(outcome: Outcome, steps: bool) -> dict[str, list[dict[str, Any]]]:
+    """The rows of the cases that are steps, or of those that are not."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in outcome.rows:
+        if (row["part"] == "step") == steps:
+            found.setdefault(row["case"], []).append(row)
+    return found
+
+
+def _mean(row: Mapping[str, Any]) -> float:
+    """The mean position error, infinite where a run failed."""
+    return np.inf if row["failed"] else row["position_rmse"]["value"]
+
+
+def _grid(table: Mapping[str, Mapping[str, str]], names: Iterable[str]) -> str:
+    """A table of finished cells."""
     head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
-    return f"<table><thead><tr><th>case</th>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+    lines = [f"<tr><td>{html.escape(case)}</td>{''.join(cells.values())}</tr>" for case, cells in table.items()]
+    return f"<table><thead><tr><th>case</th>{head}</tr></thead><tbody>{chr(10).join(lines)}</tbody></table>"
 
 
 def _shade(ratio: float) -> str:

@@ -12,7 +12,7 @@ import xarray as xr
 
 from mrctl import controller, jobs, metrics
 from mrctl.comparison import bootstrap_interval, cvar, paired_ratio, superiority
-from mrctl.experiments.cases import PARTS, Case, cases
+from mrctl.experiments.cases import BAND, PARTS, Case, cases
 from mrctl.experiments.tables import markdown, number, output_folder, write_json
 from mrctl.record import InputError
 from mrctl.result import versions
@@ -22,7 +22,6 @@ from mrctl.sweep import Sweep
 
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
 RIVALS = {"none": "PID", "model": "model"}
-BAND = 1.2  # of the error before a step, within which a robot has recovered
 CHUNK = 32  # runs in a job: enough for a batch, and few that a worker waits for at the end
 
 Laps = Mapping[str, xr.Dataset]
@@ -111,16 +110,16 @@ def run(chosen: Sequence[Case], who: Mapping[str, dict[str, Any]], workers: int 
     return laps, "; ".join(aside)
 
 
-def runs_of(chosen: Sequence[Case], laps: Laps) -> dict[str, dict[str, xr.Dataset]]:
-    """The runs of each case, by feedforward."""
-    ends = np.cumsum([len(case.scenarios) for case in chosen])
-    return {
-        case.name: {
-            name: own.isel(run=slice(end - len(case.scenarios), end), lap=slice(case.scenarios[0].laps))
-            for name, own in laps.items()
-        }
-        for case, end in zip(chosen, ends.tolist(), strict=True)
-    }
+def runs_of(chosen: Sequence[Case], laps: Laps) -> dict[str, Laps]:
+    """The runs of each case, by feedforward; a run that could not be done has its laps too, all NaN."""
+    found: dict[str, Laps] = {}
+    end = 0
+    for case in chosen:
+        start, end, count = end, end + len(case.scenarios), case.scenarios[0].laps
+        number, counts = np.arange(1, count + 1), ("run", [count] * len(case.scenarios))
+        own = {name: one.isel(run=slice(start, end)).reindex(lap=number) for name, one in laps.items()}
+        found[case.name] = {name: one.assign(laps=counts) for name, one in own.items()}
+    return found
 
 
 def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str, Any]]:
@@ -163,6 +162,7 @@ def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:
     found: dict[str, Any] = {name: paired_ratio(error[:, lap - 1], before)._asdict() for name, lap in after.items()}
     needed = metrics.recovery_laps(laps, metric, case.change, case.back - 1, BAND).values
     worst = {f"{name}_worst": cvar(error[:, lap - 1] / before) for name, lap in after.items()}
+    found["during"] = bootstrap_interval(error[:, case.back - 2])._asdict()
     return found | worst | {"recovery_laps": needed.tolist(), "recovered_within_one_lap": float(np.mean(needed <= 1))}
 
 
@@ -197,7 +197,7 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
         ]  # fmt: skip
         if own:
             tables[title] = markdown(header, cells)
-    header = ["case", "feedforward", "failed", "before, mm", "first lap", "one lap later; worst 5 %", "recovered within"]
+    header = ["case", "feedforward", "failed", "first lap", "one lap later; worst 5 %", "recovered in V / θ̇ / position"]
     header += ["return: first lap", "one lap later; worst 5 %"]
     cells = []
     for row in rows:
@@ -212,7 +212,6 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
             cells.append([row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", first, later, within])
             cells[-1] += [back, settled]
     if cells:
-        header.remove("before, mm")
         tables["Recovery and forgetting: position error over that before the step"] = markdown(header, cells)
     return tables
 

@@ -21,7 +21,8 @@ def test_bootstrap_normal():
 def test_bootstrap_coverage():
     """About 95 % of the intervals of 30 samples hold the true mean."""
     draws = np.random.default_rng(2).normal(3, 1, (200, 30))
-    held = [i.low <= 3 <= i.high for i in (comparison.bootstrap_interval(d, n=500, seed=k) for k, d in enumerate(draws))]
+    found = (comparison.bootstrap_interval(d, n=500, seed=k) for k, d in enumerate(draws))
+    held = [one.low <= 3 <= one.high for one in found]
     assert 0.89 <= np.mean(held) <= 0.99
 
 
