@@ -204,8 +204,9 @@ def suite(
     """
     from mrctl.experiments import suite as uncertainty
 
-    seeds, random = seeds or (3 if quick else 10), (20 if quick else 300) if random is None else random
-    found = uncertainty.suite(feedforward, controller, seeds, random, quick, workers, out)
+    usual = (3, 20) if quick else (10, 300)
+    runs = (usual[0] if seeds is None else seeds), (usual[1] if random is None else random)
+    found = uncertainty.suite(feedforward, controller, *runs, quick, workers, out)
     print(f"{(out / 'table.md').read_text()}\nReport: {out / 'report.html'}")
     if found.aside:
         raise _Incomplete(f"{found.aside}; the same command tries them again")

@@ -59,10 +59,9 @@ def load(name: str) -> Factory:
         raise _refused(name, error) from None
     finally:
         sys.path.remove(str(path.parent))
-    found = getattr(module, attribute, None)
-    if not callable(found):
+    if not callable(getattr(module, attribute, None)):
         raise InputError(f"controller: {path.name} has no {attribute} that can be called with a robot and a size")
-    return found
+    return getattr(module, attribute)
 
 
 def trial(name: str, scenario: Scenario) -> None:

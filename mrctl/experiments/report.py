@@ -7,7 +7,7 @@ import html
 import shlex
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -16,15 +16,12 @@ from mrctl import controller, metrics, plots
 from mrctl.comparison import superiority
 from mrctl.control.feedforward import InverseDynamics
 from mrctl.experiments import tuning
-from mrctl.experiments.cases import BAND
+from mrctl.experiments.cases import BAND, Outcome
 from mrctl.experiments.tables import number
 from mrctl.plots import InverseMap
 from mrctl.result import SIGNALS, versions
 from mrctl.scenario import Scenario
 from mrctl.simulate import Simulation
-
-if TYPE_CHECKING:
-    from mrctl.experiments.suite import Outcome
 
 KNOWING = ("none", "model", "oracle")  # feedforwards that do not learn
 GRID = 41  # points a side of a heat map

@@ -5,14 +5,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from mrctl import controller, jobs, metrics
 from mrctl.comparison import bootstrap_interval, cvar, paired_ratio, superiority
-from mrctl.experiments.cases import BAND, PARTS, Case, cases
+from mrctl.experiments import report
+from mrctl.experiments.cases import BAND, PARTS, Case, Laps, Outcome, cases
 from mrctl.experiments.tables import markdown, number, output_folder, write_json
 from mrctl.record import InputError
 from mrctl.result import versions
@@ -23,23 +24,6 @@ from mrctl.sweep import Sweep
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
 RIVALS = {"none": "PID", "model": "model"}
 CHUNK = 32  # runs in a job: enough for a batch, and few that a worker waits for at the end
-
-Laps = Mapping[str, xr.Dataset]
-"""Metrics lap by lap of all runs, `(run, lap)`, by feedforward."""
-
-
-class Outcome(NamedTuple):
-    """What a suite found."""
-
-    quick: bool
-    cases: Sequence[Case]
-    laps: Laps
-    runs: Mapping[str, Laps]
-    """The laps of each case."""
-    rows: Sequence[dict[str, Any]]
-    """A case and feedforward each; see `compare`."""
-    aside: str
-    """Runs that could not be done, and why, or ""."""
 
 
 def suite(
@@ -65,8 +49,6 @@ def suite(
     Raises:
         InputError: No feedforward, no seed, a bad controller, or a folder that cannot be written or holds other runs.
     """
-    from mrctl.experiments import report
-
     if seeds < 1 or random < 0 or not (feedforwards or controllers):
         raise InputError("seeds: at least one run of at least one feedforward")
     who: dict[str, dict[str, Any]] = {name: {"feedforward": name} for name in feedforwards}
@@ -102,10 +84,10 @@ def run(chosen: Sequence[Case], who: Mapping[str, dict[str, Any]], workers: int 
         chunk = min(CHUNK, -(-len(scenarios) // 4))
         sweep = Sweep.of(scenarios, record="laps", chunk=chunk, controller=choice.get("controller"))
         print(f"{name} ({place} of {len(who)})", file=sys.stderr)
-        report = jobs.run(sweep, out / name, workers, progress=True)
+        ended = jobs.run(sweep, out / name, workers, progress=True)
         laps[name] = open_store(out / name)
-        if report.aside:
-            lost, why = sum(map(len, report.aside)), next(iter(report.aside.values()))
+        if ended.aside:
+            lost, why = sum(map(len, ended.aside)), next(iter(ended.aside.values()))
             aside.append(f"{lost} runs of {name} could not be done ({why})")
     return laps, "; ".join(aside)
 

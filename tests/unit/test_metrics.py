@@ -221,6 +221,26 @@ def test_recovery_extremes():
     assert np.isinf(metrics.recovery_time(late, 4.0)[0])
 
 
+def test_recovery_laps():
+    """The first lap from which on all are within the band; a relapse counts, a failure is NaN, never is infinite."""
+    laps = np.array(
+        [
+            [9, 1.0, 1.1, 1.2, 1.0, 9],  # never left
+            [9, 1.0, 5.0, 1.2, 1.0, 9],
+            [9, 1.0, 1.0, 5.0, 1.1, 9],  # late
+            [9, 1.0, 5.0, 1.0, 1.3, 9],  # relapsed, and still is
+            [9, 1.0, 5.0, np.nan, np.nan, np.nan],
+        ]
+    )
+    table = xr.Dataset({"v_rmse": (("run", "lap"), laps)}, {"run": np.arange(5), "lap": np.arange(1, 7)})
+    found = metrics.recovery_laps(table, "v_rmse", change=3, until=5)
+    np.testing.assert_array_equal(found, [0, 1, 2, np.inf, np.nan])
+    assert metrics.recovery_laps(table, "v_rmse", 3, 5, factor=1.3).values[3] == 1
+    for change, until in ((1, 3), (4, 3), (3, 7)):
+        with pytest.raises(InputError, match="^change: "):
+            metrics.recovery_laps(table, "v_rmse", change, until)
+
+
 def test_error_on_return():
     """Twice the error on return is a ratio of two; a velocity's error works as well."""
     wave = lambda t: np.where(t < 4, 1.0, np.where(t < 8, 7.0, 2.0))  # noqa: E731
