@@ -267,6 +267,7 @@ class Store:
                 for row, laps in enumerate(frame[f"{name}_per_lap"]):
                     values[row, : len(laps)] = laps
                 found[name] = (("run", "lap"), values, {"units": units[name]})
+            coords.pop("laps", None)  # where it is an axis too
             return xr.Dataset(outcome | columns(["laps"]) | found, coords | {"lap": number}, attrs)
         if not self.samples:
             return xr.Dataset(outcome | columns(METRICS), coords, attrs)
