@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from mrctl import model as mjcf
-from mrctl.control.pid import Pid
+from mrctl.control.pid import PIDS
 from mrctl.record import InputError
 from mrctl.references import Lemniscate, Waypoints
 from mrctl.robot import GRAVITY, PERTURBATIONS, Perturbation, Robot
@@ -107,7 +107,7 @@ def cases(seeds: int, random: int, quick: bool) -> list[Case]:
     if not quick:
         add("steady", "odometry", measurement="odometry")
         for name in ("nominal", "all"):
-            add("steady", f"{name}, PID twice as fast", perturbation=PERTURBATIONS[name], pid=Pid(time_constant=0.075))
+            add("steady", f"{name}, PID twice as fast", perturbation=PERTURBATIONS[name], pid=PIDS["fast"])
         add("steady", "patch of ice", world="patch")
         add("steady", "rough ground", world="rough")
         for steering in STEERINGS[1:]:

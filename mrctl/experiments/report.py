@@ -15,6 +15,7 @@ import xarray as xr
 from mrctl import controller, metrics, plots
 from mrctl.comparison import superiority
 from mrctl.control.feedforward import InverseDynamics
+from mrctl.control.pid import PIDS
 from mrctl.experiments import tuning
 from mrctl.experiments.cases import BAND, Outcome
 from mrctl.experiments.tables import number
@@ -188,12 +189,12 @@ def page(
     for title, text in tables.items():
         body.append(f"<details><summary>{html.escape(title)}</summary><div class=wide>{_table(text)}</div></details>")
     what = "\n".join(f"{name} {version}" for name, version in versions().items())
-    design = tuning.text(tuning.design("flat", Scenario().pid.time_constant, 0.0))
+    pids = [tuning.statement(tuning.design("flat", pid, (0.0,))) for pid in PIDS.values()]
     body += [
         "<h2>How it was made</h2>",
         f"<pre>{html.escape(command(outcome, who))}</pre>",
         f"<pre>{html.escape(what)}</pre>",
-        f"<p>The PID:</p><pre>{html.escape(design)}</pre>",
+        f"<p>{html.escape(pids[0])}.</p><p>The one twice as fast: {html.escape(pids[1])}.</p>",
         "<p>Each run is stored under <code>runs/</code>; <code>mrctl run runs/NAME --run K</code> drives it again and "
         "compares it bit for bit. <code>table.json</code> holds every number, lap by lap.</p>",
     ]
