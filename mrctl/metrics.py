@@ -1,4 +1,4 @@
-"""What a result is worth: errors per lap, learning, recovery, and statistics over seeds.
+"""What a result is worth: errors per lap, learning, recovery, and their means over seeds.
 
 Pure functions of the dataset that `simulate` returns. Errors are against the ORIGINAL reference. A run that failed is
 counted, never dropped: its metrics are NaN from the lap in which it failed on, and every statistic says how many it
@@ -8,16 +8,15 @@ period.
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from numpy.typing import NDArray
 
+from mrctl.comparison import Interval, bootstrap_interval
 from mrctl.control.feedforward import features
 from mrctl.control.guard import ACTIONS, LIMIT, NONE, REASONS
 from mrctl.record import InputError
@@ -55,28 +54,6 @@ SAMPLED = (
     "heading_error", "v_command", "omega_command", "feedback_left", "feedback_right", "voltage_left", "voltage_right",
     "saturated", "power", "weight_norm", "guard",
 )  # fmt: skip
-
-
-class Interval(NamedTuple):
-    """A mean with its confidence interval, over the `samples` that are finite."""
-
-    value: float
-    low: float
-    high: float
-    samples: int
-    failed: int
-    """Samples that are NaN or infinite: runs that failed, or never recovered."""
-
-
-class Ratio(NamedTuple):
-    """A ratio of paired means with its confidence interval, over the `pairs` that are finite on both sides."""
-
-    value: float
-    low: float
-    high: float
-    pairs: int
-    failed_a: int
-    failed_b: int
 
 
 class Laps(NamedTuple):
@@ -363,6 +340,34 @@ def recovery_time(
     return xr.DataArray(seconds, {"run": runs["run"].values}, ("run",), "recovery_time", attrs)
 
 
+def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor: float = 1.2) -> xr.DataArray:
+    """Laps after a change until the metric of whole laps is back, to stay, within `factor` of the lap before it.
+
+    Args:
+        laps: What `per_lap` returns.
+        metric: One of `METRICS`.
+        change: The number of the lap in whose beginning the change came, from 2.
+        until: Number of the last lap to look at, before the next change.
+        factor: How close counts as recovered.
+
+    Returns:
+        Laps (run,): 0 if the lap of the change itself is within, infinite if the last one is not, NaN if it failed.
+
+    Raises:
+        InputError: No such metric, or laps that are not there.
+    """
+    known(metric)
+    if not 2 <= change <= until <= laps.sizes["lap"]:
+        raise InputError(f"change: lap {change} and lap {until} are not in order within 2 to {laps.sizes['lap']}")
+    values = laps[metric].transpose("run", "lap").values[:, change - 2 : until]
+    outside = ~(values[:, 1:] <= factor * values[:, :1])
+    last = outside.shape[1] - np.argmax(outside[:, ::-1], axis=1)
+    back = np.where(outside[:, -1], np.inf, np.where(outside.any(axis=1), last, 0))
+    number = np.where(np.isfinite(values).all(axis=1), back, np.nan)
+    attrs = {"units": "1", "long_name": f"laps until {METRICS[metric][1]} is back within {factor:g}×"}
+    return xr.DataArray(number, {"run": laps["run"].values}, ("run",), "recovery_laps", attrs)
+
+
 def error_on_return(
     result: xr.Dataset,
     event_time: float,
@@ -496,73 +501,3 @@ def known(metric: str) -> str:
     if metric not in METRICS:
         raise InputError(f"metric: {metric!r} is not one of {', '.join(METRICS)}")
     return metric
-
-
-def bootstrap_interval(samples: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0) -> Interval:
-    """Mean of the finite samples with its bias-corrected, accelerated bootstrap interval (Efron, 1987).
-
-    Args:
-        samples: One number a run (n,); NaN or infinite where it failed.
-        level: Confidence level, between 0 and 1.
-        n: Resamples.
-        seed: Of the resampling.
-
-    Returns:
-        The interval; its ends are NaN where fewer than two samples are finite: one run says nothing of the spread.
-    """
-    values = np.asarray(samples, float).ravel()
-    finite = values[np.isfinite(values)]
-    low, high = _interval((finite,), np.mean, level, n, seed)
-    mean = float(finite.mean()) if len(finite) else np.nan
-    return Interval(mean, low, high, len(finite), len(values) - len(finite))
-
-
-def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0) -> Ratio:
-    """Mean of `a` over mean of `b`, with a bootstrap interval that resamples pairs (same seed, same perturbation).
-
-    Args:
-        a: One number a run (n,); NaN or infinite where it failed.
-        b: The same runs under the other controller (n,).
-        level: Confidence level, between 0 and 1.
-        n: Resamples.
-        seed: Of the resampling.
-
-    Raises:
-        InputError: `a` and `b` differ in length.
-    """
-    first, second = np.asarray(a, float).ravel(), np.asarray(b, float).ravel()
-    if len(first) != len(second):
-        raise InputError(f"b: {len(second)} samples cannot be paired with {len(first)}")
-    fine = np.isfinite(first), np.isfinite(second)
-    both = fine[0] & fine[1]
-    pairs = first[both], second[both]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = _interval(pairs, _ratio, level, n, seed)
-        value = float(_ratio(*pairs)) if both.any() else np.nan
-    return Ratio(value, low, high, int(both.sum()), int((~fine[0]).sum()), int((~fine[1]).sum()))
-
-
-def _ratio(a: Array, b: Array, axis: int = -1) -> Array:
-    """Ratio of means."""
-    return np.divide(np.mean(a, axis=axis), np.mean(b, axis=axis))
-
-
-def _interval(
-    data: tuple[Array, ...], statistic: Callable[..., ArrayLike], level: float, n: int, seed: int
-) -> tuple[float, float]:
-    """BCa bootstrap interval of a paired statistic; percentiles where the data are too alike for BCa."""
-    if not 0 < level < 1:
-        raise InputError(f"level: {level} is not between 0 and 1")
-    if len(data[0]) < 2:
-        return np.nan, np.nan
-    for method in ("BCa", "percentile"):
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            found = stats.bootstrap(
-                data, statistic, n_resamples=n, batch=1000, vectorized=True, paired=True, confidence_level=level,
-                method=method, rng=np.random.default_rng(seed),
-            ).confidence_interval  # fmt: skip
-        low, high = float(found.low), float(found.high)
-        if np.isfinite([low, high]).all():
-            break
-    return low, high

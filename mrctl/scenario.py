@@ -37,6 +37,8 @@ class Event(Record):
     """Forces along the world's x and y on the chassis in N, torque about z in N·m."""
     push_duration: Annotated[float, Field(gt=0, le=10)] = 0.1
     """How long the push lasts in s."""
+    reference: Reference | None = None
+    """What to follow from now on, from its own start; laps are still counted by the first reference."""
     kanayama: Kanayama | None = None
     """New gains of the motion controller."""
     pid: Pid | None = None

@@ -177,7 +177,8 @@ class Simulation:
         robot = mjcf.read_robot(compiled)
         rigid = first.steering == "rigid"
         for scenario in scenarios:
-            check(scenario.reference, robot, reverse=rigid)
+            for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
+                check(reference, robot, reverse=rigid)
         stage = feedforward(robot, size) if feedforward else feedforward_of(scenarios, robot)
         self._label = getattr(feedforward, "__name__", "custom") if feedforward else first.feedforward
         self._oracle = stage if first.feedforward == "oracle" and isinstance(stage, InverseDynamics) else None
@@ -185,10 +186,10 @@ class Simulation:
         self.hierarchy = Hierarchy(scenarios, robot, stage)
         times = self._period * np.arange(self.ticks, dtype=float)
         # Robots that follow the same reference share its samples, (ticks, references, 7).
-        names = [s.reference.model_dump_json() for s in scenarios]
-        different = {name: s.reference for name, s in zip(names, scenarios, strict=True)}
+        names = [(s.reference, *((e.time, e.reference) for e in s.events if e.reference)) for s in scenarios]
+        different = dict(zip(names, scenarios, strict=True))
         order = list(different)
-        samples = np.stack([np.hstack(r.sample(times)) for r in different.values()], axis=1)
+        samples = np.stack([_course(s, times) for s in different.values()], axis=1)
         self._which = np.array([order.index(name) for name in names]) if 1 < len(order) < size else None
         shared = self._which is None and len(order) < size
         self._reference = np.broadcast_to(samples, (self.ticks, size, 7)) if shared else samples
@@ -203,7 +204,7 @@ class Simulation:
         for row, scenario in enumerate(scenarios):
             self._perturb(row, scenario.perturbation)
             for event in sorted(scenario.events, key=lambda e: e.time):
-                self._schedule[int(np.ceil(event.time / self._period - 1e-9))].append((row, event))
+                self._schedule[_tick(event, self._period)].append((row, event))
         start = self._reference_now()
         self.plant.reset(np.stack([_start(s, start[i, :3]) for i, s in enumerate(scenarios)]), start[:, 3:5])
         reading = self.plant.reading
@@ -281,6 +282,20 @@ class Simulation:
             self.hierarchy.set_pid(row, event.pid)
         if event.learning is not None:
             self.hierarchy.set_learning(row, event.learning)
+
+
+def _tick(event: Event, period: float) -> int:
+    """The first control tick that is not before an event."""
+    return int(np.ceil(event.time / period - 1e-9))
+
+
+def _course(scenario: Scenario, times: Array) -> Array:
+    """Posture, twist and acceleration to follow, `(ticks, 7)`, through all events that change the reference."""
+    course = np.hstack(scenario.reference.sample(times))
+    for event in sorted(scenario.events, key=lambda e: e.time):
+        if event.reference is not None and (left := len(times) - _tick(event, scenario.control_period)) > 0:
+            course[-left:] = np.hstack(event.reference.sample(times[:left]))
+    return course
 
 
 def _start(scenario: Scenario, reference: Array) -> Array:
