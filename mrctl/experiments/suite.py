@@ -117,8 +117,8 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
             failed = own["failed"].to_numpy(bool)
             row: dict[str, Any] = {"part": case.part, "case": case.name, "feedforward": name}
             row |= {"runs": len(own), "failed": int(failed.sum())}
-            if "guard_events" in metrics.METRICS:
-                row["guard_events"] = float(found[case.name][name]["guard_events"].sum("lap").mean())
+            if "guard_actions" in metrics.METRICS:
+                row["guard_events"] = float(found[case.name][name]["guard_actions"].sum("lap").mean())
             if "none" in ends:
                 row["failed_where_pid_did_not"] = int((failed & ~ends["none"]["failed"].to_numpy(bool)).sum())
             for metric in COLUMNS:
