@@ -82,7 +82,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool) -> str:
     lines = [f"RMSE per lap against the reference, feedforward {scenario.feedforward}, steering {scenario.steering}"]
     if failure:
         lines.append(f"failed after {float(row['failure_time']):.2f} s: {failure}")
-    acted = [f"guard at {e['time']:.2f} s: {e['action']}, {e['reason']}" for e in events.to_dict("records")]
+    acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]
     return "\n".join([*lines, markdown(header, rows), *(text.removesuffix(", ") for text in acted)])
 
 

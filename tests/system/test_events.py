@@ -99,7 +99,7 @@ def test_oracle_follows():
         stage, truth = simulation.hierarchy.feedforward, simulation.plant.truth
         assert (truth[0] != simulation.plant.robot) == changed and truth[1] == simulation.plant.robot
         for row in range(2):
-            assert np.array_equal(stage._coefficients[row], inverse_coefficients(truth[row]))
+            assert np.array_equal(stage.coefficients[row], inverse_coefficients(truth[row]))
 
 
 def test_oracle_is_better():

@@ -2,12 +2,16 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mrctl import InputError
 from mrctl.control import guard as module
+from mrctl.control.fel import FeedbackErrorLearning, Fel
+from mrctl.control.fel_torch import ModuleLearning
 from mrctl.control.guard import ACTIONS, REASONS, Guard, guard, watches
+from mrctl.control.rls import RecursiveLeastSquares, Rls
 
 PERIOD = 0.01
 SUPPLY, ROTATION = 24.0, 3.0
@@ -306,3 +310,41 @@ def test_bad_settings(bad):
     """Refused by name."""
     with pytest.raises(InputError, match=next(iter(bad))):
         Guard.from_dict(bad)
+
+
+def stages(robot):
+    """The stages that can forget."""
+    torch.manual_seed(0)
+    return {
+        "fel": FeedbackErrorLearning(robot, [Fel()] * 2, [3, 4], False),
+        "rls": RecursiveLeastSquares(robot, [Rls()] * 2, False),
+        "torch": ModuleLearning(torch.nn.Linear(8, 2), robot, 2),
+    }
+
+
+@pytest.mark.parametrize("name", ["fel", "rls", "torch"])
+def test_restore(robot, name):
+    """A robot that forgets goes on as one that never learned; the other keeps what it knows."""
+    rng = np.random.default_rng(0)
+    used, fresh, kept = (stages(robot)[name] for _ in range(3))
+
+    def lesson(stage):
+        for command, derivative, feedback in rng.normal(size=(20, 3, 2, 2)):
+            stage.output(command, derivative)
+            stage.learn(feedback, np.zeros(2), np.zeros((2, 2)), np.zeros((2, 2)))
+
+    lesson(used)
+    rng = np.random.default_rng(0)
+    lesson(kept)
+    assert (used.weight_norm > 0).all()
+    used.restore(np.array([1]))
+    assert used.weight_norm[1] == 0 and used.weight_norm[0] == kept.weight_norm[0]
+    for _ in range(2):  # before and after it learns again
+        command = np.array([[0.7, 0.3], [0.5, -1.0]])
+        out, new, old = (np.array(stage.output(command, command)) for stage in (used, fresh, kept))
+        assert np.array_equal(out[1], new[1]) and np.array_equal(out[0], old[0])
+        assert not np.array_equal(old[1], new[1])
+        seed = rng.integers(1000)
+        for stage in (used, fresh, kept):
+            rng = np.random.default_rng(seed)
+            lesson(stage)
