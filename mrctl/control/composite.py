@@ -64,7 +64,7 @@ class Composite(Record):
     """Time in which the disturbance wanders by that, s."""
     filter: Annotated[float, Field(ge=0.01, le=2)] = 0.07
     """Time constant of each of the two filters on voltage and motion, s."""
-    step: Annotated[float, Field(ge=0, le=1)] = 0.02
+    step: Annotated[float, Field(ge=0, le=1)] = 0.01
     """Share of the feedback that the tracking term moves into the feedforward each control period, as for `rls`."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
     """Feedback below this moves nothing, V (as for `noise`)."""

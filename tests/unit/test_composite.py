@@ -129,9 +129,9 @@ def drive(pupil, plant, seconds, disturbance=0.0):
         voltage = feedback + feedforward
         pupil.learn(feedback[None], np.zeros(1), twist[None], voltage[None])
         log.append(feedback)
-        for _ in range(10):
+        for _ in range(4):
             sides = left_right(voltage - disturbance)
-            twist = twist + PERIOD / 10 * accelerations(twist, sides, plant, sign_speed=0.05)
+            twist = twist + PERIOD / 4 * accelerations(twist, sides, plant, sign_speed=0.05)
     return np.array(log)
 
 
@@ -145,7 +145,7 @@ def test_finds_the_plant(robot, tmp_path):
     flat[:, range(INPUTS), range(INPUTS)] = 4.0
     save_training(tmp_path / "flat.safetensors", Training(np.zeros((UNITS, INPUTS + 1)), flat), {})
     pupil = stage(robot, weights=str(tmp_path / "flat.safetensors"), noise=0.05, disturbance=0, step=0.002, memory=1e6)
-    feedback = drive(pupil, plant, 60)
+    feedback = drive(pupil, plant, 40)
     assert np.sqrt((feedback[-1000:] ** 2).mean()) < 0.05 * np.sqrt((feedback[:100] ** 2).mean())
     missing = ((inverse_coefficients(plant) - inverse_coefficients(robot)) * feature_scale(robot)[:, None]).T
     found = pupil.state["weights"][0]
@@ -159,7 +159,7 @@ def test_disturbance(robot):
     """A constant voltage that goes astray is found by weights and disturbance together, with the shipped features."""
     lost = np.array([1.0, -0.5])
     pupil = stage(robot)
-    feedback = drive(pupil, robot.model_copy(update={"supply": 1e3}), 20, lost)
+    feedback = drive(pupil, robot.model_copy(update={"supply": 1e3}), 12, lost)
     start, end = np.abs(feedback[:200].mean(0)), np.abs(feedback[-500:].mean(0))
     assert (end < 0.1 * start).all()
 
