@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -18,8 +19,8 @@ import pytest
 from PIL import Image
 
 import mrctl
-from mrctl import cli
-from mrctl.experiments import report, suite
+from mrctl import cli, plots
+from mrctl.experiments import report, suite, tuning
 from mrctl.experiments.cases import Case
 
 LAP = 4.0
@@ -59,9 +60,15 @@ def tiny(seeds: int, random: int, quick: bool) -> list[Case]:
     return [*fixed, *([Case("random", "random", tuple(drawn))] if random else [])]
 
 
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(suite, "cases", tiny)
+@pytest.fixture(autouse=True, scope="module")
+def small() -> Iterator[None]:
+    """Few short runs, small figures, and a PID that is not measured again."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(suite, "cases", tiny)
+        patch.setitem(plots.STYLE, "savefig.dpi", 60)
+        patch.setattr(tuning, "design", lambda *_: {})
+        patch.setattr(tuning, "statement", lambda _: "phase margin 88 degrees")
+        yield
 
 
 def arguments(out: Path, *more: object) -> list[str]:
@@ -70,12 +77,10 @@ def arguments(out: Path, *more: object) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def whole(small: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A suite that ran without incident, on one worker."""
     out = tmp_path_factory.mktemp("whole") / "suite"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(suite, "cases", tiny)
-        assert cli.main(arguments(out, "--workers", 1)) == 0
+    assert cli.main(arguments(out, "--workers", 1)) == 0
     return out
 
 
@@ -179,7 +184,7 @@ def test_page_stands_alone(whole: Path) -> None:
         assert source.startswith("data:image/png;base64,")
         image = Image.open(io.BytesIO(base64.b64decode(source.split(",")[1], validate=True)))
         image.load()
-        assert image.width > 300
+        assert image.width > 150
     for word in ("39 runs", "payload", f"mujoco {mrctl.result.versions()['mujoco']}", "phase margin"):
         assert word in page.words
     again = next(line for line in page.words.splitlines() if line.startswith("mrctl suite --"))
