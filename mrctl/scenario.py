@@ -19,7 +19,7 @@ from mrctl.robot import Perturbation
 
 FeedforwardName = Literal["none", "model", "oracle", "observer", "fel", "rls", "composite"]
 FEEDFORWARDS: tuple[FeedforwardName, ...] = ("none", "model", "oracle", "observer", "fel", "rls", "composite")
-LONGEST = 10_000_000  # control periods in a run; its record takes 250 bytes each
+LONGEST = 10_000_000  # control periods in a run; its record takes 290 bytes each
 STEERINGS: tuple[Literal["compliant", "caster", "rigid"], ...] = ("compliant", "caster", "rigid")
 
 
