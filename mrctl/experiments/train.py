@@ -88,7 +88,6 @@ def train(out: Path, plants: int, seed: int) -> str:
         raise InputError(f"out: {out} is a folder, not a file")
     output_folder(out.parent)
     start = time.perf_counter()
-    torch.set_num_threads(1)  # the matrices are small, and one thread adds up in one order
     robot = mjcf.read_robot(mjcf.load("flat"))
     seen, unseen = (drive(draw(robot, n, [seed, k]), robot) for k, n in enumerate((plants, plants // 3)))
     units = fit(seen, seed)
@@ -303,6 +302,7 @@ def _queries(
 
 def fit(drives: Drives, seed: int) -> Array:
     """Trains the units, `(16, 9)`; the priors follow them now and then."""
+    torch.set_num_threads(1)  # the matrices are small, and one thread adds up in one order
     rng = np.random.default_rng([seed, 4])
     units = torch.tensor(0.7 * rng.normal(size=(UNITS, INPUTS + 1)), requires_grad=True)
     optimiser = torch.optim.Adam([units], lr=RATE)

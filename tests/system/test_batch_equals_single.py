@@ -122,7 +122,7 @@ def test_scenarios_differ(scenarios, alone):
     events = [e for s in scenarios for e in s.events]
     for field in ("perturbation", "push", "kanayama", "pid", "learning"):
         assert any(getattr(e, field) is not None for e in events)
-    for field, kinds in {"world": 4, "steering": 3, "feedforward": 5, "measurement": 2, "motion_period": 2}.items():
+    for field, kinds in {"world": 4, "steering": 3, "feedforward": 7, "measurement": 2, "motion_period": 2}.items():
         assert len({getattr(s, field) for s in scenarios}) == kinds
     assert {s.perturbation.control_delay for s in scenarios} == {0, 0.01, 0.02, 0.03, 0.04}
     assert 1 <= sum(bool(run.failed) for run in alone) <= COUNT // 4

@@ -60,7 +60,6 @@ def test_alone_or_together(steering):
         scenario(name, Perturbation(rotation_noise=0.02 * seed), steering=steering, laps=1, events=(change,), seed=seed)
         for name in ("composite", "observer") for seed in range(2)
     ]  # fmt: skip
-    some = [s.model_copy(update={"reference": Lemniscate(size=0.5, period=8.0)}) for s in some]
     together = simulate(some)
     for i in (1, 2):
         alone = simulate(some[i])
