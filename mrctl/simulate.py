@@ -110,11 +110,8 @@ def simulate(
         raise InputError("scenarios: none given")
     if len({s.control_period for s in several}) > 1:
         raise InputError("control_period: runs of one result share their time axis, so also their control period")
-    groups: dict[Hashable, list[int]] = defaultdict(list)
-    for row, scenario in enumerate(several):
-        groups[_group(scenario)].append(row)
     # Built first, so that bad input is refused before anything is computed.
-    simulations = [(rows, Simulation([several[r] for r in rows], feedforward, threads)) for rows in groups.values()]
+    simulations = batches(several, feedforward, threads)
     total = sum(simulation.ticks * len(rows) for rows, simulation in simulations)
     parts = []
     with tqdm(total=total, unit="tick", unit_scale=True, disable=not progress) as bar:
@@ -130,17 +127,23 @@ def simulate(
     return whole.isel(run=0) if isinstance(scenarios, Scenario) else whole
 
 
-def _group(scenario: Scenario) -> Hashable:
-    """Scenarios with equal keys run in one batch."""
-    s = scenario
-    return s.world, s.steering, s.feedforward, s.ticks, s.physics_step, s.motion_period, s.fel.hidden
+def batches(
+    scenarios: Sequence[Scenario], feedforward: Factory | None = None, threads: int = 0
+) -> list[tuple[list[int], Simulation]]:
+    """Uniform groups of scenarios: which they are, and their simulation. Arguments and errors as in `simulate`."""
+    groups: dict[Hashable, list[int]] = defaultdict(list)
+    for row, s in enumerate(scenarios):
+        key = s.world, s.steering, s.feedforward, s.ticks, s.physics_step, s.motion_period, s.fel.hidden
+        groups[key].append(row)
+    return [(rows, Simulation([scenarios[r] for r in rows], feedforward, threads)) for rows in groups.values()]
 
 
 class Simulation:
     """A uniform group of runs, one control period at a time.
 
     Attributes:
-        scenarios: What is run.
+        scenarios: What is run, with the events that were added.
+        model: The compiled world with the nominal robot.
         plant: The physics.
         hierarchy: The controllers.
         tick: Control periods done.
@@ -163,7 +166,7 @@ class Simulation:
         self.scenarios = list(scenarios)
         self.ticks, self.tick = first.ticks, 0
         self._period = first.control_period
-        compiled = mjcf.load(first.world, first.steering, first.physics_step)
+        self.model = compiled = mjcf.load(first.world, first.steering, first.physics_step)
         robot = mjcf.read_robot(compiled)
         rigid = first.steering == "rigid"
         for scenario in scenarios:
@@ -193,7 +196,7 @@ class Simulation:
         for row, scenario in enumerate(scenarios):
             self._perturb(row, scenario.perturbation)
             for event in sorted(scenario.events, key=lambda e: e.time):
-                self._schedule[int(np.ceil(event.time / self._period - 1e-9))].append((row, event))
+                self._schedule[self._tick_of(event)].append((row, event))
         start = self._reference_now()
         self.plant.reset(np.stack([_start(s, start[i, :3]) for i, s in enumerate(scenarios)]), start[:, 3:5])
         reading = self.plant.reading
@@ -207,6 +210,29 @@ class Simulation:
     def running(self) -> bool:
         """Whether there is anything left to do."""
         return self.tick < self.ticks and self.plant.running > 0
+
+    def add(self, event: Event, rows: Sequence[int] | None = None) -> None:
+        """Adds an event to runs that are under way: `scenarios` then hold it, and run again give the same bits.
+
+        Args:
+            event: What happens, not before the coming tick.
+            rows: To whom; by default to all.
+
+        Raises:
+            InputError: It comes too late, or a scenario with it is refused; then nothing was added.
+        """
+        if (tick := self._tick_of(event)) < self.tick:
+            raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self._period:g} s")
+        rows = range(len(self.scenarios)) if rows is None else rows
+        if event.perturbation is not None:
+            self.plant.check(event.perturbation)
+        changed = {row: self.scenarios[row].with_event(event) for row in rows}
+        for row, scenario in changed.items():
+            self.scenarios[row] = scenario
+            self._schedule[tick].append((row, event))
+
+    def _tick_of(self, event: Event) -> int:
+        return int(np.ceil(event.time / self._period - 1e-9))
 
     def step(self) -> None:
         """One control period: events, measurement, control, record, physics."""

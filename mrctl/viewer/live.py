@@ -1,0 +1,380 @@
+"""A live session in the browser: drive, break the robot, watch it learn."""
+
+from __future__ import annotations
+
+import html
+import queue
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import viser
+
+from mrctl.record import InputError
+from mrctl.robot import Perturbation
+from mrctl.scenario import FEEDFORWARDS, Event, Scenario
+from mrctl.viewer.controls import Controls
+from mrctl.viewer.plots import MOST, Plots
+from mrctl.viewer.scene import Scene, colour_of
+from mrctl.viewer.server import Server
+from mrctl.viewer.session import CHANGEABLE, Session, changed
+
+FRAME, REFRESH = 1 / 30, 1 / 12  # s of wall time between pictures, and between plots
+WINDOW = 12.0  # s that the plots show
+SAMPLES = 300  # in a curve
+BEHIND = 0.25  # s of wall time that are caught up with; what is more is lost
+SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "as fast as it goes": float("inf")}
+# What the buttons do to the robots: label of the group, button, change of the perturbation or a push.
+BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
+    "Payload": {"drop payload": {"payload": 10.0, "payload_x": 0.05, "payload_y": 0.06}, "remove": {"payload": 0.0}},
+    "Supply": {"sag supply": {"supply_factor": 0.7}, "restore": {"supply_factor": 1.0}},
+    "Floor": {"slippery patch": {"tyre_friction_factor": 0.15}, "dry": {"tyre_friction_factor": 1.0}},
+    "Push": {"push": {"push": (0.0, 60.0, 0.0)}, "spin": {"push": (0.0, 0.0, 15.0)}},
+}
+RUN = ("world", "steering", "reference", "measurement", "seed", "prefilter")
+HIDDEN = ("name", "laps", "events", "initial_pose", "initial_spread", "physics_step", "control_period", "motion_period")
+
+
+class Live:
+    """The page of a live session, and the loop that drives it.
+
+    Whatever a visitor does is queued and carried out by the loop between two ticks; the loop alone touches physics.
+    """
+
+    def __init__(self, scenarios: Sequence[Scenario], server: Server) -> None:
+        """Builds the page and stands the robots on their references.
+
+        Args:
+            scenarios: A scenario a robot, the first one solid, the others ghosts.
+            server: Where the page is served.
+
+        Raises:
+            InputError: As `Session`.
+        """
+        self.server = server
+        self.session = Session(scenarios)
+        self.playing = True
+        self.speed = 1.0
+        self.factor = 0.0  # simulated time over wall time, of the last second
+        self.late = self.ticks = 0  # ticks that began over a period after they were due, and all at a finite speed
+        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._wishes: dict[tuple[str, ...], Any] = {}
+        self._message = ""
+        self._closing = False
+        self._build()
+        self._stage()
+
+    # -- the page ------------------------------------------------------------------------------------------------
+
+    def _build(self) -> None:
+        gui = self.server.gui
+        self._curves = gui.add_panel()
+        self._charts = self._curves.add_tab("Curves", viser.Icon.CHART_LINE)
+        with self._charts:
+            self._legend = gui.add_html("")
+        self._curves.dock_left()
+        self._curves.set_width(430)
+        gui.main_panel.dock_right()
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Drive"):
+            self._status = gui.add_html("")
+            self._play = gui.add_button_group("", ("play", "pause", "step", "reset"))
+            self._on(self._play, lambda event: self._command(event.target.value))
+            speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
+            self._on(speed, lambda event: self._set_speed(SPEEDS[event.target.value]))
+            self._follow = gui.add_checkbox("Camera follows", False, hint="The first robot stays in the middle.")
+            for label, choices in BUTTONS.items():
+                group = gui.add_button_group(label, tuple(choices))
+                self._on(group, partial(self._press, choices))
+            self._timeline = gui.add_html("")
+            save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
+            self._on(save, self._save)
+        self._controls = Controls(gui, lambda path, value: self._requests.put(partial(self._wish, path, value)))
+        first, changing = self.session.start[0], [name for name in Scenario.model_fields if name not in HIDDEN]
+        with tabs.add_tab("Robot"):
+            self._controls.add(first, only=["perturbation"])
+        with tabs.add_tab("Controllers"):
+            self._controls.add(first, only=["feedforward"])
+            with gui.add_folder("compare with"):
+                for name in FEEDFORWARDS:
+                    ghost = gui.add_checkbox(name, any(s.feedforward == name for s in self.session.start[1:]))
+                    self._on(ghost, lambda event, name=name: self._compare(name, event.target.value))
+            self._learning = gui.add_checkbox("learning", True)
+            self._on(self._learning, lambda event: self._happen(learning=event.target.value))
+            self._controls.add(first, only=[n for n in changing if n not in (*RUN, "perturbation", "feedforward")])
+        self._run = tabs.add_tab("Run")
+        with self._run:
+            self._controls.add(first, only=RUN)
+
+    def _on(self, handle: Any, action: Callable[[Any], None]) -> None:  # noqa: ANN401
+        """Queues an action for whenever a visitor uses an input. Coroutines keep the order of the clicks."""
+
+        async def called(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                self._requests.put(partial(action, event))
+
+        (handle.on_click if hasattr(handle, "on_click") else handle.on_update)(called)
+
+    def _stage(self) -> None:
+        """Puts the robots of the session into the scene and the plots."""
+        session, first = self.session, self.session.start[0]
+        labels = [s.name or s.feedforward for s in session.start]
+        old = getattr(self, "_cast", None)
+        cast = (first.world, first.steering, tuple(labels))
+        if old != cast:
+            if old is not None:
+                self._scene.remove()
+                self._plots.remove()
+            self._cast = cast
+            self._scene = Scene(self.server, session.simulations[0][1].model, labels)
+            with self._charts:
+                self._plots = Plots(self.server.gui, labels, session.period)
+            keys = [
+                f'<span style="color:rgb{colour_of(k)}">■ {html.escape(label)}</span>'
+                for k, label in enumerate(labels[:MOST])
+            ]
+            self._legend.content = f'<p style="margin:0 1em">{" &nbsp; ".join(keys)} &nbsp; – reference</p>'
+        self._scene.show_reference(first.reference)
+        self._scene.forget_trails()
+        self._controls.show(first)
+        self._drawn = -1
+        self._counted = (time.monotonic(), session.tick)
+        self._describe()
+
+    # -- what visitors ask for, carried out by the loop -------------------------------------------------------------
+
+    def _command(self, name: str) -> None:
+        if name == "reset":
+            self._restart(self.session.start)
+        elif name == "step":
+            self.playing = False
+            self.session.step()
+        else:
+            self.playing = name == "play" and self.session.running
+
+    def _set_speed(self, speed: float) -> None:
+        self.speed, self._owed = speed, 0.0
+
+    def _press(self, choices: dict[str, dict[str, Any]], event: Any) -> None:  # noqa: ANN401
+        change = choices[event.target.value]
+        if "push" in change:
+            return self._happen(**change)
+        now: Perturbation = self.session.state()["perturbation"]
+        self._happen(perturbation=now.model_copy(update=change))
+
+    def _happen(self, **change: Any) -> None:  # noqa: ANN401
+        self.session.happen(**change)
+        self._describe()
+
+    def _wish(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
+        """Remembers what an input was set to; while it is dragged, the last value counts."""
+        self._wishes[path] = value
+
+    def _grant(self) -> None:
+        """Does what the inputs were set to: an event where that can be, another run where not."""
+        wishes, self._wishes = self._wishes, {}
+        for path, value in wishes.items():
+            try:
+                self._apply(path, value)
+            except InputError as error:
+                self._complain(error)
+                self._controls.show(self._present(self.session.start[0]))
+
+    def _apply(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
+        name, *rest = path
+        if path == ("perturbation", "control_delay"):  # in whole control periods
+            value = round(value / self.session.period) * self.session.period
+        if path == ("reference",):
+            value = {"kind": value}
+        if name in CHANGEABLE:
+            return self._happen(**{name: changed(self.session.state()[name], rest, value)})
+        start = self.session.start
+        touched = start[:1] if name == "feedforward" else start
+        others = start[len(touched) :]
+        new = [changed(self._present(s), path, value) for s in touched] + [self._present(s) for s in others]
+        new = [new[0], *(s for s in new[1:] if name != "feedforward" or s.feedforward != value)]
+        self._restart(new)
+        if path == ("reference",):
+            self._controls.remove(("reference",))
+            with self._run:
+                self._controls.add(self.session.start[0], only=["reference"])
+
+    def _present(self, scenario: Scenario) -> Scenario:
+        """A scenario that starts as things are now."""
+        state = self.session.state()
+        return scenario.model_copy(update={name: state[name] for name in CHANGEABLE})
+
+    def _compare(self, name: Any, wanted: bool) -> None:  # noqa: ANN401
+        first, *ghosts = map(self._present, self.session.start)
+        ghosts = [s for s in ghosts if s.feedforward != name]
+        if wanted and name != first.feedforward:
+            ghosts.append(first.model_copy(update={"feedforward": name, "name": ""}))
+        self._restart([first, *ghosts])
+
+    def _restart(self, scenarios: Sequence[Scenario]) -> None:
+        self.session = Session(scenarios)
+        self._message = ""
+        self._learning.value = True
+        self._stage()
+
+    def _save(self, event: Any) -> None:  # noqa: ANN401
+        for scenario in self.session.saved():
+            name = f"session-{scenario.name or scenario.feedforward}.toml"
+            event.client.send_file_download(name, scenario.to_toml().encode(), save_immediately=True)
+
+    # -- the loop ----------------------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Lets `run` return after the present round."""
+        self._closing = True
+
+    def run(self) -> None:
+        """Drives the session until `close`."""
+        self._owed, last = 0.0, time.monotonic()
+        next_frame = next_refresh = last
+        while not self._closing:
+            self._guarded(self._obey)
+            now = time.monotonic()
+            elapsed, last = now - last, now
+            if self.playing:
+                self._guarded(partial(self._advance, elapsed, now + FRAME))
+            now = time.monotonic()
+            if now >= next_frame:
+                next_frame = max(next_frame + FRAME, now)
+                self._guarded(self._draw)
+            if now >= next_refresh:
+                next_refresh = max(next_refresh + REFRESH, now)
+                self._guarded(self._grant)
+                self._guarded(self._refresh)
+            wait = min(next_frame, next_refresh) - time.monotonic()
+            if self.playing:
+                wait = min(wait, (1 - self._owed) * self.session.period / self.speed)
+            if wait > 0:
+                time.sleep(wait)
+
+    def _guarded(self, work: Callable[[], None]) -> None:
+        """Does a piece of work; what goes wrong in it is shown in page and terminal, and the loop goes on."""
+        try:
+            work()
+        except InputError as error:
+            self._complain(error)
+        except Exception as error:
+            self.playing = False
+            traceback.print_exc(file=sys.stderr)
+            self._complain(f"{type(error).__name__}: {error} (details in the terminal; reset starts anew)")
+
+    def _complain(self, reason: object) -> None:
+        self._message = str(reason)
+        print(f"mrctl: {reason}", file=sys.stderr)
+
+    def _obey(self) -> None:
+        while True:
+            try:
+                request = self._requests.get_nowait()
+            except queue.Empty:
+                return
+            self._guarded(request)
+
+    def _advance(self, elapsed: float, until: float) -> None:
+        """Runs the ticks that have come due, as many as there is time for."""
+        session = self.session
+        if self.speed == float("inf"):
+            self._owed = 0.0
+            while session.running and time.monotonic() < until:
+                session.step()
+        else:
+            pace = self.speed / session.period
+            self._owed = min(self._owed + elapsed * pace, max(1.0, BEHIND * pace))
+            self.late += max(0, int(self._owed) - max(1, round(self.speed)))
+            while self._owed >= 1 and session.running and time.monotonic() < until:
+                session.step()
+                self._owed -= 1
+                self.ticks += 1
+        if not session.running:
+            self.playing = False
+
+    def _draw(self) -> None:
+        session = self.session
+        if session.tick == self._drawn and not self._moved_camera():
+            return
+        self._drawn = session.tick
+        for row in range(session.size):
+            self._scene.show(row, session.qpos(row))
+        with self.server.atomic():
+            self._scene.flush(self._follow.value)
+
+    def _moved_camera(self) -> bool:
+        was, self._followed = getattr(self, "_followed", None), self._follow.value
+        return was != self._followed
+
+    def _refresh(self) -> None:
+        """Plots, trails, status: what need not be as smooth as the robots."""
+        session, now = self.session, time.monotonic()
+        since, tick = self._counted
+        if now - since >= 1:
+            self.factor = (session.tick - tick) * session.period / (now - since)
+            self._counted = now, session.tick
+        state = "playing" if self.playing else "paused" if session.running else "over: reset starts anew"
+        lap = 1 + int(session.time / session.start[0].reference.period)
+        factor = f" · {self.factor:.2f}× real time" if self.playing else ""
+        lines = [f"<b>{session.time:.2f} s</b> · lap {lap} · {state}{factor}"]
+        for row, scenario in enumerate(session.start):
+            if reason := session.failure(row):
+                lines.append(_warning(f"{scenario.name or scenario.feedforward} stopped: {reason}"))
+        if self._message:
+            lines.append(_warning(self._message))
+        content = f'<div style="margin:0 1em" id="mrctl-status">{"<br>".join(lines)}</div>'
+        if self._status.content != content:
+            self._status.content = content
+        if session.tick != getattr(self, "_plotted", None) and session.tick > 1:
+            self._plotted = session.tick
+            if self.playing:
+                self._scene.mark_trails()
+            ticks = round(WINDOW / session.period)
+            step = max(1, ticks // SAMPLES)
+            first = max(0, session.tick - ticks) // step * step
+            log = session.log(first)
+            times = np.arange(first, first + len(log), dtype=float) * session.period
+            self._plots.show(times, log, step)
+
+    def _describe(self) -> None:
+        """Writes the timeline, and sets the inputs to what holds now."""
+        scenario = max(self.session.saved(), key=lambda s: len(s.events))
+        before: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE}
+        lines = []
+        for event in sorted(scenario.events, key=lambda e: e.time):
+            lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_what(event, before))}")
+            before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
+        listed = "<br>".join(reversed(lines[-12:])) or "nothing has happened yet"
+        self._timeline.content = (
+            f'<div style="margin:0.5em 1em;max-height:9em;overflow:auto" id="mrctl-timeline">{listed}</div>'
+        )
+        state = self.session.state()
+        self._scene.show_payload(state["perturbation"])
+        for name in CHANGEABLE:
+            self._controls.show(state[name], (name,))
+
+
+def _what(event: Event, before: dict[str, Any]) -> str:
+    """An event in words."""
+    parts = []
+    for name in CHANGEABLE:
+        if (new := getattr(event, name)) is not None:
+            parts += [
+                f"{field.replace('_', ' ')} {getattr(before[name], field):g} → {getattr(new, field):g}"
+                for field in type(new).model_fields
+                if getattr(new, field) != getattr(before[name], field)
+            ]
+    if event.push is not None:
+        parts.append("push {:g} N, {:g} N, {:g} N·m".format(*event.push))
+    if event.learning is not None:
+        parts.append("learning on" if event.learning else "learning off")
+    return ", ".join(parts) or "no change"
+
+
+def _warning(text: str) -> str:
+    return f'<span style="color:#b91c1c" class="mrctl-error">{html.escape(text)}</span>'
