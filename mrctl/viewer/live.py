@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import html
-import queue
-import sys
 import time
-import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 import viser
+from typing_extensions import override
 
 from mrctl.record import InputError
 from mrctl.robot import Perturbation
 from mrctl.scenario import FEEDFORWARDS, Event, Scenario
 from mrctl.viewer.controls import Controls
-from mrctl.viewer.plots import MOST, Plots
-from mrctl.viewer.scene import Scene, colour_of
+from mrctl.viewer.page import SPEEDS, Page, block, warning, write
+from mrctl.viewer.plots import Plots
+from mrctl.viewer.scene import Scene
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import CHANGEABLE, Session, changed
 
-FRAME, REFRESH = 1 / 30, 1 / 12  # s of wall time between pictures, and between plots
 WINDOW = 12.0  # s that the plots show
 SAMPLES = 300  # in a curve
 BEHIND = 0.25  # s of wall time that are caught up with; what is more is lost
-SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "as fast as it goes": float("inf")}
 # What the buttons do to the robots: label of the group, button, change of the perturbation or a push.
 BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
     "Payload": {"drop payload": {"payload": 10.0, "payload_x": 0.05, "payload_y": 0.06}, "remove": {"payload": 0.0}},
@@ -39,11 +36,8 @@ RUN = ("world", "steering", "reference", "measurement", "seed", "prefilter")
 HIDDEN = ("name", "laps", "events", "initial_pose", "initial_spread", "physics_step", "control_period", "motion_period")
 
 
-class Live:
-    """The page of a live session, and the loop that drives it.
-
-    Whatever a visitor does is queued and carried out by the loop between two ticks; the loop alone touches physics.
-    """
+class Live(Page):
+    """The page of a live session: between two ticks, its loop does what visitors have asked for."""
 
     def __init__(self, scenarios: Sequence[Scenario], server: Server) -> None:
         """Builds the page and stands the robots on their references.
@@ -55,45 +49,33 @@ class Live:
         Raises:
             InputError: As `Session`.
         """
-        self.server = server
+        super().__init__(server)
         self.session = Session(scenarios)
-        self.playing = True
-        self.speed = 1.0
         self.factor = 0.0  # simulated time over wall time, of the last second
         self.late = self.ticks = 0  # ticks that began over a period after they were due, and all at a finite speed
-        self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._owed = 0.0  # ticks that are due
         self._wishes: dict[tuple[str, ...], Any] = {}
-        self._message = ""
-        self._closing = False
         self._build()
         self._stage()
 
     # -- the page ------------------------------------------------------------------------------------------------
 
     def _build(self) -> None:
-        gui = self.server.gui
-        self._curves = gui.add_panel()
-        self._charts = self._curves.add_tab("Curves", viser.Icon.CHART_LINE)
-        with self._charts:
-            self._legend = gui.add_html("")
-        self._curves.dock_left()
-        self._curves.set_width(430)
-        gui.main_panel.dock_right()
-        tabs = gui.add_tab_group()
+        gui, tabs = self.server.gui, self.server.gui.add_tab_group()
         with tabs.add_tab("Drive"):
             self._status = gui.add_html("")
             self._play = gui.add_button_group("", ("play", "pause", "step", "reset"))
-            self._on(self._play, lambda event: self._command(event.target.value))
+            self.on(self._play, lambda event: self._command(event.target.value))
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
-            self._on(speed, lambda event: self._set_speed(SPEEDS[event.target.value]))
+            self.on(speed, lambda event: self._set_speed(SPEEDS[event.target.value]))
             self._follow = gui.add_checkbox("Camera follows", False, hint="The first robot stays in the middle.")
             for label, choices in BUTTONS.items():
                 group = gui.add_button_group(label, tuple(choices))
-                self._on(group, partial(self._press, choices))
+                self.on(group, partial(self._press, choices))
             self._timeline = gui.add_html("")
             save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
-            self._on(save, self._save)
-        self._controls = Controls(gui, lambda path, value: self._requests.put(partial(self._wish, path, value)))
+            self.on(save, self._save)
+        self._controls = Controls(gui, partial(self.ask, self._wish))
         first, changing = self.session.start[0], [name for name in Scenario.model_fields if name not in HIDDEN]
         with tabs.add_tab("Robot"):
             self._controls.add(first, only=["perturbation"])
@@ -102,22 +84,13 @@ class Live:
             with gui.add_folder("compare with"):
                 for name in FEEDFORWARDS:
                     ghost = gui.add_checkbox(name, any(s.feedforward == name for s in self.session.start[1:]))
-                    self._on(ghost, lambda event, name=name: self._compare(name, event.target.value))
+                    self.on(ghost, lambda event, name=name: self._compare(name, event.target.value))
             self._learning = gui.add_checkbox("learning", True)
-            self._on(self._learning, lambda event: self._happen(learning=event.target.value))
+            self.on(self._learning, lambda event: self._happen(learning=event.target.value))
             self._controls.add(first, only=[n for n in changing if n not in (*RUN, "perturbation", "feedforward")])
         self._run = tabs.add_tab("Run")
         with self._run:
             self._controls.add(first, only=RUN)
-
-    def _on(self, handle: Any, action: Callable[[Any], None]) -> None:  # noqa: ANN401
-        """Queues an action for whenever a visitor uses an input. Coroutines keep the order of the clicks."""
-
-        async def called(event: viser.GuiEvent) -> None:
-            if event.client is not None:
-                self._requests.put(partial(action, event))
-
-        (handle.on_click if hasattr(handle, "on_click") else handle.on_update)(called)
 
     def _stage(self) -> None:
         """Puts the robots of the session into the scene and the plots."""
@@ -131,13 +104,8 @@ class Live:
                 self._plots.remove()
             self._cast = cast
             self._scene = Scene(self.server, session.simulations[0][1].model, labels)
-            with self._charts:
+            with self.curves:
                 self._plots = Plots(self.server.gui, labels, session.period)
-            keys = [
-                f'<span style="color:rgb{colour_of(k)}">■ {html.escape(label)}</span>'
-                for k, label in enumerate(labels[:MOST])
-            ]
-            self._legend.content = f'<p style="margin:0 1em">{" &nbsp; ".join(keys)} &nbsp; – reference</p>'
         self._scene.show_reference(first.reference)
         self._scene.forget_trails()
         self._controls.show(first)
@@ -181,7 +149,7 @@ class Live:
             try:
                 self._apply(path, value)
             except InputError as error:
-                self._complain(error)
+                self.complain(error)
                 self._controls.show(self._present(self.session.start[0]))
 
     def _apply(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
@@ -217,7 +185,7 @@ class Live:
 
     def _restart(self, scenarios: Sequence[Scenario]) -> None:
         self.session = Session(scenarios)
-        self._message = ""
+        self.message = ""
         self._learning.value = True
         self._stage()
 
@@ -228,59 +196,8 @@ class Live:
 
     # -- the loop ----------------------------------------------------------------------------------------------------
 
-    def close(self) -> None:
-        """Lets `run` return after the present round."""
-        self._closing = True
-
-    def run(self) -> None:
-        """Drives the session until `close`."""
-        self._owed, last = 0.0, time.monotonic()
-        next_frame = next_refresh = last
-        while not self._closing:
-            self._guarded(self._obey)
-            now = time.monotonic()
-            elapsed, last = now - last, now
-            if self.playing:
-                self._guarded(partial(self._advance, elapsed, now + FRAME))
-            now = time.monotonic()
-            if now >= next_frame:
-                next_frame = max(next_frame + FRAME, now)
-                self._guarded(self._draw)
-            if now >= next_refresh:
-                next_refresh = max(next_refresh + REFRESH, now)
-                self._guarded(self._grant)
-                self._guarded(self._refresh)
-            wait = min(next_frame, next_refresh) - time.monotonic()
-            if self.playing:
-                wait = min(wait, (1 - self._owed) * self.session.period / self.speed)
-            if wait > 0:
-                time.sleep(wait)
-
-    def _guarded(self, work: Callable[[], None]) -> None:
-        """Does a piece of work; what goes wrong in it is shown in page and terminal, and the loop goes on."""
-        try:
-            work()
-        except InputError as error:
-            self._complain(error)
-        except Exception as error:
-            self.playing = False
-            traceback.print_exc(file=sys.stderr)
-            self._complain(f"{type(error).__name__}: {error} (details in the terminal; reset starts anew)")
-
-    def _complain(self, reason: object) -> None:
-        self._message = str(reason)
-        print(f"mrctl: {reason}", file=sys.stderr)
-
-    def _obey(self) -> None:
-        while True:
-            try:
-                request = self._requests.get_nowait()
-            except queue.Empty:
-                return
-            self._guarded(request)
-
-    def _advance(self, elapsed: float, until: float) -> None:
-        """Runs the ticks that have come due, as many as there is time for."""
+    @override
+    def advance(self, elapsed: float, until: float) -> None:
         session = self.session
         if self.speed == float("inf"):
             self._owed = 0.0
@@ -297,7 +214,12 @@ class Live:
         if not session.running:
             self.playing = False
 
-    def _draw(self) -> None:
+    @override
+    def rest(self) -> float:
+        return (1 - self._owed) * self.session.period / self.speed
+
+    @override
+    def draw(self) -> None:
         session = self.session
         if session.tick == self._drawn and not self._moved_camera():
             return
@@ -311,8 +233,9 @@ class Live:
         was, self._followed = getattr(self, "_followed", None), self._follow.value
         return was != self._followed
 
-    def _refresh(self) -> None:
-        """Plots, trails, status: what need not be as smooth as the robots."""
+    @override
+    def refresh(self) -> None:
+        self._grant()
         session, now = self.session, time.monotonic()
         since, tick = self._counted
         if now - since >= 1:
@@ -324,12 +247,10 @@ class Live:
         lines = [f"<b>{session.time:.2f} s</b> · lap {lap} · {state}{factor}"]
         for row, scenario in enumerate(session.start):
             if reason := session.failure(row):
-                lines.append(_warning(f"{scenario.name or scenario.feedforward} stopped: {reason}"))
-        if self._message:
-            lines.append(_warning(self._message))
-        content = f'<div style="margin:0 1em" id="mrctl-status">{"<br>".join(lines)}</div>'
-        if self._status.content != content:
-            self._status.content = content
+                lines.append(warning(f"{scenario.name or scenario.feedforward} stopped: {reason}"))
+        if self.message:
+            lines.append(warning(self.message))
+        write(self._status, block("status", *lines))
         if session.tick != getattr(self, "_plotted", None) and session.tick > 1:
             self._plotted = session.tick
             if self.playing:
@@ -349,10 +270,7 @@ class Live:
         for event in sorted(scenario.events, key=lambda e: e.time):
             lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_what(event, before))}")
             before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
-        listed = "<br>".join(reversed(lines[-12:])) or "nothing has happened yet"
-        self._timeline.content = (
-            f'<div style="margin:0.5em 1em;max-height:9em;overflow:auto" id="mrctl-timeline">{listed}</div>'
-        )
+        write(self._timeline, block("timeline", *(reversed(lines[-50:]) if lines else ["nothing has happened yet"])))
         state = self.session.state()
         self._scene.show_payload(state["perturbation"])
         for name in CHANGEABLE:
@@ -374,7 +292,3 @@ def _what(event: Event, before: dict[str, Any]) -> str:
     if event.learning is not None:
         parts.append("learning on" if event.learning else "learning off")
     return ", ".join(parts) or "no change"
-
-
-def _warning(text: str) -> str:
-    return f'<span style="color:#b91c1c" class="mrctl-error">{html.escape(text)}</span>'

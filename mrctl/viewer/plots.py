@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -109,6 +110,7 @@ class Plots:
             cursor: `show` will be given one.
         """
         self._labels, self._period = labels, period
+        self._legend = gui.add_html(legend(labels))
         empty = charts(np.full((2, len(labels), len(SIGNALS)), np.nan), labels, period)
         self._handles = [_add(gui, chart, cursor) for chart in empty]
 
@@ -128,8 +130,15 @@ class Plots:
 
     def remove(self) -> None:
         """Takes the charts away."""
-        for handle in self._handles:
+        for handle in (self._legend, *self._handles):
             handle.remove()
+
+
+def legend(labels: Sequence[str]) -> str:
+    """Which colour is whose, in HTML."""
+    keys = [f'<span style="color:rgb{colour_of(k)}">■ {html.escape(name)}</span>' for k, name in enumerate(labels)]
+    keys = [*keys[:MOST], f'<span style="color:rgb{REFERENCE}">■ reference</span>']
+    return f'<p style="margin:0.3em 1em">{" &nbsp; ".join(keys)}</p>'
 
 
 def _add(gui: viser.GuiApi, chart: Chart, cursor: bool) -> viser.GuiUplotHandle:

@@ -17,6 +17,7 @@ from mrctl import model as mjcf
 from mrctl.record import InputError
 from mrctl.references import Reference
 from mrctl.robot import Perturbation
+from mrctl.viewer.recording import Recording
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -69,6 +70,7 @@ class Scene:
         self._payload = self._scene.add_box(
             "/world/robot/chassis/payload", (120, 72, 40), (0.1, 0.1, 0.1), cast_shadow=False, visible=False
         )
+        self._shown = None
         self._trails = np.zeros((self.size, TRAIL, 3))
         self._trail = None
         self._reference = None
@@ -125,6 +127,11 @@ class Scene:
         line = np.column_stack([pose[:, :2], [self._height(x, y) + 0.006 for x, y in pose[:, :2]]])
         self._reference = self._scene.add_line_segments("/world/reference", _segments(line), REFERENCE, thickness=0.025)
 
+    def show_recordings(self, recordings: Sequence[Recording]) -> None:
+        """Draws the reference and the ways of runs that are over."""
+        self.show_reference(recordings[0].scenario.reference)
+        self.show_trails(np.stack([recording.way() for recording in recordings]))
+
     def _height(self, x: float, y: float) -> float:
         try:
             return float(mjcf.ground(self._model, self._data, x, y)[2])
@@ -160,6 +167,9 @@ class Scene:
     def show_payload(self, perturbation: Perturbation) -> None:
         """Draws a payload of its size (the density of water) where it is, or none."""
         p, box = perturbation, self._payload
+        if p == self._shown:
+            return
+        self._shown = p
         box.visible = p.payload > 0
         if box.visible:
             side = (p.payload / 1000) ** (1 / 3)

@@ -58,6 +58,11 @@ class Server(viser.ViserServer):
         if verbose:
             print("mrctl: a request to share this page publicly was refused", file=sys.stderr)
 
+    def stop(self) -> None:
+        """Stops to serve, quietly."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().stop()
+
     def announce(self) -> str:
         """Where the page is, and what to know about reaching it."""
         host, port = self.get_host(), self.get_port()

@@ -88,12 +88,7 @@ class Session:
 
     def state(self) -> dict[str, Any]:
         """What holds now of what can change: the fields `CHANGEABLE`, and `learning`."""
-        scenario = max(self.saved(), key=lambda s: len(s.events))
-        state = {name: getattr(scenario, name) for name in CHANGEABLE} | {"learning": True}
-        for event in sorted(scenario.events, key=lambda e: e.time):
-            if event.time <= self.time + 1e-9:
-                state |= {name: value for name in state if (value := getattr(event, name)) is not None}
-        return state
+        return state(max(self.saved(), key=lambda s: len(s.events)), self.time)
 
     def saved(self) -> list[Scenario]:
         """Scenarios that run again as the robots did, to the end of the lap that they are in."""
@@ -117,6 +112,15 @@ class Session:
         """Why a robot has stopped, or ""."""
         sim, k = self._place[row]
         return sim.plant.failure[k]
+
+
+def state(scenario: Scenario, time: float) -> dict[str, Any]:
+    """What holds at a time of what can change in a run: the fields `CHANGEABLE`, and `learning`."""
+    found = {name: getattr(scenario, name) for name in CHANGEABLE} | {"learning": True}
+    for event in sorted(scenario.events, key=lambda e: e.time):
+        if event.time <= time + 1e-9:
+            found |= {name: value for name in found if (value := getattr(event, name)) is not None}
+    return found
 
 
 def changed(record: AnyRecord, path: Sequence[str], value: object) -> AnyRecord:
