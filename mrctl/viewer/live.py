@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from mrctl.record import InputError
 from mrctl.robot import Perturbation
-from mrctl.scenario import FEEDFORWARDS, Event, Scenario
+from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.viewer.controls import Controls
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
@@ -65,16 +65,20 @@ class Live(Page):
         with tabs.add_tab("Drive"):
             self._status = gui.add_html("")
             self._play = gui.add_button_group("", ("play", "pause", "step", "reset"))
-            self.on(self._play, lambda event: self._command(event.target.value))
+            self.on(self._play, self._command)
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
-            self.on(speed, lambda event: self._set_speed(SPEEDS[event.target.value]))
+            self.on(speed, lambda name: self._set_speed(SPEEDS[name]))
             self._follow = gui.add_checkbox("Camera follows", False, hint="The first robot stays in the middle.")
             for label, choices in BUTTONS.items():
                 group = gui.add_button_group(label, tuple(choices))
                 self.on(group, partial(self._press, choices))
             self._timeline = gui.add_html("")
             save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
-            self.on(save, self._save)
+
+            @save.on_click
+            async def _(event: viser.GuiEvent) -> None:
+                self.ask(self._save, event.client)
+
         self._controls = Controls(gui, partial(self.ask, self._wish))
         first, changing = self.session.start[0], [name for name in Scenario.model_fields if name not in HIDDEN]
         with tabs.add_tab("Robot"):
@@ -84,9 +88,9 @@ class Live(Page):
             with gui.add_folder("compare with"):
                 for name in FEEDFORWARDS:
                     ghost = gui.add_checkbox(name, any(s.feedforward == name for s in self.session.start[1:]))
-                    self.on(ghost, lambda event, name=name: self._compare(name, event.target.value))
+                    self.on(ghost, partial(self._compare, name))
             self._learning = gui.add_checkbox("learning", True)
-            self.on(self._learning, lambda event: self._happen(learning=event.target.value))
+            self.on(self._learning, lambda on: self._happen(learning=on))
             self._controls.add(first, only=[n for n in changing if n not in (*RUN, "perturbation", "feedforward")])
         self._run = tabs.add_tab("Run")
         with self._run:
@@ -127,8 +131,8 @@ class Live(Page):
     def _set_speed(self, speed: float) -> None:
         self.speed, self._owed = speed, 0.0
 
-    def _press(self, choices: dict[str, dict[str, Any]], event: Any) -> None:  # noqa: ANN401
-        change = choices[event.target.value]
+    def _press(self, choices: dict[str, dict[str, Any]], name: str) -> None:
+        change = choices[name]
         if "push" in change:
             return self._happen(**change)
         now: Perturbation = self.session.state()["perturbation"]
@@ -176,7 +180,7 @@ class Live(Page):
         state = self.session.state()
         return scenario.model_copy(update={name: state[name] for name in CHANGEABLE})
 
-    def _compare(self, name: Any, wanted: bool) -> None:  # noqa: ANN401
+    def _compare(self, name: FeedforwardName, wanted: bool) -> None:
         first, *ghosts = map(self._present, self.session.start)
         ghosts = [s for s in ghosts if s.feedforward != name]
         if wanted and name != first.feedforward:
@@ -189,10 +193,10 @@ class Live(Page):
         self._learning.value = True
         self._stage()
 
-    def _save(self, event: Any) -> None:  # noqa: ANN401
+    def _save(self, client: viser.ClientHandle) -> None:
         for scenario in self.session.saved():
             name = f"session-{scenario.name or scenario.feedforward}.toml"
-            event.client.send_file_download(name, scenario.to_toml().encode(), save_immediately=True)
+            client.send_file_download(name, scenario.to_toml().encode(), save_immediately=True)
 
     # -- the loop ----------------------------------------------------------------------------------------------------
 

@@ -53,11 +53,11 @@ class Page(ABC):
         self._requests.put(partial(action, *arguments))
 
     def on(self, handle: Any, action: Callable[[Any], None]) -> None:  # noqa: ANN401
-        """Asks for an action whenever a visitor uses an input. Coroutines keep the order of the clicks."""
+        """Asks for an action with the new value whenever a visitor uses an input; coroutines keep their order."""
 
         async def called(event: viser.GuiEvent) -> None:
             if event.client is not None:
-                self.ask(action, event)
+                self.ask(action, event.target.value)
 
         (handle.on_click if hasattr(handle, "on_click") else handle.on_update)(called)
 

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 COLUMN = {name: k for k, name in enumerate(SIGNALS)}
 SHARE_WINDOW = 1.0  # s over which the share of feedback is taken
-CURSOR: Colour = (30, 30, 30)
+CURSOR: Colour = (150, 155, 160)
 MOST = 4  # robots whose curves are drawn
 
 

@@ -48,22 +48,20 @@ class Replay(Page):
         tabs = gui.add_tab_group()
         with tabs.add_tab("Replay"):
             self._status = gui.add_html("")
-            self.on(
-                gui.add_button_group("", ("play", "pause", "start")), lambda event: self._command(event.target.value)
-            )
+            self.on(gui.add_button_group("", ("play", "pause", "start")), self._command)
             self.scrubber = gui.add_slider("Time, s", 0.0, 1.0, 0.01, 0.0)
-            self.on(self.scrubber, lambda event: self._scrub(event.target.value))
+            self.on(self.scrubber, self._scrub)
             speeds = tuple(name for name, speed in SPEEDS.items() if np.isfinite(speed))
             self.on(
                 gui.add_dropdown("Speed", speeds, initial_value="1×"),
-                lambda event: setattr(self, "speed", SPEEDS[event.target.value]),
+                lambda name: setattr(self, "speed", SPEEDS[name]),
             )
             self._follow = gui.add_checkbox("Camera follows", False)
             self._chosen = gui.add_number("Run", run, min=int(table.index[0]), max=int(table.index[-1]), step=1)
-            self.on(self._chosen, lambda event: self._show([event.target.value, *self.runs[1:]]))
-            self.on(gui.add_button("Keep this run as a ghost"), lambda event: self._show([*self.runs, self.runs[0]]))
-            self.on(gui.add_button("Only this run"), lambda event: self._show(self.runs[:1]))
-        numbers = [str(name) for name in table.select_dtypes("number") if len(set(table[name])) > 1]
+            self.on(self._chosen, lambda run: self._show([run, *self.runs[1:]]))
+            self.on(gui.add_button("Keep this run as a ghost"), lambda _: self._show([*self.runs, self.runs[0]]))
+            self.on(gui.add_button("Only this run"), lambda _: self._show(self.runs[:1]))
+        numbers = [str(name) for name, values in table.select_dtypes("number").nunique().items() if values > 1]
         self._board: list[Any] = []
         if len(table) > 1 and numbers:
             with tabs.add_tab("All runs"):
@@ -76,7 +74,7 @@ class Replay(Page):
                     for label, value in (("across", numbers[0]), ("up", last))
                 ]
                 for axis in self._axes:
-                    self.on(axis, lambda event: self._scatter())
+                    self.on(axis, lambda _: self._scatter())
             self._scatter()
 
     def _scatter(self) -> None:
@@ -141,7 +139,7 @@ class Replay(Page):
         self._times, self._log = together(recordings)
         self.duration = float(self._times[-1])
         self.scrubber.max = self.duration
-        self._scrub(min(self.time, self.duration), pause=False)
+        self._scrub(self.time, pause=False)
 
     def _command(self, name: str) -> None:
         self.playing = name == "play"
@@ -149,7 +147,7 @@ class Replay(Page):
             self._scrub(0.0, pause=name == "start")
 
     def _scrub(self, time: float, pause: bool = True) -> None:
-        self.time = time
+        self.time = min(time, self.duration)
         self.playing = self.playing and not pause
         self._drawn = self._plotted = None
 
