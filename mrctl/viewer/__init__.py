@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from mrctl.viewer.page import Page
     from mrctl.viewer.server import Server
 
-FEW = 4  # runs of a result that are all shown at once
-
 
 def view(
     file: Path | None, compare: Sequence[FeedforwardName], run: int | None, export: Path | None, host: str, port: int
@@ -36,7 +34,7 @@ def view(
     """
     from mrctl.viewer.export import export as write
     from mrctl.viewer.live import Live
-    from mrctl.viewer.recording import Library, Recording, names
+    from mrctl.viewer.recording import FEW, Library, Recording, names
     from mrctl.viewer.replay import Replay
 
     if file is not None and file.is_dir():

@@ -27,6 +27,7 @@ from mrctl.viewer.session import state
 
 Array = NDArray[np.float64]
 COLUMN = {name: k for k, name in enumerate(SIGNALS)}
+FEW = 4  # runs of a result that are all shown at once
 WHEELS = {"wheel_left": "wheel_rate_left", "wheel_right": "wheel_rate_right"}
 
 

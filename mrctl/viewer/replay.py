@@ -13,7 +13,7 @@ from typing_extensions import override
 from mrctl.record import InputError
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
-from mrctl.viewer.recording import Library, names, together
+from mrctl.viewer.recording import FEW, Library, names, together
 from mrctl.viewer.scene import Scene, colour_of
 from mrctl.viewer.server import Server
 
@@ -63,7 +63,7 @@ class Replay(Page):
             self.on(gui.add_button("Only this run"), lambda _: self._show(self.runs[:1]))
         numbers = [str(name) for name, values in table.select_dtypes("number").nunique().items() if values > 1]
         self._board: list[Any] = []
-        if len(table) > 1 and numbers:
+        if len(table) > FEW and numbers:
             with tabs.add_tab("All runs"):
                 gui.add_html(
                     block("scatter", "Each sphere behind the track is a run; red ones have failed. Click one.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import http
 import io
 import socket
@@ -83,6 +84,8 @@ def _reserve(host: str, port: int) -> socket.socket:
     Raises:
         InputError: It cannot.
     """
+    if not 0 <= port <= 65535:
+        raise InputError(f"port: {port} is not between 0 and 65535")
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         taken = socket.socket(family, kind, protocol)
@@ -94,10 +97,8 @@ def _reserve(host: str, port: int) -> socket.socket:
             taken.close()
             raise
         return taken
-    except OverflowError:
-        raise InputError(f"port: {port} is not between 0 and 65535") from None
     except OSError as error:
-        if port and isinstance(error, OSError) and error.errno == 98:
+        if error.errno == errno.EADDRINUSE:
             raise InputError(f"port: {port} is in use; choose another with --port") from None
         raise InputError(f"host: cannot listen on {host}:{port}: {error.strerror or error}") from None
 
@@ -124,8 +125,8 @@ def _admit(host: str, answer: Any, connection: ServerConnection, request: Reques
     The page must have been asked for by a name of this machine (a stranger's name may point here: DNS rebinding), and
     a connection must come from that very page. Programs other than browsers send no origin, and could send any.
     """
-    name, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-    known = host in ANYWHERE or urlsplit(f"//{name}").hostname in (*LOCAL, host)
-    if not known or (origin is not None and origin.partition("://")[2] != name):
+    names, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+    known = host in ANYWHERE or all(urlsplit(f"//{name}").hostname in (*LOCAL, host) for name in names)
+    if len(names) != 1 or not known or any(origin.partition("://")[2] != names[0] for origin in origins):
         return connection.respond(http.HTTPStatus.FORBIDDEN, "mrctl: a foreign origin\n")
     return answer(connection, request)
