@@ -55,10 +55,12 @@ class Controls:
             handle = self._gui.add_checkbox(label, value, hint=hint)
         elif isinstance(value, int | float) and (limits := _limits(field, value)):
             low, high, step = limits
+            # Floats even for whole numbers: viser passes on what any page sends for an int, however large, and then
+            # cannot pack it for any other.
             if high - low > 1e4 * step:
-                handle = self._gui.add_number(label, value, min=low, max=high, step=step, hint=hint)
+                handle = self._gui.add_number(label, float(value), min=low, max=high, step=step, hint=hint)
             else:
-                handle = self._gui.add_slider(label, low, high, step, value, hint=hint)
+                handle = self._gui.add_slider(label, low, high, step, float(value), hint=hint)
         else:
             return
         self._listen(path, handle)
@@ -98,6 +100,6 @@ def _limits(field: FieldInfo, value: float) -> tuple[float, float, float] | None
     if low is None or high is None:
         return None
     if field.annotation is int:
-        return int(low + (Gt in bounds)), int(high - (Lt in bounds)), 1
+        return float(low + (Gt in bounds)), float(high - (Lt in bounds)), 1.0
     step = 10.0 ** floor(log10(min((high - low) / 1000, abs(value) / 10 or high)))
     return float(low + step * (Gt in bounds)), float(high - step * (Lt in bounds)), step

@@ -194,6 +194,8 @@ class Live(Page):
         self._stage()
 
     def _save(self, client: viser.ClientHandle) -> None:
+        if client.client_id not in self.server.get_clients():
+            return  # left meanwhile
         for scenario in self.session.saved():
             name = f"session-{scenario.name or scenario.feedforward}.toml"
             client.send_file_download(name, scenario.to_toml().encode(), save_immediately=True)

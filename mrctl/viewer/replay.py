@@ -57,8 +57,10 @@ class Replay(Page):
                 lambda name: setattr(self, "speed", SPEEDS[name]),
             )
             self._follow = gui.add_checkbox("Camera follows", False)
-            self._chosen = gui.add_number("Run", run, min=int(table.index[0]), max=int(table.index[-1]), step=1)
-            self.on(self._chosen, lambda run: self._show([run, *self.runs[1:]]))
+            self._chosen = gui.add_number(
+                "Run", float(run), min=float(table.index[0]), max=float(table.index[-1]), step=1.0
+            )
+            self.on(self._chosen, lambda run: self._show([int(run), *self.runs[1:]]))
             self.on(gui.add_button("Keep this run as a ghost"), lambda _: self._show([*self.runs, self.runs[0]]))
             self.on(gui.add_button("Only this run"), lambda _: self._show(self.runs[:1]))
         numbers = [str(name) for name, values in table.select_dtypes("number").nunique().items() if values > 1]
@@ -122,7 +124,7 @@ class Replay(Page):
 
     def _open(self, run: int) -> None:
         self._show([run, *self.runs[1:]])
-        self._chosen.value = run
+        self._chosen.value = float(run)
 
     def _show(self, runs: Sequence[int]) -> None:
         """Puts runs into the scene and the plots."""

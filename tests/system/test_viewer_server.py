@@ -172,6 +172,7 @@ def test_rough_treatment(server, capfd):
         live.close()
         loop.join()
     assert threading.active_count() <= before + 2  # viser's pool
+    assert max(objects) < 1.15 * objects[0]
     capfd.readouterr()
 
 
