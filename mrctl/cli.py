@@ -199,19 +199,25 @@ def suite(
     print(ladder.suite(feedforward, seeds, out))
 
 
-def tune(world: str = "flat", time_constant: float = 0.15, delay: float = 0.0, json: bool = False) -> None:
-    """Designs the velocity PID from equation (3) and prints gains, margins and the learning condition.
+def tune(
+    world: str = "flat",
+    time_constant: float = 0.15,
+    delay: tuple[float, ...] = (0.0, 0.02, 0.04),
+    out: Path | None = None,
+    json: bool = False,
+) -> None:
+    """Designs the velocity PID from equation (3), measures its loops on the physics, and says where learning is safe.
 
     Args:
         world: World or MJCF file with the robot.
         time_constant: Closed-loop time constant in s.
-        delay: Loop delay in s beside the hold of half a control period.
+        delay: Loop delays in s beside the hold, whole control periods.
+        out: Folder for the table, the measured responses and a figure of them.
         json: Print JSON.
     """
     from mrctl.experiments import tuning
 
-    table = tuning.design(world, time_constant, delay)
-    print(jsonlib.dumps(table, indent=2) if json else tuning.text(table))
+    print(tuning.tune(world, time_constant, delay, out, json))
 
 
 def bench(json: bool = False) -> None:

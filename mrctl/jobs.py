@@ -120,6 +120,7 @@ def _drive(store: Store, pending: Sequence[int], pool: Pool, progress: bool) -> 
                     bar.set_postfix(failed=failed, refresh=False)
                     bar.update(size)
         except KeyboardInterrupt:
+            pool.close()  # or a worker would finish another job behind the count
             done = sum(len(store.runs(job)) for job in store.done())
             raise KeyboardInterrupt(f"{done} of {store.size} runs are done; the same command goes on") from None
     return aside

@@ -18,6 +18,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from mrctl.control.feedforward import features
 from mrctl.record import InputError
 
 Array = NDArray[np.float64]
@@ -41,14 +42,16 @@ METRICS: dict[str, tuple[str, str]] = {
     "saturation_time": ("s", "time in saturation"),
     "energy": ("J", "electrical energy"),
     "weight_norm": ("1", "norm of the learner's weights at the end of the lap"),
+    "excitation": ("1", "smallest eigenvalue of the Gram matrix of the physical features at the commanded motion"),
 }
 """Name of a metric -> (unit, description)."""
 
+ROUNDING = 1e-10  # singular values of the features below this share of the largest come of rounding alone
 PER_RUN = ("label", "feedforward", "steering", "seed", "lap_time")
 SAMPLED = (
     "x", "y", "x_ref", "y_ref", "v", "omega", "v_ref", "omega_ref", "longitudinal_error", "lateral_error",
-    "heading_error", "feedback_left", "feedback_right", "voltage_left", "voltage_right", "saturated", "power",
-    "weight_norm",
+    "heading_error", "v_command", "omega_command", "feedback_left", "feedback_right", "voltage_left", "voltage_right",
+    "saturated", "power", "weight_norm",
 )  # fmt: skip
 
 
@@ -167,6 +170,7 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
     narrow = runs[[name for name in ("x", "failed", "failure_time") if name in runs]]
     divisions = [laps_of(narrow.isel(run=row)) for row in range(size)]
     counts = [len(laps.edges) - 1 for laps in divisions]
+    scaled = {"half_track", "feature_scale"} <= set(runs.variables)
     data = {name: runs[name].transpose("run", "time").values.astype(float) for name in SAMPLED}
     values = {name: np.full((size, max(counts, default=0)), np.nan) for name in METRICS}
     groups: dict[tuple[int, ...], list[int]] = {}
@@ -179,6 +183,10 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
             steps = {name: data[name][rows, max(start - 1, 0) : end] for name in ("voltage_left", "voltage_right")}
             for name, value in _lap_metrics(rates, steps, period).items():
                 values[name][rows, lap] = value
+            if scaled and end - start > 1:
+                command = np.stack([rates["v_command"], rates["omega_command"]], axis=-1)
+                half_track, scale = runs["half_track"].values[rows], runs["feature_scale"].values[rows]
+                values["excitation"][rows, lap] = excitation(command, period, half_track, scale)
     for row, laps in enumerate(divisions):
         if laps.failed is not None:
             for value in values.values():
@@ -218,6 +226,33 @@ def _lap_metrics(data: dict[str, Array], voltages: dict[str, Array], period: flo
     found["energy"] = data["power"].sum(-1) * period
     found["weight_norm"] = data["weight_norm"][:, -1]
     return found
+
+
+def excitation(command: Array, period: float, half_track: Array, scale: Array) -> Array:
+    """Smallest eigenvalue of the Gram matrix XᵀX/n of the 8 physical features X `(n, 8)` over some stretch of motion.
+
+    How well the least excited combination of coefficients can be told from what was driven: at zero a learner may hold
+    anything there (persistency of excitation; Ioannou and Sun 1996, section 4.3).
+
+    Args:
+        command: Commanded twist in m/s, rad/s, `(…, n, 2)`; its derivative is taken by central differences.
+        period: Seconds between the samples.
+        half_track: Of the nominal robot in m, `(…,)`.
+        scale: What the features are divided by, as from `feature_scale`, `(…, 8)`.
+
+    Returns:
+        `(…,)`; NaN where the motion is not finite.
+    """
+    n = command.shape[-2]
+    x = np.empty((*command.shape[:-1], scale.shape[-1]))
+    features(command, np.gradient(command, period, axis=-2), half_track[..., None], scale[..., None, :], x)
+    finite = np.asarray(np.isfinite(x).all(axis=(-2, -1)))
+    # Squared singular values resolve what eigenvalues of the product, rounded to 1e-16 of the largest, do not.
+    triangle = np.linalg.qr(np.where(finite[..., None, None], x, 0.0), mode="r")
+    sizes = np.linalg.svd(triangle, compute_uv=False)
+    least, largest = sizes[..., -1], sizes[..., 0]
+    least = np.where((least > ROUNDING * largest) & (n >= x.shape[-1]), least, 0.0)
+    return np.where(finite, np.square(least) / n, np.nan)
 
 
 def _rms(signal: Array) -> Array:

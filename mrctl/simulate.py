@@ -15,7 +15,7 @@ from tqdm import tqdm
 from mrctl import model as mjcf
 from mrctl import result
 from mrctl.control.chain import ANY, GIVEN, OWN, one, rows, stamp
-from mrctl.control.feedforward import Feedforward, InverseDynamics
+from mrctl.control.feedforward import Feedforward, InverseDynamics, feature_scale
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.hierarchy import STATE as CONTROLLER
 from mrctl.control.hierarchy import Hierarchy, feedforward_of
@@ -270,7 +270,12 @@ class Simulation:
         log = self.log[: self.tick] if self.running else self.log
         log[self.tick :] = np.nan
         by_run = log.transpose(1, 0, 2)
-        return result.dataset(self.scenarios, labels, by_run, self.plant.failure, self._failure_time, weights)
+        found = result.dataset(self.scenarios, labels, by_run, self.plant.failure, self._failure_time, weights)
+        size, robot = len(self.scenarios), self.plant.robot
+        return found.assign(  # what turns the commanded motion into features
+            half_track=("run", np.full(size, robot.half_track), {"units": "m"}),
+            feature_scale=(("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
+        )
 
     def _perturb(self, row: int, perturbation: Perturbation) -> None:
         p = perturbation

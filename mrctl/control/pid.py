@@ -37,6 +37,23 @@ class Pid(Record):
         derivative = self.derivative_time, self.derivative_filter
         return np.array([[g.k_p, g.k_i, g.k_p * derivative[0], derivative[1]] for g in (common, second)])
 
+    def faster(self, factor: float) -> Pid:
+        """The same rule with the closed-loop time constant divided: every gain is multiplied by `factor`.
+
+        Raises:
+            InputError: This leaves the range of a field.
+        """
+        changed = {
+            "time_constant": self.time_constant / factor,
+            "steering_kp": self.steering_kp * factor,
+            "steering_ki": self.steering_ki * factor,
+        }
+        return Pid.from_dict(self.model_dump() | changed)
+
+
+PIDS: dict[str, Pid] = {"normal": Pid(), "fast": Pid().faster(2)}
+"""The feedback of every comparison: everyone's, and one twice as fast, which leaves less for a feedforward to gain."""
+
 
 class Gains(NamedTuple):
     """Proportional and integral gain of one channel."""
@@ -92,49 +109,73 @@ def pid(command, twist, gains, period, excess, state, output):  # noqa: ANN001, 
     state[6] = 1.0
 
 
+def sampled_loop(
+    frequency: NDArray[np.float64], gain: float, time_constant: float, gains: Gains, period: float, delay: float
+) -> NDArray[np.complex128]:
+    """The open velocity loop L(e^(jωh)) of PI control, as `pid` computes it, of a held K/(τs + 1) behind a delay.
+
+    Args:
+        frequency: ω in rad/s, below π/h, `(F,)`.
+        gain: K.
+        time_constant: τ in s; 0 for a plant that follows within a period.
+        gains: PI gains.
+        period: Control period h in s.
+        delay: Loop delay in s beside the hold.
+    """
+    z = np.exp(1j * frequency * period)
+    decay = np.exp(-period / time_constant) if time_constant > 0 else 0.0
+    plant = gain * (1 - decay) / (z - decay)
+    control = gains.k_p + gains.k_i * period * z / (z - 1)
+    return np.asarray(control * plant * np.exp(-1j * frequency * delay), complex)
+
+
 class Margins(NamedTuple):
-    """How robust one velocity loop is, and where feedback-error learning converges in it.
+    """How fast and how robust one loop is; NaN where its size is below one from the lowest frequency on.
 
     Attributes:
         crossover: Gain crossover in rad/s.
         phase: Phase margin in degrees.
         gain: Gain margin as a factor.
         delay: Delay margin in s.
-        ratio: K_p (B + b K_p) / (M K_i) of the delay-free loop; learning converges above 1 (Gomi and Kawato 1993).
-        positive_to: Frequency in rad/s up to which Re T(jω) > 0 with delay and hold; learning is safe below it.
+        bandwidth: Frequency in rad/s from which on the closed loop passes less than 1/√2.
     """
 
     crossover: float
     phase: float
     gain: float
     delay: float
-    ratio: float
-    positive_to: float
+    bandwidth: float
 
 
-def margins(gain: float, time_constant: float, gains: Gains, delay: float) -> Margins:
-    """Margins of PI control of K/(τs + 1) behind a delay, on a fine frequency grid.
+def margins(frequency: NDArray[np.float64], loop: NDArray[np.complex128]) -> Margins:
+    """Margins of an open loop on a fine grid of frequencies.
 
     Args:
-        gain: K.
-        time_constant: τ in s.
-        gains: PI gains.
-        delay: Loop delay in s: half a control period of hold, plus what the plant adds.
+        frequency: ω in rad/s, ascending, `(F,)`.
+        loop: L(jω), `(F,)`.
     """
-    w = np.geomspace(1e-2, 1e4, 400_001)
-    loop = (gains.k_p + gains.k_i / (1j * w)) * gain / (1j * w * time_constant + 1) * np.exp(-1j * w * delay)
     magnitude, phase = np.abs(loop), np.unwrap(np.angle(loop))
-    crossing = int(np.argmax(magnitude < 1))
-    phase_margin = np.pi + phase[crossing]
-    inverted = np.flatnonzero(phase < -np.pi)
-    sensitivity = (loop / (1 + loop)).real
-    negative = np.flatnonzero(sensitivity <= 0)
+    phase -= 2 * np.pi * np.round((phase[0] + np.pi / 2) / (2 * np.pi))  # PI control starts between 0 and −180°
+    crossover, phase_margin, bandwidth = np.nan, np.nan, np.nan
+    if magnitude[0] > 1 > magnitude[-1]:
+        crossing = int(np.argmax(magnitude < 1))
+        crossover, phase_margin = frequency[crossing], np.pi + phase[crossing]
+    passed = np.abs(loop / (1 + loop)) < np.sqrt(0.5)
+    if passed.any() and not passed[0]:
+        bandwidth = frequency[int(np.argmax(passed))]
+    inverted = np.flatnonzero((phase < -np.pi) & (magnitude < 1))
     return Margins(
-        crossover=float(w[crossing]),
+        crossover=float(crossover),
         phase=float(np.degrees(phase_margin)),
         gain=float(1 / magnitude[inverted[0]]) if inverted.size else float("inf"),
-        delay=float(phase_margin / w[crossing]),
-        # The plant K/(τs + 1) is M V̇ + B V = b U with M = τ, B = 1, b = K.
-        ratio=gains.k_p * (1 + gain * gains.k_p) / (time_constant * gains.k_i),
-        positive_to=float(w[negative[0]]) if negative.size else float("inf"),
+        delay=float(phase_margin / crossover),
+        bandwidth=float(bandwidth),
     )
+
+
+def learning_ratio(gain: float, time_constant: float, gains: Gains) -> float:
+    """K_p (B + b K_p) / (M K_i) of PI control of K/(τs + 1); above 1, feedback-error learning converges without delay.
+
+    Gomi and Kawato (1993) for M V̇ + B V = b U; here M = τ, B = 1, b = K.
+    """
+    return gains.k_p * (1 + gain * gains.k_p) / (time_constant * gains.k_i)

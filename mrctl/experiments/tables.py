@@ -38,9 +38,14 @@ def output_folder(path: Path) -> Path:
     return path
 
 
+def json_text(values: object) -> str:
+    """JSON with NaN and infinity as null."""
+    return json.dumps(_finite(values), indent=1, ensure_ascii=False)
+
+
 def write_json(path: Path, values: object) -> None:
-    """Writes JSON with NaN as null."""
-    path.write_text(json.dumps(_finite(values), indent=1, ensure_ascii=False) + "\n")
+    """Writes JSON with NaN and infinity as null."""
+    path.write_text(json_text(values) + "\n")
 
 
 def _finite(values: object) -> object:

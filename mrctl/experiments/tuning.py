@@ -1,59 +1,196 @@
-"""`mrctl tune`: the velocity PID of a robot, its margins, and where learning is safe."""
+"""`mrctl tune`: the velocity PID of a robot, its margins, and where learning is safe; designed and measured."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
 from mrctl import model as mjcf
-from mrctl.control.pid import Pid, imc, margins
+from mrctl import plots
+from mrctl.control.hierarchy import TAKE_OVER
+from mrctl.control.kanayama import Kanayama
+from mrctl.control.pid import Gains, Pid, learning_ratio, margins, sampled_loop
+from mrctl.experiments.response import Array, Response, measure, refine, safety
+from mrctl.experiments.tables import json_text, markdown, number, output_folder
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
 CHANNELS = (("common", "V/(m/s)", "V/m"), ("differential", "V/(rad/s)", "V/rad"))
+LOOPS = (("compliant", 0), ("compliant", 1), ("caster", 1), ("rigid", 1))
+"""Steering arrangement and channel; the common channel is the same for all three."""
+RESPONSES = {"design": "equation (3)", "measured": "measured", "hierarchy": "measured with motion controller"}
+STYLES: dict[str, dict[str, Any]] = {
+    "design": {"lw": 0.8},
+    "measured": {"ls": "", "marker": ".", "ms": 4},
+    "hierarchy": {"lw": 0.8, "ls": "--"},
+}
+MARGINS = {
+    "crossover": "crossover, rad/s",
+    "bandwidth": "bandwidth, rad/s",
+    "phase": "phase margin, °",
+    "gain": "gain margin",
+}
+SAFETY = {"positive_to": "Re T > 0 to, rad/s", "lowest": "least Re T", "step": "largest step"}
+ADVICE = f"""\
+Learning by feedback error is safe at frequencies where Re T > 0; with the hand-over of the built-in learners, where
+Re T > {-TAKE_OVER / (1 - TAKE_OVER):g}. Both hold for commands that do not depend on what the robot does: a fast motion
+controller behind a delay takes from them. Above the largest step a learner of one constant oscillates without
+hand-over: stay below half of it."""
 
 
-def design(world: str, time_constant: float, delay: float) -> dict[str, Any]:
-    """PID design of the robot in a world.
+def tune(world: str, time_constant: float, delays: Sequence[float], out: Path | None, json: bool) -> str:
+    """The command: designs, measures, and writes `table.json` and `sensitivity` as a figure where asked to.
+
+    Raises:
+        InputError: As `design`; or a folder that cannot be written.
+    """
+    if out is not None:
+        output_folder(out)
+    asked = Pid.from_dict({"time_constant": time_constant})
+    # `faster`, because the steering's gains go with the time constant.
+    table = design(world, Pid().faster(Pid().time_constant / asked.time_constant), delays)
+    if out is not None:
+        (out / "table.json").write_text(json_text(table) + "\n")
+        plots.save(figure(table), out, "sensitivity")
+    return json_text(table) if json else text(table)
+
+
+def design(world: str, pid: Pid, delays: Sequence[float]) -> dict[str, Any]:
+    """The loops that come of a PID design, on paper and on the physics.
 
     Args:
         world: World or MJCF file.
-        time_constant: λ in s.
-        delay: Loop delay in s beside half a control period of hold.
+        pid: The design; on paper without its derivative part.
+        delays: Loop delays in s, whole control periods, beside the hold.
 
     Returns:
-        Per channel: static gain, time constant, gains and `Margins`.
+        Per channel static gain, time constant, PI gains and the ratio of the learning condition; `loops`, a row for
+        every one of `LOOPS` and every delay, with `Margins` and `Safety` for each of `RESPONSES`; `frequency` and
+        `responses`, T of the same rows as they were measured.
 
     Raises:
-        InputError: A bad world, time constant or delay.
+        InputError: A bad world or delay, or one that the robot does not survive.
     """
-    Pid.from_dict({"time_constant": time_constant})
-    if not 0 <= delay <= 0.5:
-        raise InputError("delay: must be between 0 and 0.5 s")
+    if not delays:
+        raise InputError("delay: none given")
+    scenarios = [
+        Scenario.from_dict(
+            {
+                "world": world,
+                "pid": pid.model_dump(),
+                "kanayama": motion.model_dump(),
+                "perturbation": {"control_delay": delay},
+            }
+        )
+        for motion in (Kanayama(k_x=0, k_y=0, k_theta=0), Kanayama())
+        for delay in delays
+    ]
     robot = mjcf.read_robot(mjcf.load(world))
-    hold = Scenario().control_period / 2
+    period = scenarios[0].control_period
     plants = (
         (robot.velocity_gain, robot.velocity_time_constant),
         (robot.rotation_gain, robot.rotation_time_constant),
     )
-    table: dict[str, Any] = {"time_constant": time_constant, "delay": delay + hold}
-    for (name, *_), (gain, tau), gains in zip(CHANNELS, plants, imc(robot, time_constant), strict=True):
-        found = margins(gain, tau, gains, delay + hold)
-        table[name] = {"static_gain": gain, "plant_time_constant": tau, **gains._asdict(), **found._asdict()}
+    table: dict[str, Any] = {"time_constant": pid.time_constant, "loops": [], "responses": []}
+    for (name, *_), (gain, tau), row in zip(CHANNELS, plants, pid.gains(robot, rigid=False), strict=True):
+        gains = Gains(*row[:2])
+        table[name] = {"static_gain": gain, "plant_time_constant": tau, **gains._asdict()}
+        table[name]["ratio"] = learning_ratio(gain, tau, gains)
+    for steering, channel in LOOPS:
+        frequency, measured = measure([s.model_copy(update={"steering": steering}) for s in scenarios], channel)
+        rigid = steering == "rigid"
+        plant = (1.0, 0.0) if rigid else plants[channel]  # the steering is taken to do what it is asked to
+        gains = Gains(*pid.gains(robot, rigid)[channel, :2])
+        for k, delay in enumerate(delays):
+            loop = sampled_loop(frequency, *plant, gains, period, delay)
+            found = dict(zip(RESPONSES, (loop / (1 + loop), measured[k], measured[len(delays) + k]), strict=True))
+            row = {"steering": steering, "channel": channel, "delay": delay}
+            table["loops"].append(row | {name: _judge(frequency, found[name], period) for name in RESPONSES})
+            table["responses"].append(row | {n: _parts(t) for n, t in found.items()})
+        table["frequency"] = frequency.tolist()
     return table
+
+
+def _parts(response: Response) -> dict[str, list[float]]:
+    return {"real": response.real.tolist(), "imaginary": response.imag.tolist()}
+
+
+def _judge(frequency: Array, response: Response, period: float) -> dict[str, float]:
+    fine, t = refine(frequency, response)
+    return margins(fine, t / (1 - t))._asdict() | safety(fine, t, period)._asdict()
 
 
 def text(table: dict[str, Any]) -> str:
     """The design in words and numbers."""
-    lines = [f"closed-loop time constant {table['time_constant']:g} s, delay with hold {1e3 * table['delay']:g} ms"]
+    lines = [f"closed-loop time constant {table['time_constant']:g} s"]
     for name, unit_p, unit_i in CHANNELS:
         c = table[name]
         verdict = "converges" if c["ratio"] > 1 else "does not converge"
         lines += [
-            f"{name}: plant gain {c['static_gain']:.4g}, time constant {c['plant_time_constant']:.3f} s",
-            f"  K_p {c['k_p']:.3g} {unit_p}, K_i {c['k_i']:.3g} {unit_i}",
-            f"  crossover {c['crossover']:.2f} rad/s, phase margin {c['phase']:.1f}°, gain margin {c['gain']:.3g}, "
-            f"delay margin {1e3 * c['delay']:.0f} ms",
-            f"  learning without delay: K_p (B + b K_p) / (M K_i) = {c['ratio']:.2f}, {verdict} above 1",
-            f"  learning with delay: Re T(jω) > 0 up to {c['positive_to']:.1f} rad/s",
+            f"{name}: plant gain {c['static_gain']:.4g}, time constant {c['plant_time_constant']:.3f} s, "
+            f"K_p {c['k_p']:.3g} {unit_p}, K_i {c['k_i']:.3g} {unit_i}",
+            f"  learning without delay and hold: K_p (B + b K_p) / (M K_i) = {c['ratio']:.2f}, {verdict} above 1",
         ]
-    return "\n".join(lines)
+    rows = [
+        [
+            _name(row),
+            f"{1e3 * row['delay']:g}",
+            *(" / ".join(_cell(row[kind][name]) for kind in list(RESPONSES)[:2]) for name in MARGINS),
+            *(" / ".join(_cell(row[kind][name]) for kind in RESPONSES) for name in SAFETY),
+        ]
+        for row in table["loops"]
+    ]
+    header = ["loop", "delay, ms", *MARGINS.values(), *SAFETY.values()]
+    return "\n".join([*lines, "", f"{' / '.join(RESPONSES.values())}:", "", markdown(header, rows), "", ADVICE])
+
+
+def statement(table: dict[str, Any]) -> str:
+    """Bandwidth and margins as measured without delay, in a line, to stand beside a comparison."""
+    loops = [
+        f"{_name(row)} {' / '.join(_cell(row['measured'][name]) for name in ('bandwidth', 'phase', 'gain'))}"
+        for row in table["loops"]
+        if row["delay"] == 0
+    ]
+    return (
+        f"PID by the IMC rule with λ = {table['time_constant']:g} s; bandwidth in rad/s / phase margin in degrees / "
+        f"gain margin as measured: {'; '.join(loops)}"
+    )
+
+
+def _name(row: dict[str, Any]) -> str:
+    return "common" if row["channel"] == 0 else f"{row['steering']}, second"
+
+
+def _cell(value: float) -> str:
+    return number(value) if np.isfinite(value) else "–"
+
+
+@plots.styled
+def figure(table: dict[str, Any]) -> Figure:
+    """Re T(jω) on paper, measured, and in the whole hierarchy; below zero, learning by feedback error is not safe."""
+    drawn = Figure(figsize=(plots.PAGE, 0.7 * plots.PAGE), layout="constrained")
+    panels = list(drawn.subplots(2, 2, sharex=True, sharey=True).flat)
+    frequency = table["frequency"]
+    marks = np.unique(np.geomspace(1, len(frequency), 30).astype(int) - 1).tolist()  # dots evenly spread
+    rows, loops = table["responses"], list(dict.fromkeys(map(_name, table["responses"])))
+    for axes, name in zip(panels, loops, strict=True):
+        axes.axhspan(-2, 0, color="0.93", zorder=0)
+        for k, row in enumerate(r for r in rows if _name(r) == name):
+            for kind, style in STYLES.items():
+                colour = plots.COLOURS[k % len(plots.COLOURS)]
+                axes.plot(frequency, row[kind]["real"], color=colour, markevery=marks, **style)
+        axes.set(xscale="log", ylim=(-0.8, 1.6), title=name)
+    for axes in panels[2:]:
+        axes.set_xlabel("ω (rad/s)")
+    for axes in panels[::2]:
+        axes.set_ylabel(r"Re $T(\mathrm{j}\omega)$")
+    delays = [1e3 * row["delay"] for row in rows if _name(row) == loops[0]]
+    handles = [Line2D([], [], color=c, label=f"{d:g} ms") for d, c in zip(delays, plots.COLOURS, strict=False)]
+    handles += [Line2D([], [], color="0.3", label=RESPONSES[kind], **style) for kind, style in STYLES.items()]
+    drawn.legend(handles=handles, loc="outside upper center", ncols=3)
+    return drawn

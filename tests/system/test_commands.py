@@ -92,14 +92,20 @@ def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.Cap
     assert float(mrctl.per_lap(mrctl.simulate([carried]))["v_rmse"].values[0, 0]) < first
 
 
-def test_tune_states_the_learning_condition(capsys: pytest.CaptureFixture) -> None:
+def test_tune_states_the_learning_condition(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """The ratio of the learning condition is 1 + τ/λ, from the robot's own time constants."""
-    assert cli.main(["tune", "--json"]) == 0
-    table = json.loads(capsys.readouterr().out)
+    assert cli.main(["tune", "--delay", "0", "0.03", "--out", str(tmp_path), "--json"]) == 0
+    printed = capsys.readouterr().out
+    table = json.loads(printed)
+    assert json.loads((tmp_path / "table.json").read_text()) == table
+    assert (tmp_path / "sensitivity.png").stat().st_size > 5000
+    assert [row["delay"] for row in table["loops"]] == 4 * [0, 0.03]
     for channel, tau in (("common", 0.234), ("differential", 0.261)):
         assert table[channel]["ratio"] == pytest.approx(1 + tau / 0.15, rel=5e-3)
-    assert cli.main(["tune"]) == 0
-    assert "converges above 1" in capsys.readouterr().out
+    assert cli.main(["tune", "--delay", "0"]) == 0
+    out = capsys.readouterr().out
+    assert "converges above 1" in out
+    assert sum(line.startswith(("| common", "| compliant", "| caster", "| rigid")) for line in out.splitlines()) == 4
 
 
 @pytest.mark.parametrize(
@@ -150,6 +156,8 @@ def test_bad_scenario_is_one_line(
         (["run", "--perturbation.slope", "nan"], "perturbation.slope"),
         (["tune", "--time-constant", "-1"], "time_constant"),
         (["tune", "--world", "moon"], "moon"),
+        (["tune", "--delay", "0.013"], "control_delay"),
+        (["tune", "--delay", "0.6"], "control_delay"),
         (["suite", "--seeds", "0"], "seeds"),
         (["dance"], "dance"),
     ],

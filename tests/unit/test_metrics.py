@@ -7,7 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mrctl import metrics
+from mrctl.control.feedforward import feature_scale
 from mrctl.record import InputError
+from mrctl.references import Circle, Lemniscate
 
 DT, LAP = 0.01, 2.0
 
@@ -86,6 +88,41 @@ def test_energy_saturation_weights():
     assert lap(result, "energy") == pytest.approx(7 * LAP)
     assert lap(result, "saturation_time") == pytest.approx(LAP / 2)
     assert lap(result, "weight_norm", number=2) == pytest.approx(2 * LAP - DT)
+
+
+@pytest.mark.parametrize("period", [2.0, 3.0])
+def test_excitation(robot, period):
+    """The smallest eigenvalue of the Gram matrix, against numpy on features written out with analytic derivatives."""
+    lap, w = 2.0, 2 * np.pi / period
+    result = make(
+        laps=1,
+        v_command=lambda t: 0.3 + 0.3 * np.sin(w * t),
+        omega_command=lambda t: 1.5 * np.cos(2 * w * t),
+    ).assign(half_track=("run", [robot.half_track]), feature_scale=(("run", "feature"), [feature_scale(robot)]))
+    t = np.arange(int(lap / DT)) * DT
+    v, omega = 0.3 + 0.3 * np.sin(w * t), 1.5 * np.cos(2 * w * t)
+    d = robot.half_track
+    rows = [v, omega, 0.3 * w * np.cos(w * t), -3 * w * np.sin(2 * w * t), v * omega, omega**2]
+    rows += [np.tanh((v - d * omega) / 0.05), np.tanh((v + d * omega) / 0.05)]
+    x = np.array(rows) / feature_scale(robot)[:, None]
+    expected = np.linalg.eigvalsh(x @ x.T / len(t))[0]
+    assert expected > 1e-5
+    found = metrics.per_lap(result)["excitation"].values[0, 0]
+    assert found == pytest.approx(expected, rel=0.02)  # the derivative is a difference quotient
+    assert np.isnan(metrics.per_lap(result.drop_vars("feature_scale"))["excitation"]).all()
+
+
+def test_excitation_of_references(robot):
+    """A circle at constant speed excites one direction of eight, the eight all of them; too few samples none."""
+
+    def excited(reference, n):
+        command = reference.sample(DT * np.arange(n)).twist
+        return metrics.excitation(command[None], DT, np.array([robot.half_track]), feature_scale(robot)[None])[0]
+
+    assert excited(Circle(), 800) == 0
+    assert excited(Lemniscate(), 1200) > 1e-12
+    assert excited(Lemniscate(period=20.0), 2000) > excited(Lemniscate(), 1200)  # the inner wheel slows more
+    assert excited(Lemniscate(), 7) == 0
 
 
 def test_feedback_share():

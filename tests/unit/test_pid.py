@@ -8,7 +8,8 @@ from hypothesis.extra.numpy import arrays
 from scipy import signal
 from scipy.optimize import brentq
 
-from mrctl.control.pid import Gains, Pid, imc, margins, pid
+from mrctl.control.pid import PIDS, Gains, Pid, imc, learning_ratio, margins, pid, sampled_loop
+from mrctl.record import InputError
 
 CLOSED = 0.15  # λ
 
@@ -111,33 +112,22 @@ def test_antiwindup_of_any_gains(k_p, k_i):
     assert (np.abs(state[:2]) < 0.5 + 3 * max(k_p, 0.01 * k_i)).all()
 
 
+GRID = np.geomspace(1e-2, 1e3, 200_001)
+
+
 @pytest.mark.parametrize("delay", [0.005, 0.02, 0.04])
 @pytest.mark.parametrize("closed", [0.1, 0.15])
-def test_margins(robot, closed, delay):
-    """Under the IMC rule L = e^(−sT)/(λs), whose margins are known in closed form."""
-    for (gain, tau), gains in zip(np.transpose(plants(robot)), imc(robot, closed), strict=True):
-        found = margins(gain, tau, gains, delay)
-        expected = {
-            "crossover": 1 / closed,
-            "phase": 90 - np.degrees(delay / closed),
-            "gain": np.pi * closed / (2 * delay),
-            "delay": np.pi / 2 * closed - delay,
-            "ratio": 1 + tau / closed,
-            "positive_to": brentq(lambda w: closed * w * np.sin(w * delay) - 1, 0, np.pi / 2 / delay),  # noqa: B023
-        }
-        assert found._asdict() == pytest.approx(expected, rel=1e-3)
-
-
-def test_documented_margins(robot):
-    """The ratios 2.6 and 2.7, and 15 to 20 rad/s behind 20 ms; without delay nothing but the crossover ends."""
-    ratios = []
-    for (gain, tau), gains in zip(np.transpose(plants(robot)), imc(robot, CLOSED), strict=True):
-        assert 15 < margins(gain, tau, gains, 0.02).positive_to < 20
-        free = margins(gain, tau, gains, 0.0)
-        assert free.phase == pytest.approx(90)
-        assert free.gain == free.positive_to == np.inf
-        ratios.append(free.ratio)
-    np.testing.assert_allclose(ratios, [2.6, 2.7], atol=0.06)
+def test_margins(closed, delay):
+    """L = e^(−sT)/(λs) has margins in closed form; |1 + jλω e^(jωT)| = √2 ends its bandwidth."""
+    found = margins(GRID, np.exp(-1j * GRID * delay) / (1j * GRID * closed))
+    expected = {
+        "crossover": 1 / closed,
+        "phase": 90 - np.degrees(delay / closed),
+        "gain": np.pi * closed / (2 * delay),
+        "delay": np.pi / 2 * closed - delay,
+        "bandwidth": brentq(lambda w: abs(1 + 1j * closed * w * np.exp(1j * w * delay)) ** 2 - 2, 1, 4 / closed),
+    }
+    assert found._asdict() == pytest.approx(expected, rel=1e-3)
 
 
 def test_margins_of_other_gains():
@@ -152,14 +142,62 @@ def test_margins_of_other_gains():
 
     crossover = brentq(lambda w: size(w) - 1, 0.1, 100)
     inversion = brentq(lambda w: phase(w) + np.pi, 20, 1000)
-    found = margins(gain, tau, gains, delay)
+    loop = size(GRID) * np.exp(1j * phase(GRID))
+    found = margins(GRID, loop)
     assert found.crossover == pytest.approx(crossover, rel=1e-4)
     assert found.phase == pytest.approx(180 + np.degrees(phase(crossover)), rel=1e-3)
     assert found.gain == pytest.approx(1 / size(inversion), rel=1e-3)
     # Delayed by its delay margin the loop is on the brink.
-    assert margins(gain, tau, gains, delay + found.delay).phase == pytest.approx(0, abs=0.05)
-    # M V̇ + B V = b U with M = τ, B = 1, b = K: K_p (B + b K_p) > M K_i.
-    assert found.ratio == pytest.approx(20 * (1 + 0.1 * 20) / (0.25 * 200))
+    assert margins(GRID, loop * np.exp(-1j * GRID * found.delay)).phase == pytest.approx(0, abs=0.05)
+
+
+def test_no_margins():
+    """A loop that is never above one has no crossover and no bandwidth to speak of, and its gain margin is infinite."""
+    found = margins(GRID, 0.5 / (1 + 1j * GRID))
+    assert np.isnan([found.crossover, found.phase, found.delay, found.bandwidth]).all()
+    assert found.gain == np.inf
+
+
+def test_learning_ratio(robot):
+    """K_p (B + b K_p) > M K_i with M = τ, B = 1, b = K; under the IMC rule 1 + τ/λ, the documented 2.6 and 2.7."""
+    assert learning_ratio(0.1, 0.25, Gains(20.0, 200.0)) == pytest.approx(20 * (1 + 0.1 * 20) / (0.25 * 200))
+    designs = zip(np.transpose(plants(robot)), imc(robot, CLOSED), strict=True)
+    ratios = [learning_ratio(gain, tau, gains) for (gain, tau), gains in designs]
+    np.testing.assert_allclose(ratios, 1 + plants(robot)[1] / CLOSED, rtol=1e-12)
+    np.testing.assert_allclose(ratios, [2.6, 2.7], atol=0.06)
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_sampled_loop(robot, delay):
+    """The loop on paper is that of the law itself: the response to a sine of the compiled PID on exact plants."""
+    gain, tau = plants(robot)
+    gains, h, ticks = Pid().gains(robot, rigid=False), 0.01, 4000
+    for harmonic in (1, 7, 40, 190):
+        w = 2 * np.pi * harmonic / 400 / h
+        command = np.repeat(np.sin(w * h * np.arange(ticks))[:, None], 2, axis=1)
+        state, feedback, twist, decay = np.zeros(7), np.zeros(2), np.zeros(2), np.exp(-h / tau)
+        answer, sent = [], [np.zeros(2)] * delay
+        for wanted in command:
+            pid(wanted, twist, gains, h, np.zeros(2), state, feedback)
+            answer.append(twist)
+            sent.append(feedback.copy())
+            twist = decay * twist + (1 - decay) * gain * sent[len(answer) - 1]
+        found = np.fft.rfft(answer[-400:], axis=0)[harmonic] / np.fft.rfft(command[-400:], axis=0)[harmonic]
+        loops = [
+            sampled_loop(np.array([w]), k, t, Gains(*row[:2]), h, delay * h)[0]
+            for k, t, row in zip(gain, tau, gains, strict=True)
+        ]
+        np.testing.assert_allclose(found, [loop / (1 + loop) for loop in loops], rtol=1e-9)
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_twice_as_fast(robot, rigid):
+    """Half the time constant is twice every gain, in both channels of every steering arrangement."""
+    normal, fast = (PIDS[name].gains(robot, rigid) for name in ("normal", "fast"))
+    assert PIDS["normal"] == Pid()
+    np.testing.assert_allclose(fast[:, :3], 2 * normal[:, :3], rtol=1e-12)
+    with pytest.raises(InputError, match="time_constant"):
+        Pid().faster(10)
 
 
 def numbers(*shape, low=-5.0, high=5.0):

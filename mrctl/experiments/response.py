@@ -1,0 +1,167 @@
+"""The complementary sensitivity of a velocity loop, measured on the physics, and where learning is safe in it.
+
+Feedback-error learning lowers U_fb by adding to U_ff, so what counts is how the one answers the other: ∂U_fb/∂U_ff = −T
+with T = L/(1 + L) of the loop broken at the voltage. Learning converges at frequencies where Re T(jω) > 0, whatever the
+regressor (Gomi and Kawato 1993). A feedforward that learns nothing and shakes measures T in the loop as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from mrctl.control.fel import STEERING_SCALE
+from mrctl.control.hierarchy import TAKE_OVER
+from mrctl.record import InputError
+from mrctl.references import Line
+from mrctl.scenario import Scenario
+from mrctl.simulate import Simulation
+
+Array = NDArray[np.float64]
+Response = NDArray[np.complex128]
+
+SAMPLES = 1000  # control periods in a period of the excitation
+AMPLITUDE = 0.03  # V a line, a tenth of that in rad/s on a steering channel: no tyre slides, no wheel turns back
+
+
+def lines(samples: int) -> NDArray[np.intp]:
+    """The odd harmonics below Nyquist: a quadratic nonlinearity answers at the even ones, where it does no harm."""
+    return np.arange(1, samples // 2, 2)
+
+
+def multisine(samples: int, harmonics: NDArray[np.intp]) -> Array:
+    """One period of the sum of these harmonics with amplitude 1 and the phases of Schroeder (1970), which keep it low.
+
+    Returns:
+        `(samples,)`.
+    """
+    k = np.arange(len(harmonics))
+    angle = 2 * np.pi * np.outer(np.arange(samples), harmonics) / samples - np.pi * k * (k + 1) / len(harmonics)
+    return np.cos(angle).sum(axis=1)
+
+
+def estimate(excitation: Array, answer: Array, harmonics: NDArray[np.intp]) -> Response:
+    """Frequency response of a system in its periodic steady state, exact if it is linear.
+
+    Args:
+        excitation: One period of what went in, `(N,)`.
+        answer: The same period of what came out, `(N, …)`.
+        harmonics: Those that went in, `(F,)`.
+
+    Returns:
+        `(…, F)`.
+    """
+    return np.moveaxis(np.fft.rfft(answer, axis=0)[harmonics], 0, -1) / np.fft.rfft(excitation)[harmonics]
+
+
+class Shaker:
+    """A feedforward that repeats a signal and remembers the feedback.
+
+    Attributes:
+        feedback: `(ticks, B, 2)`.
+    """
+
+    def __init__(self, signal: Array, ticks: int, size: int) -> None:
+        """Takes one period of the signal `(N, 2)`, the length of the run and the number of robots."""
+        self._signal = np.repeat(signal[:, None], size, axis=1)
+        self._tick = 0
+        self.feedback = np.zeros((ticks, size, 2))
+
+    def output(self, command: Array, derivative: Array) -> Array:
+        """The signal now."""
+        return self._signal[self._tick % len(self._signal)]
+
+    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> None:
+        """Notes the feedback."""
+        self.feedback[self._tick] = feedback
+        self._tick += 1
+
+
+def measure(scenarios: Sequence[Scenario], channel: int) -> tuple[Array, Response]:
+    """Measures T of one channel on robots that drive straight on, with all that is in the loop: hold, delay, tyres.
+
+    With the motion controller's gains at zero this is the velocity loop; with its own, the loop that learning works in.
+
+    Args:
+        scenarios: A uniform group; their references, feedforwards and events are replaced.
+        channel: 0 for the common channel, 1 for the differential or the steering one.
+
+    Returns:
+        ω in rad/s `(F,)` and T `(B, F)`.
+
+    Raises:
+        InputError: A robot failed on the way.
+    """
+    first = scenarios[0]
+    harmonics = lines(SAMPLES)
+    signal = np.zeros((SAMPLES, 2))
+    scale = STEERING_SCALE if channel == 1 and first.steering == "rigid" else 1.0
+    signal[:, channel] = AMPLITUDE * scale * multisine(SAMPLES, harmonics)
+    duration = 2 * SAMPLES * first.control_period  # one period to settle, one to measure
+    line = Line(length=Line().speed * duration)
+    steady = {"reference": line, "laps": 1, "events": (), "initial_spread": (0.0, 0.0, 0.0), "feedforward": "none"}
+    runs = [s.model_copy(update=steady) for s in scenarios]
+    shaker = Shaker(signal, 2 * SAMPLES, len(runs))
+    simulation = Simulation(runs, lambda robot, size: shaker)
+    while simulation.running:
+        simulation.step()
+    for row in np.flatnonzero(simulation.plant.failed):
+        raise InputError(f"world: no response on {line.length:g} m of it: {simulation.plant.failure[row]}")
+    response = -estimate(signal[:, channel], shaker.feedback[SAMPLES:, :, channel], harmonics)
+    return 2 * np.pi / (SAMPLES * first.control_period) * harmonics.astype(float), response
+
+
+def refine(frequency: Array, response: Response) -> tuple[Array, Response]:
+    """A response between the lines, by cubic splines, on a grid fine and even on a logarithmic scale."""
+    fine = np.geomspace(frequency[0], frequency[-1], 4000)
+    real, imaginary = CubicSpline(frequency, np.stack([response.real, response.imag]), axis=1)(fine)
+    return fine, real + 1j * imaginary
+
+
+class Safety(NamedTuple):
+    """Where learning is safe in a loop.
+
+    With a constant regressor a learner of normalised step μ is an integrator, U_ff(k + 1) = U_ff(k) + μ U_fb(k), in a
+    loop with T. If it hands a share of what it adds over from the PID's integral, as `Hierarchy` has it, T is replaced
+    by a + (1 − a) T: the condition is then Re T > −a/(1 − a).
+
+    Attributes:
+        positive_to: Frequency in rad/s up to which Re T(jω) > 0; infinite if everywhere.
+        lowest: Least Re T.
+        step: Largest μ at which the integrator is stable without hand-over.
+        step_handed_over: The same with it.
+    """
+
+    positive_to: float
+    lowest: float
+    step: float
+    step_handed_over: float
+
+
+def safety(frequency: Array, response: Response, period: float) -> Safety:
+    """Where learning is safe, from T on a fine grid.
+
+    Args:
+        frequency: ω in rad/s, `(F,)`.
+        response: T, `(F,)`.
+        period: Control period in s.
+    """
+    negative = np.flatnonzero(response.real <= 0)
+    handed_over = TAKE_OVER + (1 - TAKE_OVER) * response
+    return Safety(
+        positive_to=float(frequency[negative[0]]) if negative.size else float("inf"),
+        lowest=float(response.real.min()),
+        step=_largest_step(frequency, response, period),
+        step_handed_over=_largest_step(frequency, handed_over, period),
+    )
+
+
+def _largest_step(frequency: Array, response: Response, period: float) -> float:
+    """Gain margin of T/(z − 1)."""
+    loop = response / (np.exp(1j * frequency * period) - 1)
+    crossing = (loop.imag[:-1] * loop.imag[1:] < 0) & (loop.real[:-1] < 0)
+    return float((1 / np.abs(loop[:-1][crossing])).min(initial=np.inf))

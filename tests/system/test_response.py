@@ -1,0 +1,179 @@
+"""T measured in the loop: the estimator on a known system, the physics against equation (3), and what T foretells."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+import mrctl
+from mrctl.control.hierarchy import TAKE_OVER
+from mrctl.control.kanayama import Kanayama
+from mrctl.control.pid import PIDS, Gains, sampled_loop
+from mrctl.experiments.response import SAMPLES, Shaker, estimate, lines, measure, multisine, refine, safety
+from mrctl.experiments.tuning import design, statement
+from mrctl.model import load, read_robot
+from mrctl.simulate import Simulation
+
+H = 0.01
+NO_MOTION_CONTROLLER = Kanayama(k_x=0, k_y=0, k_theta=0)
+
+
+def scenarios(delays=(0.0,), **changes):
+    return [
+        mrctl.Scenario(perturbation=mrctl.Perturbation(control_delay=d), kanayama=NO_MOTION_CONTROLLER, **changes)
+        for d in delays
+    ]
+
+
+def on_paper(frequency, channel, delay, pid="normal"):
+    """T of equation (3) under the sampled PI."""
+    robot = read_robot(load("flat"))
+    gain, tau = (
+        (robot.velocity_gain, robot.velocity_time_constant),
+        (robot.rotation_gain, robot.rotation_time_constant),
+    )[channel]
+    loop = sampled_loop(frequency, gain, tau, Gains(*PIDS[pid].gains(robot, rigid=False)[channel, :2]), H, delay)
+    return loop / (1 + loop)
+
+
+@pytest.mark.parametrize("samples", [200, 1000])
+def test_multisine(samples):
+    """Odd harmonics of amplitude one below Nyquist and nothing else, and no higher than a few times their RMS."""
+    harmonics = lines(samples)
+    wave = multisine(samples, harmonics)
+    assert (harmonics % 2 == 1).all() and harmonics[0] == 1 and harmonics[-1] == samples / 2 - 1
+    spectrum = np.zeros(samples // 2 + 1)
+    spectrum[harmonics] = 1
+    np.testing.assert_allclose(np.abs(np.fft.rfft(wave)) * 2 / samples, spectrum, atol=1e-12)
+    assert np.abs(wave).max() < 2.5 * np.sqrt(len(harmonics) / 2)
+
+
+def test_estimate():
+    """Exact on a discrete linear system in its steady state, whatever even harmonics a nonlinearity adds."""
+    samples, (b, a) = 400, signal.butter(3, 0.2)
+    harmonics = lines(samples)
+    wave = multisine(samples, harmonics)
+    answer = signal.lfilter(b, a, np.tile(wave, 6))[-samples:]
+    expected = signal.freqz(b, a, worN=2 * np.pi * harmonics / samples)[1]
+    both = np.stack([answer, -2 * answer + 0.1 * wave**2], axis=1)
+    np.testing.assert_allclose(estimate(wave, both, harmonics), [expected, -2 * expected], atol=1e-10)
+
+
+@pytest.mark.parametrize("pid", ["normal", "fast"])
+def test_common_channel_is_equation_3(pid):
+    """To 1 % of T's static value at every frequency, without delay and with: model, hold and delay are right."""
+    delays = (0.0, 0.02, 0.04)
+    frequency, found = measure(scenarios(delays, pid=PIDS[pid]), 0)
+    expected = [on_paper(frequency, 0, delay, pid) for delay in delays]
+    np.testing.assert_allclose(found, expected, atol=0.01)
+
+
+def test_second_channel():
+    """Of a caster within 15 % of equation (3), by the tyres' slip; a compliant fork takes most of the slow work."""
+    frequency, (caster,) = measure(scenarios(steering="caster"), 1)
+    np.testing.assert_allclose(caster, on_paper(frequency, 1, 0.0), atol=0.15)
+    _, (compliant,) = measure(scenarios(), 1)
+    slow = (frequency > 1) & (frequency < 5)
+    assert (np.abs(compliant[slow]) < 0.65 * np.abs(caster[slow])).all()
+    # Beyond the fork's own motion only the inertia is left.
+    np.testing.assert_allclose(compliant[frequency > 100], caster[frequency > 100], atol=0.01)
+
+
+@pytest.mark.parametrize("steering", ["compliant", "caster", "rigid"])
+def test_delay_turns_the_open_loop(steering):
+    """A delay T_d turns L = T/(1 − T) by −ωT_d and leaves its size alone, whatever the plant is."""
+    delays = (0.0, 0.01, 0.03)
+    frequency, t = measure(scenarios(delays, steering=steering), 1)
+    loop = t / (1 - t)
+    turned = loop[0] * np.exp(-1j * frequency * np.array(delays)[:, None])
+    np.testing.assert_allclose(loop, turned, atol=0.02 * np.abs(loop[0]).max())
+    middle = (frequency > 5) & (frequency < 60)
+    angle = np.angle(loop[1:] / loop[0]) + frequency * np.array(delays)[1:, None]
+    assert np.abs(np.exp(1j * angle[:, middle]) - 1).max() < 0.03  # rad
+
+
+def test_safety_of_a_known_loop():
+    """T = e^(−sT_d)/(λs + 1): Re T = 0 where it lags by 90°; an integrator in its loop is stable up to its margin."""
+    closed, delay = 0.15, 0.02
+    w = np.geomspace(0.5, 300, 100_001)
+    t = np.exp(-1j * w * delay) / (1j * w * closed + 1)
+    found = safety(w, t, H)
+    turning = w[np.argmax(np.arctan(closed * w) + w * delay > np.pi / 2)]
+    assert found.positive_to == pytest.approx(turning, rel=1e-3)
+    # The integrator 1/(e^(jωh) − 1) lags by 90° + ωh/2.
+    critical = w[np.argmax(np.arctan(closed * w) + w * (delay + H / 2) > np.pi / 2)]
+    step = 2 * np.sin(critical * H / 2) * np.hypot(closed * critical, 1)
+    assert found.step == pytest.approx(step, rel=1e-3)
+    assert found.step_handed_over > 10 * found.step
+    assert safety(w, 1 / (1j * w * closed + 1), H).positive_to == np.inf
+
+
+def test_hand_over_turns_the_condition():
+    """A stage whose shaking is handed over from the integral is answered by a + (1 − a) T."""
+
+    class HandedOver(Shaker):
+        def learn(self, *given):
+            before = self.output(None, None)
+            super().learn(*given)
+            return self.output(None, None) - before
+
+    frequency, (t,) = measure(scenarios(), 0)
+    harmonics = lines(SAMPLES)
+    wave = 0.03 * np.stack([multisine(SAMPLES, harmonics), np.zeros(SAMPLES)], axis=1)
+    shaker = HandedOver(wave, 2 * SAMPLES, 1)
+    line = mrctl.Line(length=16)
+    simulation = Simulation(
+        [scenarios(reference=line, laps=1, initial_spread=(0, 0, 0))[0]], lambda robot, size: shaker
+    )
+    while simulation.running:
+        simulation.step()
+    answer = -estimate(wave[:, 0], shaker.feedback[SAMPLES:, 0, 0], harmonics)
+    np.testing.assert_allclose(answer, TAKE_OVER + (1 - TAKE_OVER) * t, atol=5e-3)
+
+
+def test_refine():
+    """A smooth response between the lines is found to a thousandth."""
+    w = 2 * np.pi / 10 * lines(1000)
+    fine, found = refine(w, np.exp(-0.02j * w) / (0.15j * w + 1))
+    near = fine < 60
+    np.testing.assert_allclose(found[near], (np.exp(-0.02j * fine) / (0.15j * fine + 1))[near], atol=3e-3)
+
+
+def test_twice_as_fast():
+    """Half the λ is about twice the bandwidth and crossover on the physics too, and leaves every loop its margin."""
+    normal, fast = (design("flat", pid, (0.0,)) for pid in PIDS.values())
+    for slow_loop, fast_loop in zip(normal["loops"], fast["loops"], strict=True):
+        for name in ("bandwidth", "crossover"):
+            ratio = fast_loop["measured"][name] / slow_loop["measured"][name]
+            assert 1.85 < ratio < 2.7, (slow_loop["steering"], name)
+        assert fast_loop["measured"]["phase"] > 60
+    assert "λ = 0.075 s" in statement(fast)
+    assert f"common {fast['loops'][0]['measured']['bandwidth']:.1f} / " in statement(fast)
+
+
+class Integrator:
+    """Feedback-error learning of a constant: U_ff(k + 1) = U_ff(k) + μ U_fb(k) in one channel."""
+
+    def __init__(self, steps, channel):
+        self.step = np.array(steps)[:, None] * np.eye(2)[channel]
+        self.voltage = np.zeros_like(self.step)
+
+    def output(self, command, derivative):
+        return self.voltage
+
+    def learn(self, feedback, saturated, twist, voltage):
+        self.voltage = self.voltage + self.step * feedback
+
+
+@pytest.mark.parametrize(("steering", "channel"), [("compliant", 0), ("compliant", 1), ("caster", 1)])
+def test_foretells_instability(steering, channel):
+    """Behind 40 ms, learning settles at 0.7 of the step that T allows, and oscillates for ever at 1.3 of it."""
+    scenario = mrctl.Scenario(
+        steering=steering, reference=mrctl.Line(length=24), laps=1, perturbation=mrctl.Perturbation(control_delay=0.04)
+    )
+    frequency, (t,) = measure([scenario], channel)
+    limit = safety(*refine(frequency, t), H).step
+    result = mrctl.simulate([scenario] * 2, lambda robot, size: Integrator([0.7 * limit, 1.3 * limit], channel))
+    settled, shaken = result["v" if channel == 0 else "omega"].values
+    early, late = slice(300, 800), slice(-500, None)
+    assert np.std(settled[late]) < 0.2 * np.std(settled[early])
+    assert not np.std(shaken[late]) < 0.9 * np.std(shaken[early])  # NaN: it drove off
