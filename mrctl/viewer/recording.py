@@ -22,7 +22,7 @@ from mrctl.result import SIGNALS, scenarios_of
 from mrctl.robot import Perturbation
 from mrctl.scenario import Scenario
 from mrctl.simulate import simulate
-from mrctl.store import open_store
+from mrctl.store import Store, open_store
 from mrctl.viewer.session import state
 
 Array = NDArray[np.float64]
@@ -137,7 +137,7 @@ class Library:
         """
         self._path, self._result = path, None
         if (path / "sweep.json").is_file():
-            open_store(path)  # refuses what is no store
+            Store(path)  # refuses what is none
             self.table = pd.read_parquet(path / "runs.parquet").set_index("run", drop=False)
         else:
             result = open_store(path)

@@ -195,8 +195,8 @@ class Replay(Page):
 
 
 def _sphere() -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of an octahedron of 3 cm, a sphere for the eye at this size."""
-    corners = 0.03 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+    """Vertices and faces of an octahedron of 5 cm, a sphere for the eye at this size."""
+    corners = 0.05 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
     faces = [[a, b, c] for a in (0, 1) for b in (2, 3) for c in (4, 5)]
     faces = [f if np.linalg.det(corners[f]) > 0 else f[::-1] for f in faces]
     return corners, np.array(faces)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mrctl import Circle, Event, Perturbation, Scenario, save, simulate
+from mrctl import Circle, Event, Perturbation, Scenario, Sweep, jobs, save, simulate
 from mrctl.cli import main
 from mrctl.viewer.live import Live
 from mrctl.viewer.recording import Library
@@ -217,3 +217,32 @@ def test_export(browser, tmp_path):
         assert np.allclose(half[:2], [0, 1.6], atol=0.1)  # half way around
         picture(page, tmp_path / "export.png")
     assert main(["view", str(scenario), "--export", str(file)]) == 2  # not overwritten
+
+
+TO_SCREEN = """([x, y, z]) => {
+    const m = window.__viserMutable, point = new m.camera.position.constructor(x, y, z);
+    m.nodeRefFromName['/board/runs'].parent.localToWorld(point).project(m.camera);
+    const r = m.canvas.getBoundingClientRect();
+    return [r.left + (point.x + 1) / 2 * r.width, r.top + (1 - point.y) / 2 * r.height];
+}"""
+
+
+def test_sweep(browser, tmp_path):
+    """All runs of a sweep on a board behind the track: a click opens the one under the mouse, as `mrctl run` has it."""
+    base = {"laps": 1, "reference": {"kind": "circle", "period": 4.0, "radius": 0.5}, "feedforward": "model"}
+    axis = {"field": "perturbation.mass_factor", "uniform": [0.5, 2.0]}
+    jobs.run(Sweep.from_dict({"runs": 6, "base": base, "axes": [axis]}), tmp_path / "store", workers=1)
+    library = Library(tmp_path / "store")
+    with serving(lambda server: Replay(library, [0], server)) as (replay, url), visit(browser, url) as page:
+        until(lambda: node(page, "/board/runs") is not None, "the board")
+        page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
+        page.get_by_role("tab", name="All runs").click()
+        time.sleep(2.0)
+        picture(page, tmp_path / "sweep.png")
+        at = page.evaluate(TO_SCREEN, [float(c) for c in replay._board[0].batched_positions[4]])
+        page.mouse.move(*at)
+        time.sleep(0.5)
+        page.mouse.click(*at)
+        until(lambda: replay.runs == [4], "the run to open")
+    again = simulate(jobs.scenario_of(tmp_path / "store", 4))
+    assert replay._log[:, 0, 0].tobytes() == again.x.values.tobytes()
