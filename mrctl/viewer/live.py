@@ -212,8 +212,8 @@ class Live(Page):
         else:
             pace = self.speed / session.period
             self._owed = min(self._owed + elapsed * pace, max(1.0, BEHIND * pace))
-            self.late += max(0, int(self._owed) - max(1, round(self.speed)))
             while self._owed >= 1 and session.running and time.monotonic() < until:
+                self.late += self._owed > 1 + self.speed
                 session.step()
                 self._owed -= 1
                 self.ticks += 1

@@ -9,6 +9,7 @@ import statistics
 import sys
 import threading
 import time
+from collections.abc import Callable
 
 from playwright.sync_api import sync_playwright
 
@@ -30,13 +31,18 @@ def measure(robots: int, seconds: int) -> None:
     server = Server(port=0)
     live = Live([Scenario(seed=k, name=str(k)) for k in range(robots)], server)
     sent = {"draw": 0, "refresh": 0}
-    for name in sent:
 
-        def counted(genuine=getattr(live, name), name=name) -> None:
+    def counted(name: str) -> Callable[[], None]:
+        genuine = getattr(live, name)
+
+        def call() -> None:
             sent[name] += 1
             genuine()
 
-        setattr(live, name, counted)
+        return call
+
+    for name in sent:
+        setattr(live, name, counted(name))
     loop = threading.Thread(target=live.run)
     loop.start()
     try:
