@@ -55,6 +55,9 @@ class Live(Page):
         self.late = self.ticks = 0  # ticks that began over a period after they were due, and all at a finite speed
         self._owed = 0.0  # ticks that are due
         self._wishes: dict[tuple[str, ...], Any] = {}
+        self._cast: tuple[str, str, list[str]] | None = None  # what the scene was built for
+        self._drawn: tuple[int, bool] | None = None
+        self._plotted: int | None = None
         self._build()
         self._stage()
 
@@ -86,8 +89,10 @@ class Live(Page):
         with tabs.add_tab("Controllers"):
             self._controls.add(first, only=["feedforward"])
             with gui.add_folder("compare with"):
-                for name in FEEDFORWARDS:
-                    ghost = gui.add_checkbox(name, any(s.feedforward == name for s in self.session.start[1:]))
+                self._ghosts: dict[FeedforwardName, viser.GuiCheckboxHandle] = {
+                    name: gui.add_checkbox(name, False) for name in FEEDFORWARDS
+                }
+                for name, ghost in self._ghosts.items():
                     self.on(ghost, partial(self._compare, name))
             self._learning = gui.add_checkbox("learning", True)
             self.on(self._learning, lambda on: self._happen(learning=on))
@@ -100,10 +105,9 @@ class Live(Page):
         """Puts the robots of the session into the scene and the plots."""
         session, first = self.session, self.session.start[0]
         labels = [s.name or s.feedforward for s in session.start]
-        old = getattr(self, "_cast", None)
-        cast = (first.world, first.steering, tuple(labels))
-        if old != cast:
-            if old is not None:
+        cast = (first.world, first.steering, labels)
+        if self._cast != cast:
+            if self._cast is not None:
                 self._scene.remove()
                 self._plots.remove()
             self._cast = cast
@@ -113,7 +117,9 @@ class Live(Page):
         self._scene.show_reference(first.reference)
         self._scene.forget_trails()
         self._controls.show(first)
-        self._drawn = -1
+        for name, ghost in self._ghosts.items():
+            ghost.value = any(s.feedforward == name for s in session.start[1:])
+        self._drawn = self._plotted = None
         self._counted = (time.monotonic(), session.tick)
         self._describe()
 
@@ -226,18 +232,14 @@ class Live(Page):
 
     @override
     def draw(self) -> None:
-        session = self.session
-        if session.tick == self._drawn and not self._moved_camera():
+        session, now = self.session, (self.session.tick, self._follow.value)
+        if now == self._drawn:
             return
-        self._drawn = session.tick
+        self._drawn = now
         for row in range(session.size):
             self._scene.show(row, session.qpos(row))
         with self.server.atomic():
             self._scene.flush(self._follow.value)
-
-    def _moved_camera(self) -> bool:
-        was, self._followed = getattr(self, "_followed", None), self._follow.value
-        return was != self._followed
 
     @override
     def refresh(self) -> None:
@@ -257,7 +259,7 @@ class Live(Page):
         if self.message:
             lines.append(warning(self.message))
         write(self._status, block("status", *lines))
-        if session.tick != getattr(self, "_plotted", None) and session.tick > 1:
+        if session.tick != self._plotted and session.tick > 1:
             self._plotted = session.tick
             if self.playing:
                 self._scene.mark_trails()

@@ -154,7 +154,7 @@ def _add(gui: viser.GuiApi, chart: Chart, cursor: bool) -> viser.GuiUplotHandle:
         title=chart.title,
         scales={"x": {"time": False}},
         legend={"show": False},
-        axes=({"size": 26}, {"size": 46}),
+        axes=({"size": 24, "ticks": {"size": 4}}, {"size": 42, "ticks": {"size": 4}}),
         height=112,
         padding=(0, 8, 0, 0),
     )

@@ -13,7 +13,7 @@ from typing_extensions import override
 from mrctl.record import InputError
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
-from mrctl.viewer.recording import FEW, Library, names, together
+from mrctl.viewer.recording import FEW, Library, Recording, names, together
 from mrctl.viewer.scene import Scene, colour_of
 from mrctl.viewer.server import Server
 
@@ -40,6 +40,9 @@ class Replay(Page):
         super().__init__(server)
         self.library = library
         self.time = 0.0
+        self.recordings: list[Recording] = []
+        self._drawn: tuple[float, bool] | None = None
+        self._plotted: float | None = None
         self._build(runs[0])
         self._show(runs)
 
@@ -130,7 +133,7 @@ class Replay(Page):
         """Puts runs into the scene and the plots."""
         recordings = [self.library.recording(run) for run in runs]
         labels = names(recordings, runs)
-        if hasattr(self, "_scene"):
+        if self.recordings:
             self._scene.remove()
             self._plots.remove()
         self.runs, self.recordings = list(runs), recordings

@@ -163,7 +163,7 @@ class Scene:
             handle.batched_positions = self._place[1:, k].astype(np.float32)
             handle.batched_wxyzs = self._turn[1:, k].astype(np.float32)
         for row, label in enumerate(self._labels):
-            label.position = self._place[row, self._chassis] + [0, 0, 0.25 + 0.12 * row]
+            label.position = self._place[row, self._chassis] + [0, 0, 0.4 + 0.12 * row]
 
     def show_payload(self, perturbation: Perturbation) -> None:
         """Draws a payload of its size (the density of water) where it is, or none."""
