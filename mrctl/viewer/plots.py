@@ -145,7 +145,7 @@ def _add(gui: viser.GuiApi, chart: Chart, cursor: bool) -> viser.GuiUplotHandle:
     colours = [curve.colour for curve in chart.curves] + [CURSOR] * cursor
     dashes = [curve.dashed for curve in chart.curves] + [False] * cursor
     series = [
-        uplot.Series(label="", stroke=f"rgb{colour}", width=1.5, dash=(5, 4) if dashed else ())
+        uplot.Series(label="", stroke=f"rgb{colour}", width=1.5, dash=(5, 4) if dashed else (), points={"show": False})
         for colour, dashed in zip(colours, dashes, strict=True)
     ]
     return gui.add_uplot(

@@ -52,7 +52,7 @@ class Scene:
         """
         self.size = len(labels)
         self._scene = server.scene
-        server.initial_camera.position, server.initial_camera.look_at = (0.0, -4.0, 2.8), (0.0, 0.5, 0.2)
+        server.initial_camera.position, server.initial_camera.look_at = (0.0, -3.7, 2.7), (0.0, 0.3, 0.0)
         self._model, self._data = mjcf.clone(model), mujoco.MjData(model)
         self._radius = mjcf.read_robot(model).wheel_radius
         self._root = self._scene.add_frame("/world", show_axes=False)
