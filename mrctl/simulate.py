@@ -33,6 +33,7 @@ Factory = Callable[[Robot, int], Feedforward]
 
 DIVERGED = 1.0  # m of lateral error
 LATERAL_ERROR = list(result.SIGNALS).index("lateral_error")
+BLOCK = 10_000  # control ticks whose references are sampled at once
 FAR = 0.8  # m between robot and reference at the start
 
 _observe, _posture_error = one(observe), one(posture_error)
@@ -176,15 +177,13 @@ class Simulation:
         self._oracle = stage if first.feedforward == "oracle" and isinstance(stage, InverseDynamics) else None
         self.plant: Plant = build(compiled, size, round(first.control_period / first.physics_step), threads)
         self.hierarchy = Hierarchy(scenarios, robot, stage)
-        times = self._period * np.arange(self.ticks, dtype=float)
-        # Robots that follow the same reference share its samples, (ticks, references, 7).
+        # Robots that follow the same reference share its samples, (BLOCK, references, 7).
         names = [s.reference.model_dump_json() for s in scenarios]
         different = {name: s.reference for name, s in zip(names, scenarios, strict=True)}
         order = list(different)
-        samples = np.stack([np.hstack(r.sample(times)) for r in different.values()], axis=1)
+        self._references = list(different.values())
         self._which = np.array([order.index(name) for name in names]) if 1 < len(order) < size else None
-        shared = self._which is None and len(order) < size
-        self._reference = np.broadcast_to(samples, (self.ticks, size, 7)) if shared else samples
+        self._sampled = -1
         self._wheel_radius = robot.wheel_radius
         self._sensors = np.zeros(size, SENSORS)
         self._sensors["odometry"] = [s.measurement == "odometry" for s in scenarios]
@@ -259,7 +258,14 @@ class Simulation:
             log[plant.failed] = np.nan
 
     def _reference_now(self) -> Array:
-        now = self._reference[self.tick]
+        block, row = divmod(self.tick, BLOCK)
+        if block != self._sampled:  # a long run does not hold them all
+            times = self._period * np.arange(block * BLOCK, min((block + 1) * BLOCK, self.ticks), dtype=float)
+            samples = np.stack([np.hstack(r.sample(times)) for r in self._references], axis=1)
+            shared = self._which is None and samples.shape[1] < len(self.scenarios)
+            self._reference = np.broadcast_to(samples, (len(times), len(self.scenarios), 7)) if shared else samples
+            self._sampled = block
+        now = self._reference[row]
         return now if self._which is None else now[self._which]
 
     def result(self) -> xr.Dataset:
