@@ -1,10 +1,13 @@
 """A physics testbed for adaptive control of a car-like robot."""
 
+from mrctl.control.composite import Composite
 from mrctl.control.fel import Fel, save_weights
+from mrctl.control.guard import Guard
 from mrctl.control.kanayama import Kanayama
+from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
-from mrctl.metrics import per_lap, summary
+from mrctl.metrics import guard_events, per_lap, summary
 from mrctl.record import InputError
 from mrctl.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
 from mrctl.result import save
@@ -18,13 +21,16 @@ __all__ = [
     "PERTURBATIONS",
     "Axis",
     "Circle",
+    "Composite",
     "Event",
     "Fel",
+    "Guard",
     "InputError",
     "Kanayama",
     "LaneChange",
     "Lemniscate",
     "Line",
+    "Observer",
     "Perturbation",
     "Pid",
     "Rls",
@@ -35,6 +41,7 @@ __all__ = [
     "StopAndGo",
     "Sweep",
     "Waypoints",
+    "guard_events",
     "open",
     "per_lap",
     "save",

@@ -55,6 +55,7 @@ def _parse(arguments: list[str]) -> None:
         "sweep": sweep,
         "suite": suite,
         "tune": tune,
+        "train": train,
         "bench": bench,
         "view": view,
     }
@@ -185,18 +186,33 @@ def reproduce(out: Path = Path("reproduction")) -> None:
 
 
 def suite(
-    feedforward: tuple[FeedforwardName, ...] = FEEDFORWARDS, seeds: int = 10, out: Path = Path("suite")
+    feedforward: tuple[FeedforwardName, ...] = FEEDFORWARDS,
+    controller: tuple[str, ...] = (),
+    seeds: int | None = None,
+    random: int | None = None,
+    quick: bool = False,
+    workers: int | None = None,
+    out: Path = Path("suite"),
 ) -> None:
-    """Compares the feedforwards over steering arrangements and perturbations, with paired seeds.
+    """Drives every feedforward through every uncertainty, with paired seeds; the same command goes on where it stopped.
 
     Args:
         feedforward: Which to compare.
-        seeds: Runs of each.
-        out: Folder for the table as Markdown and JSON.
+        controller: Feedforwards of your own beside them, as my_file.py:MyController.
+        seeds: Runs of each case; by default 10, 3 if quick.
+        random: Random scenarios; by default 300, 20 if quick.
+        quick: A selection of cases with fewer laps: two minutes instead of half an hour.
+        workers: Processes on this machine; by default one a core.
+        out: Folder for report.html, the tables as Markdown and JSON, the figures and the runs.
     """
-    from mrctl.experiments import ladder
+    from mrctl.experiments import suite as uncertainty
 
-    print(ladder.suite(feedforward, seeds, out))
+    usual = (3, 20) if quick else (10, 300)
+    runs = (usual[0] if seeds is None else seeds), (usual[1] if random is None else random)
+    found = uncertainty.suite(feedforward, controller, *runs, quick, workers, out)
+    print(f"{(out / 'table.md').read_text()}\nReport: {out / 'report.html'}")
+    if found.aside:
+        raise _Incomplete(f"{found.aside}; the same command tries them again")
 
 
 def tune(
@@ -218,6 +234,21 @@ def tune(
     from mrctl.experiments import tuning
 
     print(tuning.tune(world, time_constant, delay, out, json))
+
+
+def train(out: Path = Path("composite.safetensors"), plants: int = 120, seed: int = 0) -> None:
+    """Trains the features of `composite` and their prior on randomised plants; under five minutes.
+
+    A run takes the file with --composite.weights; without, it takes the one that ships with the package.
+
+    Args:
+        out: File for the weights.
+        plants: Randomised plants; a third as many more are held out.
+        seed: Of plants, references and initial network.
+    """
+    from mrctl.experiments import train as training
+
+    print(training.train(out, plants, seed))
 
 
 def bench(json: bool = False) -> None:

@@ -126,9 +126,7 @@ def inverse_dynamics(
     return (wheels / robot.motor_gain + robot.back_emf * wheel_rates(twist, robot)) / robot.drive_gain
 
 
-def regressor(
-    twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_speed: float = 0.0
-) -> NDArray[np.float64]:
+def regressor(twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> NDArray[np.float64]:
     """The 8 features in which the inverse dynamics is linear: V, θ̇, V̇, θ̈, V θ̇, θ̇², s_l, s_r; shape (…, 8).
 
     Arguments as in `inverse_dynamics`. Of the robot only the half track is used.

@@ -7,7 +7,6 @@ import os
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
-from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from mrctl import metrics
+from mrctl import controller, metrics
 from mrctl import model as mjcf
 from mrctl.pool import Cluster, Outcome, Pool, Processes, Work
 from mrctl.record import InputError
@@ -135,7 +134,10 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
     """What a store must agree on. Fails for a sweep whose worlds do not compile or whose robot cannot follow."""
     models = _models(sweep)
     if scenario := sweep.valid(0):
-        Simulation([scenario])
+        if sweep.controller:
+            controller.trial(sweep.controller, scenario)
+        else:
+            Simulation([scenario])
     return {
         "sweep": sweep.model_dump(mode="json"),
         "versions": versions(),
@@ -149,11 +151,9 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
 
 
 def _models(sweep: Sweep) -> dict[str, str]:
-    """Digests of the compiled worlds with the robot."""
-    listed = {axis.field: axis.listed for axis in sweep.axes}
-    worlds, steerings = (listed.get(name, (getattr(sweep.base, name),)) for name in ("world", "steering"))
-    pairs = sorted(set(product(worlds, steerings)))
-    return {f"{world}, {steering}": mjcf.digest(mjcf.load(world, steering)) for world, steering in pairs}
+    """Digests of the compiled worlds with the robot, and of the file of a controller."""
+    worlds = {f"{world}, {steering}": mjcf.digest(mjcf.load(world, steering)) for world, steering in sweep.worlds}
+    return worlds | ({sweep.controller: controller.digest(sweep.controller)} if sweep.controller else {})
 
 
 def compute(path: str, job: int) -> Outcome:
@@ -198,10 +198,11 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
             batches.setdefault(scenario.control_period, {})[run] = scenario
         except InputError as error:  # drawn out of range
             rows[run] = _row(sweep, run, str(error).removeprefix(f"run {run}: "))
+    stage = controller.load(sweep.controller) if sweep.controller else None
     queue = list(batches.values())
     for batch in queue:
         try:
-            result = simulate(list(batch.values()), threads=1)
+            result = simulate(list(batch.values()), stage, threads=1)
         except InputError as error:
             if len(batch) == 1:
                 rows |= {run: _row(sweep, run, str(error)) for run in batch}
@@ -210,6 +211,9 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
             continue
         laps = metrics.per_lap(result)
         table = metrics.summary(laps).assign(lap_time=laps["lap_time"].values, failure=result["failure"].values)
+        if sweep.record == "laps":
+            for name in metrics.METRICS:
+                table[f"{name}_per_lap"] = [v[:n] for v, n in zip(laps[name].values, laps["laps"].values, strict=True)]
         for run, found in zip(batch, table.to_dict("records"), strict=True):
             rows[run] = _row(sweep, run, **{str(name): value for name, value in found.items()})
         if signals is not None:
@@ -220,10 +224,12 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
 
 def _row(sweep: Sweep, run: int, failure: str = "", **found: object) -> dict[str, Any]:
     """A row of the table: what the run was and what was found, NaN where nothing was."""
-    values, scenario = sweep.values(run), sweep.valid(run) or sweep.base
+    values, valid = sweep.values(run), sweep.valid(run)
+    scenario = valid or sweep.base
     row: dict[str, Any] = {name: np.nan for name in (*metrics.METRICS, "lap_time")}
+    row |= {name: [] for name in sweep.columns.names if name.endswith("_per_lap")}
     row |= {"run": run, "label": scenario.name or scenario.feedforward, "feedforward": scenario.feedforward}
-    row |= {"steering": scenario.steering, "seed": values["seed"], "laps": 0}
+    row |= {"steering": scenario.steering, "seed": valid.seed if valid else values["seed"], "laps": 0}
     row |= {"failed": bool(failure), "failure": failure, "failure_time": 0.0 if failure else np.nan}
     return row | found | {axis.field: axis.cell(values[axis.field]) for axis in sweep.axes}
 
@@ -239,6 +245,7 @@ class Repeat(NamedTuple):
     """`bit-identical`, `within tolerance`, or `departs`, and where."""
     same: bool
     """Whether it does not depart."""
+
 
 def scenario_of(out: str | Path, run: int) -> Scenario:
     """The scenario of one run of a stored sweep.
@@ -266,8 +273,8 @@ def repeat(out: str | Path, run: int) -> Repeat:
     reasons = [one["failure"] or "it finished" for one in (row, stored)]
     if reasons[0] != reasons[1]:
         return Repeat(f"departs: {reasons[0]}, in the store {reasons[1]}", False)
-    names = [*metrics.METRICS, "failure_time"]
-    pairs = {name: (np.array([row[name]]), np.array([stored[name]])) for name in names}
+    names = [*metrics.METRICS, "failure_time", *(name for name in row if name.endswith("_per_lap"))]
+    pairs = {name: (np.array(row[name], float, ndmin=1), np.array(stored[name], float, ndmin=1)) for name in names}
     if signals is not None:
         kept = store.signals(run)
         pairs |= {f"signal {name}": (signals[0, :, k], kept[:, k]) for k, name in enumerate(SIGNALS)}

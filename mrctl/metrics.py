@@ -1,4 +1,4 @@
-"""What a result is worth: errors per lap, learning, recovery, and statistics over seeds.
+"""What a result is worth: errors per lap, learning, recovery, and their means over seeds.
 
 Pure functions of the dataset that `simulate` returns. Errors are against the ORIGINAL reference. A run that failed is
 counted, never dropped: its metrics are NaN from the lap in which it failed on, and every statistic says how many it
@@ -8,17 +8,17 @@ period.
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from numpy.typing import NDArray
 
+from mrctl.comparison import Interval, bootstrap_interval
 from mrctl.control.feedforward import features
+from mrctl.control.guard import ACTIONS, LIMIT, NONE, REASONS
 from mrctl.record import InputError
 
 Array = NDArray[np.float64]
@@ -42,6 +42,7 @@ METRICS: dict[str, tuple[str, str]] = {
     "saturation_time": ("s", "time in saturation"),
     "energy": ("J", "electrical energy"),
     "weight_norm": ("1", "norm of the learner's weights at the end of the lap"),
+    "guard_actions": ("1", "times the guard on the learner stepped in, or took a stronger measure"),
     "excitation": ("1", "smallest eigenvalue of the Gram matrix of the physical features at the commanded motion"),
 }
 """Name of a metric -> (unit, description)."""
@@ -51,30 +52,8 @@ PER_RUN = ("label", "feedforward", "steering", "seed", "lap_time")
 SAMPLED = (
     "x", "y", "x_ref", "y_ref", "v", "omega", "v_ref", "omega_ref", "longitudinal_error", "lateral_error",
     "heading_error", "v_command", "omega_command", "feedback_left", "feedback_right", "voltage_left", "voltage_right",
-    "saturated", "power", "weight_norm",
+    "saturated", "power", "weight_norm", "guard",
 )  # fmt: skip
-
-
-class Interval(NamedTuple):
-    """A mean with its confidence interval, over the `samples` that are finite."""
-
-    value: float
-    low: float
-    high: float
-    samples: int
-    failed: int
-    """Samples that are NaN or infinite: runs that failed, or never recovered."""
-
-
-class Ratio(NamedTuple):
-    """A ratio of paired means with its confidence interval, over the `pairs` that are finite on both sides."""
-
-    value: float
-    low: float
-    high: float
-    pairs: int
-    failed_a: int
-    failed_b: int
 
 
 class Laps(NamedTuple):
@@ -180,7 +159,8 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
         for lap, (start, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
             rates = {name: data[name][rows, start:end] for name in SAMPLED}
             # The step into a lap belongs to it, so that the variation of all laps adds up to that of the run.
-            steps = {name: data[name][rows, max(start - 1, 0) : end] for name in ("voltage_left", "voltage_right")}
+            stepping = ("voltage_left", "voltage_right", "guard")
+            steps = {name: data[name][rows, max(start - 1, 0) : end] for name in stepping}
             for name, value in _lap_metrics(rates, steps, period).items():
                 values[name][rows, lap] = value
             if scaled and end - start > 1:
@@ -203,7 +183,7 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(variables, {**coords, "lap": np.arange(1, max(counts, default=0) + 1)}, dict(result.attrs))
 
 
-def _lap_metrics(data: dict[str, Array], voltages: dict[str, Array], period: float) -> dict[str, Array]:
+def _lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float) -> dict[str, Array]:
     """The metrics (rows,) of one lap, from its samples (rows, n)."""
     found: dict[str, Array] = {}
     for name in ("longitudinal", "lateral", "heading"):
@@ -221,10 +201,12 @@ def _lap_metrics(data: dict[str, Array], voltages: dict[str, Array], period: flo
     voltage = np.hypot(_rms(data["voltage_left"]), _rms(data["voltage_right"]))
     with np.errstate(divide="ignore", invalid="ignore"):
         found["feedback_share"] = np.where(feedback == 0, 0.0, feedback / voltage)  # at rest nobody works
-    found["voltage_variation"] = sum((np.abs(np.diff(u)).sum(-1) for u in voltages.values()), np.zeros(len(voltage)))
+    variations = [np.abs(np.diff(steps[name])).sum(-1) for name in ("voltage_left", "voltage_right")]
+    found["voltage_variation"] = variations[0] + variations[1]
     found["saturation_time"] = data["saturated"].sum(-1) * period
     found["energy"] = data["power"].sum(-1) * period
     found["weight_norm"] = data["weight_norm"][:, -1]
+    found["guard_actions"] = (np.diff(steps["guard"]) > 0).sum(-1).astype(float)
     return found
 
 
@@ -258,6 +240,29 @@ def excitation(command: Array, period: float, half_track: Array, scale: Array) -
 def _rms(signal: Array) -> Array:
     """Root of the mean square along the last axis."""
     return np.sqrt(np.mean(np.square(signal), axis=-1))
+
+
+def guard_events(result: xr.Dataset) -> pd.DataFrame:
+    """What the guard on the learner did, in order of time, run by run.
+
+    Args:
+        result: What `simulate` returns, or one run of it.
+
+    Returns:
+        A row an event: run, time in s, action (limit, freeze, fallback, or resume after the last two), and the reason
+        in words.
+    """
+    runs = as_runs(result)
+    rows = []
+    for row, number in enumerate(runs["run"].values):
+        action, reason = (np.nan_to_num(runs[name].values[row]).astype(int) for name in ("guard", "guard_reason"))
+        for k in np.flatnonzero(np.diff(action, prepend=0)):
+            before = action[k - 1] if k else 0
+            if action[k] == NONE and before == LIMIT or np.isnan(runs["guard"].values[row, k]):
+                continue  # a limit ends by itself, a run that failed has no guard
+            name = ACTIONS[action[k]] if action[k] != NONE else "resume"
+            rows.append((number, float(runs["time"][k]), name, REASONS[reason[k]]))
+    return pd.DataFrame(rows, columns=["run", "time", "action", "reason"])
 
 
 def laps_to_converge(laps: xr.Dataset, metric: str, factor: float = 1.2) -> xr.DataArray:
@@ -333,6 +338,34 @@ def recovery_time(
         seconds[row] = back * period if back < len(moving) else np.inf
     attrs = {"units": "s", "long_name": f"time until the RMS of {error} is back within {factor:g}×"}
     return xr.DataArray(seconds, {"run": runs["run"].values}, ("run",), "recovery_time", attrs)
+
+
+def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor: float = 1.2) -> xr.DataArray:
+    """Laps after a change until the metric of whole laps is back, to stay, within `factor` of the lap before it.
+
+    Args:
+        laps: What `per_lap` returns.
+        metric: One of `METRICS`.
+        change: The number of the lap in whose beginning the change came, from 2.
+        until: Number of the last lap to look at, before the next change.
+        factor: How close counts as recovered.
+
+    Returns:
+        Laps (run,): 0 if the lap of the change itself is within, infinite if the last one is not, NaN if it failed.
+
+    Raises:
+        InputError: No such metric, or laps that are not there.
+    """
+    known(metric)
+    if not 2 <= change <= until <= laps.sizes["lap"]:
+        raise InputError(f"change: lap {change} and lap {until} are not in order within 2 to {laps.sizes['lap']}")
+    values = laps[metric].transpose("run", "lap").values[:, change - 2 : until]
+    outside = ~(values[:, 1:] <= factor * values[:, :1])
+    last = outside.shape[1] - np.argmax(outside[:, ::-1], axis=1)
+    back = np.where(outside[:, -1], np.inf, np.where(outside.any(axis=1), last, 0))
+    number = np.where(np.isfinite(values).all(axis=1), back, np.nan)
+    attrs = {"units": "1", "long_name": f"laps until {METRICS[metric][1]} is back within {factor:g}×"}
+    return xr.DataArray(number, {"run": laps["run"].values}, ("run",), "recovery_laps", attrs)
 
 
 def error_on_return(
@@ -468,73 +501,3 @@ def known(metric: str) -> str:
     if metric not in METRICS:
         raise InputError(f"metric: {metric!r} is not one of {', '.join(METRICS)}")
     return metric
-
-
-def bootstrap_interval(samples: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0) -> Interval:
-    """Mean of the finite samples with its bias-corrected, accelerated bootstrap interval (Efron, 1987).
-
-    Args:
-        samples: One number a run (n,); NaN or infinite where it failed.
-        level: Confidence level, between 0 and 1.
-        n: Resamples.
-        seed: Of the resampling.
-
-    Returns:
-        The interval; its ends are NaN where fewer than two samples are finite: one run says nothing of the spread.
-    """
-    values = np.asarray(samples, float).ravel()
-    finite = values[np.isfinite(values)]
-    low, high = _interval((finite,), np.mean, level, n, seed)
-    mean = float(finite.mean()) if len(finite) else np.nan
-    return Interval(mean, low, high, len(finite), len(values) - len(finite))
-
-
-def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0) -> Ratio:
-    """Mean of `a` over mean of `b`, with a bootstrap interval that resamples pairs (same seed, same perturbation).
-
-    Args:
-        a: One number a run (n,); NaN or infinite where it failed.
-        b: The same runs under the other controller (n,).
-        level: Confidence level, between 0 and 1.
-        n: Resamples.
-        seed: Of the resampling.
-
-    Raises:
-        InputError: `a` and `b` differ in length.
-    """
-    first, second = np.asarray(a, float).ravel(), np.asarray(b, float).ravel()
-    if len(first) != len(second):
-        raise InputError(f"b: {len(second)} samples cannot be paired with {len(first)}")
-    fine = np.isfinite(first), np.isfinite(second)
-    both = fine[0] & fine[1]
-    pairs = first[both], second[both]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = _interval(pairs, _ratio, level, n, seed)
-        value = float(_ratio(*pairs)) if both.any() else np.nan
-    return Ratio(value, low, high, int(both.sum()), int((~fine[0]).sum()), int((~fine[1]).sum()))
-
-
-def _ratio(a: Array, b: Array, axis: int = -1) -> Array:
-    """Ratio of means."""
-    return np.divide(np.mean(a, axis=axis), np.mean(b, axis=axis))
-
-
-def _interval(
-    data: tuple[Array, ...], statistic: Callable[..., ArrayLike], level: float, n: int, seed: int
-) -> tuple[float, float]:
-    """BCa bootstrap interval of a paired statistic; percentiles where the data are too alike for BCa."""
-    if not 0 < level < 1:
-        raise InputError(f"level: {level} is not between 0 and 1")
-    if len(data[0]) < 2:
-        return np.nan, np.nan
-    for method in ("BCa", "percentile"):
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            found = stats.bootstrap(
-                data, statistic, n_resamples=n, batch=1000, vectorized=True, paired=True, confidence_level=level,
-                method=method, rng=np.random.default_rng(seed),
-            ).confidence_interval  # fmt: skip
-        low, high = float(found.low), float(found.high)
-        if np.isfinite([low, high]).all():
-            break
-    return low, high

@@ -274,6 +274,7 @@ def perturb(nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Pertur
     model.numeric("no_load_current").data[:] = no_load
     model.pair_friction[:] = nominal.pair_friction
     model.pair_friction[:, :2] *= p.tyre_friction_factor
+    model.pair_friction[_tyre_pairs(nominal), :2] *= p.left_tyre_friction_factor
     gx, gy, gz = nominal.opt.gravity
     c, s = np.cos(p.slope), np.sin(p.slope)
     model.opt.gravity[:] = c * gx + s * gz, gy, c * gz - s * gx

@@ -7,7 +7,7 @@ where a run failed. `window` is a pair of times in s, `lap` a lap's number from 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec
@@ -264,6 +264,129 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
         one.xaxis.get_major_locator().set_params(integer=True)
         _label_ends(one, ends)
     return figure
+
+
+@styled
+def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence[int] = ()) -> Figure:
+    """A metric lap by lap on a log axis, a panel a case: the mean of the runs that share a label, and their range.
+
+    Args:
+        cases: What `metrics.per_lap` returns, by title.
+        metric: One of `METRICS`.
+        changes: Laps in whose beginning something changes: dotted lines.
+
+    Raises:
+        InputError: An unknown metric, or no case.
+    """
+    unit, text = METRICS[known(metric)]
+    if not cases:
+        raise InputError("cases: none given")
+    columns = 2 if len(cases) in (2, 4) else min(3, len(cases))
+    rows = -(-len(cases) // columns)
+    figure, axes = _figure(PAGE, (0.12 + 0.55 * rows) * COLUMN, rows=rows, columns=columns, sharey=True)
+    order: list[str] = []
+    for one, (title, laps) in zip(axes, cases.items(), strict=False):
+        number, labels = laps["lap"].values, [str(label) for label in laps["label"].values]
+        for label in dict.fromkeys(labels):
+            order += [label] if label not in order else []
+            values = laps[metric].values[[row for row, other in enumerate(labels) if other == label]]
+            some = np.isfinite(values).any(0)
+            line = _line(order.index(label))
+            if some.any():
+                low, mean, high = (f(values[:, some], 0) for f in (np.nanmin, np.nanmean, np.nanmax))
+                one.fill_between(number[some], low, high, color=line["color"], alpha=0.15, lw=0)
+                one.plot(number[some], mean, marker=".", ms=3, **line)
+        for lap in changes:
+            one.axvline(lap - 0.5, color="0.4", lw=0.8, ls=":")
+        one.set(title=title, yscale="log")
+        one.xaxis.get_major_locator().set_params(integer=True)
+    for place, one in enumerate(axes):
+        one.set_xlabel("lap" if place + columns >= len(cases) else "")
+        one.tick_params(labelbottom=place + columns >= len(cases))
+        if place % columns == 0:
+            one.set_ylabel(text if unit == "1" else f"{text} ({unit})", fontsize=8)
+    for unused in axes[len(cases) :]:
+        unused.remove()
+    handles = [Line2D([], [], **_line(k)) for k in range(len(order))]
+    figure.legend(handles, order, loc="outside upper center", ncols=min(8, len(order)))
+    return figure
+
+
+@styled
+def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
+    """The share of runs below each value, on a log axis; runs that are not finite never count as below.
+
+    Args:
+        samples: Positive numbers, one a run, by name.
+        label: What they are, with its unit.
+    """
+    figure, (axes,) = _figure(COLUMN, 0.8 * COLUMN)
+    for order, values in enumerate(samples.values()):
+        finite = np.sort(values[np.isfinite(values)])
+        axes.step(finite, np.arange(1, len(finite) + 1) / max(1, len(values)), where="post", **_line(order))
+    axes.axvline(1, color="0.4", lw=0.8, ls=":")
+    axes.set(xlabel=label, ylabel="share of runs", xscale="log", ylim=(0, 1.02))
+    handles = [Line2D([], [], **_line(k)) for k in range(len(samples))]
+    figure.legend(handles, list(samples), loc="outside upper center", ncols=4)
+    return figure
+
+
+class InverseMap(NamedTuple):
+    """A feedforward in steady motion, beside the truth."""
+
+    v: np.ndarray
+    """Speeds in m/s (n,)."""
+    omega: np.ndarray
+    """Rotation velocities in rad/s (m,)."""
+    learned: np.ndarray
+    """U_Σ and U_Δ in V (m, n, 2)."""
+    true: np.ndarray
+    """The same of the true inverse dynamics."""
+    path: np.ndarray
+    """Where it was trained: commanded twists (T, 2)."""
+
+
+@styled
+def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
+    """Learned against true inverse dynamics as heat maps over the twist: a row a learner; true, learned, error in V.
+
+    The white line is where the robot drove while learning.
+
+    Raises:
+        InputError: No map.
+    """
+    if not maps:
+        raise InputError("maps: none given")
+    figure, axes = _figure(PAGE, (0.1 + 0.36 * len(maps)) * PAGE, rows=len(maps), columns=6, sharey=True)
+    true = np.stack([one.true for one in maps.values()])
+    for row, (name, one) in enumerate(maps.items()):
+        for channel, symbol in enumerate((r"\Sigma", r"\Delta")):
+            bound = float(np.abs(true[..., channel]).max())
+            error = one.learned[..., channel] - one.true[..., channel]
+            columns = ((one.true[..., channel], "true", "RdBu_r"), (one.learned[..., channel], "learned", "RdBu_r"),
+                       (error, "error", "PuOr_r"))  # fmt: skip
+            for column, (values, what, colours) in enumerate(columns):
+                panel = axes[6 * row + 3 * channel + column]
+                limit = bound / (4 if what == "error" else 1)
+                look: dict[str, Any] = {"cmap": colours, "vmin": -limit, "vmax": limit, "rasterized": True}
+                image = panel.pcolormesh(one.v, one.omega, values, **look)
+                panel.plot(*one.path.T, color="white", lw=0.5)
+                panel.grid(False)
+                panel.set(xlim=one.v[[0, -1]], ylim=one.omega[[0, -1]])
+                if row == 0:
+                    panel.set_title(f"$U_{symbol}$ {what} (V)", fontsize=8)
+                if row == len(maps) - 1:
+                    panel.set_xlabel("$V$ (m/s)")
+                    figure.colorbar(image, ax=axes[3 * channel + column :: 6], orientation="horizontal", aspect=12)
+                if column == channel == 0:
+                    panel.set_ylabel(f"{name}\n$\\dot\\theta$ (rad/s)")
+    return figure
+
+
+def _line(order: int) -> dict[str, Any]:
+    """Colour and dashes of the label in that place; colours come again with other dashes."""
+    again, colour = divmod(order, len(COLOURS))
+    return {"color": COLOURS[colour], "ls": ("-", "--", ":")[again % 3]}
 
 
 def _figure(width: float, height: float, rows: int = 1, columns: int = 1, sharey: bool = False) -> tuple[Figure, list]:

@@ -17,9 +17,7 @@ class InputError(ValueError):
 class Record(BaseModel):
     """A frozen record: unknown keys and non-finite numbers are refused by name."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     @classmethod
     def from_dict(cls, values: object, source: str = "") -> Self:

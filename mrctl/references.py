@@ -345,7 +345,8 @@ class _Spline:
 
     def derivative(self, u: Array, n: int) -> Plane:
         """The n-th derivative of x + i y with respect to u, n = 0 to 3."""
-        return self.curves[n](u) @ np.array([1, 1j])
+        x, y = np.moveaxis(self.curves[n](u), -1, 0)
+        return x + 1j * y
 
     def arc(self, start: Array, end: Array) -> Array:
         """Arc length [m] from start to end, (T,), both within one piece."""

@@ -190,6 +190,8 @@ class Perturbation(Record):
     """Applied over commanded voltage: a PWM drive on another supply."""
     tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
     """Friction of every tyre on the floor."""
+    left_tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
+    """Friction of the rear left tyre on the floor, beside the factor of all."""
     slope: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     """Inclination in rad, uphill along the world's +x, as gravity seen in the slope's own frame."""
     control_delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] = 0.0
@@ -207,7 +209,24 @@ class Perturbation(Record):
 PERTURBATIONS: dict[str, Perturbation] = {
     "nominal": Perturbation(),
     "mass +50 %": Perturbation(mass_factor=1.5),
+    "mass -50 %": Perturbation(mass_factor=0.5),
+    "payload ahead": Perturbation(payload=5.0, payload_x=0.35),  # moves the centre of mass by 5 cm
+    "payload behind": Perturbation(payload=5.0, payload_x=-0.15),
+    "payload aside": Perturbation(payload=5.0, payload_x=0.1, payload_y=0.15),
+    "left wheel +5 %": Perturbation(left_radius_factor=1.05),
+    "left wheel -5 %": Perturbation(left_radius_factor=0.95),
+    "drive friction x3": Perturbation(drive_friction_factor=3.0),
+    "resistance +30 %": Perturbation(resistance_factor=1.3),
+    "motor constant -15 %": Perturbation(motor_constant_factor=0.85),
     "supply -20 %": Perturbation(supply_factor=0.8),
+    "delay 20 ms": Perturbation(control_delay=0.02),
+    "delay 40 ms": Perturbation(control_delay=0.04),
+    "tyre friction 0.2": Perturbation(tyre_friction_factor=0.2 / 0.9),
+    "left tyre on ice": Perturbation(left_tyre_friction_factor=0.1 / 0.9),
+    "slope 10°": Perturbation(slope=0.1745),
+    "sensor noise": Perturbation(
+        velocity_noise=0.01, rotation_noise=0.02, position_noise=0.002, heading_noise=0.002
+    ),
     "all": Perturbation(mass_factor=1.5, supply_factor=0.8, drive_friction_factor=3.0, resistance_factor=1.3),
 }
-"""The named cases of the comparison tables; `all` is the combination the published targets are stated for."""
+"""What can be wrong with the default robot, one thing at a time; `all` is the combination of the published targets."""

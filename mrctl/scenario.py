@@ -6,17 +6,20 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from mrctl.control.composite import Composite
 from mrctl.control.fel import Fel
+from mrctl.control.guard import Guard
 from mrctl.control.kanayama import Kanayama
+from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
 from mrctl.record import Record
 from mrctl.references import Lemniscate, Reference
 from mrctl.robot import Perturbation
 
-FeedforwardName = Literal["none", "model", "oracle", "fel", "rls"]
-FEEDFORWARDS: tuple[FeedforwardName, ...] = ("none", "model", "oracle", "fel", "rls")
-LONGEST = 10_000_000  # control periods in a run; its record takes 250 bytes each
+FeedforwardName = Literal["none", "model", "oracle", "observer", "fel", "rls", "composite"]
+FEEDFORWARDS: tuple[FeedforwardName, ...] = ("none", "model", "oracle", "observer", "fel", "rls", "composite")
+LONGEST = 10_000_000  # control periods in a run; its record takes 290 bytes each
 STEERINGS: tuple[Literal["compliant", "caster", "rigid"], ...] = ("compliant", "caster", "rigid")
 
 
@@ -34,6 +37,8 @@ class Event(Record):
     """Forces along the world's x and y on the chassis in N, torque about z in N·m."""
     push_duration: Annotated[float, Field(gt=0, le=10)] = 0.1
     """How long the push lasts in s."""
+    reference: Reference | None = None
+    """What to follow from now on, from its own start; laps are still counted by the first reference."""
     kanayama: Kanayama | None = None
     """New gains of the motion controller."""
     pid: Pid | None = None
@@ -67,6 +72,12 @@ class Scenario(Record):
     """Settings of the `fel` feedforward."""
     rls: Rls = Rls()
     """Settings of the `rls` feedforward."""
+    observer: Observer = Observer()
+    """Settings of the `observer` feedforward."""
+    composite: Composite = Composite()
+    """Settings of the `composite` feedforward."""
+    guard: Guard = Guard()
+    """Watchdog on a feedforward that learns."""
     perturbation: Perturbation = Perturbation()
     """How the plant differs from the model, from the start."""
     events: tuple[Event, ...] = ()

@@ -73,6 +73,7 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
             r[10], r[11] = c.saturated[0], norm[i]
             r[12:14] = p.current
             r[14] = p.applied[0] * p.current[0] + p.applied[1] * p.current[1]
+            r[15], r[16] = c.guard.action, c.guard.reason
             near &= not abs(row[i, LATERAL_ERROR]) > DIVERGED or p.failed
         return near
 
@@ -134,8 +135,8 @@ def batches(
     """Uniform groups of scenarios: which they are, and their simulation. Arguments and errors as in `simulate`."""
     groups: dict[Hashable, list[int]] = defaultdict(list)
     for row, s in enumerate(scenarios):
-        key = s.world, s.steering, s.feedforward, s.ticks, s.physics_step, s.motion_period, s.fel.hidden
-        groups[key].append(row)
+        net = s.fel.hidden, s.composite.weights
+        groups[s.world, s.steering, s.feedforward, s.ticks, s.physics_step, s.motion_period, *net].append(row)
     return [(rows, Simulation([scenarios[r] for r in rows], feedforward, threads)) for rows in groups.values()]
 
 
@@ -171,19 +172,14 @@ class Simulation:
         robot = mjcf.read_robot(compiled)
         rigid = first.steering == "rigid"
         for scenario in scenarios:
-            check(scenario.reference, robot, reverse=rigid)
+            for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
+                check(reference, robot, reverse=rigid)
         stage = feedforward(robot, size) if feedforward else feedforward_of(scenarios, robot)
         self._label = getattr(feedforward, "__name__", "custom") if feedforward else first.feedforward
         self._oracle = stage if first.feedforward == "oracle" and isinstance(stage, InverseDynamics) else None
         self.plant: Plant = build(compiled, size, round(first.control_period / first.physics_step), threads)
         self.hierarchy = Hierarchy(scenarios, robot, stage)
-        # Robots that follow the same reference share its samples, (BLOCK, references, 7).
-        names = [s.reference.model_dump_json() for s in scenarios]
-        different = {name: s.reference for name, s in zip(names, scenarios, strict=True)}
-        order = list(different)
-        self._references = list(different.values())
-        self._which = np.array([order.index(name) for name in names]) if 1 < len(order) < size else None
-        self._sampled = -1
+        self._plan()
         self._wheel_radius = robot.wheel_radius
         self._sensors = np.zeros(size, SENSORS)
         self._sensors["odometry"] = [s.measurement == "odometry" for s in scenarios]
@@ -195,7 +191,7 @@ class Simulation:
         for row, scenario in enumerate(scenarios):
             self._perturb(row, scenario.perturbation)
             for event in sorted(scenario.events, key=lambda e: e.time):
-                self._schedule[self._tick_of(event)].append((row, event))
+                self._schedule[_tick(event, self._period)].append((row, event))
         start = self._reference_now()
         self.plant.reset(np.stack([_start(s, start[i, :3]) for i, s in enumerate(scenarios)]), start[:, 3:5])
         reading = self.plant.reading
@@ -210,28 +206,25 @@ class Simulation:
         """Whether there is anything left to do."""
         return self.tick < self.ticks and self.plant.running > 0
 
-    def add(self, event: Event, rows: Sequence[int] | None = None) -> None:
-        """Adds an event to runs that are under way: `scenarios` then hold it, and run again give the same bits.
+    def add(self, event: Event) -> None:
+        """Adds an event to every run under way: `scenarios` then hold it, and run again give the same bits.
 
         Args:
             event: What happens, not before the coming tick.
-            rows: To whom; by default to all.
 
         Raises:
             InputError: It comes too late, or a scenario with it is refused; then nothing was added.
         """
-        if (tick := self._tick_of(event)) < self.tick:
+        if (tick := _tick(event, self._period)) < self.tick:
             raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self._period:g} s")
-        rows = range(len(self.scenarios)) if rows is None else rows
         if event.perturbation is not None:
             self.plant.check(event.perturbation)
-        changed = {row: self.scenarios[row].with_event(event) for row in rows}
-        for row, scenario in changed.items():
-            self.scenarios[row] = scenario
-            self._schedule[tick].append((row, event))
-
-    def _tick_of(self, event: Event) -> int:
-        return int(np.ceil(event.time / self._period - 1e-9))
+        if event.reference is not None:
+            check(event.reference, self.plant.robot, reverse=self.scenarios[0].steering == "rigid")
+        self.scenarios = [scenario.with_event(event) for scenario in self.scenarios]
+        self._schedule[tick] += enumerate([event] * len(self.scenarios))
+        if event.reference is not None:
+            self._plan()
 
     def step(self) -> None:
         """One control period: events, measurement, control, record, physics."""
@@ -257,15 +250,22 @@ class Simulation:
             self._failure_time[new] = self.tick * self._period
             log[plant.failed] = np.nan
 
+    def _plan(self) -> None:
+        """Finds the courses: robots on the same one share its samples."""
+        names = [(s.reference, *((e.time, e.reference) for e in s.events if e.reference)) for s in self.scenarios]
+        self._courses = dict(zip(names, self.scenarios, strict=True))
+        order = list(self._courses)
+        self._which = np.array([order.index(n) for n in names]) if 1 < len(order) < len(names) else None
+        self._block = range(0)
+
     def _reference_now(self) -> Array:
-        block, row = divmod(self.tick, BLOCK)
-        if block != self._sampled:  # a long run does not hold them all
-            times = self._period * np.arange(block * BLOCK, min((block + 1) * BLOCK, self.ticks), dtype=float)
-            samples = np.stack([np.hstack(r.sample(times)) for r in self._references], axis=1)
-            shared = self._which is None and samples.shape[1] < len(self.scenarios)
-            self._reference = np.broadcast_to(samples, (len(times), len(self.scenarios), 7)) if shared else samples
-            self._sampled = block
-        now = self._reference[row]
+        if self.tick not in self._block:  # a long run does not hold all samples: (BLOCK, courses, 7)
+            first = self.tick // BLOCK * BLOCK
+            self._block = range(first, min(first + BLOCK, self.ticks))
+            samples = np.stack([_course(s, self._block) for s in self._courses.values()], axis=1)
+            everyone = (len(samples), len(self.scenarios), 7)
+            self._reference = np.broadcast_to(samples, everyone) if len(self._courses) == 1 else samples
+        now = self._reference[self.tick - self._block.start]
         return now if self._which is None else now[self._which]
 
     def result(self) -> xr.Dataset:
@@ -303,6 +303,23 @@ class Simulation:
             self.hierarchy.set_pid(row, event.pid)
         if event.learning is not None:
             self.hierarchy.set_learning(row, event.learning)
+
+
+def _tick(event: Event, period: float) -> int:
+    """The first control tick that is not before an event."""
+    return int(np.ceil(event.time / period - 1e-9))
+
+
+def _course(scenario: Scenario, ticks: range) -> Array:
+    """Posture, twist and acceleration to follow, `(ticks, 7)`, through all events that change the reference."""
+    period = scenario.control_period
+    course = np.hstack(scenario.reference.sample(period * np.array(ticks, float)))
+    for event in sorted(scenario.events, key=lambda e: e.time):
+        start = _tick(event, period)
+        if event.reference is not None and (since := max(start, ticks.start)) < ticks.stop:
+            times = period * np.arange(since - start, ticks.stop - start, dtype=float)
+            course[since - ticks.start :] = np.hstack(event.reference.sample(times))
+    return course
 
 
 def _start(scenario: Scenario, reference: Array) -> Array:

@@ -258,6 +258,17 @@ class Store:
         attrs = {name: json.dumps(self.manifest[name]) for name in ("sweep", "versions")}
         period = self.manifest["control_period"] * self.manifest["stride"]
         attrs |= {"control_period": period, "unfinished": self.size - len(frame)}
+        if self.manifest["sweep"]["record"] == "laps":
+            counts = frame["laps"].to_numpy()
+            number = np.arange(1, counts.max(initial=0) + 1)
+            found = {}
+            for name in METRICS:
+                values = np.full((len(frame), len(number)), np.nan)
+                for row, laps in enumerate(frame[f"{name}_per_lap"]):
+                    values[row, : len(laps)] = laps
+                found[name] = (("run", "lap"), values, {"units": units[name]})
+            coords.pop("laps", None)  # where it is an axis too
+            return xr.Dataset(outcome | columns(["laps"]) | found, coords | {"lap": number}, attrs)
         if not self.samples:
             return xr.Dataset(outcome | columns(METRICS), coords, attrs)
         whole = xr.open_zarr(self.path / "signals.zarr", chunks=None, consolidated=False)["signals"]
@@ -272,7 +283,8 @@ def open_store(path: str | Path) -> xr.Dataset:
     """Opens what `mrctl sweep` or `mrctl.save` wrote.
 
     A sweep opens as one dataset of the runs that are done, axes as coordinates on `run`: with its signals (run, time)
-    where they were recorded, with the metrics of the last lap (run,) where not. The table is `runs.parquet` in it.
+    where they were recorded, as what `per_lap` returns (run, lap) where laps were, and else with the metrics of the
+    last lap (run,). The table is `runs.parquet` in it.
 
     Raises:
         InputError: There is neither at this path.

@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import copy
 import json
+from collections.abc import Sequence
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from itertools import product
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import pyarrow as pa
@@ -25,6 +27,7 @@ from mrctl.scenario import Scenario
 
 CHUNK_BYTES = 2**27  # what the signals of a job may take in memory
 TRIED = 20  # runs of which at least one must make sense
+WHOLE = "scenario"  # the field of an axis whose values are tables of changes to the scenario
 
 
 class Grid(Record):
@@ -39,7 +42,8 @@ class Axis(Record):
     """One field of the scenario and what it takes: values, a grid, or a distribution."""
 
     field: Annotated[str, Field(min_length=1)]
-    """Dotted path into the scenario, such as `perturbation.mass_factor` or `events.0.time`."""
+    """Dotted path into the scenario, such as `perturbation.mass_factor` or `events.0.time`; or `scenario`, whose values
+    are tables of what changes in it, such as `{ laps = 4, perturbation = { payload = 5.0 } }`."""
     values: Annotated[tuple[Any, ...], Field(min_length=1)] | None = None
     """A list; a value may be a whole table, such as a perturbation."""
     grid: Grid | None = None
@@ -116,12 +120,23 @@ class Sweep(Record):
     """Draws of seed and distributions for each combination of the listed values."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Of all draws."""
-    record: Literal["metrics", "decimated", "full"] = "metrics"
-    """What to keep beside the table: nothing, every so many samples of the signals, or all of them."""
+    record: Literal["metrics", "laps", "decimated", "full"] = "metrics"
+    """What to keep: metrics of the last lap; those and the metrics of every lap, as lists in the table; or those of the
+    last lap and every so many samples of the signals, or all of them."""
     every: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Control periods from one kept sample to the next, where the record is decimated; by default 10."""
     chunk: Annotated[int, Field(ge=1, le=65536)] | None = None
     """Runs in a job; by default 64, or fewer where the runs are long."""
+    controller: str | None = None
+    """A feedforward of your own instead of the named one, as `my_file.py:MyController`; see `mrctl.controller`."""
+
+    @classmethod
+    def of(cls, scenarios: Sequence[Scenario], **settings: Any) -> Self:  # noqa: ANN401
+        """A sweep whose run i is `scenarios[i]`; settings are the fields of a sweep but `base` and `axes`."""
+        usual = Scenario().model_dump(mode="json")
+        every = [s.model_dump(mode="json") for s in scenarios]
+        changes = [{k: v for k, v in one.items() if k == "seed" or v != usual[k]} for one in every]
+        return cls.from_dict({**settings, "axes": [{"field": WHOLE, "values": changes}]}, "sweep")
 
     @model_validator(mode="after")
     def _runnable(self) -> Sweep:
@@ -148,7 +163,7 @@ class Sweep(Record):
             trials += [{self.axes[a].field: self.axes[a].listed[k] for a in group} for k in range(self._length(group))]
         trials += [{axis.field: end} for axis in self.axes for end in axis.uniform or axis.loguniform or ()]
         periods = {self._assemble(middle | trial).control_period for trial in trials}
-        if len(periods) > 1 and self.record != "metrics":
+        if len(periods) > 1 and self.record in ("decimated", "full"):
             raise ValueError("control_period: signals share their time axis; keep it, or record metrics")
         first = range(min(self.size, TRIED))
         if not any(self.valid(run) for run in first):
@@ -189,10 +204,10 @@ class Sweep(Record):
     @cached_property
     def samples(self) -> int:
         """Samples of the longest run that the store keeps; 0 where it keeps metrics only."""
-        if self.record == "metrics":
+        if self.record in ("metrics", "laps"):
             return 0
         ticks = self.base.ticks
-        if any(axis.field.startswith(("laps", "reference", "control_period")) for axis in self.axes):
+        if any(axis.field.startswith((WHOLE, "laps", "reference", "control_period")) for axis in self.axes):
             ticks = max((scenario.ticks for run in range(self.size) if (scenario := self.valid(run))), default=ticks)
         return -(-ticks // self.stride)
 
@@ -236,7 +251,10 @@ class Sweep(Record):
     def _assemble(self, values: dict[str, Any], source: str = "") -> Scenario:
         data = copy.deepcopy(self._plain)
         for field, value in values.items():
-            _put(data, field, value)
+            if field == WHOLE and isinstance(value, dict):
+                data |= value
+            else:
+                _put(data, field, value)
             if isinstance(value, dict):  # a table, completed so that later axes find its fields
                 data = Scenario.from_dict(data, source).model_dump(mode="json")
         return Scenario.from_dict(data, source)
@@ -246,8 +264,18 @@ class Sweep(Record):
         return self.base.model_dump(mode="json")
 
     @cached_property
+    def worlds(self) -> list[tuple[str, Any]]:
+        """Worlds and steering arrangements that the runs may combine."""
+        listed = {axis.field: axis.listed for axis in self.axes}
+        names = ("world", "steering")
+        pairs = set()
+        for whole in listed.get(WHOLE, ({},)):
+            pairs |= set(product(*(listed.get(n, (whole.get(n, getattr(self.base, n)),)) for n in names)))
+        return sorted(pairs)
+
+    @cached_property
     def columns(self) -> pa.Schema:
-        """Columns of the table: the run, its axes, what became of it, its metrics in the last lap."""
+        """Columns of the table: the run, its axes, what became of it, and its metrics, lap by lap too."""
         columns: dict[str, tuple[pa.DataType, str]] = {"run": (pa.int64(), "1")}
         columns |= {axis.field: (axis.type, "") for axis in self.axes}
         for name, kind, unit in (
@@ -257,6 +285,8 @@ class Sweep(Record):
         ):  # fmt: skip
             columns.setdefault(name, (kind, unit))
         columns |= {name: (pa.float64(), unit) for name, (unit, _) in METRICS.items()}
+        if self.record == "laps":
+            columns |= {f"{name}_per_lap": (pa.list_(pa.float64()), unit) for name, (unit, _) in METRICS.items()}
         return pa.schema([pa.field(name, kind, metadata={"units": u}) for name, (kind, u) in columns.items()])
 
 

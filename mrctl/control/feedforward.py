@@ -21,7 +21,10 @@ STEERING_SHARE = 0.1  # how much slower a steering channel learns: its geometry 
 class Feedforward(Protocol):
     """The stage that turns the commanded motion into voltages. Any object with these two methods is one.
 
-    A stage serves B robots; what it remembers belongs in arrays with a leading B, so that rows cannot mix.
+    A stage serves B robots; what it remembers belongs in arrays with a leading B, so that rows cannot mix. What it may
+    have besides helps the guard (`mrctl.control.guard`): `weight_norm`, a float64 array `(B,)`; `weight_volts`, what
+    weights of norm one make of features of one, in V, a number or `(B,)`; and `restore(rows)`, which takes the robots
+    with these indices back to what they began with.
     """
 
     def output(self, command: Array, derivative: Array) -> Array:
@@ -106,12 +109,16 @@ class NoFeedforward:
 
 
 class InverseDynamics:
-    """The corrected equation (3) inverted: `model` with nominal parameters, `oracle` with the plant's own."""
+    """The corrected equation (3) inverted: `model` with nominal parameters, `oracle` with the plant's own.
+
+    Attributes:
+        coefficients: Of the features in the two channels, `(B, 8, 2)`.
+    """
 
     def __init__(self, robots: Sequence[Robot], rigid: bool) -> None:
         """Takes a robot a row, and whether the second channel is steering."""
         self._half_track = np.array([robot.half_track for robot in robots])
-        self._coefficients = np.zeros((len(robots), 8, 2))
+        self.coefficients = np.zeros((len(robots), 8, 2))
         self._rigid = rigid
         self._scale = np.ones(8)
         self._features, self._output = np.zeros((len(robots), 8)), np.zeros((len(robots), 2))
@@ -121,14 +128,14 @@ class InverseDynamics:
     def set_robot(self, row: int, robot: Robot) -> None:
         """Replaces the parameters of one row."""
         self._half_track[row] = robot.half_track
-        self._coefficients[row] = inverse_coefficients(robot)
+        self.coefficients[row] = inverse_coefficients(robot)
         if self._rigid:  # the steering makes θ̇; its inverse is φ_c itself
-            self._coefficients[row, :, 1] = 0.0
+            self.coefficients[row, :, 1] = 0.0
 
     def output(self, command: Array, derivative: Array) -> Array:
         """Voltages of the inverse dynamics, before the supply limit."""
         features(command, derivative, self._half_track, self._scale, self._features)
-        linear(self._features, self._coefficients, self._output)
+        linear(self._features, self.coefficients, self._output)
         return self._output
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> None:

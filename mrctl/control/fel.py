@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numba import float64, guvectorize, njit
+from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.chain import ANY, EACH, GIVEN, OWN, one, rows, stamp
@@ -340,6 +341,7 @@ class FeedbackErrorLearning:
         state: `weights` `(B, n)`, flat.
         prior: What leak and projection refer to, `(B, n)`.
         weight_norm: Euclidean distance between the two, `(B,)`.
+        weight_volts: Output scale, `(B,)`.
     """
 
     def __init__(self, robot: Robot, settings: list[Fel], seeds: list[int], rigid: bool) -> None:
@@ -363,6 +365,12 @@ class FeedbackErrorLearning:
         )
         self.state = {"weights": self.prior.copy()}
         self.weight_norm = self._rows["norm"][:, 0]
+        self.weight_volts = np.array([s.output_scale for s in settings])
+
+    def restore(self, rows: NDArray[np.intp]) -> None:
+        """Takes robots back to their prior weights."""
+        self.state["weights"][rows] = self.prior[rows]
+        self.weight_norm[rows] = 0.0
 
     def output(self, command: Array, derivative: Array) -> Array:
         """The network at the commanded motion; never at the measured one."""

@@ -6,6 +6,7 @@ import copy
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 from torch.func import functional_call, stack_module_state, vjp, vmap
 
@@ -77,6 +78,12 @@ class ModuleLearning:
         self.prior = {name: value.detach().clone() for name, value in stacked.items()}
         self.state = {name: value.clone() for name, value in self.prior.items()}
         self.weight_norm = np.zeros(size)
+
+    def restore(self, rows: NDArray[np.intp]) -> None:
+        """Takes robots back to the module's own parameters."""
+        for name, value in self.state.items():
+            value[rows] = self.prior[name][rows]
+        self.weight_norm[rows] = 0.0
 
     def _forward(self, parameters: dict[str, torch.Tensor]) -> torch.Tensor:
         x = torch.from_numpy(self._features)

@@ -10,11 +10,14 @@ from numba import boolean, float64, njit
 from numpy.typing import NDArray
 
 from mrctl.control import steering
-from mrctl.control.chain import EACH, GIVEN, one, rows, stamp
-from mrctl.control.feedforward import Feedforward, InverseDynamics, NoFeedforward
+from mrctl.control.chain import ANY, EACH, GIVEN, OWN, one, rows, stamp
+from mrctl.control.composite import CompositeAdaptation
+from mrctl.control.feedforward import Feedforward, InverseDynamics, NoFeedforward, features, linear
 from mrctl.control.fel import FeedbackErrorLearning
+from mrctl.control.guard import UNSURE, WATCH, guard, watches
 from mrctl.control.kanayama import Kanayama, kanayama
 from mrctl.control.limiter import limit
+from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import Pid, pid
 from mrctl.control.rls import RecursiveLeastSquares
 from mrctl.control.steering import allocate
@@ -24,6 +27,8 @@ from mrctl.scenario import Scenario
 Array = NDArray[np.float64]
 
 _kanayama, _limit, _pid, _allocate = one(kanayama), one(limit), one(pid), one(allocate)
+HALF_TRACK = 4  # where it is in `steering.parameters`
+_features, _linear, _guard = one(features), one(linear), one(guard)
 
 
 # All that the hierarchy keeps of one robot: settings, memory, and what it computed last; shapes as in the laws.
@@ -34,7 +39,7 @@ STATE = np.dtype(
         ("correction", "f8", 2), ("limiter", "f8", 4), ("pid", "f8", 7), ("steering", "f8", 2), ("excess", "f8", 2),
         ("error", "f8", 3), ("request", "f8", 2), ("command", "f8", 2), ("derivative", "f8", 2),
         ("feedback", "f8", 2), ("parts", "f8", 4), ("output", "f8", 4), ("voltage", "f8", 2),
-        ("saturated", "f8", (1,)), ("idle", "f8"),
+        ("saturated", "f8", (1,)), ("idle", "f8"), ("guard", WATCH),
     ],
     align=True,
 )  # fmt: skip
@@ -59,28 +64,39 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
             _limit(wish, v, acceleration, limits, s.prefilter, period, s.limiter, s.command, s.derivative)
             _pid(s.command, twist[i], s.pid_gains, period, s.excess, s.pid, s.feedback)
 
-    @njit((GIVEN, EACH, float64, rows(STATE)), cache=True)
-    def follow(feedforward, robot, period, state):  # noqa: ANN001, ANN202
-        """Feedback and feedforward to voltages and steering; returns whether all of them are finite."""
+    @njit((GIVEN, ANY, EACH, OWN, float64, rows(STATE)), cache=True)
+    def follow(feedforward, norm, robot, inverse, period, state):  # noqa: ANN001, ANN202
+        """Feedback and feedforward to voltages and steering.
+
+        Returns whether all of them are finite, and whether a guard wants a learner to forget.
+        """
         _ = version
-        finite = True
+        finite, restore = True, False
+        ones, x, nominal = np.ones(8), np.empty(8), np.empty(2)
         for i in range(len(state)):
             s = state[i]
+            if s.guard.on > 0:
+                _features(s.command, s.derivative, robot[HALF_TRACK], ones, x)
+                _linear(x, inverse, nominal)
+            _guard(
+                s.guard, feedforward[i], nominal, s.error, norm[i], s.saturated[0], s.voltage, period, s.pid, s.feedback
+            )
+            restore |= s.guard.restore > 0
             _allocate(
-                s.command, s.derivative, s.feedback, feedforward[i], robot, period,
+                s.command, s.derivative, s.feedback, s.guard.output, robot, period,
                 s.steering, s.output, s.parts, s.excess, s.saturated,
             )  # fmt: skip
             for k in range(2):
-                s.voltage[k] = s.feedback[k] + feedforward[i, k] + s.excess[k]
-            s.idle = max(s.saturated[0], s.frozen)
+                s.voltage[k] = s.feedback[k] + s.guard.output[k] + s.excess[k]
+            s.idle = max(s.saturated[0], s.frozen, s.guard.idle)
             for k in range(4):
                 finite &= np.isfinite(s.parts[k])
-        return finite
+        return finite, restore
 
     return lead, follow
 
 
-_lead, _follow = _compile(stamp(kanayama, limit, pid, allocate))
+_lead, _follow = _compile(stamp(kanayama, limit, pid, features, guard, allocate))
 
 
 def feedforward_of(scenarios: Sequence[Scenario], robot: Robot) -> Feedforward:
@@ -91,6 +107,10 @@ def feedforward_of(scenarios: Sequence[Scenario], robot: Robot) -> Feedforward:
         return NoFeedforward(len(scenarios))
     if first.feedforward in ("model", "oracle"):  # the loop tells the oracle the truth
         return InverseDynamics([robot] * len(scenarios), rigid)
+    if first.feedforward == "observer":
+        return DisturbanceObserver(robot, [s.observer for s in scenarios], rigid, first.control_period)
+    if first.feedforward == "composite":
+        return CompositeAdaptation(robot, [s.composite for s in scenarios], rigid, first.control_period)
     if first.feedforward == "rls":
         return RecursiveLeastSquares(robot, [s.rls for s in scenarios], rigid)
     return FeedbackErrorLearning(robot, [s.fel for s in scenarios], [s.seed for s in scenarios], rigid)
@@ -106,7 +126,7 @@ TAKE_OVER = 0.5
 def _hand_over(taken, state):  # noqa: ANN001, ANN202
     for i in range(len(state)):
         for k in range(2):
-            state[i].pid[k] -= TAKE_OVER * taken[i, k]
+            state[i].pid[k] -= TAKE_OVER * state[i].guard.authority * taken[i, k]
 
 
 def _fitting(values: Array, like: Array) -> Array:
@@ -144,14 +164,20 @@ class Hierarchy:
             [robot.max_speed, robot.max_rotation, robot.max_acceleration, robot.max_rotation_acceleration]
         )
         self._parameters = steering.parameters(robot, self._rigid)
+        self._nominal = InverseDynamics([robot] * size, self._rigid)
         self.state = state = np.zeros(size, STATE)
         state["prefilter"] = [max(s.prefilter, s.control_period) for s in scenarios]
         for row, scenario in enumerate(scenarios):
             self.set_kanayama(row, scenario.kanayama)
             self.set_pid(row, scenario.pid)
+        volts = np.broadcast_to(getattr(feedforward, "weight_volts", 0.0), size)
+        state["guard"] = watches([s.guard for s in scenarios], robot.supply, robot.max_rotation, volts, self._rigid)
+        if type(feedforward) in (NoFeedforward, InverseDynamics):
+            state["guard"]["on"] = 0.0
         self.error, self.command, self.derivative = state["error"], state["command"], state["derivative"]
         self.feedback, self.parts, self.output = state["feedback"], state["parts"], state["output"]
         self.saturated, self._idle, self._voltage = state["saturated"][:, 0], state["idle"], state["voltage"]
+        self._teaching = state["guard"]["teaching"]
         self.finite = True
         self._no_weights = np.zeros(size)
 
@@ -178,8 +204,7 @@ class Hierarchy:
         self.state["limiter"][:, 2:] = twist
         self.state["steering"][:, 0] = steering_angle
         # The integral holds what the nominal robot takes here, less what the feedforward brings by itself.
-        nominal = InverseDynamics([self._robot] * len(twist), self._rigid)
-        integral = nominal.output(twist, acceleration) - self.feedforward.output(twist, acceleration)
+        integral = self._nominal.output(twist, acceleration) - self.feedforward.output(twist, acceleration)
         self.state["pid"][:, :2] = integral
 
     def update(self, pose: Array, twist: Array, reference: Array) -> Array:
@@ -197,12 +222,24 @@ class Hierarchy:
         _lead(self._tick % self._every == 0, pose, twist, reference, self._limits, self._period, state)
         self._tick += 1
         feedforward = _fitting(stage.output(self.command, self.derivative), self.feedback)
-        self.finite = _follow(feedforward, self._parameters, self._period, state)
+        self.finite, forget = _follow(
+            feedforward, self.weight_norm, self._parameters, self._nominal.coefficients[0], self._period, state
+        )
         # A robot that must not learn is treated as one whose voltage did not act.
-        taken = stage.learn(self.feedback, self._idle, twist, self._voltage)
+        taken = stage.learn(self._teaching, self._idle, twist, self._voltage)
         if taken is not None:
             _hand_over(_fitting(taken, self.feedback), state)
+        if forget:
+            self._forget()
         return self.output
+
+    def _forget(self) -> None:
+        """Takes learners that failed back to what they began with; one that cannot has to go on more slowly."""
+        rows = np.flatnonzero(self.state["guard"]["restore"])
+        if restore := getattr(self.feedforward, "restore", None):
+            restore(rows)
+        else:
+            self.state["guard"]["gain"][rows] *= UNSURE
 
     @property
     def weight_norm(self) -> Array:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import numpy as np
 from numba import float64, guvectorize
+from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features, linear
@@ -80,7 +81,10 @@ class RecursiveLeastSquares:
     Attributes:
         state: `coefficients` `(B, 8, 2)` and `covariance` `(B, 8, 8)`.
         weight_norm: Euclidean norm of the coefficients, `(B,)`.
+        weight_volts: The coefficients are in volts.
     """
+
+    weight_volts = 1.0
 
     def __init__(self, robot: Robot, settings: list[Rls], rigid: bool) -> None:
         """Takes the nominal robot (for the scales alone), settings a row, and whether channel two is steering."""
@@ -91,10 +95,16 @@ class RecursiveLeastSquares:
         self._settings = np.array([[s.drift, s.covariance_bound, s.dead_zone, share, s.step] for s in settings])
         self._features, self._output = np.zeros((size, 8)), np.zeros((size, 2))
         self.weight_norm = np.zeros(size)
+        self._covariance = np.array([s.initial_covariance * np.eye(8) for s in settings])
         self.state = {
             "coefficients": np.zeros((size, 8, 2)),
-            "covariance": np.array([s.initial_covariance * np.eye(8) for s in settings]),
+            "covariance": self._covariance.copy(),
         }
+
+    def restore(self, rows: NDArray[np.intp]) -> None:
+        """Takes robots back to the start."""
+        self.state["coefficients"][rows], self.weight_norm[rows] = 0.0, 0.0
+        self.state["covariance"][rows] = self._covariance[rows]
 
     def output(self, command: Array, derivative: Array) -> Array:
         """θᵀ features of the commanded motion."""

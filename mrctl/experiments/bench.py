@@ -105,9 +105,7 @@ def text(figures: dict[str, Any]) -> str:
         )  # fmt: skip
 
     sizes = list(figures["parts"])
-    parts = [
-        [name, *(f"{figures['parts'][size][name]:.2f}" for size in sizes)] for name in figures["parts"][sizes[0]]
-    ]
+    parts = [[name, *(f"{figures['parts'][size][name]:.2f}" for size in sizes)] for name in figures["parts"][sizes[0]]]
     exact = all(r["replayed_exactly"] for r in figures["robots"] + figures["threads"])
     return "\n\n".join(
         [
@@ -287,9 +285,7 @@ def _stopwatches() -> Iterator[dict[str, list[float]]]:
 
     with ExitStack() as stack:
         for name, (owner, attribute) in PARTS.items():
-            stack.enter_context(
-                mock.patch.object(owner, attribute, watched(getattr(owner, attribute), seconds[name]))
-            )
+            stack.enter_context(mock.patch.object(owner, attribute, watched(getattr(owner, attribute), seconds[name])))
         yield seconds
 
 

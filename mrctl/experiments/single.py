@@ -23,6 +23,7 @@ COLUMNS = {
     "feedback_share": ("RMS(U_fb)/RMS(U)", 1.0),
     "saturation_time": ("saturated, s", 1.0),
     "energy": ("energy, J", 1.0),
+    "guard_actions": ("guard acted", 1.0),
 }
 
 
@@ -59,6 +60,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool) -> str:
             plots.save(figure, out, name)
     failure = str(result["failure"].values[0])
     row = laps.isel(run=0)
+    events = metrics.guard_events(result).drop(columns="run")
     if as_json:
         values = {
             "scenario": scenario.model_dump(mode="json"),
@@ -69,6 +71,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool) -> str:
             "laps": [
                 {name: _number(row[name].values[k]) for name in metrics.METRICS} for k in range(row.sizes["lap"])
             ],
+            "guard": events.to_dict("records"),
         }
         return json.dumps(values, indent=1)
     header = ["lap", *(title for title, _ in COLUMNS.values())]
@@ -79,7 +82,8 @@ def run(scenario: Scenario, out: Path | None, as_json: bool) -> str:
     lines = [f"RMSE per lap against the reference, feedforward {scenario.feedforward}, steering {scenario.steering}"]
     if failure:
         lines.append(f"failed after {float(row['failure_time']):.2f} s: {failure}")
-    return "\n".join([*lines, markdown(header, rows)])
+    acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]
+    return "\n".join([*lines, markdown(header, rows), *(text.removesuffix(", ") for text in acted)])
 
 
 def _number(value: float) -> float | None:

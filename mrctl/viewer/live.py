@@ -114,7 +114,7 @@ class Live(Page):
             self._scene = Scene(self.server, session.simulations[0][1].model, labels)
             with self.curves:
                 self._plots = Plots(self.server.gui, labels, session.period)
-        self._scene.show_reference(first.reference)
+        self._scene.show_reference(first)
         self._scene.forget_trails()
         self._controls.show(first)
         for name, ghost in self._ghosts.items():
@@ -295,6 +295,8 @@ def _what(event: Event, before: dict[str, Any]) -> str:
                 for field in type(new).model_fields
                 if getattr(new, field) != getattr(before[name], field)
             ]
+    if event.reference is not None:
+        parts.append(f"now along a {event.reference.kind.replace('_', ' ')}")
     if event.push is not None:
         parts.append("push {:g} N, {:g} N, {:g} N·m".format(*event.push))
     if event.learning is not None:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from mrctl import model as mjcf
 from mrctl.record import InputError
-from mrctl.references import Reference
 from mrctl.robot import Perturbation
+from mrctl.scenario import Scenario
 from mrctl.viewer.recording import Recording
 
 Array = NDArray[np.float64]
@@ -122,15 +122,20 @@ class Scene:
                 ghosts.append((k, handle))
         return solid, ghosts
 
-    def show_reference(self, reference: Reference) -> None:
-        """Draws a lap of a reference on the ground."""
-        pose = reference.sample(np.linspace(0, reference.period, 401)).pose
-        line = np.column_stack([pose[:, :2], [self._height(x, y) + 0.006 for x, y in pose[:, :2]]])
-        self._reference = self._scene.add_line_segments("/world/reference", _segments(line), REFERENCE, thickness=0.025)
+    def show_reference(self, scenario: Scenario) -> None:
+        """Draws a lap of each reference of a scenario on the ground."""
+        lines = []
+        for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
+            pose = reference.sample(np.linspace(0, reference.period, 401)).pose
+            heights = [self._height(x, y) + 0.006 for x, y in pose[:, :2]]
+            lines.append(_segments(np.column_stack([pose[:, :2], heights])))
+        self._reference = self._scene.add_line_segments(
+            "/world/reference", np.concatenate(lines), REFERENCE, thickness=0.025
+        )
 
     def show_recordings(self, recordings: Sequence[Recording]) -> None:
         """Draws the reference and the ways of runs that are over."""
-        self.show_reference(recordings[0].scenario.reference)
+        self.show_reference(recordings[0].scenario)
         self.show_trails(np.stack([recording.way() for recording in recordings]))
 
     def _height(self, x: float, y: float) -> float:

@@ -72,7 +72,9 @@ def scenario(seed: int) -> Scenario:
         laps=1,
         steering=steering,
         world="flat" if alike else str(rng.choice(["flat", "flat", "flat", "slope", "rough", "patch"])),
-        feedforward="fel" if alike else str(rng.choice(["none", "model", "oracle", "fel", "rls"])),
+        feedforward="fel"
+        if alike
+        else str(rng.choice(["none", "model", "oracle", "observer", "fel", "rls", "composite"])),
         measurement=str(rng.choice(["truth", "odometry"])),
         kanayama=Kanayama(k_x=float(rng.uniform(2, 4))),
         fel=Fel(step=float(rng.uniform(0, 0.1))),
@@ -120,7 +122,7 @@ def test_scenarios_differ(scenarios, alone):
     events = [e for s in scenarios for e in s.events]
     for field in ("perturbation", "push", "kanayama", "pid", "learning"):
         assert any(getattr(e, field) is not None for e in events)
-    for field, kinds in {"world": 4, "steering": 3, "feedforward": 5, "measurement": 2, "motion_period": 2}.items():
+    for field, kinds in {"world": 4, "steering": 3, "feedforward": 7, "measurement": 2, "motion_period": 2}.items():
         assert len({getattr(s, field) for s in scenarios}) == kinds
     assert {s.perturbation.control_delay for s in scenarios} == {0, 0.01, 0.02, 0.03, 0.04}
     assert 1 <= sum(bool(run.failed) for run in alone) <= COUNT // 4

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrctl import Circle, Event, Fel, Kanayama, Line, Perturbation, Pid, Scenario, simulate
+from mrctl import Circle, Event, Fel, InputError, Kanayama, Line, Perturbation, Pid, Scenario, simulate
 from mrctl import model as mjcf
 from mrctl.dynamics import inverse_coefficients
 from mrctl.result import SIGNALS
@@ -99,7 +99,7 @@ def test_oracle_follows():
         stage, truth = simulation.hierarchy.feedforward, simulation.plant.truth
         assert (truth[0] != simulation.plant.robot) == changed and truth[1] == simulation.plant.robot
         for row in range(2):
-            assert np.array_equal(stage._coefficients[row], inverse_coefficients(truth[row]))
+            assert np.array_equal(stage.coefficients[row], inverse_coefficients(truth[row]))
 
 
 def test_oracle_is_better():
@@ -146,6 +146,27 @@ def test_gains():
         assert hierarchy.state["kanayama"][0, 0] == (9 if tick >= 2 else 3)
         gains = Pid(time_constant=0.3 if tick >= 2 else 0.15).gains(simulation.plant.robot, False)
         assert np.array_equal(hierarchy.state["pid_gains"][0], gains)
+
+
+def test_reference():
+    """From the event on the robot is shown the new reference from its own start, and follows it."""
+    other = Circle(period=5, radius=0.7, clockwise=True)
+    event = Event(time=4.0, reference=other)
+    changed, plain = (simulate(with_events(*e, laps=3, initial_spread=(0, 0, 0))) for e in ((event,), ()))
+    assert first_difference(changed, plain) == 400
+    motion = other.sample(PERIOD * np.arange(800))
+    for name, column in (("x_ref", motion.pose[:, 0]), ("theta_ref", motion.pose[:, 2]), ("v_ref", motion.twist[:, 0])):
+        np.testing.assert_array_equal(changed[name][400:], column)
+    assert np.hypot(changed.x - changed.x_ref, changed.y - changed.y_ref)[-100:].max() < 0.02
+    together = simulate([with_events(*e, laps=3, initial_spread=(0, 0, 0)) for e in ((event,), (), (event,))])
+    for k, one in enumerate((changed, plain, changed)):
+        assert first_difference(together.isel(run=k), one) == 1200
+
+
+def test_impossible_reference():
+    """A new reference is held to the robot's limits as the first one is, before anything runs."""
+    with pytest.raises(InputError, match="max_speed"):
+        Simulation([with_events(Event(time=9, reference=Circle(period=0.5)))])
 
 
 def test_frozen_from_the_start():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrctl import Circle, Event, Line, Perturbation, Scenario, simulate
+from mrctl import Circle, Event, Guard, Line, Perturbation, Scenario, simulate
 from mrctl.control.feedforward import NoFeedforward
 from mrctl.result import SIGNALS
 
@@ -90,8 +90,9 @@ def test_alone(kind):
 
 
 def test_non_finite_stage():
-    """A user's stage that breaks in one row stops that row, not with full voltage, and no other."""
-    whole, sound = simulate(HEALTHY, BreaksAfter), simulate(HEALTHY, lambda robot, size: NoFeedforward(size))
+    """Without the guard, a user's stage that breaks in one row stops that row, not with full voltage, and no other."""
+    bare = [scenario.model_copy(update={"guard": Guard(on=False)}) for scenario in HEALTHY]
+    whole, sound = simulate(bare, BreaksAfter), simulate(bare, lambda robot, size: NoFeedforward(size))
     check_record(whole.isel(run=1), "non-finite voltage")
     assert float(whole.failure_time[1]) == pytest.approx(1.0, abs=2 * PERIOD)
     for run in (0, 2):

@@ -168,8 +168,9 @@ class Integrator:
 def test_foretells_instability(steering, channel):
     """Behind 40 ms, learning settles at 0.7 of the step that T allows, and oscillates for ever at 1.3 of it."""
     scenario = mrctl.Scenario(
-        steering=steering, reference=mrctl.Line(length=24), laps=1, perturbation=mrctl.Perturbation(control_delay=0.04)
-    )
+        steering=steering, reference=mrctl.Line(length=24), laps=1, perturbation=mrctl.Perturbation(control_delay=0.04),
+        guard=mrctl.Guard(on=False),
+    )  # fmt: skip
     frequency, (t,) = measure([scenario], channel)
     limit = safety(*refine(frequency, t), H).step
     result = mrctl.simulate([scenario] * 2, lambda robot, size: Integrator([0.7 * limit, 1.3 * limit], channel))

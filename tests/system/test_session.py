@@ -101,3 +101,31 @@ def test_stopped_robot():
 def test_must_share():
     with pytest.raises(InputError, match="world"):
         Session([BASE, BASE.model_copy(update={"world": "patch"})])
+
+
+def test_new_reference():
+    """Another course from a moment on, added under way and brought along by the file, over a boundary of blocks."""
+    session = Session([BASE, BASE.model_copy(update={"feedforward": "none"})])
+    drive(session, 200)
+    event = Event(time=2.5, reference=Circle(radius=0.5, period=5.0, clockwise=True))
+    for _, simulation in session.simulations:
+        simulation.add(event)
+    drive(session, 300)
+    results = simulate(session.saved())
+    same(session, [results.isel(run=k) for k in range(2)])
+    assert abs(results.omega_ref.values[0, 240] - 2 * np.pi / 4) < 1e-9
+    assert abs(results.omega_ref.values[0, 260] + 2 * np.pi / 5) < 1e-9
+
+
+def test_blocks(monkeypatch):
+    """References sampled in blocks of any length are the same."""
+    event = Event(time=1.3, reference=Circle(radius=0.5, period=5.0))
+    scenarios = [
+        BASE.model_copy(update={"events": (event,)}),
+        BASE.model_copy(update={"reference": Circle(radius=0.6, period=4)}),
+    ]
+    whole = simulate(scenarios)
+    monkeypatch.setattr("mrctl.simulate.BLOCK", 97)
+    parts = simulate(scenarios)
+    for name in ("x_ref", "omega_ref", "x", "voltage_left"):
+        assert parts[name].values.tobytes() == whole[name].values.tobytes()

@@ -135,6 +135,22 @@ def test_metrics_only(file, tmp_path):
     assert not (tmp_path / "store" / "signals.zarr").exists()
 
 
+def test_every_lap(tmp_path):
+    """A store of laps opens as what `per_lap` returns, shorter runs ending in NaN; a run of it repeats."""
+    axes = [{"field": "laps", "values": [1, 3]}, {"field": "perturbation.mass_factor", "values": [1.0, 1.5]}]
+    base = {"feedforward": "none", "reference": {"kind": "line", "length": 0.8}}
+    sweep = Sweep.from_dict({"base": base, "axes": axes, "record": "laps", "chunk": 2})
+    jobs.run(sweep, tmp_path / "store", 1)
+    opened = mrctl.open(tmp_path / "store")
+    direct = mrctl.per_lap(simulate([sweep.scenario(run) for run in range(4)]))
+    for name in mrctl.metrics.METRICS:
+        np.testing.assert_array_equal(opened[name], direct[name])
+        assert opened[name].attrs["units"] == direct[name].attrs["units"]
+    assert opened["laps"].values.tolist() == [1, 1, 3, 3] and opened["lap"].values.tolist() == [1, 2, 3]
+    pd.testing.assert_frame_equal(mrctl.summary(opened), mrctl.summary(direct), check_dtype=False)
+    assert jobs.repeat(tmp_path / "store", 3) == ("bit-identical", True)
+
+
 def test_full_with_runs_of_different_length(tmp_path):
     """Shorter runs end in NaN; a run that diverges says when and why and costs only itself."""
     push = {"time": 0.5, "push": [4000.0, 4000.0, 0.0]}
@@ -293,9 +309,7 @@ def small_files(path, job):
     return compute(path, job)
 
 
-@pytest.mark.parametrize(
-    ("work", "reason"), [(full_disk, "No space left on device"), (small_files, "File too large")]
-)
+@pytest.mark.parametrize(("work", "reason"), [(full_disk, "No space left on device"), (small_files, "File too large")])
 def test_disk_full(file, sweep, tmp_path, whole, capsys, work, reason):
     """One line; what was done is kept, nothing half-written counts, and the sweep goes on when there is space."""
     store = tmp_path / "store"

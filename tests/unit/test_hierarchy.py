@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from mrctl.control.composite import CompositeAdaptation
 from mrctl.control.feedforward import InverseDynamics, NoFeedforward
 from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.hierarchy import TAKE_OVER, Hierarchy, feedforward_of
 from mrctl.control.kanayama import Kanayama, kanayama
+from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import Pid
 from mrctl.control.rls import RecursiveLeastSquares
 from mrctl.dynamics import inverse_dynamics
@@ -49,14 +51,15 @@ def drive(hierarchy, inputs):
     ("name", "kind"),
     [
         ("none", NoFeedforward), ("model", InverseDynamics), ("oracle", InverseDynamics),
-        ("fel", FeedbackErrorLearning), ("rls", RecursiveLeastSquares),
+        ("observer", DisturbanceObserver), ("fel", FeedbackErrorLearning), ("rls", RecursiveLeastSquares),
+        ("composite", CompositeAdaptation),
     ],
 )  # fmt: skip
 def test_feedforwards(robot, name, kind):
-    """Each name is its law; `model` and `oracle` alone give something before they have learned."""
+    """Each name is its law; those that know the model give something before they have learned."""
     stage = build(robot, 2, feedforward=name).feedforward
     assert type(stage) is kind
-    assert stage.output(np.ones((2, 2)), np.ones((2, 2))).any() == (name in ("model", "oracle"))
+    assert stage.output(np.ones((2, 2)), np.ones((2, 2))).any() == (name not in ("none", "fel", "rls"))
 
 
 @pytest.mark.parametrize("name", ["model", "oracle"])
@@ -107,7 +110,7 @@ def test_motion_rate(robot, every):
 def test_rows(robot, name, steering):
     """Through the whole hierarchy robots keep to themselves: each has the same bits alone and among others."""
     body = robot.model_copy(update={"trail": 0.0}) if steering == "rigid" else robot
-    inputs = signals(3, 60)
+    inputs = signals(3, 120)
     scenarios = [Scenario(feedforward=name, steering=steering, seed=seed) for seed in range(3)]
 
     def answer(rows):
@@ -124,22 +127,23 @@ def test_rows(robot, name, steering):
         assert array.shape[0] == 3  # what is remembered has a leading B
     for array in (hierarchy.output, hierarchy.parts, hierarchy.weight_norm, hierarchy.saturated):
         assert array.shape[0] == 3
-    assert (hierarchy.weight_norm > 0).all() == (name in ("fel", "rls"))
+    assert (hierarchy.weight_norm > 0).all() == (name in ("fel", "rls", "composite"))
 
 
-@pytest.mark.parametrize("name", ["fel", "rls"])
+@pytest.mark.parametrize("name", ["fel", "rls", "composite"])
 def test_learning_switch(robot, name):
     """Switched off, a robot keeps its weights while its neighbour learns; switched on again, it goes on."""
     hierarchy = build(robot, 2, feedforward=name)
-    key = {"fel": "weights", "rls": "coefficients"}[name]
-    inputs = signals(2, 90)
-    early, middle, late = ([signal[part] for signal in inputs] for part in np.split(np.arange(90), 3))
+    key = "coefficients" if name == "rls" else "weights"
+    kept = slice(26) if name == "composite" else slice(None)  # a disturbance fades, the weights stay
+    inputs = signals(2, 360)
+    early, middle, late = ([signal[part] for signal in inputs] for part in np.split(np.arange(360), 3))
     drive(hierarchy, early)
     learned = hierarchy.feedforward.state[key].copy()
     norm = hierarchy.weight_norm.copy()
     hierarchy.set_learning(0, False)
     drive(hierarchy, middle)
-    np.testing.assert_array_equal(hierarchy.feedforward.state[key][0], learned[0])
+    np.testing.assert_array_equal(hierarchy.feedforward.state[key][0, ..., kept], learned[0, ..., kept])
     assert (hierarchy.feedforward.state[key][1] != learned[1]).any()
     assert hierarchy.weight_norm[0] == norm[0] != hierarchy.weight_norm[1]
     hierarchy.set_learning(0, True)

@@ -15,10 +15,10 @@ LAYERS = (
     {"record", "robot", "kinematics", "dynamics"},
     {"laws", "references"},
     {"scenario"},
-    {"control.hierarchy", "measurement", "metrics", "plots", "result"},
+    {"control.hierarchy", "measurement", "comparison", "metrics", "plots", "result"},
     {"model", "plant"},
     {"simulate", "checks"},
-    {"experiments", "sweep", "store", "pool", "jobs", "viewer", "environment"},
+    {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment"},
     {"cli"},
 )
 ENGINE = {"model", "plant", "checks", "viewer", "environment", "experiments"}

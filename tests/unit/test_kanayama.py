@@ -54,9 +54,7 @@ def test_published_law():
     """One value by hand: a robot turned by 90° that stands 0.1 m ahead of and 0.2 m right of its reference."""
     error, request = kanayama([1.0, 1.0, np.pi / 2], [0.8, 0.9, np.pi / 6], [0.5, 0.3], [10.0, 64.0, 16.0])
     np.testing.assert_allclose(error, [-0.1, 0.2, -np.pi / 3], atol=1e-12)
-    np.testing.assert_allclose(
-        request, [0.5 * 0.5 - 1.0, 0.3 + 0.5 * (64 * 0.2 - 16 * np.sqrt(3) / 2)], atol=1e-12
-    )
+    np.testing.assert_allclose(request, [0.5 * 0.5 - 1.0, 0.3 + 0.5 * (64 * 0.2 - 16 * np.sqrt(3) / 2)], atol=1e-12)
 
 
 @given(

@@ -59,6 +59,7 @@ def test_odometry_order():
 
 def test_odometry_of_a_varying_twist():
     """A twist that changes is taken at the middle of the period: second order too."""
+
     def end(h):
         pose, twist = np.zeros(3), np.array([0.5, 0.0])
         for t in h * np.arange(1, round(2 / h) + 1):

@@ -285,6 +285,19 @@ def test_factor(perturbation, expected):
     assert changes(**perturbation) == pytest.approx(expected)
 
 
+def test_one_tyre_on_ice():
+    """The left tyre loses its grip on every floor, the others keep theirs; all of them together multiply."""
+    nominal = mjcf.load("patch")
+    pairs = [nominal.pair(k).name or "tyre" for k in range(nominal.npair)]
+    left = [nominal.geom("wheel_left").id in (nominal.pair_geom1[k], nominal.pair_geom2[k]) for k in range(len(pairs))]
+    assert sum(left) == 5
+    model = mjcf.clone(nominal)
+    mjcf.perturb(nominal, model, Perturbation(left_tyre_friction_factor=0.2, tyre_friction_factor=0.5))
+    expected = nominal.pair_friction[:, :2] * np.where(left, 0.1, 0.5)[:, None]
+    assert model.pair_friction[:, :2] == pytest.approx(expected)
+    assert np.array_equal(model.pair_friction[:, 2:], nominal.pair_friction[:, 2:])
+
+
 def test_drive_friction():
     """τ_loss grows, rolling does not; without any, nothing but rolling is left."""
     for factor in (0.0, 3.0, 20.0):

@@ -190,6 +190,43 @@ def test_drawings(draw, words):
             assert not box.overlaps(boxes[other]), (axes.texts[number].get_text(), axes.texts[other].get_text())
 
 
+def test_laps_by_case():
+    """A panel a case, a line a label through the means of its runs, their range behind it; dots where things change."""
+    laps = {title: metrics.per_lap(make(["none", "fel", "fel"])) for title in ("nominal", "all", "ice")}
+    laps["ice"]["energy"][:] = np.nan
+    figure = plots.laps_by_case(laps, "energy", changes=(2,))
+    assert [axes.get_title() for axes in figure.axes] == [*laps] and legend(figure) == ["none", "fel"]
+    first, _, empty = figure.axes
+    energy = laps["nominal"]["energy"].values
+    assert drawn(first, [1, 2, 3], energy[0]) and drawn(first, [1, 2, 3], energy[1:].mean(0))
+    band = first.collections[1].get_paths()[0].vertices[:, 1]
+    assert (band.min(), band.max()) == (energy[1:].min(), energy[1:].max())
+    assert [line.get_xdata() for line in empty.lines] == [[1.5, 1.5]]
+    assert "(J)" in first.get_ylabel()
+
+
+def test_distributions():
+    """The share of all runs, so that one that failed keeps its line below one."""
+    figure = plots.distributions({"fel": np.array([3.0, np.nan, 1.0, 2.0])}, "ratio")
+    (axes,) = figure.axes
+    np.testing.assert_array_equal(axes.lines[0].get_xydata(), [[1, 0.25], [2, 0.5], [3, 0.75]])
+    assert legend(figure) == ["fel"]
+
+
+def test_inverse_dynamics():
+    """True, learned and their difference for both channels, each in its panel."""
+    v, omega = np.linspace(0, 1, 4), np.linspace(-1, 1, 5)
+    learned, true = np.random.default_rng(0).normal(size=(2, 5, 4, 2))
+    figure = plots.inverse_dynamics({"fel": plots.InverseMap(v, omega, learned, true, np.zeros((9, 2)))})
+    shown = [axes.collections[0].get_array().reshape(5, 4) for axes in figure.axes[:6]]
+    for channel in range(2):
+        expected = (true[..., channel], learned[..., channel], learned[..., channel] - true[..., channel])
+        for panel, values in zip(shown[3 * channel :], expected, strict=False):
+            np.testing.assert_array_equal(panel, values)
+    assert all("(V)" in axes.get_title() for axes in figure.axes[:6])
+    assert all(axes.get_xlabel() == "$V$ (m/s)" for axes in figure.axes[:6])
+
+
 def test_save(tmp_path):
     """PNG and PDF are written into a new folder; the PNG is not blank, and 180 mm at 200 dpi."""
     png, pdf = plots.save(plots.control_structure(), tmp_path / "new" / "folder", "figure3")
@@ -225,6 +262,9 @@ def test_leaves_settings_alone():
         (lambda r: plots.errors(r, window=(0, 1), lap=1), "window"),
         (lambda r: plots.learning_curve(r, ["speed"]), "metric"),
         (lambda r: plots.learning_curve(r, []), "metrics"),
+        (lambda r: plots.laps_by_case({"a": r}, "speed"), "metric"),
+        (lambda r: plots.laps_by_case({}, "energy"), "cases"),
+        (lambda r: plots.inverse_dynamics({}), "maps"),
     ],
 )
 def test_bad_input(call, field):

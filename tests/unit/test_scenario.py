@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mrctl import Event, Fel, Kanayama, Perturbation, Pid, Rls, Scenario, simulate
+from mrctl import Composite, Event, Fel, Kanayama, Observer, Perturbation, Pid, Rls, Scenario, simulate
 from mrctl.control.feedforward import NoFeedforward
 from mrctl.record import InputError
 from mrctl.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
@@ -18,7 +18,16 @@ values = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.floats(0, 1) | st.text(max_size=5)
     | st.sampled_from(["flat", "rigid", "fel", "truth", [], {}, [0.1, 0.2, 0.3], [{}], [{"time": 1}]])
 )  # fmt: skip
-PARTS = {"kanayama": Kanayama, "pid": Pid, "fel": Fel, "rls": Rls, "perturbation": Perturbation, "events": Event}
+PARTS = {
+    "kanayama": Kanayama,
+    "pid": Pid,
+    "fel": Fel,
+    "rls": Rls,
+    "observer": Observer,
+    "composite": Composite,
+    "perturbation": Perturbation,
+    "events": Event,
+}
 parts = st.sampled_from(
     [(name,) for name in Scenario.model_fields]
     + [(part, name) for part, kind in PARTS.items() for name in kind.model_fields]
@@ -265,7 +274,7 @@ def test_order():
         for seed, (kind, steering, period) in enumerate(kinds)
     ]
     whole_result = simulate(scenarios)
-    assert whole_result.sizes == {"run": 5, "time": 500, "weight": 282}
+    assert whole_result.sizes == {"run": 5, "time": 500, "weight": 282, "feature": 8}
     assert list(whole_result.seed) == list(range(5)) == list(whole_result.run)
     assert list(whole_result.label.values) == [s.name for s in scenarios]
     assert list(whole_result.feedforward.values) == [s.feedforward for s in scenarios]

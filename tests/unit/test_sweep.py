@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from mrctl import Circle, InputError, Perturbation, Scenario, Sweep
+from mrctl import Circle, Event, InputError, Perturbation, Scenario, Sweep
 from mrctl import store as folder
 from mrctl.result import SIGNALS
 
@@ -219,6 +219,30 @@ def test_columns():
     assert kinds == [pa.int64(), pa.float64(), pa.string(), pa.float64()]
     assert one.axes[-1].cell({"slope": 0.1}) == '{"slope": 0.1}' and one.axes[2].cell("fel") == "fel"
     assert one.columns.names.count("laps") == 1 and one.columns.field("energy").metadata == {b"units": b"J"}
+
+
+def test_list_of_scenarios():
+    """Run i of a list is its i-th scenario, whatever it changes, seed and events included."""
+    step = Event(time=0.2, perturbation=Perturbation(payload=3), reference=Circle(period=9))
+    scenarios = [
+        Scenario(), Scenario(seed=7, laps=2, name="a", feedforward="rls"), Scenario(reference=Circle(), events=(step,)),
+        Scenario(world="rough", steering="rigid", control_period=0.02, motion_period=0.02, prefilter=0.1),
+    ]  # fmt: skip
+    one = Sweep.of(scenarios, record="laps", chunk=3)
+    assert [one.scenario(run) for run in range(one.size)] == scenarios
+    assert one.worlds == [("flat", "compliant"), ("rough", "rigid")] and one.samples == 0
+    assert Sweep.from_dict(one.model_dump(mode="json")) == one
+
+
+def test_scenario_axis_combines_with_others():
+    """What a table leaves out is the base's or another axis's; what it says replaces the whole field."""
+    tables = [{"perturbation": {"slope": 0.1}}, {"laps": 3}]
+    one = sweep({"field": "scenario", "values": tables}, LAWS, base={**BASE, "perturbation": {"payload": 2.0}})
+    found = [one.scenario(run) for run in range(one.size)]
+    assert [s.feedforward for s in found] == ["none", "model", "fel"] * 2
+    assert {(s.perturbation.slope, s.perturbation.payload, s.laps) for s in found} == {(0.1, 0.0, 1), (0.0, 2.0, 3)}
+    with pytest.raises(InputError, match="laps"):
+        sweep({"field": "scenario", "values": [{"laps": 0}]})
 
 
 def test_toml(tmp_path):

@@ -1,0 +1,193 @@
+"""What the suite drives: named cases, each a list of scenarios that every feedforward runs; and what comes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from mrctl import model as mjcf
+from mrctl.control.pid import PIDS
+from mrctl.record import InputError
+from mrctl.references import Lemniscate, Waypoints
+from mrctl.robot import GRAVITY, PERTURBATIONS, Perturbation, Robot
+from mrctl.scenario import STEERINGS, Event, Scenario
+
+LADDER = ("nominal", "mass +50 %", "supply -20 %", "all")  # of every steering arrangement
+STEPS = (
+    "mass +50 %", "payload ahead", "payload aside", "left wheel +5 %", "drive friction x3", "resistance +30 %",
+    "motor constant -15 %", "supply -20 %", "delay 20 ms", "tyre friction 0.2", "left tyre on ice", "slope 10°", "all",
+)  # fmt: skip
+SHORT, LONG = 12.0, 18.0  # s a lap: the benchmark's, and a slower one to learn on
+LAP_TIMES = (12.0, 16.0, 20.0, 24.0, 30.0)  # s, of random splines: few, so that many run in one batch
+RANDOM_LAPS = 4
+MARGIN = 0.8  # of its limits that a random spline may ask of the robot
+GRIP = 0.3  # tyre friction that it relies on
+
+
+BAND = 1.2  # times the error before a step, within which a robot has recovered
+
+
+class Case(NamedTuple):
+    """Runs that belong together."""
+
+    name: str
+    part: str
+    """One of `PARTS`."""
+    scenarios: tuple[Scenario, ...]
+    """Without feedforward."""
+    change: int = 0
+    """The lap in whose beginning something changes, from 1; 0 if nothing does."""
+    back: int = 0
+    """The lap in whose beginning it changes back."""
+
+
+Laps = Mapping[str, xr.Dataset]
+"""Metrics lap by lap of all runs, `(run, lap)`, by feedforward."""
+
+
+class Outcome(NamedTuple):
+    """What a suite found."""
+
+    quick: bool
+    cases: Sequence[Case]
+    laps: Laps
+    runs: Mapping[str, Laps]
+    """The laps of each case."""
+    rows: Sequence[dict[str, Any]]
+    """A case and feedforward each; see `suite.compare`."""
+    aside: str
+    """Runs that could not be done, and why, or ""."""
+
+
+PARTS = {
+    "steady": "One thing wrong from the start",
+    "step": "A step, and the return",
+    "learning": "Learning switched on, and off",
+    "steering": "Other steering arrangements",
+    "random": "Random robots, splines and perturbations",
+}
+
+
+def cases(seeds: int, random: int, quick: bool) -> list[Case]:
+    """The cases of the suite, the longest runs first.
+
+    Args:
+        seeds: Runs of each case, the same seeds in all.
+        random: Random scenarios.
+        quick: A selection with fewer laps.
+    """
+    laps, third = (4, 2) if quick else (8, 4)
+    base = Scenario(laps=laps)
+    found: list[Case] = []
+
+    def add(part: str, name: str, change: int = 0, back: int = 0, **fields: Any) -> None:  # noqa: ANN401
+        changed = base.model_copy(update=fields)
+        runs = tuple(changed.model_copy(update={"name": name, "seed": seed}) for seed in range(seeds))
+        found.append(Case(name, part, runs, change, back))
+
+    for name in ("supply -20 %", "payload ahead") if quick else STEPS:
+        events = (
+            Event(time=third * SHORT, perturbation=PERTURBATIONS[name]),
+            Event(time=2 * third * SHORT, perturbation=Perturbation()),
+        )
+        add("step", f"{name}, on and off", third + 1, 2 * third + 1, laps=3 * third, events=events)
+    for name in ("nominal", "all"):
+        frozen = Event(time=third * LONG, learning=False, reference=Lemniscate(period=SHORT))
+        slow = Lemniscate(period=LONG)
+        case = {"reference": slow, "laps": third + 2, "events": (frozen,), "perturbation": PERTURBATIONS[name]}
+        add("learning", f"{name}, frozen on laps half as fast again", third + 1, **case)
+        half = laps // 2
+        events = (Event(time=0.0, learning=False), Event(time=half * SHORT, learning=True))
+        add("learning", f"{name}, learning from half time", half + 1, perturbation=PERTURBATIONS[name], events=events)
+    for name in (*LADDER, "delay 20 ms") if quick else PERTURBATIONS:
+        add("steady", name, perturbation=PERTURBATIONS[name])
+    if not quick:
+        add("steady", "odometry", measurement="odometry")
+        for name in ("nominal", "all"):
+            add("steady", f"{name}, PID twice as fast", perturbation=PERTURBATIONS[name], pid=PIDS["fast"])
+        add("steady", "patch of ice", world="patch")
+        add("steady", "rough ground", world="rough")
+        for steering in STEERINGS[1:]:
+            for name in LADDER:
+                add("steering", f"{steering}, {name}", steering=steering, perturbation=PERTURBATIONS[name])
+    if random:
+        found.append(Case("random", "random", tuple(random_scenarios(random))))
+    return found
+
+
+def random_scenarios(count: int) -> list[Scenario]:
+    """The first of an endless list of random scenarios, each a pure function of its place."""
+    robot = mjcf.read_robot(mjcf.load())
+    return sorted((random_scenario(seed, robot) for seed in range(count)), key=lambda s: s.ticks)
+
+
+def random_scenario(seed: int, robot: Robot) -> Scenario:
+    """A random robot on a random closed spline with a random perturbation, from the start or as a step.
+
+    Args:
+        seed: Of everything, the scenario's own seed too.
+        robot: The nominal one, for its limits.
+    """
+    random = np.random.default_rng([seed, 3])
+    body = {
+        f"{name}_factor": round(random.uniform(0.5, 1.5), 4)
+        for name in ("mass", "inertia", "drive_friction", "resistance", "motor_constant")
+    }
+    plain, kind = Perturbation(**body), random.choice(list(_KINDS))
+    disturbed = plain.model_copy(update=_KINDS[kind](random))
+    reference = _spline(random, robot)
+    lap = int(random.integers(RANDOM_LAPS - 1))
+    events = (Event(time=lap * reference.period, perturbation=disturbed),)
+    return Scenario(
+        name=f"random {seed}: {kind}", seed=seed, laps=RANDOM_LAPS, reference=reference,
+        perturbation=plain if lap else disturbed, events=events if lap else (),
+    )  # fmt: skip
+
+
+# A payload of 6 kg at these places tips no robot of half the mass.
+_KINDS = {
+    "payload": lambda r: {
+        "payload": r.uniform(0, 6), "payload_x": r.uniform(-0.1, 0.3), "payload_y": r.uniform(-0.12, 0.12)
+    },
+    "supply": lambda r: {"supply_factor": r.uniform(0.7, 1.0)},
+    "wheel": lambda r: {"left_radius_factor": r.uniform(0.95, 1.05)},
+    "delay": lambda r: {"control_delay": 0.01 * r.integers(1, 4)},
+    "grip": lambda r: {"tyre_friction_factor": r.uniform(0.4, 1.0)},
+    "ice": lambda r: {"left_tyre_friction_factor": r.uniform(0.1, 0.5)},
+    "slope": lambda r: {"slope": r.uniform(-0.17, 0.17)},
+    "noise": lambda r: {"velocity_noise": r.uniform(0, 0.02), "rotation_noise": r.uniform(0, 0.04)},
+}  # fmt: skip
+
+
+def _spline(random: np.random.Generator, robot: Robot) -> Waypoints:
+    """A closed loop around the origin, driven as fast as leaves a margin to the robot's limits, or a step slower."""
+    while True:
+        count = int(random.integers(4, 9))
+        angles = 2 * np.pi * (np.arange(count) + random.uniform(-0.25, 0.25, count)) / count
+        radii = random.uniform(0.9, 2.0, count)
+        points = [*zip(*(np.round(radii * f(angles), 3).tolist() for f in (np.cos, np.sin)), strict=True)]
+        slower = int(random.integers(2))
+        if random.random() < 0.5:  # the other way round
+            points.reverse()
+        try:
+            loop = Waypoints.from_dict({"points": points})
+        except InputError:  # it turns on the spot
+            continue
+        length = loop.period * loop.speed
+        times = [time for time in LAP_TIMES if length / time <= _fastest(loop, robot)]
+        if times:
+            return loop.model_copy(update={"speed": length / times[min(slower, len(times) - 1)]})
+
+
+def _fastest(loop: Waypoints, robot: Robot) -> float:
+    """The highest speed in m/s that leaves a margin; θ̇ and the lateral acceleration grow with it and its square."""
+    _, twist, acceleration = loop.sample(np.linspace(0, loop.period, 2001))
+    curvature = float(np.abs(twist[:, 1]).max()) / loop.speed
+    sharpness = float(np.abs(acceleration[:, 1]).max()) / loop.speed**2
+    if curvature > np.tan(MARGIN * robot.steering_limit) / robot.wheelbase:
+        return 0.0
+    turning = MARGIN * robot.max_rotation / curvature, np.sqrt(MARGIN * robot.max_rotation_acceleration / sharpness)
+    return min(MARGIN * robot.max_speed, *turning, np.sqrt(GRIP * GRAVITY / curvature))

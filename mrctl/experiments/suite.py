@@ -1,0 +1,211 @@
+"""`mrctl suite`: every feedforward over every case, with paired seeds; tables, figures and a report of it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from mrctl import controller, jobs, metrics
+from mrctl.comparison import bootstrap_interval, cvar, paired_ratio, superiority
+from mrctl.experiments import report
+from mrctl.experiments.cases import BAND, PARTS, Case, Laps, Outcome, cases
+from mrctl.experiments.tables import markdown, number, output_folder, write_json
+from mrctl.record import InputError
+from mrctl.result import versions
+from mrctl.scenario import FeedforwardName, Scenario
+from mrctl.store import open_store
+from mrctl.sweep import Sweep
+
+COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
+RIVALS = {"none": "PID", "model": "model"}
+CHUNK = 32  # runs in a job: enough for a batch, and few that a worker waits for at the end
+
+
+def suite(
+    feedforwards: Sequence[FeedforwardName],
+    controllers: Sequence[str],
+    seeds: int,
+    random: int,
+    quick: bool,
+    workers: int | None,
+    out: Path,
+) -> Outcome:
+    """Runs what is left of the suite and writes `table.md`, `table.json`, figures and `report.html`.
+
+    Args:
+        feedforwards: Which to compare.
+        controllers: Feedforwards of your own, as `my_file.py:MyController`.
+        seeds: Runs of each case, seeds 0 to `seeds` − 1 for everyone.
+        random: How many random scenarios.
+        quick: A selection with fewer laps.
+        workers: Processes, by default one a core.
+        out: Folder; the runs of each feedforward are a store of their own in it, under `runs`.
+
+    Raises:
+        InputError: No feedforward, no seed, a bad controller, or a folder that cannot be written or holds other runs.
+    """
+    if seeds < 1 or random < 0 or not (feedforwards or controllers):
+        raise InputError("seeds: at least one run of at least one feedforward")
+    who: dict[str, dict[str, Any]] = {name: {"feedforward": name} for name in feedforwards}
+    for one in controllers:
+        file, name = controller.split(one)
+        if name in who:
+            raise InputError(f"controller: the name {name} is taken")
+        who[name] = {"controller": f"{file}:{name}"}
+        controller.trial(who[name]["controller"], Scenario(laps=1))
+    output_folder(out)
+    chosen = cases(seeds, random, quick)
+    laps, aside = run(chosen, who, workers, out / "runs")
+    runs = runs_of(chosen, laps)
+    rows = compare(chosen, runs)
+    found = Outcome(quick, chosen, laps, runs, rows, aside)
+    tables = as_markdown(rows)
+    (out / "table.md").write_text("\n\n".join(f"## {title}\n\n{text}" for title, text in tables.items()) + "\n")
+    write_json(out / "table.json", {"versions": versions(), "rows": rows, "runs": each_run(runs)})
+    report.write(found, who, tables, out)
+    return found
+
+
+def run(chosen: Sequence[Case], who: Mapping[str, dict[str, Any]], workers: int | None, out: Path) -> tuple[Laps, str]:
+    """Runs every case under every feedforward, or what is left of it; each feedforward is a sweep with its own store.
+
+    Returns:
+        The laps, and what could not be done.
+    """
+    laps, aside = {}, []
+    for place, (name, choice) in enumerate(who.items(), 1):
+        feedforward = {"feedforward": choice.get("feedforward", "none")}
+        scenarios = [s.model_copy(update=feedforward) for case in chosen for s in case.scenarios]
+        chunk = min(CHUNK, -(-len(scenarios) // 4))
+        sweep = Sweep.of(scenarios, record="laps", chunk=chunk, controller=choice.get("controller"))
+        print(f"{name} ({place} of {len(who)})", file=sys.stderr)
+        ended = jobs.run(sweep, out / name, workers, progress=True)
+        laps[name] = open_store(out / name)
+        if ended.aside:
+            lost, why = sum(map(len, ended.aside)), next(iter(ended.aside.values()))
+            aside.append(f"{lost} runs of {name} could not be done ({why})")
+    return laps, "; ".join(aside)
+
+
+def runs_of(chosen: Sequence[Case], laps: Laps) -> dict[str, Laps]:
+    """The runs of each case, by feedforward; a run that could not be done has its laps too, all NaN."""
+    found: dict[str, Laps] = {}
+    end = 0
+    for case in chosen:
+        start, end, count = end, end + len(case.scenarios), case.scenarios[0].laps
+        number, counts = np.arange(1, count + 1), ("run", [count] * len(case.scenarios))
+        own = {name: one.isel(run=slice(start, end)).reindex(lap=number) for name, one in laps.items()}
+        found[case.name] = {name: one.assign(laps=counts) for name, one in own.items()}
+    return found
+
+
+def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str, Any]]:
+    """What the tables show: a row a case and feedforward, in the order of `PARTS`.
+
+    Of the last lap: mean with 95 % bootstrap interval, the worst 5 % (infinite where a run failed), ratio to and
+    probability of beating PID and `model` in the same run. Of a step: see `_step`.
+    """
+    rows = []
+    for case in sorted(chosen, key=lambda case: [*PARTS].index(case.part)):
+        ends = {name: metrics.summary(own) for name, own in found[case.name].items()}
+        for name, own in ends.items():
+            failed = own["failed"].to_numpy(bool)
+            row: dict[str, Any] = {"part": case.part, "case": case.name, "feedforward": name}
+            row |= {"runs": len(own), "failed": int(failed.sum())}
+            if "guard_actions" in metrics.METRICS:
+                row["guard_events"] = float(found[case.name][name]["guard_actions"].sum("lap").mean())
+            if "none" in ends:
+                row["failed_where_pid_did_not"] = int((failed & ~ends["none"]["failed"].to_numpy(bool)).sum())
+            for metric in COLUMNS:
+                samples = own[metric].to_numpy(float)
+                row[metric] = {**bootstrap_interval(samples)._asdict(), "worst": cvar(samples)}
+                for rival, title in RIVALS.items():
+                    if rival in ends and rival != name:
+                        theirs = ends[rival][metric].to_numpy(float)
+                        row[metric][f"to_{title}"] = paired_ratio(samples, theirs)._asdict()
+                        row[metric][f"beats_{title}"] = superiority(samples, theirs)._asdict()
+                if case.back:
+                    row[metric] |= _step(found[case.name][name], metric, case)
+            rows.append(row)
+    return rows
+
+
+def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:
+    """Recovery and forgetting, run by run against the error in the lap before the change."""
+    error = laps[metric].values
+    before = error[:, case.change - 2]
+    after = {"in_first_lap": case.change, "after_one_lap": case.change + 1}
+    after |= {"return_first_lap": case.back, "return_after_one_lap": case.back + 1}
+    found: dict[str, Any] = {name: paired_ratio(error[:, lap - 1], before)._asdict() for name, lap in after.items()}
+    needed = metrics.recovery_laps(laps, metric, case.change, case.back - 1, BAND).values
+    worst = {f"{name}_worst": cvar(error[:, lap - 1] / before) for name, lap in after.items()}
+    found["during"] = bootstrap_interval(error[:, case.back - 2])._asdict()
+    return found | worst | {"recovery_laps": needed.tolist(), "recovered_within_one_lap": float(np.mean(needed <= 1))}
+
+
+def each_run(found: Mapping[str, Laps]) -> list[dict[str, Any]]:
+    """What became of every run, for statistics of your own."""
+    rows = []
+    for case, runs in found.items():
+        for name, own in runs.items():
+            reasons = zip(own["failure"].values, own["failure_time"].values, strict=True)
+            for k, (reason, time) in enumerate(reasons):
+                row = {"case": case, "feedforward": name, "seed": int(own["seed"][k]), "run": int(own["run"][k])}
+                row |= {"failure": reason, "failure_time": float(time) if reason else None}
+                rows.append(row | {metric: own[metric].values[k].tolist() for metric in COLUMNS})
+    return rows
+
+
+def as_markdown(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
+    """The tables by title: each part's last lap, then the steps' recovery."""
+    tables = {}
+    guarded = any("guard_events" in row for row in rows)
+    header = ["case", "feedforward", "failed", *(f"{title}; worst 5 %" for title in COLUMNS.values())]
+    header += ["beats PID in V / θ̇ / position", "beats model", *(["guard acted"] if guarded else [])]
+    for part, title in PARTS.items():
+        own = [row for row in rows if row["part"] == part]
+        cells = [
+            [
+                row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", *(_mean(row[m]) for m in COLUMNS),
+                *(_wins(row, rival) for rival in RIVALS.values()),
+                *([number(row["guard_events"])] if guarded else []),
+            ]
+            for row in own
+        ]  # fmt: skip
+        if own:
+            tables[title] = markdown(header, cells)
+    header = ["case", "feedforward", "failed", "first lap", "one lap later; worst 5 %", "recovered in V / θ̇ / position"]
+    header += ["return: first lap", "one lap later; worst 5 %"]
+    cells = []
+    for row in rows:
+        if row["part"] == "step":
+            error = row["position_rmse"]
+            names = ("in_first_lap", "after_one_lap", "return_first_lap", "return_after_one_lap")
+            first, later, back, settled = (f"{number(error[name]['value'])}×" for name in names)
+            within = " / ".join(f"{100 * row[m]['recovered_within_one_lap']:.0f} %" for m in COLUMNS)
+            later, settled = (
+                f"{text}; {number(error[f'{name}_worst'])}×" for text, name in ((later, names[1]), (settled, names[3]))
+            )
+            cells.append([row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", first, later, within])
+            cells[-1] += [back, settled]
+    if cells:
+        tables["Recovery and forgetting: position error over that before the step"] = markdown(header, cells)
+    return tables
+
+
+def _mean(error: dict[str, Any]) -> str:
+    value, low, high, worst = (number(1e3 * error[key]) for key in ("value", "low", "high", "worst"))
+    return f"{value} [{low}, {high}]; {worst}" if error["samples"] else "–"
+
+
+def _wins(row: dict[str, Any], rival: str) -> str:
+    if f"beats_{rival}" not in row["position_rmse"]:
+        return ""
+    values = [row[metric][f"beats_{rival}"] for metric in COLUMNS]
+    last = values[-1]
+    return " / ".join(f"{one['value']:.2f}" for one in values) + f" [{last['low']:.2f}, {last['high']:.2f}]"

@@ -1,0 +1,127 @@
+"""The guard in the loop: what diverges without it does not with it, and what is sound it leaves alone, to the bit."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from mrctl import (
+    PERTURBATIONS,
+    Event,
+    Fel,
+    Guard,
+    Lemniscate,
+    Perturbation,
+    Rls,
+    Scenario,
+    guard_events,
+    per_lap,
+    simulate,
+)
+from mrctl.control.feedforward import NoFeedforward
+from mrctl.experiments import single
+from mrctl.result import SIGNALS
+
+OFF = Guard(on=False)
+ERRORS = ("position_rmse", "v_rmse", "omega_rmse")
+DELAYED = Scenario(reference=Lemniscate(period=12.0), laps=4, perturbation=Perturbation(control_delay=0.04))
+# Both ten times as fast as by default.
+FAST = {"fel": Fel(step=1.0), "rls": Rls(step=0.2, initial_covariance=2.0, covariance_bound=2.0)}
+
+
+def of(scenario, feedforward, guard=OFF, **changes):
+    """The scenario with another learner and guard."""
+    return scenario.model_copy(update={"feedforward": feedforward, "guard": guard, **changes})
+
+
+def same(one, other):
+    """Two runs with the same bits in every signal."""
+    return all(np.array_equal(one[name].values, other[name].values, equal_nan=True) for name in SIGNALS)
+
+
+@pytest.mark.parametrize(("steering", "name"), [("compliant", "rls"), ("caster", "rls"), ("rigid", "fel")])
+def test_too_fast(steering, name):
+    """40 ms of delay and ten times the learning rate: without the guard it shakes the robot, with it it tracks."""
+    base = of(DELAYED, "none", steering=steering)
+    runs = simulate([base, of(base, name, **FAST), of(base, name, Guard(), **FAST)])
+    laps = per_lap(runs)
+    pid, bare, guarded = (np.array([laps[error].values[k] for error in ERRORS]) for k in range(3))
+    assert (bare[:, 0] > 2 * pid[:, 0]).sum() >= 2 and np.abs(runs.feedforward_right[1]).max() > 30
+    assert not runs.failed[2] and np.abs(runs.feedforward_right[2]).max() <= 24
+    assert (guarded[0] < pid[0]).all()  # position, also in the lap in which it happened
+    assert (guarded[:, 2:] < 0.75 * pid[:, 2:]).all()  # everything, from the third lap on
+    events = guard_events(runs)
+    assert set(events["run"]) == {2} and (events["reason"] == "growing oscillation").any()
+    assert laps["guard_actions"].values[2].sum() == (events["action"] != "resume").sum()
+    assert (laps["guard_actions"].values[:2] == 0).all()
+
+
+def test_silent():
+    """Learners in order: nothing happens, and every bit is what it is without a guard."""
+    push = (Event(time=6.0, push=(0.0, 40.0, 0.0)), Event(time=9.0, perturbation=Perturbation(payload=5.0)))
+    noise = Perturbation(velocity_noise=0.01, rotation_noise=0.02, position_noise=0.002, heading_noise=0.005)
+    cases = (
+        {"perturbation": PERTURBATIONS["all"]},
+        {"events": push, "perturbation": Perturbation()},
+        {"perturbation": noise},
+        {"perturbation": Perturbation(control_delay=0.04)},
+    )
+    for name in FAST:
+        scenarios = [of(DELAYED, name, laps=1, **case) for case in cases]
+        watched = simulate([scenario.model_copy(update={"guard": Guard()}) for scenario in scenarios])
+        bare = simulate(scenarios)
+        assert guard_events(watched).empty
+        assert all(same(watched.isel(run=k), bare.isel(run=k)) for k in range(len(cases)))
+
+
+def test_batch():
+    """A guard that acts in one row does what it does alone, and nothing to the others."""
+    fast = of(DELAYED, "fel", Guard(), steering="rigid", laps=1, **FAST)
+    calm = of(fast, "fel", Guard(), fel=Fel(), seed=3)
+    together = simulate([calm, fast, calm])
+    alone = simulate(fast)
+    assert set(guard_events(together)["run"]) == {1} and not guard_events(alone).empty
+    assert same(together.isel(run=1), alone)
+    assert same(together.isel(run=0), simulate(calm)) and same(together.isel(run=0), together.isel(run=2))
+
+
+class Shakes(NoFeedforward):
+    """A user's stage that begins to shake after a second, and cannot forget; in row 1 it breaks instead."""
+
+    def __init__(self, robot, size):
+        self.ticks, self.out = 0, np.zeros((size, 2))
+
+    def output(self, command, derivative):
+        self.ticks += 1
+        t = max(0.01 * self.ticks - 1, 0)
+        self.out[:, 1] = np.sin(6 * t) * min(np.expm1(3 * t), 60)
+        if t > 0:
+            self.out[1:2] = np.nan
+        return self.out
+
+
+def test_own_stage():
+    """What somebody else's stage does wrong ends in the fallback, and stays there: the robot goes on tracking."""
+    base = DELAYED.model_copy(update={"laps": 1, "perturbation": Perturbation()})
+    bare = simulate([of(base, "none")] * 2, feedforward=Shakes)
+    watched = simulate([of(base, "none", Guard(hold=0.3, retries=2))] * 2, feedforward=Shakes)
+    pid = simulate([of(base, "none")])
+    errors = [np.hypot(run.x - run.x_ref, run.y - run.y_ref).values for run in (bare, watched, pid)]
+    assert errors[0][0].max() > 0.5 and bare.failed[1]
+    assert not watched.failed.any() and errors[1][0].max() < 0.2 * errors[0][0].max()
+    late = watched.time.values > 6.0
+    assert (errors[1][:, late].max(axis=1) < errors[2][0, late].max()).all()
+    events = guard_events(watched)
+    assert list(events[events["run"] == 1]["action"]) == ["fallback"]
+    assert (watched["guard"][:, late] == 3).all() and (events["run"] == 0).sum() > 3
+
+
+def test_told():
+    """A run says how often and why."""
+    fast = of(DELAYED, "fel", Guard(), steering="rigid", laps=1, **FAST)
+    text = single.run(fast, None, False)
+    assert "guard acted" in text and re.search(r"guard at \d\.\d\d s: fallback, growing oscillation", text)
+    listed = json.loads(single.run(fast, None, True))
+    assert {"time", "action", "reason"} == set(listed["guard"][0])
+    assert listed["laps"][0]["guard_actions"] == sum(event["action"] != "resume" for event in listed["guard"])

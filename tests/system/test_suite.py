@@ -1,0 +1,271 @@
+"""The suite, on a few short laps: the same files for any workers and interruptions, a page that stands alone."""
+
+import base64
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mrctl
+from mrctl import cli, plots
+from mrctl.experiments import report, suite, tuning
+from mrctl.experiments.cases import Case
+
+LAP = 4.0
+GAIN = """
+class Gain:
+    def __init__(self, robot, size):
+        self.gain = 1 / robot.velocity_gain, 1 / robot.rotation_gain
+        self.ticks = 0
+
+    def output(self, command, derivative):
+        return command * self.gain
+
+    def learn(self, feedback, saturated, twist, voltage):
+        self.ticks += 1
+"""
+
+
+def tiny(seeds: int, random: int, quick: bool) -> list[Case]:
+    """A case of each part, on a small circle."""
+    base = mrctl.Scenario(laps=2, reference=mrctl.Circle(radius=0.5, period=LAP))
+    payload = mrctl.Event(time=2 * LAP, perturbation=mrctl.PERTURBATIONS["payload ahead"])
+    back = mrctl.Event(time=4 * LAP, perturbation=mrctl.Perturbation())
+    off, on = mrctl.Event(time=0, learning=False), mrctl.Event(time=LAP, learning=True)
+    found = [
+        ("payload", "step", {"laps": 6, "events": (payload, back)}, 3, 5),
+        ("switch", "learning", {"events": (off, on)}, 2, 0),
+        ("nominal", "steady", {}, 0, 0),
+        ("all", "steady", {"perturbation": mrctl.PERTURBATIONS["all"]}, 0, 0),
+        ("caster", "steering", {"steering": "caster"}, 0, 0),
+    ]
+    fixed = [
+        Case(name, part, tuple(base.model_copy(update={"seed": k, **fields}) for k in range(seeds)), *laps)
+        for name, part, fields, *laps in found
+    ]
+    masses = [mrctl.Perturbation(mass_factor=0.6 + 0.4 * k) for k in range(random)]
+    drawn = [base.model_copy(update={"perturbation": one}) for one in masses]
+    return [*fixed, *([Case("random", "random", tuple(drawn))] if random else [])]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def small() -> Iterator[None]:
+    """Few short runs, small figures, and a PID that is not measured again."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(suite, "cases", tiny)
+        patch.setitem(plots.STYLE, "savefig.dpi", 60)
+        patch.setattr(tuning, "design", lambda *_: {})
+        patch.setattr(tuning, "statement", lambda _: "phase margin 88 degrees")
+        yield
+
+
+def arguments(out: Path, *more: object) -> list[str]:
+    fixed = ["suite", "--feedforward", "none", "model", "rls", "--seeds", "2", "--random", "3", "--out", out]
+    return [str(word) for word in (*fixed, *more)]
+
+
+@pytest.fixture(scope="module")
+def whole(small: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A suite that ran without incident, on one worker."""
+    out = tmp_path_factory.mktemp("whole") / "suite"
+    assert cli.main(arguments(out, "--workers", 1)) == 0
+    return out
+
+
+def content(out: Path) -> dict[str, bytes]:
+    """Every file but the locks and the sheets with their dates."""
+    files = [file for file in out.rglob("*") if file.is_file() and file.name != "lock" and file.suffix != ".pdf"]
+    return {str(file.relative_to(out)): file.read_bytes() for file in files}
+
+
+def refused(capsys: pytest.CaptureFixture, words: list[str], status: int = 2) -> str:
+    """The one line that a command ends with."""
+    capsys.readouterr()
+    assert cli.main(words) == status
+    lines = capsys.readouterr().err.replace("\r", "\n").splitlines()
+    lines = [line for line in lines if line.strip() and "run/s" not in line and not re.match(r".* \(\d of \d\)$", line)]
+    lines = [line for line in lines if "it/s" not in line and "?" not in line and "s/run" not in line]
+    assert len(lines) == 1 and "Traceback" not in lines[0], lines
+    return lines[0]
+
+
+def test_table(whole: Path) -> None:
+    """Every combination is there, equal to the same scenarios run directly, and comparisons pair the runs."""
+    table = json.loads((whole / "table.json").read_text())
+    assert len(table["rows"]) == 6 * 3 and len(table["runs"]) == (5 * 2 + 3) * 3
+    cases = {case.name: case.scenarios for case in tiny(2, 3, False)}
+    found = {(row["case"], row["feedforward"]): row for row in table["rows"]}
+    for case in ("all", "caster", "random"):
+        alone = {
+            name: mrctl.summary(mrctl.simulate([s.model_copy(update={"feedforward": name}) for s in cases[case]]))
+            for name in ("none", "rls")
+        }
+        row = found[case, "rls"]["omega_rmse"]
+        own, bare = (alone[name]["omega_rmse"].to_numpy() for name in ("rls", "none"))
+        assert row["value"] == pytest.approx(own.mean(), rel=1e-12) and row["worst"] == pytest.approx(own.max())
+        assert row["to_PID"]["value"] == pytest.approx(np.exp(np.log(own / bare).mean()), rel=1e-12)
+        assert row["beats_PID"]["wins"] == (own < bare).sum() and found[case, "rls"]["failed"] == 0
+    assert (whole / "table.md").read_text().count("| rls ") == 7  # six cases, and the recovery
+
+
+def test_recovery(whole: Path) -> None:
+    """Of a step: each run's laps against its own lap before."""
+    table = json.loads((whole / "table.json").read_text())
+    runs = [row for row in table["runs"] if (row["case"], row["feedforward"]) == ("payload", "rls")]
+    laps = np.array([run["v_rmse"] for run in runs])
+    assert laps.shape == (2, 6) and [run["seed"] for run in runs] == [0, 1]
+    row = next(r for r in table["rows"] if (r["case"], r["feedforward"]) == ("payload", "rls"))["v_rmse"]
+    assert row["after_one_lap"]["value"] == pytest.approx(np.exp(np.log(laps[:, 3] / laps[:, 1]).mean()))
+    assert row["return_first_lap"]["value"] == pytest.approx(np.exp(np.log(laps[:, 4] / laps[:, 1]).mean()))
+    assert row["recovered_within_one_lap"] == np.mean(laps[:, 3] <= 1.2 * laps[:, 1])
+
+
+def test_goes_on_where_it_stopped(whole: Path, tmp_path: Path) -> None:
+    """Interrupted in its second feedforward, it keeps what was done; continued by two workers, it writes the same files
+    as one that ran through, byte for byte, page and figures included.
+    """
+    out = tmp_path / "suite"
+    command = [sys.executable, __file__, *arguments(out, "--workers", 1)]
+    victim = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    done, second = out / "runs" / "none" / "runs.parquet", out / "runs" / "model" / "sweep.json"
+    while not second.exists() and victim.poll() is None:
+        time.sleep(0.01)
+    os.kill(victim.pid, signal.SIGINT)
+    complaint = victim.communicate(timeout=60)[1]
+    assert victim.returncode == 130 and "mrctl: interrupted" in complaint.splitlines()[-1]
+    assert not (out / "report.html").exists()
+    stamp = done.stat().st_mtime_ns
+    assert cli.main(arguments(out, "--workers", 2)) == 0
+    assert content(out) == content(whole) and done.stat().st_mtime_ns == stamp
+
+
+class Page(HTMLParser):
+    """Collects what a page shows and what it would load."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.loads: list[str] = []
+        self.words = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.loads += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+        assert tag not in ("script", "link", "iframe")
+        if tag not in ("img", "meta"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.words += data
+
+
+def test_page_stands_alone(whole: Path) -> None:
+    """It loads nothing; its images are whole; it says what was run, with which versions, and how to do it again."""
+    text = (whole / "report.html").read_text()
+    page = Page(text)
+    assert not page.open and "url(" not in text and "@import" not in text
+    assert len(page.loads) >= 5
+    for source in page.loads:
+        assert source.startswith("data:image/png;base64,")
+        image = Image.open(io.BytesIO(base64.b64decode(source.split(",")[1], validate=True)))
+        image.load()
+        assert image.width > 150
+    for word in ("39 runs", "payload", f"mujoco {mrctl.result.versions()['mujoco']}", "phase margin"):
+        assert word in page.words
+    again = next(line for line in page.words.splitlines() if line.startswith("mrctl suite --"))
+    assert again == "mrctl suite --feedforward none model rls --seeds 2 --random 3"
+
+
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures take seconds."""
+    monkeypatch.setattr(report, "figures", lambda *_: {})
+
+
+@pytest.mark.usefixtures("plain")
+def test_controller_joins(whole: Path, tmp_path: Path) -> None:
+    """Somebody's own feedforward joins a suite that is there: only its runs are computed, and they are `simulate`'s."""
+    file, out = tmp_path / "mine.py", tmp_path / "suite"
+    file.write_text(GAIN)
+    shutil.copytree(whole, out)
+    before = {p: p.stat().st_mtime_ns for p in out.glob("runs/*/runs.parquet")}
+    assert cli.main(arguments(out, "--workers", 2, "--controller", f"{file}:Gain")) == 0
+    assert {p: p.stat().st_mtime_ns for p in before} == before
+    table = json.loads((out / "table.json").read_text())
+    row = next(r for r in table["rows"] if (r["case"], r["feedforward"]) == ("all", "Gain"))
+    namespace: dict = {}
+    exec(GAIN, namespace)
+    scenarios = next(case.scenarios for case in tiny(2, 3, False) if case.name == "all")
+    alone = mrctl.summary(mrctl.simulate(list(scenarios), feedforward=namespace["Gain"]))
+    assert row["v_rmse"]["value"] == pytest.approx(alone["v_rmse"].mean(), rel=1e-12)
+    assert "Gain" in (out / "report.html").read_text()
+    assert content(whole)["runs/rls/runs.parquet"] == content(out)["runs/rls/runs.parquet"]
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("class Gain(: pass", "SyntaxError"),
+        ("import no_such_module", "ModuleNotFoundError: No module named 'no_such_module'"),
+        ("raise SystemExit('no')", "SystemExit: no"),
+        ("Other = 1", "has no Gain"),
+        (GAIN.replace("robot.velocity_gain", "robot.speed"), "AttributeError"),
+        (GAIN.replace("command * self.gain", "command[:1, :1] * [1, 2, 3]"), "ValueError"),
+        (GAIN.replace("self.ticks += 1", "raise KeyError('boom')"), "KeyError: 'boom'"),
+        (GAIN.replace("def learn", "def teach"), "AttributeError"),
+    ],
+)
+def test_bad_controller(tmp_path: Path, capsys: pytest.CaptureFixture, code: str, message: str) -> None:
+    """What is wrong in it, or in loading it, is one line, before anything is run."""
+    (tmp_path / "mine.py").write_text(code)
+    line = refused(capsys, arguments(tmp_path / "suite", "--controller", tmp_path / "mine.py:Gain"))
+    assert line.startswith("mrctl: controller: ") and message in line
+    assert not (tmp_path / "suite").exists()
+
+
+@pytest.mark.usefixtures("plain")
+def test_controller_that_fails_later(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Its runs count as failed, the tables are there, and the command says so in one line."""
+    late = GAIN.replace("self.ticks += 1", "self.ticks += 1\n        assert self.ticks < 50, 'tired'")
+    (tmp_path / "mine.py").write_text(late)
+    words = ["suite", "--feedforward", "none", "--seeds", "1", "--random", "0", "--workers", "1"]
+    words += ["--out", str(tmp_path / "suite"), "--controller", str(tmp_path / "mine.py:Gain")]
+    line = refused(capsys, words, status=1)
+    assert "5 runs of Gain could not be done" in line and "AssertionError: tired" in line
+    row = json.loads((tmp_path / "suite" / "table.json").read_text())["rows"][-1]
+    assert row["feedforward"] == "Gain" and row["failed"] == row["runs"] == 1
+
+
+def test_bad_input(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """One line each."""
+    out = tmp_path / "suite"
+    assert "seeds" in refused(capsys, arguments(out, "--seeds", -1))
+    assert "feedforward" in refused(capsys, ["suite", "--feedforward", "magic", "--out", str(out)])
+    assert "not of the form" in refused(capsys, arguments(out, "--controller", "mine.py"))
+    assert "no file" in refused(capsys, arguments(out, "--controller", "mine.py:Gain"))
+    (tmp_path / "mine.py").write_text(GAIN + "\nrls = Gain\n")
+    assert "the name rls is taken" in refused(capsys, arguments(out, "--controller", tmp_path / "mine.py:rls"))
+    assert "workers: 0" in refused(capsys, arguments(out, "--workers", 0))
+    assert "begun with another" in refused(capsys, arguments(whole, "--seeds", 3))
+    (tmp_path / "file").write_text("mine")
+    assert "cannot be written" in refused(capsys, arguments(tmp_path / "file"))
+
+
+if __name__ == "__main__":
+    suite.cases = tiny
+    sys.exit(cli.main())

@@ -1,0 +1,82 @@
+"""What the suite drives: complete, paired, reproducible, and within what the robot can do."""
+
+import numpy as np
+import pytest
+
+from mrctl import PERTURBATIONS, InputError, Scenario
+from mrctl import model as mjcf
+from mrctl.experiments import cases
+from mrctl.references import check
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return mjcf.read_robot(mjcf.load())
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_complete_and_paired(quick):
+    """Every part is there under names of their own; each case has the same seeds, and runs of one length."""
+    found = cases.cases(3, 2, quick)
+    assert {case.part for case in found} == set(cases.PARTS) - ({"steering"} if quick else set())
+    assert len({case.name for case in found}) == len(found)
+    for case in found:
+        if case.part != "random":
+            assert [s.seed for s in case.scenarios] == [0, 1, 2]
+            assert len({s.model_copy(update={"seed": 0}) for s in case.scenarios}) == 1
+        assert len({s.laps for s in case.scenarios}) == 1
+    if not quick:
+        steady = {s.perturbation for case in found if case.part == "steady" for s in case.scenarios}
+        assert steady >= set(PERTURBATIONS.values())
+        ladder = {(s.steering, s.perturbation) for case in found if not case.change for s in case.scenarios}
+        assert ladder >= {(steering, PERTURBATIONS[p]) for steering in cases.STEERINGS for p in cases.LADDER}
+
+
+def test_steps_are_where_the_laps_say():
+    """The perturbation comes in the beginning of lap `change`, and goes in that of lap `back`."""
+    for case in cases.cases(1, 0, False):
+        events = case.scenarios[0].events
+        if case.part == "step":
+            laps = [1 + event.time / case.scenarios[0].reference.period for event in events]
+            assert laps == [case.change, case.back] and case.back + 1 <= case.scenarios[0].laps
+            assert events[0].perturbation != events[1].perturbation == case.scenarios[0].perturbation
+
+
+def test_frozen_laps_count_whole():
+    """The faster reference fits three half laps of its symmetric figure into a lap, so that every lap says the same."""
+    for case in cases.cases(1, 0, False):
+        for event in case.scenarios[0].events:
+            if event.reference is not None:
+                assert case.scenarios[0].reference.period / event.reference.period == pytest.approx(1.5)
+
+
+def test_random_scenario_is_a_function_of_its_seed(robot):
+    """The same again, also among others; different for another seed; every kind of perturbation comes up."""
+    many = cases.random_scenarios(40)
+    assert sorted(s.seed for s in many) == list(range(40)) and cases.random_scenario(17, robot) in many
+    assert len({s.reference for s in many}) == 40
+    assert {s.name.split(": ")[1] for s in many} == set(cases._KINDS)
+    assert {len(s.events) for s in many} == {0, 1}
+    assert len({s.ticks for s in many}) <= len(cases.LAP_TIMES)
+    assert Scenario.from_dict(many[0].model_dump(mode="json")) == many[0]
+
+
+def test_random_robots_can_follow_and_stand(robot):
+    """Each reference leaves its margin to the limits, and is not slower than need be by more than one lap time; no
+    payload tips the robot.
+    """
+    limits = ("max_speed", "max_rotation", "max_rotation_acceleration", "steering_limit")
+    careful = {name: cases.MARGIN * getattr(robot, name) for name in limits}
+    careful = robot.model_copy(update={**careful, "tyre_friction": cases.GRIP})
+    nominal = mjcf.load()
+    for scenario in cases.random_scenarios(12):
+        check(scenario.reference, careful, reverse=False)
+        period = scenario.reference.period
+        if (faster := [time for time in cases.LAP_TIMES if time < period - 1e-6])[1:]:
+            quick = scenario.reference.model_copy(update={"speed": scenario.reference.speed * period / faster[-2]})
+            with pytest.raises(InputError):
+                check(quick, careful, reverse=False)
+        for one in (scenario.perturbation, *(event.perturbation for event in scenario.events)):
+            mjcf.perturb(nominal, mjcf.clone(nominal), one)
+            factors = [value for name, value in one.model_dump().items() if name.endswith("_factor")]
+            assert np.all(np.abs(np.array(factors) - 1) <= 0.9)

@@ -1,0 +1,121 @@
+"""Statistics against closed forms, published values and values worked out by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mrctl import comparison
+from mrctl.record import InputError
+
+
+def test_bootstrap_normal():
+    """For many normal samples the interval is close to mean ± 1.96 s/√n."""
+    samples = np.random.default_rng(1).normal(5, 2, 400)
+    found = comparison.bootstrap_interval(samples)
+    half = 1.96 * samples.std(ddof=1) / 20
+    assert found.value == pytest.approx(samples.mean())
+    assert (found.low, found.high) == pytest.approx((samples.mean() - half, samples.mean() + half), abs=0.1 * half)
+
+
+def test_bootstrap_coverage():
+    """About 95 % of the intervals of 30 samples hold the true mean."""
+    draws = np.random.default_rng(2).normal(3, 1, (200, 30))
+    found = (comparison.bootstrap_interval(d, n=500, seed=k) for k, d in enumerate(draws))
+    held = [one.low <= 3 <= one.high for one in found]
+    assert 0.89 <= np.mean(held) <= 0.99
+
+
+def test_bootstrap_degenerate():
+    """Constant samples have no width, one sample has no interval, NaN and inf are counted, and seeds repeat."""
+    assert comparison.bootstrap_interval([2, 2, 2]) == (2, 2, 2, 3, 0)
+    one = comparison.bootstrap_interval([2, np.nan])
+    assert one.value == 2 and np.isnan(one.low) and (one.samples, one.failed) == (1, 1)
+    assert comparison.bootstrap_interval([1, 2, 4, np.nan, np.inf])[3:] == (3, 2)
+    assert np.isnan(comparison.bootstrap_interval([]).value)
+    assert comparison.bootstrap_interval([1, 2, 4], seed=3) == comparison.bootstrap_interval([1, 2, 4], seed=3)
+
+
+def test_paired_ratio():
+    """An exact ratio has no width however much the seeds differ: pairs are resampled together."""
+    b = np.random.default_rng(0).lognormal(0, 2, 12)
+    found = comparison.paired_ratio(0.5 * b, b)
+    assert found[:3] == pytest.approx((0.5, 0.5, 0.5)) and found[3:] == (12, 0, 0)
+
+
+def test_paired_ratio_failures():
+    """A pair with a failure on either side leaves the mean and is counted on its side."""
+    found = comparison.paired_ratio([1, 2, np.nan, 4], [2, 4, 6, np.inf])
+    assert found.value == pytest.approx(0.5) and (found.pairs, found.failed_a, found.failed_b) == (2, 1, 1)
+    noisy = comparison.paired_ratio([1.0, 2.2, 2.9, 4.1], [2, 4, 6, 8])
+    assert noisy.low < noisy.value < noisy.high
+
+
+@given(st.lists(st.tuples(*[st.floats(1e-6, 1e6)] * 2), min_size=2, max_size=6))
+def test_paired_ratio_is_even_handed(pairs):
+    """It is the n-th root of the product of the ratios; turned round it is one over it, which a mean is not."""
+    a, b = np.array(pairs).T
+    found = comparison.paired_ratio(a, b, n=50).value
+    assert found == pytest.approx(np.prod((a / b) ** (1 / len(a))), rel=1e-9)
+    assert comparison.paired_ratio(b, a, n=50).value == pytest.approx(1 / found, rel=1e-9)
+
+
+def test_superiority():
+    """Wins count one, ties half; a failure loses, and two failures are a tie."""
+    a = [1.0, 2.0, 5.0, 4.0, np.nan, np.inf]
+    b = [2.0, 2.0, 4.0, np.nan, 1.0, np.nan]
+    found = comparison.superiority(a, b)
+    assert (found.wins, found.ties, found.losses) == (2, 2, 2) and found.value == 0.5
+    assert comparison.superiority([1, 1, 1], [2, 2, 3]).value == 1
+    assert np.isnan(comparison.superiority([], []).value)
+
+
+@pytest.mark.parametrize(
+    ("wins", "n", "low", "high"),
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+)
+def test_superiority_interval(wins, n, low, high):
+    """The examples of Newcombe (1998), table I, method 3."""
+    found = comparison.superiority([0.0] * wins + [2.0] * (n - wins), [1.0] * n)
+    assert (found.low, found.high) == pytest.approx((low, high), abs=6e-5)
+
+
+@given(st.lists(st.tuples(*[st.floats(0, 10) | st.just(float("nan"))] * 2), min_size=1))
+def test_superiority_is_even_handed(pairs):
+    """What A wins, B loses, and the intervals mirror."""
+    a, b = np.array(pairs).T
+    one, other = comparison.superiority(a, b), comparison.superiority(b, a)
+    assert one.value == pytest.approx(1 - other.value) and one.low == pytest.approx(1 - other.high)
+    assert one.low <= one.value <= one.high
+
+
+def test_cvar_of_a_distribution():
+    """The worst 5 % of many uniform samples on (0, 1) average 0.975; of exponential ones, 1 + ln 20."""
+    random = np.random.default_rng(0)
+    assert comparison.cvar(random.random(200_000)) == pytest.approx(0.975, abs=1e-3)
+    assert comparison.cvar(random.exponential(size=200_000)) == pytest.approx(1 + np.log(20), abs=0.05)
+
+
+def test_cvar_by_hand():
+    """Of 30 samples one and a half count; of ten, the worst; a failure is worse than any number."""
+    assert comparison.cvar(np.arange(30)) == pytest.approx((29 + 0.5 * 28) / 1.5)
+    assert comparison.cvar(np.arange(10)) == 9
+    assert comparison.cvar([1, 2, 3, 4], share=1) == pytest.approx(2.5)
+    assert comparison.cvar([*range(99), np.nan]) == np.inf
+    assert np.isnan(comparison.cvar([]))
+
+
+@pytest.mark.parametrize(
+    ("call", "field"),
+    [
+        (lambda: comparison.bootstrap_interval([1, 2], level=95), "level"),
+        (lambda: comparison.superiority([1, 2], [1, 2], level=0), "level"),
+        (lambda: comparison.paired_ratio([1, 2], [1]), "b"),
+        (lambda: comparison.superiority([1], [1, 2]), "b"),
+        (lambda: comparison.cvar([1], share=0), "share"),
+    ],
+)
+def test_bad_input(call, field):
+    """One line that begins with the field."""
+    with pytest.raises(InputError, match=rf"^{field}: .+"):
+        call()

@@ -1,0 +1,241 @@
+"""Composite adaptation against a Kalman filter in matrices, against torch, and against equation (3) itself."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from mrctl.control.composite import (
+    FEATURES,
+    INPUTS,
+    PHYSICAL,
+    UNITS,
+    Composite,
+    CompositeAdaptation,
+    Training,
+    adapt,
+    basis,
+    load_training,
+    save_training,
+)  # fmt: skip
+from mrctl.control.feedforward import InverseDynamics, feature_scale
+from mrctl.dynamics import accelerations, inverse_coefficients, left_right
+from mrctl.record import InputError
+
+RNG = np.random.default_rng(8)
+PERIOD = 0.01
+N = 4  # features in the tests of the law alone
+
+
+def numbers(*shape, bound=3.0):
+    return arrays(float, shape, elements=st.floats(-bound, bound))
+
+
+def spd(root):
+    """A covariance from any square matrix."""
+    found = root @ root.T + 0.01 * np.eye(len(root))
+    return (found + found.T) / 2
+
+
+@given(
+    numbers(N), numbers(N), numbers(N + 1), numbers(N + 1, N + 1, bound=1), numbers(N, N, bound=1),
+    st.floats(-20, 20), st.floats(-3, 3), st.floats(0.1, 2), st.floats(0, 1),
+)  # fmt: skip
+def test_one_step(x, command, weights, root, prior_root, residual, feedback, noise, step):
+    """Correction, prediction to the stationary prior, tracking: each as in the books, in matrices."""
+    settings = np.array([noise, 0.99, 0.9, 0.5, step, 0.1])
+    covariance, prior = spd(root), spd(prior_root)
+    h, f = np.append(x, 1), np.append(np.full(N, 0.99), 0.9)
+    stationary = np.block([[prior, np.zeros((N, 1))], [np.zeros((1, N)), np.array([[0.25]])]])
+    total = h @ covariance @ h + noise**2
+    innovation = np.clip(residual - h @ weights, -3 * np.sqrt(total), 3 * np.sqrt(total))
+    gain = covariance @ h / total
+    expected = f * (weights + gain * innovation)
+    joseph = np.eye(N + 1) - np.outer(gain, h)
+    posterior = joseph @ covariance @ joseph.T + noise**2 * np.outer(gain, gain)
+    predicted = np.diag(f) @ posterior @ np.diag(f) + stationary - np.diag(f) @ stationary @ np.diag(f)
+    direction = predicted[:N, :N] @ command
+    if abs(feedback) > 0.1 and command @ direction > 0:
+        expected[:N] += step * feedback * direction / (command @ direction)
+    found, spread = weights.copy(), covariance.copy()
+    adapt(x, residual, command, feedback, settings, prior, found, spread)
+    np.testing.assert_allclose(spread, predicted, atol=1e-9)
+    np.testing.assert_allclose(found, expected, atol=1e-7, rtol=1e-7)
+
+
+@given(numbers(40, N), numbers(N, N, bound=1), st.floats(0.5, 0.9999))
+def test_covariance(inputs, root, forgetting):
+    """From the prior on, it stays symmetric, positive and below the prior: nothing that is not excited blows up."""
+    prior = spd(root)
+    stationary = np.block([[prior, np.zeros((N, 1))], [np.zeros((1, N)), np.array([[0.25]])]])
+    covariance, weights = stationary.copy(), np.zeros(N + 1)
+    for x in inputs:
+        adapt(x, 1.0, x, 1.0, np.array([0.5, forgetting, 0.9, 0.5, 0.02, 0.0]), prior, weights, covariance)
+        np.testing.assert_array_equal(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance).min() > 0
+        assert np.linalg.eigvalsh(stationary - covariance).min() > -1e-9
+
+
+def test_outlier():
+    """A sample a thousand times too large moves the weights as far as one of three standard deviations."""
+    moved = []
+    for residual in (3 * np.sqrt(1.25 + N), 1e4):
+        weights, covariance = np.zeros(N + 1), np.diag([*np.ones(N), 0.25])
+        adapt(np.ones(N), residual, np.zeros(N), 0.0, np.array([1, 1, 1, 0.5, 0, 0.0]), np.eye(N), weights, covariance)
+        moved.append(weights)
+    np.testing.assert_allclose(moved[0], moved[1], rtol=1e-12)
+
+
+@given(numbers(PHYSICAL), numbers(UNITS, INPUTS + 1))
+def test_basis(x, units):
+    """φ is the physical features and a torch layer of the first eight."""
+    layer = torch.nn.Linear(INPUTS, UNITS, dtype=torch.float64)
+    layer.load_state_dict({"weight": torch.tensor(units[:, :INPUTS]), "bias": torch.tensor(units[:, INPUTS])})
+    hidden = torch.tanh(layer(torch.tensor(x[:INPUTS]))).detach().numpy()
+    phi = np.empty(FEATURES)
+    basis(x, units, phi)
+    np.testing.assert_allclose(phi, np.concatenate([x, hidden]), atol=1e-14)
+
+
+def stage(robot, size=1, rigid=False, **settings):
+    return CompositeAdaptation(robot, [Composite(**settings)] * size, rigid, PERIOD)
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_begins_as_model(robot, rigid):
+    """Before it has seen anything it is the model, and stays so while it may not learn."""
+    pupil, model = stage(robot, 3, rigid), InverseDynamics([robot] * 3, rigid)
+    for _ in range(100):
+        command, derivative = RNG.uniform(-1, 1, (2, 3, 2))
+        np.testing.assert_allclose(pupil.output(command, derivative), model.output(command, derivative), atol=1e-12)
+        added = pupil.learn(RNG.normal(size=(3, 2)), np.ones(3), command, RNG.normal(size=(3, 2)))
+        assert not added.any()
+    assert not pupil.weight_norm.any()
+
+
+def drive(pupil, plant, seconds, disturbance=0.0):
+    """Equation (3) under the stage and a proportional feedback along a rich motion; returns its feedback."""
+    twist, log = np.array([0.8, 0.0]), []
+    for tick in range(round(seconds / PERIOD)):
+        t = PERIOD * tick
+        w = np.array([[0.9, 2.3], [1.3, 3.1]])
+        a = np.array([[0.25, 0.15], [0.8, 0.4]])
+        command = np.array([0.8, 0.0]) + (a * np.sin(w * t)).sum(1)
+        derivative = (a * w * np.cos(w * t)).sum(1)
+        feedforward = pupil.output(command[None], derivative[None])[0]
+        feedback = np.array([10.0, 2.0]) * (command - twist)
+        voltage = feedback + feedforward
+        pupil.learn(feedback[None], np.zeros(1), twist[None], voltage[None])
+        log.append(feedback)
+        for _ in range(4):
+            sides = left_right(voltage - disturbance)
+            twist = twist + PERIOD / 4 * accelerations(twist, sides, plant, sign_speed=0.05)
+    return np.array(log)
+
+
+def test_finds_the_plant(robot, tmp_path):
+    """Driving a plant that is not the model, the weights of the physical features become what the two differ by.
+
+    With the network out of the way the weights are coefficients of equation (3), and those are known.
+    """
+    plant = robot.model_copy(update={"mass": 28.0, "yaw_inertia": 0.9, "resistance": 3.0, "supply": 1e3})
+    flat = np.zeros((3, FEATURES, FEATURES))
+    flat[:, range(INPUTS), range(INPUTS)] = 4.0
+    save_training(tmp_path / "flat.safetensors", Training(np.zeros((UNITS, INPUTS + 1)), flat), {})
+    pupil = stage(robot, weights=str(tmp_path / "flat.safetensors"), noise=0.05, disturbance=0, step=0.002, memory=1e6)
+    feedback = drive(pupil, plant, 40)
+    assert np.sqrt((feedback[-1000:] ** 2).mean()) < 0.05 * np.sqrt((feedback[:100] ** 2).mean())
+    missing = ((inverse_coefficients(plant) - inverse_coefficients(robot)) * feature_scale(robot)[:, None]).T
+    found = pupil.state["weights"][0]
+    # The signs hardly move at these speeds and share a constant with V; half a period of hold is taken for inertia.
+    for channel, feature in ((0, 2), (1, 3), (1, 4), (0, 5)):
+        assert found[channel, feature] == pytest.approx(missing[channel, feature], rel=0.12, abs=0.02)
+    assert abs(missing[0, 2]) > 0.5 and abs(missing[1, 3]) > 0.5
+
+
+def test_disturbance(robot):
+    """A constant voltage that goes astray is found by weights and disturbance together, with the shipped features."""
+    lost = np.array([1.0, -0.5])
+    pupil = stage(robot)
+    feedback = drive(pupil, robot.model_copy(update={"supply": 1e3}), 12, lost)
+    start, end = np.abs(feedback[:200].mean(0)), np.abs(feedback[-500:].mean(0))
+    assert (end < 0.1 * start).all()
+
+
+def test_gates(robot):
+    """At rest and while it may not learn the weights keep still, and the disturbance fades with its own time."""
+    pupil = stage(robot)
+    drive(pupil, robot.model_copy(update={"mass": 30.0, "supply": 1e3}), 3)
+    for twist, idle in ((np.zeros((1, 2)), 0.0), (np.ones((1, 2)), 1.0)):
+        for _ in range(100):  # until the filters are at rest too
+            pupil.learn(np.ones((1, 2)), np.full(1, idle), twist, np.ones((1, 2)))
+        kept = pupil.state["weights"].copy()
+        assert kept[..., :FEATURES].any()
+        kept[..., FEATURES] = 0.2
+        pupil.state["weights"][:] = kept
+        for _ in range(50):
+            assert not pupil.learn(np.ones((1, 2)), np.full(1, idle), twist, np.ones((1, 2))).any()
+        np.testing.assert_array_equal(pupil.state["weights"][..., :FEATURES], kept[..., :FEATURES])
+        np.testing.assert_allclose(pupil.state["weights"][..., FEATURES], 0.2 * np.exp(-1), rtol=1e-9)
+
+
+def test_what_it_added(robot):
+    """It reports what its weights added to the output for the same command, and leaves the disturbance out."""
+    pupil = stage(robot)
+    drive(pupil, robot.model_copy(update={"mass": 30.0, "supply": 1e3}), 3)
+    command, derivative = np.array([[0.9, 0.4]]), np.array([[0.3, -0.5]])
+
+    def learned():
+        return pupil.output(command, derivative) - pupil.state["weights"][..., FEATURES]
+
+    before = learned().copy()
+    added = pupil.learn(np.array([[0.5, -0.2]]), np.zeros(1), command, np.array([[9.0, 1.0]])).copy()
+    pupil_after = learned()
+    assert np.abs(added).min() > 1e-4
+    # The output also turns with the heading, by a tick.
+    np.testing.assert_allclose(pupil_after - before, added, atol=2e-3)
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_rows(robot, rigid):
+    """Robots do not mix: a row has the same bits alone and beside others, one of which is lost."""
+    inputs = RNG.uniform(-1, 1, (80, 5, 4, 2)) + [0.7, 0.0]
+
+    def answer(rows, lost=()):
+        pupil, log = stage(robot, len(inputs[0, 0, rows]), rigid), []
+        for command, derivative, feedback, twist, voltage in inputs[:, :, rows].copy():
+            twist[list(lost)] = np.nan
+            log.append(pupil.output(command, derivative).copy())
+            log.append(pupil.learn(feedback, np.zeros(len(command)), twist, voltage).copy())
+        return np.array(log), pupil.state["covariance"]
+
+    together, covariance = answer(slice(None), lost=[2])
+    for i in (0, 1, 3):
+        alone, own = answer(slice(i, i + 1))
+        assert together[:, i].tobytes() == alone[:, 0].tobytes()
+        assert covariance[i].tobytes() == own[0].tobytes()
+
+
+def test_files(robot, tmp_path):
+    """What is saved is what is read; anything else is refused in one line that names the file."""
+    training = Training(RNG.normal(size=(UNITS, INPUTS + 1)), np.tile(np.eye(FEATURES), (3, 1, 1)))
+    save_training(tmp_path / "a.safetensors", training, {"recipe": "none"})
+    for one, other in zip(training, load_training(tmp_path / "a.safetensors"), strict=True):
+        np.testing.assert_array_equal(one, other)
+    save_training(tmp_path / "b.safetensors", Training(training.units[:4], training.priors), {})
+    save_training(tmp_path / "c.safetensors", Training(training.units * np.nan, training.priors), {})
+    (tmp_path / "d.safetensors").write_text("nothing of the kind")
+    for name, message in (("b", "needs units"), ("c", "non-finite"), ("d", "not a weights file"), ("e", "no file")):
+        with pytest.raises(InputError, match=rf"^composite\.weights: .*{message}"):
+            stage(robot, weights=str(tmp_path / f"{name}.safetensors"))
+    with pytest.raises(InputError, match="cannot write"):
+        save_training(tmp_path / "nowhere" / "a.safetensors", training, {})
+
+
+def test_shipped_prior():
+    """The file in the package holds covariances."""
+    for prior in load_training().priors:
+        np.testing.assert_array_equal(prior, prior.T)
+        assert np.linalg.eigvalsh(prior).min() > 0

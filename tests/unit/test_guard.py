@@ -1,0 +1,350 @@
+"""The guard's law against cases computed by hand: what it sees, what it does, when, and what it leaves alone."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mrctl import InputError
+from mrctl.control import guard as module
+from mrctl.control.fel import FeedbackErrorLearning, Fel
+from mrctl.control.fel_torch import ModuleLearning
+from mrctl.control.guard import ACTIONS, REASONS, Guard, guard, watches
+from mrctl.control.rls import RecursiveLeastSquares, Rls
+
+PERIOD = 0.01
+SUPPLY, ROTATION = 24.0, 3.0
+
+
+class Bench:
+    """One robot's guard and what it is connected to, by default in peace."""
+
+    def __init__(self, rigid=False, volts=1.0, **settings):
+        self.g = watches([Guard(**settings)], SUPPLY, ROTATION, np.array([volts]), rigid)[0]
+        self.integral, self.feedback = np.zeros(7), np.zeros(2)
+        self.ticks = 0
+
+    def tick(self, feedforward=(0, 0), nominal=(0, 0), feedback=(0, 0), error=0.0, norm=0.0, saturated=0.0, sent=None):
+        self.feedback[:] = feedback
+        nominal = np.array(nominal, float)
+        voltage = nominal if sent is None else np.array(sent, float)
+        guard(
+            self.g, np.array(feedforward, float), nominal, np.array([error, 0.0, 0.0]), float(norm), float(saturated),
+            voltage, PERIOD, self.integral, self.feedback,
+        )  # fmt: skip
+        self.ticks += 1
+        return ACTIONS[int(self.g["action"])]
+
+    def until(self, action, longest=100.0, **inputs):
+        """Ticks until the guard does this."""
+        for k in range(round(longest / PERIOD)):
+            if self.tick(**inputs) == action:
+                return k + 1
+        raise AssertionError(f"never: {action}")
+
+    def play(self, wave, channel=0, signal="feedforward"):
+        """Feeds a wave until the guard acts: when it did and how, or None."""
+        for k, value in enumerate(wave):
+            pair = np.zeros(2)
+            pair[channel] = value
+            if (action := self.tick(**{signal: pair})) != "none":
+                return k * PERIOD, action
+        return None
+
+    @property
+    def reason(self):
+        return REASONS[int(self.g["reason"])]
+
+
+def oscillation(amplitude, frequency, growth=0.0, duration=20.0):
+    """A sin(2πft) e^{growth t}."""
+    t = PERIOD * np.arange(round(duration / PERIOD))
+    return amplitude * np.sin(2 * np.pi * frequency * t) * np.exp(growth * t)
+
+
+def passed(frequency):
+    """Gain of the guard's band-pass, as designed in continuous time."""
+    s = 2j * np.pi * frequency
+    return abs(s * module.DRIFT / (1 + s * module.DRIFT) / (1 + s * module.SMOOTH))
+
+
+small = st.floats(-5, 5)
+
+
+@given(st.lists(st.tuples(small, small, small, small), min_size=1, max_size=10))
+@settings(max_examples=30)
+def test_silent(inputs):
+    """While nothing is wrong it passes on the same bits: U_ff to the plant, U_fb to the learner."""
+    bench = Bench()
+    for a, b, c, d in inputs:
+        calm = np.array([a, b]) / 5, np.array([c, d]) / 5  # below the amplitude that counts
+        assert bench.tick(feedforward=calm[0], feedback=calm[1]) == "none"
+        assert np.array_equal(bench.g["output"], calm[0]) and np.array_equal(bench.g["teaching"], calm[1])
+        assert np.array_equal(bench.feedback, calm[1]) and not bench.integral.any() and bench.g["idle"] == 0
+
+
+def test_off():
+    """Switched off it passes on everything."""
+    bench = Bench(on=False)
+    for values in ((100.0, -200.0), (np.nan, np.inf)):
+        assert bench.tick(feedforward=values, feedback=(50, 60), error=9.0, norm=1e9, saturated=1) == "none"
+        np.testing.assert_array_equal(bench.g["output"], values)
+        np.testing.assert_array_equal(bench.g["teaching"], (50, 60))
+
+
+@pytest.mark.parametrize(
+    ("rigid", "share", "output"),
+    [(False, 1.0, (16.0, -8.0)), (False, 0.5, (8.0, -4.0)), (True, 1.0, (24.0, -3.0)), (True, 0.5, (12.0, -1.5))],
+)
+def test_limit(rigid, share, output):
+    """U_r,l = 32 ∓ 16 V shrinks in proportion until no wheel has more than its share; a steering channel by itself."""
+    bench = Bench(rigid=rigid, share=share)
+    assert bench.tick(feedforward=(32, -16)) == "limit" and "share of the supply" in bench.reason
+    np.testing.assert_allclose(bench.g["output"], output)
+    assert bench.g["idle"] == 1
+    assert bench.tick(feedforward=np.array(output) * 0.999) == "limit"  # for a second, so that it is one event
+    assert bench.g["idle"] == 0
+    np.testing.assert_array_equal(bench.g["output"], np.array(output) * 0.999)
+    assert bench.until("none") == pytest.approx(module.BUSY / PERIOD, abs=2)
+
+
+def test_limit_for_long():
+    """An output that is limited most of the time is no help: after ln 2 of the averaging time, the fallback."""
+    bench = Bench()
+    assert bench.until("fallback", feedforward=(30, 0)) == pytest.approx(np.log(2) * module.BUSY / PERIOD, abs=2)
+    assert "for most of a second" in bench.reason
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+@pytest.mark.parametrize("signal", ["feedforward", "feedback"])
+@pytest.mark.parametrize("frequency", [0.7, 3.0, 6.0])
+def test_growing(signal, channel, frequency):
+    """Growth by e in two periods is seen in every signal, before the amplitude is a third of the supply."""
+    growth = frequency / 2
+    wave = oscillation(0.1, frequency, growth)
+    bench = Bench()
+    time, action = bench.play(wave, channel, signal)
+    amplitude = 0.1 * np.exp(growth * time) * passed(frequency) / SUPPLY
+    assert action == "freeze" and bench.reason == "growing oscillation"
+    assert 0.05 < amplitude < 0.34
+    # not before three half-waves above the threshold
+    assert time > np.log(0.05 * SUPPLY / 0.1 / passed(frequency)) / growth + 2 / (2 * frequency)
+
+
+@given(st.floats(0.1, 2.3), st.floats(0.3, 20.0), st.floats(-3, 0), st.integers(0, 1))
+@settings(max_examples=30)
+def test_steady_or_decaying(amplitude, frequency, growth, channel):
+    """Up to a tenth of the supply, an oscillation that does not grow is its own baseline, from its first wave on."""
+    assert Bench().play(oscillation(amplitude, frequency, growth), channel) is None
+
+
+@given(st.floats(5, 20), st.floats(0.05, 5))
+@settings(max_examples=40)
+def test_slow(amplitude, growth):
+    """What a lap asks for is no oscillation of the loop, however it grows."""
+    wave = np.clip(oscillation(amplitude, 0.4, growth, duration=10), -23, 23)
+    assert Bench().play(wave) is None
+
+
+@pytest.mark.parametrize("step", [2.0, 10.0, -15.0])
+@pytest.mark.parametrize("signal", ["feedforward", "feedback"])
+def test_step_and_push(signal, step):
+    """A step, a pulse, and the ringing of a well damped loop (ζ = 0.3) after either are not growing."""
+    t = PERIOD * np.arange(1000)
+    quiet = oscillation(0.2, 2.0, duration=5)
+    w = 2 * np.pi * 2
+    ringing = np.exp(-0.3 * w * t) * np.sin(w * t)
+    for event in (np.ones(1000), (t < 0.1) * 1.0, ringing, 1 - ringing):
+        assert Bench().play(np.concatenate([quiet, quiet[-1] + step * event]), signal=signal) is None
+
+
+def test_noise():
+    """White noise of any ordinary size, from the start or from one moment on, is not growing."""
+    noise = np.random.default_rng(0).normal(size=(20, 1000))
+    for k, wave in enumerate(noise):
+        assert Bench().play(0.12 * k * wave, signal="feedback") is None
+
+
+def test_large():
+    """An oscillation of half the supply is not normal even if it is steady; it is not merely frozen either."""
+    bench = Bench()
+    time, action = bench.play(oscillation(12.0, 3.0))
+    assert action == "fallback" and time < 1.5
+
+
+def frozen(bench):
+    """Brings the guard to freeze by a growing oscillation."""
+    assert bench.play(oscillation(0.1, 3.0, growth=1.0))[1] == "freeze"
+
+
+def test_freeze_and_resume():
+    """Frozen for the hold: nothing is learned, nothing else changes. Then on with a third of the gain."""
+    bench = Bench(hold=2.0)
+    frozen(bench)
+    for k in range(1, 200):
+        assert bench.tick(feedforward=(1, 2), feedback=(3, 4)) == "freeze", k
+        assert bench.g["idle"] == 1
+        np.testing.assert_array_equal(bench.g["output"], (1, 2))
+    assert bench.tick(feedforward=(1, 2), feedback=(3, 6)) == "none"
+    assert bench.g["idle"] == 0
+    np.testing.assert_allclose(bench.g["teaching"], (1, 2))
+    np.testing.assert_array_equal(bench.feedback, (3, 6))
+
+
+def test_freezing_was_not_enough():
+    """Growth that goes on while frozen ends in the fallback, as part of the same attempt."""
+    bench = Bench()
+    bench.play(wave := oscillation(0.1, 3.0, growth=1.0))
+    for value in 1.5 * wave[bench.ticks :]:
+        if bench.tick(feedforward=(value, 0)) == "fallback":
+            break
+    assert bench.g["strikes"] == 1 and bench.g["restore"] == 1
+
+
+@pytest.mark.parametrize("fallback", ["model", "none"])
+def test_fallback(fallback):
+    """Nominal inverse dynamics or nothing in place of the learner; the voltage goes there without a jump.
+
+    The integral takes what the nominal model lacked on average, 2 V here; what is left fades.
+    """
+    bench = Bench(fallback=fallback, fade=0.1)
+    for _ in range(1000):
+        bench.tick(feedforward=(7, 1), nominal=(5, 1), sent=(7, 1))
+    bench.integral[:2] = 0.5, -0.5
+    feedback = np.array([0.6, -0.4])  # of which the integral is all but 0.1 V
+    assert bench.tick(feedforward=(9, 4), nominal=(5, 1), feedback=feedback, sent=(7, 1), norm=1e9) == "fallback"
+    assert "weights" in bench.reason and bench.g["restore"] == 1
+    np.testing.assert_allclose(bench.g["output"] + bench.feedback, (9.6, 3.6))  # 9 + 0.6, 4 − 0.4: no jump
+    given = np.array([5.0, 1.0]) if fallback == "model" else np.zeros(2)
+    np.testing.assert_allclose(bench.integral[:2], np.array([7.0, 1.0]) - given, atol=1e-3)
+    np.testing.assert_allclose(bench.feedback, bench.integral[:2] + 0.1)
+    bump = bench.g["output"] - given
+    for k in range(1, 30):
+        integral = bench.integral.copy()
+        bench.tick(feedforward=(-9, -9), nominal=(5, 1), feedback=(1, 1))
+        np.testing.assert_allclose(bench.g["output"], given + bump * (0.1 / 0.11) ** k)
+        np.testing.assert_array_equal(bench.integral, integral)
+        assert bench.g["restore"] == 0 and bench.g["idle"] == 1
+
+
+def test_return():
+    """After the first fallback the learner's share of the output grows from none to all over three times 5 s."""
+    bench = Bench(hold=0.5)
+    assert bench.tick(norm=1e9) == "fallback"
+    assert bench.until("none", nominal=(4, 2)) == pytest.approx(50, abs=1)
+    for k in range(0, 1500, 100):
+        np.testing.assert_allclose(bench.g["output"], (4 + k / 1500 * 2, 2 - k / 1500 * 2), atol=0.01)
+        assert bench.g["idle"] == 0
+        for _ in range(100):
+            bench.tick(feedforward=(6, 0), nominal=(4, 2))
+    bench.tick(feedforward=(6, 0.7), nominal=(4, 2))
+    np.testing.assert_array_equal(bench.g["output"], (6, 0.7))  # to the bit again
+
+
+def test_back_off():
+    """Each attempt learns with a third of the gain and waits three times as long; the last one ends it."""
+    bench = Bench(hold=0.2, retries=3)
+    for k in range(3):
+        assert bench.tick(norm=1e9) == "fallback"
+        bench.tick()
+        assert bench.until("none") == pytest.approx(20 * 3**k, abs=2)
+        bench.tick(feedback=(27, 27))
+        np.testing.assert_allclose(bench.g["teaching"], 27 / 3 ** (k + 1))
+    assert bench.tick(norm=1e9) == "fallback"
+    with pytest.raises(AssertionError, match="never"):
+        bench.until("none", longest=200)
+
+
+def test_hopeless_is_not_frozen():
+    """After the last retry a growing oscillation, too, ends in the fallback."""
+    bench = Bench(retries=0)
+    assert bench.play(oscillation(0.1, 3.0, growth=1.0))[1] == "fallback"
+
+
+def test_not_finite():
+    """What is no number never reaches the plant, and does not come back while it is none."""
+    bench = Bench(hold=0.3)
+    bench.tick(feedforward=(2, 1), nominal=(3, 0))
+    assert bench.tick(feedforward=(np.nan, 1), nominal=(3, 0)) == "fallback" and "finite" in bench.reason
+    assert np.isfinite(bench.g["output"]).all() and np.isfinite(bench.integral).all()
+    for _ in range(100):
+        assert bench.tick(feedforward=(np.inf, 1), nominal=(3, 0)) == "fallback"
+    np.testing.assert_allclose(bench.g["output"], (3, 0), atol=1e-3)
+    assert bench.until("none", feedforward=(1, 1), nominal=(3, 0)) == pytest.approx(30, abs=1)
+
+
+@pytest.mark.parametrize(("volts", "bound"), [(1.0, 60.0), (6.0, 10.0)])
+def test_weights(volts, bound):
+    """Two and a half times the supply, in the stage's own unit; without a unit there is no bound, but NaN is none."""
+    assert Bench(volts=volts).tick(norm=bound * 0.999) == "none"
+    assert Bench(volts=volts).tick(norm=bound * 1.001) == "fallback"
+    assert Bench(volts=volts).tick(norm=np.nan) == "fallback"
+    assert Bench(volts=0.0).tick(norm=1e300) == "none"
+
+
+def test_far():
+    """0.15 m is always tolerated, and so is a start half a metre off; growth to three times the usual is not."""
+    bench = Bench()
+    for _ in range(1000):
+        assert bench.tick(error=0.05) == "none"
+    assert bench.tick(error=0.149) == "none"
+    assert bench.tick(error=0.151) == "fallback" and bench.reason == "far from the reference"
+    bench = Bench()
+    for k in range(1000):
+        assert bench.tick(error=0.5 * np.exp(-k / 200)) == "none"
+
+
+def test_saturation():
+    """Saturated for 2 ln 2 s, it freezes until that is over; the setting of the learner is not to blame."""
+    bench = Bench()
+    assert bench.until("freeze", saturated=1) == pytest.approx(np.log(2) * module.STUCK / PERIOD, abs=2)
+    assert bench.tick(saturated=1) == "freeze"
+    bench.until("none")
+    bench.tick(feedback=(3, 1))
+    np.testing.assert_array_equal(bench.g["teaching"], (3, 1))
+
+
+@pytest.mark.parametrize("bad", [{"share": 1.1}, {"growth": 0.5}, {"fallback": "oracle"}, {"retries": -1}])
+def test_bad_settings(bad):
+    """Refused by name."""
+    with pytest.raises(InputError, match=next(iter(bad))):
+        Guard.from_dict(bad)
+
+
+def stages(robot):
+    """The stages that can forget."""
+    torch.manual_seed(0)
+    return {
+        "fel": FeedbackErrorLearning(robot, [Fel()] * 2, [3, 4], False),
+        "rls": RecursiveLeastSquares(robot, [Rls()] * 2, False),
+        "torch": ModuleLearning(torch.nn.Linear(8, 2), robot, 2),
+    }
+
+
+@pytest.mark.parametrize("name", ["fel", "rls", "torch"])
+def test_restore(robot, name):
+    """A robot that forgets goes on as one that never learned; the other keeps what it knows."""
+    rng = np.random.default_rng(0)
+    used, fresh, kept = (stages(robot)[name] for _ in range(3))
+
+    def lesson(stage):
+        for command, derivative, feedback in rng.normal(size=(20, 3, 2, 2)):
+            stage.output(command, derivative)
+            stage.learn(feedback, np.zeros(2), np.zeros((2, 2)), np.zeros((2, 2)))
+
+    lesson(used)
+    rng = np.random.default_rng(0)
+    lesson(kept)
+    assert (used.weight_norm > 0).all()
+    used.restore(np.array([1]))
+    assert used.weight_norm[1] == 0 and used.weight_norm[0] == kept.weight_norm[0]
+    for _ in range(2):  # before and after it learns again
+        command = np.array([[0.7, 0.3], [0.5, -1.0]])
+        out, new, old = (np.array(stage.output(command, command)) for stage in (used, fresh, kept))
+        assert np.array_equal(out[1], new[1]) and np.array_equal(out[0], old[0])
+        assert not np.array_equal(old[1], new[1])
+        seed = rng.integers(1000)
+        for stage in (used, fresh, kept):
+            rng = np.random.default_rng(seed)
+            lesson(stage)

@@ -1,0 +1,103 @@
+"""The disturbance observer on equation (3): its estimate against Q's own response, and its margins."""
+
+import numpy as np
+import pytest
+
+from mrctl.control.feedforward import InverseDynamics
+from mrctl.control.observer import DisturbanceObserver, Observer
+from mrctl.dynamics import accelerations, left_right
+
+PERIOD = 0.01
+T = Observer().time_constant
+RNG = np.random.default_rng(9)
+
+
+def drive(robot, disturbance, seconds):
+    """Estimates `(ticks, 2)` on the nominal plant that loses `disturbance(t)` volts, driven without feedback."""
+    plant = robot.model_copy(update={"supply": 1e3})
+    stage = DisturbanceObserver(robot, [Observer()], False, PERIOD)
+    twist, log = np.array([0.8, 0.2]), []
+    for tick in range(round(seconds / PERIOD)):
+        voltage = np.array([9.0 + np.sin(3 * PERIOD * tick), 0.5])
+        stage.learn(np.zeros((1, 2)), np.zeros(1), twist[None], voltage[None])
+        log.append(stage.state["disturbance"][0].copy())
+        for part in range(10):
+            lost = disturbance(PERIOD * (tick + part / 10))
+            twist = twist + PERIOD / 10 * accelerations(twist, left_right(voltage - lost), plant, sign_speed=0.05)
+    return np.array(log)
+
+
+def test_step(robot):
+    """A constant disturbance is found as Q finds a step: 1 − exp(−t/T)."""
+    lost = np.array([1.0, -0.4])
+    found = drive(robot, lambda t: lost, 5 * T)
+    t = PERIOD * np.arange(len(found))
+    np.testing.assert_allclose(found, np.outer(1 - np.exp(-t / T), lost), atol=0.05)
+    np.testing.assert_allclose(found[-1], lost, rtol=0.02)
+
+
+@pytest.mark.parametrize("ratio", [0.2, 1.0])
+def test_bandwidth(robot, ratio):
+    """A disturbance that swings at ω is found with the gain and phase of 1/(1 + jωT)."""
+    w = ratio / T
+    found = drive(robot, lambda t: np.array([np.sin(w * t), 0.0]), 40.0)[:, 0]
+    t = PERIOD * np.arange(len(found))
+    late = t >= t[-1] - 2 * np.pi / w * np.floor(20 * w / (2 * np.pi))
+    response = 2 * np.mean(found[late] * np.exp(-1j * w * t[late])) * 1j
+    assert response == pytest.approx(1 / (1 + 1j * ratio), abs=0.06)
+
+
+def sensitivity(time_constant, delay, pid_time_constant=0.15):
+    """Peak of |1/(1 + L)| with C P = 1/(λ s), from the two blocks and not from the formula of the module."""
+    s = 1j * np.geomspace(0.1, 300, 100_000)
+    q = 1 / (time_constant * s + 1)
+    loop = (1 / (pid_time_constant * s) + q) / (1 - q) * np.exp(-s * delay)
+    summed = 1 / (pid_time_constant * s) + 1 / (time_constant * s) + 1 / (pid_time_constant * time_constant * s**2)
+    np.testing.assert_allclose(loop, summed * np.exp(-s * delay), rtol=1e-9)
+    return np.abs(1 / (1 + loop)).max()
+
+
+def test_margin():
+    """With 40 ms of delay and the hold the sensitivity stays below 2; a hundredth of a second faster it does not."""
+    assert sensitivity(T, 0.045) < 2 < sensitivity(T - 0.01, 0.045)
+    assert sensitivity(T, 0.005) < 1.1
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+def test_output(robot, rigid):
+    """It begins as the model and adds what it has observed; the PID's integral is left alone."""
+    stage, model = DisturbanceObserver(robot, [Observer()] * 2, rigid, PERIOD), InverseDynamics([robot] * 2, rigid)
+    command, derivative = RNG.uniform(-1, 1, (2, 2, 2))
+    np.testing.assert_array_equal(stage.output(command, derivative), model.output(command, derivative))
+    for _ in range(3):
+        assert stage.learn(np.ones((2, 2)), np.zeros(2), command, np.ones((2, 2))) is None
+    expected = model.output(command, derivative) + stage.state["disturbance"]
+    np.testing.assert_array_equal(stage.output(command, derivative), expected)
+    assert stage.state["disturbance"].any()
+
+
+def test_steering(robot):
+    """Under rigid steering the disturbance is the rotation that is asked for and does not come."""
+    stage = DisturbanceObserver(robot, [Observer()], True, PERIOD)
+    command = np.array([[0.8, 0.5]])
+    for _ in range(300):
+        stage.output(command, np.zeros((1, 2)))
+        stage.learn(np.zeros((1, 2)), np.zeros(1), np.array([[0.8, 0.45]]), np.array([[9.0, 0.02]]))
+    assert stage.state["disturbance"][0, 1] == pytest.approx(0.5 + 0.02 - 0.45, rel=1e-6)
+
+
+def test_rows(robot):
+    """Robots do not mix: a row has the same bits alone and beside one that is lost."""
+    inputs = RNG.uniform(-1, 1, (30, 3, 3, 2))
+
+    def answer(rows, lost=()):
+        stage, log = DisturbanceObserver(robot, [Observer()] * len(inputs[0, 0, rows]), False, PERIOD), []
+        for command, twist, voltage in inputs[:, :, rows].copy():
+            twist[list(lost)] = np.nan
+            log.append(stage.output(command, command).copy())
+            stage.learn(command, np.zeros(len(twist)), twist, voltage)
+        return np.array(log)
+
+    together = answer(slice(None), lost=[1])
+    for i in (0, 2):
+        assert together[:, i].tobytes() == answer(slice(i, i + 1))[:, 0].tobytes()
