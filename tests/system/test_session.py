@@ -1,5 +1,7 @@
 """A session under way: what is done to it is kept, and the saved session runs again headless to the bit."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -125,7 +127,7 @@ def test_blocks(monkeypatch):
         BASE.model_copy(update={"reference": Circle(radius=0.6, period=4)}),
     ]
     whole = simulate(scenarios)
-    monkeypatch.setattr("mrctl.simulate.BLOCK", 97)
+    monkeypatch.setattr(sys.modules["mrctl.simulate"], "BLOCK", 97)  # `mrctl.simulate` itself is the function
     parts = simulate(scenarios)
     for name in ("x_ref", "omega_ref", "x", "voltage_left"):
         assert parts[name].values.tobytes() == whole[name].values.tobytes()
