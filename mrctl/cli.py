@@ -57,6 +57,7 @@ def _parse(arguments: list[str]) -> None:
         "tune": tune,
         "train": train,
         "bench": bench,
+        "view": view,
     }
     complaints = io.StringIO()
     try:
@@ -260,6 +261,30 @@ def bench(json: bool = False) -> None:
 
     figures = benchmark.run()
     print(jsonlib.dumps(figures, indent=2, ensure_ascii=False) if json else benchmark.text(figures))
+
+
+def view(
+    file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml|RESULT")] = None,
+    /,
+    compare: tuple[FeedforwardName, ...] = (),
+    number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
+    export: Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+) -> None:
+    """Shows robots in the browser: a live session of a scenario, or the replay of a result or sweep.
+
+    Args:
+        file: Scenario file, or what `mrctl run --out` or `mrctl sweep` wrote; by default the default scenario, live.
+        compare: Feedforwards that drive ghosts beside the scenario's own, with the same seed and events.
+        number: Run of a result or sweep to begin with.
+        export: Writes one HTML file that plays by itself, instead of serving a page.
+        host: Address to listen on; other than 127.0.0.1 lets others in, without asking them who they are.
+        port: Port to listen on.
+    """
+    from mrctl import viewer
+
+    viewer.view(file, compare, number, export, host, port)
 
 
 if __name__ == "__main__":

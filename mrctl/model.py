@@ -385,13 +385,13 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray) -> State:
     steering = float(np.clip(scrub_free_angle(twist, robot), -robot.steering_limit, robot.steering_limit))
     reach = robot.wheelbase - robot.trail * np.cos(steering)
     aside = -robot.trail * np.sin(steering)
-    ground = np.array(
+    floor = np.array(
         [
-            _ground(model, data, *(np.array([x, y]) + offset))
+            ground(model, data, *(np.array([x, y]) + offset))
             for offset in (robot.half_track * left, -robot.half_track * left, reach * ahead + aside * left)
         ]
     )
-    normal = np.cross(ground[1] - ground[0], ground[2] - ground[0])
+    normal = np.cross(floor[1] - floor[0], floor[2] - floor[0])
     normal /= np.linalg.norm(normal) * np.sign(normal[2])
     # Distances from that plane: each wheel's centre at its radius. In the body frame the rear centres are (0, ±D, 0).
     radius_left, radius_right = model.geom("wheel_left").size[0], model.geom("wheel_right").size[0]
@@ -406,7 +406,7 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray) -> State:
     rise = np.arcsin(up[0] / np.hypot(slope, normal[2])) - np.arctan2(slope, normal[2])
     body_x = np.append(np.cos(rise) * ahead, np.sin(rise))
     frame = _frame(normal, body_x) @ _frame(up, np.array([1.0, 0.0, 0.0])).T
-    point = ground[:2].mean(axis=0)
+    point = floor[:2].mean(axis=0)
     origin_z = (height - normal[:2] @ (np.array([x, y]) - point[:2])) / normal[2] + point[2]
     data.qpos[:3] = x, y, origin_z
     mujoco.mju_mat2Quat(data.qpos[3:7], frame.ravel())
@@ -436,7 +436,7 @@ def _frame(up: NDArray, ahead: NDArray) -> NDArray:
     return np.column_stack([np.cross(side, up), side, up])
 
 
-def _ground(model: mujoco.MjModel, data: mujoco.MjData, x: float, y: float) -> NDArray:
+def ground(model: mujoco.MjModel, data: mujoco.MjData, x: float, y: float) -> NDArray:
     """The ground point below (x, y); the robot itself (geom groups above 0) is transparent to the ray."""
     mujoco.mj_kinematics(model, data)
     groups = np.array([1, 0, 0, 0, 0, 0], np.uint8)

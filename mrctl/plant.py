@@ -268,6 +268,14 @@ class Plant(ABC):
         self.state["resistance"][robot], self.state["back_emf"][robot] = resistance[0], back_emf[0]
         self.state["drive_gain"][robot], self.state["delay"][robot] = perturbation.supply_factor, delay
 
+    def check(self, perturbation: Perturbation) -> None:
+        """Refuses a perturbation with which a robot could not stand.
+
+        Raises:
+            InputError: Why.
+        """
+        mjcf.perturb(self._nominal, self._scratch, perturbation)
+
     def reset(self, pose: Array, twist: Array) -> None:
         """Stands every robot on the ground, rolling.
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -50,6 +51,24 @@ class Record(BaseModel):
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not TOML: {error}") from None
         return cls.from_dict(values, str(path))
+
+    def to_toml(self) -> str:
+        """The record as `from_toml` reads it, complete, a field a line and an element of a list a line."""
+        return "".join(
+            f"{name} = {_toml(value, nested=False)}\n"
+            for name, value in self.model_dump(mode="json", exclude_none=True).items()
+        )
+
+
+def _toml(value: Any, nested: bool = True) -> str:  # noqa: ANN401
+    """A value in TOML, whose numbers, booleans and, but for one character, strings are JSON's."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, list) and not nested and any(isinstance(item, dict) for item in value):
+        return "[\n" + "".join(f"    {_toml(item)},\n" for item in value) + "]"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def describe(error: ValidationError, source: str = "") -> str:

@@ -109,6 +109,15 @@ class Scenario(Record):
             raise ValueError(f"laps: a run of {self.duration:g} s is not between 1 and {LONGEST:,} control periods")
         return self
 
+    def with_event(self, event: Event) -> Scenario:
+        """The same run with one event more.
+
+        Raises:
+            InputError: It does not fit the run.
+        """
+        values = {name: getattr(self, name) for name in Scenario.model_fields}
+        return Scenario.from_dict(values | {"events": (*self.events, event)})
+
     @property
     def duration(self) -> float:
         """Length of the run in s."""

@@ -33,6 +33,7 @@ Factory = Callable[[Robot, int], Feedforward]
 
 DIVERGED = 1.0  # m of lateral error
 LATERAL_ERROR = list(result.SIGNALS).index("lateral_error")
+BLOCK = 10_000  # control ticks whose references are sampled at once
 FAR = 0.8  # m between robot and reference at the start
 
 _observe, _posture_error = one(observe), one(posture_error)
@@ -111,11 +112,8 @@ def simulate(
         raise InputError("scenarios: none given")
     if len({s.control_period for s in several}) > 1:
         raise InputError("control_period: runs of one result share their time axis, so also their control period")
-    groups: dict[Hashable, list[int]] = defaultdict(list)
-    for row, scenario in enumerate(several):
-        groups[_group(scenario)].append(row)
     # Built first, so that bad input is refused before anything is computed.
-    simulations = [(rows, Simulation([several[r] for r in rows], feedforward, threads)) for rows in groups.values()]
+    simulations = batches(several, feedforward, threads)
     total = sum(simulation.ticks * len(rows) for rows, simulation in simulations)
     parts = []
     with tqdm(total=total, unit="tick", unit_scale=True, disable=not progress) as bar:
@@ -131,26 +129,23 @@ def simulate(
     return whole.isel(run=0) if isinstance(scenarios, Scenario) else whole
 
 
-def _group(scenario: Scenario) -> Hashable:
-    """Scenarios with equal keys run in one batch."""
-    s = scenario
-    return (
-        s.world,
-        s.steering,
-        s.feedforward,
-        s.ticks,
-        s.physics_step,
-        s.motion_period,
-        s.fel.hidden,
-        s.composite.weights,
-    )
+def batches(
+    scenarios: Sequence[Scenario], feedforward: Factory | None = None, threads: int = 0
+) -> list[tuple[list[int], Simulation]]:
+    """Uniform groups of scenarios: which they are, and their simulation. Arguments and errors as in `simulate`."""
+    groups: dict[Hashable, list[int]] = defaultdict(list)
+    for row, s in enumerate(scenarios):
+        net = s.fel.hidden, s.composite.weights
+        groups[s.world, s.steering, s.feedforward, s.ticks, s.physics_step, s.motion_period, *net].append(row)
+    return [(rows, Simulation([scenarios[r] for r in rows], feedforward, threads)) for rows in groups.values()]
 
 
 class Simulation:
     """A uniform group of runs, one control period at a time.
 
     Attributes:
-        scenarios: What is run.
+        scenarios: What is run, with the events that were added.
+        model: The compiled world with the nominal robot.
         plant: The physics.
         hierarchy: The controllers.
         tick: Control periods done.
@@ -173,7 +168,7 @@ class Simulation:
         self.scenarios = list(scenarios)
         self.ticks, self.tick = first.ticks, 0
         self._period = first.control_period
-        compiled = mjcf.load(first.world, first.steering, first.physics_step)
+        self.model = compiled = mjcf.load(first.world, first.steering, first.physics_step)
         robot = mjcf.read_robot(compiled)
         rigid = first.steering == "rigid"
         for scenario in scenarios:
@@ -184,15 +179,7 @@ class Simulation:
         self._oracle = stage if first.feedforward == "oracle" and isinstance(stage, InverseDynamics) else None
         self.plant: Plant = build(compiled, size, round(first.control_period / first.physics_step), threads)
         self.hierarchy = Hierarchy(scenarios, robot, stage)
-        times = self._period * np.arange(self.ticks, dtype=float)
-        # Robots that follow the same reference share its samples, (ticks, references, 7).
-        names = [(s.reference, *((e.time, e.reference) for e in s.events if e.reference)) for s in scenarios]
-        different = dict(zip(names, scenarios, strict=True))
-        order = list(different)
-        samples = np.stack([_course(s, times) for s in different.values()], axis=1)
-        self._which = np.array([order.index(name) for name in names]) if 1 < len(order) < size else None
-        shared = self._which is None and len(order) < size
-        self._reference = np.broadcast_to(samples, (self.ticks, size, 7)) if shared else samples
+        self._plan()
         self._wheel_radius = robot.wheel_radius
         self._sensors = np.zeros(size, SENSORS)
         self._sensors["odometry"] = [s.measurement == "odometry" for s in scenarios]
@@ -219,6 +206,26 @@ class Simulation:
         """Whether there is anything left to do."""
         return self.tick < self.ticks and self.plant.running > 0
 
+    def add(self, event: Event) -> None:
+        """Adds an event to every run under way: `scenarios` then hold it, and run again give the same bits.
+
+        Args:
+            event: What happens, not before the coming tick.
+
+        Raises:
+            InputError: It comes too late, or a scenario with it is refused; then nothing was added.
+        """
+        if (tick := _tick(event, self._period)) < self.tick:
+            raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self._period:g} s")
+        if event.perturbation is not None:
+            self.plant.check(event.perturbation)
+        if event.reference is not None:
+            check(event.reference, self.plant.robot, reverse=self.scenarios[0].steering == "rigid")
+        self.scenarios = [scenario.with_event(event) for scenario in self.scenarios]
+        self._schedule[tick] += enumerate([event] * len(self.scenarios))
+        if event.reference is not None:
+            self._plan()
+
     def step(self) -> None:
         """One control period: events, measurement, control, record, physics."""
         for row, event in self._schedule.get(self.tick, ()):
@@ -243,8 +250,22 @@ class Simulation:
             self._failure_time[new] = self.tick * self._period
             log[plant.failed] = np.nan
 
+    def _plan(self) -> None:
+        """Finds the courses: robots on the same one share its samples."""
+        names = [(s.reference, *((e.time, e.reference) for e in s.events if e.reference)) for s in self.scenarios]
+        self._courses = dict(zip(names, self.scenarios, strict=True))
+        order = list(self._courses)
+        self._which = np.array([order.index(n) for n in names]) if 1 < len(order) < len(names) else None
+        self._block = range(0)
+
     def _reference_now(self) -> Array:
-        now = self._reference[self.tick]
+        if self.tick not in self._block:  # a long run does not hold all samples: (BLOCK, courses, 7)
+            first = self.tick // BLOCK * BLOCK
+            self._block = range(first, min(first + BLOCK, self.ticks))
+            samples = np.stack([_course(s, self._block) for s in self._courses.values()], axis=1)
+            everyone = (len(samples), len(self.scenarios), 7)
+            self._reference = np.broadcast_to(samples, everyone) if len(self._courses) == 1 else samples
+        now = self._reference[self.tick - self._block.start]
         return now if self._which is None else now[self._which]
 
     def result(self) -> xr.Dataset:
@@ -289,12 +310,15 @@ def _tick(event: Event, period: float) -> int:
     return int(np.ceil(event.time / period - 1e-9))
 
 
-def _course(scenario: Scenario, times: Array) -> Array:
+def _course(scenario: Scenario, ticks: range) -> Array:
     """Posture, twist and acceleration to follow, `(ticks, 7)`, through all events that change the reference."""
-    course = np.hstack(scenario.reference.sample(times))
+    period = scenario.control_period
+    course = np.hstack(scenario.reference.sample(period * np.array(ticks, float)))
     for event in sorted(scenario.events, key=lambda e: e.time):
-        if event.reference is not None and (left := len(times) - _tick(event, scenario.control_period)) > 0:
-            course[-left:] = np.hstack(event.reference.sample(times[:left]))
+        start = _tick(event, period)
+        if event.reference is not None and (since := max(start, ticks.start)) < ticks.stop:
+            times = period * np.arange(since - start, ticks.stop - start, dtype=float)
+            course[since - ticks.start :] = np.hstack(event.reference.sample(times))
     return course
 
 

@@ -3,8 +3,13 @@
 import tomllib
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mrctl.record import InputError, Record
+from mrctl.references import Line, Waypoints
+from mrctl.robot import Perturbation
+from mrctl.scenario import Event, Scenario
 
 
 class Inner(Record):
@@ -103,3 +108,18 @@ def test_field_docs():
         """Turns per second."""
 
     assert Documented.model_fields["rate"].description == "Turns per second."
+
+
+TEXT = st.text(st.characters(codec="utf-8", exclude_characters="\x00"), max_size=30)
+NUMBER = st.floats(-1, 1)
+
+
+@given(name=TEXT, x=NUMBER, time=st.floats(0, 1e8), delay=st.integers(0, 50), points=st.booleans())
+def test_toml(tmp_path_factory, name, x, time, delay, points):
+    """What is written is what is read, to the bit, with quotes, control characters and small numbers in it."""
+    event = Event(time=time, perturbation=Perturbation(payload=abs(x), payload_x=x, control_delay=delay / 100))
+    reference = Waypoints() if points else Line(heading=x)
+    scenario = Scenario(name=name, reference=reference, events=(event, Event(time=1, push=(x, 0, 1e-9))))
+    path = tmp_path_factory.mktemp("toml") / "scenario.toml"
+    path.write_bytes(scenario.to_toml().encode())
+    assert Scenario.from_toml(path) == scenario

@@ -1,0 +1,105 @@
+"""Inputs of a page, made from the fields of a record and their limits."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Callable, Sequence
+from math import floor, log10
+from typing import Any, Literal
+
+import viser
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic.fields import FieldInfo
+
+from mrctl.record import Record
+
+Changed = Callable[[tuple[str, ...], Any], None]
+WORLDS = ("flat", "slope", "rough", "patch")
+
+
+class Controls:
+    """An input for every field of a record that is a number, a choice or a switch; records in it become folders."""
+
+    def __init__(self, gui: viser.GuiApi, changed: Changed) -> None:
+        """Takes the page's GUI and what is told of a change: the path of the field, and its new value."""
+        self._gui, self._changed = gui, changed
+        self._inputs: dict[tuple[str, ...], Any] = {}
+        self._folders: dict[tuple[str, ...], viser.GuiFolderHandle] = {}
+
+    def add(self, record: Record, path: tuple[str, ...] = (), only: Sequence[str] | None = None) -> None:
+        """Adds inputs where the GUI's context is.
+
+        Args:
+            record: The present values.
+            path: Where it is in the whole.
+            only: Which of its fields; by default all.
+        """
+        for name, field in type(record).model_fields.items():
+            if only is None or name in only:
+                self._add(getattr(record, name), field, (*path, name))
+
+    def _add(self, value: Any, field: FieldInfo, path: tuple[str, ...]) -> None:  # noqa: ANN401
+        label, hint = path[-1].replace("_", " "), field.description
+        if isinstance(value, Record):
+            self._folders[path] = self._gui.add_folder(label, expand_by_default=len(path) == 1)
+            with self._folders[path]:
+                if kinds := _kinds(field):
+                    kind = value.model_dump()["kind"]
+                    self._listen(path, self._gui.add_dropdown("kind", kinds, initial_value=kind))
+                return self.add(value, path)
+        if typing.get_origin(field.annotation) is Literal and len(typing.get_args(field.annotation)) > 1:
+            handle = self._gui.add_dropdown(label, typing.get_args(field.annotation), initial_value=value, hint=hint)
+        elif path == ("world",):
+            handle = self._gui.add_dropdown(label, tuple(dict.fromkeys([value, *WORLDS])), initial_value=value)
+        elif isinstance(value, bool):
+            handle = self._gui.add_checkbox(label, value, hint=hint)
+        elif isinstance(value, int | float) and (limits := _limits(field, value)):
+            low, high, step = limits
+            # Floats even for whole numbers: viser passes on what any page sends for an int, however large, and then
+            # cannot pack it for any other.
+            if high - low > 1e4 * step:
+                handle = self._gui.add_number(label, float(value), min=low, max=high, step=step, hint=hint)
+            else:
+                handle = self._gui.add_slider(label, low, high, step, float(value), hint=hint)
+        else:
+            return
+        self._listen(path, handle)
+
+    def _listen(self, path: tuple[str, ...], handle: Any) -> None:  # noqa: ANN401
+        self._inputs[path] = handle
+
+        @handle.on_update
+        async def _(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                self._changed(path, handle.value)
+
+    def show(self, record: Record, path: tuple[str, ...] = ()) -> None:
+        """Sets the inputs below a path to the values of a record."""
+        for name in type(record).model_fields:
+            value, where = getattr(record, name), (*path, name)
+            if isinstance(value, Record):
+                self.show(value, where)
+            elif where in self._inputs and self._inputs[where].value != value:
+                self._inputs[where].value = value
+
+    def remove(self, path: tuple[str, ...]) -> None:
+        """Takes the folder of a record away."""
+        self._folders.pop(path).remove()
+        self._inputs = {where: handle for where, handle in self._inputs.items() if where[: len(path)] != path}
+
+
+def _kinds(field: FieldInfo) -> tuple[str, ...]:
+    """The alternatives of a record that comes in several kinds."""
+    return tuple(kind.model_fields["kind"].default for kind in typing.get_args(field.annotation) if field.discriminator)
+
+
+def _limits(field: FieldInfo, value: float) -> tuple[float, float, float] | None:
+    """Least and greatest value and a step that suits range and value, or None where a side is open."""
+    bounds = {type(m): getattr(m, type(m).__name__.lower()) for m in field.metadata if isinstance(m, Ge | Gt | Le | Lt)}
+    low, high = bounds.get(Ge, bounds.get(Gt)), bounds.get(Le, bounds.get(Lt))
+    if low is None or high is None:
+        return None
+    if field.annotation is int:
+        return float(low + (Gt in bounds)), float(high - (Lt in bounds)), 1.0
+    step = 10.0 ** floor(log10(min((high - low) / 1000, abs(value) / 10 or high)))
+    return float(low + step * (Gt in bounds)), float(high - step * (Lt in bounds)), step

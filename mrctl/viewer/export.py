@@ -1,0 +1,95 @@
+"""A replay as one HTML file that needs neither server nor network."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrctl.record import InputError
+from mrctl.viewer.plots import charts, legend
+from mrctl.viewer.recording import Recording, together
+from mrctl.viewer.scene import Scene
+from mrctl.viewer.server import Server
+
+PICTURES = 25  # a second
+SAMPLES = 1200  # in a curve
+PLAYER = Path(__file__).parent / "player.html"
+
+
+def export(recordings: Sequence[Recording], labels: Sequence[str], path: Path) -> None:
+    """Writes recordings as a page with the 3-D scene and the curves, and one scrubber for both.
+
+    Args:
+        recordings: Runs in one world, the first one solid.
+        labels: A name a run.
+        path: The file.
+
+    Raises:
+        InputError: It exists or cannot be written.
+    """
+    if path.exists():
+        raise InputError(f"export: {path} exists already; nothing was overwritten")
+    parts = {
+        "legend": legend(labels),
+        "scene": html.escape(_scene(recordings, labels)),
+        "data": _curves(recordings, labels),
+    }
+    page = re.sub(r"{{(\w+)}}", lambda found: parts[found[1]], PLAYER.read_text())
+    try:
+        path.write_text(page)
+    except OSError as error:
+        raise InputError(f"export: {path}: {error.strerror or error}") from None
+
+
+def _scene(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
+    """The scene with its player, as a page of its own."""
+    server = Server(port=0)
+    try:
+        scene = Scene(server, recordings[0].model, labels)
+        scene.show_recordings(recordings)
+        duration = max(r.duration for r in recordings)
+        serializer = server.get_scene_serializer()
+        for time in np.arange(0, duration, 1 / PICTURES):
+            for row, recording in enumerate(recordings):
+                scene.show(row, recording.qpos(recording.index(time)))
+            scene.show_payload(recordings[0].perturbation(time))
+            scene.flush(follow=False)
+            serializer.insert_sleep(1 / PICTURES)
+        return serializer.as_html()
+    finally:
+        server.stop()
+
+
+def _curves(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
+    """The curves as JSON, safe inside a script element."""
+    times, log = together(recordings)
+    step = max(1, len(log) // SAMPLES)
+    drawn = []
+    for chart in charts(log, labels, recordings[0].period):
+        values = [curve.values[::step] for curve in chart.curves]
+        known = np.concatenate(values)
+        known = known[np.isfinite(known)]
+        drawn.append(
+            {
+                "title": chart.title,
+                "range": [float(known.min()), float(known.max())] if known.size else [0.0, 1.0],
+                "curves": [
+                    {"colour": f"rgb{curve.colour}", "dashed": curve.dashed, "values": _rounded(v)}
+                    for curve, v in zip(chart.curves, values, strict=True)
+                ],
+            }
+        )
+    marks = sorted({e.time for r in recordings for e in r.scenario.events if e.time <= times[-1]})
+    data: dict[str, Any] = {"time": _rounded(times[::step]), "charts": drawn, "marks": marks}
+    return json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float | None]:
+    return [float(f"{v:.5g}") if np.isfinite(v) else None for v in values]

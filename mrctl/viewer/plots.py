@@ -1,0 +1,170 @@
+"""Who does the work: the curves that live pages, replays and exported files show."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser import uplot
+
+from mrctl.result import SIGNALS
+from mrctl.viewer.scene import REFERENCE, Colour, colour_of
+
+Array = NDArray[np.float64]
+
+COLUMN = {name: k for k, name in enumerate(SIGNALS)}
+SHARE_WINDOW = 1.0  # s over which the share of feedback is taken
+CURSOR: Colour = (150, 155, 160)
+MOST = 4  # robots whose curves are drawn
+
+
+class Curve(NamedTuple):
+    """One line of a chart."""
+
+    label: str
+    colour: Colour
+    dashed: bool
+    values: Array
+
+
+class Chart(NamedTuple):
+    """Curves with one axis."""
+
+    title: str
+    curves: list[Curve]
+
+
+def charts(log: Array, labels: Sequence[str], period: float) -> list[Chart]:
+    """The charts of a record.
+
+    Args:
+        log: `(T, B, signals)`, columns as in `mrctl.result.SIGNALS`.
+        labels: A name a robot.
+        period: Time between samples in s.
+    """
+    shown = range(min(len(labels), MOST))
+
+    def signal(name: str, row: int) -> Array:
+        return log[:, row, COLUMN[name]]
+
+    def each(quantity: str, values: Sequence[Array], dashed: bool = False) -> list[Curve]:
+        return [Curve(f"{labels[r]} {quantity}", colour_of(r), dashed, values[r]) for r in shown]
+
+    def tracked(title: str, name: str) -> Chart:
+        reference = Curve("reference", REFERENCE, False, signal(f"{name}_ref", 0))
+        return Chart(title, [reference, *each(name, [signal(name, r) for r in shown])])
+
+    def voltages(title: str, sign: float) -> Chart:
+        parts = {
+            part: [(signal(f"{part}_right", r) + sign * signal(f"{part}_left", r)) / 2 for r in shown]
+            for part in ("feedback", "feedforward")
+        }
+        return Chart(
+            title, each("feedback", parts["feedback"]) + each("feedforward", parts["feedforward"], dashed=True)
+        )
+
+    def squares(part: str, row: int) -> Array:
+        both = signal(f"{part}_left", row) ** 2 + signal(f"{part}_right", row) ** 2
+        return _moving_mean(both, round(SHARE_WINDOW / period))
+
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shares = [np.sqrt(squares("feedback", r) / squares("voltage", r)) for r in shown]
+    position = [1e3 * np.hypot(signal("longitudinal_error", r), signal("lateral_error", r)) for r in shown]
+    limits = [name for name in ("saturated", "guard") if name in COLUMN]
+    return [
+        tracked("V, m/s", "v"),
+        tracked("θ̇, rad/s", "omega"),
+        Chart("position error, mm", each("position error", position)),
+        Chart("share of the voltage from feedback, last second", each("share", shares)),
+        voltages("Σ: feedback (solid), feedforward (dashed), V", 1.0),
+        voltages("Δ: feedback (solid), feedforward (dashed), V", -1.0),
+        Chart("what has been learned, ‖W‖", each("weight norm", [signal("weight_norm", r) for r in shown])),
+        Chart(
+            ", ".join(limits), [c for k, n in enumerate(limits) for c in each(n, [signal(n, r) for r in shown], k > 0)]
+        ),
+    ]
+
+
+def _moving_mean(values: Array, window: int) -> Array:
+    """Mean of the last `window` values, or of as many as there are; a NaN counts as 0."""
+    total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(values))])
+    end = np.arange(1, len(values) + 1)
+    first = np.maximum(end - window, 0)
+    return (total[end] - total[first]) / (end - first)
+
+
+class Plots:
+    """uPlot charts in the page."""
+
+    def __init__(self, gui: viser.GuiApi, labels: Sequence[str], period: float, cursor: bool = False) -> None:
+        """Adds empty charts where the GUI's context is.
+
+        Args:
+            gui: The page's GUI.
+            labels: A name a robot.
+            period: Time between samples in s.
+            cursor: `show` will be given one.
+        """
+        self._labels, self._period = labels, period
+        self._legend = gui.add_html(legend(labels))
+        empty = charts(np.full((2, len(labels), len(SIGNALS)), np.nan), labels, period)
+        self._handles = [_add(gui, chart, cursor) for chart in empty]
+
+    def show(self, time: Array, log: Array, step: int, cursor: float | None = None) -> None:
+        """Draws a record.
+
+        Args:
+            time: Of the samples in s, `(T,)`.
+            log: `(T, B, signals)`.
+            step: Every how manyeth sample is drawn.
+            cursor: Where a vertical line stands, in s.
+        """
+        for handle, chart in zip(self._handles, charts(log, self._labels, self._period), strict=True):
+            curves = [np.ascontiguousarray(curve.values[::step]) for curve in chart.curves]
+            at = np.ascontiguousarray(time[::step])
+            handle.data = (at, *curves) if cursor is None else _with_cursor(at, curves, cursor)
+
+    def remove(self) -> None:
+        """Takes the charts away."""
+        for handle in (self._legend, *self._handles):
+            handle.remove()
+
+
+def legend(labels: Sequence[str]) -> str:
+    """Which colour is whose, in HTML."""
+    keys = [f'<span style="color:rgb{colour_of(k)}">■ {html.escape(name)}</span>' for k, name in enumerate(labels)]
+    keys = [*keys[:MOST], f'<span style="color:rgb{REFERENCE}">■ reference</span>']
+    return f'<p style="margin:0.3em 1em">{" &nbsp; ".join(keys)}</p>'
+
+
+def _add(gui: viser.GuiApi, chart: Chart, cursor: bool) -> viser.GuiUplotHandle:
+    colours = [curve.colour for curve in chart.curves] + [CURSOR] * cursor
+    dashes = [curve.dashed for curve in chart.curves] + [False] * cursor
+    series = [
+        uplot.Series(label="", stroke=f"rgb{colour}", width=1.5, dash=(5, 4) if dashed else (), points={"show": False})
+        for colour, dashed in zip(colours, dashes, strict=True)
+    ]
+    return gui.add_uplot(
+        tuple(np.zeros(2) for _ in range(1 + len(series))),
+        (uplot.Series(label="s"), *series),
+        title=chart.title,
+        scales={"x": {"time": False}},
+        legend={"show": False},
+        axes=({"size": 24, "ticks": {"size": 4}}, {"size": 42, "ticks": {"size": 4}}),
+        height=112,
+        padding=(0, 8, 0, 0),
+    )
+
+
+def _with_cursor(time: Array, curves: Sequence[Array], cursor: float) -> tuple[Array, ...]:
+    """Data for uPlot with one series more: a vertical line at a time, and a base line elsewhere."""
+    at = min(int(np.searchsorted(time, cursor)), len(time) - 1)
+    known = np.concatenate(curves)
+    low, high = (np.nanmin(known), np.nanmax(known)) if np.isfinite(known).any() else (0.0, 0.0)
+    line = np.full(len(time) + 3, low)
+    line[at + 1] = high
+    return np.insert(time, at, [cursor] * 3), *(np.insert(c, at, [c[at]] * 3) for c in curves), line

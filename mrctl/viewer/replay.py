@@ -1,0 +1,205 @@
+"""A replay in the browser: a result or a sweep, with a scrubber."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import viser
+from typing_extensions import override
+
+from mrctl.record import InputError
+from mrctl.viewer.page import SPEEDS, Page, block, warning, write
+from mrctl.viewer.plots import Plots
+from mrctl.viewer.recording import FEW, Library, Recording, names, together
+from mrctl.viewer.scene import Scene, colour_of
+from mrctl.viewer.server import Server
+
+SAMPLES = 800  # in a curve
+BOARD = np.array([4.0, 0.0, 2.2])  # m: width and height of the scatter in the scene
+CORNER = np.array([-2.0, 3.2, 0.3])  # m: where it stands
+FAILED = (185, 28, 28)
+
+
+class Replay(Page):
+    """The page of runs that are over."""
+
+    def __init__(self, library: Library, runs: Sequence[int], server: Server) -> None:
+        """Builds the page.
+
+        Args:
+            library: Where runs come from.
+            runs: Which are shown, the first one solid.
+            server: Where the page is served.
+
+        Raises:
+            InputError: A run that is not there, or runs in different worlds.
+        """
+        super().__init__(server)
+        self.library = library
+        self.time = 0.0
+        self.recordings: list[Recording] = []
+        self._drawn: tuple[float, bool] | None = None
+        self._plotted: float | None = None
+        self._build(runs[0])
+        self._show(runs)
+
+    def _build(self, run: int) -> None:
+        gui, table = self.server.gui, self.library.table
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Replay"):
+            self._status = gui.add_html("")
+            self.on(gui.add_button_group("", ("play", "pause", "start")), self._command)
+            self.scrubber = gui.add_slider("Time, s", 0.0, 1.0, 0.01, 0.0)
+            self.on(self.scrubber, self._scrub)
+            speeds = tuple(name for name, speed in SPEEDS.items() if np.isfinite(speed))
+            self.on(
+                gui.add_dropdown("Speed", speeds, initial_value="1×"),
+                lambda name: setattr(self, "speed", SPEEDS[name]),
+            )
+            self._follow = gui.add_checkbox("Camera follows", False)
+            self._chosen = gui.add_number(
+                "Run", float(run), min=float(table.index[0]), max=float(table.index[-1]), step=1.0
+            )
+            self.on(self._chosen, lambda run: self._show([int(run), *self.runs[1:]]))
+            self.on(gui.add_button("Keep this run as a ghost"), lambda _: self._show([*self.runs, self.runs[0]]))
+            self.on(gui.add_button("Only this run"), lambda _: self._show(self.runs[:1]))
+        numbers = [str(name) for name, values in table.select_dtypes("number").nunique().items() if values > 1]
+        self._board: list[Any] = []
+        if len(table) > FEW and numbers:
+            with tabs.add_tab("All runs"):
+                gui.add_html(
+                    block("scatter", "Each sphere behind the track is a run; red ones have failed. Click one.")
+                )
+                last = "position_rmse" if "position_rmse" in numbers else numbers[-1]
+                self._axes = [
+                    gui.add_dropdown(label, numbers, initial_value=value)
+                    for label, value in (("across", numbers[0]), ("up", last))
+                ]
+                for axis in self._axes:
+                    self.on(axis, lambda _: self._scatter())
+            self._scatter()
+
+    def _scatter(self) -> None:
+        """Puts all runs on a board behind the track, by two columns of the table."""
+        scene, table = self.server.scene, self.library.table
+        for node in self._board:
+            node.remove()
+        fields = [axis.value for axis in self._axes]
+        values = table[fields].to_numpy(float)
+        known = np.isfinite(values).all(axis=1)
+        if not known.any():
+            self._board = []
+            raise InputError(f"{fields[0]}, {fields[1]}: no run has both")
+        low, high = values[known].min(axis=0), values[known].max(axis=0)
+        share = (values[known] - low) / np.where(high > low, high - low, 1.0)
+        where = CORNER + share[:, [0, 0, 1]] * BOARD
+        failed = table["failed"].to_numpy(bool)[known]
+        sphere = _sphere()
+        points = scene.add_batched_meshes_simple(
+            "/board/runs", *sphere, np.tile([1.0, 0, 0, 0], (len(where), 1)), where,
+            batched_colors=np.where(failed[:, None], FAILED, colour_of(0)).astype(np.uint8),
+            lod="off", cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        runs = table.index.to_numpy()[known]
+
+        @points.on_click
+        async def _(event: viser.SceneNodePointerEvent) -> None:
+            if event.instance_index is not None:
+                self.ask(self._open, int(runs[event.instance_index]))
+
+        frame = np.array([CORNER, CORNER + BOARD * [1, 0, 0], CORNER + BOARD, CORNER + BOARD * [0, 0, 1], CORNER])
+        lines = np.stack([frame[:-1], frame[1:]], axis=1)
+        labels = {
+            "low": (f"{fields[0]} {low[0]:.3g}", [0, 0, -0.15]), "high": (f"{high[0]:.3g}", [1, 0, -0.15]),
+            "bottom": (f"{fields[1]} {low[1]:.3g}", [-0.1, 0, 0.06]), "top": (f"{high[1]:.3g}", [-0.1, 0, 1]),
+        }  # fmt: skip
+        self._board = [
+            points,
+            scene.add_line_segments("/board/frame", lines, (120, 120, 120), thickness=0.01),
+            *(
+                scene.add_label(f"/board/{key}", text, position=CORNER + BOARD * at)
+                for key, (text, at) in labels.items()
+            ),
+        ]
+
+    def _open(self, run: int) -> None:
+        self._show([run, *self.runs[1:]])
+        self._chosen.value = float(run)
+
+    def _show(self, runs: Sequence[int]) -> None:
+        """Puts runs into the scene and the plots."""
+        recordings = [self.library.recording(run) for run in runs]
+        labels = names(recordings, runs)
+        if self.recordings:
+            self._scene.remove()
+            self._plots.remove()
+        self.runs, self.recordings = list(runs), recordings
+        self._scene = Scene(self.server, recordings[0].model, labels)
+        self._scene.show_recordings(recordings)
+        with self.curves:
+            self._plots = Plots(self.server.gui, labels, recordings[0].period, cursor=True)
+        self._times, self._log = together(recordings)
+        self.duration = float(self._times[-1])
+        self.scrubber.max = self.duration
+        self._scrub(self.time, pause=False)
+
+    def _command(self, name: str) -> None:
+        self.playing = name == "play"
+        if name == "start" or (self.playing and self.time >= self.duration):
+            self._scrub(0.0, pause=name == "start")
+
+    def _scrub(self, time: float, pause: bool = True) -> None:
+        self.time = min(time, self.duration)
+        self.playing = self.playing and not pause
+        self._drawn = self._plotted = None
+
+    @override
+    def advance(self, elapsed: float, until: float) -> None:
+        self.time = min(self.time + elapsed * self.speed, self.duration)
+        if self.time >= self.duration:
+            self.playing = False
+
+    @override
+    def rest(self) -> float:
+        return 1.0  # until the next picture
+
+    @override
+    def draw(self) -> None:
+        now = (self.time, self._follow.value)
+        if now == self._drawn:
+            return
+        self._drawn = now
+        for row, recording in enumerate(self.recordings):
+            self._scene.show(row, recording.qpos(recording.index(self.time)))
+        self._scene.show_payload(self.recordings[0].perturbation(self.time))
+        with self.server.atomic():
+            self._scene.flush(self._follow.value)
+
+    @override
+    def refresh(self) -> None:
+        state = "playing" if self.playing else "paused"
+        lines = [f"<b>{self.time:.2f} s</b> of {self.duration:.2f} s · {state}"]
+        for r in self.recordings:
+            if r.failure:
+                lines.append(warning(f"{r.label} stopped after {r.duration:.2f} s: {r.failure}"))
+        row = self.library.table.loc[self.runs[0]]
+        known = [f"{html.escape(str(k))} {v:.4g}" for k, v in row.items() if isinstance(v, int | float) and v == v]
+        lines += known
+        if self.message:
+            lines.append(warning(self.message))
+        write(self._status, block("status", *lines))
+        if self.time != self._plotted:
+            self._plotted = self.time
+            self.scrubber.value = self.time
+            self._plots.show(self._times, self._log, max(1, len(self._log) // SAMPLES), self.time)
+
+
+def _sphere() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of an octahedron of 5 cm, a sphere for the eye at this size."""
+    corners = 0.05 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+    faces = [[a, b, c] for a in (0, 1) for b in (2, 3) for c in (4, 5)]
+    faces = [f if np.linalg.det(corners[f]) > 0 else f[::-1] for f in faces]
+    return corners, np.array(faces)

@@ -1,0 +1,216 @@
+"""The world, its robots and their ways in three dimensions."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import viser
+from mjviser.conversions import merge_geoms
+from numpy.typing import NDArray
+
+from mrctl import model as mjcf
+from mrctl.record import InputError
+from mrctl.robot import Perturbation
+from mrctl.scenario import Scenario
+from mrctl.viewer.recording import Recording
+
+Array = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+# The first robot is solid, the others are translucent; curves of a robot have its colour.
+COLOURS: list[Colour] = [
+    (37, 99, 235), (234, 88, 12), (22, 163, 74), (147, 51, 234), (8, 145, 178), (202, 138, 4), (219, 39, 119),
+]  # fmt: skip
+REFERENCE: Colour = (110, 115, 122)
+TRAIL = 240  # points of the way that a robot has come
+SEEN = 2  # the last geom group that is for the eye
+
+
+def colour_of(row: int) -> Colour:
+    """The colour of a robot."""
+    return COLOURS[row % len(COLOURS)]
+
+
+class Scene:
+    """One world, one solid robot, any number of translucent ones.
+
+    Everything hangs below the node `/world`, so that following a robot moves that node instead of cameras.
+    """
+
+    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel, labels: Sequence[str]) -> None:
+        """Draws the world and its robots.
+
+        Args:
+            server: Where to.
+            model: Compiled world; it is not changed.
+            labels: A name a robot.
+        """
+        self.size = len(labels)
+        self._scene = server.scene
+        server.initial_camera.position, server.initial_camera.look_at = (0.0, -3.7, 2.7), (0.0, 0.3, 0.0)
+        self._model, self._data = mjcf.clone(model), mujoco.MjData(model)
+        self._radius = mjcf.read_robot(model).wheel_radius
+        self._root = self._scene.add_frame("/world", show_axes=False)
+        chassis = model.body("chassis").id
+        self._bodies = [b for b in range(model.nbody) if model.body_rootid[b] == chassis]
+        self._chassis = self._bodies.index(chassis)
+        self._place = np.zeros((self.size, len(self._bodies), 3))
+        self._turn = np.tile([1.0, 0.0, 0.0, 0.0], (self.size, len(self._bodies), 1))
+        self._draw_world()
+        self._solid, self._ghosts = self._draw_robots()
+        self._labels = [
+            self._scene.add_label(f"/world/label{row}", label, font_screen_scale=0.8)
+            for row, label in enumerate(labels)
+            if 1 < self.size <= len(COLOURS)
+        ]
+        self._payload = self._scene.add_box(
+            "/world/robot/chassis/payload", (120, 72, 40), (0.1, 0.1, 0.1), cast_shadow=False, visible=False
+        )
+        self._shown = None
+        self._trails = np.zeros((self.size, TRAIL, 3))
+        self._trail = None
+        self._reference = None
+
+    def _draw_world(self) -> None:
+        model, data = self._model, self._data
+        mujoco.mj_kinematics(model, data)
+        for geom in range(model.ngeom):
+            if model.body_weldid[model.geom_bodyid[geom]] or model.geom_group[geom] > SEEN:
+                continue
+            name, turn = f"/world/fixed/{geom}", np.zeros(4)
+            mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+                self._scene.add_grid(
+                    name, 24, 24, cell_size=0.5, section_size=1, cell_color=(214, 217, 221),
+                    section_color=(190, 194, 200), plane_color=(238, 240, 242), plane_opacity=1.0, shadow_opacity=0.0,
+                    wxyz=turn, position=data.geom_xpos[geom],
+                )  # fmt: skip
+            else:
+                mesh = merge_geoms(model, [geom])
+                colour = 255 * model.mat_rgba[model.geom_matid[geom], :3] if model.geom_matid[geom] >= 0 else 200
+                self._scene.add_mesh_simple(
+                    name, mesh.vertices, mesh.faces, color=np.broadcast_to(0.92 * colour, 3).astype(np.uint8),
+                    flat_shading=True, cast_shadow=False, receive_shadow=False,
+                )  # fmt: skip
+
+    def _draw_robots(self) -> tuple[list[viser.FrameHandle], list[tuple[int, viser.BatchedMeshHandle]]]:
+        model, solid = self._model, []
+        ghosts: list[tuple[int, viser.BatchedMeshHandle]] = []
+        others = self.size - 1
+        for k, body in enumerate(self._bodies):
+            name = model.body(body).name
+            solid.append(self._scene.add_frame(f"/world/robot/{name}", show_axes=False))
+            geoms = [
+                g for g in range(model.ngeom)
+                if model.geom_bodyid[g] == body and model.geom_group[g] <= SEEN and model.geom_rgba[g, 3] > 0
+            ]  # fmt: skip
+            if not geoms:
+                continue
+            mesh = merge_geoms(model, geoms)
+            self._scene.add_mesh_trimesh(f"/world/robot/{name}/mesh", mesh, cast_shadow=False, receive_shadow=False)
+            if others:
+                handle = self._scene.add_batched_meshes_simple(
+                    f"/world/ghosts/{name}", mesh.vertices, mesh.faces, self._turn[1:, k], self._place[1:, k],
+                    batched_colors=np.array([colour_of(row + 1) for row in range(others)], np.uint8),
+                    opacity=0.4, lod="off", cast_shadow=False, receive_shadow=False,
+                )  # fmt: skip
+                ghosts.append((k, handle))
+        return solid, ghosts
+
+    def show_reference(self, scenario: Scenario) -> None:
+        """Draws a lap of each reference of a scenario on the ground."""
+        lines = []
+        for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
+            pose = reference.sample(np.linspace(0, reference.period, 401)).pose
+            heights = [self._height(x, y) + 0.006 for x, y in pose[:, :2]]
+            lines.append(_segments(np.column_stack([pose[:, :2], heights])))
+        self._reference = self._scene.add_line_segments(
+            "/world/reference", np.concatenate(lines), REFERENCE, thickness=0.025
+        )
+
+    def show_recordings(self, recordings: Sequence[Recording]) -> None:
+        """Draws the reference and the ways of runs that are over."""
+        self.show_reference(recordings[0].scenario)
+        self.show_trails(np.stack([recording.way() for recording in recordings]))
+
+    def _height(self, x: float, y: float) -> float:
+        try:
+            return float(mjcf.ground(self._model, self._data, x, y)[2])
+        except InputError:
+            return 0.0
+
+    def show(self, row: int, qpos: Array) -> None:
+        """Moves a robot; it is seen there after `flush`.
+
+        Args:
+            row: Which one.
+            qpos: Its generalised position `(nq,)`.
+        """
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, self._data)
+        self._place[row], self._turn[row] = self._data.xpos[self._bodies], self._data.xquat[self._bodies]
+
+    def flush(self, follow: bool) -> None:
+        """Sends what `show` has changed.
+
+        Args:
+            follow: The first robot stays where it is on the screen, and the world moves.
+        """
+        self._root.position = -self._place[0, self._chassis] * [1, 1, 0] if follow else np.zeros(3)
+        for k, frame in enumerate(self._solid):
+            frame.position, frame.wxyz = self._place[0, k], self._turn[0, k]
+        for k, handle in self._ghosts:
+            handle.batched_positions = self._place[1:, k].astype(np.float32)
+            handle.batched_wxyzs = self._turn[1:, k].astype(np.float32)
+        for row, label in enumerate(self._labels):
+            label.position = self._place[row, self._chassis] + [0, 0, 0.4 + 0.12 * row]
+
+    def show_payload(self, perturbation: Perturbation) -> None:
+        """Draws a payload of its size (the density of water) where it is, or none."""
+        p, box = perturbation, self._payload
+        if p == self._shown:
+            return
+        self._shown = p
+        box.visible = p.payload > 0
+        if box.visible:
+            side = (p.payload / 1000) ** (1 / 3)
+            box.dimensions = (side, side, side)
+            box.position = (p.payload_x, p.payload_y, p.payload_z - self._radius)
+
+    def mark_trails(self) -> None:
+        """Adds where the robots are to the ways that they have come."""
+        here = self._place[:, self._chassis] - [0, 0, self._radius - 0.01]
+        if self._trail is None:
+            self._trails[:] = here[:, None]
+        self._trails = np.concatenate([self._trails[:, 1:], here[:, None]], axis=1)
+        self.show_trails(self._trails)
+
+    def show_trails(self, ways: Array) -> None:
+        """Draws ways, `(B, n, 3)` in m."""
+        points = np.concatenate([_segments(way) for way in ways])
+        if self._trail is None or len(self._trail.points) != len(points):
+            colours = np.repeat([colour_of(row) for row in range(self.size)], ways.shape[1] - 1, axis=0)
+            colours = np.repeat(colours[:, None], 2, axis=1).astype(np.uint8)
+            self._trail = self._scene.add_line_segments("/world/trail", points, colours, thickness=0.012)
+        else:
+            self._trail.points = points.astype(np.float32)
+
+    def forget_trails(self) -> None:
+        """Begins the ways anew."""
+        if self._trail is not None:
+            self._trail.remove()
+        self._trail = None
+
+    def remove(self) -> None:
+        """Takes everything away."""
+        self._root.remove()
+
+
+def _segments(line: Array) -> Array:
+    """A polyline `(n, 3)` as segments `(n - 1, 2, 3)`."""
+    return np.stack([line[:-1], line[1:]], axis=1)

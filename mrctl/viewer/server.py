@@ -1,0 +1,132 @@
+"""A viser server that serves this machine alone."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import http
+import io
+import socket
+import sys
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+from unittest import mock
+from urllib.parse import urlsplit
+
+import viser
+import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from mrctl.record import InputError
+
+LOCAL = ("localhost", "127.0.0.1", "::1")
+ANYWHERE = ("0.0.0.0", "::")
+
+
+class Server(viser.ViserServer):
+    """Viser without what would let others in.
+
+    Viser itself listens on all interfaces, moves to another port when one is taken, answers pages of any origin, and
+    opens a public tunnel for whoever asks.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", port: int = 8080) -> None:
+        """Starts to serve.
+
+        Args:
+            host: Address to listen on.
+            port: Port; 0 for any that is free.
+
+        Raises:
+            InputError: The port is taken, or there is no such address here.
+        """
+        with contextlib.closing(_reserve(host, port)) as taken:
+            port = taken.getsockname()[1]
+        with _guarded(host), contextlib.redirect_stdout(io.StringIO()):  # viser's own announcement
+            super().__init__(host, port, label="mrctl", verbose=False)
+        if self.get_port() != port:  # somebody was quicker
+            self.stop()
+            raise InputError(f"port: {port} is in use; choose another with --port")
+        self.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        self.scene.configure_environment_map(None)
+        self.scene.configure_default_lights(cast_shadow=False)
+        self.scene.add_light_ambient("/light", intensity=1.2)
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Refuses to open a tunnel to a public server, which any client may ask for."""
+        if verbose:
+            print("mrctl: a request to share this page publicly was refused", file=sys.stderr)
+
+    def stop(self) -> None:
+        """Stops to serve, quietly."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().stop()
+
+    def announce(self) -> str:
+        """Where the page is, and what to know about reaching it."""
+        host, port = self.get_host(), self.get_port()
+        if host in LOCAL:
+            return (
+                f"open http://{host}:{port}  (Ctrl-C ends)\n"
+                f"from another machine: ssh -L {port}:127.0.0.1:{port} THIS-MACHINE, then http://127.0.0.1:{port}"
+            )
+        return (
+            f"open http://{host}:{port}  (Ctrl-C ends)\n"
+            f"warning: --host {host}: everyone who reaches this address controls the viewer; nobody is asked to log in"
+        )
+
+
+def _reserve(host: str, port: int) -> socket.socket:
+    """A socket on the address, to know that it can be had.
+
+    Raises:
+        InputError: It cannot.
+    """
+    if not 0 <= port <= 65535:
+        raise InputError(f"port: {port} is not between 0 and 65535")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        taken = socket.socket(family, kind, protocol)
+        try:
+            taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            taken.bind(address)
+            taken.listen()
+        except OSError:
+            taken.close()
+            raise
+        return taken
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise InputError(f"port: {port} is in use; choose another with --port") from None
+        raise InputError(f"host: cannot listen on {host}:{port}: {error.strerror or error}") from None
+
+
+@contextlib.contextmanager
+def _guarded(host: str) -> Iterator[None]:
+    """Lets viser, which offers no way to say so, start its web server with a look at every request first."""
+    started = []
+
+    def serve(*args: Any, process_request: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+        started.append(True)
+        return genuine(*args, process_request=partial(_admit, host, process_request), **kwargs)
+
+    genuine = websockets.asyncio.server.serve
+    with mock.patch.object(websockets.asyncio.server, "serve", serve):
+        yield
+    if not started:
+        raise RuntimeError("this version of viser starts its web server in another way; origins are not checked")
+
+
+def _admit(host: str, answer: Any, connection: ServerConnection, request: Request) -> Response | None:  # noqa: ANN401
+    """Refuses requests that pages of another origin make through a visitor's browser.
+
+    The page must have been asked for by a name of this machine (a stranger's name may point here: DNS rebinding), and
+    a connection must come from that very page. Programs other than browsers send no origin, and could send any.
+    """
+    names, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+    known = host in ANYWHERE or all(urlsplit(f"//{name}").hostname in (*LOCAL, host) for name in names)
+    if len(names) != 1 or not known or any(origin.partition("://")[2] != names[0] for origin in origins):
+        return connection.respond(http.HTTPStatus.FORBIDDEN, "mrctl: a foreign origin\n")
+    return answer(connection, request)

@@ -1,0 +1,133 @@
+"""A session under way: what is done to it is kept, and the saved session runs again headless to the bit."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from mrctl import Circle, Event, InputError, Perturbation, RoundedSquare, Scenario, simulate
+from mrctl.result import SIGNALS
+from mrctl.viewer.session import Session, changed
+
+BASE = Scenario(reference=Circle(period=4, radius=0.5), seed=3)
+
+
+def drive(session, ticks):
+    for _ in range(ticks):
+        session.step()
+
+
+def same(session, results):
+    """Whether a session's record is that of results, as far as it goes."""
+    log = session.log()
+    for row, run in enumerate(results):
+        again = np.array([run[name].values for name in SIGNALS]).T[: session.tick]
+        assert again.tobytes() == np.ascontiguousarray(log[:, row]).tobytes()
+
+
+@pytest.mark.parametrize("reference", [BASE.reference, RoundedSquare()], ids=lambda r: r.kind)
+def test_saved_session(reference, tmp_path):
+    """Payload, noise, delay, gains, push and the switch, at odd ticks, for three controllers; through a file."""
+    scenarios = [
+        BASE.model_copy(update={"feedforward": name, "reference": reference}) for name in ("fel", "none", "oracle")
+    ]
+    session = Session(scenarios)
+    drive(session, 37)
+    session.happen(perturbation=Perturbation(payload=6, payload_x=0.05, velocity_noise=0.01))
+    session.happen(push=(0.0, 30.0, 0.0))
+    drive(session, 101)
+    session.happen(learning=False)
+    session.happen(kanayama=changed(session.state()["kanayama"], ["k_y"], 10.0))
+    drive(session, 1)
+    session.happen(perturbation=changed(session.state()["perturbation"], ["control_delay"], 0.02))
+    session.happen(pid=changed(session.state()["pid"], ["time_constant"], 0.25))
+    drive(session, 363)
+    again = []
+    for k, scenario in enumerate(session.saved()):
+        path = tmp_path / f"{k}.toml"
+        path.write_text(scenario.to_toml())
+        again.append(Scenario.from_toml(path))
+        assert again[-1] == scenario
+    assert again[0].laps == np.ceil(5.02 / reference.period)
+    results = simulate(again)  # the three of them; one alone goes through dm_control
+    same(session, [results.isel(run=k) for k in range(3)])
+    alone = Session(scenarios[:1])
+    drive(alone, 20)
+    alone.happen(push=(20.0, 0.0, 0.0))
+    drive(alone, 60)
+    same(alone, [simulate(alone.saved()[0])])
+
+
+def test_refused_change():
+    """What the robot or the scenario cannot do is refused in one line, and neither happens nor is kept."""
+    session = Session([BASE])
+    drive(session, 5)
+    with pytest.raises(InputError, match="tip over"):
+        session.happen(perturbation=Perturbation(payload=150, payload_x=-1))
+    with pytest.raises(InputError, match="control_delay"):
+        session.happen(perturbation=Perturbation(control_delay=0.0123))
+    with pytest.raises(InputError, match="has passed"):
+        session.simulations[0][1].add(_event(0.01))
+    assert session.saved()[0].events == ()
+    drive(session, 20)
+    same(session, [simulate(session.saved()[0])])
+
+
+def _event(time):
+    return Event(time=time, push=(1.0, 0.0, 0.0))
+
+
+def test_events_of_the_file():
+    """What a scenario brings along happens too, and counts for what holds now."""
+    base = BASE.model_copy(update={"events": (_event(0.1), Event(time=0.2, perturbation=Perturbation(payload=3)))})
+    session = Session([base])
+    drive(session, 15)
+    session.happen(perturbation=Perturbation(supply_factor=0.8))
+    assert session.state()["perturbation"].payload == 0
+    drive(session, 10)
+    assert session.state()["perturbation"].payload == 3
+    same(session, [simulate(session.saved()[0])])
+
+
+def test_stopped_robot():
+    """A robot that has stopped leaves the others driving; its record ends in NaN."""
+    weak = BASE.model_copy(update={"feedforward": "none", "perturbation": Perturbation(supply_factor=0.05)})
+    session = Session([BASE, weak])
+    drive(session, 1500)
+    assert "lateral error" in session.failure(1) and session.failure(0) == ""
+    assert session.running and np.isnan(session.log(1400)[:, 1]).all() and np.isfinite(session.log(1400)[:, 0]).all()
+    session.happen(push=(0.0, 5.0, 0.0))
+    session.step()
+
+
+def test_must_share():
+    with pytest.raises(InputError, match="world"):
+        Session([BASE, BASE.model_copy(update={"world": "patch"})])
+
+
+def test_new_reference():
+    """Another course from a moment on, added under way and brought along by the file, over a boundary of blocks."""
+    session = Session([BASE, BASE.model_copy(update={"feedforward": "none"})])
+    drive(session, 200)
+    event = Event(time=2.5, reference=Circle(radius=0.5, period=5.0, clockwise=True))
+    for _, simulation in session.simulations:
+        simulation.add(event)
+    drive(session, 300)
+    results = simulate(session.saved())
+    same(session, [results.isel(run=k) for k in range(2)])
+    assert abs(results.omega_ref.values[0, 240] - 2 * np.pi / 4) < 1e-9
+    assert abs(results.omega_ref.values[0, 260] + 2 * np.pi / 5) < 1e-9
+
+
+def test_blocks(monkeypatch):
+    """References sampled in blocks of any length are the same."""
+    event = Event(time=1.3, reference=Circle(radius=0.5, period=5.0))
+    scenarios = [
+        BASE.model_copy(update={"events": (event,)}),
+        BASE.model_copy(update={"reference": Circle(radius=0.6, period=4)}),
+    ]
+    whole = simulate(scenarios)
+    monkeypatch.setattr(sys.modules["mrctl.simulate"], "BLOCK", 97)  # `mrctl.simulate` itself is the function
+    parts = simulate(scenarios)
+    for name in ("x_ref", "omega_ref", "x", "voltage_left"):
+        assert parts[name].values.tobytes() == whole[name].values.tobytes()

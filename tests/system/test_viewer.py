@@ -1,0 +1,248 @@
+"""The viewer in a real headless browser: what a visitor sees and does. Screenshots are in pytest's folders."""
+
+import io
+import shutil
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mrctl import Circle, Event, Perturbation, Scenario, Sweep, jobs, save, simulate
+from mrctl.cli import main
+from mrctl.viewer.live import Live
+from mrctl.viewer.recording import Library
+from mrctl.viewer.replay import Replay
+from mrctl.viewer.server import Server
+
+CHROMIUM = shutil.which("chromium")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+BASE = Scenario(reference=Circle(radius=0.8, period=6.0), laps=2)
+PATIENCE = 60_000  # ms, on a machine that does other things too
+ROBOT, GHOSTS, PAYLOAD = "/world/robot/chassis", "/world/ghosts/chassis", "/world/robot/chassis/payload"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def visit(browser, url, offline=False):
+    """A page; no error on its console is tolerated."""
+    context = browser.new_context(viewport={"width": 1280, "height": 800}, offline=offline)
+    page = context.new_page()
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.goto(url)
+    yield page
+    assert errors == []
+    context.close()
+
+
+@contextmanager
+def serving(build):
+    """A page that is served, with its loop in a thread."""
+    server = Server(port=0)
+    try:
+        served = build(server)
+        thread = threading.Thread(target=served.run)
+        thread.start()
+        try:
+            yield served, f"http://127.0.0.1:{server.get_port()}"
+        finally:
+            served.close()
+            thread.join()
+    finally:
+        server.stop()
+
+
+def node(page, name, frame="window"):
+    """Position of a node of the scene, as the browser has it."""
+    found = page.evaluate(f"{frame}.__viserMutable?.nodePoseData[{name!r}]?.position ?? null")
+    return None if found is None else np.array(found)
+
+
+def until(condition, what):
+    """Waits for something to become true, and returns it."""
+    end = time.monotonic() + PATIENCE / 1000
+    while time.monotonic() < end:
+        if (found := condition()) is not None and found is not False:
+            return found
+        time.sleep(0.1)
+    raise AssertionError(f"not within {PATIENCE / 1000:g} s: {what}")
+
+
+def picture(page, path):
+    """The scene between the panels as pixels."""
+    page.screenshot(path=path, timeout=PATIENCE)
+    return np.asarray(Image.open(io.BytesIO(path.read_bytes())).convert("RGB"), float)[:, 450:900]
+
+
+def moved(before, after):
+    """How many pixels differ clearly."""
+    return int((np.abs(before - after).max(axis=-1) > 60).sum())
+
+
+def curves(page, title):
+    """Data of a chart, as the browser draws it."""
+    charts = page.evaluate(
+        "Object.values(window.__viserTestpoints?.uplots ?? {}).map(({chart}) => "
+        "[chart.root.querySelector('.u-title').textContent, chart.data.map((d) => Array.from(d))])"
+    )
+    return [np.array(data) for name, data in charts if name == title]
+
+
+def test_live(browser, tmp_path):
+    """Two robots drive along the reference, pause holds them, a payload is dropped, seen, listed, and felt."""
+    scenarios = [BASE, BASE.model_copy(update={"feedforward": "none"})]
+    with serving(lambda server: Live(scenarios, server)) as (live, url), visit(browser, url) as page:
+        until(lambda: node(page, ROBOT) is not None, "the scene")
+        start = node(page, ROBOT)
+        until(lambda: np.linalg.norm(node(page, ROBOT) - start) > 0.3, "the robot to move")
+        page.get_by_text("pause", exact=True).click()
+        until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
+        page.mouse.move(640, 700)
+        time.sleep(1.0)  # the last pictures arrive
+        held, tick = node(page, ROBOT), live.session.tick
+        assert abs(np.hypot(*(held[:2] - [0, 0.8])) - 0.8) < 0.06  # on the circle that the reference is
+        still = picture(page, tmp_path / "live_two_robots.png")
+        orange = (still[..., 0] > 150) & (still[..., 0] > still[..., 2] + 70)
+        assert orange.sum() > 100  # the ghost
+        time.sleep(0.5)
+        assert live.session.tick == tick and (node(page, ROBOT) == held).all()
+        names = page.evaluate("Object.keys(window.__viserSceneTree.getState())")
+        assert {ROBOT, GHOSTS, "/world/reference", "/world/trail"} <= set(names)
+
+        page.get_by_text("drop payload").click()
+        until(lambda: "payload 0 → 10" in page.inner_text("#mrctl-timeline"), "the payload in the timeline")
+        page.get_by_text("play", exact=True).click()
+        until(lambda: live.session.tick > tick + 250, "the robots to drive on")
+        page.get_by_text("pause", exact=True).click()
+        until(lambda: "paused" in page.inner_text("#mrctl-status"), "the second pause")
+        time.sleep(1.0)
+        assert moved(still, picture(page, tmp_path / "live_payload.png")) > 300
+        t, _, without = until(lambda: curves(page, "position error, mm") or None, "the curves")[0]
+        dropped = live.session.saved()[1].events[0].time
+        assert without[t > dropped].max() > 1.1 * without[(t > dropped - 0.3) & (t < dropped)].max()
+        assert t[-1] == pytest.approx(live.session.time, abs=0.1)
+
+
+def test_inputs(browser, tmp_path):
+    """A slider becomes an event, a choice another run, a ghost is added; a mistake in a tick is shown, and mended."""
+    with serving(lambda server: Live([BASE], server)) as (live, url), visit(browser, url) as page:
+        until(lambda: node(page, ROBOT) is not None, "the scene")
+        page.get_by_role("tab", name="Robot").click()
+        slider = page.get_by_role("slider").first
+        slider.focus()
+        for _ in range(3):
+            page.keyboard.press("ArrowRight")
+        until(lambda: live.session.state()["perturbation"].mass_factor == pytest.approx(1.03), "the slider's event")
+        page.get_by_role("tab", name="Controllers").click()
+        page.get_by_label("rls", exact=True).first.click()
+        until(lambda: [s.feedforward for s in live.session.start] == ["fel", "rls"], "the ghost")
+        assert live.session.start[1].perturbation.mass_factor == pytest.approx(1.03)  # goes on as things were
+        until(lambda: node(page, "/world/ghosts/chassis") is not None, "the ghost in the scene")
+
+        genuine, live.session.step = live.session.step, lambda: 1 / 0
+        page.get_by_role("tab", name="Drive").click()
+        until(lambda: "ZeroDivisionError" in page.inner_text("#mrctl-status"), "the error in the page")
+        picture(page, tmp_path / "error.png")
+        page.get_by_text("reset", exact=True).click()
+        page.get_by_text("play", exact=True).click()
+        until(lambda: live.session.tick > 20 and live.message == "", "the session to go on")
+        del genuine
+
+
+def test_visitors_come_and_go(browser):
+    """A second page, a reload and a page that is closed leave the session alone; a late visitor sees it as it is."""
+    with serving(lambda server: Live([BASE], server)) as (live, url):
+        with visit(browser, url) as page:
+            until(lambda: node(page, ROBOT) is not None, "the scene")
+            with visit(browser, url) as other:
+                until(lambda: node(other, ROBOT) is not None, "the other page")
+                page.reload()
+            until(lambda: node(page, ROBOT) is not None, "the page again")
+        tick = live.session.tick
+        until(lambda: live.session.tick > tick + 50, "the session to go on without anybody")
+        assert live.playing and live.message == ""
+
+
+def test_replay(browser, tmp_path):
+    """A saved result: the scrubber puts the robots where they were, and the curves have its cursor."""
+    event = Event(time=4.0, perturbation=Perturbation(payload=8))
+    result = simulate([BASE.model_copy(update={"feedforward": f, "events": (event,)}) for f in ("fel", "none")])
+    save(result, tmp_path / "result.zarr")
+    library = Library(tmp_path / "result.zarr")
+    with serving(lambda server: Replay(library, [0, 1], server)) as (replay, url), visit(browser, url) as page:
+        until(lambda: node(page, ROBOT) is not None, "the scene")
+        until(lambda: node(page, ROBOT)[0] > 0.3, "it to play")
+        page.get_by_text("pause", exact=True).click()
+        field = page.locator("input[inputmode=decimal]").first
+        field.fill("7.5")
+        field.press("Enter")
+        until(lambda: replay.time == pytest.approx(7.5), "the scrubber")
+        expected = result.isel(run=0).sel(time=7.5, method="nearest")
+        until(lambda: np.allclose(node(page, ROBOT)[:2], [expected.x, expected.y], atol=1e-3), "the robot to be there")
+        time.sleep(1.0)
+        picture(page, tmp_path / "replay.png")
+        t, *_, cursor = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
+        assert t[np.argmax(cursor)] == pytest.approx(7.5) and t[-1] == pytest.approx(11.99)
+
+
+def test_export(browser, tmp_path):
+    """The exported file plays from the disk without a network, and its curves and its scene share the time."""
+    scenario = tmp_path / "scenario.toml"
+    scenario.write_text('laps = 1\n[reference]\nkind = "circle"\nradius = 0.8\nperiod = 6.0\n')
+    file = tmp_path / "run.html"
+    assert main(["view", str(scenario), "--compare", "none", "--export", str(file)]) == 0
+    scene = "document.getElementById('scene').contentWindow"
+    with visit(browser, file.as_uri(), offline=True) as page:
+        until(lambda: node(page, ROBOT, scene) is not None, "the scene")
+        first = node(page, ROBOT, scene)
+        until(lambda: np.linalg.norm(node(page, ROBOT, scene) - first) > 0.2, "it to play by itself")
+        chart = page.locator("canvas").first.bounding_box()
+        page.mouse.click(chart["x"] + 52 + (chart["width"] - 60) / 2, chart["y"] + 60)
+        until(lambda: page.inner_text("#time").startswith(("2.9", "3.0")), "the scrubber to follow the curves")
+        half = until(lambda: (p := node(page, ROBOT, scene)) is not None and p[1] > 1.4 and p, "the robot to follow")
+        assert np.allclose(half[:2], [0, 1.6], atol=0.1)  # half way around
+        picture(page, tmp_path / "export.png")
+    assert main(["view", str(scenario), "--export", str(file)]) == 2  # not overwritten
+
+
+TO_SCREEN = """([x, y, z]) => {
+    const m = window.__viserMutable, point = new m.camera.position.constructor(x, y, z);
+    m.nodeRefFromName['/board/runs'].parent.localToWorld(point).project(m.camera);
+    const r = m.canvas.getBoundingClientRect();
+    return [r.left + (point.x + 1) / 2 * r.width, r.top + (1 - point.y) / 2 * r.height];
+}"""
+
+
+def test_sweep(browser, tmp_path):
+    """All runs of a sweep on a board behind the track: a click opens the one under the mouse, as `mrctl run` has it."""
+    base = {"laps": 1, "reference": {"kind": "circle", "period": 4.0, "radius": 0.5}, "feedforward": "model"}
+    axis = {"field": "perturbation.mass_factor", "uniform": [0.5, 2.0]}
+    jobs.run(Sweep.from_dict({"runs": 6, "base": base, "axes": [axis]}), tmp_path / "store", workers=1)
+    library = Library(tmp_path / "store")
+    with serving(lambda server: Replay(library, [0], server)) as (replay, url), visit(browser, url) as page:
+        until(lambda: node(page, "/board/runs") is not None, "the board")
+        page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
+        page.get_by_role("tab", name="All runs").click()
+        time.sleep(2.0)
+        picture(page, tmp_path / "sweep.png")
+        at = page.evaluate(TO_SCREEN, [float(c) for c in replay._board[0].batched_positions[4]])
+        page.mouse.move(*at)
+        time.sleep(0.5)
+        page.mouse.click(*at)
+        until(lambda: replay.runs == [4], "the run to open")
+    again = simulate(jobs.scenario_of(tmp_path / "store", 4))
+    assert replay._log[:, 0, 0].tobytes() == again.x.values.tobytes()

@@ -1,0 +1,83 @@
+"""What an input of the page changes is what the same scenario file would change."""
+
+import pytest
+
+from mrctl import Scenario
+from mrctl.viewer.live import Live
+from mrctl.viewer.server import Server
+from mrctl.viewer.session import CHANGEABLE
+
+
+@pytest.fixture(scope="module")
+def live():
+    server = Server(port=0)
+    yield Live([Scenario()], server)
+    server.stop()
+
+
+def other(handle):
+    """Another value that the page allows."""
+    if hasattr(handle, "options"):
+        return next(option for option in reversed(handle.options) if option != handle.value)
+    if isinstance(handle.value, bool):
+        return not handle.value
+    return handle.value + round((handle.max - handle.value) / 4 / handle.step) * handle.step
+
+
+def test_every_input(live):
+    """Each is in the scenario or in an event of the session thereafter; those that need another run begin one."""
+    start = Scenario()
+    seen = 0
+    for path, handle in list(live._controls._inputs.items()):
+        live._restart([start])
+        live.session.step()
+        value = other(handle)
+        if path == ("perturbation", "control_delay"):
+            value = 0.12  # in whole control periods
+        live._wish(path, value)
+        live._grant()
+        assert live.message == "", path
+        saved = live.session.saved()[0]
+        changing = path[0] in CHANGEABLE
+        found = saved.events[-1] if changing else saved
+        for name in path:
+            found = getattr(found, name)
+        assert getattr(found, "kind", found) == (pytest.approx(value) if isinstance(value, float) else value), path
+        assert live.session.tick == changing and len(saved.events) == changing
+        shown = live._controls._inputs[path].value if path[:1] != ("reference",) else value
+        assert shown == (pytest.approx(value) if isinstance(value, float) else value), path
+        for _ in range(3):
+            live.session.step()
+        live.draw()
+        live.refresh()
+        seen += 1
+        if path == ("reference",):
+            break  # the inputs below it are others now
+    assert seen > 40
+
+
+def test_refusals(live):
+    """What cannot be is said in the page, and the inputs show again what holds."""
+    live._restart([Scenario()])
+    live._wish(("reference",), "stop_and_go")  # reverses, with a fork that cannot
+    live._grant()
+    assert "reverses" in live.message and live.session.start == [Scenario()]
+    live._wish(("perturbation", "payload_x"), -1.0)
+    live._wish(("perturbation", "payload"), 200.0)
+    live._grant()
+    assert "tip over" in live.message
+    assert live._controls._inputs["perturbation", "payload"].value == 0.0
+    live._wish(("perturbation", "mass_factor"), "heavy")
+    live._grant()
+    assert "mass_factor" in live.message and len(live.session.saved()[0].events) == 1
+
+
+def test_robot_that_stops(live):
+    """The page says that a robot has stopped and why, and waits."""
+    live._restart([Scenario()])
+    live._happen(push=(0.0, 5000.0, 0.0))
+    live.playing = True
+    for _ in range(30):
+        live.advance(0.1, float("inf"))
+    live.refresh()
+    assert not live.playing and "stopped:" in live._status.content and "reset" in live._status.content

@@ -1,0 +1,189 @@
+"""Who gets to the viewer, and what it survives; without a browser, by viser's own protocol."""
+
+import contextlib
+import gc
+import random
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+
+import msgspec
+import pytest
+import viser
+from viser import _messages
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from mrctl import InputError, Scenario
+from mrctl.cli import main
+from mrctl.viewer import server as module
+from mrctl.viewer.live import Live
+from mrctl.viewer.server import Server
+
+PROTOCOL = [f"viser-v{viser.__version__}"]
+
+
+@pytest.fixture
+def server():
+    server = Server(port=0)
+    yield server
+    server.stop()
+
+
+def client(server, **options):
+    return connect(f"ws://127.0.0.1:{server.get_port()}", subprotocols=PROTOCOL, max_size=None, **options)
+
+
+def packed(message):
+    return msgspec.msgpack.encode(message.as_serializable_dict())
+
+
+def fetch(server, host):
+    request = urllib.request.Request(f"http://127.0.0.1:{server.get_port()}/", headers={"Host": host})
+    with urllib.request.urlopen(request, timeout=10) as answer:
+        return answer.status
+
+
+def test_origins(server):
+    """Pages of this server may connect, by whatever tunnel; those of others may not, nor by a name of theirs."""
+    port = server.get_port()
+    assert server.get_host() == "127.0.0.1"
+    for origin in (None, f"http://127.0.0.1:{port}"):
+        with client(server, origin=origin):
+            pass
+    tunnel = socket.create_connection(("127.0.0.1", port))  # ssh -L 9000:127.0.0.1:PORT
+    with connect("ws://localhost:9000", sock=tunnel, subprotocols=PROTOCOL, origin="http://localhost:9000"):
+        pass
+    for origin in ("http://evil.example", "http://127.0.0.1:1", "null", f"http://127.0.0.1:{port}.evil.example"):
+        with pytest.raises(InvalidStatus, match="403"):
+            client(server, origin=origin)
+    assert fetch(server, f"localhost:{port}") == 200
+    for host in ("evil.example", f"evil.example:{port}", ""):  # DNS rebinding: their name, our address
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            fetch(server, host)
+
+
+def test_sharing(server, monkeypatch, capfd):
+    """A client that asks for a public tunnel gets none."""
+    from viser import _viser
+
+    monkeypatch.setattr(_viser, "ViserTunnel", lambda *_: pytest.fail("a tunnel was opened"))
+    with client(server) as visitor:
+        visitor.send(packed(_messages.ShareUrlRequest()))
+        visitor.send(packed(_messages.ShareUrlDisconnect()))
+        deadline, said = time.monotonic() + 10, ""
+        while "refused" not in said and time.monotonic() < deadline:
+            time.sleep(0.05)
+            said += capfd.readouterr().err
+    assert "refused" in said and server.request_share_url(verbose=False) is None
+
+
+def test_addresses(monkeypatch, capsys):
+    """A port that is taken, an address that is not ours and a number that is no port are one line each."""
+    with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as taken:
+        port = taken.getsockname()[1]
+        assert main(["view", "--port", str(port)]) == 2
+        assert capsys.readouterr().err == f"mrctl: port: {port} is in use; choose another with --port\n"
+    for options in (["--host", "203.0.113.1"], ["--host", "no.such.name.invalid"], ["--port", "70000"]):
+        assert main(["view", *options]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    anywhere = Server("0.0.0.0", 0)
+    try:
+        assert "warning" in anywhere.announce() and fetch(anywhere, "robot.example:1") == 200
+        with pytest.raises(InvalidStatus, match="403"):
+            client(anywhere, origin="http://evil.example")
+    finally:
+        anywhere.stop()
+
+
+def test_viser_that_starts_otherwise(monkeypatch):
+    """Should viser start its web server in another way, it is not served unguarded."""
+    monkeypatch.setattr(module.websockets.asyncio.server, "serve", module.websockets.asyncio.server.serve)
+    with pytest.raises(RuntimeError, match="origins"), module._guarded("127.0.0.1"):
+        pass
+
+
+def test_command():
+    """`mrctl view` says where it is, and ends on Ctrl-C."""
+    command = [sys.executable, "-m", "mrctl.cli", "view", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stderr is not None
+        assert process.stdout.readline().startswith("open http://127.0.0.1:")
+        process.send_signal(2)
+        assert process.wait(60) == 130
+        assert process.stderr.read() == "mrctl: interrupted\n"
+
+
+def test_bad_files(tmp_path, capsys):
+    (tmp_path / "bad.toml").write_text("laps = 0\n")
+    (tmp_path / "empty").mkdir()
+    for arguments in (["bad.toml"], ["empty"], ["missing.toml"], ["empty", "--compare", "fel"]):
+        assert main(["view", str(tmp_path / arguments[0]), *arguments[1:]]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    with pytest.raises(InputError, match="several"):
+        from mrctl.viewer import view
+
+        view(None, (), 3, None, "127.0.0.1", 0)
+
+
+CAMERA = _messages.ViewerCameraMessage((1.0, 0.0, 0.0, 0.0), (0, 0, 1), 1.0, 0.1, 100.0, 600, 800, (0, 0, 0), (0, 0, 1))
+
+
+def test_rough_treatment(server, capfd):
+    """Hundreds of random inputs, sensible and not, from visitors that come and go: it drives on, and leaks nothing."""
+    rng = random.Random(1)
+    live = Live([Scenario()], server)
+    inputs = list(server.gui._gui_input_handle_from_uuid.values())
+    before = threading.active_count()
+    loop = threading.Thread(target=live.run)
+    loop.start()
+    objects = []
+    try:
+        for round_ in range(12):
+            with client(server) as visitor:
+                visitor.send(packed(CAMERA))
+                for _ in range(25):
+                    handle = rng.choice(inputs)
+                    value = _random_value(handle, rng)
+                    visitor.send(packed(_messages.GuiUpdateMessage(handle._impl.uuid, {"value": value})))
+                    with contextlib.suppress(TimeoutError):
+                        while visitor.recv(timeout=0):
+                            pass
+                if round_ % 3 == 0:
+                    visitor.send(rng.choice([b"", b"\x00" * 40, b"\xc1", packed(CAMERA)[:-7], "text"]))
+                    with contextlib.suppress(ConnectionClosed):
+                        visitor.recv(timeout=0.2)
+            assert loop.is_alive()
+            if round_ > 5:
+                gc.collect()
+                objects.append(len(gc.get_objects()))
+        live.ask(live._command, "reset")
+        live.ask(live._command, "play")
+        live.ask(live._set_speed, 1.0)
+        deadline = time.monotonic() + 30
+        while not (live.playing and 5 < live.session.tick) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert live.playing and live.session.tick > 5 and live.message == ""
+    finally:
+        live.close()
+        loop.join()
+    assert threading.active_count() <= before + 2  # viser's pool
+    assert max(objects) < 1.15 * objects[0]
+    capfd.readouterr()
+
+
+def _random_value(handle, rng):
+    """A value that a page could send for an input, or now and then one that it could not."""
+    if rng.random() < 0.1:
+        return rng.choice([None, "x" * 100, -1e300, [], {}, float("nan")])
+    if hasattr(handle, "options"):
+        return rng.choice(handle.options)
+    if isinstance(handle.value, bool):
+        return rng.random() < 0.5
+    if hasattr(handle, "max"):
+        return rng.uniform(handle.min, handle.max)
+    return True
