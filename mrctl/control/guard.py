@@ -59,9 +59,9 @@ class Guard(Record):
     growth: Annotated[float, Field(ge=1, le=100)] = 3.0
     """How far oscillation and distance to the reference may grow beyond their running baselines, as a factor."""
     hold: Annotated[float, Field(gt=0, le=100)] = 1.0
-    """How long the first freeze or fallback lasts at least, s; each later one lasts twice as long."""
+    """How long the first freeze or fallback lasts at least, s; each later one lasts three times as long."""
     retries: Annotated[int, Field(ge=0, le=20)] = 4
-    """How often learning may resume, each time with half the gain; the next time it ends in the fallback."""
+    """How often learning may resume, each time with a third of the gain; the next time it ends in the fallback."""
     fade: Annotated[float, Field(gt=0, le=2)] = 0.1
     """Time constant with which a voltage that the fallback does not explain fades, s."""
     fallback: Literal["model", "none"] = "model"
