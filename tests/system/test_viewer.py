@@ -152,6 +152,10 @@ def test_inputs(browser, tmp_path):
         until(lambda: [s.feedforward for s in live.session.start] == ["fel", "rls"], "the ghost")
         assert live.session.start[1].perturbation.mass_factor == pytest.approx(1.03)  # goes on as things were
         until(lambda: node(page, "/world/ghosts/chassis") is not None, "the ghost in the scene")
+        live.ask(live._compare, "rls", False)  # while the page is busy: it gets all of this at once
+        live.ask(live._wish, ("reference",), "rounded_square")
+        page.evaluate("() => { const end = performance.now() + 2000; while (performance.now() < end); }")
+        until(lambda: live.session.start[0].reference.kind == "rounded_square", "another reference")
 
         genuine, live.session.step = live.session.step, lambda: 1 / 0
         page.get_by_role("tab", name="Drive").click()
