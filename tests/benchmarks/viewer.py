@@ -4,7 +4,8 @@ For one and for sixteen robots: median of simulated over wall time, taken each s
 began more than a period after they were due; pictures and curves that the page was sent; growth of memory.
 
 `python tests/benchmarks/viewer.py rough [SECONDS]` instead treats it roughly, without a browser: visitors that come and
-go and set inputs at random, five times a second. Memory every minute, least squares slope of the second half.
+go and set inputs at random, five times a second. Memory every minute, and the
+slope of it, less the session's record, in the second half.
 """
 
 import contextlib
@@ -31,6 +32,11 @@ def resident() -> float:
     """Memory of this process in MiB."""
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) / 256
+
+
+def recorded(live: Live) -> float:
+    """What the session keeps in order to be saved and drawn, in MiB; it grows with simulated time, and goes with it."""
+    return sum(simulation.log[: simulation.tick].nbytes for _, simulation in live.session.simulations) / 2**20
 
 
 def measure(robots: int, seconds: int) -> None:
@@ -109,9 +115,12 @@ def rough(seconds: int) -> None:
                     with contextlib.suppress(TimeoutError):
                         while (left := end - time.monotonic()) > 0:
                             visitor.recv(timeout=left)
-            samples.append((now, resident()))
+            samples.append((now, resident() - recorded(live)))
             if now // 60 > (samples[-2][0] // 60 if len(samples) > 1 else -1):
-                print(f"{now:4.0f} s: {samples[-1][1]:.0f} MiB, {actions} actions, {len(live.session.start)} robots")
+                print(
+                    f"{now:4.0f} s: {resident():.0f} MiB, of which the record of the session {recorded(live):.0f}; "
+                    f"{actions} actions, {len(live.session.start)} robots"
+                )
         late = [(t, m) for t, m in samples if t > seconds / 2]
         slope = statistics.linear_regression(*zip(*late, strict=True)).slope
         print(f"{actions} actions, alive: {loop.is_alive()}, {60 * slope:+.2f} MiB/min in the second half")
