@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         0 on success, 2 on bad input, with one line on stderr that names the field or file; 1 if a sweep ends with
-        jobs set aside or a run of it does not repeat; 130 on Ctrl-C.
+        jobs set aside, a run of it does not repeat, or a robot fails a check; 130 on Ctrl-C.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
@@ -56,6 +56,7 @@ def _parse(arguments: list[str]) -> None:
         "suite": suite,
         "tune": tune,
         "train": train,
+        "check": check,
         "bench": bench,
         "view": view,
     }
@@ -249,6 +250,27 @@ def train(out: Path = Path("composite.safetensors"), plants: int = 120, seed: in
     from mrctl.experiments import train as training
 
     print(training.train(out, plants, seed))
+
+
+def check(
+    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT.xml")] = "flat",
+    /,
+    json: bool = False,
+) -> None:
+    """Runs the physics checks on a robot and says what in its model is the likely cause of a failure; under a minute.
+
+    Exit status 1 if a check fails.
+
+    Args:
+        robot: MJCF file of a level floor with the robot; by default the shipped one.
+        json: Print JSON.
+    """
+    from mrctl.experiments import check as checking
+
+    text, verdict = checking.run(robot, json)
+    print(text)
+    if verdict:
+        raise _Incomplete(f"{robot}: {verdict}")
 
 
 def bench(json: bool = False) -> None:
