@@ -255,6 +255,9 @@ def train(out: Path = Path("composite.safetensors"), plants: int = 120, seed: in
 def check(
     robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT.xml")] = "flat",
     /,
+    wheels: tuple[str, ...] = (),
+    steering: tuple[str, ...] = (),
+    chassis: str = "",
     json: bool = False,
 ) -> None:
     """Runs the physics checks on a robot and says what in its model is the likely cause of a failure; under a minute.
@@ -262,12 +265,15 @@ def check(
     Exit status 1 if a check fails.
 
     Args:
-        robot: MJCF file of a level floor with the robot; by default the shipped one.
+        robot: MJCF file of a robot, with a level floor or without; by default the shipped one.
+        wheels: Joints of the driven wheels, left and right; by default the two with a <dcmotor>.
+        steering: Joints of what is steered; by default the upright ones with an actuator.
+        chassis: Body that carries them; by default the root.
         json: Print JSON.
     """
     from mrctl.experiments import check as checking
 
-    text, verdict = checking.run(robot, json)
+    text, verdict = checking.run(robot, wheels, steering, chassis, json)
     print(text)
     if verdict:
         raise _Incomplete(f"{robot}: {verdict}")

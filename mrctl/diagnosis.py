@@ -24,8 +24,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.adopt import MOTORS, REAR
 from mrctl.checks import CHECKS, Car, Check, Comparison, Report, rolling_wheels, steered
-from mrctl.model import MOTORS, REAR, Steering, fronts, read_robot
+from mrctl.model import Steering, fronts, read_robot
 from mrctl.record import InputError
 from mrctl.robot import GRAVITY, Robot
 
@@ -536,14 +537,14 @@ def _gravity(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 def _tyres(model: mujoco.MjModel) -> dict[int, str]:
-    """Contact pairs of the wheels, and whose they are."""
-    wheels = {model.geom(w).id: w for w in _standing(model)}
+    """Contact pairs of what rolls, and whose they are."""
+    wheels = {model.geom(w).id: w for w in rolling_wheels(model)}
     pairs = ((p, {model.pair_geom1[p], model.pair_geom2[p]} & wheels.keys()) for p in range(model.npair))
     return {p: wheels[geoms.pop()] for p, geoms in pairs if geoms}
 
 
 def _missing(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
-    wheels = {model.geom(w).id: w for w in _standing(model)}
+    wheels = {model.geom(w).id: w for w in rolling_wheels(model)}
     data = Car(model).data
     touching = {g for c in data.contact for g in c.geom}
     odd = [name for geom, name in wheels.items() if geom not in touching and name not in _tyres(model).values()]

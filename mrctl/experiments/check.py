@@ -5,31 +5,66 @@ from __future__ import annotations
 import json as jsonlib
 import math
 import unicodedata
+from collections.abc import Sequence
 
+import mujoco
+
+from mrctl.adopt import SHIPPED, has
 from mrctl.checks import Comparison
 from mrctl.diagnosis import Examination, Finding, excess
-from mrctl.model import load
+from mrctl.model import arrangement, load, load_robot, steerings, world_path
+from mrctl.record import InputError
 
 UNEXPLAINED = "nothing odd in the model explains this, nor does a shorter time step"
 
 
-def examination(robot: str) -> Examination:
+def examination(
+    path: str = "flat", wheels: Sequence[str] = (), steering: Sequence[str] = (), chassis: str = ""
+) -> Examination:
     """Gets a robot ready to be checked.
 
     Args:
-        robot: World or MJCF file with the robot.
+        path: A world with its robot, or a robot, which gets a level floor (see `mrctl.model.load_robot`).
+        wheels: Joints of the two driven wheels of a robot without a world.
+        steering: Joints of what it steers.
+        chassis: Body that carries them.
 
     Raises:
         InputError: It cannot be loaded.
     """
-    return Examination(lambda steering: load(robot, steering or "compliant"))
+    if not (wheels or steering or chassis) and _is_world(path):
+        return Examination(lambda arranged: load(path, arranged or "compliant"))
+    robot = load_robot(path, wheels, steering, chassis)
+    own = arrangement(robot)
+    offered = steerings(load(steering=own, robot=robot))
+    return Examination(lambda arranged: load(steering=arranged if arranged in offered else own, robot=robot))
 
 
-def run(robot: str, json: bool = False) -> tuple[str, str]:
+def _is_world(path: str) -> bool:
+    """Whether a file brings its own floor, and wheels under our names on it."""
+    if path in SHIPPED:
+        return False
+    try:
+        model = mujoco.MjModel.from_xml_path(str(world_path(path)))
+    except ValueError as error:
+        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
+    return model.npair > 0 and has(model, "geom", "wheel_left")
+
+
+def run(
+    path: str = "flat",
+    wheels: Sequence[str] = (),
+    steering: Sequence[str] = (),
+    chassis: str = "",
+    json: bool = False,
+) -> tuple[str, str]:
     """Runs all checks that suit a robot.
 
     Args:
-        robot: World or MJCF file with the robot.
+        path: As in `examination`, like what follows.
+        wheels: Joints of the driven wheels.
+        steering: Joints of what is steered.
+        chassis: Body that carries them.
         json: Return JSON.
 
     Returns:
@@ -38,12 +73,12 @@ def run(robot: str, json: bool = False) -> tuple[str, str]:
     Raises:
         InputError: The robot cannot be loaded.
     """
-    patient = examination(robot)
+    patient = examination(path, wheels, steering, chassis)
     findings = [patient.look(check) for check in patient.checks]
     failed = sum(finding.status == "failed" for finding in findings)
     verdict = f"{failed} of {len(findings)} checks failed" if failed else ""
     if json:
-        report = {"robot": robot, "failed": failed, "checks": [as_data(finding) for finding in findings]}
+        report = {"robot": path, "failed": failed, "checks": [as_data(finding) for finding in findings]}
         return jsonlib.dumps(report, indent=2, ensure_ascii=False, allow_nan=False), verdict
     return table(findings), verdict
 

@@ -16,13 +16,13 @@ LAYERS = (
     {"laws", "references"},
     {"scenario"},
     {"control.hierarchy", "measurement", "comparison", "metrics", "plots", "result"},
-    {"model", "plant"},
+    {"adopt", "model", "plant"},
     {"simulate", "checks"},
     {"diagnosis"},
     {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment"},
     {"cli", "pytest_plugin"},
 )
-ENGINE = {"model", "plant", "checks", "diagnosis", "viewer", "environment", "experiments"}
+ENGINE = {"adopt", "model", "plant", "checks", "diagnosis", "viewer", "environment", "experiments"}
 
 
 def module_of(path: Path) -> str:
