@@ -31,7 +31,7 @@ from mrctl.record import InputError
 from mrctl.robot import GRAVITY, Robot
 
 Load = Callable[[Steering | None], mujoco.MjModel]  # None: the robot's own arrangement
-BASICS = ("stance", "limits", "inertias", "motors")  # of whatever is to be a robot
+BASICS = ("stance", "limits", "inertias", "turning_limits", "motors")  # of whatever is to be a robot
 FIRST = BASICS[:3]  # without these, the other checks mean little
 SIDES = ("left", "right")
 FINER = 8  # by which the time step is divided, where nothing else explains a failure
@@ -87,6 +87,7 @@ class Examination:
 
     Attributes:
         checks: Those that are for a level floor.
+        suspects: What is odd in the robot's model.
     """
 
     checks = tuple(check for check in CHECKS if check.world == "flat")
@@ -98,7 +99,7 @@ class Examination:
             InputError: The robot cannot be loaded.
         """
         self._load = load
-        self._suspects = suspects(load(None))
+        self.suspects = suspects(load(None))
         self._basics: dict[str, Finding] = {}
 
     def look(self, check: Check) -> Finding:
@@ -123,7 +124,7 @@ class Examination:
         report = check.measure(model, read_robot(model))
         if all(c.passed for c in report):
             return Finding(check, report)
-        return Finding(check, report, tuple(_explain(self._load, check, report, self._suspects)))
+        return Finding(check, report, tuple(_explain(self._load, check, report, self.suspects)))
 
 
 def _explain(load: Load, check: Check, report: Report, found: list[Suspect]) -> Iterator[Explanation]:
@@ -474,7 +475,7 @@ def _creep(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
         for name in odd:
             m.dof_solimp[m.joint(name).dofadr[0], :2] = 0.99
 
-    text = f"solimpfriction {min(odd.values()):g} of {_join(list(odd))}: MuJoCo's soft Coulomb friction creeps in proportion to"
+    text = f"solimpfriction {min(odd.values()):g} of {_join(list(odd))}: soft Coulomb friction creeps in proportion to"
     return Suspect("creeping friction loss", f'{text} 1 − that; set solimpfriction="0.99 0.99"', repair)
 
 
@@ -499,8 +500,8 @@ def _balance(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
         body = m.body("chassis")
         body.ipos[1] -= _aside(m) * robot.mass / body.mass[0]
 
-    text = f"it lies {1e3 * abs(side):.3g} mm to the {SIDES[side < 0]} of the axis: equation (3) knows only an offset ahead"
-    return Suspect("centre of mass off the axis", text, repair)
+    text = f"it lies {1e3 * abs(side):.3g} mm to the {SIDES[side < 0]} of the axis:"
+    return Suspect("centre of mass off the axis", f"{text} equation (3) knows only an offset ahead", repair)
 
 
 def _wheel_inertia(model: mujoco.MjModel, robot: Robot) -> Suspect | None:

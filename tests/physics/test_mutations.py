@@ -151,6 +151,8 @@ MUTATIONS = [
     ("limits", gear, 2.2),
     ("limits", resistance, 20.0),
     ("limits", grip, 1e-3),
+    ("turning_limits", track, 3.0),
+    ("turning_limits", inertia, 100.0),
     ("motors", rotor, 0.0),
     ("motors", motor_constant, 0.1),
     ("inertias", wheel_inertia, 100.0),
