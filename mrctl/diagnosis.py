@@ -31,8 +31,9 @@ from mrctl.record import InputError
 from mrctl.robot import GRAVITY, Robot
 
 Load = Callable[[Steering | None], mujoco.MjModel]  # None: the robot's own arrangement
-BASICS = ("stance", "limits", "inertias", "turning_limits", "motors")  # of whatever is to be a robot
-FIRST = BASICS[:3]  # without these, the other checks mean little
+FIRST = ("stance", "limits", "inertias")  # a robot that fails these fails others, too, for the same cause
+# Checks of whatever is to be a robot, and those of `FIRST` that have to go before them.
+BASICS = {"stance": (), "inertias": (), "motors": (), "limits": ("stance",), "turning_limits": ("stance",)}
 SIDES = ("left", "right")
 FINER = 8  # by which the time step is divided, where nothing else explains a failure
 
@@ -108,14 +109,15 @@ class Examination:
         A robot that does not stand, or cannot do what it declares, fails all sorts of checks for the same cause: with
         that explained, the others wait.
         """
-        if check.name in BASICS:
-            if check.name not in self._basics:
-                self._basics[check.name] = self._run(check)
+        if check.name in self._basics:
             return self._basics[check.name]
-        for basic in (self.look(c) for c in self.checks if c.name in FIRST):
-            if basic.causes:
-                return Finding(check, [], reason=f"waits for {basic.check.name}")
-        return self._run(check)
+        for first in (c for c in self.checks if c.name in BASICS.get(check.name, FIRST)):
+            if self.look(first).causes:
+                return Finding(check, [], reason=f"waits for {first.name}")
+        finding = self._run(check)
+        if check.name in BASICS:
+            self._basics[check.name] = finding
+        return finding
 
     def _run(self, check: Check) -> Finding:
         model = self._load(check.steering)

@@ -1,5 +1,8 @@
 """`mrctl check`: the physics checks on a robot, as a table or as JSON, with the causes of what fails."""
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
 from __future__ import annotations
 
 import json as jsonlib
