@@ -21,6 +21,7 @@ from mrctl import model as mjcf
 from mrctl.pool import Cluster, Outcome, Pool, Processes, Work
 from mrctl.record import InputError
 from mrctl.result import SIGNALS, versions
+from mrctl.robot import CAR
 from mrctl.scenario import Scenario
 from mrctl.simulate import Simulation, simulate
 from mrctl.store import Store
@@ -153,7 +154,7 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
 def _models(sweep: Sweep) -> dict[str, str]:
     """Digests of the compiled worlds with the robot, and of the file of a controller."""
     worlds = {
-        f"{world}, {steering}" + (f", {robot.path}" if robot != mjcf.CAR else ""): mjcf.digest(
+        f"{world}, {steering}" + (f", {robot.path}" if robot != CAR else ""): mjcf.digest(
             mjcf.load(world, steering, robot=robot)
         )
         for world, steering, robot in sweep.worlds

@@ -19,12 +19,11 @@ from mrctl import adopt
 from mrctl.adopt import FRONTS, MOTORS, REAR, SHIPPED, find, has, models_folder
 from mrctl.kinematics import scrub_free_angle
 from mrctl.record import InputError
-from mrctl.robot import ANY_ANGLE, GRAVITY, Perturbation, Robot, RobotFile
+from mrctl.robot import ANY_ANGLE, CAR, GRAVITY, Perturbation, Robot, RobotFile
 
 Steering = Literal["compliant", "caster", "rigid"]
 Fields = dict[str, NDArray]
 
-CAR = RobotFile()
 STEERINGS: tuple[Steering, ...] = ("compliant", "caster", "rigid")
 # Elements that the robot of a world must name; `load_robot` names those of any other.
 REQUIRED = {
