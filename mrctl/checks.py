@@ -13,23 +13,38 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mrctl.dynamics import accelerations
+from mrctl.adopt import MOTORS, REAR, has
+from mrctl.dynamics import accelerations, inverse_dynamics
 from mrctl.kinematics import scrub_free_angle, twist_from_front_wheel, wheel_rates
-from mrctl.model import Steering, clone, fronts, perturb, stand
-from mrctl.plant import OMEGA, RATE_LEFT, RATE_RIGHT, STEERING, THETA, UPRIGHT, V_LATERAL, V, X, Y, addresses, read
+from mrctl.model import Steering, clone, fronts, perturb, stand, steerings
+from mrctl.plant import (
+    OMEGA,
+    RATE_LEFT,
+    RATE_RIGHT,
+    STEERING,
+    THETA,
+    UPRIGHT,
+    V_LATERAL,
+    V,
+    X,
+    Y,
+    addresses,
+    inputs,
+    read,
+)
 from mrctl.robot import GRAVITY, Perturbation, Robot
 
 Array = NDArray[np.float64]
 Control = Callable[[float], ArrayLike]  # time in s to left V, right V, steering rad, steering rate rad/s
 
-WHEELS = ("wheel_left", "wheel_right", "front_wheel")
 HOLD = 0.02  # s for which a control is held
+BLOWN = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
 class Comparison(NamedTuple):
@@ -41,10 +56,19 @@ class Comparison(NamedTuple):
     tolerance: float
     unit: str
 
+    @property
+    def passed(self) -> bool:
+        """Whether the two are within tolerance; what is no number is not."""
+        return abs(self.measured - self.expected) <= self.tolerance
+
     def __str__(self) -> str:
         """One line."""
         bounds = f"{self.expected:.5g} ± {self.tolerance:.2g}"
         return f"{self.quantity}: {self.measured:.5g}, expected {bounds} {self.unit}".strip()
+
+
+class Unstable(Exception):
+    """The simulation blew up."""
 
 
 class CheckFailed(AssertionError):
@@ -60,6 +84,16 @@ class CheckFailed(AssertionError):
         self.comparison = comparison
 
 
+def steered(model: mujoco.MjModel) -> bool:
+    """Whether a wheel is."""
+    return has(model, "joint", "steering")
+
+
+def rolling_wheels(model: mujoco.MjModel) -> list[str]:
+    """All that turn on a joint: the driven two and those in front that do not merely slide."""
+    return [*REAR, *(front for front in fronts(model) if has(model, "joint", front))]
+
+
 Report = list[Comparison]
 CheckFunction = Callable[[mujoco.MjModel, Robot], Report]
 
@@ -67,16 +101,14 @@ CheckFunction = Callable[[mujoco.MjModel, Robot], Report]
 def compare(
     quantity: str, measured: float, expected: float, unit: str = "", *, relative: float = 0.0, absolute: float = 0.0
 ) -> Comparison:
-    """Holds a measured value to an expected one, within `absolute` + `relative` · |expected|.
-
-    Raises:
-        CheckFailed: It is farther away, or not a number.
-    """
+    """A measured value beside an expected one, within `absolute` + `relative` · |expected|."""
     tolerance = absolute + relative * abs(expected)
-    comparison = Comparison(quantity, float(measured), float(expected), float(tolerance), unit)
-    if not abs(measured - expected) <= tolerance:
-        raise CheckFailed(comparison)
-    return comparison
+    return Comparison(quantity, float(measured), float(expected), float(tolerance), unit)
+
+
+def between(quantity: str, measured: float, low: float, high: float, unit: str = "") -> Comparison:
+    """A measured value that has to lie between two."""
+    return compare(quantity, measured, (low + high) / 2, unit, absolute=(high - low) / 2)
 
 
 # Driving open loop
@@ -84,7 +116,7 @@ def compare(
 
 @dataclass(frozen=True)
 class Log:
-    """What happened, one sample per `HOLD` and one at the start, (T, …)."""
+    """What happened, one sample per hold of the control and one at the start, (T, …)."""
 
     time: Array
     qpos: Array
@@ -108,42 +140,56 @@ class Car:
         """Stands the robot at a posture `(3,)` in m, m, rad, rolling with a twist `(2,)` in m/s, rad/s."""
         self.model, self.data = model, mujoco.MjData(model)
         self.data.qpos[:], self.data.qvel[:] = stand(model, np.asarray(pose, float), np.asarray(twist, float))
-        motors = [model.actuator(n).id for n in ("motor_left", "motor_right", "steering")]
-        left, right, steering = model.actuator_ctrladr[motors]
-        self._inputs = [left, right, steering, steering + 1]
+        self._inputs = inputs(model)
         self._address = addresses(model)
         mujoco.mj_forward(model, self.data)
 
     def control(self, control: ArrayLike) -> None:
         """Sets voltages left and right in V, steering angle in rad and rate in rad/s, `(4,)`."""
-        self.data.ctrl[self._inputs] = control
+        self.data.ctrl[self._inputs] = np.asarray(control)[: len(self._inputs)]
 
-    def drive(self, seconds: float, control: ArrayLike | Control) -> Log:
-        """Drives for a time with a control, constant or a function of the time since the call, held for `HOLD`."""
+    def drive(self, seconds: float, control: ArrayLike | Control, hold: float = HOLD) -> Log:
+        """Drives for a time with a control, constant or a function of the time since the call, held for `hold`.
+
+        Raises:
+            Unstable: The state is no longer finite.
+        """
         law = control if callable(control) else lambda _: control
-        substeps = round(HOLD / self.model.opt.timestep)
-        ticks = max(1, round(seconds / HOLD))
+        substeps = max(1, round(hold / self.model.opt.timestep))
+        hold = substeps * self.model.opt.timestep  # in whole steps
+        ticks = max(1, round(seconds / hold))
         qpos, qvel = np.empty((ticks + 1, self.model.nq)), np.empty((ticks + 1, self.model.nv))
         qpos[0], qvel[0] = self.data.qpos, self.data.qvel
         for k in range(ticks):
-            self.control(law(k * HOLD))
+            self.control(law(k * hold))
             mujoco.mj_step(self.model, self.data, substeps)
             qpos[k + 1], qvel[k + 1] = self.data.qpos, self.data.qvel
         reading = np.zeros((ticks + 1, 11))
         read(qpos, qvel, self._address, reading)
-        return Log(HOLD * np.arange(ticks + 1.0), qpos, qvel, reading)
+        self.assert_sane()
+        return Log(hold * np.arange(ticks + 1.0), qpos, qvel, reading)
+
+    def assert_sane(self) -> None:
+        """Refuses a state that is not finite, and one from which the engine has silently started again at rest.
+
+        Raises:
+            Unstable: Either.
+        """
+        if any(self.data.warning[w].number for w in BLOWN) or not np.isfinite(self.data.qvel).all():
+            raise Unstable
 
     def tyre_forces(self) -> Array:
-        """Forces of the ground on left, right and front wheel in the world frame, `(3, 3)` in N."""
+        """Forces of the ground on left wheel, right wheel and front in the world frame, `(3, 3)` in N."""
         mujoco.mj_forward(self.model, self.data)
         forces, force = np.zeros((3, 3)), np.zeros(6)
-        geoms = [self.model.geom(name).id for name in WHEELS]
+        row = {self.model.geom(name).id: k for k, name in enumerate(REAR)}
+        row |= {self.model.geom(name).id: 2 for name in fronts(self.model)}
         for i in range(self.data.ncon):
             contact = self.data.contact[i]
             mujoco.mj_contactForce(self.model, self.data, i, force)
             for side, sign in ((0, -1), (1, 1)):  # the frame's first axis points from geom 0 to geom 1
-                if contact.geom[side] in geoms:
-                    forces[geoms.index(contact.geom[side])] += sign * contact.frame.reshape(3, 3).T @ force[:3]
+                if (geom := int(contact.geom[side])) in row:
+                    forces[row[geom]] += sign * contact.frame.reshape(3, 3).T @ force[:3]
         return forces
 
 
@@ -157,9 +203,16 @@ def _time_constant(log: Log, column: int, tau: float) -> float:
 
     Not from the start: the tyres, springs of 10 ms, first have to take up their load.
     """
-    first, last = round(tau / 2 / HOLD), round(2 * tau / HOLD)
+    first, last = (int(np.searchsorted(log.time, time)) for time in (tau / 2, 2 * tau))
     left = (log[column][-1] - log[column][last]) / (log[column][-1] - log[column][first])
     return -(log.time[last] - log.time[first]) / np.log(left) if left > 0 else np.nan
+
+
+def _cruise(model: mujoco.MjModel, robot: Robot, left: float, right: float) -> tuple[Car, Log]:
+    """Drives with constant voltages until the twist has settled, from about where it will: no spin, no rising nose."""
+    v = robot.velocity_gain * max(0.0, (left + right) / 2 - _loss_volts(robot))
+    car = Car(model, twist=(v, robot.rotation_gain * (right - left) / 2))
+    return car, car.drive(_settled(robot), (left, right, 0, 0))
 
 
 def _loss_volts(robot: Robot) -> float:
@@ -181,7 +234,7 @@ def _brake(robot: Robot) -> float:
 
 
 def _motors(model: mujoco.MjModel) -> list[int]:
-    return [model.actuator(name).id for name in ("motor_left", "motor_right")]
+    return [model.actuator(name).id for name in MOTORS]
 
 
 def open_circuit(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -196,6 +249,19 @@ def on_skid(model: mujoco.MjModel) -> mujoco.MjModel:
     model = clone(model)
     for wheel in (model.geom(name).id for name in fronts(model)):
         model.pair_friction[(model.pair_geom1 == wheel) | (model.pair_geom2 == wheel)] = 1e-5
+    return model
+
+
+def crisp(model: mujoco.MjModel, robot: Robot, tau: float) -> mujoco.MjModel:
+    """Contacts and time step as short, against a time constant and the wheel radius, as those of the default robot.
+
+    Slip and the tyres' sinking in, in proportion to a contact's time constant and to its square, then weigh no more.
+    """
+    share = min(1.0, tau / 0.18, np.sqrt(robot.wheel_radius / 0.098))
+    model = clone(model)
+    model.opt.timestep *= share
+    model.pair_solref[:, 0] *= share
+    model.pair_solreffriction[:, 0] *= share
     return model
 
 
@@ -220,6 +286,85 @@ def perturbed(model: mujoco.MjModel, perturbation: Perturbation) -> mujoco.MjMod
     copy = clone(model)
     perturb(model, copy, perturbation)
     return copy
+
+
+# Is it a robot?
+
+
+def stance(model: mujoco.MjModel, robot: Robot) -> Report:
+    """On level ground the robot stands level: radii and heights of the axles fit together.
+
+    Tolerance 0.5°, more than tyres that sink in can do, less than a wrong radius does.
+    """
+    car = Car(model)
+    car.drive(1.0, (0, 0, 0, 0))
+    frame = car.data.body("chassis").xmat.reshape(3, 3)
+    nose, side = np.degrees(np.arcsin(frame[2, :2]))
+    return [
+        compare("nose up", nose, 0.0, "°", absolute=0.5),
+        compare("left side up", side, 0.0, "°", absolute=0.5),
+    ]
+
+
+def _to_its_limit(model: mujoco.MjModel, robot: Robot, along: tuple[float, float], limit: float, rate: float) -> Log:
+    """Drives from rest to a limit at the limit on its rate, with the voltages of equation (3) within the supply."""
+    hold = min(HOLD, limit / rate / 50)
+
+    def law(t: float) -> tuple[float, ...]:
+        volts = inverse_dynamics(np.array(along) * rate * (t + hold / 2), np.array(along) * rate, robot)
+        left, right = np.clip(volts, -robot.supply, robot.supply)
+        return left, right, 0.0, 0.0
+
+    return Car(model).drive(limit / rate, law, hold)
+
+
+def limits(model: mujoco.MjModel, robot: Robot) -> Report:
+    """What the model declares as limits on V and V̇, motors, gear, supply and grip can do, and the fork can steer.
+
+    Tolerance 10 %: the voltages are those of equation (3), and nothing corrects slip.
+    """
+    log = _to_its_limit(model, robot, (1, 0), robot.max_speed, robot.max_acceleration)
+    return [
+        compare("V at its limit", log[V][-1], robot.max_speed, "m/s", relative=0.1),
+        between("largest steering angle", robot.steering_limit, 0.1, np.pi / 2, "rad"),
+    ]
+
+
+def turning_limits(model: mujoco.MjModel, robot: Robot) -> Report:
+    """The same of θ̇ and θ̈, on the spot, the front tyre without friction."""
+    log = _to_its_limit(on_skid(model), robot, (0, 1), robot.max_rotation, robot.max_rotation_acceleration)
+    return [compare("θ̇ at its limit", log[OMEGA][-1], robot.max_rotation, "rad/s", relative=0.1)]
+
+
+def motors(model: mujoco.MjModel, robot: Robot) -> Report:
+    """Each motor, on its own shaft, is one that exists: no-load speed U/k_E and time constant J_m R_a/k².
+
+    Hub motors turn at some 100 rpm, model racing motors at 50,000; from coreless to cheap, 0.5 to 200 ms. The inertia
+    may also be written at the wheel's joint; without a gear it may be part of the wheel's.
+    """
+    report = []
+    for motor, wheel in zip(MOTORS, REAR, strict=True):
+        actuator = model.actuator(motor)
+        gear, (resistance, constant) = actuator.gear[0], actuator.gainprm[:2]
+        inertia = model.actuator_armature[actuator.id] + model.joint(wheel).armature[0] / gear**2
+        volts = model.actuator_ctrlrange[model.actuator_ctrladr[actuator.id], 1]
+        report += [
+            between(f"no-load speed of {motor}", volts / constant * 30 / np.pi, 100, 60e3, "rpm"),
+            between(f"time constant of {motor}", inertia * resistance / constant**2, 0.5e-3 * (gear > 3), 0.2, "s"),
+        ]
+    return report
+
+
+def inertias(model: mujoco.MjModel, robot: Robot) -> Report:
+    """Inertias are possible: a wheel's is at most that of a hoop, the robot's about the vertical fits its size."""
+    report = []
+    for name in rolling_wheels(model):
+        body, radius = model.body(name), model.geom(name).size[0]
+        spin = body.inertia.max()  # a disc's own axis
+        report.append(between(f"inertia of {name} over m r²", spin / (body.mass[0] * radius**2), 0.01, 1))
+    gyration = np.sqrt(robot.yaw_inertia / robot.mass)
+    size = np.hypot(robot.wheelbase, robot.half_track)
+    return report + [between("radius of gyration over the size", gyration / size, 0.05, 1.0)]
 
 
 # At rest
@@ -252,18 +397,36 @@ def hold_on_slope(model: mujoco.MjModel, robot: Robot) -> Report:
     """Shorted motors do not hold a robot on a slope, Coulomb friction does: up to m g sin α = 2 τ_loss/r + F_roll.
 
     At half of that slope it stands, but MuJoCo's friction is soft and creeps in proportion to its load: allowed is a
-    tenth of the speed without friction. At twice it rolls, and back-EMF brakes it to (m g sin α − losses)/B with
-    B = 2 N² k²/(R_a r²). Tolerance 0.5 %: slip and sinking tyres take 0.05 % each.
+    tenth of the speed without friction. At twice, or less if tyres would slip, it rolls, and back-EMF brakes it to
+    (m g sin α − losses)/B with B = 2 N² k²/(R_a r²). Tolerance 0.25 % of the force: slip and sinking tyres take 0.05 %
+    each.
     """
     force, weight = _holding_force(robot), robot.mass * GRAVITY
-    speeds = []
-    for share in (0.5, 2.0):
+    speeds, shares = [], (0.5, _steepest(robot))
+    for share in shares:
         car = Car(perturbed(model, Perturbation(slope=-float(np.arcsin(share * force / weight)))))
         speeds.append(car.drive(_settled(robot), (0, 0, 0, 0))[V][-1])
     return [
         compare("creep at half the holding force", speeds[0], 0.0, "m/s", absolute=0.1 * force / 2 / _brake(robot)),
-        compare("speed at twice the holding force", speeds[1], force / _brake(robot), "m/s", relative=5e-3),
+        compare(
+            f"speed at {shares[1]:.3g} times the holding force",
+            speeds[1],
+            (shares[1] - 1) * force / _brake(robot),
+            "m/s",
+            absolute=2.5e-3 * shares[1] * force / _brake(robot),
+        ),
     ]
+
+
+def _steepest(robot: Robot) -> float:
+    """Downhill force over the holding force, up to 2, at which half of the driven tyres' grip holds."""
+    for share in np.linspace(2.0, 1.1, 10):
+        sine = share * _holding_force(robot) / (robot.mass * GRAVITY)
+        cosine, base = np.sqrt(max(0.0, 1 - sine**2)), robot.wheelbase - robot.trail
+        front = (robot.com_offset * cosine + robot.com_height * sine) / base
+        if sine < 0.5 * robot.tyre_friction * (cosine - front) and front > 0:
+            return float(share)
+    return 1.1
 
 
 # Motors
@@ -276,7 +439,7 @@ def top_speed(model: mujoco.MjModel, robot: Robot) -> Report:
     0.05 % of the radius; of the loss 1 %, because it is a small difference of large numbers.
     """
     high, low = robot.supply, robot.supply / 2
-    fast, slow = (Car(model).drive(_settled(robot), (u, u, 0, 0))[V][-1] for u in (high, low))
+    fast, slow = (_cruise(model, robot, u, u)[1][V][-1] for u in (high, low))
     gain = (fast - slow) / (high - low)
     loss = high - fast / gain
     return [
@@ -296,7 +459,7 @@ def stall(model: mujoco.MjModel, robot: Robot) -> Report:
     car = Car(model)
     car.control((robot.supply, robot.supply, 0, 0))
     mujoco.mj_forward(model, car.data)
-    shaft = [car.data.qfrc_actuator[model.joint(name).dofadr[0]] for name in WHEELS[:2]]
+    shaft = [car.data.qfrc_actuator[model.joint(name).dofadr[0]] for name in REAR]
     report = [
         compare(f"stall torque {side}", torque, robot.motor_gain * robot.supply, "N·m", relative=1e-6)
         for side, torque in zip(("left", "right"), shaft, strict=True)
@@ -327,10 +490,9 @@ def velocity_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
     """
     volts = robot.supply / 3
     step = robot.supply / 24
-    car = Car(model)
-    car.drive(_settled(robot), (volts, volts, 0, 0))
-    log = car.drive(_settled(robot), (volts + step, volts + step, 0, 0))
     tau = robot.velocity_time_constant
+    car, _ = _cruise(crisp(model, robot, tau), robot, volts, volts)
+    log = car.drive(_settled(robot), (volts + step, volts + step, 0, 0), min(HOLD, tau / 10))
     gain = (log[V][-1] - log[V][0]) / step
     return [
         compare("gain of V", gain, robot.velocity_gain, "m/s/V", relative=5e-3),
@@ -348,13 +510,12 @@ def rotation_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
     """
     skid = skid_robot(robot)
     common, step = robot.supply / 3, robot.supply / 240
-    car = Car(on_skid(model))
-    car.drive(_settled(robot), (common, common, 0, 0))
-    log = car.drive(_settled(robot), (common - step, common + step, 0, 0))
     arm = robot.half_track / robot.wheel_radius
     v = robot.velocity_gain * (common - _loss_volts(skid))
     damping = 2 * arm**2 * robot.motor_gain * robot.back_emf + robot.mass * robot.com_offset * v
     tau = skid.effective_inertia / damping
+    car, _ = _cruise(on_skid(crisp(model, robot, tau)), robot, common, common)
+    log = car.drive(_settled(robot), (common - step, common + step, 0, 0), min(HOLD, tau / 10))
     gain = (log[OMEGA][-1] - log[OMEGA][0]) / step
     return [
         compare("gain of θ̇", gain, 2 * arm * robot.motor_gain / damping, "rad/s/V", relative=1e-2),
@@ -428,7 +589,7 @@ def rolling(model: mujoco.MjModel, robot: Robot) -> Report:
     car = Car(model)
     car.drive(_settled(robot), _electronic_differential(robot, volts, 0.0))
     log = car.drive(6.0, law)
-    front = log.qvel[:, model.joint("front_wheel").dofadr[0]] * robot.front_wheel_radius
+    front = np.mean([log.qvel[:, model.joint(f).dofadr[0]] for f in fronts(model)], axis=0) * robot.front_wheel_radius
     twist = twist_from_front_wheel(front, log[STEERING], robot)
     rates = wheel_rates(twist, robot)
     rows = (
@@ -460,8 +621,10 @@ def _spinning(model: mujoco.MjModel, robot: Robot, friction: float, x: float = 0
     inert = robot.mass + robot.front_wheel_inertia / robot.front_wheel_radius**2
     inert -= friction * robot.mass * robot.com_height / (robot.wheelbase - robot.trail)
     expected = (friction * robot.mass * GRAVITY * (1 - front) - front * robot.rolling_force) / inert
-    log = Car(model, pose=(x, 0, 0)).drive(0.8, (robot.supply, robot.supply, 0, 0))
-    steady = log.time > 0.2  # the wheels have reached their speed
+    seconds = min(0.8, 0.5 * robot.velocity_gain * robot.supply / expected)  # faster, the wheels would catch up
+    car = Car(crisp(model, robot, robot.velocity_time_constant), pose=(x, 0, 0))
+    log = car.drive(seconds, (robot.supply, robot.supply, 0, 0), min(HOLD, seconds / 40))
+    steady = log.time > seconds / 4  # the wheels have reached their speed
     acceleration = np.polyfit(log.time[steady], log[V][steady], 1)[0]
     slip = ((log[RATE_LEFT] + log[RATE_RIGHT]) / 2 * robot.wheel_radius - log[V])[steady].min()
     return [
@@ -500,8 +663,8 @@ def cornering(model: mujoco.MjModel, robot: Robot) -> Report:
     slow, fast = logs
     ahead = np.stack([np.cos(fast[THETA]), np.sin(fast[THETA])], axis=1)
     centre = fast.reading[:, [X, Y]] + robot.com_offset * ahead
-    k = round(0.1 / HOLD)  # second difference over 0.1 s: no vibration
-    bend = np.hypot(*(centre[2 * k :] - 2 * centre[k:-k] + centre[: -2 * k]).T) / (k * HOLD) ** 2
+    k = round(0.1 / fast.time[1])  # second difference over 0.1 s: no vibration
+    bend = np.hypot(*(centre[2 * k :] - 2 * centre[k:-k] + centre[: -2 * k]).T) / fast.time[k] ** 2
     return [
         compare("radius below the limit", slow[V][-1] / slow[OMEGA][-1], radius, "m", relative=5e-3),
         compare("largest acceleration above it", bend.max(), limit, "m/s²", relative=3e-2),
@@ -525,12 +688,17 @@ def centre_of_mass(model: mujoco.MjModel, robot: Robot) -> Report:
     ballast = robot.mass * robot.com_offset * (1 - left) / (back + left * robot.com_offset)
     payload = Perturbation(payload=ballast, payload_x=-back, payload_z=robot.wheel_radius)
     update = {"mass": robot.mass + ballast, "com_offset": left * robot.com_offset}
-    volts = np.array([0.1, 0.5]) * robot.supply
+    loss = skid_robot(robot).drive_loss / robot.motor_gain
+    drive = np.array([0.1, 0.5]) * robot.supply - loss
+    v, omega = robot.velocity_gain * drive.mean(), robot.rotation_gain * (drive[1] - drive[0]) / 2
+    volts = loss + drive * min(1.0, np.sqrt(0.2 * robot.tyre_friction * GRAVITY / abs(v * omega)))
     report = []
     whole = robot.mass * robot.com_offset
     laden = perturbed(model, payload), robot.model_copy(update=update)
     for name, car, true in (("", model, robot), (" with c/10", *laden)):
-        log = Car(on_skid(car)).drive(2 * _settled(true), (*volts, 0, 0))
+        crispy = crisp(on_skid(car), true, min(true.velocity_time_constant, true.rotation_time_constant))
+        start = Car(crispy, twist=(robot.velocity_gain * (volts.mean() - loss), 0))
+        log = start.drive(2 * _settled(true), (*volts, 0, 0))
         v, omega, sideways = log.reading[-1, [V, OMEGA, V_LATERAL]]
         torques = true.motor_gain * (volts - true.back_emf * wheel_rates((v, omega), true))
         loss = 2 * skid_robot(true).drive_loss
@@ -547,9 +715,9 @@ def centre_of_mass(model: mujoco.MjModel, robot: Robot) -> Report:
 def prediction(model: mujoco.MjModel, robot: Robot) -> Report:
     """Equation (3), corrected, predicts V and θ̇ of a caster-steered robot from its voltages alone.
 
-    Both voltages wind through 20 s with periods of 2 to 7 s; the law is integrated by Runge and Kutta's method.
-    Tolerances are shares of the signals' root mean square: 1 % of V, 5 % of θ̇, to which the real fork, with the
-    mass, damping and rolling loss of its wheel, adds what the equation leaves out.
+    Both voltages wind through 20 s with periods of 2 to 7 s, from about the speed that they hold; the law is integrated
+    by Runge and Kutta's method. Tolerances are shares of the root mean squares: 1 % of V, 6 % of θ̇, to which the
+    real fork, with the mass, damping and rolling loss of its wheel, adds what the equation leaves out.
     """
 
     def law(t: float) -> tuple[float, ...]:
@@ -557,11 +725,13 @@ def prediction(model: mujoco.MjModel, robot: Robot) -> Report:
         apart = robot.supply * (0.05 * np.sin(1.3 * t) + 0.04 * np.sin(3.1 * t))
         return common - apart, common + apart, 0.0, 0.0
 
-    log = Car(model).drive(20.0, law)
+    rolling = robot.velocity_gain * (0.35 * robot.supply - _loss_volts(robot)), 0.0
+    log = Car(model, twist=rolling).drive(20.0, law)
     twist = np.zeros((len(log.time), 2))
+    twist[0] = rolling
     for k, t in enumerate(log.time[:-1]):
         volts = law(t)[:2]
-        s, h = twist[k], HOLD
+        s, h = twist[k], log.time[1]
         k1 = accelerations(s, volts, robot)
         k2 = accelerations(s + h / 2 * k1, volts, robot)
         k3 = accelerations(s + h / 2 * k2, volts, robot)
@@ -570,7 +740,7 @@ def prediction(model: mujoco.MjModel, robot: Robot) -> Report:
     error = np.sqrt(np.mean((twist - log.reading[:, [V, OMEGA]]) ** 2, axis=0) / np.mean(twist**2, axis=0))
     return [
         compare("error of V", error[0], 0.0, absolute=1e-2),
-        compare("error of θ̇", error[1], 0.0, absolute=5e-2),
+        compare("error of θ̇", error[1], 0.0, absolute=6e-2),
     ]
 
 
@@ -610,11 +780,14 @@ def scrub_free(model: mujoco.MjModel, robot: Robot) -> Report:
 
 def _winding(robot: Robot) -> Callable[[float], tuple[float, ...]]:
     """A control that speeds up and slows down, turns both ways and steers as it turns."""
+    lock = min(0.3, 0.6 * robot.steering_limit)
+    grip = np.sqrt(0.1 * robot.tyre_friction * GRAVITY * abs(robot.wheelbase) / np.tan(lock))  # at a tenth of it
+    volts = min(0.4 * robot.supply, grip / robot.velocity_gain + _loss_volts(robot))
 
     def law(t: float) -> tuple[float, ...]:
-        common = robot.supply * (0.4 + 0.1 * np.sin(2.0 * t))
-        apart = robot.supply * 0.06 * np.sin(1.7 * t)
-        return common - apart, common + apart, 0.3 * np.sin(1.7 * t - 0.5), 0.51 * np.cos(1.7 * t - 0.5)
+        common = volts * (1 + 0.25 * np.sin(2.0 * t))
+        apart = volts * 0.15 * np.sin(1.7 * t)
+        return common - apart, common + apart, lock * np.sin(1.7 * t - 0.5), 1.7 * lock * np.cos(1.7 * t - 0.5)
 
     return law
 
@@ -623,21 +796,24 @@ def _energy_balance(model: mujoco.MjModel, robot: Robot, seconds: float) -> tupl
     """Drives a winding run; returns what is missing in the energy balance and what came from the supply, in J.
 
     From the supply: U I, with the current of the nominal motor, of which R_a I² is heat. To the floor and the bearings:
-    tyre slip from the contact forces, and the nominal Coulomb torques. The rest is MuJoCo's mechanical energy.
+    tyre slip from the contact forces, what linkages and bearings of the steering take, and the nominal Coulomb torques.
+    The rest is MuJoCo's mechanical energy.
     """
     model = clone(model)
     model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     car, law = Car(model), _winding(robot)
     data = car.data
-    dofs = np.array([model.joint(name).dofadr[0] for name in WHEELS])
-    steering = model.joint("steering").dofadr[0]
+    dofs = np.array([model.joint(name).dofadr[0] for name in rolling_wheels(model)])
+    forks = [dof for dof in range(6, model.nv) if dof not in dofs]
+    servos = [model.joint("steering").dofadr[0]] if steered(model) else []
     rear = robot.drive_loss + robot.rolling_force * (1 - robot.front_load) / 2 * robot.wheel_radius
-    coulomb = np.array([rear, rear, robot.rolling_force * robot.front_load * robot.front_wheel_radius])
-    h, substeps = model.opt.timestep, round(HOLD / model.opt.timestep)
+    front = robot.rolling_force * robot.front_load * robot.front_wheel_radius
+    coulomb = np.array([rear, rear, *([front / max(1, len(dofs) - 2)] * (len(dofs) - 2))])
+    h, substeps = model.opt.timestep, max(1, round(HOLD / model.opt.timestep))
     before = data.energy.sum()
     supplied = balance = 0.0
-    for k in range(round(seconds / HOLD)):
-        control = np.asarray(law(k * HOLD))
+    for k in range(round(seconds / (h * substeps))):
+        control = np.asarray(law(k * h * substeps))
         car.control(control)
         for _ in range(substeps):
             velocity = data.qvel.copy()
@@ -646,13 +822,16 @@ def _energy_balance(model: mujoco.MjModel, robot: Robot, seconds: float) -> tupl
             current = (control[:2] - robot.back_emf * velocity[dofs[:2]]) / robot.resistance
             rows = np.zeros(data.nefc)
             mujoco.mj_mulJacVec(model, data, rows, velocity)
-            touching = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
-            slip = -(data.efc_force * rows)[touching].sum()
-            servo = data.qfrc_actuator[steering] * velocity[steering]
+            coulombs = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF)
+            slip = (
+                -(data.efc_force * rows)[data.efc_type != coulombs].sum() - data.qfrc_passive[forks] @ velocity[forks]
+            )
+            servo = data.qfrc_actuator[servos] @ velocity[servos]
             supplied += h * control[:2] @ current
             balance += h * (control[:2] @ current - robot.resistance * current @ current - slip + servo)
             balance -= h * coulomb @ np.abs(velocity[dofs])
     mujoco.mj_forward(model, data)
+    car.assert_sane()
     return balance - (data.energy.sum() - before), supplied
 
 
@@ -663,15 +842,16 @@ def energy(model: mujoco.MjModel, robot: Robot) -> Report:
     is halved (the integrator is of first order); 0.2 for the start from rest, which jumps between steps.
     """
     report, missing = [], []
-    for step in (2e-3, 1e-3, 5e-4):
+    for halvings in range(3):
         fine = clone(model)
-        fine.opt.timestep = step
+        fine.opt.timestep /= 2**halvings
         lost, supplied = _energy_balance(fine, robot, 2.0)
         missing.append(abs(lost))
-        report.append(compare(f"missing share at {1e3 * step:g} ms", lost / supplied, 0.0, absolute=0.02))
+        step = f"{1e3 * fine.opt.timestep:g} ms"
+        report.append(compare(f"missing share at {step}", lost / supplied, 0.0, absolute=0.02))
     return report + [
-        compare("missing at 1 ms over 2 ms", missing[1] / missing[0], 0.5, absolute=0.2),
-        compare("missing at 0.5 ms over 1 ms", missing[2] / missing[1], 0.5, absolute=0.2),
+        compare("missing at half the time step", missing[1] / missing[0], 0.5, absolute=0.2),
+        compare("missing at a quarter, to that at half", missing[2] / missing[1], 0.5, absolute=0.2),
     ]
 
 
@@ -704,23 +884,25 @@ def invariance(model: mujoco.MjModel, robot: Robot) -> Report:
 def convergence(model: mujoco.MjModel, robot: Robot) -> Report:
     """The path converges with the time step, at first order: halving the step halves the change of the end point.
 
-    `implicitfast` is a first order method, so the ratio of changes is 1/2 but for the next term; measured 0.4998.
+    `implicitfast` is a first order method, so the ratio of changes is 1/2 but for the next term; measured 0.4998. Stiff
+    servos and linkages come to it at shorter steps: 0.15.
     Started rolling, because the instant at which Coulomb friction lets go jumps from step to step. The first change,
     also the error that is left at 1 ms, is below 0.5 mm per metre driven.
     """
     ends, path = [], 0.0
-    speed = robot.velocity_gain * robot.supply / 3
-    for step in (2e-3, 1e-3, 5e-4, 2.5e-4):
+    law = _winding(robot)
+    speed = 5 / 6 * robot.velocity_gain * law(0.0)[0]  # less than it will be, so that a fast motor shows
+    for halvings in range(4):
         fine = clone(model)
-        fine.opt.timestep = step
-        log = Car(fine, twist=(speed, 0)).drive(4.0, _winding(robot))
+        fine.opt.timestep /= 2**halvings
+        log = Car(fine, twist=(speed, 0)).drive(4.0, law)
         ends.append(log.reading[-1, [X, Y]])
-        path = np.abs(log[V]).sum() * HOLD
+        path = np.abs(log[V]).mean() * log.time[-1]
     changes = np.hypot(*np.diff(ends, axis=0).T)
     return [
-        compare("change 1 to 0.5 ms over 2 to 1 ms", changes[1] / changes[0], 0.5, absolute=0.05),
-        compare("change 0.5 to 0.25 ms over 1 to 0.5 ms", changes[2] / changes[1], 0.5, absolute=0.05),
-        compare("change 2 to 1 ms", changes[0], 0.0, "m", absolute=5e-4 * path),
+        compare("second change of the end point over the first", changes[1] / changes[0], 0.5, absolute=0.15),
+        compare("third over the second", changes[2] / changes[1], 0.5, absolute=0.15),
+        compare("change as the time step is halved", changes[0], 0.0, "m", absolute=5e-4 * path),
     ]
 
 
@@ -783,19 +965,55 @@ def rough(model: mujoco.MjModel, robot: Robot) -> Report:
 
 
 class Check(NamedTuple):
-    """A check with the world and the steering arrangement that it is for."""
+    """A check with the world and the steering arrangement that it is for, and what kind of front it needs, if any."""
 
-    run: CheckFunction
+    function: CheckFunction
     world: str
     steering: Steering
+    front: Literal["any", "steered", "following", "trailing fork"] = "any"
 
     @property
     def name(self) -> str:
         """Name of the function."""
-        return getattr(self.run, "__name__", str(self.run))
+        return getattr(self.function, "__name__", str(self.function))
+
+    def unsuited(self, model: mujoco.MjModel) -> str:
+        """Why the check is not for a robot; empty if it is."""
+        if self.front == "steered" and not steered(model):
+            return "nothing is steered"
+        if self.front == "following" and steerings(model) == ("rigid",):
+            return "servos hold the front wheels, which then leave the motors one degree of freedom"
+        if self.front == "trailing fork" and "compliant" not in steerings(model):
+            return "no trailing fork"
+        return ""
+
+    def measure(self, model: mujoco.MjModel, robot: Robot) -> Report:
+        """All values, passed or not."""
+        try:
+            with np.errstate(all="ignore"):  # a ratio of nothing is no number, and no number passes
+                return self.function(model, robot)
+        except (Unstable, np.linalg.LinAlgError):
+            return [compare("the simulation stays finite (1: yes)", 0.0, 1.0)]
+
+    def run(self, model: mujoco.MjModel, robot: Robot) -> Report:
+        """All values.
+
+        Raises:
+            CheckFailed: The first that is out of tolerance.
+        """
+        report = self.measure(model, robot)
+        for comparison in report:
+            if not comparison.passed:
+                raise CheckFailed(comparison)
+        return report
 
 
 CHECKS = (
+    Check(stance, "flat", "compliant"),
+    Check(limits, "flat", "compliant"),
+    Check(turning_limits, "flat", "rigid"),
+    Check(motors, "flat", "compliant"),
+    Check(inertias, "flat", "compliant"),
     Check(rest, "flat", "compliant"),
     Check(hold_on_slope, "flat", "compliant"),
     Check(top_speed, "flat", "compliant"),
@@ -803,13 +1021,13 @@ CHECKS = (
     Check(velocity_time_constant, "flat", "compliant"),
     Check(rotation_time_constant, "flat", "rigid"),
     Check(coast_down, "flat", "compliant"),
-    Check(circle, "flat", "rigid"),
-    Check(rolling, "flat", "rigid"),
+    Check(circle, "flat", "rigid", "steered"),
+    Check(rolling, "flat", "rigid", "steered"),
     Check(traction, "flat", "compliant"),
-    Check(cornering, "flat", "rigid"),
+    Check(cornering, "flat", "rigid", "steered"),
     Check(centre_of_mass, "flat", "rigid"),
-    Check(prediction, "flat", "caster"),
-    Check(scrub_free, "flat", "caster"),
+    Check(prediction, "flat", "caster", "following"),
+    Check(scrub_free, "flat", "caster", "trailing fork"),
     Check(energy, "flat", "compliant"),
     Check(mirror, "flat", "compliant"),
     Check(invariance, "flat", "compliant"),

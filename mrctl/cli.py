@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         0 on success, 2 on bad input, with one line on stderr that names the field or file; 1 if a sweep ends with
-        jobs set aside or a run of it does not repeat; 130 on Ctrl-C.
+        jobs set aside, a run of it does not repeat, or a robot fails a check; 130 on Ctrl-C.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     try:
@@ -58,6 +58,7 @@ def _parse(arguments: list[str]) -> None:
         "tune": tune,
         "identify": identify,
         "train": train,
+        "check": check,
         "bench": bench,
         "view": view,
     }
@@ -272,6 +273,33 @@ def train(out: Path = Path("composite.safetensors"), plants: int = 120, seed: in
     from mrctl.experiments import train as training
 
     print(training.train(out, plants, seed))
+
+
+def check(
+    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT.xml")] = "flat",
+    /,
+    wheels: tuple[str, ...] = (),
+    steering: tuple[str, ...] = (),
+    chassis: str = "",
+    json: bool = False,
+) -> None:
+    """Runs the physics checks on a robot and says what in its model is the likely cause of a failure; under a minute.
+
+    Exit status 1 if a check fails.
+
+    Args:
+        robot: MJCF file of a robot, with a level floor or without; by default the shipped one.
+        wheels: Joints of the driven wheels, left and right; by default the two with a <dcmotor>.
+        steering: Joints of what is steered; by default the upright ones with an actuator.
+        chassis: Body that carries them; by default the root.
+        json: Print JSON.
+    """
+    from mrctl.experiments import check as checking
+
+    text, verdict = checking.run(robot, wheels, steering, chassis, json)
+    print(text)
+    if verdict:
+        raise _Incomplete(f"{robot}: {verdict}")
 
 
 def bench(json: bool = False) -> None:

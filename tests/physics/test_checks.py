@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mrctl.checks import CHECKS, CheckFailed, Comparison, compare
+from mrctl.checks import CHECKS, Check, CheckFailed, Comparison, between, compare
 from mrctl.model import clone, load, perturb, read_robot
 from mrctl.robot import Perturbation
 
@@ -95,12 +95,21 @@ def test_other_robots(check, change):
 @pytest.mark.parametrize("measured", [1.02, 0.98, math.nan, math.inf])
 def test_compare_refuses(measured):
     """Out of tolerance, or not a number."""
+
+    def speed(model, robot):
+        return [compare("length", 1.0, 1.0, "m"), compare("speed", measured, 1.0, "m/s", relative=0.01)]
+
+    check = Check(speed, "flat", "compliant")
+    model = load()
+    assert [c.passed for c in check.measure(model, read_robot(model))] == [True, False]
     with pytest.raises(CheckFailed, match="speed") as caught:
-        compare("speed", measured, 1.0, "m/s", relative=0.01)
+        check.run(model, read_robot(model))
     assert isinstance(caught.value, AssertionError)
     assert caught.value.comparison.expected == 1.0
 
 
 def test_compare_accepts():
     """Within tolerance, the edge included."""
-    assert compare("speed", 1.5, 1.0, "m/s", absolute=0.5) == Comparison("speed", 1.5, 1.0, 0.5, "m/s")
+    comparison = compare("speed", 1.5, 1.0, "m/s", absolute=0.5)
+    assert comparison == Comparison("speed", 1.5, 1.0, 0.5, "m/s") and comparison.passed
+    assert between("speed", 2.0, 0.0, 2.0).passed and not between("speed", 2.1, 0.0, 2.0).passed

@@ -46,6 +46,14 @@ def front_radius(m, factor):
     m.body("fork").pos[2] += 0.075 * (factor - 1)
 
 
+def wheel_inertia(m, factor):
+    m.body("wheel_left").inertia[:] *= factor
+
+
+def small_front(m, factor):
+    m.geom("front_wheel").size[0] *= factor
+
+
 def frictionloss(m, factor):
     for name in REAR:
         m.joint(name).frictionloss[0] *= factor
@@ -138,6 +146,16 @@ def bumps(m, factor):
 
 # Each check with the ways in which its physics can be wrong.
 MUTATIONS = [
+    ("stance", small_front, 0.9),
+    ("stance", radius, 1.1),
+    ("limits", gear, 2.2),
+    ("limits", resistance, 20.0),
+    ("limits", grip, 1e-3),
+    ("turning_limits", track, 3.0),
+    ("turning_limits", inertia, 100.0),
+    ("motors", rotor, 0.0),
+    ("motors", motor_constant, 0.1),
+    ("inertias", wheel_inertia, 100.0),
     ("rest", com_ahead, 0.01),
     ("rest", com_aside, 0.01),
     ("rest", mass, 1.01),

@@ -18,10 +18,11 @@ LAYERS = (
     {"control.hierarchy", "measurement", "comparison", "metrics", "plots", "result"},
     {"adopt", "model", "plant"},
     {"simulate", "checks"},
+    {"diagnosis"},
     {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment"},
-    {"cli"},
+    {"cli", "pytest_plugin"},
 )
-ENGINE = {"adopt", "model", "plant", "checks", "viewer", "environment", "experiments"}
+ENGINE = {"adopt", "model", "plant", "checks", "diagnosis", "viewer", "environment", "experiments"}
 
 
 def module_of(path: Path) -> str:

@@ -1,0 +1,279 @@
+"""`mrctl check` and its pytest plugin: broken robots are caught, each for its own cause; good ones pass."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from mrctl.checks import CHECKS
+from mrctl.cli import main
+from mrctl.diagnosis import BASICS, Examination, suspects
+from mrctl.experiments.check import examination
+from mrctl.model import load, models_folder
+
+
+def wheel(side, attributes):
+    """A rear wheel's contact geom with other attributes."""
+    geom = f'<geom name="wheel_{side}" class="contact" '
+    return f'{geom}size="0.098"/>', f"{geom}{attributes}/>"
+
+
+def tyre(side, attributes):
+    """Attributes added to a contact pair."""
+    pair = f'<pair class="tyre" name="tyre_{side}" '
+    return pair, pair + attributes + " "
+
+
+JOINT = '<joint name="wheel_{}"{}/>'
+MOTOR = '<dcmotor name="motor_right" class="motor"'
+AXLE = '<joint axis="0 1 0"{} frictionloss="0.24'
+FRONT = '<geom name="front_wheel" class="contact" size="{}"/>'
+FORK = 'name="steering" axis="0 0 {}"'
+BOX = '<geom name="belly" type="box" size="0.18 0.12 0.035" pos="0.105 0 -0.0628" contype="1" conaffinity="1"/>'
+LYING = 'type="cylinder" size="0.098 0.02" euler="1.5707963 0 0"'
+
+# Faults, as passages of the robot's files with what stands there instead.
+FAULTS = {
+    "cylinders": [wheel("left", LYING), wheel("right", LYING)],
+    "off centre": [wheel("left", 'size="0.098" pos="0.003 0 0"')],
+    "radii": [wheel("left", 'size="0.1"')],
+    "front radius": [(FRONT.format(0.075), FRONT.format(0.06))],
+    "one gear": [(MOTOR, MOTOR + ' gear="45"')],
+    "gear": [('gear="43"', 'gear="86"')],
+    "V/rpm": [('"0.0234 0.0234"', '"0.00245 0.00245"')],
+    "no armature": [('armature="1.03e-6"', "")],
+    "twice": [('armature="1.03e-6"', 'armature="0.0019"')],
+    "step": [('timestep="0.002"', 'timestep="0.005"')],
+    "coarse": [('timestep="0.002"', 'timestep="0.01"')],
+    "load": [('pos="0.089884 0', 'pos="0.089884 0.02')],
+    "belly": [('<camera name="follow"', BOX + '<camera name="follow"')],
+    "condim": [tyre("left", 'condim="1"'), tyre("right", 'condim="1"')],
+    "no pair": [('<pair class="tyre" name="tyre_front" geom1="floor" geom2="front_wheel"/>', "")],
+    "axis": [(JOINT.format("right", ""), JOINT.format("right", ' axis="0 -1 0"'))],
+    "damping": [(AXLE.format(""), AXLE.format(' damping="0.02"'))],
+    "loss": [(JOINT.format("left", ""), JOINT.format("left", ' frictionloss="0.3"'))],
+    "default contacts": [('solref="0.01 1" solreffriction="0.004 1"', "")],
+    "pyramid": [('cone="elliptic" impratio="10"', "")],
+    "g·cm²": [('"0.002 0.0034 0.002"', '"2 3.4 2"')],
+    "moon": [("<option ", '<option gravity="0 0 -1.62" ')],
+    "ice": [tyre("right", 'friction="0.3 0.3 0.005 0.0001 0.0001"')],
+    "track": [('<body name="wheel_left" pos="0 0.188 0"', '<body name="wheel_left" pos="0 0.2 0"')],
+    "fork": [(FORK.format(1), FORK.format(-1))],
+    "degrees": [('"-1.0471976 1.0471976"', '"-0.018277 0.018277"')],
+}
+# Which checks it fails, for which cause, and what has to be said of it.
+DIAGNOSES = {
+    "cylinders": ("rolling mirror", "cylinder scrub", "wheel_left, wheel_right"),
+    "off centre": ("rest mirror", "off-centre wheel", "wheel_left is 3 mm off"),
+    "radii": ("rest mirror", "rear wheel radii differ", "left 100 mm, right 98 mm"),
+    "front radius": ("stance", "wheel radius against axle height", "front_wheel ends 15 mm above"),
+    "one gear": ("stall mirror", "left and right motors differ", "gear 43 left, 45 right"),
+    "gear": ("limits", "wrong gear", "need one of 8 to 59"),
+    "V/rpm": ("limits motors", "motor constant in other units", "is it in V/rpm?"),
+    "no armature": ("motors", "missing armature", "behind a gear of 43"),
+    "twice": ("limits motors", "armature reflected twice", "rotor's own, 1.03e-06"),
+    "step": ("convergence", "time step too long", "contacts of 4 ms"),
+    "coarse": ("velocity_time_constant", "time step too long", "get 10 ms"),
+    "load": ("rest mirror", "centre of mass off the axis", "17.2 mm to the left"),
+    "belly": ("cornering", "contact beside the wheels", "belly can touch"),
+    "condim": ("limits", "condim of a tyre", "wheel_right has condim 1, which has no friction"),
+    "no pair": ("stance", "missing contact pair", "pairs front_wheel"),
+    "axis": ("limits", "wheel axis", "wheel_right turns about (0, -1, 0)"),
+    "damping": ("coast_down", "drag", "wheel_left has damping 0.02"),
+    "loss": ("stall", "left and right losses differ", "0.3 N·m left"),
+    "default contacts": ("scrub_free", "soft contacts", "solref 0.02 s"),
+    "pyramid": ("cornering", "soft contacts", "pyramid"),
+    "g·cm²": ("inertias", "wheel inertia", "wheel_left is 443 times a hoop's"),
+    "moon": ("rest", "gravity", "(0, 0, -1.62)"),
+    "ice": ("traction mirror", "tyres of different grip", "wheel_right has friction 0.3"),
+    "track": ("rest stall", "misplaced axle", "wheel_left at (0, 0.2, 0)"),
+    "fork": ("circle", "steering axis", "(0, 0, -1)"),
+    "degrees": ("limits", "angles in degrees", "1.05°"),
+}
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """Writes a world whose robot has some faults."""
+
+    def write(*names):
+        folder = shutil.copytree(models_folder(), tmp_path / "models")
+        text = {name: (folder / name).read_text() for name in ("car.xml", "flat.xml")}
+        for old, new in (edit for name in names for edit in FAULTS[name]):
+            assert any(old in t for t in text.values()), old
+            text = {name: t.replace(old, new) for name, t in text.items()}
+        for name, content in text.items():
+            (folder / name).write_text(content)
+        return folder / "flat.xml"
+
+    return write
+
+
+def look(path, *names):
+    """Findings of some checks, by name."""
+    patient = examination(str(path))
+    return {check.name: patient.look(check) for check in patient.checks if check.name in names}
+
+
+def causes(finding):
+    """Names of what is said to be the cause."""
+    return {cause.cause for cause in finding.causes}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_broken(robot, name):
+    """The fault is caught, its cause is named with the numbers of this robot, and nothing else is."""
+    checks, cause, said = DIAGNOSES[name]
+    findings = look(robot(name), *BASICS, *checks.split())
+    for check in checks.split():
+        assert findings[check].status == "failed" and causes(findings[check]) == {cause}
+        assert said in findings[check].causes[0].text
+        assert not all(c.passed for c in findings[check].report)
+    assert set().union(*map(causes, findings.values())) == {cause}
+
+
+@pytest.mark.parametrize("name", ["flat", "turtlebot", "racecar"])
+def test_good(name):
+    """The shipped robots pass all that suits them; what does not suit them is skipped for a reason."""
+    patient = examination(name)
+    findings = [patient.look(check) for check in patient.checks]
+    assert {f.check.name: [str(c) for c in f.report if not c.passed] for f in findings if f.status == "failed"} == {}
+    skipped = {f.check.name: f.reason for f in findings if f.status == "skipped"}
+    nothing, fork = "nothing is steered", "no trailing fork"
+    servos = "servos hold the front wheels, which then leave the motors one degree of freedom"
+    assert (
+        skipped
+        == {
+            "flat": {},
+            "turtlebot": {"circle": nothing, "rolling": nothing, "cornering": nothing, "scrub_free": fork},
+            "racecar": {"prediction": servos, "scrub_free": fork},
+        }[name]
+    )
+
+
+def test_nothing_odd():
+    """Inspection finds nothing in the shipped robots."""
+    for name in ("flat", "turtlebot", "racecar"):
+        assert [suspect.cause for suspect in examination(name).suspects] == []
+
+
+HUB = '<joint name="rear_left_wheel_joint"{}/>'
+ADOPTED = {
+    "turtlebot": ('armature="7e-7"', "", "motors", "missing armature"),
+    "racecar": (HUB.format(""), HUB.format(' damping="0.001"'), "mirror", "drag"),
+}
+
+
+@pytest.mark.parametrize("name", ADOPTED)
+def test_broken_adopted(name, tmp_path):
+    """Faults of robots under other names and of other kinds."""
+    old, new, check, cause = ADOPTED[name]
+    text = (models_folder() / f"{name}.xml").read_text()
+    assert old in text
+    (tmp_path / "mine.xml").write_text(text.replace(old, new))
+    finding = look(tmp_path / "mine.xml", check)[check]
+    assert finding.status == "failed" and causes(finding) == {cause}
+
+
+def test_two_faults(robot):
+    """Each check is explained by the fault that it shows, and by both where either is enough to fail it."""
+    findings = look(robot("off centre", "damping"), "mirror", "top_speed", "stall")
+    assert causes(findings["mirror"]) == {"off-centre wheel"}
+    assert causes(findings["top_speed"]) == {"off-centre wheel", "drag"}
+
+
+def test_harmless(robot):
+    """What is odd but does no harm is not named."""
+    path = robot()
+    text = (path.parent / "car.xml").read_text().replace(' solimpfriction="0.99 0.99"', "")
+    (path.parent / "car.xml").write_text(text)
+    assert [suspect.cause for suspect in suspects(load(str(path)))] == ["creeping friction loss"]
+    findings = look(path, *BASICS, "hold_on_slope", "top_speed")
+    assert {finding.status for finding in findings.values()} == {"passed"}
+
+
+def test_unexplained(robot):
+    """A fault that no inspection knows is caught, and no cause is invented."""
+    path = robot()
+    text = (
+        (path.parent / "car.xml").read_text().replace('name="steering" axis', 'name="steering" frictionloss="2" axis')
+    )
+    (path.parent / "car.xml").write_text(text)
+    finding = look(path, "prediction")["prediction"]
+    assert finding.status == "failed" and not finding.causes
+
+
+def test_others_wait(robot):
+    """A robot that does not stand is not driven."""
+    findings = look(robot("no pair"), "stance", "rest", "mirror")
+    assert [f.status for f in findings.values()] == ["failed", "skipped", "skipped"]
+    assert findings["rest"].reason == "waits for stance"
+
+
+def test_command(robot, capsys):
+    """A table, the cause below it, and exit status 1; as JSON the same."""
+    path = str(robot("gear"))
+    assert main(["check", path]) == 1
+    out, err = capsys.readouterr()
+    assert "because of wrong gear" in out and "- wrong gear: gear 86" in out and "skipped, waits for limits" in out
+    assert err == f"mrctl: {path}: 1 of {len(Examination.checks)} checks failed\n"
+    assert main(["check", path, "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    failed = [check for check in report["checks"] if check["status"] == "failed"]
+    assert report["failed"] == 1 and [c["check"] for c in failed] == ["limits"]
+    assert failed[0]["causes"][0]["cause"] == "wrong gear"
+    assert [v["passed"] for v in failed[0]["values"]].count(False) == 1
+
+
+def test_bad_input(tmp_path, capsys):
+    """What is no robot: exit status 2 and one line."""
+    (tmp_path / "stone.xml").write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    for path in (tmp_path / "stone.xml", tmp_path / "none.xml"):
+        assert main(["check", str(path)]) == 2
+        out, err = capsys.readouterr()
+        assert not out and err.count("\n") == 1 and path.name in err
+
+
+def pytest_in(folder, *arguments):
+    """Runs pytest as a user would, outside of this repository."""
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+
+
+def test_plugin(robot):
+    """A test for each check; the failure shows values and cause, and no traceback."""
+    path = robot("gear")
+    run = pytest_in(path.parent, "--mrctl-robot", "flat.xml", "-rs")
+    assert run.returncode == 1, run.stdout + run.stderr
+    others = len(Examination.checks) - len(BASICS)
+    assert f"1 failed, {len(BASICS) - 1} passed, {others} skipped" in run.stdout
+    assert "V at its limit: 1." in run.stdout and "wrong gear: gear 86" in run.stdout
+    assert "waits for limits" in run.stdout and "Traceback" not in run.stdout
+
+
+def test_plugin_beside_tests(robot):
+    """Files that are given run as well; what is no robot is an error of collection."""
+    folder = robot().parent
+    (folder / "test_mine.py").write_text("def test_mine():\n    pass\n")
+    run = pytest_in(folder, "--mrctl-robot", "car.xml", "test_mine.py", "--continue-on-collection-errors")
+    assert run.returncode == 1 and "1 passed, 1 error" in run.stdout
+    assert "car.xml" in run.stdout and "Traceback" not in run.stdout
+
+
+def test_plugin_sleeps(tmp_path):
+    """Without the option nobody pays: neither mrctl nor MuJoCo is imported, and no MJCF file collected."""
+    code = "import sys\ndef test_light():\n    assert not {'mrctl', 'mujoco', 'numba', 'torch'} & sys.modules.keys()\n"
+    (tmp_path / "test_light.py").write_text(code)
+    (tmp_path / "test_robot.xml").write_text("<mujoco/>")
+    run = pytest_in(tmp_path)
+    assert run.returncode == 0 and "1 passed" in run.stdout, run.stdout
+    assert "mrctl" in run.stdout  # among the plugins
+
+
+def test_all_checks():
+    """Only those of the shipped worlds are left out."""
+    assert {check.name for check in CHECKS} - {check.name for check in Examination.checks} == {
+        "slope", "tilted_gravity", "patch", "rough",
+    }  # fmt: skip
