@@ -18,7 +18,8 @@ LAYERS = (
     {"control.hierarchy", "measurement", "comparison", "metrics", "plots", "result"},
     {"model", "plant"},
     {"simulate", "checks"},
-    {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment"},
+    {"episodes"},
+    {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment", "gym"},
     {"cli"},
 )
 ENGINE = {"model", "plant", "checks", "viewer", "environment", "experiments"}
