@@ -19,7 +19,7 @@ LAYERS = (
     {"model", "plant"},
     {"simulate", "checks"},
     {"episodes"},
-    {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment", "gym"},
+    {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment", "gym", "export"},
     {"cli"},
 )
 ENGINE = {"model", "plant", "checks", "viewer", "environment", "experiments"}
