@@ -19,7 +19,7 @@ from dm_control.rl import control
 from dm_control.utils import containers
 from dm_env import specs
 
-from mrctl.episodes import ACTIONS, Action, Array, Episodes, read
+from mrctl.episodes import ACTIONS, OBSERVATIONS, Action, Array, Episodes, read
 from mrctl.plant import PhysicsPlant
 from mrctl.scenario import Scenario
 
@@ -68,11 +68,13 @@ class Tracking(control.Task):
 
     def get_observation(self, physics: Physics) -> dict[str, Array]:
         """As named in `mrctl.episodes.OBSERVATIONS`."""
-        return {name: value[0] for name, value in self.episodes.observe().items()}
+        seen = self.episodes.observe()[0][0]
+        ends = np.cumsum(list(OBSERVATIONS.values()))
+        return dict(zip(OBSERVATIONS, np.split(seen, ends[:-1]), strict=True))
 
     def get_reward(self, physics: Physics) -> float:
-        """See `Episodes.reward`."""
-        return float(self.episodes.reward()[0])
+        """See `Episodes.observe`."""
+        return float(self.episodes.observe()[1][0])
 
     def get_termination(self, physics: Physics) -> float | None:
         """Discount 0 where the robot has failed, 1 at the end of the scenario, None before."""

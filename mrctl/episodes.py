@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numba import float64, njit
 from numpy.typing import NDArray
 
 from mrctl import result
+from mrctl.control.chain import GIVEN, OWN, one, rows, stamp
+from mrctl.control.hierarchy import STATE as CONTROLLER
 from mrctl.control.kanayama import posture_error
 from mrctl.plant import OMEGA, RATE_LEFT, RATE_RIGHT, STEERING, THETA, V, X
+from mrctl.plant import STATE as ROBOT
 from mrctl.record import InputError
 from mrctl.robot import Robot
 from mrctl.scenario import Scenario
-from mrctl.simulate import Simulation, course, start_pose, tick_of
+from mrctl.simulate import SENSORS, Simulation, course, group_of, start_pose, tick_of
 
 Array = NDArray[np.float64]
 Action = Literal["twist", "voltage", "residual"]
@@ -29,7 +33,34 @@ OBSERVATIONS: dict[str, int] = {
 reference and their derivatives; rates of the rear wheels (rad/s); angle of the fork (rad); voltages sent last (V)."""
 RESIDUAL = 0.25  # of the supply, what a residual may add
 NEAR = 0.05  # m off the reference at which the reward is a half
-_ERROR = slice(list(result.SIGNALS).index("longitudinal_error"), list(result.SIGNALS).index("heading_error") + 1)
+_ERROR = list(result.SIGNALS).index("longitudinal_error")  # and lateral, and heading
+_posture_error = one(posture_error)
+
+
+def _compile(version: int) -> Callable[..., Any]:
+    """What `observe` gives; see `chain.stamp` for the version."""
+
+    @njit((rows(ROBOT), rows(SENSORS), rows(CONTROLLER), GIVEN, GIVEN, float64, OWN, float64[::1]), cache=True)
+    def see(robots, sensors, controllers, goal, record, half_track, seen, reward):  # noqa: ANN001, ANN202
+        _ = version
+        for i in range(len(robots)):
+            r, s, out = robots[i], sensors[i], seen[i]
+            _posture_error(s.pose, goal[i, :3], out[:3])
+            out[3:5], out[5:9] = s.twist, goal[i, 3:]
+            out[9], out[10], out[11] = r.reading[RATE_LEFT], r.reading[RATE_RIGHT], r.reading[STEERING]
+            out[12:] = controllers[i].output[:2]
+            x, y, theta = record[i, _ERROR], record[i, _ERROR + 1], half_track * record[i, _ERROR + 2]
+            reward[i] = 1 / (1 + (x * x + y * y + theta * theta) / NEAR**2)
+            if r.failed:
+                reward[i] = 0.0
+                for k in range(len(out)):  # it may have blown up
+                    if not np.isfinite(out[k]):
+                        out[k] = 0.0
+
+    return see
+
+
+_see = _compile(stamp(posture_error))
 
 
 class Given:
@@ -74,10 +105,7 @@ class Episodes(Simulation):
         first = scenarios[0]
         if action not in ACTIONS:
             raise InputError(f"action: {action!r} is not {', '.join(ACTIONS)}")
-        if (
-            len({(s.world, s.steering, s.feedforward, s.ticks, s.physics_step, s.control_period) for s in scenarios})
-            > 1
-        ):
+        if len(set(map(group_of, scenarios))) > 1:
             raise InputError("scenarios: differ in world, steering, feedforward, length or rates")
         if len(scenarios) > 1 and first.motion_period != first.control_period:
             raise InputError("motion_period: robots that begin at different times need that of control_period")
@@ -137,7 +165,12 @@ class Episodes(Simulation):
             self._schedule[self.tick + tick_of(event, self._period)].append((row, event))
         self._random[row] = np.random.default_rng([seed, 2])
         self.hierarchy.renew(row, scenario)
-        self._perturb(row, scenario.perturbation)
+        if any(event.perturbation for event in scenario.events):
+            self._perturb(row, scenario.perturbation)
+        else:
+            self._noise[row] = 0.0
+            if self._oracle:
+                self._oracle.set_robot(row, self.plant.truth[row])
         start = self._reference_now()
         self.plant.restart(row, start_pose(scenario, start[row, :3]), start[row, 3:5])
         reading, sensor = self.plant.reading, self._sensors[row]
@@ -159,33 +192,19 @@ class Episodes(Simulation):
         """Sets the action of the coming tick, `(B, 2)`."""
         self._action[:] = action
 
-    def observe(self) -> dict[str, Array]:
-        """What the robots see at the coming tick, by the names of `OBSERVATIONS`, `(B, n)`."""
-        self.sense()
-        reading, goal = self.plant.reading, self._goal
-        error = np.empty_like(self._pose)
-        posture_error(self._pose, goal[:, :3], error)
-        seen = {
-            "error": error,
-            "twist": self._twist.copy(),
-            "reference": goal[:, 3:].copy(),
-            "wheel_rates": reading[:, [RATE_LEFT, RATE_RIGHT]],
-            "steering_angle": reading[:, [STEERING]],
-            "voltage": self.hierarchy.output[:, :2].copy(),
-        }
-        if self.plant.running < self.plant.size:  # a robot that blew up
-            seen = {name: np.nan_to_num(value, posinf=0.0, neginf=0.0) for name, value in seen.items()}
-        return seen
+    def observe(self) -> tuple[Array, Array]:
+        """What the robots see at the coming tick, and what the last one was worth.
 
-    def reward(self) -> Array:
-        """One on the reference, a half where the rear wheels are 5 cm off, zero where a robot has failed, `(B,)`.
-
-        The distance is the root mean square of the two wheels', √(e_x² + e_y² + (D e_θ)²), of the true posture.
+        Returns:
+            The numbers that `OBSERVATIONS` names side by side, `(B, 14)`. And the reward, `(B,)`: one on the reference,
+            a half where the rear wheels are 5 cm off, zero where a robot has failed. That distance is the root mean
+            square of the two wheels', √(e_x² + e_y² + (D e_θ)²), of the true posture.
         """
         self.sense()
-        error = self._row[:, _ERROR]
-        square = error[:, 0] ** 2 + error[:, 1] ** 2 + (self.plant.robot.half_track * error[:, 2]) ** 2
-        return np.where(self.plant.failed, 0.0, 1 / (1 + square / NEAR**2))
+        size, half_track = len(self.scenarios), self.plant.robot.half_track
+        seen, reward = np.empty((size, sum(OBSERVATIONS.values()))), np.empty(size)
+        _see(self.plant.state, self._sensors, self.hierarchy.state, self._goal, self._row, half_track, seen, reward)
+        return seen, reward
 
     def over(self) -> NDArray[np.bool]:
         """Which robots have driven their scenario to the end, `(B,)`."""

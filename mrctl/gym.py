@@ -30,10 +30,6 @@ OBSERVATION = Box(-np.inf, np.inf, (sum(OBSERVATIONS.values()),), np.float64)
 ACTION = Box(-1.0, 1.0, (2,), np.float64)
 
 
-def _seen(episodes: Episodes) -> Array:
-    return np.hstack(list(episodes.observe().values()))
-
-
 class TrackingEnv(gymnasium.Env):
     """One robot that shall follow the reference of a scenario."""
 
@@ -49,7 +45,7 @@ class TrackingEnv(gymnasium.Env):
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(SEEDS))
         self.episodes.begin_all([drawn if seed is None else seed % SEEDS])
-        return _seen(self.episodes)[0], {}
+        return self.episodes.observe()[0][0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """One control period; terminated where the robot has failed, and the info says why."""
@@ -57,10 +53,10 @@ class TrackingEnv(gymnasium.Env):
         loop.act(action * loop.bound)
         with np.errstate(invalid="ignore", over="ignore"):
             loop.step()
-            seen = _seen(loop)[0]
+            (seen,), (reward,) = loop.observe()
         failed = bool(loop.plant.failed[0])
         info = {"failure": loop.plant.failure[0]} if failed else {}
-        return seen, float(loop.reward()[0]), failed, bool(loop.over()[0]) and not failed, info
+        return seen, float(reward), failed, bool(loop.over()[0]) and not failed, info
 
 
 class TrackingVectorEnv(VectorEnv):
@@ -115,7 +111,7 @@ class TrackingVectorEnv(VectorEnv):
         drawn = [self._draw(row) for row in range(self.num_envs)]
         self.episodes.begin_all([d if s is None else s % SEEDS for s, d in zip(seeds, drawn, strict=True)])
         self._over[:] = False
-        return _seen(self.episodes), {}
+        return self.episodes.observe()[0], {}
 
     def _draw(self, row: int) -> int:
         return int(self._randoms[row].integers(SEEDS))
@@ -128,8 +124,7 @@ class TrackingVectorEnv(VectorEnv):
             loop.step()
             for row in begun:
                 loop.begin(int(row), self._draw(int(row)))
-            seen = _seen(loop)
-        reward = loop.reward()
+            seen, reward = loop.observe()
         reward[begun] = 0.0
         terminated = loop.plant.failed.copy()
         truncated = loop.over() & ~terminated

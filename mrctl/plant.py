@@ -308,11 +308,11 @@ class Plant(ABC):
             self.running += 1
         self._pushes.pop(robot, None)
         self._clear(robot)
-        self.qpos[robot], self.qvel[robot] = mjcf.stand(self._model_of(robot), pose, twist)
+        self.qpos[robot], self.qvel[robot] = mjcf.stand(self._model_of(robot), pose, twist, self.truth[robot])
         self.applied[robot] = 0.0
-        self._queue[:, robot] = 0.0
-        self._queue[:, robot, 2] = self.qpos[robot, self._address[6]]
         self._look()
+        self._queue[:, robot] = 0.0
+        self._queue[:, robot, 2] = self.reading[robot, STEERING]
 
     @abstractmethod
     def _clear(self, robot: int) -> None:
@@ -429,6 +429,7 @@ class BatchPlant(Plant):
         quiet = mjcf.clone(model)
         quiet.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nobody reads them here
         self.batch = mujoco_batch.Batch(quiet, size, threads)
+        self._held = mjcf.clone(quiet)  # for `_model_of` to write into
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.act, self.ctrl = self.batch.bind("act"), self.batch.bind("ctrl")
         self.wrench = self.batch.bind("xfrc_applied")
@@ -436,7 +437,7 @@ class BatchPlant(Plant):
         self._expanded: set[str] = set()
 
     def _model_of(self, robot: int) -> mujoco.MjModel:
-        return self.batch.get_model(robot)
+        return self.batch.get_model(robot, self._held)
 
     def _write(self, robot: int, model: mujoco.MjModel) -> None:
         for name, value in mjcf.fields(model).items():

@@ -140,9 +140,14 @@ def batches(
     """Uniform groups of scenarios: which they are, and their simulation. Arguments and errors as in `simulate`."""
     groups: dict[Hashable, list[int]] = defaultdict(list)
     for row, s in enumerate(scenarios):
-        net = s.fel.hidden, s.composite.weights
-        groups[s.world, s.steering, s.feedforward, s.ticks, s.physics_step, s.motion_period, *net].append(row)
+        groups[group_of(s)].append(row)
     return [(rows, Simulation([scenarios[r] for r in rows], threads=threads, **stages)) for rows in groups.values()]
+
+
+def group_of(s: Scenario) -> Hashable:
+    """What runs in one simulation must share."""
+    net = s.fel.hidden, s.composite.weights
+    return s.world, s.steering, s.feedforward, s.ticks, s.physics_step, s.control_period, s.motion_period, *net
 
 
 class Simulation:

@@ -236,7 +236,7 @@ def test_reward():
 
     def reward(pose):
         scenario = SHORT.model_copy(update={"initial_pose": pose, "initial_spread": (0, 0, 0)})
-        return Episodes([scenario], "residual").reward()[0]
+        return Episodes([scenario], "residual").observe()[1][0]
 
     (x, y, theta), half_track = SHORT.reference.sample(np.zeros(1))[0][0], 0.188
     assert reward((x, y, theta)) == 1
