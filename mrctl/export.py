@@ -169,7 +169,7 @@ def _npz(whole: xr.Dataset, path: Path) -> None:
     names = [name for name in SIGNALS if name in whole]
     arrays: Columns = {name: whole[name].transpose("run", "time").values for name in names}
     arrays |= {"time": whole["time"].values, "run": whole["run"].values}
-    arrays |= {name: np.array([str(text) for text in whole[name].values]) for name in ("label", "failure")}
+    arrays |= {name: np.array([str(text) for text in np.atleast_1d(whole[name])]) for name in ("label", "failure")}
     arrays["units"] = np.array(json.dumps({name: _unit(name) for name in ("time", *names)}))
     arrays |= {name: np.array(str(value)) for name, value in whole.attrs.items()}
     with open(path, "wb") as file:

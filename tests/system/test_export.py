@@ -178,6 +178,21 @@ def test_npz(result, path, tmp_path):
         assert arrays["failure"].tolist() == ["", "non-finite state"]
 
 
+@pytest.mark.parametrize("kind", ["mcap", "csv", "parquet", "npz"])
+def test_run_alone(result, tmp_path, kind):
+    """A result of one scenario, which has no dimension for runs."""
+    save(result.isel(run=0), tmp_path / "alone.zarr")
+    out, other = tmp_path / f"alone.{kind}", tmp_path / f"first.{kind}"
+    assert export(tmp_path / "alone.zarr", kind, out) == 1
+    if kind == "npz":
+        with np.load(out) as arrays:
+            assert np.array_equal(arrays["v"], result["v"].values[:1]) and arrays["label"].tolist() == ["none"]
+    else:
+        save(result, tmp_path / "both.zarr")
+        export(tmp_path / "both.zarr", kind, other, 0)
+        assert out.read_bytes() == other.read_bytes()
+
+
 def test_sweep(tmp_path):
     """Of a sweep with signals, the runs that are asked for; one with metrics alone says what to do."""
     sweep = {"base": SHORT.model_dump(), "runs": 3}
