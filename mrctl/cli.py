@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -61,6 +61,7 @@ def _parse(arguments: list[str]) -> None:
         "check": check,
         "bench": bench,
         "view": view,
+        "export": export,
     }
     complaints = io.StringIO()
     try:
@@ -114,6 +115,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         scenario: Annotated[Scenario, tyro.conf.arg(name="")] = default,
         out: Path | None = None,
         json: bool = False,
+        controller: str | None = None,
         number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
     ) -> None:
         """Runs one scenario and prints its metrics lap by lap.
@@ -123,6 +125,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             scenario: The scenario.
             out: Folder for the result, the figures and the learned weights.
             json: Print JSON.
+            controller: Stages of your own, as my_file.py:MyFeedforward, or motion=my_file.py:MyMotion,feedback=...
             number: Run of the sweep to run again and to compare with the store.
         """
         if number is not None:
@@ -131,7 +134,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             raise InputError(f"run: which one of {file}? give its number with --run")
         from mrctl.experiments import single
 
-        print(single.run(scenario, out, json))
+        print(single.run(scenario, out, json, controller))
 
     return run
 
@@ -140,11 +143,12 @@ def _repeat(store: Path | None, number: int, out: Path | None, json: bool) -> No
     """`mrctl run STORE --run K`."""
     from mrctl import jobs
     from mrctl.experiments import single
+    from mrctl.store import Store
 
     if store is None:
         raise InputError("run: needs the store of a sweep in front of it")
     if out is not None or json:
-        print(single.run(jobs.scenario_of(store, number), out, json))
+        print(single.run(jobs.scenario_of(store, number), out, json, Store(store).manifest["sweep"]["controller"]))
     repeated = jobs.repeat(store, number)
     verdict = f"run {number}: {repeated.verdict}"
     if not repeated.same:
@@ -201,7 +205,7 @@ def suite(
 
     Args:
         feedforward: Which to compare.
-        controller: Feedforwards of your own beside them, as my_file.py:MyController.
+        controller: Controllers of your own beside them, as my_file.py:MyFeedforward or motion=my_file.py:MyMotion.
         seeds: Runs of each case; by default 10, 3 if quick.
         random: Random scenarios; by default 300, 20 if quick.
         quick: A selection of cases with fewer laps: two minutes instead of half an hour.
@@ -336,6 +340,27 @@ def view(
     from mrctl import viewer
 
     viewer.view(file, compare, number, export, host, port)
+
+
+def export(
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")],
+    /,
+    to: Literal["mcap", "csv", "parquet", "npz"],
+    out: Path,
+    number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
+) -> None:
+    """Writes a result for other tools: ROS 2 messages, a table, or NumPy arrays.
+
+    Args:
+        file: What `mrctl run --out` or `mrctl sweep` wrote.
+        to: Format.
+        out: File to write.
+        number: One run; by default all, numbered in a column or before each topic.
+    """
+    from mrctl import export as exporting
+
+    count = exporting.export(file, to, out, number)
+    print(f"{out}: {count} {'run' if count == 1 else 'runs'}")
 
 
 if __name__ == "__main__":

@@ -477,7 +477,7 @@ class State(NamedTuple):
     qvel: NDArray[np.float64]
 
 
-def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray) -> State:
+def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | None = None) -> State:
     """Stands the robot with its wheels on the ground, rolling with a given twist.
 
     Rays find the ground under the driven wheels and in the middle under the others; the plane through those three
@@ -487,11 +487,12 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray) -> State:
         model: Compiled world.
         pose: Posture `(3,)` of P in m, m, rad.
         twist: V in m/s and θ̇ in rad/s, `(2,)`.
+        robot: What `read_robot` makes of the model, where that is known.
 
     Raises:
         InputError: There is no ground below the pose.
     """
-    robot = read_robot(model)
+    robot = robot or read_robot(model)
     data = mujoco.MjData(model)
     x, y, theta = pose
     ahead, left = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])

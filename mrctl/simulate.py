@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import xarray as xr
@@ -15,21 +15,21 @@ from tqdm import tqdm
 from mrctl import model as mjcf
 from mrctl import result
 from mrctl.control.chain import ANY, GIVEN, OWN, one, rows, stamp
-from mrctl.control.feedforward import Feedforward, InverseDynamics, feature_scale
+from mrctl.control.feedforward import InverseDynamics, feature_scale
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.hierarchy import STATE as CONTROLLER
-from mrctl.control.hierarchy import Hierarchy, feedforward_of
+from mrctl.control.hierarchy import Hierarchy
 from mrctl.control.kanayama import posture_error
+from mrctl.control.stages import Own, StageError, Stages
 from mrctl.measurement import observe
 from mrctl.plant import OMEGA, RATE_LEFT, RATE_RIGHT, STEERING, THETA, Plant, V, X, build
 from mrctl.plant import STATE as ROBOT
 from mrctl.record import InputError
 from mrctl.references import check
-from mrctl.robot import Perturbation, Robot
+from mrctl.robot import Perturbation
 from mrctl.scenario import Event, Scenario
 
 Array = NDArray[np.float64]
-Factory = Callable[[Robot, int], Feedforward]
 
 DIVERGED = 1.0  # m of lateral error
 LATERAL_ERROR = list(result.SIGNALS).index("lateral_error")
@@ -40,8 +40,10 @@ _observe, _posture_error = one(observe), one(posture_error)
 _STATE, _REFERENCE, _ERROR = STEERING + 1, 5, 3  # how many columns of the record each takes
 
 
-# What is measured of one robot: the last measurement, this tick's noise, and whether by odometry.
-SENSORS = np.dtype([("pose", "f8", 3), ("twist", "f8", 2), ("noise", "f8", 5), ("odometry", "f8")], align=True)
+# What is measured of one robot: the last measurement and how long ago it was, this tick's noise, whether by odometry.
+SENSORS = np.dtype(
+    [("pose", "f8", 3), ("twist", "f8", 2), ("noise", "f8", 5), ("odometry", "f8"), ("elapsed", "f8")], align=True
+)
 
 
 def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -54,7 +56,10 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
         for i in range(len(robots)):
             true, s, row = robots[i].reading, sensors[i], record[i]
             slip_free = wheel_radius * (true[RATE_LEFT] + true[RATE_RIGHT]) / 2
-            _observe(true[X : THETA + 1], true[V : OMEGA + 1], s.noise, s.odometry, slip_free, period, s.pose, s.twist)
+            _observe(
+                true[X : THETA + 1], true[V : OMEGA + 1], s.noise, s.odometry, slip_free, s.elapsed, s.pose, s.twist
+            )
+            s.elapsed = period
             row[:_STATE] = true[:_STATE]
             row[_STATE : _STATE + _REFERENCE] = reference[i, :_REFERENCE]
             at = _STATE + _REFERENCE
@@ -84,10 +89,7 @@ _sense, _record = _compile(stamp(observe, posture_error))
 
 
 def simulate(
-    scenarios: Scenario | Sequence[Scenario],
-    feedforward: Factory | None = None,
-    progress: bool = False,
-    threads: int = 0,
+    scenarios: Scenario | Sequence[Scenario], *, progress: bool = False, threads: int = 0, **stages: Unpack[Stages]
 ) -> xr.Dataset:
     """Runs scenarios in closed loop.
 
@@ -95,17 +97,20 @@ def simulate(
 
     Args:
         scenarios: One, or several; those that differ in world, laws, steering, length or rates run in turn.
-        feedforward: A stage of your own instead of the named one: called with the nominal robot and the number of
-            robots, returns an object with the two methods of `mrctl.control.feedforward.Feedforward`.
         progress: Shows a progress bar.
         threads: Of the batch engine, which change no bit; 0 for all cores.
+        stages: Stages of your own, `motion`, `feedback`, `feedforward` or `steering`, instead of the scenario's: a
+            factory, called with the nominal robot and the number of robots, which returns an object with the two
+            methods of that stage in `mrctl.control.stages`. One that raises, or returns what does not fit, fails its
+            whole group of runs; one that returns NaN for a robot fails that run.
 
     Returns:
         The signals of `mrctl.result.SIGNALS` with dimensions run and time (time alone for one scenario), with units;
         `failed`, `failure` and `failure_time` a run; `weights` where a network learned.
 
     Raises:
-        InputError: A scenario asks for what is not there or what the robot cannot do; the message names the field.
+        InputError: A scenario asks for what is not there or what the robot cannot do; the message names the field. Or
+            a stage of yours cannot be made.
     """
     several = [scenarios] if isinstance(scenarios, Scenario) else list(scenarios)
     if not several:
@@ -113,7 +118,7 @@ def simulate(
     if len({s.control_period for s in several}) > 1:
         raise InputError("control_period: runs of one result share their time axis, so also their control period")
     # Built first, so that bad input is refused before anything is computed.
-    simulations = batches(several, feedforward, threads)
+    simulations = batches(several, threads=threads, **stages)
     total = sum(simulation.ticks * len(rows) for rows, simulation in simulations)
     parts = []
     with tqdm(total=total, unit="tick", unit_scale=True, disable=not progress) as bar:
@@ -130,14 +135,19 @@ def simulate(
 
 
 def batches(
-    scenarios: Sequence[Scenario], feedforward: Factory | None = None, threads: int = 0
+    scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]
 ) -> list[tuple[list[int], Simulation]]:
     """Uniform groups of scenarios: which they are, and their simulation. Arguments and errors as in `simulate`."""
     groups: dict[Hashable, list[int]] = defaultdict(list)
     for row, s in enumerate(scenarios):
-        net = s.fel.hidden, s.composite.weights
-        groups[s.world, s.robot, s.steering, s.feedforward, s.ticks, s.physics_step, s.motion_period, *net].append(row)
-    return [(rows, Simulation([scenarios[r] for r in rows], feedforward, threads)) for rows in groups.values()]
+        groups[group_of(s)].append(row)
+    return [(rows, Simulation([scenarios[r] for r in rows], threads=threads, **stages)) for rows in groups.values()]
+
+
+def group_of(s: Scenario) -> Hashable:
+    """What runs in one simulation must share."""
+    net = s.fel.hidden, s.composite.weights
+    return s.world, s.robot, s.steering, s.feedforward, s.ticks, s.physics_step, s.control_period, s.motion_period, *net
 
 
 class Simulation:
@@ -151,15 +161,16 @@ class Simulation:
         tick: Control periods done.
         ticks: Control periods in the whole run.
         log: What was recorded, `(ticks, B, signals)`; nothing yet from `tick` on.
+        override: Changes what the controllers command, `(B, 4)`, in place, before it is sent; None.
     """
 
-    def __init__(self, scenarios: Sequence[Scenario], feedforward: Factory | None = None, threads: int = 0) -> None:
+    def __init__(self, scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]) -> None:
         """Compiles the world, stands the robots on their references, rolling.
 
         Args:
             scenarios: Scenarios that `simulate` would run together.
-            feedforward: As in `simulate`.
             threads: As in `simulate`.
+            stages: As in `simulate`.
 
         Raises:
             InputError: As `simulate`.
@@ -174,11 +185,15 @@ class Simulation:
         for scenario in scenarios:
             for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
                 check(reference, robot, self._reverses)
-        stage = feedforward(robot, size) if feedforward else feedforward_of(scenarios, robot)
-        self._label = getattr(feedforward, "__name__", "custom") if feedforward else first.feedforward
-        self._oracle = stage if first.feedforward == "oracle" and isinstance(stage, InverseDynamics) else None
+        factories: dict[str, Any] = {name: factory for name, factory in stages.items() if factory}
+        own = {name: Own(name, factory, robot, size) for name, factory in factories.items()}
+        names = {name: getattr(factory, "__name__", "custom") for name, factory in factories.items()}
+        self._feedforward = names.pop("feedforward", first.feedforward)
+        self._label = " + ".join([self._feedforward, *names.values()])
         self.plant: Plant = build(compiled, size, round(first.control_period / first.physics_step), threads)
-        self.hierarchy = Hierarchy(scenarios, robot, stage)
+        self.hierarchy = Hierarchy(scenarios, robot, own=own)
+        stage = self.hierarchy.feedforward
+        self._oracle = stage if first.feedforward == "oracle" and isinstance(stage, InverseDynamics) else None
         self._plan()
         self._wheel_radius = robot.wheel_radius
         self._sensors = np.zeros(size, SENSORS)
@@ -191,15 +206,17 @@ class Simulation:
         for row, scenario in enumerate(scenarios):
             self._perturb(row, scenario.perturbation)
             for event in sorted(scenario.events, key=lambda e: e.time):
-                self._schedule[_tick(event, self._period)].append((row, event))
+                self._schedule[tick_of(event, self._period)].append((row, event))
         start = self._reference_now()
-        self.plant.reset(np.stack([_start(s, start[i, :3]) for i, s in enumerate(scenarios)]), start[:, 3:5])
+        self.plant.reset(np.stack([start_pose(s, start[i, :3]) for i, s in enumerate(scenarios)]), start[:, 3:5])
         reading = self.plant.reading
         self.hierarchy.reset(start[:, 3:5], start[:, 5:], reading[:, STEERING])
         self._pose[:], self._twist[:] = reading[:, X : THETA + 1], reading[:, V : OMEGA + 1]
         # A tick's records side by side: the loop writes one block of memory a tick, however many robots there are.
         self.log = np.empty((self.ticks, size, len(result.SIGNALS)))
         self._failure_time = np.full(size, np.nan)
+        self._sensed = -1
+        self.override: Callable[[Array], None] | None = None
 
     @property
     def running(self) -> bool:
@@ -215,7 +232,7 @@ class Simulation:
         Raises:
             InputError: It comes too late, or a scenario with it is refused; then nothing was added.
         """
-        if (tick := _tick(event, self._period)) < self.tick:
+        if (tick := tick_of(event, self._period)) < self.tick:
             raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self._period:g} s")
         if event.perturbation is not None:
             self.plant.check(event.perturbation)
@@ -227,19 +244,50 @@ class Simulation:
             self._plan()
 
     def step(self) -> None:
-        """One control period: events, measurement, control, record, physics."""
+        """One control period: events, measurement, control, physics, record."""
+        self.decide()
+        self.plant.advance()
+        self.settle()
+
+    @property
+    def _row(self) -> Array:
+        """Where the record of this tick goes, `(B, signals)`."""
+        return self.log[self.tick]
+
+    def sense(self) -> None:
+        """Lets this tick's events happen and measures, once a tick."""
+        if self._sensed == self.tick:
+            return
+        self._sensed = self.tick
         for row, event in self._schedule.get(self.tick, ()):
             self._happen(row, event)
-        plant, hierarchy, log = self.plant, self.hierarchy, self.log[self.tick]
         for row in self._noisy:
             self._noise[row] = self._noise_scale[row] * self._random[row].standard_normal(5)
-        reference = self._reference_now()
-        _sense(plant.state, reference, self._sensors, self._wheel_radius, self._period if self.tick else 0.0, log)
-        output = hierarchy.update(self._pose, self._twist, reference)
+        self._goal = self._reference_now()
+        _sense(self.plant.state, self._goal, self._sensors, self._wheel_radius, self._period, self._row)
+
+    def decide(self) -> None:
+        """What comes before the physics: events, measurement, control."""
+        self.sense()
+        plant, hierarchy = self.plant, self.hierarchy
+        try:
+            output = hierarchy.update(self._pose, self._twist, self._goal)
+        except StageError as error:  # of the whole group: what was recorded until now is kept
+            output = hierarchy.output
+            hierarchy.faults = dict.fromkeys(range(plant.size), str(error))
+        for row, fault in hierarchy.faults.items():
+            plant.fail(row, f"{fault}, tick {self.tick}")
         if not hierarchy.finite:  # the limit would turn NaN into the full voltage
             for row in np.flatnonzero(~np.isfinite(hierarchy.parts).all(axis=1)):
                 plant.fail(int(row), "non-finite voltage")
-        plant.step(output)
+        if self.override:
+            self.override(output)
+        plant.send(output)
+
+    def settle(self) -> None:
+        """What comes after the physics: readouts, record, failures."""
+        plant, hierarchy, log = self.plant, self.hierarchy, self._row
+        plant.look()
         near = _record(hierarchy.state, hierarchy.weight_norm, plant.state, log)
         if not near:
             for row in np.flatnonzero(np.abs(log[:, LATERAL_ERROR]) > DIVERGED):
@@ -262,7 +310,7 @@ class Simulation:
         if self.tick not in self._block:  # a long run does not hold all samples: (BLOCK, courses, 7)
             first = self.tick // BLOCK * BLOCK
             self._block = range(first, min(first + BLOCK, self.ticks))
-            samples = np.stack([_course(s, self._block) for s in self._courses.values()], axis=1)
+            samples = np.stack([course(s, self._block) for s in self._courses.values()], axis=1)
             everyone = (len(samples), len(self.scenarios), 7)
             self._reference = np.broadcast_to(samples, everyone) if len(self._courses) == 1 else samples
         now = self._reference[self.tick - self._block.start]
@@ -272,12 +320,12 @@ class Simulation:
         """What was recorded so far; the whole length, ending in NaN, once every robot has failed."""
         stage = self.hierarchy.feedforward
         weights = stage.state["weights"].copy() if isinstance(stage, FeedbackErrorLearning) else None
-        labels = [self._label] * len(self.scenarios)
+        size, robot = len(self.scenarios), self.plant.robot
         log = self.log[: self.tick] if self.running else self.log
         log[self.tick :] = np.nan
         by_run = log.transpose(1, 0, 2)
-        found = result.dataset(self.scenarios, labels, by_run, self.plant.failure, self._failure_time, weights)
-        size, robot = len(self.scenarios), self.plant.robot
+        names = [self._label] * size, [self._feedforward] * size
+        found = result.dataset(self.scenarios, *names, by_run, self.plant.failure, self._failure_time, weights)
         return found.assign(  # what turns the commanded motion into features
             half_track=("run", np.full(size, robot.half_track), {"units": "m"}),
             feature_scale=(("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
@@ -305,24 +353,24 @@ class Simulation:
             self.hierarchy.set_learning(row, event.learning)
 
 
-def _tick(event: Event, period: float) -> int:
+def tick_of(event: Event, period: float) -> int:
     """The first control tick that is not before an event."""
     return int(np.ceil(event.time / period - 1e-9))
 
 
-def _course(scenario: Scenario, ticks: range) -> Array:
+def course(scenario: Scenario, ticks: range) -> Array:
     """Posture, twist and acceleration to follow, `(ticks, 7)`, through all events that change the reference."""
     period = scenario.control_period
-    course = np.hstack(scenario.reference.sample(period * np.array(ticks, float)))
+    posts = np.hstack(scenario.reference.sample(period * np.array(ticks, float)))
     for event in sorted(scenario.events, key=lambda e: e.time):
-        start = _tick(event, period)
+        start = tick_of(event, period)
         if event.reference is not None and (since := max(start, ticks.start)) < ticks.stop:
             times = period * np.arange(since - start, ticks.stop - start, dtype=float)
-            course[since - ticks.start :] = np.hstack(event.reference.sample(times))
-    return course
+            posts[since - ticks.start :] = np.hstack(event.reference.sample(times))
+    return posts
 
 
-def _start(scenario: Scenario, reference: Array) -> Array:
+def start_pose(scenario: Scenario, reference: Array) -> Array:
     """Posture at the start `(3,)`: the given one or the reference's, plus the seeded offset.
 
     Raises:

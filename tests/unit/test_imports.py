@@ -18,8 +18,8 @@ LAYERS = (
     {"control.hierarchy", "measurement", "comparison", "metrics", "plots", "result"},
     {"adopt", "model", "plant"},
     {"simulate", "checks"},
-    {"diagnosis"},
-    {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment"},
+    {"diagnosis", "episodes"},
+    {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment", "gym", "export"},
     {"cli", "pytest_plugin"},
 )
 ENGINE = {"adopt", "model", "plant", "checks", "diagnosis", "viewer", "environment", "experiments"}
