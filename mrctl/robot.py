@@ -224,9 +224,7 @@ PERTURBATIONS: dict[str, Perturbation] = {
     "tyre friction 0.2": Perturbation(tyre_friction_factor=0.2 / 0.9),
     "left tyre on ice": Perturbation(left_tyre_friction_factor=0.1 / 0.9),
     "slope 10°": Perturbation(slope=0.1745),
-    "sensor noise": Perturbation(
-        velocity_noise=0.01, rotation_noise=0.02, position_noise=0.002, heading_noise=0.002
-    ),
+    "sensor noise": Perturbation(velocity_noise=0.01, rotation_noise=0.02, position_noise=0.002, heading_noise=0.002),
     "all": Perturbation(mass_factor=1.5, supply_factor=0.8, drive_friction_factor=3.0, resistance_factor=1.3),
 }
 """What can be wrong with the default robot, one thing at a time; `all` is the combination of the published targets."""

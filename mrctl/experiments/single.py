@@ -68,9 +68,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool) -> str:
             "failed": bool(failure),
             "failure": failure,
             "failure_time": float(row["failure_time"]) if failure else None,
-            "laps": [
-                {name: _number(row[name].values[k]) for name in metrics.METRICS} for k in range(row.sizes["lap"])
-            ],
+            "laps": [{name: _number(row[name].values[k]) for name in metrics.METRICS} for k in range(row.sizes["lap"])],
             "guard": events.to_dict("records"),
         }
         return json.dumps(values, indent=1)
