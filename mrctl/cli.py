@@ -111,6 +111,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         scenario: Annotated[Scenario, tyro.conf.arg(name="")] = default,
         out: Path | None = None,
         json: bool = False,
+        controller: str | None = None,
         number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
     ) -> None:
         """Runs one scenario and prints its metrics lap by lap.
@@ -120,6 +121,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             scenario: The scenario.
             out: Folder for the result, the figures and the learned weights.
             json: Print JSON.
+            controller: Stages of your own, as my_file.py:MyFeedforward, or motion=my_file.py:MyMotion,feedback=...
             number: Run of the sweep to run again and to compare with the store.
         """
         if number is not None:
@@ -128,7 +130,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             raise InputError(f"run: which one of {file}? give its number with --run")
         from mrctl.experiments import single
 
-        print(single.run(scenario, out, json))
+        print(single.run(scenario, out, json, controller))
 
     return run
 
@@ -137,11 +139,12 @@ def _repeat(store: Path | None, number: int, out: Path | None, json: bool) -> No
     """`mrctl run STORE --run K`."""
     from mrctl import jobs
     from mrctl.experiments import single
+    from mrctl.store import Store
 
     if store is None:
         raise InputError("run: needs the store of a sweep in front of it")
     if out is not None or json:
-        print(single.run(jobs.scenario_of(store, number), out, json))
+        print(single.run(jobs.scenario_of(store, number), out, json, Store(store).manifest["sweep"]["controller"]))
     repeated = jobs.repeat(store, number)
     verdict = f"run {number}: {repeated.verdict}"
     if not repeated.same:
@@ -198,7 +201,7 @@ def suite(
 
     Args:
         feedforward: Which to compare.
-        controller: Feedforwards of your own beside them, as my_file.py:MyController.
+        controller: Controllers of your own beside them, as my_file.py:MyFeedforward or motion=my_file.py:MyMotion.
         seeds: Runs of each case; by default 10, 3 if quick.
         random: Random scenarios; by default 300, 20 if quick.
         quick: A selection of cases with fewer laps: two minutes instead of half an hour.

@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from mrctl import controller, metrics
 from mrctl import model as mjcf
+from mrctl.control.stages import METHODS, Stages
 from mrctl.pool import Cluster, Outcome, Pool, Processes, Work
 from mrctl.record import InputError
 from mrctl.result import SIGNALS, versions
@@ -151,7 +152,7 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
 
 
 def _models(sweep: Sweep) -> dict[str, str]:
-    """Digests of the compiled worlds with the robot, and of the file of a controller."""
+    """Digests of the compiled worlds with the robot, and of the files of a controller."""
     worlds = {f"{world}, {steering}": mjcf.digest(mjcf.load(world, steering)) for world, steering in sweep.worlds}
     return worlds | ({sweep.controller: controller.digest(sweep.controller)} if sweep.controller else {})
 
@@ -198,16 +199,20 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
             batches.setdefault(scenario.control_period, {})[run] = scenario
         except InputError as error:  # drawn out of range
             rows[run] = _row(sweep, run, str(error).removeprefix(f"run {run}: "))
-    stage = controller.load(sweep.controller) if sweep.controller else None
+    stages: Stages = controller.load(sweep.controller) if sweep.controller else {}
     queue = list(batches.values())
     for batch in queue:
         try:
-            result = simulate(list(batch.values()), stage, threads=1)
+            result = simulate(list(batch.values()), threads=1, **stages)
         except InputError as error:
             if len(batch) == 1:
                 rows |= {run: _row(sweep, run, str(error)) for run in batch}
             else:  # one that cannot be run shall not cost the others
                 queue.extend({run: scenario} for run, scenario in batch.items())
+            continue
+        if stages and len(batch) > 1 and any(str(why).startswith((*METHODS,)) for why in result["failure"].values):
+            # A stage that raises ends its whole group; alone, each run is what it is in any company.
+            queue.extend({run: scenario} for run, scenario in batch.items())
             continue
         laps = metrics.per_lap(result)
         table = metrics.summary(laps).assign(lap_time=laps["lap_time"].values, failure=result["failure"].values)

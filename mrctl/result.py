@@ -65,6 +65,7 @@ def versions() -> dict[str, str]:
 def dataset(
     scenarios: Sequence[Scenario],
     labels: Sequence[str],
+    feedforwards: Sequence[str],
     log: NDArray[np.float64],
     failure: Sequence[str],
     failure_time: NDArray[np.float64],
@@ -74,7 +75,8 @@ def dataset(
 
     Args:
         scenarios: A scenario a run.
-        labels: Name of the feedforward a run.
+        labels: What to call a run that has no name.
+        feedforwards: Name of the feedforward a run.
         log: `(B, ticks, signals)`.
         failure: Why a run stopped early, or "".
         failure_time: When, s, or NaN.
@@ -92,7 +94,7 @@ def dataset(
         "time": ("time", period * np.arange(log.shape[1]), {"units": "s"}),
         "run": np.arange(len(scenarios)),
         "label": ("run", np.array([s.name or label for s, label in zip(scenarios, labels, strict=True)], object)),
-        "feedforward": ("run", np.array(labels, object)),
+        "feedforward": ("run", np.array(feedforwards, object)),
         "steering": ("run", np.array([s.steering for s in scenarios], object)),
         "seed": ("run", np.array([s.seed for s in scenarios])),
         "lap_time": ("run", np.array([s.reference.period for s in scenarios]), {"units": "s"}),

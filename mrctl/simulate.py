@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import xarray as xr
@@ -15,21 +15,21 @@ from tqdm import tqdm
 from mrctl import model as mjcf
 from mrctl import result
 from mrctl.control.chain import ANY, GIVEN, OWN, one, rows, stamp
-from mrctl.control.feedforward import Feedforward, InverseDynamics, feature_scale
+from mrctl.control.feedforward import InverseDynamics, feature_scale
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.hierarchy import STATE as CONTROLLER
-from mrctl.control.hierarchy import Hierarchy, feedforward_of
+from mrctl.control.hierarchy import Hierarchy
 from mrctl.control.kanayama import posture_error
+from mrctl.control.stages import Own, StageError, Stages
 from mrctl.measurement import observe
 from mrctl.plant import OMEGA, RATE_LEFT, RATE_RIGHT, STEERING, THETA, Plant, V, X, build
 from mrctl.plant import STATE as ROBOT
 from mrctl.record import InputError
 from mrctl.references import check
-from mrctl.robot import Perturbation, Robot
+from mrctl.robot import Perturbation
 from mrctl.scenario import Event, Scenario
 
 Array = NDArray[np.float64]
-Factory = Callable[[Robot, int], Feedforward]
 
 DIVERGED = 1.0  # m of lateral error
 LATERAL_ERROR = list(result.SIGNALS).index("lateral_error")
@@ -84,10 +84,7 @@ _sense, _record = _compile(stamp(observe, posture_error))
 
 
 def simulate(
-    scenarios: Scenario | Sequence[Scenario],
-    feedforward: Factory | None = None,
-    progress: bool = False,
-    threads: int = 0,
+    scenarios: Scenario | Sequence[Scenario], *, progress: bool = False, threads: int = 0, **stages: Unpack[Stages]
 ) -> xr.Dataset:
     """Runs scenarios in closed loop.
 
@@ -95,17 +92,20 @@ def simulate(
 
     Args:
         scenarios: One, or several; those that differ in world, laws, steering, length or rates run in turn.
-        feedforward: A stage of your own instead of the named one: called with the nominal robot and the number of
-            robots, returns an object with the two methods of `mrctl.control.feedforward.Feedforward`.
         progress: Shows a progress bar.
         threads: Of the batch engine, which change no bit; 0 for all cores.
+        stages: Stages of your own, `motion`, `feedback`, `feedforward` or `steering`, instead of the scenario's: a
+            factory, called with the nominal robot and the number of robots, which returns an object with the two
+            methods of that stage in `mrctl.control.stages`. One that raises, or returns what does not fit, fails its
+            whole group of runs; one that returns NaN for a robot fails that run.
 
     Returns:
         The signals of `mrctl.result.SIGNALS` with dimensions run and time (time alone for one scenario), with units;
         `failed`, `failure` and `failure_time` a run; `weights` where a network learned.
 
     Raises:
-        InputError: A scenario asks for what is not there or what the robot cannot do; the message names the field.
+        InputError: A scenario asks for what is not there or what the robot cannot do; the message names the field. Or
+            a stage of yours cannot be made.
     """
     several = [scenarios] if isinstance(scenarios, Scenario) else list(scenarios)
     if not several:
@@ -113,7 +113,7 @@ def simulate(
     if len({s.control_period for s in several}) > 1:
         raise InputError("control_period: runs of one result share their time axis, so also their control period")
     # Built first, so that bad input is refused before anything is computed.
-    simulations = batches(several, feedforward, threads)
+    simulations = batches(several, threads=threads, **stages)
     total = sum(simulation.ticks * len(rows) for rows, simulation in simulations)
     parts = []
     with tqdm(total=total, unit="tick", unit_scale=True, disable=not progress) as bar:
@@ -130,14 +130,14 @@ def simulate(
 
 
 def batches(
-    scenarios: Sequence[Scenario], feedforward: Factory | None = None, threads: int = 0
+    scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]
 ) -> list[tuple[list[int], Simulation]]:
     """Uniform groups of scenarios: which they are, and their simulation. Arguments and errors as in `simulate`."""
     groups: dict[Hashable, list[int]] = defaultdict(list)
     for row, s in enumerate(scenarios):
         net = s.fel.hidden, s.composite.weights
         groups[s.world, s.steering, s.feedforward, s.ticks, s.physics_step, s.motion_period, *net].append(row)
-    return [(rows, Simulation([scenarios[r] for r in rows], feedforward, threads)) for rows in groups.values()]
+    return [(rows, Simulation([scenarios[r] for r in rows], threads=threads, **stages)) for rows in groups.values()]
 
 
 class Simulation:
@@ -153,13 +153,13 @@ class Simulation:
         log: What was recorded, `(ticks, B, signals)`; nothing yet from `tick` on.
     """
 
-    def __init__(self, scenarios: Sequence[Scenario], feedforward: Factory | None = None, threads: int = 0) -> None:
+    def __init__(self, scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]) -> None:
         """Compiles the world, stands the robots on their references, rolling.
 
         Args:
             scenarios: Scenarios that `simulate` would run together.
-            feedforward: As in `simulate`.
             threads: As in `simulate`.
+            stages: As in `simulate`.
 
         Raises:
             InputError: As `simulate`.
@@ -174,11 +174,15 @@ class Simulation:
         for scenario in scenarios:
             for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
                 check(reference, robot, reverse=rigid)
-        stage = feedforward(robot, size) if feedforward else feedforward_of(scenarios, robot)
-        self._label = getattr(feedforward, "__name__", "custom") if feedforward else first.feedforward
-        self._oracle = stage if first.feedforward == "oracle" and isinstance(stage, InverseDynamics) else None
+        factories: dict[str, Any] = {name: factory for name, factory in stages.items() if factory}
+        own = {name: Own(name, factory, robot, size) for name, factory in factories.items()}
+        names = {name: getattr(factory, "__name__", "custom") for name, factory in factories.items()}
+        self._feedforward = names.pop("feedforward", first.feedforward)
+        self._label = " + ".join([self._feedforward, *names.values()])
         self.plant: Plant = build(compiled, size, round(first.control_period / first.physics_step), threads)
-        self.hierarchy = Hierarchy(scenarios, robot, stage)
+        self.hierarchy = Hierarchy(scenarios, robot, own=own)
+        stage = self.hierarchy.feedforward
+        self._oracle = stage if first.feedforward == "oracle" and isinstance(stage, InverseDynamics) else None
         self._plan()
         self._wheel_radius = robot.wheel_radius
         self._sensors = np.zeros(size, SENSORS)
@@ -235,7 +239,13 @@ class Simulation:
             self._noise[row] = self._noise_scale[row] * self._random[row].standard_normal(5)
         reference = self._reference_now()
         _sense(plant.state, reference, self._sensors, self._wheel_radius, self._period if self.tick else 0.0, log)
-        output = hierarchy.update(self._pose, self._twist, reference)
+        try:
+            output = hierarchy.update(self._pose, self._twist, reference)
+        except StageError as error:  # of the whole group: what was recorded until now is kept
+            output = hierarchy.output
+            hierarchy.faults = dict.fromkeys(range(plant.size), str(error))
+        for row, fault in hierarchy.faults.items():
+            plant.fail(row, f"{fault}, tick {self.tick}")
         if not hierarchy.finite:  # the limit would turn NaN into the full voltage
             for row in np.flatnonzero(~np.isfinite(hierarchy.parts).all(axis=1)):
                 plant.fail(int(row), "non-finite voltage")
@@ -272,12 +282,12 @@ class Simulation:
         """What was recorded so far; the whole length, ending in NaN, once every robot has failed."""
         stage = self.hierarchy.feedforward
         weights = stage.state["weights"].copy() if isinstance(stage, FeedbackErrorLearning) else None
-        labels = [self._label] * len(self.scenarios)
+        size, robot = len(self.scenarios), self.plant.robot
         log = self.log[: self.tick] if self.running else self.log
         log[self.tick :] = np.nan
         by_run = log.transpose(1, 0, 2)
-        found = result.dataset(self.scenarios, labels, by_run, self.plant.failure, self._failure_time, weights)
-        size, robot = len(self.scenarios), self.plant.robot
+        names = [self._label] * size, [self._feedforward] * size
+        found = result.dataset(self.scenarios, *names, by_run, self.plant.failure, self._failure_time, weights)
         return found.assign(  # what turns the commanded motion into features
             half_track=("run", np.full(size, robot.half_track), {"units": "m"}),
             feature_scale=(("run", "feature"), np.tile(feature_scale(robot), (size, 1))),

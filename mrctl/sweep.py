@@ -128,7 +128,8 @@ class Sweep(Record):
     chunk: Annotated[int, Field(ge=1, le=65536)] | None = None
     """Runs in a job; by default 64, or fewer where the runs are long."""
     controller: str | None = None
-    """A feedforward of your own instead of the named one, as `my_file.py:MyController`; see `mrctl.controller`."""
+    """A feedforward of your own instead of the named one, as `my_file.py:MyController`, or other stages, as
+    `motion=my_file.py:PurePursuit`; see `mrctl.controller`."""
 
     @classmethod
     def of(cls, scenarios: Sequence[Scenario], **settings: Any) -> Self:  # noqa: ANN401

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,12 @@ from mrctl.control.composite import CompositeAdaptation
 from mrctl.control.feedforward import Feedforward, InverseDynamics, NoFeedforward, features, linear
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.guard import UNSURE, WATCH, guard, watches
-from mrctl.control.kanayama import Kanayama, kanayama
+from mrctl.control.kanayama import Kanayama, kanayama, posture_error
 from mrctl.control.limiter import limit
 from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import Pid, pid
 from mrctl.control.rls import RecursiveLeastSquares
+from mrctl.control.stages import Own
 from mrctl.control.steering import allocate
 from mrctl.robot import Robot
 from mrctl.scenario import Scenario
@@ -129,12 +130,6 @@ def _hand_over(taken, state):  # noqa: ANN001, ANN202
             state[i].pid[k] -= TAKE_OVER * state[i].guard.authority * taken[i, k]
 
 
-def _fitting(values: Array, like: Array) -> Array:
-    """What somebody's own stage returned, in the shape and type that compiled loops rely on."""
-    fits = isinstance(values, np.ndarray) and values.shape == like.shape and values.dtype == like.dtype
-    return values if fits else np.broadcast_to(np.asarray(values, float), like.shape)
-
-
 class Hierarchy:
     """Both controllers for B robots that share steering arrangement and rates.
 
@@ -149,12 +144,32 @@ class Hierarchy:
         output: Voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
         finite: Whether all `parts` are finite numbers.
         saturated: 1 where a limit acted, `(B,)`.
+        faults: Which robots somebody's own stage gave no finite number for in the last tick, and what to say of it.
     """
 
-    def __init__(self, scenarios: Sequence[Scenario], robot: Robot, feedforward: Feedforward) -> None:
-        """Takes a uniform group of scenarios, the nominal robot and a feedforward stage."""
+    def __init__(
+        self,
+        scenarios: Sequence[Scenario],
+        robot: Robot,
+        feedforward: Feedforward | None = None,
+        own: Mapping[str, Own] | None = None,
+    ) -> None:
+        """Wires the stages.
+
+        Args:
+            scenarios: A uniform group.
+            robot: The nominal robot.
+            feedforward: Instead of the named one, and trusted.
+            own: Somebody's own stages by name, which are not; they run in Python around the compiled loops.
+        """
         first, size = scenarios[0], len(scenarios)
-        self.feedforward = feedforward
+        self._own = dict(own or {})
+        self._motion, self._feedback, self._steering = map(self._own.get, ("motion", "feedback", "steering"))
+        self._feedforward = self._own.get("feedforward")
+        if self._feedforward:
+            feedforward = self._feedforward.stage
+        self.feedforward = feedforward = feedforward or feedforward_of(scenarios, robot)
+        self.faults: dict[int, str] = {}
         self._robot = robot
         self._rigid = first.steering == "rigid"
         self._period = first.control_period
@@ -204,8 +219,12 @@ class Hierarchy:
         self.state["limiter"][:, 2:] = twist
         self.state["steering"][:, 0] = steering_angle
         # The integral holds what the nominal robot takes here, less what the feedforward brings by itself.
-        integral = self._nominal.output(twist, acceleration) - self.feedforward.output(twist, acceleration)
+        integral = self._nominal.output(twist, acceleration) - self._forward(twist, acceleration)
         self.state["pid"][:, :2] = integral
+        if self._feedback:
+            self._feedback.tell("reset", integral, self._period)
+        if self._steering:
+            self._steering.tell("reset", steering_angle, self._period)
 
     def update(self, pose: Array, twist: Array, reference: Array) -> Array:
         """One control tick.
@@ -219,29 +238,95 @@ class Hierarchy:
             `output`, `(B, 4)`.
         """
         state, stage = self.state, self.feedforward
-        _lead(self._tick % self._every == 0, pose, twist, reference, self._limits, self._period, state)
+        moves = self._tick % self._every == 0
+        if self._own:
+            self.faults.clear()
+        if self._motion and moves:
+            self._move(self._motion, pose, twist, reference)
+        _lead(moves and not self._motion, pose, twist, reference, self._limits, self._period, state)
+        if self._feedback:
+            self._feed_back(self._feedback, twist)
         self._tick += 1
-        feedforward = _fitting(stage.output(self.command, self.derivative), self.feedback)
+        feedforward = self._forward(self.command, self.derivative)
         self.finite, forget = _follow(
             feedforward, self.weight_norm, self._parameters, self._nominal.coefficients[0], self._period, state
         )
+        if self._steering:
+            self._steer(self._steering)
         # A robot that must not learn is treated as one whose voltage did not act.
-        taken = stage.learn(self._teaching, self._idle, twist, self._voltage)
+        if not self._feedforward:
+            taken = stage.learn(self._teaching, self._idle, twist, self._voltage)
+        else:
+            taken = self._feedforward.tell("learn", self._teaching, self._idle, twist, self._voltage)
+            if taken is not None:
+                taken = self._feedforward.fitting(taken, self.feedback.shape, "what `learn` returns")
+                taken = self._sound(self._feedforward, taken)
         if taken is not None:
-            _hand_over(_fitting(taken, self.feedback), state)
+            _hand_over(taken, state)
+        if self._feedback and (integral := getattr(self._feedback.stage, "integral", None)) is not None:
+            integral[:] = state["pid"][:, :2]
         if forget:
             self._forget()
         return self.output
 
+    def _forward(self, command: Array, derivative: Array) -> Array:
+        """The feedforward's output; of somebody's own stage, finite but where a guard is there to see to that."""
+        if not self._feedforward:
+            return self.feedforward.output(command, derivative)
+        answer = self._feedforward.ask("output", command, derivative)
+        return self._sound(self._feedforward, answer, self.state["guard"]["on"] > 0)
+
+    def _move(self, own: Own, pose: Array, twist: Array, reference: Array) -> None:
+        """Asks somebody's own motion controller."""
+        if self._tick == 0:
+            own.tell("reset", pose, reference, self._period * self._every)
+        state = self.state
+        posture_error(pose, reference[:, :3], state["error"])
+        state["request"] = self._sound(own, own.ask("output", pose, twist, reference))
+        state["correction"] = state["request"] - reference[:, 3:5]
+
+    def _feed_back(self, own: Own, twist: Array) -> None:
+        """Asks somebody's own feedback, and shows its integral to guard and hand-over."""
+        state = self.state
+        self.feedback[:] = self._sound(own, own.ask("output", self.command, twist, state["excess"]))
+        integral = getattr(own.stage, "integral", None)
+        state["pid"][:, :2] = 0.0 if integral is None else own.fitting(integral, self.feedback.shape, "`integral`")
+
+    def _steer(self, own: Own) -> None:
+        """Asks somebody's own law of the fork, and limits it as `steering.allocate` does."""
+        state, wish, limit = self.state, self.command.copy(), self._robot.steering_limit
+        if self._rigid:
+            wish[:, 1] += self.feedback[:, 1] + state["guard"]["output"][:, 1]
+        answer = self._sound(own, own.ask("output", wish, self.derivative))
+        angle = np.clip(answer[:, 0], -limit, limit)
+        beyond = angle != answer[:, 0]
+        rate = np.where(beyond, 0.0, answer[:, 1])
+        self.output[:, 2], self.output[:, 3] = np.clip(angle + rate * self._period / 2, -limit, limit), rate
+        if self._rigid:  # the fork is what makes θ̇, so its limit is one of the second channel
+            clipped = (self.output[:, :2] != self.parts[:, :2] + self.parts[:, 2:]).any(axis=1)
+            made = wish[:, 0] * np.tan(angle) / self._robot.wheelbase
+            state["excess"][:, 1] = np.where(beyond, made - wish[:, 1], 0.0)
+            self.saturated[:] = beyond | clipped
+            self._voltage[:, 1] = wish[:, 1] - self.command[:, 1] + state["excess"][:, 1]
+            self._idle[:] = np.maximum(self.saturated, np.maximum(state["frozen"], state["guard"]["idle"]))
+
+    def _sound(self, own: Own, answer: Array, guarded: NDArray[np.bool] | bool = False) -> Array:
+        """An answer without the rows that are not finite, which are noted; guarded rows stay as they are."""
+        broken = ~np.isfinite(answer).all(axis=1) & ~np.asarray(guarded)
+        for row in np.flatnonzero(broken):
+            self.faults.setdefault(int(row), f"{own.title}: not finite")
+        return np.where(broken[:, None], 0.0, answer) if broken.any() else answer
+
     def _forget(self) -> None:
         """Takes learners that failed back to what they began with; one that cannot has to go on more slowly."""
         rows = np.flatnonzero(self.state["guard"]["restore"])
-        if restore := getattr(self.feedforward, "restore", None):
-            restore(rows)
+        if getattr(self.feedforward, "restore", None):
+            self._feedforward.tell("restore", rows) if self._feedforward else self.feedforward.restore(rows)  # type: ignore
         else:
             self.state["guard"]["gain"][rows] *= UNSURE
 
     @property
     def weight_norm(self) -> Array:
         """Size of what the feedforward has learned, `(B,)`."""
-        return getattr(self.feedforward, "weight_norm", self._no_weights)
+        norm = getattr(self.feedforward, "weight_norm", self._no_weights)
+        return self._feedforward.fitting(norm, self._no_weights.shape, "`weight_norm`") if self._feedforward else norm

@@ -16,6 +16,7 @@ from mrctl import controller, metrics, plots
 from mrctl.comparison import superiority
 from mrctl.control.feedforward import InverseDynamics
 from mrctl.control.pid import PIDS
+from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
 from mrctl.experiments.cases import BAND, Outcome
 from mrctl.experiments.tables import number
@@ -118,9 +119,9 @@ def _labelled(runs: Mapping[str, xr.Dataset]) -> xr.Dataset:
 
 def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
     """Drives a scenario once more and asks the feedforward what it makes of steady motion."""
-    factory = controller.load(choice["controller"]) if "controller" in choice else None
+    stages: Stages = controller.load(choice["controller"]) if "controller" in choice else {}
     scenario = scenario.model_copy(update={"feedforward": choice.get("feedforward", "none")})
-    simulation = Simulation([scenario], factory)
+    simulation = Simulation([scenario], **stages)
     while simulation.running:
         simulation.step()
     names = list(SIGNALS)

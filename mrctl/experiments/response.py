@@ -106,7 +106,7 @@ def measure(scenarios: Sequence[Scenario], channel: int) -> tuple[Array, Respons
     steady = {"reference": line, "laps": 1, "events": (), "initial_spread": (0.0, 0.0, 0.0), "feedforward": "none"}
     runs = [s.model_copy(update=steady) for s in scenarios]
     shaker = Shaker(signal, 2 * SAMPLES, len(runs))
-    simulation = Simulation(runs, lambda robot, size: shaker)
+    simulation = Simulation(runs, feedforward=lambda robot, size: shaker)
     while simulation.running:
         simulation.step()
     for row in np.flatnonzero(simulation.plant.failed):

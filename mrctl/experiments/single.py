@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from mrctl import metrics, plots
+from mrctl import controller, metrics, plots
 from mrctl.control.fel import save_weights
+from mrctl.control.stages import Stages
 from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.record import InputError
 from mrctl.result import save, versions
@@ -27,23 +28,25 @@ COLUMNS = {
 }
 
 
-def run(scenario: Scenario, out: Path | None, as_json: bool) -> str:
+def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = None) -> str:
     """Runs a scenario.
 
     Args:
         scenario: What to run.
         out: Folder for `result.zarr`, figures and learned weights, or None.
         as_json: JSON instead of a table.
+        own: Stages of your own; see `mrctl.controller`.
 
     Returns:
         The metrics, a row a lap.
 
     Raises:
-        InputError: A bad scenario, or a folder that cannot be written or holds a result already.
+        InputError: A bad scenario or controller, or a folder that cannot be written or holds a result already.
     """
     if out is not None and (output_folder(out) / "result.zarr").exists():
         raise InputError(f"out: {out} holds a result already; nothing was overwritten")
-    result = simulate([scenario], progress=True)
+    stages: Stages = controller.load(own) if own else {}
+    result = simulate([scenario], progress=True, **stages)
     laps = metrics.per_lap(result)
     if out is not None:
         save(result, out / "result.zarr")
@@ -64,6 +67,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool) -> str:
     if as_json:
         values = {
             "scenario": scenario.model_dump(mode="json"),
+            "controller": own,
             "versions": versions(),
             "failed": bool(failure),
             "failure": failure,
@@ -77,7 +81,8 @@ def run(scenario: Scenario, out: Path | None, as_json: bool) -> str:
         [str(k + 1), *(number(scale * float(row[name].values[k])) for name, (_, scale) in COLUMNS.items())]
         for k in range(row.sizes["lap"])
     ]
-    lines = [f"RMSE per lap against the reference, feedforward {scenario.feedforward}, steering {scenario.steering}"]
+    name = str(result["feedforward"].values[0]) + (f", own stages {own}" if own else "")
+    lines = [f"RMSE per lap against the reference, feedforward {name}, steering {scenario.steering}"]
     if failure:
         lines.append(f"failed after {float(row['failure_time']):.2f} s: {failure}")
     acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]

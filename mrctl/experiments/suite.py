@@ -39,7 +39,7 @@ def suite(
 
     Args:
         feedforwards: Which to compare.
-        controllers: Feedforwards of your own, as `my_file.py:MyController`.
+        controllers: Controllers of your own, as `my_file.py:MyController`; see `mrctl.controller`.
         seeds: Runs of each case, seeds 0 to `seeds` − 1 for everyone.
         random: How many random scenarios.
         quick: A selection with fewer laps.
@@ -53,10 +53,10 @@ def suite(
         raise InputError("seeds: at least one run of at least one feedforward")
     who: dict[str, dict[str, Any]] = {name: {"feedforward": name} for name in feedforwards}
     for one in controllers:
-        file, name = controller.split(one)
+        name = "+".join(part.attribute for part in controller.parts(one))
         if name in who:
             raise InputError(f"controller: the name {name} is taken")
-        who[name] = {"controller": f"{file}:{name}"}
+        who[name] = {"controller": controller.absolute(one)}
         controller.trial(who[name]["controller"], Scenario(laps=1))
     output_folder(out)
     chosen = cases(seeds, random, quick)

@@ -92,8 +92,12 @@ def test_alone(kind):
 def test_non_finite_stage():
     """Without the guard, a user's stage that breaks in one row stops that row, not with full voltage, and no other."""
     bare = [scenario.model_copy(update={"guard": Guard(on=False)}) for scenario in HEALTHY]
-    whole, sound = simulate(bare, BreaksAfter), simulate(bare, lambda robot, size: NoFeedforward(size))
-    check_record(whole.isel(run=1), "non-finite voltage")
+    whole, sound = (
+        simulate(bare, feedforward=BreaksAfter),
+        simulate(bare, feedforward=lambda robot, size: NoFeedforward(size)),
+    )
+    tick = round(float(whole.failure_time[1]) / PERIOD) - 1
+    check_record(whole.isel(run=1), f"feedforward BreaksAfter: not finite, tick {tick}")
     assert float(whole.failure_time[1]) == pytest.approx(1.0, abs=2 * PERIOD)
     for run in (0, 2):
         same(whole.isel(run=run), sound.isel(run=run))

@@ -106,12 +106,14 @@ def test_torch_module(runs):
     start = unflatten(initial_weights(24, BASE.seed))
     twin.load_state_dict({name: torch.tensor(layer) for name, layer in start.items()})
     short = variant(laps=1)
-    same = simulate(short, lambda robot, size: ModuleLearning(twin, robot, size))
+    same = simulate(short, feedforward=lambda robot, size: ModuleLearning(twin, robot, size))
     for name in ("x", "omega", "feedforward_left"):
         assert np.allclose(same[name], lap(runs.isel(run=0), 0)[name], atol=1e-6), name
 
     torch.manual_seed(0)
     own = torch.nn.Sequential(torch.nn.Linear(8, 16), torch.nn.Tanh(), torch.nn.Linear(16, 2))
-    learned = simulate([short, variant(laps=1, seed=1)], lambda robot, size: ModuleLearning(own, robot, size))
+    learned = simulate(
+        [short, variant(laps=1, seed=1)], feedforward=lambda robot, size: ModuleLearning(own, robot, size)
+    )
     assert not learned.failed.any() and float(learned.weight_norm[0, -1]) > 0
     assert rms(learned.feedback_left[0, TICKS // 2 :]) < rms(lap(runs.isel(run=1), 0).feedback_left[TICKS // 2 :])

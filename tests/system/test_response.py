@@ -122,7 +122,7 @@ def test_hand_over_turns_the_condition():
     shaker = HandedOver(wave, 2 * SAMPLES, 1)
     line = mrctl.Line(length=16)
     simulation = Simulation(
-        [scenarios(reference=line, laps=1, initial_spread=(0, 0, 0))[0]], lambda robot, size: shaker
+        [scenarios(reference=line, laps=1, initial_spread=(0, 0, 0))[0]], feedforward=lambda robot, size: shaker
     )
     while simulation.running:
         simulation.step()
@@ -173,7 +173,9 @@ def test_foretells_instability(steering, channel):
     )  # fmt: skip
     frequency, (t,) = measure([scenario], channel)
     limit = safety(*refine(frequency, t), H).step
-    result = mrctl.simulate([scenario] * 2, lambda robot, size: Integrator([0.7 * limit, 1.3 * limit], channel))
+    result = mrctl.simulate(
+        [scenario] * 2, feedforward=lambda robot, size: Integrator([0.7 * limit, 1.3 * limit], channel)
+    )
     settled, shaken = result["v" if channel == 0 else "omega"].values
     early, late = slice(300, 800), slice(-500, None)
     assert np.std(settled[late]) < 0.2 * np.std(settled[early])

@@ -302,5 +302,9 @@ def test_label():
         return NoFeedforward(size)
 
     assert str(simulate(scenario).label.item()) == "none"
-    assert str(simulate(scenario, mine).label.item()) == str(simulate(scenario, mine).feedforward.item()) == "mine"
+    assert (
+        str(simulate(scenario, feedforward=mine).label.item())
+        == str(simulate(scenario, feedforward=mine).feedforward.item())
+        == "mine"
+    )
     assert str(simulate(scenario.model_copy(update={"name": "x"})).label.item()) == "x"

@@ -1,0 +1,362 @@
+"""Somebody's own stages: any of the four can be replaced, what goes wrong in one is said, and the rest is kept."""
+
+import numpy as np
+import pytest
+import torch
+
+import mrctl
+from mrctl import Circle, Guard, InputError, Lemniscate, Scenario, Sweep, jobs, simulate
+from mrctl.cli import main
+from mrctl.control.kanayama import kanayama, posture_error
+from mrctl.control.pid import pid
+from mrctl.control.stages import METHODS
+from mrctl.control.steering import allocate, parameters
+from mrctl.result import SIGNALS
+
+SHORT = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
+THREE = [SHORT.model_copy(update={"seed": seed}) for seed in range(3)]
+LAP = Scenario(reference=Lemniscate(period=10), laps=1)
+
+
+class Stanley:
+    """Hoffmann et al. 2007: the front wheel turns by the heading error and by atan(k e / V)."""
+
+    def __init__(self, robot, size):
+        self.wheelbase = robot.wheelbase
+
+    def reset(self, pose, reference, period):
+        pass
+
+    def output(self, pose, twist, reference):
+        e = posture_error(pose, reference[:, :3])
+        v = reference[:, 3] + 2.0 * e[:, 0]
+        angle = (
+            e[:, 2]
+            + np.arctan2(4.0 * e[:, 1], np.maximum(v, 0.1))
+            + np.arctan2(self.wheelbase * reference[:, 4], reference[:, 3])
+        )
+        return np.stack([v, v * np.tan(angle) / self.wheelbase], axis=1)
+
+
+class Kanayama:
+    """The built-in motion controller, from outside."""
+
+    def __init__(self, robot, size):
+        pass
+
+    def reset(self, pose, reference, period):
+        assert period == 0.01 and reference.shape == (len(pose), 7)
+
+    def output(self, pose, twist, reference):
+        return kanayama(pose, reference[:, :3], reference[:, 3:5], np.array([3.0, 25.0, 10.0]))[1]
+
+
+class TorchKanayama(Kanayama):
+    """The same in torch, with a gradient."""
+
+    def output(self, pose, twist, reference):
+        return torch.tensor(super().output(pose, twist, reference), requires_grad=True) * 1.0
+
+
+class Feedback:
+    """The built-in PID, from outside."""
+
+    def __init__(self, robot, size, rigid=False):
+        self.gains = mrctl.Pid().gains(robot, rigid)
+        self.state = np.zeros((size, 7))
+        self.integral = self.state[:, :2]
+
+    def reset(self, steady, period):
+        self.period = period
+        self.integral[:] = steady
+
+    def output(self, command, twist, excess):
+        volts = np.zeros_like(command)
+        pid(command, twist, self.gains, self.period, excess, self.state, volts)
+        return volts
+
+
+class Fork:
+    """The built-in law of the fork, from outside."""
+
+    def __init__(self, robot, size):
+        self.parameters = parameters(robot, False)
+        self.state = np.zeros((size, 2))
+
+    def reset(self, angle, period):
+        self.period = period
+        self.state[:, 0] = angle
+
+    def output(self, command, derivative):
+        zero = np.zeros_like(command)
+        sink = [np.zeros((len(command), n)) for n in (4, 4, 2, 1)]
+        allocate(command, derivative, zero, zero, self.parameters, self.period, self.state, *sink[:3], sink[3][:, 0])
+        return self.state
+
+
+def same(one, other):
+    """Two results with the same bits in every signal."""
+    for name in (*SIGNALS, "failed", "failure_time", "failure"):
+        a, b = one[name].values, other[name].values
+        assert np.array_equal(a, b, equal_nan=a.dtype.kind == "f"), name
+
+
+@pytest.mark.parametrize("steering", ["compliant", "rigid"])
+@pytest.mark.parametrize(
+    "own",
+    [{"motion": Kanayama}, {"motion": TorchKanayama}, {"feedback": Feedback}, {"steering": Fork}, None],
+    ids=["motion", "torch", "feedback", "steering", "all"],
+)
+def test_same_law(own, steering):
+    """The built-in laws brought in from outside give the built-in bits: saturation, learning and hand-over included."""
+    hard = mrctl.Perturbation(supply_factor=0.5, mass_factor=1.5)
+    base = LAP.model_copy(update={"steering": steering, "perturbation": hard})
+    scenarios = [base, base.model_copy(update={"seed": 1})]
+    own = dict(own or {"motion": Kanayama, "feedback": Feedback, "steering": Fork})
+    if "feedback" in own:
+        own["feedback"] = lambda robot, size: Feedback(robot, size, steering == "rigid")
+    builtin = simulate(scenarios)
+    assert float(builtin.saturated.sum()) > 0
+    found = simulate(scenarios, **own)
+    if steering == "rigid" and "steering" in own:  # the tangent at the limit is NumPy's there
+        for name in SIGNALS:
+            np.testing.assert_allclose(found[name], builtin[name], rtol=1e-9, atol=1e-9, err_msg=name)
+    else:
+        same(found, builtin)
+
+
+def test_slow_motion():
+    """A motion controller of your own is asked at the motion controller's rate."""
+    calls = []
+
+    class Counted(Kanayama):
+        def reset(self, pose, reference, period):
+            calls.append(period)
+
+        def output(self, pose, twist, reference):
+            calls.append(len(pose))
+            return super().output(pose, twist, reference)
+
+    slow = [s.model_copy(update={"motion_period": 0.05}) for s in THREE]
+    same(simulate(slow, motion=Counted), simulate(slow))
+    assert calls == [0.05] + [3] * 80
+
+
+def test_stanley():
+    """A known motion controller in a few lines drives the robot, and the result says whose it is."""
+    run = simulate(LAP, motion=Stanley)
+    assert not run.failed and str(run.label.item()) == "fel + Stanley" and str(run.feedforward.item()) == "fel"
+    assert float(np.hypot(run.longitudinal_error, run.lateral_error)[-200:].max()) < 0.1
+
+
+def breaking(stage, fault, after=100):
+    """A stage that does as the built-in one for a while, and then what `fault` makes of it."""
+    base = {"motion": Kanayama, "feedback": Feedback, "steering": Fork, "feedforward": Silent}[stage]
+
+    class Breaks(base):
+        calls = 0
+
+        def output(self, *given):
+            self.calls += 1
+            answer = np.array(super().output(*given))
+            return fault(answer) if self.calls > after else answer
+
+    return {stage: Breaks}
+
+
+class Silent:
+    """A feedforward of nothing."""
+
+    def __init__(self, robot, size):
+        self.size = size
+
+    def output(self, command, derivative):
+        return np.zeros_like(command)
+
+    def learn(self, feedback, saturated, twist, voltage):
+        pass
+
+
+def raises(answer):
+    raise ZeroDivisionError("too near")
+
+
+def spoilt(answer):
+    answer[1, 1] = np.inf
+    return answer
+
+
+FAULTS = {
+    "raises": (raises, "ZeroDivisionError: too near (test_stages.py, line "),
+    "shape": (lambda answer: answer[:, :1], "output is shape (3, 1), expected shape (3, 2)"),
+    "nothing": (lambda answer: None, "output is nothing, expected shape (3, 2)"),
+    "text": (lambda answer: "left", "ValueError: could not convert string to float: 'left'"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("stage", METHODS)
+def test_fault(stage, fault):
+    """What raises or does not fit ends its group with what it has; other groups never notice."""
+    other = SHORT.model_copy(update={"steering": "caster"})
+    what, message = FAULTS[fault]
+    whole = simulate([*THREE, other], **breaking(stage, what))
+    sound = simulate([*THREE, other])
+    tick = 99 if stage == "feedforward" else 100  # which is asked once before the first tick
+    for run in range(3):
+        text = str(whole.failure[run].item())
+        assert text.startswith(f"{stage} Breaks: {message}") and text.endswith(f", tick {tick}"), text
+        assert float(whole.failure_time[run]) == pytest.approx(0.01 * (tick + 1))
+        for name in SIGNALS:
+            values, expected = whole[name].values[run], sound[name].values[run]
+            assert np.array_equal(values[:tick], expected[:tick]) and np.isnan(values[tick:]).all(), name
+    # The other group has a robot alone, whose answers have other shapes.
+    text = str(whole.failure[3].item())
+    assert text.startswith(f"{stage} Breaks: ") and "(1, 2)" in text if "shape" in message else text
+
+
+@pytest.mark.parametrize("stage", METHODS)
+def test_not_finite(stage):
+    """A number that is none in one row stops that run, by name and tick, and no other."""
+    bare = [s.model_copy(update={"guard": Guard(on=False)}) for s in THREE]
+    whole, sound = simulate(bare, **breaking(stage, spoilt)), simulate(bare)
+    tick = 99 if stage == "feedforward" else 100
+    assert str(whole.failure[1].item()) == f"{stage} Breaks: not finite, tick {tick}"
+    assert whole.failed.values.tolist() == [False, True, False]
+    for run in (0, 2):
+        same(whole.isel(run=run), sound.isel(run=run))
+
+
+def test_guarded_feedforward():
+    """With the guard on, NaN in a feedforward is the guard's business: it falls back and the run goes on."""
+    whole = simulate(THREE, **breaking("feedforward", spoilt))
+    assert not whole.failed.any()
+    events = mrctl.guard_events(whole)
+    assert (events[events["run"] == 1]["reason"] == "output not finite").all() and len(events) == 1
+
+
+def test_blown_up_robot():
+    """A robot that blew up shows no NaN to somebody's stage, which may well raise on it."""
+
+    class Careful(Kanayama):
+        def output(self, pose, twist, reference):
+            assert np.isfinite(pose).all() and np.isfinite(twist).all()
+            return super().output(pose, twist, reference)
+
+    blown = THREE[1].model_copy(update={"events": (mrctl.Event(time=1.0, push=(1e12, 0.0, 1e15)),)})
+    whole = simulate([THREE[0], blown, THREE[2]], motion=Careful)
+    assert whole.failed.values.tolist() == [False, True, False]
+
+
+def test_inputs_are_copies():
+    """A stage that writes into what it is given harms nobody."""
+
+    class Careless(Kanayama):
+        def output(self, pose, twist, reference):
+            answer = super().output(pose, twist, reference)
+            pose[:], twist[:], reference[:] = 1e9, 1e9, 1e9
+            return answer
+
+    same(simulate(THREE, motion=Careless), simulate(THREE))
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ({"motor": Kanayama}, "motor: no such stage; there are motion, feedback, feedforward, steering"),
+        ({"motion": lambda robot: None}, "motion <lambda>: TypeError: "),
+        ({"motion": Silent}, "motion Silent: has no method reset"),
+        ({"feedforward": Kanayama}, "feedforward Kanayama: has no method learn"),
+        ({"feedback": lambda robot, size: robot.nothing}, "feedback <lambda>: AttributeError: "),
+    ],
+)
+def test_refused(own, message):
+    """What is no stage is refused before anything is computed."""
+    with pytest.raises(InputError, match="(?s)^" + message.replace("<", "[<]")):
+        simulate(SHORT, **own)
+
+
+def test_command_line(tmp_path, capsys):
+    """From a file: the same numbers as from Python, faults in the table's heading, mistakes in one line."""
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import numpy as np\n"
+        "from mrctl.control.kanayama import kanayama\n"
+        "class Mine:\n"
+        "    def __init__(self, robot, size): self.calls = 0\n"
+        "    def reset(self, pose, reference, period): pass\n"
+        "    def output(self, pose, twist, reference):\n"
+        "        self.calls += 1\n"
+        "        return kanayama(pose, reference[:, :3], reference[:, 3:5], np.array([3.0, 25.0, 10.0]))[1]\n"
+        "class Stops(Mine):\n"
+        "    def output(self, pose, twist, reference):\n"
+        "        return super().output(pose, twist, reference) if self.calls < 50 else 1 / 0\n"
+    )
+    scenario = tmp_path / "scenario.toml"
+    scenario.write_text(SHORT.to_toml())
+    run = ["run", str(scenario)]
+
+    def table(*more):
+        assert main([*run, *more]) == 0
+        return capsys.readouterr().out.splitlines()
+
+    plain, mine, stops = (
+        table(), table("--controller", f"motion={file}:Mine"), table("--controller", f"motion={file}:Stops")
+    )  # fmt: skip
+    assert mine[1:] == plain[1:] and f"motion={file}:Mine" in mine[0]
+    assert stops[1] == (
+        "failed after 0.51 s: motion Stops: ZeroDivisionError: division by zero (mine.py, line 11), tick 50"
+    )
+    for name, message in (
+        (f"{file}:Mine", "feedforward Mine: has no method learn"),
+        (f"motor={file}:Mine", "controller: 'motor' is no stage; there are motion, feedback, feedforward, steering"),
+        (f"motion={file}:Mine,motion={file}:Mine", "controller: motion is there twice"),
+        (f"motion={file}:Other", "controller: mine.py has no Other"),
+        ("motion=nowhere.py:Mine", "controller: no file nowhere.py"),
+    ):
+        assert main([*run, "--controller", name]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and message in error, error
+
+
+def test_sweep(tmp_path):
+    """In a sweep: a stage of your own by its file, and a fault of it in the table."""
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import numpy as np\n"
+        "class Late:\n"
+        "    def __init__(self, robot, size): self.calls = 0\n"
+        "    def reset(self, pose, reference, period): pass\n"
+        "    def output(self, pose, twist, reference):\n"
+        "        self.calls += 1\n"
+        "        if self.calls > 60: raise KeyError('late')\n"
+        "        return reference[:, 3:5]\n"
+    )
+    sweep = Sweep(base=SHORT, runs=2, controller=f"motion={file}:Late")
+    report = jobs.run(sweep, tmp_path / "store", workers=1)
+    assert report.failed == 2 and not report.aside
+    failure = mrctl.open(tmp_path / "store").failure.values
+    assert all(text == "motion Late: KeyError: 'late' (mine.py, line 7), tick 60" for text in failure)
+
+
+def test_company(tmp_path):
+    """In a sweep, what raises for one run costs no other run of its job."""
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "class Picky:\n"
+        "    def __init__(self, robot, size): pass\n"
+        "    def reset(self, pose, reference, period): pass\n"
+        "    def output(self, pose, twist, reference):\n"
+        "        assert (reference[:, 3] < 0.9).all(), 'too fast'\n"
+        "        return reference[:, 3:5]\n"
+    )
+    sweep = Sweep.from_dict(
+        {
+            "base": SHORT.model_dump(), "controller": f"motion={file}:Picky",
+            "axes": [{"field": "reference.radius", "values": [0.5, 0.6, 0.4]}],
+        }
+    )  # fmt: skip
+    assert jobs.run(sweep, tmp_path / "store", workers=1).failed == 1
+    failed = mrctl.open(tmp_path / "store").failed.values
+    assert failed.tolist() == [False, True, False]
+    assert jobs.repeat(tmp_path / "store", 0).verdict == "bit-identical"
