@@ -153,7 +153,12 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
 
 def _models(sweep: Sweep) -> dict[str, str]:
     """Digests of the compiled worlds with the robot, and of the files of a controller."""
-    worlds = {f"{world}, {steering}": mjcf.digest(mjcf.load(world, steering)) for world, steering in sweep.worlds}
+    worlds = {
+        f"{world}, {steering}" + (f", {robot.path}" if robot != mjcf.CAR else ""): mjcf.digest(
+            mjcf.load(world, steering, robot=robot)
+        )
+        for world, steering, robot in sweep.worlds
+    }
     return worlds | ({sweep.controller: controller.digest(sweep.controller)} if sweep.controller else {})
 
 

@@ -16,12 +16,12 @@ LAYERS = (
     {"laws", "references"},
     {"scenario"},
     {"control.hierarchy", "measurement", "comparison", "metrics", "plots", "result"},
-    {"model", "plant"},
+    {"adopt", "model", "plant"},
     {"simulate", "checks"},
     {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment"},
     {"cli"},
 )
-ENGINE = {"model", "plant", "checks", "viewer", "environment", "experiments"}
+ENGINE = {"adopt", "model", "plant", "checks", "viewer", "environment", "experiments"}
 
 
 def module_of(path: Path) -> str:
