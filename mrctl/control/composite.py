@@ -15,8 +15,9 @@ on a regressor biases its weight toward zero.
 
 The weights are taken to wander as an Ornstein-Uhlenbeck process whose stationary covariance P₀ is how they scatter over
 the plants of the training: it tells the filter what plants differ in, and P stays below P₀ where nothing is excited. d
-does the same, fast: what is no function of the motion, such as a push, goes there. The heading that slope features need
-is dead reckoning; from where it counts does not matter. The tracking term moves a along P φ(x) by a share of the
+does the same, fast: what is no function of the motion, such as a push, goes there. When the innovations grow at once,
+the plant has changed, and P begins again at P₀. The heading that slope features need is dead reckoning; from where it
+counts does not matter. The tracking term moves a along P φ(x) by a share of the
 feedback voltage, like `rls`.
 
 Under `rigid` steering the second channel is treated alike: what is asked of the steering stands for the voltage, its
@@ -47,6 +48,8 @@ STEERING_SCALE = 0.1  # rad/s that count on a steering channel as one volt does 
 STEERING_DISTURBANCE = 0.03  # rad/s of disturbance per volt: less, since the geometry holds without a motor
 OUTLIER = 3.0  # standard deviations beyond which a sample pulls no harder: a tyre slips, a wheel lost its load
 SLOW = 0.1  # m/s of the faster wheel; below it stiction, not the motion, decides about the voltage
+BRIEF, LASTING = 0.25, 4.0  # s over which innovations are averaged, to see a change of the plant
+CHANGE = 6.0  # times the lasting mean square of the innovations that the brief one of a changed plant exceeds
 SETTLED = 6.0  # time constants until two filters have forgotten how they began
 SHIPPED = Path(__file__).with_suffix(".safetensors")
 
@@ -155,17 +158,30 @@ def _times(covariance, vector, out):  # noqa: ANN001, ANN202
             out[i] += covariance[j, i] * vector[j]
 
 
+@njit
+def _reset(prior, disturbance, covariance):  # noqa: ANN001, ANN202
+    """P of a and d as at the start."""
+    n = prior.shape[0]
+    for i in range(n):
+        covariance[i, n] = covariance[n, i] = 0.0
+        for j in range(n):
+            covariance[i, j] = prior[i, j]
+    covariance[n, n] = disturbance * disturbance
+
+
 @guvectorize(
-    [(float64[:], float64, float64[:], float64, float64[:], float64[:, :], float64[:], float64[:, :])],
-    "(n),(),(n),(),(s),(n,n),(m),(m,m)",
-    writable_args=("weights", "covariance"),
+    [(float64[:], float64, float64[:], float64, float64[:], float64[:, :], float64[:], float64[:], float64[:, :])],
+    "(n),(),(n),(),(s),(n,n),(k),(m),(m,m)",
+    writable_args=("usual", "weights", "covariance"),
     cache=True,
 )
-def adapt(measured, residual, commanded, feedback, settings, prior, weights, covariance):  # noqa: ANN001, ANN201
+def adapt(measured, residual, commanded, feedback, settings, prior, usual, weights, covariance):  # noqa: ANN001, ANN201
     """One composite step for one channel of one robot.
 
     Prediction: the Kalman filter for residual = φ a + d. Its innovation counts for no more than 3 standard deviations
-    (Huber). Between samples a ← f a, P ← f² P + (1 − f²) P₀, likewise for d.
+    (Huber). Between samples a ← f a, P ← f² P + (1 − f²) P₀, likewise for d. When the innovations are suddenly much
+    larger than usual, the plant has changed: what was certain is so no more, P ← P₀ (covariance resetting; Goodwin and
+    Sin, 1984), and the weights stay.
     Tracking: a ← a + P φ_c e · step/(φ_cᵀ P φ_c), which moves φ_c a by `step` times the feedback e.
 
     Args:
@@ -173,8 +189,10 @@ def adapt(measured, residual, commanded, feedback, settings, prior, weights, cov
         residual: Filtered voltage less the model's, V.
         commanded: φ_c at the command that the feedback belongs to `(n,)`.
         feedback: V.
-        settings: Noise, f of a, f of d, standard deviation of d, step, dead zone, `(6,)`.
+        settings: Noise, f of a, f of d, standard deviation of d, step, dead zone, weight of a new sample in the brief
+            and the lasting mean, `(8,)`.
         prior: P₀ of a, `(n, n)`.
+        usual: In and out: brief and lasting mean square of the innovations, V², `(2,)`.
         weights: In and out: a, and d last, `(n + 1,)`.
         covariance: In and out: P of both, `(n + 1, n + 1)`.
     """
@@ -190,7 +208,10 @@ def adapt(measured, residual, commanded, feedback, settings, prior, weights, cov
         total += x[i] * gain[i]
         innovation -= x[i] * weights[i]
     bound = OUTLIER * np.sqrt(total)
-    innovation = max(-bound, min(bound, innovation)) / total
+    innovation = max(-bound, min(bound, innovation))
+    for i in range(2):
+        usual[i] += settings[6 + i] * (innovation * innovation - usual[i])
+    innovation /= total
     for i in range(n):
         weights[i] = slow * (weights[i] + gain[i] * innovation)
         for j in range(n):
@@ -210,6 +231,9 @@ def adapt(measured, residual, commanded, feedback, settings, prior, weights, cov
         if power > 0:
             for i in range(n):
                 weights[i] += step / power * feedback * gain[i]
+    if usual[0] > CHANGE * usual[1]:
+        usual[1] = usual[0]
+        _reset(prior, settings[3], covariance)
 
 
 _features, _basis, _adapt = one(features), one(basis), one(adapt)
@@ -221,10 +245,10 @@ SIGNALS = 6
 # What is kept of one robot; `once` and `twice` are the filtered signals.
 STATE = np.dtype(
     [
-        ("settings", "f8", (CHANNELS, 6)), ("share", "f8"), ("rigid", "f8"),
+        ("settings", "f8", (CHANNELS, 8)), ("share", "f8"), ("rigid", "f8"),
         ("command", "f8", CHANNELS), ("phi", "f8", FEATURES), ("output", "f8", CHANNELS), ("added", "f8", CHANNELS),
         ("age", "f8"), ("heading", "f8"), ("signals", "f8", SIGNALS), ("once", "f8", SIGNALS), ("twice", "f8", SIGNALS),
-        ("weights", "f8", (CHANNELS, FEATURES + 1)),
+        ("usual", "f8", (CHANNELS, 2)), ("weights", "f8", (CHANNELS, FEATURES + 1)),
         ("covariance", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)), ("norm", "f8", (1,)),
     ],
     align=True,
@@ -290,8 +314,9 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
                         residual -= model[k, j] * x[j]
                     before = _learned(s.weights[k], s.phi)
                     _adapt(
-                        phi, residual, s.phi, feedback[i, k], s.settings[k], priors[k], s.weights[k], s.covariance[k]
-                    )
+                        phi, residual, s.phi, feedback[i, k], s.settings[k], priors[k], s.usual[k], s.weights[k],
+                        s.covariance[k],
+                    )  # fmt: skip
                     s.added[k] = _learned(s.weights[k], s.phi) - before
             else:  # only the disturbance fades
                 for k in range(CHANNELS):
@@ -337,8 +362,9 @@ class CompositeAdaptation:
         state["share"] = [period / (period + s.filter) for s in settings]
         for row, s in enumerate(settings):
             memories = np.exp(-period / np.array([s.memory, s.disturbance_memory]))
-            common = np.array([s.noise, *memories, s.disturbance, s.step, s.dead_zone])
-            second = common * [STEERING_SCALE, 1, 1, STEERING_DISTURBANCE, STEERING_SHARE, STEERING_SCALE]
+            means = period / (period + np.array([BRIEF, LASTING]))
+            common = np.array([s.noise, *memories, s.disturbance, s.step, s.dead_zone, *means])
+            second = common * [STEERING_SCALE, 1, 1, STEERING_DISTURBANCE, STEERING_SHARE, STEERING_SCALE, 1, 1]
             state["settings"][row] = common, second if rigid else common
         self._output, self._added, self.weight_norm = state["output"], state["added"], state["norm"][:, 0]
         self.restore(np.arange(len(settings)))
@@ -351,6 +377,7 @@ class CompositeAdaptation:
             state["covariance"][row] = 0.0
             state["covariance"][row, :, :FEATURES, :FEATURES] = self._priors
             state["covariance"][row, :, FEATURES, FEATURES] = state["settings"][row, :, 3] ** 2
+            state["usual"][row] = state["settings"][row, :, :1] ** 2
 
     def output(self, command: Array, derivative: Array) -> Array:
         """The model, what is adapted at the commanded motion, and the disturbance."""

@@ -325,8 +325,9 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
                 s.features, hidden[i], feedback[i], saturated[i], s.targets, s.steps, prior[i], error, gradient,
                 weights[i], s.norm, s.output,
             )  # fmt: skip
+            held = s.norm[0] >= s.steps[2]  # at the bound: what is gained here is lost elsewhere
             for k in range(OUTPUTS):
-                s.added[k] = s.output[k] - s.added[k]
+                s.added[k] = 0.0 if held else s.output[k] - s.added[k]
 
     return respond, teach
 
@@ -380,6 +381,10 @@ class FeedbackErrorLearning:
         return self._output
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
-        """One step on the features of the last output; returns what it added to that output."""
+        """One step on the features of the last output.
+
+        Returns:
+            What it added to that output; nothing at the bound of the weights, where the PID must keep what it holds.
+        """
         _teach(feedback, saturated, self._rows, self.prior, self.state["weights"], self._hidden)
         return self._added

@@ -118,7 +118,8 @@ class ModuleLearning:
         norm = torch.where(active, distance.clamp_max(self._bound), torch.from_numpy(self.weight_norm))
         self.weight_norm = norm.numpy()
         with torch.no_grad():
-            return (scale * (self._forward(self.state) - before)).numpy()
+            added = scale * (self._forward(self.state) - before)
+        return torch.where((norm >= self._bound)[:, None], 0.0, added).numpy()
 
 
 def _square(layers: dict[str, torch.Tensor]) -> torch.Tensor:

@@ -185,7 +185,7 @@ def page(
         "more than 20), which is infinite where one failed. “beats”: probability of the smaller error in the same run, "
         "with the 95 % interval of the last one. Recovery: geometric mean of the error of a lap over that of the lap "
         "before the change, run by run; recovered is back to stay within 1.2 times, from the second lap on at the "
-        "latest, in V / θ̇ / position.</p>",
+        "latest, in V / θ̇ / position; settled is the last lap before the return.</p>",
     ]
     for title, text in tables.items():
         body.append(f"<details><summary>{html.escape(title)}</summary><div class=wide>{_table(text)}</div></details>")

@@ -22,7 +22,8 @@ from mrctl.store import open_store
 from mrctl.sweep import Sweep
 
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
-RIVALS = {"none": "PID", "model": "model"}
+TITLES = {"none": "PID"}  # of feedforwards in the tables
+YARDSTICKS = ("none", "model")  # whom the tables compare everyone with
 CHUNK = 32  # runs in a job: enough for a batch, and few that a worker waits for at the end
 
 
@@ -107,8 +108,8 @@ def runs_of(chosen: Sequence[Case], laps: Laps) -> dict[str, Laps]:
 def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str, Any]]:
     """What the tables show: a row a case and feedforward, in the order of `PARTS`.
 
-    Of the last lap: mean with 95 % bootstrap interval, the worst 5 % (infinite where a run failed), ratio to and
-    probability of beating PID and `model` in the same run. Of a step: see `_step`.
+    Of the last lap: mean with 95 % bootstrap interval, the worst 5 % (infinite where a run failed), ratio to PID and to
+    `model`, and probability of beating each of the others, in the same run. Of a step: see `_step`.
     """
     rows = []
     for case in sorted(chosen, key=lambda case: [*PARTS].index(case.part)):
@@ -124,11 +125,11 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
             for metric in COLUMNS:
                 samples = own[metric].to_numpy(float)
                 row[metric] = {**bootstrap_interval(samples)._asdict(), "worst": cvar(samples)}
-                for rival, title in RIVALS.items():
-                    if rival in ends and rival != name:
-                        theirs = ends[rival][metric].to_numpy(float)
+                for rival in (one for one in ends if one != name):
+                    theirs, title = ends[rival][metric].to_numpy(float), TITLES.get(rival, rival)
+                    row[metric][f"beats_{title}"] = superiority(samples, theirs)._asdict()
+                    if rival in YARDSTICKS:
                         row[metric][f"to_{title}"] = paired_ratio(samples, theirs)._asdict()
-                        row[metric][f"beats_{title}"] = superiority(samples, theirs)._asdict()
                 if case.back:
                     row[metric] |= _step(found[case.name][name], metric, case)
             rows.append(row)
@@ -136,15 +137,16 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
 
 
 def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:
-    """Recovery and forgetting, run by run against the error in the lap before the change."""
+    """Recovery and forgetting, run by run against the error in the lap before the change, and where that settles."""
     error = laps[metric].values
-    before = error[:, case.change - 2]
+    before, settled = error[:, case.change - 2], error[:, case.back - 2]
     after = {"in_first_lap": case.change, "after_one_lap": case.change + 1}
     after |= {"return_first_lap": case.back, "return_after_one_lap": case.back + 1}
     found: dict[str, Any] = {name: paired_ratio(error[:, lap - 1], before)._asdict() for name, lap in after.items()}
     needed = metrics.recovery_laps(laps, metric, case.change, case.back - 1, BAND).values
     worst = {f"{name}_worst": cvar(error[:, lap - 1] / before) for name, lap in after.items()}
-    found["during"] = bootstrap_interval(error[:, case.back - 2])._asdict()
+    found["after_one_lap_to_settled"] = paired_ratio(error[:, case.change], settled)._asdict()
+    found["during"] = bootstrap_interval(settled)._asdict()
     return found | worst | {"recovery_laps": needed.tolist(), "recovered_within_one_lap": float(np.mean(needed <= 1))}
 
 
@@ -172,15 +174,17 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
         cells = [
             [
                 row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", *(_mean(row[m]) for m in COLUMNS),
-                *(_wins(row, rival) for rival in RIVALS.values()),
+                *(_wins(row, TITLES.get(one, one)) for one in YARDSTICKS),
                 *([number(row["guard_events"])] if guarded else []),
             ]
             for row in own
         ]  # fmt: skip
         if own:
             tables[title] = markdown(header, cells)
+    if any(row["feedforward"] != "oracle" for row in rows):
+        tables["Best in each case, and who is level with it"] = markdown(["case", *COLUMNS.values()], leaders(rows))
     header = ["case", "feedforward", "failed", "first lap", "one lap later; worst 5 %", "recovered in V / θ̇ / position"]
-    header += ["return: first lap", "one lap later; worst 5 %"]
+    header += ["one lap later over settled", "return: first lap", "one lap later; worst 5 %"]
     cells = []
     for row in rows:
         if row["part"] == "step":
@@ -192,10 +196,28 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
                 f"{text}; {number(error[f'{name}_worst'])}×" for text, name in ((later, names[1]), (settled, names[3]))
             )
             cells.append([row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", first, later, within])
-            cells[-1] += [back, settled]
+            cells[-1] += [f"{number(error['after_one_lap_to_settled']['value'])}×", back, settled]
     if cells:
         tables["Recovery and forgetting: position error over that before the step"] = markdown(header, cells)
     return tables
+
+
+def leaders(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Case by case and metric by metric: the least mean but that of the oracle, who knows the plant, and who is level.
+
+    Level is whom the best does not beat with 95 % confidence in the same runs; a failed run excludes.
+    """
+    lines = []
+    for case in dict.fromkeys(row["case"] for row in rows):
+        own = {r["feedforward"]: r for r in rows if r["case"] == case and r["feedforward"] != "oracle"}
+        fine = [name for name, row in own.items() if not row["failed"]] or list(own)
+        cells = []
+        for metric in COLUMNS:
+            best, *others = sorted(fine, key=lambda name: own[name][metric]["value"])
+            level = [o for o in others if own[best][metric][f"beats_{TITLES.get(o, o)}"]["low"] <= 0.5]
+            cells.append(", ".join(TITLES.get(name, name) for name in (best, *level)))
+        lines.append([case, *cells])
+    return lines
 
 
 def _mean(error: dict[str, Any]) -> str:

@@ -18,7 +18,11 @@ WORLDS = ("flat", "slope", "rough", "patch")
 
 
 class Controls:
-    """An input for every field of a record that is a number, a choice or a switch; records in it become folders."""
+    """An input for every field of a record that is a number, a choice or a switch; records in it become folders.
+
+    Of a record that comes in several kinds, every kind has its folder and the present one is seen. None is ever taken
+    away: a browser that is behind applies what it was sent in one go, removals first, and complains about the rest.
+    """
 
     def __init__(self, gui: viser.GuiApi, changed: Changed) -> None:
         """Takes the page's GUI and what is told of a change: the path of the field, and its new value."""
@@ -41,12 +45,16 @@ class Controls:
     def _add(self, value: Any, field: FieldInfo, path: tuple[str, ...]) -> None:  # noqa: ANN401
         label, hint = path[-1].replace("_", " "), field.description
         if isinstance(value, Record):
-            self._folders[path] = self._gui.add_folder(label, expand_by_default=len(path) == 1)
-            with self._folders[path]:
-                if kinds := _kinds(field):
-                    kind = value.model_dump()["kind"]
-                    self._listen(path, self._gui.add_dropdown("kind", kinds, initial_value=kind))
-                return self.add(value, path)
+            with self._gui.add_folder(label, expand_by_default=len(path) == 1):
+                if not (kinds := _kinds(field)):
+                    return self.add(value, path)
+                kind = type(value).model_fields["kind"].default
+                self._listen(path, self._gui.add_dropdown("kind", tuple(kinds), initial_value=kind))
+                for name, alternative in kinds.items():
+                    self._folders[*path, name] = self._gui.add_folder(None, visible=name == kind)
+                    with self._folders[*path, name]:
+                        self.add(value if name == kind else alternative(), (*path, name))
+                return
         if typing.get_origin(field.annotation) is Literal and len(typing.get_args(field.annotation)) > 1:
             handle = self._gui.add_dropdown(label, typing.get_args(field.annotation), initial_value=value, hint=hint)
         elif path == ("world",):
@@ -67,30 +75,36 @@ class Controls:
 
     def _listen(self, path: tuple[str, ...], handle: Any) -> None:  # noqa: ANN401
         self._inputs[path] = handle
+        field = path[:-2] + path[-1:] if path[:-1] in self._folders else path  # the kind is no part of a field's path
 
         @handle.on_update
         async def _(event: viser.GuiEvent) -> None:
             if event.client is not None:
-                self._changed(path, handle.value)
+                self._changed(field, handle.value)
 
     def show(self, record: Record, path: tuple[str, ...] = ()) -> None:
         """Sets the inputs below a path to the values of a record."""
-        for name in type(record).model_fields:
+        for name, field in type(record).model_fields.items():
             value, where = getattr(record, name), (*path, name)
             if isinstance(value, Record):
+                if where in self._inputs:
+                    kind = type(value).model_fields["kind"].default
+                    self._set(where, kind)
+                    for other in _kinds(field):
+                        self._folders[*where, other].visible = other == kind
+                    where = (*where, kind)
                 self.show(value, where)
-            elif where in self._inputs and self._inputs[where].value != value:
-                self._inputs[where].value = value
+            elif where in self._inputs:
+                self._set(where, value)
 
-    def remove(self, path: tuple[str, ...]) -> None:
-        """Takes the folder of a record away."""
-        self._folders.pop(path).remove()
-        self._inputs = {where: handle for where, handle in self._inputs.items() if where[: len(path)] != path}
+    def _set(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
+        if self._inputs[path].value != value:
+            self._inputs[path].value = value
 
 
-def _kinds(field: FieldInfo) -> tuple[str, ...]:
-    """The alternatives of a record that comes in several kinds."""
-    return tuple(kind.model_fields["kind"].default for kind in typing.get_args(field.annotation) if field.discriminator)
+def _kinds(field: FieldInfo) -> dict[str, type[Record]]:
+    """The alternatives of a record that comes in several kinds, by kind."""
+    return {k.model_fields["kind"].default: k for k in typing.get_args(field.annotation) if field.discriminator}
 
 
 def _limits(field: FieldInfo, value: float) -> tuple[float, float, float] | None:

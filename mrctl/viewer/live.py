@@ -75,6 +75,7 @@ class Live(Page):
 
     def _build(self) -> None:
         gui, tabs = self.server.gui, self.server.gui.add_tab_group()
+        self._plots = Plots(gui, self.curves)
         with tabs.add_tab("Drive"):
             self._status = gui.add_html("")
             self._play = gui.add_button_group("", ("play", "pause", "step", "reset"))
@@ -107,8 +108,7 @@ class Live(Page):
             self._learning = gui.add_checkbox("learning", True)
             self.on(self._learning, lambda on: self._happen(learning=on))
             self._controls.add(first, only=[n for n in changing if n not in (*RUN, "perturbation", "feedforward")])
-        self._run = tabs.add_tab("Run")
-        with self._run:
+        with tabs.add_tab("Run"):
             self._controls.add(first, only=RUN)
 
     def _stage(self) -> None:
@@ -119,11 +119,9 @@ class Live(Page):
         if self._cast != cast:
             if self._cast is not None:
                 self._scene.remove()
-                self._plots.remove()
             self._cast = cast
             self._scene = Scene(self.server, session.simulations[0][1].model, labels)
-            with self.curves:
-                self._plots = Plots(self.server.gui, labels, session.period)
+            self._plots.cast(labels, session.period)
         self._scene.show_reference(first)
         self._scene.forget_trails()
         self._controls.show(first)
@@ -186,10 +184,6 @@ class Live(Page):
         new = [changed(self._present(s), path, value) for s in touched] + [self._present(s) for s in others]
         new = [new[0], *(s for s in new[1:] if name != "feedforward" or s.feedforward != value)]
         self._restart(new)
-        if path == ("reference",):
-            self._controls.remove(("reference",))
-            with self._run:
-                self._controls.add(self.session.start[0], only=["reference"])
 
     def _present(self, scenario: Scenario) -> Scenario:
         """A scenario that starts as things are now."""

@@ -98,21 +98,36 @@ def _moving_mean(values: Array, window: int) -> Array:
 
 
 class Plots:
-    """uPlot charts in the page."""
+    """uPlot charts in the page.
 
-    def __init__(self, gui: viser.GuiApi, labels: Sequence[str], period: float, cursor: bool = False) -> None:
-        """Adds empty charts where the GUI's context is.
+    A set of charts for each number of robots that comes, of which one is seen; as with `Controls`, nothing is removed.
+    """
+
+    def __init__(self, gui: viser.GuiApi, tab: viser.GuiTabHandle, cursor: bool = False) -> None:
+        """Takes the page's GUI and the tab where the charts go; with a cursor, `show` will be told where it stands."""
+        self._gui, self._tab, self._cursor = gui, tab, cursor
+        self._sets: dict[int, list[viser.GuiUplotHandle]] = {}
+        with tab:
+            self._legend = gui.add_html("")
+
+    def cast(self, labels: Sequence[str], period: float) -> None:
+        """Says whose curves come.
 
         Args:
-            gui: The page's GUI.
             labels: A name a robot.
             period: Time between samples in s.
-            cursor: `show` will be given one.
         """
         self._labels, self._period = labels, period
-        self._legend = gui.add_html(legend(labels))
-        empty = charts(np.full((2, len(labels), len(SIGNALS)), np.nan), labels, period)
-        self._handles = [_add(gui, chart, cursor) for chart in empty]
+        self._legend.content = legend(labels)
+        size = min(len(labels), MOST)
+        if size not in self._sets:
+            empty = charts(np.full((2, size, len(SIGNALS)), np.nan), labels[:size], period)
+            with self._tab:
+                self._sets[size] = [_add(self._gui, chart, self._cursor) for chart in empty]
+        for count, handles in self._sets.items():
+            for handle in handles:
+                handle.visible = count == size
+        self._handles = self._sets[size]
 
     def show(self, time: Array, log: Array, step: int, cursor: float | None = None) -> None:
         """Draws a record.
@@ -127,11 +142,6 @@ class Plots:
             curves = [np.ascontiguousarray(curve.values[::step]) for curve in chart.curves]
             at = np.ascontiguousarray(time[::step])
             handle.data = (at, *curves) if cursor is None else _with_cursor(at, curves, cursor)
-
-    def remove(self) -> None:
-        """Takes the charts away."""
-        for handle in (self._legend, *self._handles):
-            handle.remove()
 
 
 def legend(labels: Sequence[str]) -> str:

@@ -48,6 +48,7 @@ class Replay(Page):
 
     def _build(self, run: int) -> None:
         gui, table = self.server.gui, self.library.table
+        self._plots = Plots(gui, self.curves, cursor=True)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Replay"):
             self._status = gui.add_html("")
@@ -135,12 +136,10 @@ class Replay(Page):
         labels = names(recordings, runs)
         if self.recordings:
             self._scene.remove()
-            self._plots.remove()
         self.runs, self.recordings = list(runs), recordings
         self._scene = Scene(self.server, recordings[0].model, labels)
         self._scene.show_recordings(recordings)
-        with self.curves:
-            self._plots = Plots(self.server.gui, labels, recordings[0].period, cursor=True)
+        self._plots.cast(labels, recordings[0].period)
         self._times, self._log = together(recordings)
         self.duration = float(self._times[-1])
         self.scrubber.max = self.duration

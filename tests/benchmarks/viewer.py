@@ -2,16 +2,24 @@
 
 For one and for sixteen robots: median of simulated over wall time, taken each second; the share of control ticks that
 began more than a period after they were due; pictures and curves that the page was sent; growth of memory.
+
+`python tests/benchmarks/viewer.py rough [SECONDS]` instead treats it roughly, without a browser: visitors that come and
+go and set inputs at random, five times a second. Memory every minute, and the
+slope of it, less the session's record, in the second half.
 """
 
+import contextlib
+import random
 import shutil
 import statistics
 import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 from playwright.sync_api import sync_playwright
+from viser._messages import GuiUpdateMessage
 
 from mrctl import Scenario
 from mrctl.viewer.live import Live
@@ -24,6 +32,11 @@ def resident() -> float:
     """Memory of this process in MiB."""
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) / 256
+
+
+def recorded(live: Live) -> float:
+    """What the session keeps in order to be saved and drawn, in MiB; it grows with simulated time, and goes with it."""
+    return sum(simulation.log[: simulation.tick].nbytes for _, simulation in live.session.simulations) / 2**20
 
 
 def measure(robots: int, seconds: int) -> None:
@@ -78,6 +91,49 @@ def measure(robots: int, seconds: int) -> None:
         server.stop()
 
 
+def rough(seconds: int) -> None:
+    """Prints memory while visitors do whatever comes to their minds."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "system"))
+    from test_viewer_server import CAMERA, _random_value, client, packed
+
+    rng, server = random.Random(1), Server(port=0)
+    live = Live([Scenario()], server)
+    inputs = list(server.gui._gui_input_handle_from_uuid.values())
+    loop = threading.Thread(target=live.run)
+    loop.start()
+    start, samples, actions = time.monotonic(), [], 0
+    try:
+        while (now := time.monotonic() - start) < seconds:
+            with client(server) as visitor:
+                visitor.send(packed(CAMERA))
+                for _ in range(25):
+                    handle = rng.choice(inputs)
+                    value = _random_value(handle, rng)
+                    visitor.send(packed(GuiUpdateMessage(handle._impl.uuid, {"value": value})))
+                    actions += 1
+                    end = time.monotonic() + 0.2
+                    with contextlib.suppress(TimeoutError):
+                        while (left := end - time.monotonic()) > 0:
+                            visitor.recv(timeout=left)
+            samples.append((now, resident() - recorded(live)))
+            if now // 60 > (samples[-2][0] // 60 if len(samples) > 1 else -1):
+                print(
+                    f"{now:4.0f} s: {resident():.0f} MiB, of which the record of the session {recorded(live):.0f}; "
+                    f"{actions} actions, {len(live.session.start)} robots"
+                )
+        late = [(t, m) for t, m in samples if t > seconds / 2]
+        slope = statistics.linear_regression(*zip(*late, strict=True)).slope
+        print(f"{actions} actions, alive: {loop.is_alive()}, {60 * slope:+.2f} MiB/min in the second half")
+    finally:
+        live.close()
+        loop.join()
+        server.stop()
+
+
 if __name__ == "__main__":
-    for robots in (1, 16):
-        measure(robots, int(sys.argv[1]) if len(sys.argv) > 1 else 60)
+    mode, *rest = sys.argv[1:] if "rough" in sys.argv else ["watched", *sys.argv[1:]]
+    if mode == "rough":
+        rough(int(rest[0]) if rest else 600)
+    else:
+        for robots in (1, 16):
+            measure(robots, int(rest[0]) if rest else 60)

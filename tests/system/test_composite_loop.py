@@ -52,6 +52,19 @@ def test_slope():
     assert float(laps.position_rmse[1]) < float(laps.position_rmse[0]) / 3
 
 
+def test_recovery():
+    """Within one lap of a change the error is near the one at which it settles, and on return near that of before."""
+    heavy, weak = PERTURBATIONS["mass +50 %"], PERTURBATIONS["supply -20 %"]
+    steps = [
+        (Event(time=4 * LAP, perturbation=case), Event(time=8 * LAP, perturbation=Perturbation()))
+        for case in (heavy, weak)
+    ]
+    error = per_lap(simulate([scenario("composite", Perturbation(), laps=10, events=e) for e in steps])).position_rmse
+    before, settled = error[:, 3], error[:, 7]
+    assert (error[:, 5] < 1.35 * settled).all() and (settled < 1.3 * before).all()
+    assert (error[:, 9] < 1.25 * before).all()
+
+
 @pytest.mark.parametrize("steering", ["caster", "rigid"])
 def test_alone_or_together(steering):
     """A robot of a batch is the same scenario run alone, bit for bit, through a change of the plant."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Scenario, save_weights, simulate
+from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Scenario, per_lap, save_weights, simulate
 from mrctl.control.fel import initial_weights, unflatten
 
 BASE = Scenario(
@@ -117,3 +117,10 @@ def test_torch_module(runs):
     )
     assert not learned.failed.any() and float(learned.weight_norm[0, -1]) > 0
     assert rms(learned.feedback_left[0, TICKS // 2 :]) < rms(lap(runs.isel(run=1), 0).feedback_left[TICKS // 2 :])
+
+
+def test_too_small_a_bound():
+    """A network at the bound of its weights helps less, but does not talk the PID out of what it holds."""
+    small = Scenario(laps=2, fel=Fel(weight_bound=7.0, output_scale=0.76), initial_spread=(0, 0, 0))
+    bound, alone = per_lap(simulate([small, small.model_copy(update={"feedforward": "none"})])).position_rmse[:, 1]
+    assert bound < alone

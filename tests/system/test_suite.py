@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import stats
 
 import mrctl
 from mrctl import cli, plots
@@ -130,6 +131,26 @@ def test_recovery(whole: Path) -> None:
     assert row["after_one_lap"]["value"] == pytest.approx(np.exp(np.log(laps[:, 3] / laps[:, 1]).mean()))
     assert row["return_first_lap"]["value"] == pytest.approx(np.exp(np.log(laps[:, 4] / laps[:, 1]).mean()))
     assert row["recovered_within_one_lap"] == np.mean(laps[:, 3] <= 1.2 * laps[:, 1])
+    assert row["after_one_lap_to_settled"]["value"] == pytest.approx(np.exp(np.log(laps[:, 3] / laps[:, 3]).mean()))
+
+
+def test_leaders() -> None:
+    """The least mean, and whom it does not beat by Wilson's interval; the oracle and who failed are out of it."""
+    random = np.random.default_rng(0)
+    errors = {"none": 5 + random.random(10), "model": 2 + random.random(10), "rls": 2.1 + random.random(10)}
+    errors |= {"oracle": random.random(10), "fel": np.where(np.arange(10) == 3, np.nan, 0.1)}
+    rows = []
+    for name, own in errors.items():
+        row = {"case": "a", "feedforward": name, "failed": int(np.isnan(own).sum())}
+        for metric in suite.COLUMNS:
+            row[metric] = {"value": np.nanmean(own)}
+            for rival, theirs in errors.items():
+                wins = int((np.nan_to_num(own, nan=np.inf) < np.nan_to_num(theirs, nan=np.inf)).sum())
+                low = stats.binomtest(wins, 10).proportion_ci(method="wilson").low
+                row[metric][f"beats_{'PID' if rival == 'none' else rival}"] = {"low": low}
+        rows.append(row)
+    assert 0.2 < np.mean(errors["model"] < errors["rls"]) < 0.9
+    assert suite.leaders(rows) == [["a", *["model, rls"] * 3]]
 
 
 def test_goes_on_where_it_stopped(whole: Path, tmp_path: Path) -> None:

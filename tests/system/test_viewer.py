@@ -136,6 +136,15 @@ def test_live(browser, tmp_path):
         assert without[t > dropped].max() > 1.1 * without[(t > dropped - 0.3) & (t < dropped)].max()
         assert t[-1] == pytest.approx(live.session.time, abs=0.1)
 
+        tick = live.session.tick
+        page.get_by_text("step", exact=True).click()
+        until(lambda: live.session.tick == tick + 1, "a single step")
+        page.get_by_label("Camera follows").click()  # the robot stays, and the world moves
+        until(lambda: np.allclose(node(page, "/world")[:2], -node(page, ROBOT)[:2], atol=1e-3), "the world to move")
+        page.get_by_label("Camera follows").click()
+        until(lambda: np.allclose(node(page, "/world"), 0), "the world to be back")
+        assert live.session.tick == tick + 1
+
 
 def test_inputs(browser, tmp_path):
     """A slider becomes an event, a choice another run, a ghost is added; a mistake in a tick is shown, and mended."""
@@ -152,6 +161,10 @@ def test_inputs(browser, tmp_path):
         until(lambda: [s.feedforward for s in live.session.start] == ["fel", "rls"], "the ghost")
         assert live.session.start[1].perturbation.mass_factor == pytest.approx(1.03)  # goes on as things were
         until(lambda: node(page, "/world/ghosts/chassis") is not None, "the ghost in the scene")
+        live.ask(live._compare, "rls", False)  # while the page is busy: it gets all of this at once
+        live.ask(live._wish, ("reference",), "rounded_square")
+        page.evaluate("() => { const end = performance.now() + 2000; while (performance.now() < end); }")
+        until(lambda: live.session.start[0].reference.kind == "rounded_square", "another reference")
 
         genuine, live.session.step = live.session.step, lambda: 1 / 0
         page.get_by_role("tab", name="Drive").click()

@@ -1,8 +1,11 @@
 """What an input of the page changes is what the same scenario file would change."""
 
+import typing
+
 import pytest
 
 from mrctl import Scenario
+from mrctl.references import Reference
 from mrctl.viewer.live import Live
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import CHANGEABLE
@@ -26,34 +29,39 @@ def other(handle):
 
 def test_every_input(live):
     """Each is in the scenario or in an event of the session thereafter; those that need another run begin one."""
-    start = Scenario()
-    seen = 0
-    for path, handle in list(live._controls._inputs.items()):
-        live._restart([start])
+    kinds = {kind.model_fields["kind"].default: kind() for kind in typing.get_args(Reference.__origin__)}
+    seen = []
+    for where, handle in list(live._controls._inputs.items()):
+        kind = where[1] if where[0] == "reference" and len(where) == 3 else None
+        path = (where[0], where[2]) if kind else where
+        live._restart([Scenario(reference=kinds[kind], steering="rigid") if kind else Scenario()])
         live.session.step()
         value = other(handle)
         if path == ("perturbation", "control_delay"):
             value = 0.12  # in whole control periods
+        if path == ("reference",):
+            value = "circle"
+        if kind and isinstance(value, float):  # a little, within what the robot can do
+            value = handle.value - max(1, round(handle.value / 20 / handle.step)) * handle.step
         live._wish(path, value)
         live._grant()
-        assert live.message == "", path
+        assert live.message == "", where
         saved = live.session.saved()[0]
         changing = path[0] in CHANGEABLE
         found = saved.events[-1] if changing else saved
         for name in path:
             found = getattr(found, name)
-        assert getattr(found, "kind", found) == (pytest.approx(value) if isinstance(value, float) else value), path
+        assert getattr(found, "kind", found) == (pytest.approx(value) if isinstance(value, float) else value), where
         assert live.session.tick == changing and len(saved.events) == changing
-        shown = live._controls._inputs[path].value if path[:1] != ("reference",) else value
-        assert shown == (pytest.approx(value) if isinstance(value, float) else value), path
+        assert handle.value == (pytest.approx(value) if isinstance(value, float) else value), where
+        open_folders = [name for name in kinds if live._controls._folders["reference", name].visible]
+        assert open_folders == [live.session.start[0].reference.kind]
         for _ in range(3):
             live.session.step()
         live.draw()
         live.refresh()
-        seen += 1
-        if path == ("reference",):
-            break  # the inputs below it are others now
-    assert seen > 40
+        seen.append(kind)
+    assert len(seen) > 55 and set(seen) == {None, *kinds}
 
 
 def test_refusals(live):

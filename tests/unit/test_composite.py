@@ -45,7 +45,7 @@ def spd(root):
 )  # fmt: skip
 def test_one_step(x, command, weights, root, prior_root, residual, feedback, noise, step):
     """Correction, prediction to the stationary prior, tracking: each as in the books, in matrices."""
-    settings = np.array([noise, 0.99, 0.9, 0.5, step, 0.1])
+    settings = np.array([noise, 0.99, 0.9, 0.5, step, 0.1, 0.0, 0.0])
     covariance, prior = spd(root), spd(prior_root)
     h, f = np.append(x, 1), np.append(np.full(N, 0.99), 0.9)
     stationary = np.block([[prior, np.zeros((N, 1))], [np.zeros((1, N)), np.array([[0.25]])]])
@@ -60,7 +60,7 @@ def test_one_step(x, command, weights, root, prior_root, residual, feedback, noi
     if abs(feedback) > 0.1 and command @ direction > 0:
         expected[:N] += step * feedback * direction / (command @ direction)
     found, spread = weights.copy(), covariance.copy()
-    adapt(x, residual, command, feedback, settings, prior, found, spread)
+    adapt(x, residual, command, feedback, settings, prior, np.ones(2), found, spread)
     np.testing.assert_allclose(spread, predicted, atol=1e-9)
     np.testing.assert_allclose(found, expected, atol=1e-7, rtol=1e-7)
 
@@ -70,9 +70,10 @@ def test_covariance(inputs, root, forgetting):
     """From the prior on, it stays symmetric, positive and below the prior: nothing that is not excited blows up."""
     prior = spd(root)
     stationary = np.block([[prior, np.zeros((N, 1))], [np.zeros((1, N)), np.array([[0.25]])]])
-    covariance, weights = stationary.copy(), np.zeros(N + 1)
+    covariance, weights, usual = stationary.copy(), np.zeros(N + 1), np.ones(2)
+    settings = np.array([0.5, forgetting, 0.9, 0.5, 0.02, 0, 0.1, 0.01])
     for x in inputs:
-        adapt(x, 1.0, x, 1.0, np.array([0.5, forgetting, 0.9, 0.5, 0.02, 0.0]), prior, weights, covariance)
+        adapt(x, 1.0, x, 1.0, settings, prior, usual, weights, covariance)
         np.testing.assert_array_equal(covariance, covariance.T)
         assert np.linalg.eigvalsh(covariance).min() > 0
         assert np.linalg.eigvalsh(stationary - covariance).min() > -1e-9
@@ -83,9 +84,32 @@ def test_outlier():
     moved = []
     for residual in (3 * np.sqrt(1.25 + N), 1e4):
         weights, covariance = np.zeros(N + 1), np.diag([*np.ones(N), 0.25])
-        adapt(np.ones(N), residual, np.zeros(N), 0.0, np.array([1, 1, 1, 0.5, 0, 0.0]), np.eye(N), weights, covariance)
+        settings = np.array([1, 1, 1, 0.5, 0, 0, 0.1, 0.1])
+        adapt(np.ones(N), residual, np.zeros(N), 0.0, settings, np.eye(N), np.ones(2), weights, covariance)
         moved.append(weights)
     np.testing.assert_allclose(moved[0], moved[1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("change", [0.0, 1.0])
+def test_change_of_the_plant(change):
+    """Certainty grows with what is seen, in noise too; when the weights jump it is given up, and they follow."""
+    random = np.random.default_rng(3)
+    settings = np.array([0.5, 0.99999, 0.9, 0.1, 0, 0, PERIOD / 0.26, PERIOD / 4.01])
+    truth, prior = np.array([1.0, -0.5, 0.3, 0.8]), np.eye(N)
+    weights, covariance, usual = np.zeros(N + 1), np.diag([*np.ones(N), 0.01]), np.full(2, 0.25)
+    spread = []
+    for tick in range(4000):
+        x = random.standard_normal(N)
+        y = x @ (truth + change * (tick >= 3000)) + 0.05 * random.standard_normal()
+        adapt(x, y, x, 0.0, settings, prior, usual, weights, covariance)
+        spread.append(np.trace(covariance))
+    jumps = 1 + np.flatnonzero(np.diff(spread) > 0.5)
+    assert max(spread[2900:2999]) < 0.02
+    if change:
+        assert 3000 <= jumps[0] < 3030 and len(jumps) < 4
+        np.testing.assert_allclose(weights[:N], truth + 1, atol=0.03)
+    else:
+        assert not len(jumps)
 
 
 @given(numbers(PHYSICAL), numbers(UNITS, INPUTS + 1))
