@@ -2,7 +2,8 @@
 
 The file is taken apart, not changed: its robot moves into the world with P at the origin of `chassis`, x ahead and z
 up; driven wheels turn forwards under positive voltage and touch the floor with spheres of their own radius, because
-cylinders scrub on their edges; no other geom collides.
+cylinders scrub on their edges; a caster that does not roll is without friction, because a contact that slides hops;
+no other geom collides.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -69,7 +70,7 @@ class Wheel(NamedTuple):
     """Something on the floor: where it touches, in the world of the file as it stands."""
 
     body: str
-    joint: str  # that it rolls on; empty if it slides
+    joint: str  # that it rolls on; empty if it slides, without friction
     centre: Array
     radius: float
     friction: float
@@ -311,7 +312,7 @@ class _Adoption:
         for geom, wheel in (*zip(REAR, self.rear, strict=True), *zip(self._front_names(), self.front, strict=True)):
             for floor, name, friction in floors:
                 mu = wheel.friction * friction[0] / usual
-                pair = spec.add_pair(geomname1=floor, geomname2=geom, condim=3, **tyre)
+                pair = spec.add_pair(geomname1=floor, geomname2=geom, condim=3 if wheel.joint else 1, **tyre)
                 pair.friction[:] = mu, mu, *friction[2:]
                 pair.name = name.replace("left", geom.removeprefix("wheel_")) if name else ""
         self._add_numbers(spec)

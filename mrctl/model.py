@@ -19,12 +19,11 @@ from mrctl import adopt
 from mrctl.adopt import FRONTS, MOTORS, REAR, SHIPPED, find, has, models_folder
 from mrctl.kinematics import scrub_free_angle
 from mrctl.record import InputError
-from mrctl.robot import ANY_ANGLE, GRAVITY, Perturbation, Robot, RobotFile
+from mrctl.robot import ANY_ANGLE, CAR, GRAVITY, Perturbation, Robot, RobotFile
 
 Steering = Literal["compliant", "caster", "rigid"]
 Fields = dict[str, NDArray]
 
-CAR = RobotFile()
 STEERINGS: tuple[Steering, ...] = ("compliant", "caster", "rigid")
 # Elements that the robot of a world must name; `load_robot` names those of any other.
 REQUIRED = {
@@ -98,7 +97,8 @@ def load_robot(
 
     Two wheels must be driven by a `<dcmotor>` each, whose `ctrlrange` is the supply. One wheel may be steered, or two
     by Ackermann's geometry, by a `<position>` or `<pid>` actuator; without, it is a differential drive, and what else
-    touches the floor is its caster. The file's own floor is left out, and wheels roll on spheres of their radius.
+    touches the floor is its caster, without friction unless it rolls. The file's own floor is left out, and wheels roll
+    on spheres of their radius.
 
     Args:
         path: `turtlebot`, `racecar`, or an MJCF file.
@@ -202,9 +202,8 @@ def _rearrange(model: mujoco.MjModel, robot: Robot, steering: Steering) -> None:
 def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
     """Reads the parameters of equations (1) to (3) out of a compiled model, by element name.
 
-    The rolling coefficient follows from the front wheel's frictionloss (nothing else brakes that wheel), or from the
-    friction of a caster that slides; what is left of a rear wheel's frictionloss after rolling and no-load loss is the
-    gearbox.
+    The rolling coefficient follows from the front wheel's frictionloss (nothing else brakes that wheel; a caster that
+    slides has none); what is left of a rear wheel's frictionloss after rolling and no-load loss is the gearbox.
 
     Raises:
         InputError: A value that `Robot` refuses, or a rear frictionloss below rolling and no-load loss.
@@ -226,10 +225,9 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
     load = _load_torques(model)
     if min(load.values()) <= 0:
         raise InputError("com_offset: the centre of mass must lie over the triangle of the wheels")
+    rolling = 0.0
     if rolling_fronts:
         rolling = sum(model.joint(f).frictionloss[0] for f in rolling_fronts) / sum(load[f] for f in rolling_fronts)
-    else:
-        rolling = model.pair_friction[_pairs(model, front), 0].max()
     drives = [model.joint(wheel).frictionloss[0] - rolling * load[wheel] for wheel in REAR]
     gear_loss = np.mean(drives) - gear * constant * no_load
     if gear_loss < -1e-9:
@@ -342,13 +340,9 @@ def _inductance(model: mujoco.MjModel) -> float:
 
 def _tyre_pairs(model: mujoco.MjModel) -> list[int]:
     """The contact pairs of the rear left wheel, the named tyre pair first."""
-    return sorted(_pairs(model, ["wheel_left"]), key=lambda p: model.pair(p).name != "tyre_left")
-
-
-def _pairs(model: mujoco.MjModel, wheels: Sequence[str]) -> list[int]:
-    """The contact pairs of some wheels."""
-    geoms = {model.geom(wheel).id for wheel in wheels}
-    return [p for p in range(model.npair) if geoms & {int(model.pair_geom1[p]), int(model.pair_geom2[p])}]
+    wheel = model.geom("wheel_left").id
+    pairs = [p for p in range(model.npair) if wheel in (model.pair_geom1[p], model.pair_geom2[p])]
+    return sorted(pairs, key=lambda p: model.pair(p).name != "tyre_left")
 
 
 def perturb(nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Perturbation) -> None:
@@ -391,8 +385,7 @@ def perturb(nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Pertur
     no_load = nominal.numeric("no_load_current").data * p.drive_friction_factor / p.motor_constant_factor
     model.numeric("no_load_current").data[:] = no_load
     model.pair_friction[:] = nominal.pair_friction
-    tyres = _pairs(nominal, (*REAR, *_rolling(nominal)))
-    model.pair_friction[tyres, :2] *= p.tyre_friction_factor
+    model.pair_friction[:, :2] *= p.tyre_friction_factor
     model.pair_friction[_tyre_pairs(nominal), :2] *= p.left_tyre_friction_factor
     gx, gy, gz = nominal.opt.gravity
     c, s = np.cos(p.slope), np.sin(p.slope)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mrctl import model as mjcf
 from mrctl.adopt import has
 from mrctl.control.chain import GIVEN, one, rows
-from mrctl.robot import LONGEST_DELAY, Perturbation, Robot, RobotFile
+from mrctl.robot import CAR, LONGEST_DELAY, Perturbation, Robot, RobotFile
 
 with warnings.catch_warnings():  # on a machine without a display dm_control tries GLFW first, which complains
     warnings.simplefilter("ignore")
@@ -133,7 +133,7 @@ class CarPhysics(dm_mujoco.Physics):
 
     @classmethod
     def from_world(
-        cls, world: str = "flat", steering: mjcf.Steering = "compliant", robot: RobotFile = mjcf.CAR
+        cls, world: str = "flat", steering: mjcf.Steering = "compliant", robot: RobotFile = CAR
     ) -> CarPhysics:
         """Loads a world by name or path with a robot (see `mrctl.model.load`)."""
         return cls.from_compiled(mjcf.load(world, steering, robot=robot))

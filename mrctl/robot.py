@@ -176,6 +176,10 @@ class RobotFile(Record):
     """Body that carries the rest; by default the one at the root of the wheels."""
 
 
+CAR = RobotFile()
+"""The robot that a world has by itself."""
+
+
 class Perturbation(Record):
     """What the plant does that the controller is not told. The default changes nothing.
 
