@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -60,6 +60,7 @@ def _parse(arguments: list[str]) -> None:
         "train": train,
         "bench": bench,
         "view": view,
+        "export": export,
     }
     complaints = io.StringIO()
     try:
@@ -311,6 +312,27 @@ def view(
     from mrctl import viewer
 
     viewer.view(file, compare, number, export, host, port)
+
+
+def export(
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")],
+    /,
+    to: Literal["mcap", "csv", "parquet", "npz"],
+    out: Path,
+    number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
+) -> None:
+    """Writes a result for other tools: ROS 2 messages, a table, or NumPy arrays.
+
+    Args:
+        file: What `mrctl run --out` or `mrctl sweep` wrote.
+        to: Format.
+        out: File to write.
+        number: One run; by default all, numbered in a column or before each topic.
+    """
+    from mrctl import export as exporting
+
+    count = exporting.export(file, to, out, number)
+    print(f"{out}: {count} {'run' if count == 1 else 'runs'}")
 
 
 if __name__ == "__main__":

@@ -300,6 +300,32 @@ class Plant(ABC):
         self._look()
         self._queue[..., 2] = self.reading[:, STEERING]
 
+    def restart(self, robot: int, pose: Array, twist: Array) -> None:
+        """Stands one robot on the ground again, as `reset` does all of them; what happened to it is forgotten.
+
+        Args:
+            robot: Its row.
+            pose: `(3,)` in m, m, rad.
+            twist: `(2,)` in m/s, rad/s.
+
+        Raises:
+            InputError: There is no ground below the pose.
+        """
+        if self.failed[robot]:
+            self.failed[robot], self.failure[robot] = False, ""
+            self.running += 1
+        self._pushes.pop(robot, None)
+        self._clear(robot)
+        self.qpos[robot], self.qvel[robot] = mjcf.stand(self._model_of(robot), pose, twist)
+        self.applied[robot] = 0.0
+        self._queue[:, robot] = 0.0
+        self._queue[:, robot, 2] = self.qpos[robot, self._address[6]]
+        self._look()
+
+    @abstractmethod
+    def _clear(self, robot: int) -> None:
+        """Takes the engine's state of one robot back to the model's default."""
+
     @abstractmethod
     def _model_of(self, robot: int) -> mujoco.MjModel:
         """The compiled model of one robot, for `stand`."""
@@ -316,7 +342,13 @@ class Plant(ABC):
         self._pushes[robot] = self._tick + periods
 
     def step(self, command: Array) -> None:
-        """Holds a command for one control period.
+        """Holds a command for one control period: `send`, `advance`, `look`."""
+        self.send(command)
+        self.advance()
+        self.look()
+
+    def send(self, command: Array) -> None:
+        """Hands a command to the actuators, or to the queue where it is delayed.
 
         Args:
             command: Commanded voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
@@ -328,9 +360,15 @@ class Plant(ABC):
             sent = self._queue[(self._tick - self.state["delay"]) % len(self._queue), np.arange(self.size)]
             for robot in np.flatnonzero(~np.isfinite(sent).all(axis=1)):
                 self.fail(int(robot), "non-finite command")
+
+    def advance(self) -> None:
+        """The physics of one control period."""
         if self.running:
             for robot, reason in self._advance().items():
                 self.fail(robot, reason)
+
+    def look(self) -> None:
+        """Readouts after the physics; judges whether robots are still what they should be."""
         self._tick += 1
         if self._pushes:
             for robot in [r for r, end in self._pushes.items() if end == self._tick]:
@@ -377,6 +415,9 @@ class PhysicsPlant(Plant):
     def _write(self, robot: int, model: mujoco.MjModel) -> None:
         mjcf.write(self.physics.model.ptr, mjcf.fields(model))
 
+    def _clear(self, robot: int) -> None:
+        mujoco.mj_resetData(self.physics.model.ptr, self.physics.data.ptr)
+
     def _advance(self) -> dict[int, str]:
         try:
             self.physics.step(self.substeps)
@@ -411,6 +452,9 @@ class BatchPlant(Plant):
                 self._expanded.add(name)
                 self.batch.expand(name)[robot] = value
         self.batch.set_const(np.array([robot]))
+
+    def _clear(self, robot: int) -> None:
+        self.batch.reset(np.array([robot]), stage=mujoco.mjtStage.mjSTAGE_NONE)
 
     def _advance(self) -> dict[int, str]:
         ids = None if self.running == self.size else np.flatnonzero(~self.failed)

@@ -40,8 +40,10 @@ _observe, _posture_error = one(observe), one(posture_error)
 _STATE, _REFERENCE, _ERROR = STEERING + 1, 5, 3  # how many columns of the record each takes
 
 
-# What is measured of one robot: the last measurement, this tick's noise, and whether by odometry.
-SENSORS = np.dtype([("pose", "f8", 3), ("twist", "f8", 2), ("noise", "f8", 5), ("odometry", "f8")], align=True)
+# What is measured of one robot: the last measurement and how long ago it was, this tick's noise, whether by odometry.
+SENSORS = np.dtype(
+    [("pose", "f8", 3), ("twist", "f8", 2), ("noise", "f8", 5), ("odometry", "f8"), ("elapsed", "f8")], align=True
+)
 
 
 def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -54,7 +56,10 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
         for i in range(len(robots)):
             true, s, row = robots[i].reading, sensors[i], record[i]
             slip_free = wheel_radius * (true[RATE_LEFT] + true[RATE_RIGHT]) / 2
-            _observe(true[X : THETA + 1], true[V : OMEGA + 1], s.noise, s.odometry, slip_free, period, s.pose, s.twist)
+            _observe(
+                true[X : THETA + 1], true[V : OMEGA + 1], s.noise, s.odometry, slip_free, s.elapsed, s.pose, s.twist
+            )
+            s.elapsed = period
             row[:_STATE] = true[:_STATE]
             row[_STATE : _STATE + _REFERENCE] = reference[i, :_REFERENCE]
             at = _STATE + _REFERENCE
@@ -151,6 +156,7 @@ class Simulation:
         tick: Control periods done.
         ticks: Control periods in the whole run.
         log: What was recorded, `(ticks, B, signals)`; nothing yet from `tick` on.
+        override: Changes what the controllers command, `(B, 4)`, in place, before it is sent; None.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]) -> None:
@@ -195,15 +201,17 @@ class Simulation:
         for row, scenario in enumerate(scenarios):
             self._perturb(row, scenario.perturbation)
             for event in sorted(scenario.events, key=lambda e: e.time):
-                self._schedule[_tick(event, self._period)].append((row, event))
+                self._schedule[tick_of(event, self._period)].append((row, event))
         start = self._reference_now()
-        self.plant.reset(np.stack([_start(s, start[i, :3]) for i, s in enumerate(scenarios)]), start[:, 3:5])
+        self.plant.reset(np.stack([start_pose(s, start[i, :3]) for i, s in enumerate(scenarios)]), start[:, 3:5])
         reading = self.plant.reading
         self.hierarchy.reset(start[:, 3:5], start[:, 5:], reading[:, STEERING])
         self._pose[:], self._twist[:] = reading[:, X : THETA + 1], reading[:, V : OMEGA + 1]
         # A tick's records side by side: the loop writes one block of memory a tick, however many robots there are.
         self.log = np.empty((self.ticks, size, len(result.SIGNALS)))
         self._failure_time = np.full(size, np.nan)
+        self._sensed = -1
+        self.override: Callable[[Array], None] | None = None
 
     @property
     def running(self) -> bool:
@@ -219,7 +227,7 @@ class Simulation:
         Raises:
             InputError: It comes too late, or a scenario with it is refused; then nothing was added.
         """
-        if (tick := _tick(event, self._period)) < self.tick:
+        if (tick := tick_of(event, self._period)) < self.tick:
             raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self._period:g} s")
         if event.perturbation is not None:
             self.plant.check(event.perturbation)
@@ -231,16 +239,34 @@ class Simulation:
             self._plan()
 
     def step(self) -> None:
-        """One control period: events, measurement, control, record, physics."""
+        """One control period: events, measurement, control, physics, record."""
+        self.decide()
+        self.plant.advance()
+        self.settle()
+
+    @property
+    def _row(self) -> Array:
+        """Where the record of this tick goes, `(B, signals)`."""
+        return self.log[self.tick]
+
+    def sense(self) -> None:
+        """Lets this tick's events happen and measures, once a tick."""
+        if self._sensed == self.tick:
+            return
+        self._sensed = self.tick
         for row, event in self._schedule.get(self.tick, ()):
             self._happen(row, event)
-        plant, hierarchy, log = self.plant, self.hierarchy, self.log[self.tick]
         for row in self._noisy:
             self._noise[row] = self._noise_scale[row] * self._random[row].standard_normal(5)
-        reference = self._reference_now()
-        _sense(plant.state, reference, self._sensors, self._wheel_radius, self._period if self.tick else 0.0, log)
+        self._goal = self._reference_now()
+        _sense(self.plant.state, self._goal, self._sensors, self._wheel_radius, self._period, self._row)
+
+    def decide(self) -> None:
+        """What comes before the physics: events, measurement, control."""
+        self.sense()
+        plant, hierarchy = self.plant, self.hierarchy
         try:
-            output = hierarchy.update(self._pose, self._twist, reference)
+            output = hierarchy.update(self._pose, self._twist, self._goal)
         except StageError as error:  # of the whole group: what was recorded until now is kept
             output = hierarchy.output
             hierarchy.faults = dict.fromkeys(range(plant.size), str(error))
@@ -249,7 +275,14 @@ class Simulation:
         if not hierarchy.finite:  # the limit would turn NaN into the full voltage
             for row in np.flatnonzero(~np.isfinite(hierarchy.parts).all(axis=1)):
                 plant.fail(int(row), "non-finite voltage")
-        plant.step(output)
+        if self.override:
+            self.override(output)
+        plant.send(output)
+
+    def settle(self) -> None:
+        """What comes after the physics: readouts, record, failures."""
+        plant, hierarchy, log = self.plant, self.hierarchy, self._row
+        plant.look()
         near = _record(hierarchy.state, hierarchy.weight_norm, plant.state, log)
         if not near:
             for row in np.flatnonzero(np.abs(log[:, LATERAL_ERROR]) > DIVERGED):
@@ -272,7 +305,7 @@ class Simulation:
         if self.tick not in self._block:  # a long run does not hold all samples: (BLOCK, courses, 7)
             first = self.tick // BLOCK * BLOCK
             self._block = range(first, min(first + BLOCK, self.ticks))
-            samples = np.stack([_course(s, self._block) for s in self._courses.values()], axis=1)
+            samples = np.stack([course(s, self._block) for s in self._courses.values()], axis=1)
             everyone = (len(samples), len(self.scenarios), 7)
             self._reference = np.broadcast_to(samples, everyone) if len(self._courses) == 1 else samples
         now = self._reference[self.tick - self._block.start]
@@ -315,24 +348,24 @@ class Simulation:
             self.hierarchy.set_learning(row, event.learning)
 
 
-def _tick(event: Event, period: float) -> int:
+def tick_of(event: Event, period: float) -> int:
     """The first control tick that is not before an event."""
     return int(np.ceil(event.time / period - 1e-9))
 
 
-def _course(scenario: Scenario, ticks: range) -> Array:
+def course(scenario: Scenario, ticks: range) -> Array:
     """Posture, twist and acceleration to follow, `(ticks, 7)`, through all events that change the reference."""
     period = scenario.control_period
-    course = np.hstack(scenario.reference.sample(period * np.array(ticks, float)))
+    posts = np.hstack(scenario.reference.sample(period * np.array(ticks, float)))
     for event in sorted(scenario.events, key=lambda e: e.time):
-        start = _tick(event, period)
+        start = tick_of(event, period)
         if event.reference is not None and (since := max(start, ticks.start)) < ticks.stop:
             times = period * np.arange(since - start, ticks.stop - start, dtype=float)
-            course[since - ticks.start :] = np.hstack(event.reference.sample(times))
-    return course
+            posts[since - ticks.start :] = np.hstack(event.reference.sample(times))
+    return posts
 
 
-def _start(scenario: Scenario, reference: Array) -> Array:
+def start_pose(scenario: Scenario, reference: Array) -> Array:
     """Posture at the start `(3,)`: the given one or the reference's, plus the seeded offset.
 
     Raises:

@@ -130,6 +130,15 @@ def _hand_over(taken, state):  # noqa: ANN001, ANN202
             state[i].pid[k] -= TAKE_OVER * state[i].guard.authority * taken[i, k]
 
 
+def _take(mine: dict[str, Any], theirs: dict[str, Any], row: int, size: int) -> None:
+    """Copies what a stage for one robot keeps into a row of the same stage for several."""
+    for name, value in mine.items():
+        if isinstance(value, dict):
+            _take(value, theirs[name], row, size)
+        elif isinstance(value, np.ndarray) and value.shape[:1] == (size,) and theirs[name].shape[:1] == (1,):
+            value[row] = theirs[name][0]
+
+
 class Hierarchy:
     """Both controllers for B robots that share steering arrangement and rates.
 
@@ -208,19 +217,35 @@ class Hierarchy:
         """Lets the feedforward of one robot learn, or not."""
         self.state["frozen"][row] = float(not on)
 
-    def reset(self, twist: Array, acceleration: Array, steering_angle: Array) -> None:
+    def renew(self, row: int, scenario: Scenario) -> None:
+        """Gives one robot the settings and the memory of a new one, before `reset`; stages must be built in.
+
+        Args:
+            row: Which.
+            scenario: One that fits the group.
+        """
+        fresh = Hierarchy([scenario], self._robot)
+        self.state[row] = fresh.state[0]
+        _take(vars(self.feedforward), vars(fresh.feedforward), row, len(self.state))
+
+    def restart_clock(self) -> None:
+        """Counts the motion controller's periods from here on."""
+        self._tick = 0
+
+    def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
         """Starts without a bump, as if the nominal robot had been driven here steadily.
 
         Args:
             twist: What the robots already do, `(B, 2)`.
             acceleration: Its derivative along the reference, `(B, 2)`.
             steering_angle: Angles of the forks in rad, `(B,)`.
+            rows: Which of them start.
         """
-        self.state["limiter"][:, 2:] = twist
-        self.state["steering"][:, 0] = steering_angle
+        self.state["limiter"][rows, 2:] = twist[rows]
+        self.state["steering"][rows, 0] = steering_angle[rows]
         # The integral holds what the nominal robot takes here, less what the feedforward brings by itself.
         integral = self._nominal.output(twist, acceleration) - self._forward(twist, acceleration)
-        self.state["pid"][:, :2] = integral
+        self.state["pid"][rows, :2] = integral[rows]
         if self._feedback:
             self._feedback.tell("reset", integral, self._period)
         if self._steering:

@@ -18,7 +18,8 @@ LAYERS = (
     {"control.hierarchy", "measurement", "comparison", "metrics", "plots", "result"},
     {"adopt", "model", "plant"},
     {"simulate", "checks"},
-    {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment"},
+    {"episodes"},
+    {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment", "gym", "export"},
     {"cli"},
 )
 ENGINE = {"adopt", "model", "plant", "checks", "viewer", "environment", "experiments"}

@@ -1,0 +1,287 @@
+"""Environments: what their own makers' checkers ask for, and the very physics of `simulate`, bit for bit."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from absl.testing import absltest
+from dm_env import StepType, test_utils
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+from mrctl import PERTURBATIONS, Circle, Event, InputError, Line, Perturbation, Scenario, simulate
+from mrctl.environment import SUITE, Environment, Tracking, register
+from mrctl.episodes import ACTIONS, OBSERVATIONS, Episodes
+from mrctl.gym import TrackingEnv, TrackingVectorEnv
+from mrctl.result import SIGNALS
+
+IDS = [f"mrctl/{action.capitalize()}Tracking-v0" for action in ACTIONS]
+SHORT = Scenario(reference=Circle(period=2.2, radius=0.3), laps=1)
+# All that a robot remembers: weights, delays, filters, odometry, noise, a perturbation and a push under way.
+BUSY = Scenario(
+    reference=Circle(period=2.2, radius=0.3),
+    laps=1,
+    measurement="odometry",
+    perturbation=Perturbation(control_delay=0.02, velocity_noise=0.01, rotation_noise=0.01, mass_factor=1.3),
+    events=(
+        Event(time=0.5, perturbation=PERTURBATIONS["all"]),
+        Event(time=1.9, push=(30.0, 0.0, 0.0), push_duration=0.3),
+        Event(time=1.0, reference=Circle(period=2.4, radius=0.3)),
+    ),
+)
+FEEDFORWARDS = ("none", "oracle", "observer", "fel", "rls", "composite")
+
+
+def expected(scenario, seed):
+    """Every signal of the scenario alone under `simulate`, `(ticks, signals)`."""
+    result = simulate(scenario.model_copy(update={"seed": seed}))
+    return np.stack([result[name].values for name in SIGNALS], axis=-1)
+
+
+def last(loop, row=0):
+    """The complete record of the tick that has just ended."""
+    return loop.log[(loop.tick - 1) % 2, row].copy()
+
+
+@pytest.mark.parametrize("feedforward", FEEDFORWARDS)
+def test_gym_bits(feedforward):
+    """Episodes with a zero residual are the scenario's own run, the first as the second."""
+    scenario = BUSY.model_copy(update={"feedforward": feedforward})
+    env = TrackingEnv(scenario)
+    for seed in (3, 8, 3):
+        env.reset(seed=seed)
+        found, over = [], False
+        while not over:
+            _, _, failed, over, _ = env.step(np.zeros(2))
+            assert not failed
+            found.append(last(env.episodes))
+        assert np.array_equal(found, expected(scenario, seed)), seed
+
+
+@pytest.mark.parametrize("steering", ["compliant", "rigid"])
+def test_dm_env_bits(steering):
+    """The same through dm_control; the first episode has the scenario's seed."""
+    scenario = BUSY.model_copy(update={"seed": 5, "steering": steering})
+    env = SUITE["residual"](scenario, random=1)
+    seeds = [5, int(np.random.RandomState(1).randint(2**32, dtype=np.uint32))]
+    for seed in seeds:
+        step, found = env.reset(), []
+        while not step.last():
+            step = env.step(np.zeros(2))
+            found.append(last(env.task.episodes))
+        assert np.array_equal(found, expected(scenario, seed)), seed
+
+
+@pytest.mark.parametrize("feedforward", FEEDFORWARDS)
+def test_vector_bits(feedforward):
+    """Robots that begin again at different moments, some after a failure: each episode is its run alone."""
+    scenarios = [s.model_copy(update={"feedforward": feedforward}) for s in (BUSY, SHORT, BUSY, SHORT)]
+    env = TrackingVectorEnv(4, scenarios, threads=1)
+    loop, zero = env.episodes, np.zeros((4, 2))
+    env.reset(seed=[1, 2, 3, 4])
+    episodes = [[[]] for _ in scenarios]
+    seeds = [[1], [2], [3], [4]]
+    over = np.zeros(4, bool)
+    for tick in range(520):
+        action = zero.copy()
+        action[1] = np.nan if tick in (70, 130) else 0.0  # which fails it on the spot
+        _, reward, terminated, truncated, info = env.step(action)
+        for row in range(4):
+            if over[row]:
+                assert reward[row] == 0 and not terminated[row] and not truncated[row]
+                episodes[row].append([])
+                seeds[row].append(loop.scenarios[row].seed)
+            else:
+                episodes[row][-1].append(last(loop, row))
+        if terminated[1]:
+            assert (
+                info["failure"][1] == "non-finite command" and info["_failure"].tolist() == [False, True] + [False] * 2
+            )
+        over = terminated | truncated
+    assert [len(some) for some in episodes] == [3, 4, 3, 3]
+    for row, some in enumerate(episodes):
+        for seed, found in zip(seeds[row], some, strict=True):
+            found = np.array(found)[: -1 if np.isnan(found[-1]).any() else None]  # the tick of a failure
+            assert np.array_equal(found, expected(scenarios[row], seed)[: len(found)]), (row, seed)
+
+
+@pytest.mark.parametrize("action", ACTIONS)
+def test_vector_is_single(action):
+    """Under any actions the vector environment is Gymnasium's own vector of single ones, autoreset and all."""
+    line = Scenario(reference=Line(speed=0.5, length=1.1), laps=1)
+    scenarios = [SHORT, line, SHORT.model_copy(update={"perturbation": PERTURBATIONS["all"]})]
+    mine = TrackingVectorEnv(3, scenarios, action, threads=1)
+    theirs = SyncVectorEnv([lambda s=s: TrackingEnv(s, action) for s in scenarios])
+    assert mine.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
+    assert mine.observation_space == theirs.observation_space and mine.action_space == theirs.action_space
+    assert mine.single_action_space == theirs.single_action_space
+    random = np.random.default_rng(0)
+    for one, other in ([env.reset(seed=4) for env in (mine, theirs)],):
+        assert np.array_equal(one[0], other[0]) and one[1] == other[1] == {}
+    ended = np.zeros(3)
+    for _ in range(450):
+        actions = random.uniform(-1, 1, (3, 2))
+        one, other = mine.step(actions), theirs.step(actions)
+        assert mine.observation_space.contains(one[0]) and mine.action_space.contains(actions)
+        for a, b in zip(one[:4], other[:4], strict=True):
+            assert a.dtype == b.dtype and np.array_equal(a, b)
+        assert one[4].keys() == other[4].keys()
+        ended += one[2] | one[3]
+    assert (ended >= 2).all()
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_gym_checker(name):
+    """Gymnasium's checker has nothing to say, but that what is measured has no bounds."""
+    env = gymnasium.make(name, scenario=SHORT)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*Box observation space (minimum|maximum) value is .*infinity")
+        check_env(env.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_make_vec(name):
+    """Registered for `make_vec`, and fit for Gymnasium's wrappers."""
+    env = RecordEpisodeStatistics(gymnasium.make_vec(name, 2, vectorization_mode="vector_entry_point", scenario=SHORT))
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    lengths = []
+    for _ in range(450):
+        info = env.step(env.action_space.sample())[4]
+        if "episode" in info:
+            lengths += info["episode"]["l"][info["_episode"]].tolist()
+    assert len(lengths) >= 4 and set(lengths) == {220}
+
+
+class Contract(test_utils.EnvironmentTestMixin):
+    """dm_env's own tests."""
+
+    scenario, action = SHORT.model_copy(update={"reference": Line(speed=0.5, length=0.5)}), "residual"
+
+    def make_object_under_test(self):
+        return Environment(Tracking(self.scenario, self.action))
+
+    def make_action_sequence(self):
+        random = np.random.default_rng(0)
+        spec = self.environment.action_spec()
+        for _ in range(230):
+            yield random.uniform(spec.minimum, spec.maximum)
+
+
+class TestTwist(Contract, absltest.TestCase):
+    action = "twist"
+
+
+class TestVoltage(Contract, absltest.TestCase):
+    action = "voltage"
+
+
+class TestResidual(Contract, absltest.TestCase):
+    pass
+
+
+class TestFails(Contract, absltest.TestCase):
+    """An episode that ends before its time."""
+
+    scenario = SHORT.model_copy(update={"events": (Event(time=0.5, push=(1e12, 0.0, 1e15)),)})
+
+    def test_discount(self):
+        steps = [self.environment.reset()]
+        while not steps[-1].last():
+            steps.append(self.environment.step(np.zeros(2)))
+        assert steps[-1].discount == 0 and steps[-1].reward == 0 and len(steps) < 100
+        assert all(np.isfinite(value).all() for value in steps[-1].observation.values())
+
+
+def test_suite():
+    """Loaded by name as dm_control's own domains are; settings of the environment go through."""
+    from dm_control import suite
+
+    register()
+    env = suite.load(
+        "mrctl", "twist", task_kwargs={"scenario": SHORT, "random": 0}, environment_kwargs={"flat_observation": True}
+    )
+    step = env.reset()
+    assert step.step_type == StepType.FIRST and step.observation["observations"].shape == (14,)
+    assert sorted(SUITE) == sorted(ACTIONS) == sorted(SUITE.tagged("tracking"))
+    limited = SUITE["voltage"](SHORT, environment_kwargs={"time_limit": 0.05})
+    limited.reset()
+    assert [limited.step(np.zeros(2)).last() for _ in range(5)] == [False] * 4 + [True]
+
+
+def test_observation():
+    """Named, in SI, and of the moment at which the coming action begins."""
+    env = SUITE["residual"](SHORT.model_copy(update={"initial_pose": (0.05, -0.02, 1.6), "initial_spread": (0, 0, 0)}))
+    first = env.reset().observation
+    assert {name: len(value) for name, value in first.items()} == OBSERVATIONS
+    physics, reference = env.physics, SHORT.reference
+    for tick in (0, 1, 2):
+        pose, twist, acceleration = (part[0] for part in reference.sample(np.array([0.01 * tick])))
+        seen = first if tick == 0 else env.step(np.zeros(2)).observation
+        delta = pose - physics.pose()
+        c, s = np.cos(physics.pose()[2]), np.sin(physics.pose()[2])
+        ahead = c * delta[0] + s * delta[1], c * delta[1] - s * delta[0], np.angle(np.exp(1j * delta[2]))
+        np.testing.assert_allclose(seen["error"], ahead, atol=1e-12)
+        np.testing.assert_array_equal(seen["twist"], physics.twist())
+        np.testing.assert_allclose(seen["reference"], [*twist, *acceleration], atol=1e-12)
+        np.testing.assert_array_equal(seen["wheel_rates"], physics.wheel_rates())
+        assert seen["steering_angle"] == physics.steering_angle()
+
+
+def test_reward():
+    """One on the reference; a half with both rear wheels 5 cm off."""
+
+    def reward(pose):
+        scenario = SHORT.model_copy(update={"initial_pose": pose, "initial_spread": (0, 0, 0)})
+        return Episodes([scenario], "residual").reward()[0]
+
+    (x, y, theta), half_track = SHORT.reference.sample(np.zeros(1))[0][0], 0.188
+    assert reward((x, y, theta)) == 1
+    assert reward((x + 0.03, y - 0.04, theta)) == pytest.approx(0.5)
+    assert reward((x, y, theta + 0.05 / half_track)) == pytest.approx(0.5, rel=1e-2)
+
+
+def test_actions():
+    """What is acted is what is sent: a twist is driven, volts are volts, a residual adds to the controllers'."""
+    straight = Scenario(reference=Line(speed=0.5, length=2.0), laps=1, initial_spread=(0, 0, 0), feedforward="model")
+    env = TrackingEnv(straight, "twist")
+    env.reset(seed=0)
+    for _ in range(200):
+        env.step(np.array([0.7, 0.3]) / env.episodes.bound)
+    np.testing.assert_allclose(env.episodes.plant.reading[0, 3:5], [0.7, 0.3], atol=0.03)
+    volts = TrackingEnv(straight, "voltage")
+    volts.reset(seed=0)
+    for action, sent in (((0.5, -0.25), (12.0, -6.0)), ((1.5, -99.0), (24.0, -24.0))):
+        volts.step(np.array(action))
+        assert volts.episodes.plant.applied[0].tolist() == list(sent)
+    pair = [TrackingEnv(straight) for _ in range(2)]
+    for env, action in zip(pair, (0.0, 0.25), strict=True):
+        env.reset(seed=0)
+        env.step(np.full(2, action))
+    assert pair[1].episodes.plant.applied - pair[0].episodes.plant.applied == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: TrackingEnv(SHORT, "torque"), "action: 'torque' is not twist, voltage, residual"),
+        (lambda: TrackingVectorEnv(2, [SHORT, SHORT.model_copy(update={"laps": 2})]), "scenarios: differ in"),
+        (lambda: TrackingVectorEnv(2, SHORT.model_copy(update={"motion_period": 0.05})), "motion_period: "),
+        (lambda: TrackingVectorEnv(3, [SHORT]), "num_envs: 3, but 1 scenarios"),
+        (lambda: TrackingEnv("nowhere.toml"), "nowhere.toml: No such file"),
+    ],
+)
+def test_refused(make, message):
+    """What cannot be is said at once."""
+    with pytest.raises((InputError, ValueError), match=message):
+        make()
+
+
+def test_scenario_file(tmp_path):
+    """The scenario files of the command line are the environments' too."""
+    file = tmp_path / "scenario.toml"
+    file.write_text(BUSY.to_toml())
+    assert TrackingEnv(file).episodes.scenarios == SUITE["residual"](str(file)).task.episodes.scenarios == [BUSY]

@@ -1,0 +1,218 @@
+"""Exports read back by tools that know nothing of mrctl: the result's numbers, at the result's times."""
+
+import csv
+import json
+import sys
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+import mrctl
+from mrctl import Circle, Event, InputError, Scenario, Sweep, jobs, save, simulate
+from mrctl.cli import main
+from mrctl.export import export
+from mrctl.result import SIGNALS
+
+SHORT = Scenario(reference=Circle(period=3, radius=0.4), laps=1, feedforward="none")
+FAILS = SHORT.model_copy(update={"seed": 1, "events": (Event(time=1.0, push=(1e12, 0.0, 1e15)),)})
+ROS = get_typestore(Stores.ROS2_HUMBLE)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return simulate([SHORT, FAILS])
+
+
+@pytest.fixture(scope="module")
+def path(result, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("result") / "result.zarr"
+    save(result, path)
+    return path
+
+
+def messages(file: Path):
+    """Topic to type, times in ns and messages, decoded by the definitions of ROS and not by those in the file."""
+    found = {}
+    with AnyReader([file]) as reader:
+        for connection, time, raw in reader.messages():
+            times, decoded = found.setdefault(connection.topic, (connection.msgtype, [], []))[1:]
+            times.append(time)
+            decoded.append(ROS.deserialize_cdr(raw, connection.msgtype))
+    return found
+
+
+def test_mcap(result, path, tmp_path):
+    """Odometry, twists, joints and IMU: values to the bit, stamps to the nanosecond."""
+    out = tmp_path / "run.mcap"
+    assert export(path, "mcap", out, 0) == 1
+    found = messages(out)
+    assert {topic: kind for topic, (kind, _, _) in found.items()} == {
+        "/odom": "nav_msgs/msg/Odometry", "/reference": "nav_msgs/msg/Odometry",
+        "/cmd_vel": "geometry_msgs/msg/TwistStamped", "/measured": "geometry_msgs/msg/TwistStamped",
+        "/joint_states": "sensor_msgs/msg/JointState", "/imu": "sensor_msgs/msg/Imu",
+    }  # fmt: skip
+    run = result.isel(run=0)
+    for _, times, some in found.values():
+        assert times == [10_000_000 * k for k in range(300)]
+        assert [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in some] == times
+
+    def same(topic, read, name):
+        assert np.array_equal([read(m) for m in found[topic][2]], run[name].values), (topic, name)
+
+    for topic, after in (("/odom", ""), ("/reference", "_ref")):
+        same(topic, lambda m: m.pose.pose.position.x, "x" + after)
+        same(topic, lambda m: m.pose.pose.position.y, "y" + after)
+        same(topic, lambda m: m.twist.twist.linear.x, "v" + after)
+        same(topic, lambda m: m.twist.twist.angular.z, "omega" + after)
+        turned = [2 * np.arctan2(m.pose.pose.orientation.z, m.pose.pose.orientation.w) for m in found[topic][2]]
+        apart = np.angle(np.exp(1j * (np.array(turned) - run["theta" + after].values)))
+        np.testing.assert_allclose(apart, 0, atol=1e-12)
+    same("/odom", lambda m: m.twist.twist.linear.y, "v_lateral")
+    for topic, after in (("/cmd_vel", "_command"), ("/measured", "_measured")):
+        same(topic, lambda m: m.twist.linear.x, "v" + after)
+        same(topic, lambda m: m.twist.angular.z, "omega" + after)
+    for k, side in enumerate(("left", "right")):
+        same("/joint_states", lambda m, k=k: m.velocity[k], f"wheel_rate_{side}")
+    same("/joint_states", lambda m: m.position[2], "steering_angle")
+    same("/imu", lambda m: m.angular_velocity.z, "omega_measured")
+    assert found["/odom"][2][0].header.frame_id == "odom" and found["/odom"][2][0].child_frame_id == "base_link"
+    assert found["/joint_states"][2][0].name == ["wheel_left", "wheel_right", "steering"]
+
+
+def test_derived(result, path, tmp_path):
+    """What is not recorded but follows: a wheel has rolled as far as P has come, a circle presses with v ω."""
+    out = tmp_path / "run.mcap"
+    export(path, "mcap", out, 0)
+    found, run = messages(out), result.isel(run=0)
+    rolled = np.mean([m.position[:2] for m in found["/joint_states"][2]], axis=1) * 0.098
+    np.testing.assert_allclose(rolled[-1], np.trapezoid(run.v, run.time), rtol=0.01)
+    late = found["/imu"][2][150:]
+    aside = np.array([m.linear_acceleration.y for m in late])
+    np.testing.assert_allclose(aside.mean(), float((run.v * run.omega)[150:].mean()), rtol=0.02)
+    assert {m.linear_acceleration.z for m in late} == {9.81}
+
+
+def test_definitions(path, tmp_path):
+    """The definitions in the file are those of ROS: read by them alone, the messages are the same."""
+    out = tmp_path / "run.mcap"
+    export(path, "mcap", out, 0)
+    theirs = messages(out)
+    with open(out, "rb") as file:
+        decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        for _, channel, message, mine in islice(decoded, 30):
+            other = theirs[channel.topic][2][message.sequence]
+            if channel.topic == "/imu":
+                assert mine.linear_acceleration.x == other.linear_acceleration.x
+            elif channel.topic == "/joint_states":
+                assert list(mine.velocity) == list(other.velocity)
+            else:
+                deep = channel.topic in ("/odom", "/reference")
+                a, b = (m.twist.twist if deep else m.twist for m in (mine, other))
+                assert a.linear.x == b.linear.x and a.angular.z == b.angular.z
+    with AnyReader([out]) as reader:
+        for connection in reader.connections:
+            embedded = reader.typestore.fielddefs[connection.msgtype]
+            assert embedded == ROS.fielddefs[connection.msgtype], connection.msgtype
+
+
+def test_several(result, path, tmp_path):
+    """All runs of a result: a name before each topic, and a run that failed ends where it failed."""
+    out = tmp_path / "runs.mcap"
+    assert export(path, "mcap", out) == 2
+    found = messages(out)
+    assert {topic.split("/")[1] for topic in found} == {"run0", "run1"} and len(found) == 12
+    driven = int(np.isfinite(result.x[1]).sum())
+    assert len(found["/run0/odom"][1]) == 300 and len(found["/run1/odom"][1]) == driven < 110
+
+
+def long(result):
+    """The result as a table, a row a run and sample, without what comes after a failure."""
+    frame = result[list(SIGNALS)].to_dataframe().reset_index()[["run", "time", *SIGNALS]]
+    return frame[np.isfinite(frame["x"])].sort_values(["run", "time"]).reset_index(drop=True)
+
+
+def test_csv(result, path, tmp_path):
+    """Every number in full, with its unit in the first line."""
+    out = tmp_path / "runs.csv"
+    export(path, "csv", out)
+    with open(out, newline="") as file:
+        header = next(csv.reader(file))
+        table = [[float(cell) for cell in row] for row in csv.reader(file)]
+    assert header[:4] == ["run", "time [s]", "x [m]", "y [m]"] and "power [W]" in header and "saturated" in header
+    assert [name.split(" ")[0] for name in header] == list(long(result).columns)
+    assert np.array_equal(table, long(result).to_numpy())
+    export(path, "csv", tmp_path / "one.csv", 1)
+    one = pd.read_csv(tmp_path / "one.csv")
+    assert "run" not in one and len(one) == (long(result)["run"] == 1).sum()
+
+
+def test_parquet(result, path, tmp_path):
+    """The same with units on the columns, and what was run beside them."""
+    out = tmp_path / "runs.parquet"
+    export(path, "parquet", out)
+    table = pq.read_table(out)
+    pd.testing.assert_frame_equal(table.to_pandas(), long(result), check_exact=True)
+    for name, (unit, meaning) in SIGNALS.items():
+        assert table.schema.field(name).metadata == {b"units": unit.encode(), b"long_name": meaning.encode()}
+    scenarios = json.loads(table.schema.metadata[b"scenarios"])
+    assert [Scenario.from_dict(one) for one in scenarios] == [SHORT, FAILS]
+
+
+def test_npz(result, path, tmp_path):
+    """Arrays a run and sample, read without pickle."""
+    out = tmp_path / "runs.npz"
+    export(path, "npz", out)
+    with np.load(out, allow_pickle=False) as arrays:
+        units = json.loads(str(arrays["units"]))
+        for name, (unit, _) in SIGNALS.items():
+            assert np.array_equal(arrays[name], result[name].values, equal_nan=True) and units[name] == unit
+        assert np.array_equal(arrays["time"], result.time) and arrays["run"].tolist() == [0, 1]
+        assert arrays["failure"].tolist() == ["", "non-finite state"]
+
+
+def test_sweep(tmp_path):
+    """Of a sweep with signals, the runs that are asked for; one with metrics alone says what to do."""
+    sweep = {"base": SHORT.model_dump(), "runs": 3}
+    for record in ("decimated", "metrics"):
+        jobs.run(Sweep.from_dict(sweep | {"record": record}), tmp_path / record, workers=1)
+    out = tmp_path / "sweep.parquet"
+    assert export(tmp_path / "decimated", "parquet", out) == 3
+    table, signals = pd.read_parquet(out), mrctl.open(tmp_path / "decimated")
+    assert table["run"].value_counts().to_dict() == {0: 30, 1: 30, 2: 30}
+    assert np.array_equal(table["omega"].to_numpy().reshape(3, 30), signals.omega.values)
+    with pytest.raises(InputError, match="holds metrics only"):
+        export(tmp_path / "metrics", "csv", tmp_path / "none.csv")
+
+
+def test_command(path, tmp_path, capsys):
+    """From the shell: what `mrctl run --out` wrote is exported; bad input is one line."""
+    out = tmp_path / "out.csv"
+    assert main(["export", str(path.parent), "--to", "csv", "--out", str(out), "--run", "1"]) == 0
+    assert capsys.readouterr().out == f"{out}: 1 run\n"
+    for words, message in (
+        ((str(path), "--to", "csv", "--out", str(out)), "exists already"),
+        ((str(path), "--to", "csv", "--out", str(tmp_path / "b"), "--run", "7"), "has no run 7"),
+        ((str(path), "--to", "bag", "--out", str(tmp_path / "b")), "bag"),
+        ((str(tmp_path / "none"), "--to", "npz", "--out", str(tmp_path / "b")), "not a saved result"),
+        ((str(path), "--to", "npz", "--out", str(out / "b")), "cannot be written"),
+    ):
+        assert main(["export", *words]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and message in error, error
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.csv"]
+
+
+def test_without_library(path, tmp_path, monkeypatch):
+    """Without the library for MCAP one line says which to install, and the others work."""
+    monkeypatch.setitem(sys.modules, "mcap_ros2.writer", None)
+    with pytest.raises(InputError, match=r"mrctl\[mcap\]"):
+        export(path, "mcap", tmp_path / "run.mcap")
+    assert not list(tmp_path.iterdir())
