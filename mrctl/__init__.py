@@ -17,6 +17,7 @@ from mrctl.scenario import Event, Scenario
 from mrctl.simulate import Simulation, simulate
 from mrctl.store import open_store as open
 from mrctl.sweep import Axis, Sweep
+from mrctl.viewer.embed import replay
 
 __all__ = [
     "PERTURBATIONS",
@@ -47,6 +48,7 @@ __all__ = [
     "load_robot",
     "open",
     "per_lap",
+    "replay",
     "save",
     "save_weights",
     "simulate",

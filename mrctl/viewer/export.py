@@ -24,11 +24,11 @@ PLAYER = Path(__file__).parent / "player.html"
 
 
 def export(recordings: Sequence[Recording], labels: Sequence[str], path: Path) -> None:
-    """Writes recordings as a page with the 3-D scene and the curves, and one scrubber for both.
+    """Writes recordings as a page of their own.
 
     Args:
-        recordings: Runs in one world, the first one solid.
-        labels: A name a run.
+        recordings: As for `page`.
+        labels: As for `page`.
         path: The file.
 
     Raises:
@@ -36,16 +36,25 @@ def export(recordings: Sequence[Recording], labels: Sequence[str], path: Path) -
     """
     if path.exists():
         raise InputError(f"export: {path} exists already; nothing was overwritten")
+    try:
+        path.write_text(page(recordings, labels))
+    except OSError as error:
+        raise InputError(f"export: {path}: {error.strerror or error}") from None
+
+
+def page(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
+    """Recordings as a page with the 3-D scene and the curves, and one scrubber for both.
+
+    Args:
+        recordings: Runs in one world, the first one solid.
+        labels: A name a run.
+    """
     parts = {
         "legend": legend(labels),
         "scene": html.escape(_scene(recordings, labels)),
         "data": _curves(recordings, labels),
     }
-    page = re.sub(r"{{(\w+)}}", lambda found: parts[found[1]], PLAYER.read_text())
-    try:
-        path.write_text(page)
-    except OSError as error:
-        raise InputError(f"export: {path}: {error.strerror or error}") from None
+    return re.sub(r"{{(\w+)}}", lambda found: parts[found[1]], PLAYER.read_text())
 
 
 def _scene(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
@@ -86,7 +95,8 @@ def _curves(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
                 ],
             }
         )
-    marks = sorted({e.time for r in recordings for e in r.scenario.events if e.time <= times[-1]})
+    events = {e.time - r.start for r in recordings for e in r.scenario.events}
+    marks = sorted(t for t in events if 0 <= t <= times[-1])
     data: dict[str, Any] = {"time": _rounded(times[::step]), "charts": drawn, "marks": marks}
     return json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
 

@@ -38,15 +38,17 @@ class Recording:
         scenario: What was run.
         label: Its name.
         period: Time between samples in s.
+        start: Time of the first sample in the run, s; the times below are counted from there.
         log: What was recorded, `(T, signals)`; as long as the robot drove.
         failure: Why it stopped early, or "".
     """
 
     def __init__(self, run: xr.Dataset) -> None:
-        """Takes a single run of a result."""
+        """Takes a single run of a result, or a stretch of one."""
         self.scenario: Scenario = scenarios_of(run)[0]
         self.label = str(run["label"].values)
         self.period = float(run.attrs["control_period"])
+        self.start = float(run["time"][0])
         log = np.stack(
             [run[name].values if name in run else np.full(run.sizes["time"], np.nan) for name in SIGNALS], -1
         )
@@ -79,7 +81,7 @@ class Recording:
 
     def perturbation(self, time: float) -> Perturbation:
         """What the plant did differently at a time."""
-        return state(self.scenario, time)["perturbation"]
+        return state(self.scenario, self.start + time)["perturbation"]
 
     def way(self, points: int = 600) -> Array:
         """The way that P went, a little above the ground, `(points, 3)` in m."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import http
-import io
 import socket
 import sys
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from typing import Any
 from unittest import mock
 from urllib.parse import urlsplit
 
+import rich
 import viser
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
@@ -44,7 +44,7 @@ class Server(viser.ViserServer):
         """
         with contextlib.closing(_reserve(host, port)) as taken:
             port = taken.getsockname()[1]
-        with _guarded(host), contextlib.redirect_stdout(io.StringIO()):  # viser's own announcement
+        with _guarded(host), _quiet():
             super().__init__(host, port, label="mrctl", verbose=False)
         if self.get_port() != port:  # somebody was quicker
             self.stop()
@@ -61,7 +61,7 @@ class Server(viser.ViserServer):
 
     def stop(self) -> None:
         """Stops to serve, quietly."""
-        with contextlib.redirect_stdout(io.StringIO()):
+        with _quiet():
             super().stop()
 
     def announce(self) -> str:
@@ -101,6 +101,11 @@ def _reserve(host: str, port: int) -> socket.socket:
         if error.errno == errno.EADDRINUSE:
             raise InputError(f"port: {port} is in use; choose another with --port") from None
         raise InputError(f"host: cannot listen on {host}:{port}: {error.strerror or error}") from None
+
+
+def _quiet() -> contextlib.AbstractContextManager[object]:
+    """Without viser's own announcements, which in a notebook go around stdout."""
+    return mock.patch.object(rich, "print")
 
 
 @contextlib.contextmanager

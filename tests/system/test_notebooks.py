@@ -1,0 +1,96 @@
+"""Every notebook runs, holds what it says, and shows its pictures and its replay in a real headless browser."""
+
+import io
+import re
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+
+import nbformat
+import numpy as np
+import pytest
+from nbclient import NotebookClient
+from nbconvert import HTMLExporter
+from PIL import Image
+
+FOLDER = Path(__file__).resolve().parents[2] / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+CHROMIUM = shutil.which("chromium")
+SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+PATIENCE = 60_000  # ms, on a machine that does other things too
+# What a page of nbconvert asks for by itself, for equations and for widgets that are not there.
+USUAL = re.compile(r"https://cdnjs\.cloudflare\.com/ajax/libs/(mathjax|require\.js)/")
+ROBOT = "window.__viserMutable?.nodePoseData['/world/robot/chassis']?.position"
+
+
+def named(path):
+    return path.stem
+
+
+def test_there_are_notebooks():
+    """The lessons are there."""
+    assert [path.stem[:2] for path in NOTEBOOKS] == ["01", "02", "03", "04", "05"]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=named)
+def test_committed_clean(path):
+    """In the repository a notebook holds no outputs, and nothing of the machine on which it was written."""
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(not cell.outputs and cell.execution_count is None for cell in code)
+    assert all(not cell.metadata for cell in notebook.cells)
+    assert notebook.metadata.kernelspec.name == "python3"
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=named)
+def test_notebook(path, tmp_path):
+    """It runs from top to bottom with all its assertions; as a file, without server or network, it shows everything."""
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(notebook, timeout=600, resources={"metadata": {"path": tmp_path}}).execute()
+    body, _ = HTMLExporter().from_notebook_node(notebook)
+    page = tmp_path / f"{path.stem}.html"
+    page.write_text(body)
+    assert page.stat().st_size < 6e6
+    if CHROMIUM is None:
+        pytest.skip("ran without error; to look at the page needs chromium")
+    with visit(page) as seen:
+        pictures = seen.locator(".jp-RenderedImage img")
+        assert pictures.count() >= 2
+        assert all(width > 0 for width in pictures.evaluate_all("all => all.map((one) => one.naturalWidth)"))
+        replay = seen.locator("iframe.mrctl-replay")
+        assert replay.count() == 1
+        replay.scroll_into_view_if_needed()
+        scene = replay.content_frame.locator("iframe").element_handle(timeout=PATIENCE).content_frame()
+        start = np.array(scene.wait_for_function(ROBOT, timeout=PATIENCE).json_value())
+        x, y, _ = start
+        scene.wait_for_function(f"Math.hypot({ROBOT}[0] - {x}, {ROBOT}[1] - {y}) > 0.1", timeout=PATIENCE)  # it drives
+        shown = np.asarray(Image.open(io.BytesIO(replay.screenshot(timeout=PATIENCE))).convert("RGB"))
+        Image.fromarray(shown).save(tmp_path / "replay.png")
+        curves, world = shown[:, :430], shown[:, 430:]  # as in `mrctl/viewer/player.html`
+        for half in (curves, world):
+            assert len(np.unique(half.reshape(-1, 3), axis=0)) > 100  # drawn, not blank
+
+
+@contextmanager
+def visit(file):
+    """A page of a file; no error on its console is tolerated, nor anything from the network but what is usual."""
+    from playwright.sync_api import sync_playwright
+
+    asked, errors = [], []
+
+    def answer(route):
+        asked.append(route.request.url)
+        route.fulfill(body="", content_type="text/javascript")
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        page = browser.new_page(viewport={"width": 1000, "height": 560})
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.route(re.compile("^(https?|wss?):"), answer)
+        page.goto(file.as_uri())
+        yield page
+        assert errors == []
+        assert all(USUAL.match(url) for url in asked)
+        browser.close()

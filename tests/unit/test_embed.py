@@ -1,0 +1,56 @@
+"""Replays inside notebooks; `tests/system/test_notebooks.py` looks at them in a browser."""
+
+import html
+import json
+import re
+
+import pytest
+
+import mrctl
+
+
+@pytest.fixture(scope="module")
+def result():
+    circle = mrctl.Circle(radius=0.8, period=6.0)
+    event = mrctl.Event(time=2.0, perturbation=mrctl.Perturbation(payload=5.0))
+    base = mrctl.Scenario(reference=circle, laps=1, events=(event,))
+    return mrctl.simulate([base.model_copy(update={"feedforward": f}) for f in ("model", "none")])
+
+
+def data(replay):
+    """What the page's curves are drawn from."""
+    return json.loads(re.search(r'<script id="data"[^>]*>(.*?)</script>', replay.page, re.DOTALL)[1])
+
+
+def test_stretch(result):
+    """A stretch of time shows its own samples, with the events where they happened."""
+    found = data(mrctl.replay(result.sel(time=slice(1.5, 3.5))))
+    assert found["marks"] == [0.5]
+    assert found["time"][0] == 0 and found["time"][-1] == pytest.approx(2.0)
+    speeds = next(chart for chart in found["charts"] if chart["title"].startswith("V"))["curves"]
+    shown = [
+        next(c["values"] for c in speeds if c["values"][0] == pytest.approx(v, rel=1e-4))
+        for v in result.v.values[:, 150]
+    ]
+    for values, run in zip(shown, result.v.values, strict=True):
+        assert values == pytest.approx(run[150:351], rel=1e-4)
+
+
+def test_runs(result):
+    """Runs of one result, or of several, in one page, which is a single attribute of an iframe."""
+    one, two = result.isel(run=0).sel(time=slice(0, 1)), result.isel(run=[1]).sel(time=slice(0, 1))
+    replay = mrctl.replay(one, two)
+    assert len(data(replay)["charts"][0]["curves"]) == 3  # two robots, the reference
+    (inside,) = re.findall(r'srcdoc="([^"]*)"', replay._repr_html_())
+    assert html.unescape(inside) == replay.page
+
+
+def test_refused(result):
+    """No run, too long, a world of its own, or over before it began: one line each."""
+    with pytest.raises(mrctl.InputError, match="results: no run"):
+        mrctl.replay()
+    with pytest.raises(mrctl.InputError, match="results: .* too long"):
+        mrctl.replay(result.assign_coords(time=result.time).pad(time=(0, 6000), mode="edge"))
+    failed = result.where(result.time < 2)
+    with pytest.raises(mrctl.InputError, match="model had failed before 3 s"):
+        mrctl.replay(failed.sel(time=slice(3, 4)))
