@@ -412,7 +412,7 @@ class _Adoption:
 
         With the middle of the front axle at φ, a wheel at y to the left is at atan(L tan φ/(L − y tan φ)).
         """
-        servos = [k for k in range(self.model.nu) if self._trains(k)]
+        servos = [k for k in range(len(self.model.actuator_trntype)) if self._trains(k)]
         kp, kv = (sum(-self.model.actuator_biasprm[k, i] for k in servos) for i in (1, 2))
         if not kp > 0:
             raise InputError(f"steering: {_listed(self.steered)} needs a <position> or <pid> actuator with a kp")

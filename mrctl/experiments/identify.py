@@ -150,9 +150,14 @@ def identify(
 
 def _constant(name: str, values: Array, unit: str, true: float) -> Constant:
     mean = float(values.mean())
-    scatter = stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
-    reach = float(np.hypot(scatter, MODEL * mean))
+    reach = float(np.hypot(scatter(values), MODEL * mean))
     return Constant(name, unit, mean, mean - reach, mean + reach, true)
+
+
+def scatter(values: Array) -> Array:
+    """Half of the 95 % interval of a mean by Student's t, for values along the last axis."""
+    count = values.shape[-1]
+    return stats.t.ppf(0.975, count - 1) * values.std(ddof=1, axis=-1) / np.sqrt(count)
 
 
 def _bandwidth(robot: Robot) -> float:
