@@ -46,8 +46,8 @@ TICK = 0.005  # s
 FINE = 100  # physics steps in a time constant: the engine, of first order, adds half a step of braking to the mass
 MODEL = 0.015  # share of a constant that what equation (3) leaves out may cost
 NOISE = PERTURBATIONS["sensor noise"]
-APART = """Not identifiable from such drives: m, J_w, J_m (only in M_e and J_e), c (only m c; c with m from a scale),
-I_0, gear and rolling loss (only in F_c), N and k_M (only N k; k_E is taken to be k_M, as it is in SI)."""
+APART = """c takes m from a scale. Not identifiable from such drives: m, J_w and J_m (only in M_e and J_e); I_0, gear and
+rolling loss (only in F_c); N and k_M (only N k; k_E is taken to be k_M, as it is in SI)."""
 
 
 class Constant(NamedTuple):
@@ -136,7 +136,8 @@ def identify(
     rows = []
     for straight, turn in zip(ahead, turning, strict=True):
         found = drive_constants(straight, nominal.wheel_radius, highest)
-        rows.append({**found, **turn_constants(turn, found["R_a"], found["N k"], nominal, highest)})
+        found |= turn_constants(turn, found["R_a"], found["N k"], nominal, highest)
+        rows.append(found | {"c": found["m c"] / true.mass})
     facts = {
         "R_a": ("Ω", true.resistance),
         "N k": ("N·m/A", true.back_emf),
@@ -144,6 +145,7 @@ def identify(
         "F_c": ("N", 2 * true.drive_loss / true.wheel_radius + true.rolling_force),
         "J_e": ("kg·m²", true.effective_inertia),
         "m c": ("kg·m", true.mass * true.com_offset),
+        "c": ("m", true.com_offset),
     }
     return [_constant(name, np.array([row[name] for row in rows]), *fact) for name, fact in facts.items()]
 

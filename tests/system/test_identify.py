@@ -12,7 +12,7 @@ def test_default_robot(capsys):
     """All constants within 1 % with the noise of ordinary sensors, and inside of their intervals; the table says so."""
     assert cli.main(["identify", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["constants"]
-    assert [row["name"] for row in rows] == ["R_a", "N k", "M_e", "F_c", "J_e", "m c"]
+    assert [row["name"] for row in rows] == ["R_a", "N k", "M_e", "F_c", "J_e", "m c", "c"]
     for row in rows:
         assert abs(row["error"]) < 0.01, row
         assert row["low"] < row["true"] < row["high"], row

@@ -26,10 +26,12 @@ def test_there_are_snippets() -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder with the README's scenario and sweep in it, the sweep with one draw instead of hundreds."""
+    """An empty folder with the README's scenario, robot and sweep in it, the sweep with one draw, not hundreds."""
     monkeypatch.chdir(tmp_path)
     scenario, sweep = blocks("toml")
     Path("scenario.toml").write_text(scenario)
+    for robot in blocks("xml"):
+        Path("my_robot.xml").write_text(robot)
     Path("sweep.toml").write_text(re.sub(r"^runs = \d+", "runs = 1", sweep, flags=re.MULTILINE))
     return tmp_path
 
