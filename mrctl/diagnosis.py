@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from mrctl.adopt import MOTORS, REAR
 from mrctl.checks import CHECKS, Car, Check, Comparison, Report, rolling_wheels, steered
-from mrctl.model import Steering, fronts, read_robot
+from mrctl.model import Steering, fronts, read_robot, steerings
 from mrctl.record import InputError
 from mrctl.robot import GRAVITY, Robot
 
@@ -676,6 +676,26 @@ def _fork(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     )
 
 
+def _servo(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
+    if steerings(model) != ("rigid",):
+        return None  # other arrangements have stiffness of their own
+    stiffness = -model.actuator("steering").biasprm[1]
+    torque = robot.trail * robot.tyre_friction * robot.front_load * robot.mass * GRAVITY
+    if torque <= 0.05 * stiffness:
+        return None
+
+    def repair(m: mujoco.MjModel) -> None:
+        servo = m.actuator("steering")
+        for k, power in ((1, 1.0), (2, 0.5)):
+            for gains in (servo.gainprm, servo.biasprm):
+                gains[k] *= (300 * torque / stiffness) ** power
+
+    text = (
+        f"{stiffness:g} N·m/rad against the {torque:.2g} N·m with which the tyre, trailing its axis, can turn the fork:"
+    )
+    return Suspect("soft steering servo", f"{text} raise kp", repair)
+
+
 def _degrees(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     limit = robot.steering_limit
     if limit >= 0.1 or not steered(model):
@@ -695,7 +715,7 @@ INSPECTIONS = (
     _motors_differ, _armature, _constant, _gear, _drag, _losses_differ, _creep,
     _balance, _wheel_inertia, _gravity,
     _missing, _strangers, _condim, _grip, _step, _soft,
-    _fork, _degrees,
+    _fork, _servo, _degrees,
 )  # fmt: skip
 
 
