@@ -8,10 +8,11 @@ from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
 from mrctl.metrics import guard_events, per_lap, summary
+from mrctl.model import load_robot
 from mrctl.record import InputError
 from mrctl.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
 from mrctl.result import save
-from mrctl.robot import PERTURBATIONS, Perturbation, Robot
+from mrctl.robot import PERTURBATIONS, Perturbation, Robot, RobotFile
 from mrctl.scenario import Event, Scenario
 from mrctl.simulate import Simulation, simulate
 from mrctl.store import open_store as open
@@ -35,6 +36,7 @@ __all__ = [
     "Pid",
     "Rls",
     "Robot",
+    "RobotFile",
     "RoundedSquare",
     "Scenario",
     "Simulation",
@@ -42,6 +44,7 @@ __all__ = [
     "Sweep",
     "Waypoints",
     "guard_events",
+    "load_robot",
     "open",
     "per_lap",
     "save",

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mrctl.dynamics import accelerations
 from mrctl.kinematics import scrub_free_angle, twist_from_front_wheel, wheel_rates
-from mrctl.model import Steering, clone, perturb, stand
+from mrctl.model import Steering, clone, fronts, perturb, stand
 from mrctl.plant import OMEGA, RATE_LEFT, RATE_RIGHT, STEERING, THETA, UPRIGHT, V_LATERAL, V, X, Y, addresses, read
 from mrctl.robot import GRAVITY, Perturbation, Robot
 
@@ -194,8 +194,8 @@ def open_circuit(model: mujoco.MjModel) -> mujoco.MjModel:
 def on_skid(model: mujoco.MjModel) -> mujoco.MjModel:
     """The front tyre without friction, so that it follows wherever equation (3) sends it, and brakes nothing."""
     model = clone(model)
-    wheel = model.geom("front_wheel").id
-    model.pair_friction[(model.pair_geom1 == wheel) | (model.pair_geom2 == wheel)] = 1e-5
+    for wheel in (model.geom(name).id for name in fronts(model)):
+        model.pair_friction[(model.pair_geom1 == wheel) | (model.pair_geom2 == wheel)] = 1e-5
     return model
 
 

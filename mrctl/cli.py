@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from mrctl.record import InputError
+from mrctl.robot import CAR, PERTURBATIONS, Perturbation, RobotFile
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
 
@@ -55,6 +56,7 @@ def _parse(arguments: list[str]) -> None:
         "sweep": sweep,
         "suite": suite,
         "tune": tune,
+        "identify": identify,
         "train": train,
         "bench": bench,
         "view": view,
@@ -238,6 +240,27 @@ def tune(
     from mrctl.experiments import tuning
 
     print(tuning.tune(world, time_constant, delay, out, json))
+
+
+def identify(
+    world: str = "flat",
+    robot: RobotFile = CAR,
+    perturbation: Perturbation = PERTURBATIONS["sensor noise"],
+    seed: int = 0,
+    json: bool = False,
+) -> None:
+    """Identifies the constants of equation (3) from two drives, with intervals, beside those of the model.
+
+    Args:
+        world: Level world to drive in.
+        robot: Whose constants.
+        perturbation: How the plant differs from its model, and the noise of its sensors.
+        seed: Of signals and noise.
+        json: Print JSON.
+    """
+    from mrctl.experiments import identify as identification
+
+    print(identification.run(world, robot, perturbation, seed, json))
 
 
 def train(out: Path = Path("composite.safetensors"), plants: int = 120, seed: int = 0) -> None:

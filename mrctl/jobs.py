@@ -22,6 +22,7 @@ from mrctl.control.stages import METHODS, Stages
 from mrctl.pool import Cluster, Outcome, Pool, Processes, Work
 from mrctl.record import InputError
 from mrctl.result import SIGNALS, versions
+from mrctl.robot import CAR
 from mrctl.scenario import Scenario
 from mrctl.simulate import Simulation, simulate
 from mrctl.store import Store
@@ -153,7 +154,12 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
 
 def _models(sweep: Sweep) -> dict[str, str]:
     """Digests of the compiled worlds with the robot, and of the files of a controller."""
-    worlds = {f"{world}, {steering}": mjcf.digest(mjcf.load(world, steering)) for world, steering in sweep.worlds}
+    worlds = {
+        f"{world}, {steering}" + (f", {robot.path}" if robot != CAR else ""): mjcf.digest(
+            mjcf.load(world, steering, robot=robot)
+        )
+        for world, steering, robot in sweep.worlds
+    }
     return worlds | ({sweep.controller: controller.digest(sweep.controller)} if sweep.controller else {})
 
 

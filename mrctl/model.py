@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Mapping
-from importlib import resources
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -16,16 +15,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl import adopt
+from mrctl.adopt import FRONTS, MOTORS, REAR, SHIPPED, find, has, models_folder
 from mrctl.kinematics import scrub_free_angle
 from mrctl.record import InputError
-from mrctl.robot import GRAVITY, Perturbation, Robot
+from mrctl.robot import ANY_ANGLE, CAR, GRAVITY, Perturbation, Robot, RobotFile
 
 Steering = Literal["compliant", "caster", "rigid"]
 Fields = dict[str, NDArray]
 
-REAR = ("wheel_left", "wheel_right")
-MOTORS = ("motor_left", "motor_right")
-# Elements that a robot's MJCF must name (README: bring your own robot).
+STEERINGS: tuple[Steering, ...] = ("compliant", "caster", "rigid")
+# Elements that the robot of a world must name; `load_robot` names those of any other.
 REQUIRED = {
     "body": ("chassis", "wheel_left", "wheel_right", "fork", "front_wheel"),
     "joint": ("chassis", "wheel_left", "wheel_right", "steering", "front_wheel"),
@@ -35,49 +35,130 @@ REQUIRED = {
 NUMERICS = {"no_load_current": 1, "limits": 4}  # and how many values they hold
 
 
-def models_folder() -> Path:
-    """The folder of the shipped MJCF files, in a checkout and in an installed wheel."""
-    inside = Path(str(resources.files("mrctl"))) / "models"
-    return inside if inside.is_dir() else Path(__file__).resolve().parent.parent / "models"
-
-
 def world_path(world: str) -> Path:
     """The file of a world: one of the shipped names, or a path that ends in `.xml`.
 
     Raises:
         InputError: No such file; the message lists the shipped worlds.
     """
-    path = Path(world) if world.endswith(".xml") else models_folder() / f"{world}.xml"
+    if world in SHIPPED:
+        raise InputError(f"world: {world} is a robot; name it as robot.path")
+    path = find(world)
     if not path.is_file():
-        shipped = ", ".join(sorted(p.stem for p in models_folder().glob("*.xml") if p.stem not in ("car", "scenery")))
+        others = (*SHIPPED, "scenery")
+        shipped = ", ".join(sorted(p.stem for p in models_folder().glob("*.xml") if p.stem not in others))
         raise InputError(f"world: no file {path}; shipped worlds: {shipped}")
     return path
 
 
-def load(world: str = "flat", steering: Steering = "compliant", timestep: float | None = None) -> mujoco.MjModel:
+def load(
+    world: str = "flat",
+    steering: Steering = "compliant",
+    timestep: float | None = None,
+    robot: RobotFile = CAR,
+) -> mujoco.MjModel:
     """Compiles a world with the robot in one of the three steering arrangements.
 
     Args:
         world: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file.
         steering: `compliant` is the MJCF as it stands; `caster` and `rigid` take their stiffness, damping and trail
-            from the model's numerics `steering_caster` and `steering_rigid`.
+            from the model's numerics `steering_caster` and `steering_rigid`. A robot that is not the world's own has
+            one arrangement: see `steerings`.
         timestep: Time step of the physics in s; by default the file's own.
+        robot: Whose robot drives there; by default the world's own.
 
     Raises:
         InputError: The file is missing, does not compile, lacks a named element, or holds a robot that makes no sense.
     """
     path = world_path(world)
+    foreign = None if robot == CAR else adopt.compiled(robot, path)
+    source = path if foreign is None else adopt.robot_path(robot)
     try:
-        model = mujoco.MjModel.from_xml_path(str(path))
+        model = foreign or mujoco.MjModel.from_xml_path(str(path))
+        if steering not in (offered := steerings(model)):
+            raise InputError(f"steering: {robot.path} is driven with {' or '.join(offered)}, not {steering}")
         _complete(model, steering)
-        robot = read_robot(model)
-        if steering != "compliant":
-            _rearrange(model, robot, steering)
+        if foreign:
+            _limit(model)
+        nominal = read_robot(model)
+        if steering != "compliant" and len(offered) > 1:
+            _rearrange(model, nominal, steering)
     except ValueError as error:
-        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
+        raise InputError(f"{source}: {' '.join(str(error).split())}") from None
     if timestep is not None:
         model.opt.timestep = timestep
     return model
+
+
+def load_robot(
+    path: str | Path, wheels: Sequence[str] = (), steering: str | Sequence[str] = (), chassis: str = ""
+) -> RobotFile:
+    """Names the robot of any MJCF file for `Scenario.robot`, after trying it on a level floor.
+
+    Two wheels must be driven by a `<dcmotor>` each, whose `ctrlrange` is the supply. One wheel may be steered, or two
+    by Ackermann's geometry, by a `<position>` or `<pid>` actuator; without, it is a differential drive, and what else
+    touches the floor is its caster, without friction unless it rolls. The file's own floor is left out, and wheels roll
+    on spheres of their radius.
+
+    Args:
+        path: `turtlebot`, `racecar`, or an MJCF file.
+        wheels: Joints of the two driven wheels; by default the two with a `<dcmotor>`.
+        steering: Joint or joints of what is steered; by default the upright ones with an actuator.
+        chassis: The body that carries them; by default the root.
+
+    Raises:
+        InputError: One line that says what is missing or ambiguous, or cannot be.
+    """
+    steered = (steering,) if isinstance(steering, str) else tuple(steering)
+    values = {"path": str(path), "wheels": tuple(wheels), "steering": steered, "chassis": chassis}
+    robot = RobotFile.from_dict(values, "robot")
+    load(steering=arrangement(robot), robot=robot)
+    return robot
+
+
+def arrangement(robot: RobotFile) -> Steering:
+    """The steering arrangement that a robot is driven with unless one asks for another.
+
+    Raises:
+        InputError: As `load`.
+    """
+    return "compliant" if robot == CAR else steerings(adopt.compiled(robot, world_path("flat")))[0]
+
+
+def steerings(model: mujoco.MjModel) -> tuple[Steering, ...]:
+    """The arrangements that a compiled robot can be driven with, its own first.
+
+    A differential drive is `caster`: the torque difference alone makes θ̇. An adopted robot whose wheels are held by
+    servos is `rigid`. The default robot has all three.
+    """
+    if not has(model, "joint", "steering"):
+        return ("caster",)
+    return ("rigid",) if has(model, "text", adopt.RIGID) else STEERINGS
+
+
+def reverses(model: mujoco.MjModel, steering: Steering) -> bool:
+    """Whether a robot can be driven backwards: a trailing fork would jackknife."""
+    return steering == "rigid" or not has(model, "joint", "steering")
+
+
+def _limit(model: mujoco.MjModel) -> None:
+    """Gives a robot whose file has no numeric `limits` some, from its motors and its grip.
+
+    With the default robot's numbers they come out near its own: 64 % of the no-load speed, a sixth of the acceleration
+    at stall, a fifth (along) and half (across) of the tyres' grip.
+    """
+    if np.any(model.numeric("limits").data):
+        return
+    model.numeric("limits").data[:] = 1.0
+    robot = read_robot(model)
+    grip = robot.tyre_friction * GRAVITY
+    speed = 0.64 * robot.velocity_gain * robot.supply
+    rotation = min(0.4 * speed / robot.half_track, 0.5 * grip / speed)
+    if robot.steering_limit < ANY_ANGLE:
+        rotation = min(rotation, 0.5 * speed * np.tan(robot.steering_limit) / robot.wheelbase)
+    stall = 2 * robot.motor_gain * robot.supply / robot.wheel_radius / robot.effective_mass
+    acceleration = min(stall / 6, 0.2 * grip)
+    model.numeric("limits").data[:] = speed, rotation, acceleration, 2 * rotation * acceleration / speed
 
 
 def _complete(model: mujoco.MjModel, steering: Steering) -> None:
@@ -86,8 +167,10 @@ def _complete(model: mujoco.MjModel, steering: Steering) -> None:
     Raises:
         InputError: The first that is missing or of another kind.
     """
-    numerics = NUMERICS if steering == "compliant" else NUMERICS | {f"steering_{steering}": 3}
-    for kind, names in (*REQUIRED.items(), ("numeric", numerics)):
+    arranged = steering == "compliant" or len(steerings(model)) == 1
+    numerics = NUMERICS if arranged else NUMERICS | {f"steering_{steering}": 3}
+    required = REQUIRED if not fronts(model) or has(model, "geom", "front_wheel") else {}
+    for kind, names in (*required.items(), ("numeric", numerics)):
         for name in names:
             try:
                 getattr(model, kind)(name)
@@ -99,7 +182,7 @@ def _complete(model: mujoco.MjModel, steering: Steering) -> None:
     for name in MOTORS:
         if model.actuator(name).gaintype != mujoco.mjtGain.mjGAIN_DCMOTOR:
             raise InputError(f"actuator {name} must be a <dcmotor>")
-    if model.actuator_ctrlnum[model.actuator("steering").id] != 2:
+    if required and model.actuator_ctrlnum[model.actuator("steering").id] != 2:
         raise InputError("actuator steering must be a <pid> with position and velocity inputs")
     if not _tyre_pairs(model):
         raise InputError("no contact pair between the wheels and a floor")
@@ -119,8 +202,8 @@ def _rearrange(model: mujoco.MjModel, robot: Robot, steering: Steering) -> None:
 def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
     """Reads the parameters of equations (1) to (3) out of a compiled model, by element name.
 
-    The rolling coefficient follows from the front wheel's frictionloss (nothing else brakes that wheel); what is left
-    of a rear wheel's frictionloss after rolling and no-load loss is the gearbox.
+    The rolling coefficient follows from the front wheel's frictionloss (nothing else brakes that wheel; a caster that
+    slides has none); what is left of a rear wheel's frictionloss after rolling and no-load loss is the gearbox.
 
     Raises:
         InputError: A value that `Robot` refuses, or a rear frictionloss below rolling and no-load loss.
@@ -133,14 +216,18 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
         up = data.ximat[body].reshape(3, 3)[2]
         inertia += up**2 @ model.body_inertia[body]
     radius = np.mean([model.geom(wheel).size[0] for wheel in REAR])
-    half_track, wheelbase, trail = _layout(model)
+    half_track, wheelbase, trail = _layout(model, data)
+    front = fronts(model)
+    rolling_fronts = _rolling(model)
     motor = model.actuator("motor_left")
     gear, constant = motor.gear[0], motor.gainprm[1]
     no_load = model.numeric("no_load_current").data[0]
     load = _load_torques(model)
     if min(load.values()) <= 0:
         raise InputError("com_offset: the centre of mass must lie over the triangle of the wheels")
-    rolling = model.joint("front_wheel").frictionloss[0] / load["front_wheel"]
+    rolling = 0.0
+    if rolling_fronts:
+        rolling = sum(model.joint(f).frictionloss[0] for f in rolling_fronts) / sum(load[f] for f in rolling_fronts)
     drives = [model.joint(wheel).frictionloss[0] - rolling * load[wheel] for wheel in REAR]
     gear_loss = np.mean(drives) - gear * constant * no_load
     if gear_loss < -1e-9:
@@ -153,11 +240,11 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
             "com_offset": com[0],
             "com_height": com[2] + radius,
             "wheel_radius": radius,
-            "front_wheel_radius": model.geom("front_wheel").size[0],
+            "front_wheel_radius": model.geom(front[0]).size[0],
             "half_track": half_track,
             "wheelbase": wheelbase,
             "trail": trail,
-            "steering_limit": model.joint("steering").range[1],
+            "steering_limit": model.joint("steering").range[1] if has(model, "joint", "steering") else ANY_ANGLE,
             "resistance": motor.gainprm[0],
             "inductance": _inductance(model),
             "torque_constant": constant,
@@ -167,7 +254,7 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
             "gear_loss": max(0.0, gear_loss),
             "rolling_coefficient": rolling,
             "wheel_inertia": _spin_inertia(model, "wheel_left"),
-            "front_wheel_inertia": _spin_inertia(model, "front_wheel"),
+            "front_wheel_inertia": sum(_spin_inertia(model, wheel) for wheel in rolling_fronts),
             "supply": model.actuator_ctrlrange[model.actuator_ctrladr[motor.id], 1],
             "drive_gain": drive_gain,
             "tyre_friction": model.pair_friction[_tyre_pairs(model)[0], 0],
@@ -195,18 +282,43 @@ def _at_rest(model: mujoco.MjModel) -> tuple[mujoco.MjData, NDArray[np.float64]]
     return data, chassis.xmat.reshape(3, 3).T @ (com - chassis.xpos)
 
 
-def _layout(model: mujoco.MjModel) -> tuple[float, float, float]:
+def fronts(model: mujoco.MjModel) -> list[str]:
+    """What else the robot stands on: geoms of one front wheel, of two, or of casters."""
+    return [name for name in FRONTS if has(model, "geom", name)]
+
+
+def _rolling(model: mujoco.MjModel) -> list[str]:
+    """Those of `fronts` that roll instead of sliding."""
+    return [name for name in fronts(model) if has(model, "joint", name)]
+
+
+def centres(model: mujoco.MjModel, data: mujoco.MjData, wheels: Sequence[str]) -> NDArray[np.float64]:
+    """Centres of wheels from P in the chassis' frame, `(n, 3)` in m, to the picometre."""
+    chassis = data.body("chassis")
+    return np.array([_round(chassis.xmat.reshape(3, 3).T @ (data.geom(w).xpos - chassis.xpos)) for w in wheels])
+
+
+def _round(position: NDArray) -> NDArray:
+    return np.round(position, 12)  # 0.40 − 0.37 is 0.03
+
+
+def _layout(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float, float]:
     """Half track, wheelbase and trail in m."""
-    left, right = (model.body(wheel).pos[1] for wheel in REAR)
-    return (left - right) / 2, model.body("fork").pos[0], -model.body("front_wheel").pos[0]
+    (left, right), front = centres(model, data, REAR)[:, 1], centres(model, data, fronts(model))[:, 0].mean()
+    axis = front
+    if has(model, "joint", "steering"):
+        chassis = data.body("chassis")
+        axis = _round(chassis.xmat.reshape(3, 3).T @ (data.joint("steering").xanchor - chassis.xpos))[0]
+    return (left - right) / 2, float(axis), float(_round(axis - front))
 
 
 def _load_torques(model: mujoco.MjModel) -> dict[str, float]:
     """Static load on each wheel times its radius in N·m, by the lever rule on level ground."""
-    half_track, wheelbase, trail = _layout(model)
-    _, com = _at_rest(model)
+    data, com = _at_rest(model)
+    half_track, wheelbase, trail = _layout(model, data)
     front, side = com[0] / (wheelbase - trail), com[1] / (2 * half_track)
-    shares = {"wheel_left": (1 - front) / 2 + side, "wheel_right": (1 - front) / 2 - side, "front_wheel": front}
+    shares = {"wheel_left": (1 - front) / 2 + side, "wheel_right": (1 - front) / 2 - side}
+    shares |= {wheel: front / len(fronts(model)) for wheel in fronts(model)}
     weight = GRAVITY * model.body_mass[_bodies(model)].sum()
     return {wheel: float(weight * share * model.geom(wheel).size[0]) for wheel, share in shares.items()}
 
@@ -284,9 +396,9 @@ def perturb(nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Pertur
     height = _at_rest(model)[1][2] + np.mean([model.geom(wheel).size[0] for wheel in REAR])
     if height < 0:
         raise InputError("perturbation.payload_z: the centre of mass lies below the ground")
-    for wheel in after:
-        dof = nominal.joint(wheel).dofadr[0]
-        drive = 0.0 if wheel == "front_wheel" else base.drive_loss * (p.drive_friction_factor - 1)
+    for wheel in (*REAR, *_rolling(nominal)):
+        dof = nominal.joint(wheel).dofadr[0] + np.arange(len(nominal.joint(wheel).frictionloss))
+        drive = 0.0 if wheel not in REAR else base.drive_loss * (p.drive_friction_factor - 1)
         rolling = base.rolling_coefficient * (after[wheel] - before[wheel])
         model.dof_frictionloss[dof] = nominal.dof_frictionloss[dof] + drive + rolling
     mujoco.mj_setConst(model, mujoco.MjData(model))
@@ -366,9 +478,10 @@ class State(NamedTuple):
 
 
 def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | None = None) -> State:
-    """Stands the robot with its three wheels on the ground, rolling with a given twist.
+    """Stands the robot with its wheels on the ground, rolling with a given twist.
 
-    Rays find the ground under the wheels; the plane through those three points decides height, roll and pitch.
+    Rays find the ground under the driven wheels and in the middle under the others; the plane through those three
+    points decides height, roll and pitch.
 
     Args:
         model: Compiled world.
@@ -398,7 +511,9 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | N
     radius_left, radius_right = model.geom("wheel_left").size[0], model.geom("wheel_right").size[0]
     height = (radius_left + radius_right) / 2
     up = np.array([0.0, (radius_left - radius_right) / (2 * robot.half_track), 1.0])
-    centre = np.array([reach, aside, model.body("fork").pos[2] + model.body("front_wheel").pos[2]])
+    mujoco.mj_kinematics(model, data)
+    front = fronts(model)
+    centre = np.array([reach, aside, centres(model, data, front)[:, 2].mean()])
     for _ in range(8):
         up[2] = np.sqrt(1 - up[0] ** 2 - up[1] ** 2)
         up[0] = (robot.front_wheel_radius - height - up[1:] @ centre[1:]) / centre[0]
@@ -411,23 +526,61 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | N
     origin_z = (height - normal[:2] @ (np.array([x, y]) - point[:2])) / normal[2] + point[2]
     data.qpos[:3] = x, y, origin_z
     mujoco.mju_mat2Quat(data.qpos[3:7], frame.ravel())
-    data.qpos[model.joint("steering").qposadr[0]] = steering
+    steer(model, data.qpos, steering)
     v, omega = twist
     data.qvel[:3] = frame[:, 0] * v
     data.qvel[3:6] = 0.0, 0.0, omega
-    for wheel, rate in (
-        ("wheel_left", (v - robot.half_track * omega) / radius_left),
-        ("wheel_right", (v + robot.half_track * omega) / radius_right),
-        (
-            "front_wheel",
-            (v * np.cos(steering) + robot.wheelbase * omega * np.sin(steering)) / robot.front_wheel_radius,
-        ),
-    ):
+    rates = {"wheel_left": (v - robot.half_track * omega) / radius_left}
+    rates["wheel_right"] = (v + robot.half_track * omega) / radius_right
+    for wheel, rate in (rates | front_rates(model, robot, v, omega, np.array(steering))).items():
         data.qvel[model.joint(wheel).dofadr[0]] = rate
     mujoco.mj_forward(model, data)
     if data.ncon:
         data.qpos[2] -= min(0.0, data.contact.dist.min())  # bumps between the three points
     return State(data.qpos.copy(), data.qvel.copy())
+
+
+def _knuckles(model: mujoco.MjModel) -> list[str]:
+    """Joints of two steered wheels, which an equality couples to the joint `steering`."""
+    return [f"steering_{wheel}" for wheel in fronts(model) if has(model, "joint", f"steering_{wheel}")]
+
+
+def _linkage(model: mujoco.MjModel, knuckle: str, angle: NDArray) -> NDArray:
+    """Angle of a knuckle in rad at a steering angle."""
+    return np.polynomial.polynomial.polyval(angle, model.equality(knuckle).data[:5])
+
+
+def steer(model: mujoco.MjModel, qpos: NDArray, angle: float) -> None:
+    """Turns what is steered to a steering angle in rad, in `qpos` `(nq,)`."""
+    if has(model, "joint", "steering"):
+        qpos[model.joint("steering").qposadr[0]] = angle
+    for knuckle in _knuckles(model):
+        qpos[model.joint(knuckle).qposadr[0]] = _linkage(model, knuckle, np.array(angle))
+
+
+def front_rates(
+    model: mujoco.MjModel, robot: Robot, v: NDArray, omega: NDArray, steering: NDArray
+) -> dict[str, NDArray]:
+    """Rates in rad/s of the steered wheels that roll without slip, by name; shapes as those of the arguments.
+
+    Args:
+        model: Compiled world.
+        robot: The robot.
+        v: V in m/s.
+        omega: θ̇ in rad/s.
+        steering: φ in rad.
+    """
+    if not has(model, "joint", "steering"):
+        return {}
+    along = v * np.cos(steering) + robot.wheelbase * omega * np.sin(steering)  # of the middle of the front axle
+    rates = {wheel: along / robot.front_wheel_radius for wheel in fronts(model)}
+    for knuckle in _knuckles(model):  # seen from the turning point a wheel is as fast as it is far away
+        angle, wheel = _linkage(model, knuckle, steering), knuckle.removeprefix("steering_")
+        far = np.where(np.abs(steering) > 1e-6, np.sin(steering), 1.0) / np.where(
+            np.abs(angle) > 1e-6, np.sin(angle), 1.0
+        )
+        rates[wheel] = rates[wheel] * far
+    return rates
 
 
 def _frame(up: NDArray, ahead: NDArray) -> NDArray:

@@ -19,8 +19,9 @@ from numba import float64, guvectorize, int64, njit
 from numpy.typing import NDArray
 
 from mrctl import model as mjcf
+from mrctl.adopt import has
 from mrctl.control.chain import GIVEN, one, rows
-from mrctl.robot import LONGEST_DELAY, Perturbation, Robot
+from mrctl.robot import CAR, LONGEST_DELAY, Perturbation, Robot, RobotFile
 
 with warnings.catch_warnings():  # on a machine without a display dm_control tries GLFW first, which complains
     warnings.simplefilter("ignore")
@@ -34,7 +35,7 @@ Array = NDArray[np.float64]
 X, Y, THETA, V, OMEGA, V_LATERAL, RATE_LEFT, RATE_RIGHT, STEERING, STEERING_RATE, UPRIGHT = range(11)
 HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) on a sane state
 TILT = float(np.cos(np.radians(30)))
-JOINTS = ("chassis", "wheel_left", "wheel_right", "steering")
+JOINTS = ("chassis", "wheel_left", "wheel_right")
 
 
 @guvectorize(
@@ -43,7 +44,8 @@ JOINTS = ("chassis", "wheel_left", "wheel_right", "steering")
 def read(qpos, qvel, address, reading):  # noqa: ANN001, ANN201
     """State to reading: posture, twist in the body frame, wheel rates, steering, cosine of the tilt (NaN: blown up).
 
-    `address` holds qpos and dof addresses of chassis, left wheel, right wheel and steering joint in turn.
+    `address` holds qpos and dof addresses of chassis, left wheel, right wheel and, unless nothing is steered, steering
+    joint in turn.
     """
     q, d = address[0], address[1]
     w, i, j, k = qpos[q + 3], qpos[q + 4], qpos[q + 5], qpos[q + 6]
@@ -58,8 +60,10 @@ def read(qpos, qvel, address, reading):  # noqa: ANN001, ANN201
     reading[5] = yx * qvel[d] + yy * qvel[d + 1] + yz * qvel[d + 2]
     reading[6] = qvel[address[3]]
     reading[7] = qvel[address[5]]
-    reading[8] = qpos[address[6]]
-    reading[9] = qvel[address[7]]
+    reading[8] = reading[9] = 0.0
+    if address.shape[0] > 6:
+        reading[8] = qpos[address[6]]
+        reading[9] = qvel[address[7]]
     reading[10] = 1 - 2 * (i * i + j * j)
     for value in qpos:
         if not abs(value) < HUGE:
@@ -91,7 +95,7 @@ def _drive(command, tick, queue, inputs, state, ctrl):  # noqa: ANN001, ANN202
         s = state[i]
         queue[tick % len(queue), i] = command[i]
         now = queue[(tick - s.delay) % len(queue), i]
-        for k in range(4):
+        for k in range(len(inputs)):
             ctrl[i, inputs[k]] = now[k] * s.drive_gain if k < 2 else now[k]
             finite &= np.isfinite(now[k]) or s.failed
         for k in range(2):
@@ -116,8 +120,9 @@ def _look(qpos, qvel, act, address, acts, state):  # noqa: ANN001, ANN202
 
 
 def addresses(model: mujoco.MjModel) -> NDArray[np.int64]:
-    """Addresses in qpos and qvel of each joint in `JOINTS`, alternating, `(8,)`."""
-    return np.array([a for name in JOINTS for a in (model.joint(name).qposadr[0], model.joint(name).dofadr[0])], int)
+    """Addresses in qpos and qvel of each joint in `JOINTS` and of `steering`, if there is one, alternating, `(8,)`."""
+    joints = (*JOINTS, "steering") if has(model, "joint", "steering") else JOINTS
+    return np.array([a for name in joints for a in (model.joint(name).qposadr[0], model.joint(name).dofadr[0])], int)
 
 
 class CarPhysics(dm_mujoco.Physics):
@@ -127,9 +132,11 @@ class CarPhysics(dm_mujoco.Physics):
     """
 
     @classmethod
-    def from_world(cls, world: str = "flat", steering: mjcf.Steering = "compliant") -> CarPhysics:
-        """Loads a world by name or path (see `mrctl.model.load`)."""
-        return cls.from_compiled(mjcf.load(world, steering))
+    def from_world(
+        cls, world: str = "flat", steering: mjcf.Steering = "compliant", robot: RobotFile = CAR
+    ) -> CarPhysics:
+        """Loads a world by name or path with a robot (see `mrctl.model.load`)."""
+        return cls.from_compiled(mjcf.load(world, steering, robot=robot))
 
     @classmethod
     def from_compiled(cls, model: mujoco.MjModel) -> CarPhysics:
@@ -168,19 +175,20 @@ class CarPhysics(dm_mujoco.Physics):
         """Armature currents left and right in A, `(2,)`: (U − k_E N ω)/R_a, or the current state with inductance."""
         model = self.model.ptr
         return motor_current(
-            self.data.ctrl[None, _inputs(model)[:2]],
+            self.data.ctrl[None, inputs(model)[:2]],
             self.wheel_rates()[None],
             np.ascontiguousarray(self.data.act)[None],
             *_motor_parameters(model),
         )[0]
 
 
-def _inputs(model: mujoco.MjModel) -> list[int]:
-    """Positions in ctrl of left voltage, right voltage, steering angle, steering rate."""
-    left, right, steering = (
-        model.actuator_ctrladr[model.actuator(n).id] for n in ("motor_left", "motor_right", "steering")
-    )
-    return [left, right, steering, steering + 1]
+def inputs(model: mujoco.MjModel) -> list[int]:
+    """Positions in ctrl of left voltage, right voltage and, unless nothing is steered, steering angle and rate."""
+    found = [int(model.actuator_ctrladr[model.actuator(name).id]) for name in mjcf.MOTORS]
+    if has(model, "actuator", "steering"):
+        steering = int(model.actuator_ctrladr[model.actuator("steering").id])
+        found += [steering, steering + 1]
+    return found
 
 
 def _motor_parameters(model: mujoco.MjModel) -> tuple[Array, Array, list[int]]:
@@ -232,7 +240,7 @@ class Plant(ABC):
         self._nominal = model
         self._scratch = mjcf.clone(model)
         self._address = addresses(model)
-        self._inputs = np.array(_inputs(model), int)
+        self._inputs = np.array(inputs(model), int)
         resistance, back_emf, acts = _motor_parameters(model)
         self._acts = np.array(acts, int)
         state["resistance"], state["back_emf"], state["drive_gain"] = resistance, back_emf, 1.0
@@ -289,8 +297,8 @@ class Plant(ABC):
         for i in range(self.size):
             state = mjcf.stand(self._model_of(i), pose[i], twist[i])
             self.qpos[i], self.qvel[i] = state
-        self._queue[..., 2] = self.qpos[None, :, self._address[6]]
         self._look()
+        self._queue[..., 2] = self.reading[:, STEERING]
 
     def restart(self, robot: int, pose: Array, twist: Array) -> None:
         """Stands one robot on the ground again, as `reset` does all of them; what happened to it is forgotten.

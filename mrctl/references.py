@@ -398,7 +398,7 @@ def check(reference: Reference, robot: Robot, reverse: bool) -> None:
             "which steering = compliant or caster cannot; use rigid"
         )
     # atan2 keeps the ratio θ̇/V all the way to rest, and is zero there: a pause asks for no steering angle.
-    steering = np.arctan2(robot.wheelbase * np.abs(omega), np.abs(v))
+    steering = np.arctan2(abs(robot.wheelbase) * np.abs(omega), np.abs(v))
     for name, values, unit, limit, bound in (
         ("speed", v, "m/s", "max_speed", robot.max_speed),
         ("rotation", omega, "rad/s", "max_rotation", robot.max_rotation),

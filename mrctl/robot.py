@@ -5,6 +5,7 @@ No MuJoCo here: `mrctl.model` reads a `Robot` from a compiled MJCF and applies a
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from pydantic import Field, model_validator
@@ -12,6 +13,7 @@ from pydantic import Field, model_validator
 from mrctl.record import Record
 
 GRAVITY = 9.81  # m/s²
+ANY_ANGLE = math.pi / 2  # rad, the steering limit of what is not steered
 LONGEST_DELAY = 0.5  # s, of a command on its way to the motors
 
 Positive = Annotated[float, Field(ge=1e-9, le=1e9)]
@@ -39,12 +41,12 @@ class Robot(Record):
     """Front wheel radius in m."""
     half_track: Positive
     """Half the distance between the rear wheels [D] in m."""
-    wheelbase: Positive
-    """Rear axle to steering axis [L] in m."""
+    wheelbase: float
+    """Rear axle to steering axis [L] in m; to the caster where nothing is steered, negative if it is behind."""
     trail: NonNegative
     """Front contact point behind the steering axis [t] in m."""
-    steering_limit: Annotated[float, Field(gt=0, lt=1.5)]
-    """Largest steering angle in rad."""
+    steering_limit: Annotated[float, Field(gt=0, le=ANY_ANGLE)]
+    """Largest steering angle in rad; π/2 for a differential drive, which turns on the spot."""
     resistance: Positive
     """Terminal resistance [R_a] in Ω."""
     inductance: NonNegative
@@ -64,7 +66,7 @@ class Robot(Record):
     wheel_inertia: Positive
     """Spin inertia of one rear wheel [J_w] in kg·m²."""
     front_wheel_inertia: NonNegative
-    """Spin inertia of the front wheel in kg·m²."""
+    """Spin inertia of the front wheel, or of both, in kg·m²."""
     supply: Positive
     """Supply voltage [U_max] in V."""
     drive_gain: Positive = 1.0
@@ -82,9 +84,11 @@ class Robot(Record):
 
     @model_validator(mode="after")
     def _geometry(self) -> Robot:
-        if self.trail >= self.wheelbase:
+        if self.wheelbase <= 0 and self.steering_limit < ANY_ANGLE:
+            raise ValueError("wheelbase: steered wheels must be ahead of the driven ones")
+        if self.trail >= abs(self.wheelbase):
             raise ValueError("trail: must be shorter than the wheelbase")
-        if not 0 <= self.com_offset < self.wheelbase - self.trail:
+        if not 0 <= self.com_offset / (self.wheelbase - self.trail) < 1:
             raise ValueError("com_offset: the centre of mass must lie between the rear axle and the front contact")
         return self
 
@@ -156,6 +160,24 @@ class Robot(Record):
         """Time constant of θ̇ under U_Δ in s."""
         damping = 2 * self.half_track**2 * self.motor_gain * self.back_emf / self.wheel_radius**2
         return self.effective_inertia / damping
+
+
+class RobotFile(Record):
+    """Whose robot drives: an MJCF, and what its parts are called. What has no name is found where it is unambiguous."""
+
+    path: str = "car"
+    """`car`, `turtlebot`, `racecar`, or the path of an MJCF file with the robot."""
+    wheels: tuple[str, ...] = ()
+    """Joints of the two driven wheels; by default the two joints with a <dcmotor>."""
+    steering: tuple[str, ...] = ()
+    """Joint of the steered wheel, or of both; by default the upright joints with an actuator, so none for a
+    differential drive."""
+    chassis: str = ""
+    """Body that carries the rest; by default the one at the root of the wheels."""
+
+
+CAR = RobotFile()
+"""The robot that a world has by itself."""
 
 
 class Perturbation(Record):

@@ -15,7 +15,7 @@ from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
 from mrctl.record import Record
 from mrctl.references import Lemniscate, Reference
-from mrctl.robot import Perturbation
+from mrctl.robot import CAR, Perturbation, RobotFile
 
 FeedforwardName = Literal["none", "model", "oracle", "observer", "fel", "rls", "composite"]
 FEEDFORWARDS: tuple[FeedforwardName, ...] = ("none", "model", "oracle", "observer", "fel", "rls", "composite")
@@ -54,6 +54,8 @@ class Scenario(Record):
     """Label of the run in tables and figures; by default the feedforward's name."""
     world: str = "flat"
     """`flat`, `slope`, `rough`, `patch`, or the path of an MJCF file."""
+    robot: RobotFile = CAR
+    """Whose robot drives there; by default the world's own."""
     steering: Literal["compliant", "caster", "rigid"] = "compliant"
     """Steering arrangement of the front wheel."""
     reference: Reference = Lemniscate()

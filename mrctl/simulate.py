@@ -147,7 +147,8 @@ def batches(
 def group_of(s: Scenario) -> Hashable:
     """What runs in one simulation must share."""
     net = s.fel.hidden, s.composite.weights
-    return s.world, s.steering, s.feedforward, s.ticks, s.physics_step, s.control_period, s.motion_period, *net
+    rates = s.ticks, s.physics_step, s.control_period, s.motion_period
+    return s.world, s.robot, s.steering, s.feedforward, *rates, *net
 
 
 class Simulation:
@@ -179,12 +180,12 @@ class Simulation:
         self.scenarios = list(scenarios)
         self.ticks, self.tick = first.ticks, 0
         self._period = first.control_period
-        self.model = compiled = mjcf.load(first.world, first.steering, first.physics_step)
+        self.model = compiled = mjcf.load(first.world, first.steering, first.physics_step, first.robot)
         robot = mjcf.read_robot(compiled)
-        rigid = first.steering == "rigid"
+        self._reverses = mjcf.reverses(compiled, first.steering)
         for scenario in scenarios:
             for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
-                check(reference, robot, reverse=rigid)
+                check(reference, robot, self._reverses)
         factories: dict[str, Any] = {name: factory for name, factory in stages.items() if factory}
         own = {name: Own(name, factory, robot, size) for name, factory in factories.items()}
         names = {name: getattr(factory, "__name__", "custom") for name, factory in factories.items()}
@@ -237,7 +238,7 @@ class Simulation:
         if event.perturbation is not None:
             self.plant.check(event.perturbation)
         if event.reference is not None:
-            check(event.reference, self.plant.robot, reverse=self.scenarios[0].steering == "rigid")
+            check(event.reference, self.plant.robot, self._reverses)
         self.scenarios = [scenario.with_event(event) for scenario in self.scenarios]
         self._schedule[tick] += enumerate([event] * len(self.scenarios))
         if event.reference is not None:

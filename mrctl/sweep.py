@@ -23,6 +23,7 @@ from pydantic import Field, model_validator
 from mrctl.metrics import METRICS
 from mrctl.record import InputError, Record
 from mrctl.result import SIGNALS
+from mrctl.robot import RobotFile
 from mrctl.scenario import Scenario
 
 CHUNK_BYTES = 2**27  # what the signals of a job may take in memory
@@ -265,14 +266,17 @@ class Sweep(Record):
         return self.base.model_dump(mode="json")
 
     @cached_property
-    def worlds(self) -> list[tuple[str, Any]]:
-        """Worlds and steering arrangements that the runs may combine."""
+    def worlds(self) -> list[tuple[str, Any, RobotFile]]:
+        """Worlds, steering arrangements and robots that the runs may combine."""
         listed = {axis.field: axis.listed for axis in self.axes}
-        names = ("world", "steering")
-        pairs = set()
+        names = ("world", "steering", "robot")
+        found = set()
         for whole in listed.get(WHOLE, ({},)):
-            pairs |= set(product(*(listed.get(n, (whole.get(n, getattr(self.base, n)),)) for n in names)))
-        return sorted(pairs)
+            worlds, steerings, robots = (listed.get(n, (whole.get(n, getattr(self.base, n)),)) for n in names)
+            files = [RobotFile.model_validate(robot) for robot in robots]
+            files = [f.model_copy(update={"path": p}) for f in files for p in listed.get("robot.path", (f.path,))]
+            found |= set(product(worlds, steerings, files))
+        return sorted(found, key=str)
 
     @cached_property
     def columns(self) -> pa.Schema:

@@ -36,7 +36,17 @@ BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
     "Push": {"push": {"push": (0.0, 60.0, 0.0)}, "spin": {"push": (0.0, 0.0, 15.0)}},
 }
 RUN = ("world", "steering", "reference", "measurement", "seed", "prefilter")
-HIDDEN = ("name", "laps", "events", "initial_pose", "initial_spread", "physics_step", "control_period", "motion_period")
+HIDDEN = (
+    "name",
+    "laps",
+    "events",
+    "initial_pose",
+    "initial_spread",
+    "robot",
+    "physics_step",
+    "control_period",
+    "motion_period",
+)
 
 
 class Live(Page):
@@ -58,7 +68,7 @@ class Live(Page):
         self.late = self.ticks = 0  # ticks that began over a period after they were due, and all at a finite speed
         self._owed = 0.0  # ticks that are due
         self._wishes: dict[tuple[str, ...], Any] = {}
-        self._cast: tuple[str, str, list[str]] | None = None  # what the scene was built for
+        self._cast: tuple[object, ...] | None = None  # what the scene was built for
         self._drawn: tuple[int, bool] | None = None
         self._plotted: int | None = None
         self._build()
@@ -108,7 +118,7 @@ class Live(Page):
         """Puts the robots of the session into the scene and the plots."""
         session, first = self.session, self.session.start[0]
         labels = [s.name or s.feedforward for s in session.start]
-        cast = (first.world, first.steering, labels)
+        cast = (first.world, first.robot, first.steering, labels)
         if self._cast != cast:
             if self._cast is not None:
                 self._scene.remove()

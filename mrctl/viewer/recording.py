@@ -66,16 +66,15 @@ class Recording:
     @cached_property
     def model(self) -> mujoco.MjModel:
         """The compiled world with the nominal robot."""
-        return mjcf.load(self.scenario.world, self.scenario.steering)
+        return mjcf.load(self.scenario.world, self.scenario.steering, robot=self.scenario.robot)
 
     @cached_property
     def _turned(self) -> dict[str, Array]:
         """How far each wheel has turned at the samples, rad."""
         signal = {name: self.log[:, column] for name, column in COLUMN.items()}
         robot, steering = mjcf.read_robot(self.model), signal["steering_angle"]
-        speed = signal["v"] * np.cos(steering) + robot.wheelbase * signal["omega"] * np.sin(steering)
         rates = {wheel: signal[name] for wheel, name in WHEELS.items()}
-        rates["front_wheel"] = speed / robot.front_wheel_radius
+        rates |= mjcf.front_rates(self.model, robot, signal["v"], signal["omega"], steering)
         return {wheel: self.period * np.cumsum(rate) for wheel, rate in rates.items()}
 
     def perturbation(self, time: float) -> Perturbation:
@@ -93,7 +92,7 @@ class Recording:
         row = self.log[index]
         pose, twist = row[[COLUMN[n] for n in ("x", "y", "theta")]], row[[COLUMN[n] for n in ("v", "omega")]]
         qpos = mjcf.stand(self.model, pose, twist).qpos
-        qpos[self.model.joint("steering").qposadr[0]] = row[COLUMN["steering_angle"]]
+        mjcf.steer(self.model, qpos, row[COLUMN["steering_angle"]])
         for wheel, angle in self._turned.items():
             qpos[self.model.joint(wheel).qposadr[0]] = angle[index]
         return qpos
@@ -115,8 +114,9 @@ def names(recordings: Sequence[Recording], runs: Sequence[int]) -> list[str]:
     """
     first = recordings[0]
     for r in recordings:
-        if (r.scenario.world, r.period) != (first.scenario.world, first.period):
-            raise InputError(f"run: {r.label} drove in another world or at another control period than {first.label}")
+        for what in ("world", "robot", "control_period"):
+            if getattr(r.scenario, what) != getattr(first.scenario, what):
+                raise InputError(f"run: {r.label} drove with another {what} than {first.label}")
     labels = [r.label for r in recordings]
     unique = len(set(labels)) == len(labels)
     return labels if unique else [f"{label} {run}" for label, run in zip(labels, runs, strict=True)]

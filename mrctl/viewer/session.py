@@ -14,7 +14,7 @@ from mrctl.scenario import Event, Scenario
 from mrctl.simulate import batches
 
 HOUR = 3600.0  # s of simulated time that a session has room for
-ALIKE = ("world", "steering", "control_period", "physics_step")
+ALIKE = ("world", "robot", "steering", "control_period", "physics_step")
 # What can change in the middle of a run, by the name of the scenario's field; the rest needs another run.
 CHANGEABLE = [name for name in ("perturbation", "kanayama", "pid") if name in Event.model_fields]
 

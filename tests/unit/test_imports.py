@@ -16,13 +16,13 @@ LAYERS = (
     {"laws", "references"},
     {"scenario"},
     {"control.hierarchy", "measurement", "comparison", "metrics", "plots", "result"},
-    {"model", "plant"},
+    {"adopt", "model", "plant"},
     {"simulate", "checks"},
     {"episodes"},
     {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment", "gym", "export"},
     {"cli"},
 )
-ENGINE = {"model", "plant", "checks", "viewer", "environment", "experiments"}
+ENGINE = {"adopt", "model", "plant", "checks", "viewer", "environment", "experiments"}
 
 
 def module_of(path: Path) -> str:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from mrctl import Circle, Event, InputError, Perturbation, Scenario, Sweep
+from mrctl import Circle, Event, InputError, Perturbation, RobotFile, Scenario, Sweep
 from mrctl import store as folder
 from mrctl.result import SIGNALS
 
@@ -230,7 +230,8 @@ def test_list_of_scenarios():
     ]  # fmt: skip
     one = Sweep.of(scenarios, record="laps", chunk=3)
     assert [one.scenario(run) for run in range(one.size)] == scenarios
-    assert one.worlds == [("flat", "compliant"), ("rough", "rigid")] and one.samples == 0
+    own = RobotFile()
+    assert one.worlds == [("flat", "compliant", own), ("rough", "rigid", own)] and one.samples == 0
     assert Sweep.from_dict(one.model_dump(mode="json")) == one
 
 

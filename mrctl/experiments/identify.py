@@ -1,0 +1,277 @@
+"""`mrctl identify`: the constants of equation (3) from two drives, from voltages, currents and the measured twist.
+
+Robots drive open loop under periodic multisines, always forwards, so that Coulomb friction is constant: first straight
+on, then in turns with the front wheel held straight and without grip, as on a sheet of ice, because a front wheel that
+steers or trails carries a part of what equation (3) gives to the motors. Least squares follow, on signals averaged over
+periods and low-pass filtered by keeping their lowest harmonics:
+
+    motors, straight on      ω = U/(N k) − i R_a/(N k),    ω = V/r
+    straight on              V̇ = [ (N k/r) (i_d + i_s) − F_c ] / M_e
+    turning                  θ̈ = [ (N k D/r) (i_d − i_s) − m c V θ̇ ] / J_e + constant
+
+with F_c = 2 τ_loss/r + F_roll. The currents give torques, so masses come out in kg; without current sensors only
+ratios such as M_e/(N k) would. V̇ is the difference of two samples over a tick, thus its mean in between, as is the
+current beside it. What is noisy stands alone on the left, where noise does not bias.
+
+Each robot drives its own signal and gives one estimate. The interval around their mean is that of Student's t for noise
+and signals, and in quadrature 1.5 % for what equation (3) leaves out and no repetition shows: tyres that creep and sink
+in, the engine's time step.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from mrctl import model as mjcf
+from mrctl.checks import on_skid
+from mrctl.experiments.tables import json_text, markdown
+from mrctl.plant import OMEGA, V, build
+from mrctl.record import InputError
+from mrctl.robot import CAR, PERTURBATIONS, Perturbation, Robot, RobotFile
+
+Array = NDArray[np.float64]
+
+PERIOD = 10.0  # s of the excitation
+PERIODS = 2  # that are averaged, after one to settle
+REPEATS = 8  # robots, each under its own signal
+TICK = 0.005  # s
+FINE = 100  # physics steps in a time constant: the engine, of first order, adds half a step of braking to the mass
+MODEL = 0.015  # share of a constant that what equation (3) leaves out may cost
+NOISE = PERTURBATIONS["sensor noise"]
+APART = """Not identifiable from such drives: m, J_w, J_m (only in M_e and J_e), c (only m c; c with m from a scale),
+I_0, gear and rolling loss (only in F_c), N and k_M (only N k; k_E is taken to be k_M, as it is in SI)."""
+
+
+class Constant(NamedTuple):
+    """An identified constant: estimate, 95 % interval, and what the plant's model says."""
+
+    name: str
+    unit: str
+    estimate: float
+    low: float
+    high: float
+    true: float
+
+    @property
+    def error(self) -> float:
+        """Relative error of the estimate."""
+        return self.estimate / self.true - 1
+
+
+class Drive(NamedTuple):
+    """One period of one robot, averaged over periods: in the mean of each tick or at its end, `(N, 2)`.
+
+    Left comes before right, V before θ̇.
+    """
+
+    twist: Array
+    """V in m/s and θ̇ in rad/s in the mean."""
+    rate: Array
+    """Their derivatives in the mean, in m/s² and rad/s²."""
+    end: Array
+    """V and θ̇ at the end."""
+    voltage: Array
+    """At the terminals in V, constant in a tick."""
+    current: Array
+    """At the end, in A."""
+
+
+def run(world: str, robot: RobotFile, perturbation: Perturbation, seed: int, json: bool) -> str:
+    """The command: drives, identifies, and prints a table or JSON.
+
+    Args:
+        world: Where to drive; level ground.
+        robot: Whose constants.
+        perturbation: How it differs from its model, and the noise of its sensors.
+        seed: Of signals and noise.
+        json: JSON instead of a table.
+
+    Raises:
+        InputError: The robot cannot drive there.
+    """
+    found = identify(world, robot, perturbation, seed)
+    if json:
+        rows: list[dict[str, Any]] = [c._asdict() | {"error": c.error} for c in found]
+        return json_text({"world": world, "robot": robot.model_dump(), "constants": rows})
+    header = ["constant", "unit", "estimate", "95 % interval", "true", "error"]
+    numbers = [[f"{x:.4g}" for x in (c.estimate, c.low, c.high, c.true)] for c in found]
+    cells = [
+        [c.name, c.unit, estimate, f"{low} to {high}", true, f"{100 * c.error:+.2f} %"]
+        for c, (estimate, low, high, true) in zip(found, numbers, strict=True)
+    ]
+    return f"{markdown(header, cells)}\n{APART}"
+
+
+def identify(
+    world: str = "flat", robot: RobotFile = CAR, perturbation: Perturbation = NOISE, seed: int = 0
+) -> list[Constant]:
+    """Identifies the constants of equation (3) that show.
+
+    Args:
+        world: World to drive in; level ground.
+        robot: Whose constants.
+        perturbation: How the plant differs from its model, and the noise of its sensors.
+        seed: Of signals and noise.
+
+    Raises:
+        InputError: The robot fails on the way.
+    """
+    own = mjcf.arrangement(robot)
+    model = mjcf.load(world, "rigid" if own == "compliant" else own, robot=robot)
+    nominal = mjcf.read_robot(model)
+    tau = min(nominal.velocity_time_constant, nominal.rotation_time_constant)
+    model.opt.timestep = TICK / max(5, int(np.ceil(FINE * TICK / tau)))
+    random = np.random.default_rng([seed, 3])
+    ahead, true = excite(model, nominal, perturbation, random, turns=False)
+    turning, _ = excite(on_skid(model), nominal, perturbation, random, turns=True)
+    highest = round(2 * _bandwidth(nominal) * PERIOD)
+    rows = []
+    for straight, turn in zip(ahead, turning, strict=True):
+        found = drive_constants(straight, nominal.wheel_radius, highest)
+        rows.append({**found, **turn_constants(turn, found["R_a"], found["N k"], nominal, highest)})
+    facts = {
+        "R_a": ("Ω", true.resistance),
+        "N k": ("N·m/A", true.back_emf),
+        "M_e": ("kg", true.effective_mass),
+        "F_c": ("N", 2 * true.drive_loss / true.wheel_radius + true.rolling_force),
+        "J_e": ("kg·m²", true.effective_inertia),
+        "m c": ("kg·m", true.mass * true.com_offset),
+    }
+    return [_constant(name, np.array([row[name] for row in rows]), *fact) for name, fact in facts.items()]
+
+
+def _constant(name: str, values: Array, unit: str, true: float) -> Constant:
+    mean = float(values.mean())
+    reach = float(np.hypot(scatter(values), MODEL * mean))
+    return Constant(name, unit, mean, mean - reach, mean + reach, true)
+
+
+def scatter(values: Array) -> Array:
+    """Half of the 95 % interval of a mean by Student's t, for values along the last axis."""
+    count = values.shape[-1]
+    return stats.t.ppf(0.975, count - 1) * values.std(ddof=1, axis=-1) / np.sqrt(count)
+
+
+def _bandwidth(robot: Robot) -> float:
+    """Highest frequency of the excitation in Hz: twice the corner of the slower channel, from 1 to 4."""
+    slower = max(robot.velocity_time_constant, robot.rotation_time_constant)
+    return float(np.clip(2 / (2 * np.pi * slower), 1.0, 4.0))
+
+
+def signals(robot: Robot, random: np.random.Generator, turns: bool) -> Array:
+    """One period of U_Σ and U_Δ in V, `(N, 2)`: random phases, amplitudes that the robot's limits allow.
+
+    The common channel has the even harmonics, the differential one the odd ones. Predicted from the nominal robot, V
+    stays within half of its mean, which is half of the limit, and θ̇ within half of its limit and of what keeps both
+    wheels turning forwards; accelerations stay within two thirds of their limits.
+    """
+    samples = round(PERIOD / TICK)
+    lines = np.arange(1, round(PERIOD * _bandwidth(robot)) + 1)
+    speed = robot.max_speed / 2
+    turn = min(robot.max_rotation / 2, speed / 4 / robot.half_track)
+    channels = (
+        (lines[1::2], robot.velocity_gain, robot.velocity_time_constant, speed / 2, robot.max_acceleration),
+        (lines[::2], robot.rotation_gain, robot.rotation_time_constant, turn, robot.max_rotation_acceleration),
+    )
+    omega = 2 * np.pi / PERIOD * np.arange(samples // 2 + 1)
+    found = np.zeros((samples, 2))
+    for k, (harmonics, gain, tau, reach, acceleration) in enumerate(channels[: 1 + turns]):
+        spectrum = np.zeros(len(omega), complex)
+        spectrum[harmonics] = np.exp(2j * np.pi * random.random(len(harmonics)))
+        answer = spectrum * gain / (1 + 1j * omega * tau)
+        peaks = [np.abs(np.fft.irfft(part, samples)).max() for part in (answer, 1j * omega * answer)]
+        found[:, k] = np.fft.irfft(spectrum, samples) * min(reach / peaks[0], acceleration / 1.5 / peaks[1])
+    loss = (robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2) / robot.motor_gain
+    return found + [speed / robot.velocity_gain + loss, 0.0]
+
+
+def excite(
+    model: mujoco.MjModel, robot: Robot, perturbation: Perturbation, random: np.random.Generator, turns: bool
+) -> tuple[list[Drive], Robot]:
+    """Drives robots open loop; returns what was measured of each, and the robot as it truly is."""
+    period = np.stack([signals(robot, random, turns) for _ in range(REPEATS)], axis=1)  # (N, B, 2)
+    samples = len(period)
+    plant = build(model, REPEATS, round(TICK / model.opt.timestep), threads=1)
+    for row in range(REPEATS):
+        plant.perturb(row, perturbation, round(perturbation.control_delay / TICK))
+    plant.reset(np.zeros((REPEATS, 3)), np.tile([robot.max_speed / 2, 0.0], (REPEATS, 1)))
+    ticks = (1 + PERIODS) * samples
+    twist, voltage, current = np.zeros((ticks + 1, REPEATS, 2)), *np.zeros((2, ticks, REPEATS, 2))
+    command = np.zeros((REPEATS, 4))
+    for k in range(ticks):
+        common, differential = period[k % samples].T
+        command[:, 0], command[:, 1] = common - differential, common + differential
+        twist[k] = plant.reading[:, [V, OMEGA]]
+        plant.step(command)
+        voltage[k], current[k] = plant.applied, plant.current()
+    twist[ticks] = plant.reading[:, [V, OMEGA]]
+    if plant.failed.any():
+        raise InputError(f"identify: {next(filter(None, plant.failure))} on the way")
+    twist += random.standard_normal(twist.shape) * [perturbation.velocity_noise, perturbation.rotation_noise]
+
+    def mean(values: Array) -> Array:
+        return values[-PERIODS * samples :].reshape(PERIODS, samples, REPEATS, 2).mean(axis=0).transpose(1, 0, 2)
+
+    first, last = twist[:-1], twist[1:]
+    measured = map(mean, ((first + last) / 2, (last - first) / TICK, last, voltage, current))
+    return [Drive(*row) for row in zip(*measured, strict=True)], plant.truth[0]
+
+
+def drive_constants(drive: Drive, wheel_radius: float, highest: int) -> dict[str, float]:
+    """R_a, N k, M_e and F_c from a drive straight on.
+
+    Args:
+        drive: What was measured.
+        wheel_radius: Of the driven wheels in m.
+        highest: Harmonics above it are filtered out.
+    """
+    rate = np.repeat(drive.end[:, :1] / wheel_radius, 2, axis=1)  # of both wheels: their motors are alike
+    speed_per_volt, fall = _fit(highest, rate.T, drive.voltage.T, -drive.current.T)
+    resistance, constant = fall / speed_per_volt, 1 / speed_per_volt
+    force = constant / wheel_radius * _mean_current(drive, resistance).sum(axis=1)
+    lighter, loss = _fit(highest, drive.rate[:, 0], force, -np.ones_like(force))
+    found = {"R_a": resistance, "N k": constant, "M_e": 1 / lighter, "F_c": loss / lighter}
+    return {name: float(value) for name, value in found.items()}
+
+
+def turn_constants(drive: Drive, resistance: float, constant: float, robot: Robot, highest: int) -> dict[str, float]:
+    """J_e and m c from a drive in turns.
+
+    Args:
+        drive: What was measured.
+        resistance: R_a in Ω.
+        constant: N k in N·m/A.
+        robot: Of it wheel radius and half track are used, which a ruler measures.
+        highest: Harmonics above it are filtered out.
+    """
+    current = _mean_current(drive, resistance)
+    torque = constant * robot.half_track / robot.wheel_radius * (current[:, 1] - current[:, 0])
+    v, omega = drive.twist.T
+    nimbler, drag, _ = _fit(highest, drive.rate[:, 1], torque, -v * omega, np.ones_like(v))
+    return {"J_e": float(1 / nimbler), "m c": float(drag / nimbler)}
+
+
+def _mean_current(drive: Drive, resistance: float) -> Array:
+    """Mean currents of the ticks: at its beginning the current jumps with the voltage, then it bends to its end."""
+    jump = (drive.voltage - np.roll(drive.voltage, 1, axis=0)) / resistance
+    return (np.roll(drive.current, 1, axis=0) + jump + drive.current) / 2
+
+
+def _fit(highest: int, left: Array, *right: Array) -> Array:
+    """Coefficients of least squares, of signals over whole periods `(…, N)` of which the lowest harmonics are kept."""
+
+    def low(signal: Array) -> Array:
+        spectrum = np.fft.rfft(signal)
+        spectrum[..., highest + 1 :] = 0
+        return np.fft.irfft(spectrum, signal.shape[-1]).ravel()
+
+    found = np.linalg.lstsq(np.stack([low(r) for r in right], axis=1), low(left), rcond=None)[0]
+    return np.asarray(found, float)

@@ -1,0 +1,285 @@
+"""Robots of other files: whatever they call their parts and wherever these stand, the same robot comes out."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import mrctl
+from mrctl import InputError, Perturbation, Robot, RobotFile
+from mrctl import model as mjcf
+from mrctl.adopt import models_folder
+from mrctl.plant import OMEGA, V, build
+
+MOTOR = '<dcmotor name="{0}" joint="{0}" gear="{1}" motorconst="0.02 0.02" resistance="2" ctrlrange="-12 12" {2}/>'
+FLOOR = '<light pos="0 0 3"/><geom name="floor" type="plane" size="5 5 .1"/>'
+
+
+def wheel(joint, at, axis="0 1 0", extra="", loss=0.1):
+    """A solid cylinder of 0.1 m by 0.04 m and 2 kg with its joint."""
+    return f"""<body pos="{at}">
+      <joint name="{joint}" axis="{axis}" frictionloss="{loss}"/>
+      <geom type="cylinder" size="0.1 0.02" euler="90 0 0" mass="2" friction="0.8"/>{extra}
+    </body>"""
+
+
+def document(body, actuators, pose='pos="0 0 0.1"', extra="", compiler='angle="degree"'):
+    return f"""<mujoco><compiler {compiler}/>{extra}
+      <worldbody>{FLOOR}<body name="base" {pose}>{body}</body></worldbody>
+      <actuator>{actuators}</actuator></mujoco>"""
+
+
+BOX = '<geom type="box" size="0.2 0.1 0.05" pos="{} 0 0.03" mass="10"/>'
+BALL = '<geom name="ball" type="sphere" size="0.04" pos="{} 0 -0.06" mass="0"/>'
+DIFF = "<freejoint/>" + BOX.format(0.1) + BALL.format(0.3) + wheel("a", "0 0.2 0") + wheel("b", "0 -0.2 0")
+MOTORS = MOTOR.format("a", 30, "") + MOTOR.format("b", 30, "")
+KNUCKLE = """<body pos="{1}"><joint name="{0}" axis="0 0 1" range="-30 30"/>
+  <geom type="sphere" size="0.01" mass="0.1"/>{2}</body>"""
+SERVO = '<position joint="{}" kp="8" kv="0.4"/>'
+CAR = (
+    "<freejoint/>" + BOX.format(0.15) + wheel("a", "0 0.2 0") + wheel("b", "0 -0.2 0")
+    + KNUCKLE.format("s1", "0.5 0.2 0", wheel("c", "0 0 0", loss=0.02))
+    + KNUCKLE.format("s2", "0.5 -0.2 0", wheel("d", "0 0 0", loss=0.02))
+)  # fmt: skip
+TRICYCLE = (
+    "<freejoint/>" + BOX.format(0.15) + wheel("a", "0 0.2 0") + wheel("b", "0 -0.2 0")
+    + KNUCKLE.format("s1", "0.5 0 0", wheel("c", "0 0 0", loss=0.02))
+)  # fmt: skip
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(text):
+        path = tmp_path / "mine.xml"
+        path.write_text(text)
+        return str(path)
+
+    return write
+
+
+def read(path, **names):
+    robot = mrctl.load_robot(path, **names)
+    model = mjcf.load("flat", mjcf.arrangement(robot), robot=robot)
+    return mjcf.read_robot(model), model
+
+
+def test_by_hand(file):
+    """Every parameter against what the file says: a box, two solid wheels, a massless caster."""
+    robot, model = read(file(document(DIFF, MOTORS)))
+    spin, yaw = 2 * 0.1**2 / 2, 10 * (0.4**2 + 0.2**2) / 12 + 10 * (0.1 - 10 * 0.1 / 14) ** 2
+    across = 2 * (0.1**2 / 4 + 0.04**2 / 12)
+    yaw += 2 * (across + 2 * (0.2**2 + (10 * 0.1 / 14) ** 2))
+    expected = {
+        "mass": 14, "yaw_inertia": yaw, "com_offset": 10 * 0.1 / 14, "com_height": 0.1 + 10 * 0.03 / 14,
+        "wheel_radius": 0.1, "front_wheel_radius": 0.04, "half_track": 0.2, "wheelbase": 0.3, "trail": 0,
+        "steering_limit": np.pi / 2, "resistance": 2, "torque_constant": 0.02, "gear_ratio": 30, "supply": 12,
+        "wheel_inertia": spin, "front_wheel_inertia": 0, "gear_loss": 0.1, "rolling_coefficient": 0,
+        "tyre_friction": 0.8,
+    }  # fmt: skip
+    for name, value in expected.items():
+        assert getattr(robot, name) == pytest.approx(value, rel=1e-6, abs=1e-12), name
+    assert mjcf.steerings(model) == ("caster",) and mjcf.reverses(model, "caster")
+
+
+def mirrored(body):
+    return body.replace('axis="0 1 0"', 'axis="0 -1 0"')
+
+
+ELSEWHERE = 'pos="3 -2 0.1" euler="0 0 70"'
+VARIANTS = {
+    "elsewhere": document(DIFF, MOTORS, ELSEWHERE),
+    "wheels turn backwards": document(mirrored(DIFF), MOTORS),
+    "a motor is mirrored": document(DIFF, MOTOR.format("a", -30, "") + MOTOR.format("b", 30, "")),
+    "right before left": document(DIFF, MOTOR.format("b", 30, "") + MOTOR.format("a", 30, "")),
+    "origin elsewhere": document(
+        f'<freejoint/><frame pos="0.1 0.3 0.4" euler="0 0 30">{DIFF.removeprefix("<freejoint/>")}</frame>', MOTORS,
+        'pos="0 0 -0.3" euler="0 0 -30"'),
+    "radian": document(
+        DIFF.replace('euler="90 0 0"', 'euler="1.5707963267949 0 0"'), MOTORS, compiler='angle="radian"'),
+    "welded to the world": document(DIFF.removeprefix("<freejoint/>"), MOTORS),
+    "names of ours": document(DIFF, MOTORS).replace('"ball"', '"chassis"'),
+    "sensors and keys": document(
+        DIFF, MOTORS, extra='<sensor><jointpos joint="a"/></sensor><keyframe><key time="1"/></keyframe>'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_the_same_robot(file, name):
+    """However the file puts it, the robot is the same, and voltages drive it along the same path."""
+    ideal, plain = read(file(document(DIFF, MOTORS)))
+    robot, model = read(file(VARIANTS[name]))
+    assert robot.model_dump() == pytest.approx(ideal.model_dump(), rel=1e-6, abs=1e-9)
+    ends = [drive(m, (5.0, 6.0)) for m in (plain, model)]
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+    assert ends[1][V] > 0.2 and ends[1][OMEGA] > 0.05  # ahead, and to the left
+
+
+def drive(model, volts, steering=0.0, seconds=3.0, twist=(0.0, 0.0)):
+    plant = build(model, 1, 5)
+    plant.reset(np.zeros((1, 3)), np.array([twist]))
+    for _ in range(round(100 * seconds)):
+        plant.step(np.array([[*volts, steering, 0.0]]))
+    assert not plant.failed.any(), plant.failure
+    return plant.reading[0].copy()
+
+
+def test_caster_behind(file):
+    """A caster behind the axle has a negative wheelbase, with the centre of mass on its side."""
+    body = DIFF.replace('pos="0.1 0 0.03"', 'pos="-0.1 0 0.03"').replace('pos="0.3 0 -0.06"', 'pos="-0.3 0 -0.06"')
+    robot, model = read(file(document(body, MOTORS)))
+    assert robot.wheelbase == pytest.approx(-0.3) and robot.com_offset == pytest.approx(-10 * 0.1 / 14)
+    assert robot.front_load == pytest.approx(10 * 0.1 / 14 / 0.3)
+    plant = build(model, 1, 5)
+    plant.reset(np.zeros((1, 3)), np.zeros((1, 2)))
+    for _ in range(100):
+        plant.step(np.zeros((1, 4)))
+    assert abs(plant.reading[0, V]) < 1e-5 and plant.reading[0, 10] > 0.9999  # stands level
+
+
+@pytest.mark.parametrize("body", [CAR, TRICYCLE], ids=["two wheels", "one wheel"])
+def test_steered(file, body):
+    """Driven with the electronic differential, it goes round L/tan φ; the inner wheel turns farther, by Ackermann."""
+    servos = SERVO.format("s1") + (SERVO.format("s2") if "s2" in body else "")
+    robot, model = read(file(document(body, MOTORS + servos)))
+    assert mjcf.steerings(model) == ("rigid",) and robot.wheelbase == 0.5 and robot.trail == 0
+    inner = np.radians(30)
+    limit = np.arctan(0.5 / (0.5 / np.tan(inner) + 0.2)) if body is CAR else inner
+    assert robot.steering_limit == pytest.approx(limit)
+    phi = 0.3
+    omega = 0.4 * np.tan(phi) / 0.5
+    apart = robot.back_emf * robot.half_track * omega / robot.wheel_radius
+    reading = drive(model, (5 - apart, 5 + apart), phi, 4.0, (0.4, omega))
+    assert reading[V] / reading[OMEGA] == pytest.approx(0.5 / np.tan(phi), rel=0.01)
+    if body is CAR:
+        qpos = np.zeros(model.nq)
+        mjcf.steer(model, qpos, phi)
+        left, right = (qpos[model.joint(f"steering_front_{s}").qposadr[0]] for s in ("left", "right"))
+        assert 1 / np.tan(right) - 1 / np.tan(left) == pytest.approx(0.4 / 0.5, rel=2e-3) and left > phi > right
+
+
+def test_front_rates(file):
+    """Steered wheels roll as fast as their distance from the turning point says."""
+    robot, model = read(file(document(CAR, MOTORS + SERVO.format("s1") + SERVO.format("s2"))))
+    phi, v = 0.25, 0.6
+    turn = 0.5 / np.tan(phi)
+    rates = mjcf.front_rates(model, robot, np.array(v), np.array(v / turn), np.array(phi))
+    for name, y in (("front_left", 0.2), ("front_right", -0.2)):
+        assert rates[name] == pytest.approx(v / turn * np.hypot(turn - y, 0.5) / 0.1, rel=1e-3)
+
+
+def test_ours_as_a_stranger():
+    """The default robot, brought in from its own file, is the default robot, steered by its servo."""
+    robot = mrctl.load_robot(models_folder() / "car.xml")
+    found = mjcf.read_robot(mjcf.load("flat", "rigid", robot=robot))
+    own = mjcf.read_robot(mjcf.load("flat"))
+    different = {n for n in Robot.model_fields if getattr(found, n) != pytest.approx(getattr(own, n), rel=1e-9)}
+    assert different == {"tyre_friction"}  # which the world says, not the robot's file
+
+
+@pytest.mark.parametrize("world", ["flat", "slope", "rough", "patch"])
+@pytest.mark.parametrize("name", ["turtlebot", "racecar"])
+def test_every_world(name, world):
+    """Robots stand in every world, on all their wheels, and roll."""
+    robot = RobotFile(path=name)
+    model = mjcf.load(world, mjcf.arrangement(robot), robot=robot)
+    expected = mjcf.read_robot(mjcf.load("flat", mjcf.arrangement(robot), robot=robot))
+    assert mjcf.read_robot(model).model_dump() == pytest.approx(expected.model_dump(), rel=1e-9)
+    state = mjcf.stand(model, np.array([-2.0, 0.3, 0.4]), np.array([0.3, 0.0]))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = state
+    start = data.qpos[:3].copy()
+    mujoco.mj_step(model, data, 50)
+    touching = {model.geom(g).name for pair in data.contact.geom for g in pair} - {"floor"}
+    assert np.abs(data.qpos[:3] - start).max() < 0.1  # rolled on a little, and did not fall
+    if world != "rough":
+        assert {"wheel_left", "wheel_right", *mjcf.fronts(model)} <= touching
+
+
+def test_slippery_in_proportion():
+    """The icy patch is as much more slippery for another tyre as for ours."""
+    model = mjcf.load("patch", "rigid", robot=RobotFile(path="racecar"))
+    friction = {model.pair(p).name: model.pair_friction[p, 0] for p in range(model.npair)}
+    assert friction["tyre_left"] == pytest.approx(1.0489) and friction["ice_left"] == pytest.approx(1.0489 / 9)
+
+
+def test_published():
+    """The two robots have the numbers of their sources."""
+    turtle, _ = read("turtlebot")
+    assert (turtle.mass, turtle.wheel_radius, 2 * turtle.half_track) == pytest.approx((6.3, 0.035, 0.23))
+    # Kobuki: 0.7 m/s at most; no-load speed of the motor 9960 rpm ± 15 %, 6545/132.
+    no_load = (12 - turtle.no_load_current * turtle.resistance) / turtle.torque_constant
+    assert no_load * 60 / 2 / np.pi == pytest.approx(9960, rel=0.15)
+    car, model = read("racecar")
+    assert (car.mass, car.yaw_inertia, car.com_offset) == pytest.approx((3.74, 0.04712, 0.17145), rel=1e-3)
+    assert (car.com_height, car.wheelbase, car.steering_limit) == pytest.approx((0.074, 0.3302, 0.4189), rel=1e-3)
+    assert model.opt.timestep == 0.002
+
+
+def test_limits(file):
+    """Without a numeric `limits`, those of the default robot would come out near what was chosen for it."""
+    text = (models_folder() / "car.xml").read_text().replace('<numeric name="limits" data="1.5 3 1.5 6"/>', "")
+    robot, _ = read(file(text))
+    found = robot.max_speed, robot.max_rotation, robot.max_acceleration, robot.max_rotation_acceleration
+    assert found == pytest.approx((1.5, 3, 1.5, 6), rel=0.2)
+
+
+def test_slow_casters_tip_nobody(file):
+    """Perturbations reach an adopted robot: mass, motor, wheel, and losses."""
+    _, model = read(file(document(DIFF, MOTORS)))
+    changed = mjcf.clone(model)
+    p = Perturbation(
+        mass_factor=1.5, resistance_factor=1.3, left_radius_factor=1.04, drive_friction_factor=3, payload=2
+    )
+    mjcf.perturb(model, changed, p)
+    robot = mjcf.read_robot(changed)
+    assert robot.mass == pytest.approx(1.5 * 14 + 2) and robot.resistance == pytest.approx(2.6)
+    assert robot.wheel_radius == pytest.approx(0.102) and robot.drive_loss == pytest.approx(0.3)
+
+
+PLAIN = '<velocity name="drive" joint="a"/>' + MOTOR.format("b", 30, "")
+TRIPLE = MOTORS + MOTOR.format("c", 30, "")
+ERRORS = {
+    "no motors": (document(DIFF, ""), {}, ("wheels", "dcmotor", "'a', 'b'")),
+    "three motors": (document(TRICYCLE, TRIPLE + SERVO.format("s1")), {}, ("wheels", "3 joints")),
+    "another motor": (document(DIFF, PLAIN), {"wheels": ("a", "b")}, ("motor", "'a'", "'drive'", "<dcmotor joint=")),
+    "no supply": (document(DIFF, MOTORS.replace('ctrlrange="-12 12"', "")), {}, ("motor", "ctrlrange")),
+    "no such wheel": (document(DIFF, MOTORS), {"wheels": ("a", "z")}, ("wheels", "'z'", "'a', 'b'")),
+    "no such chassis": (document(DIFF, MOTORS), {"chassis": "z"}, ("chassis", "'z'", "'base'")),
+    "no caster": (document(DIFF.replace(BALL.format(0.3), ""), MOTORS), {}, ("caster",)),
+    "casters around": (document(DIFF + BALL.format(-0.3).replace("ball", "o"), MOTORS), {}, ("caster", "both")),
+    "axles at an angle": (
+        document(DIFF.replace('name="b" axis="0 1 0"', 'name="b" axis="1 1 0"'), MOTORS), {}, ("wheels", "axle")),
+    "no servo": (document(TRICYCLE, MOTORS), {"steering": ("s1",)}, ("steering", "'s1'", "kp")),
+    "no stops": (
+        document(TRICYCLE.replace('range="-30 30"', ""), MOTORS + SERVO.format("s1")), {}, ("steering", "range")),
+    "nothing to roll on": (
+        document(TRICYCLE.replace('name="c" axis="0 1 0"', 'name="c" axis="0 0 1"'), MOTORS + SERVO.format("s1")), {},
+        ("steering", "'s1'", "roll")),
+    "tips over": (document(DIFF.replace('pos="0.1 0 0.03"', 'pos="-0.1 0 0.03"'), MOTORS), {}, ("com_offset",)),
+    "not MJCF": ("<urdf/>", {}, ("mine.xml",)),
+    "limits": (
+        document(DIFF, MOTORS, extra='<custom><numeric name="limits" data="1 2"/></custom>'), {}, ("limits", "4")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_refused(file, name):
+    """What is missing is said in one line, with the file."""
+    text, names, words = ERRORS[name]
+    with pytest.raises(InputError) as refusal:
+        mrctl.load_robot(file(text), **names)
+    assert "\n" not in str(refusal.value) and "mine.xml" in str(refusal.value)
+    for word in words:
+        assert word in str(refusal.value), refusal.value
+
+
+def test_refused_elsewhere():
+    """A file that is not there, a robot as a world, and a way to steer that a robot has not."""
+    for scenario, words in (
+        (mrctl.Scenario(robot=RobotFile(path="none.xml")), ("robot.path", "turtlebot")),
+        (mrctl.Scenario(robot=RobotFile(path="flat")), ("robot.path", "turtlebot")),
+        (mrctl.Scenario(world="racecar"), ("world", "robot.path")),
+        (mrctl.Scenario(robot=RobotFile(path="turtlebot"), steering="rigid"), ("steering", "caster")),
+    ):
+        with pytest.raises(InputError) as refusal:
+            mrctl.simulate(scenario)
+        assert all(word in str(refusal.value) for word in words), refusal.value
