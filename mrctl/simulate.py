@@ -147,7 +147,8 @@ def batches(
 def group_of(s: Scenario) -> Hashable:
     """What runs in one simulation must share."""
     net = s.fel.hidden, s.composite.weights
-    return s.world, s.robot, s.steering, s.feedforward, s.ticks, s.physics_step, s.control_period, s.motion_period, *net
+    rates = s.ticks, s.physics_step, s.control_period, s.motion_period
+    return s.world, s.robot, s.steering, s.feedforward, *rates, *net
 
 
 class Simulation:

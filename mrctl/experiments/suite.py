@@ -209,11 +209,12 @@ def leaders(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
     """
     lines = []
     for case in dict.fromkeys(row["case"] for row in rows):
-        own = {r["feedforward"]: r for r in rows if r["case"] == case and r["feedforward"] != "oracle"}
+        own = {str(r["feedforward"]): r for r in rows if r["case"] == case and r["feedforward"] != "oracle"}
         fine = [name for name, row in own.items() if not row["failed"]] or list(own)
         cells = []
         for metric in COLUMNS:
-            best, *others = sorted(fine, key=lambda name: own[name][metric]["value"])
+            errors = {name: float(own[name][metric]["value"]) for name in fine}
+            best, *others = sorted(errors, key=lambda name: errors[name])
             level = [o for o in others if own[best][metric][f"beats_{TITLES.get(o, o)}"]["low"] <= 0.5]
             cells.append(", ".join(TITLES.get(name, name) for name in (best, *level)))
         lines.append([case, *cells])
