@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import gc
 import html
 import time
 from collections.abc import Sequence
@@ -199,6 +202,7 @@ class Live(Page):
 
     def _restart(self, scenarios: Sequence[Scenario]) -> None:
         self.session = Session(scenarios)
+        _tidy()
         self.message = ""
         self._learning.value = True
         self._stage()
@@ -287,6 +291,13 @@ class Live(Page):
         self._scene.show_payload(state["perturbation"])
         for name in CHANGEABLE:
             self._controls.show(state[name], (name,))
+
+
+def _tidy() -> None:
+    """Hands the memory of the session before back; glibc would keep the gaps between its models, and they add up."""
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _what(event: Event, before: dict[str, Any]) -> str:

@@ -4,8 +4,8 @@ For one and for sixteen robots: median of simulated over wall time, taken each s
 began more than a period after they were due; pictures and curves that the page was sent; growth of memory.
 
 `python tests/benchmarks/viewer.py rough [SECONDS]` instead treats it roughly, without a browser: visitors that come and
-go and set inputs at random, five times a second. Memory every minute, and the
-slope of it, less the session's record, in the second half.
+go and set inputs at random, five times a second. Memory every minute, and its slope in the second half, less the
+session's record.
 """
 
 import contextlib
