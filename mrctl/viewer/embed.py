@@ -29,9 +29,8 @@ class Replay:
 
     def _repr_html_(self) -> str:
         style = f"width: 100%; height: {HEIGHT}px; border: 1px solid #e5e7eb"
-        return (
-            f'<iframe class="mrctl-replay" title="replay" srcdoc="{html.escape(self.page)}" style="{style}"></iframe>'
-        )
+        start = '<iframe class="mrctl-replay" title="replay" loading="lazy"'  # begins when a reader gets there
+        return f'{start} style="{style}" srcdoc="{html.escape(self.page)}"></iframe>'
 
 
 def replay(*results: xr.Dataset) -> Replay:

@@ -58,18 +58,21 @@ def test_notebook(path, tmp_path):
         pictures = seen.locator(".jp-RenderedImage img")
         assert pictures.count() >= 2
         assert all(width > 0 for width in pictures.evaluate_all("all => all.map((one) => one.naturalWidth)"))
-        replay = seen.locator("iframe.mrctl-replay")
-        assert replay.count() == 1
-        replay.scroll_into_view_if_needed()
-        scene = replay.content_frame.locator("iframe").element_handle(timeout=PATIENCE).content_frame()
-        start = np.array(scene.wait_for_function(ROBOT, timeout=PATIENCE).json_value())
-        x, y, _ = start
-        scene.wait_for_function(f"Math.hypot({ROBOT}[0] - {x}, {ROBOT}[1] - {y}) > 0.1", timeout=PATIENCE)  # it drives
-        shown = np.asarray(Image.open(io.BytesIO(replay.screenshot(timeout=PATIENCE))).convert("RGB"))
+        (replay,) = seen.query_selector_all("iframe.mrctl-replay")
+        replay.evaluate("frame => frame.scrollIntoView()")
+        curves = replay.content_frame()
+        scene = curves.wait_for_selector("#scene", timeout=PATIENCE).content_frame()
+        x, y, _ = scene.wait_for_function(ROBOT, timeout=PATIENCE).json_value()
+        curves.evaluate("seek(4)")  # and pause
+        scene.wait_for_function(f"Math.hypot({ROBOT}[0] - {x}, {ROBOT}[1] - {y}) > 0.5", timeout=PATIENCE)
+        curves.wait_for_function("document.getElementById('time').textContent.startsWith('4.0')", timeout=PATIENCE)
+        shown = np.asarray(Image.open(io.BytesIO(seen.screenshot(timeout=PATIENCE))).convert("RGB"))
         Image.fromarray(shown).save(tmp_path / "replay.png")
-        curves, world = shown[:, :430], shown[:, 430:]  # as in `mrctl/viewer/player.html`
-        for half in (curves, world):
-            assert len(np.unique(half.reshape(-1, 3), axis=0)) > 100  # drawn, not blank
+        box = replay.bounding_box()
+        left, top = int(box["x"]), max(0, int(box["y"]))
+        for start in (left, left + 430):  # the curves, and the scene beside them, are drawn
+            part = shown[top:, start : start + 400].reshape(-1, 3)
+            assert len(np.unique(part, axis=0)) > 100
 
 
 @contextmanager
