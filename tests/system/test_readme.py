@@ -12,7 +12,7 @@ from mrctl.sweep import Sweep
 README = Path(__file__).resolve().parents[2] / "README.md"
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", README.read_text(), re.MULTILINE | re.DOTALL)
 # Run by other tests, because they take minutes or make the environment that this test runs in.
-ELSEWHERE = ("python3 -m pip", "mrctl reproduce", "mrctl suite", "mrctl bench", "mrctl train", "mrctl view")
+ELSEWHERE = ("python3 -m pip", "mrctl reproduce", "mrctl suite", "mrctl bench", "mrctl train", "mrctl view", "pytest")
 
 
 def blocks(language: str) -> list[str]:
