@@ -46,8 +46,8 @@ TICK = 0.005  # s
 FINE = 100  # physics steps in a time constant: the engine, of first order, adds half a step of braking to the mass
 MODEL = 0.015  # share of a constant that what equation (3) leaves out may cost
 NOISE = PERTURBATIONS["sensor noise"]
-APART = """c takes m from a scale. Not identifiable from such drives: m, J_w and J_m (only in M_e and J_e); I_0, gear and
-rolling loss (only in F_c); N and k_M (only N k; k_E is taken to be k_M, as it is in SI)."""
+APART = """c takes m from a scale. Not identifiable from such drives: m, J_w and J_m (only in M_e and J_e); I_0, gear
+and rolling loss (only in F_c); N and k_M (only N k; k_E is taken to be k_M, as it is in SI)."""
 
 
 class Constant(NamedTuple):
