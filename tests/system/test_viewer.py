@@ -76,7 +76,7 @@ def until(condition, what):
     """Waits for something to become true, and returns it."""
     end = time.monotonic() + PATIENCE / 1000
     while time.monotonic() < end:
-        if (found := condition()) is not None and found is not False:
+        if not any((found := condition()) is no for no in (None, False, np.False_)):
             return found
         time.sleep(0.1)
     raise AssertionError(f"not within {PATIENCE / 1000:g} s: {what}")
