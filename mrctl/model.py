@@ -75,7 +75,8 @@ def load(
     source = path if foreign is None else adopt.robot_path(robot)
     try:
         model = foreign or mujoco.MjModel.from_xml_path(str(path))
-        if steering not in (offered := steerings(model)):
+        offered = steerings(model)
+        if foreign and steering not in offered:
             raise InputError(f"steering: {robot.path} is driven with {' or '.join(offered)}, not {steering}")
         _complete(model, steering)
         if foreign:

@@ -295,11 +295,10 @@ class Hierarchy:
         return self.output
 
     def _forward(self, command: Array, derivative: Array) -> Array:
-        """The feedforward's output; of somebody's own stage, finite but where a guard is there to see to that."""
+        """The feedforward's output."""
         if not self._feedforward:
             return self.feedforward.output(command, derivative)
-        answer = self._feedforward.ask("output", command, derivative)
-        return self._sound(self._feedforward, answer, self.state["guard"]["on"] > 0)
+        return self._sound(self._feedforward, self._feedforward.ask("output", command, derivative))
 
     def _move(self, own: Own, pose: Array, twist: Array, reference: Array) -> None:
         """Asks somebody's own motion controller."""
@@ -335,9 +334,9 @@ class Hierarchy:
             self._voltage[:, 1] = wish[:, 1] - self.command[:, 1] + state["excess"][:, 1]
             self._idle[:] = np.maximum(self.saturated, np.maximum(state["frozen"], state["guard"]["idle"]))
 
-    def _sound(self, own: Own, answer: Array, guarded: NDArray[np.bool] | bool = False) -> Array:
-        """An answer without the rows that are not finite, which are noted; guarded rows stay as they are."""
-        broken = ~np.isfinite(answer).all(axis=1) & ~np.asarray(guarded)
+    def _sound(self, own: Own, answer: Array) -> Array:
+        """An answer without the rows that are not finite, which are noted."""
+        broken = ~np.isfinite(answer).all(axis=1)
         for row in np.flatnonzero(broken):
             self.faults.setdefault(int(row), f"{own.title}: not finite")
         return np.where(broken[:, None], 0.0, answer) if broken.any() else answer

@@ -70,7 +70,7 @@ def test_bash(line: str, folder: Path, capsys: pytest.CaptureFixture) -> None:
         assert command.startswith(ELSEWHERE) or command.startswith("git clone"), command
 
 
-@pytest.mark.parametrize("path", re.findall(r"\]\(([^)#:]+)\)", README.read_text()))
+@pytest.mark.parametrize("path", re.findall(r"\]\(([^)#:\"]+)\)", README.read_text()))
 def test_links(path: str) -> None:
     """Links and pictures that point into the repository point at something."""
     assert (README.parent / path).exists()

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import mrctl
-from mrctl import Circle, Guard, InputError, Lemniscate, Scenario, Sweep, jobs, simulate
+from mrctl import Circle, InputError, Lemniscate, Scenario, Sweep, jobs, simulate
 from mrctl.cli import main
 from mrctl.control.kanayama import kanayama, posture_error
 from mrctl.control.pid import pid
@@ -218,21 +218,12 @@ def test_fault(stage, fault):
 @pytest.mark.parametrize("stage", METHODS)
 def test_not_finite(stage):
     """A number that is none in one row stops that run, by name and tick, and no other."""
-    bare = [s.model_copy(update={"guard": Guard(on=False)}) for s in THREE]
-    whole, sound = simulate(bare, **breaking(stage, spoilt)), simulate(bare)
+    whole, sound = simulate(THREE, **breaking(stage, spoilt)), simulate(THREE)
     tick = 99 if stage == "feedforward" else 100
     assert str(whole.failure[1].item()) == f"{stage} Breaks: not finite, tick {tick}"
     assert whole.failed.values.tolist() == [False, True, False]
     for run in (0, 2):
         same(whole.isel(run=run), sound.isel(run=run))
-
-
-def test_guarded_feedforward():
-    """With the guard on, NaN in a feedforward is the guard's business: it falls back and the run goes on."""
-    whole = simulate(THREE, **breaking("feedforward", spoilt))
-    assert not whole.failed.any()
-    events = mrctl.guard_events(whole)
-    assert (events[events["run"] == 1]["reason"] == "output not finite").all() and len(events) == 1
 
 
 def test_blown_up_robot():

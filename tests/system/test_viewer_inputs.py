@@ -6,6 +6,7 @@ import pytest
 
 from mrctl import Scenario
 from mrctl.references import Reference
+from mrctl.viewer import live as module
 from mrctl.viewer.live import Live
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import CHANGEABLE
@@ -14,7 +15,9 @@ from mrctl.viewer.session import CHANGEABLE
 @pytest.fixture(scope="module")
 def live():
     server = Server(port=0)
-    yield Live([Scenario()], server)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_tidy", lambda: None)  # a hundred sessions would take their time
+        yield Live([Scenario()], server)
     server.stop()
 
 
