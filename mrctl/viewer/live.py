@@ -27,6 +27,7 @@ from mrctl.viewer.session import CHANGEABLE, Session, changed
 
 WINDOW = 12.0  # s that the plots show
 SAMPLES = 300  # in a curve
+UNMARKED = 3  # plots for each point of the trails, which cost a browser more
 BEHIND = 0.25  # s of wall time that are caught up with; what is more is lost
 # What the buttons do to the robots: label of the group, button, change of the perturbation or a push.
 BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
@@ -71,6 +72,7 @@ class Live(Page):
         self._cast: tuple[object, ...] | None = None  # what the scene was built for
         self._drawn: tuple[int, bool] | None = None
         self._plotted: int | None = None
+        self._unmarked = 0
         self._build()
         self._stage()
 
@@ -269,7 +271,9 @@ class Live(Page):
         write(self._status, block("status", *lines))
         if session.tick != self._plotted and session.tick > 1:
             self._plotted = session.tick
-            if self.playing:
+            self._unmarked += 1
+            if self.playing and self._unmarked >= UNMARKED:
+                self._unmarked = 0
                 self._scene.mark_trails()
             ticks = round(WINDOW / session.period)
             step = max(1, ticks // SAMPLES)

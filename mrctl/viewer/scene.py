@@ -28,6 +28,7 @@ COLOURS: list[Colour] = [
 ]  # fmt: skip
 REFERENCE: Colour = (110, 115, 122)
 TRAIL = 240  # points of the way that a robot has come
+TRAILS = 800  # and of all together: a browser builds them anew for each picture of them
 SEEN = 2  # the last geom group that is for the eye
 
 
@@ -54,6 +55,8 @@ class Scene:
         self._scene = server.scene
         server.initial_camera.position, server.initial_camera.look_at = (0.0, -3.7, 2.7), (0.0, 0.3, 0.0)
         self._model, self._data = mjcf.clone(model), mujoco.MjData(model)
+        round_ends = self._model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
+        self._model.geom_type[round_ends] = mujoco.mjtGeom.mjGEOM_CYLINDER  # which take thousands of triangles each
         self._radius = mjcf.read_robot(model).wheel_radius
         self._root = self._scene.add_frame("/world", show_axes=False)
         chassis = model.body("chassis").id
@@ -72,7 +75,7 @@ class Scene:
             "/world/robot/chassis/payload", (120, 72, 40), (0.1, 0.1, 0.1), cast_shadow=False, visible=False
         )
         self._shown = None
-        self._trails = np.zeros((self.size, TRAIL, 3))
+        self._trails = np.zeros((self.size, max(2, min(TRAIL, TRAILS // self.size)), 3))
         self._trail = None
         self._reference = None
 

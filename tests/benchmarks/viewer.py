@@ -25,7 +25,10 @@ from mrctl import Scenario
 from mrctl.viewer.live import Live
 from mrctl.viewer.server import Server
 
-SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+# Without a GPU the scene is drawn by SwiftShader; the curves, as in any browser without one, by Skia on the CPU.
+SOFTWARE = [
+    "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-accelerated-2d-canvas",
+]  # fmt: skip
 
 
 def resident() -> float:
