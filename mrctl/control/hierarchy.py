@@ -336,7 +336,7 @@ class Hierarchy:
 
     def _sound(self, own: Own, answer: Array) -> Array:
         """An answer without the rows that are not finite, which are noted."""
-        broken = ~np.isfinite(answer).all(axis=1)
+        broken = np.any(~np.isfinite(answer), axis=1)
         for row in np.flatnonzero(broken):
             self.faults.setdefault(int(row), f"{own.title}: not finite")
         return np.where(broken[:, None], 0.0, answer) if broken.any() else answer

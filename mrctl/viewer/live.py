@@ -27,6 +27,7 @@ from mrctl.viewer.session import CHANGEABLE, Session, changed
 
 WINDOW = 12.0  # s that the plots show
 SAMPLES = 300  # in a curve
+TIDY = 10.0  # s at least between two times that freed memory is handed back, which may take half a second
 UNMARKED = 3  # plots for each point of the trails, which cost a browser more
 BEHIND = 0.25  # s of wall time that are caught up with; what is more is lost
 # What the buttons do to the robots: label of the group, button, change of the perturbation or a push.
@@ -73,6 +74,7 @@ class Live(Page):
         self._drawn: tuple[int, bool] | None = None
         self._plotted: int | None = None
         self._unmarked = 0
+        self._tidied = time.monotonic()
         self._build()
         self._stage()
 
@@ -204,7 +206,9 @@ class Live(Page):
 
     def _restart(self, scenarios: Sequence[Scenario]) -> None:
         self.session = Session(scenarios)
-        _tidy()
+        if time.monotonic() > self._tidied + TIDY:
+            self._tidied = time.monotonic()
+            _tidy()
         self.message = ""
         self._learning.value = True
         self._stage()
