@@ -142,13 +142,10 @@ class Episodes(Simulation):
         whole, end = range(self.ticks), range(self.ticks, self.ticks + 1)
         courses = [np.vstack([course(s, whole), course(s, end)]) for s in self._courses.values()]
         self._table = np.stack(courses, axis=1)
-        order = list(self._courses)
-        names = [(s.reference, *((e.time, e.reference) for e in s.events if e.reference)) for s in self.scenarios]
-        self._which_course = np.array([order.index(name) for name in names])
-        self._since = np.zeros(len(names), int)
+        self._since = np.zeros(len(self.scenarios), int)
 
     def _reference_now(self) -> Array:
-        return self._table[np.minimum(self.tick - self._since, self.ticks), self._which_course]
+        return self._table[np.minimum(self.tick - self._since, self.ticks), self._place]
 
     def begin(self, row: int, seed: int) -> None:
         """Begins another episode of one robot at the coming tick, which must not be sensed yet.

@@ -304,7 +304,8 @@ class Simulation:
         names = [(s.reference, *((e.time, e.reference) for e in s.events if e.reference)) for s in self.scenarios]
         self._courses = dict(zip(names, self.scenarios, strict=True))
         order = list(self._courses)
-        self._which = np.array([order.index(n) for n in names]) if 1 < len(order) < len(names) else None
+        self._place = np.array([order.index(n) for n in names])
+        self._which = self._place if 1 < len(order) < len(names) else None
         self._block = range(0)
 
     def _reference_now(self) -> Array:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from PIL import Image
 from scipy import stats
 
@@ -131,7 +132,16 @@ def test_recovery(whole: Path) -> None:
     assert row["after_one_lap"]["value"] == pytest.approx(np.exp(np.log(laps[:, 3] / laps[:, 1]).mean()))
     assert row["return_first_lap"]["value"] == pytest.approx(np.exp(np.log(laps[:, 4] / laps[:, 1]).mean()))
     assert row["recovered_within_one_lap"] == np.mean(laps[:, 3] <= 1.2 * laps[:, 1])
-    assert row["after_one_lap_to_settled"]["value"] == pytest.approx(np.exp(np.log(laps[:, 3] / laps[:, 3]).mean()))
+
+
+def test_step_over_settled() -> None:
+    """One lap after the change over the last lap before the return, run by run."""
+    error = np.array([[9.0, 2.0, 8.0, 6.0, 5.0, 2.0, 4.0, 2.0], [9.0, 1.0, 8.0, 3.0, 2.0, 6.0, 4.0, 2.0]])
+    laps = xr.Dataset({"v_rmse": (("run", "lap"), error)}, {"run": [0, 1], "lap": np.arange(1, 9)})
+    found = suite._step(laps, "v_rmse", Case("step", "step", (), change=3, back=7))
+    assert found["after_one_lap_to_settled"]["value"] == pytest.approx(np.sqrt(6 / 2 * 3 / 6))
+    assert found["after_one_lap"]["value"] == pytest.approx(np.sqrt(6 / 2 * 3 / 1))
+    assert found["during"]["value"] == pytest.approx(4.0)
 
 
 def test_leaders() -> None:
