@@ -173,7 +173,7 @@ class Episodes(Simulation):
         reading, sensor = self.plant.reading, self._sensors[row]
         self.hierarchy.reset(start[:, 3:5], start[:, 5:], reading[:, STEERING], row)
         sensor["pose"], sensor["twist"] = reading[row, X : THETA + 1], reading[row, V : OMEGA + 1]
-        sensor["elapsed"] = 0.0
+        sensor["elapsed"] = sensor["slip"] = 0.0
         self._failure_time[row] = np.nan
         self._action[row] = 0.0
 

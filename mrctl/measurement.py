@@ -1,9 +1,12 @@
-"""What the controller is shown of the robot: the truth, or odometry from encoders and gyro; with noise."""
+"""What the controller is shown of the robot: the truth, or odometry from encoders and gyro, with noise; and slip."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import float64, guvectorize
+
+SLIP_FILTER = 0.1  # s
+SLIP_SPEED = 0.3  # m/s that a slip is held against at least: noise is no slip of a wheel that stands
 
 
 @guvectorize(
@@ -40,3 +43,32 @@ def observe(true_pose, true_twist, noise, odometry, slip_free_speed, period, pos
         for i in range(3):
             pose[i] = true_pose[i] + noise[i]
         twist[0], twist[1] = true_twist[0] + noise[3], true_twist[1] + noise[4]
+
+
+@guvectorize(
+    [(float64[:], float64[:], float64, float64, float64[:])],
+    "(w),(u),(),(),()",
+    writable_args=("slip",),
+    cache=True,
+)
+def watch_slip(wheel_speeds, twist, half_track, period, slip):  # noqa: ANN001, ANN201
+    """Slip ratio of the driven wheels of one robot, of the one that slips more.
+
+    |v_i − u_i| over the larger of |v_i| and |u_i|, where u = V ∓ D θ̇ is how fast the measured motion carries the wheel
+    over the floor; behind a first-order low-pass, so that noise does not pass for slip, and a slip lasts until what a
+    learner's filters hold of it is gone. Odometry, whose V is the mean of the encoders, shows about half of what one
+    wheel slips.
+
+    Args:
+        wheel_speeds: v left and right, by the encoders and the nominal wheel radius in m/s, `(2,)`.
+        twist: Measured V in m/s and θ̇ in rad/s `(2,)`.
+        half_track: D in m.
+        period: Control period in s.
+        slip: In and out.
+    """
+    worst = 0.0
+    for k in range(2):
+        carried = twist[0] + (2 * k - 1) * half_track * twist[1]
+        speed = max(abs(wheel_speeds[k]), abs(carried), SLIP_SPEED)
+        worst = max(worst, abs(wheel_speeds[k] - carried) / speed)
+    slip[0] += period / (period + SLIP_FILTER) * (worst - slip[0])

@@ -37,6 +37,7 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "heading_error": ("rad", "heading error, reference minus true posture in the body frame"),
     "v_measured": ("m/s", "measured linear velocity"),
     "omega_measured": ("rad/s", "measured rotation velocity"),
+    "slip": ("1", "slip ratio of the driven wheel that slips more, as sensors show it; above 0.1 nothing is learned"),
     "v_command": ("m/s", "commanded linear velocity"),
     "omega_command": ("rad/s", "commanded rotation velocity"),
     "feedback_left": ("V", "left feedback voltage"),

@@ -21,7 +21,7 @@ from mrctl.control.hierarchy import STATE as CONTROLLER
 from mrctl.control.hierarchy import Hierarchy
 from mrctl.control.kanayama import posture_error
 from mrctl.control.stages import Own, StageError, Stages
-from mrctl.measurement import observe
+from mrctl.measurement import observe, watch_slip
 from mrctl.plant import OMEGA, RATE_LEFT, RATE_RIGHT, STEERING, THETA, Plant, V, X, build
 from mrctl.plant import STATE as ROBOT
 from mrctl.record import InputError
@@ -36,42 +36,50 @@ LATERAL_ERROR = list(result.SIGNALS).index("lateral_error")
 BLOCK = 10_000  # control ticks whose references are sampled at once
 FAR = 0.8  # m between robot and reference at the start
 
-_observe, _posture_error = one(observe), one(posture_error)
+_observe, _watch_slip, _posture_error = one(observe), one(watch_slip), one(posture_error)
 _STATE, _REFERENCE, _ERROR = STEERING + 1, 5, 3  # how many columns of the record each takes
 
 
 # What is measured of one robot: the last measurement and how long ago it was, this tick's noise, whether by odometry.
 SENSORS = np.dtype(
-    [("pose", "f8", 3), ("twist", "f8", 2), ("noise", "f8", 5), ("odometry", "f8"), ("elapsed", "f8")], align=True
-)
+    [
+        ("pose", "f8", 3), ("twist", "f8", 2), ("slip", "f8", (1,)), ("noise", "f8", 5), ("odometry", "f8"),
+        ("elapsed", "f8"),
+    ],
+    align=True,
+)  # fmt: skip
 
 
 def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """What the loop does for each robot beside control and physics; see `chain.stamp` for the version."""
 
-    @njit((rows(ROBOT), GIVEN, rows(SENSORS), float64, float64, OWN), cache=True)
-    def sense(robots, reference, sensors, wheel_radius, period, record):  # noqa: ANN001, ANN202
-        """Measures, and records state, reference, true error and measured twist."""
+    @njit((rows(ROBOT), GIVEN, rows(SENSORS), *[float64] * 3, OWN), cache=True)
+    def sense(robots, reference, sensors, wheel_radius, half_track, period, record):  # noqa: ANN001, ANN202
+        """Measures, and records state, reference, true error, measured twist and slip."""
         _ = version
+        speeds = np.empty(2)
         for i in range(len(robots)):
             true, s, row = robots[i].reading, sensors[i], record[i]
-            slip_free = wheel_radius * (true[RATE_LEFT] + true[RATE_RIGHT]) / 2
+            speeds[0], speeds[1] = wheel_radius * true[RATE_LEFT], wheel_radius * true[RATE_RIGHT]
+            slip_free = (speeds[0] + speeds[1]) / 2
             _observe(
                 true[X : THETA + 1], true[V : OMEGA + 1], s.noise, s.odometry, slip_free, s.elapsed, s.pose, s.twist
             )
+            _watch_slip(speeds, s.twist, half_track, period, s.slip)
             s.elapsed = period
             row[:_STATE] = true[:_STATE]
             row[_STATE : _STATE + _REFERENCE] = reference[i, :_REFERENCE]
             at = _STATE + _REFERENCE
             _posture_error(true[X : THETA + 1], reference[i, :3], row[at : at + _ERROR])
             row[at + _ERROR : at + _ERROR + 2] = s.twist
+            row[at + _ERROR + 2] = s.slip[0]
 
     @njit((rows(CONTROLLER), ANY, rows(ROBOT), OWN), cache=True)
     def record(controllers, norm, robots, row):  # noqa: ANN001, ANN202
         """Records commands, currents and power; returns whether all robots are near their references."""
         _ = version
         near = True
-        at = _STATE + _REFERENCE + _ERROR + 2
+        at = _STATE + _REFERENCE + _ERROR + 3
         for i in range(len(row)):
             r, c, p = row[i, at:], controllers[i], robots[i]
             r[0:2], r[2:6], r[6:10] = c.command, c.parts, c.output
@@ -85,7 +93,7 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     return sense, record
 
 
-_sense, _record = _compile(stamp(observe, posture_error))
+_sense, _record = _compile(stamp(observe, watch_slip, posture_error))
 
 
 def simulate(
@@ -196,10 +204,11 @@ class Simulation:
         stage = self.hierarchy.feedforward
         self._oracle = stage if first.feedforward == "oracle" and isinstance(stage, InverseDynamics) else None
         self._plan()
-        self._wheel_radius = robot.wheel_radius
+        self._geometry = robot.wheel_radius, robot.half_track
         self._sensors = np.zeros(size, SENSORS)
         self._sensors["odometry"] = [s.measurement == "odometry" for s in scenarios]
         self._pose, self._twist, self._noise = (self._sensors[name] for name in ("pose", "twist", "noise"))
+        self._slip = self._sensors["slip"][:, 0]
         self._noise_scale = np.zeros((size, 5))
         self._noisy: list[int] = []
         self._random = [np.random.default_rng([s.seed, 2]) for s in scenarios]
@@ -265,14 +274,14 @@ class Simulation:
         for row in self._noisy:
             self._noise[row] = self._noise_scale[row] * self._random[row].standard_normal(5)
         self._goal = self._reference_now()
-        _sense(self.plant.state, self._goal, self._sensors, self._wheel_radius, self._period, self._row)
+        _sense(self.plant.state, self._goal, self._sensors, *self._geometry, self._period, self._row)
 
     def decide(self) -> None:
         """What comes before the physics: events, measurement, control."""
         self.sense()
         plant, hierarchy = self.plant, self.hierarchy
         try:
-            output = hierarchy.update(self._pose, self._twist, self._goal)
+            output = hierarchy.update(self._pose, self._twist, self._goal, self._slip)
         except StageError as error:  # of the whole group: what was recorded until now is kept
             output = hierarchy.output
             hierarchy.faults = dict.fromkeys(range(plant.size), str(error))

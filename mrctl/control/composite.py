@@ -15,10 +15,11 @@ on a regressor biases its weight toward zero.
 
 The weights are taken to wander as an Ornstein-Uhlenbeck process whose stationary covariance P₀ is how they scatter over
 the plants of the training: it tells the filter what plants differ in, and P stays below P₀ where nothing is excited. d
-does the same, fast: what is no function of the motion, such as a push, goes there. When the innovations grow at once,
-the plant has changed, and P begins again at P₀. The heading that slope features need is dead reckoning; from where it
-counts does not matter. The tracking term moves a along P φ(x) by a share of the
-feedback voltage, like `rls`.
+does the same, fast: what is no function of the motion, such as a push, goes there. When the innovations of one channel
+grow at once, the plant has changed, and P of both begins again. How noisily the motion is measured shows in its second
+differences, which mass keeps small; the noisier, the less a sample counts. The heading that slope features need is dead
+reckoning; from where it counts does not matter. The tracking term moves a along P φ(x) by a share of the feedback
+voltage, like `rls`.
 
 Under `rigid` steering the second channel is treated alike: what is asked of the steering stands for the voltage, its
 nominal inverse is the rotation itself, and U is what has to be added to the command.
@@ -50,6 +51,8 @@ OUTLIER = 3.0  # standard deviations beyond which a sample pulls no harder: a ty
 SLOW = 0.1  # m/s of the faster wheel; below it stiction, not the motion, decides about the voltage
 BRIEF, LASTING = 0.25, 4.0  # s over which innovations are averaged, to see a change of the plant
 CHANGE = 6.0  # times the lasting mean square of the innovations that the brief one of a changed plant exceeds
+NOTHING = 1e-9  # V²: features that vary less are none that a feedback could be put down to
+SCATTER = 300.0  # V of noise that a sample is taken to have per m/s by which the measured wheel speed scatters
 SETTLED = 6.0  # time constants until two filters have forgotten how they began
 SHIPPED = Path(__file__).with_suffix(".safetensors")
 
@@ -57,17 +60,18 @@ SHIPPED = Path(__file__).with_suffix(".safetensors")
 class Composite(Record):
     """Settings of the `composite` feedforward; one setting serves every robot, steering and perturbation."""
 
-    noise: Annotated[float, Field(gt=0, le=100)] = 0.7
-    """Standard deviation of one sample of the regression, V (a tenth of it in rad/s on a steering channel)."""
+    noise: Annotated[float, Field(gt=0, le=100)] = 0.35
+    """Standard deviation of one sample of the regression, V (a tenth of it in rad/s on a steering channel), where the
+    motion is measured without noise; what noise the measured motion shows is added."""
     memory: Annotated[float, Field(ge=1, le=1e6)] = 1000.0
     """Time in which the weights are taken to wander by as much as plants differ, s."""
-    disturbance: Annotated[float, Field(ge=0, le=100)] = 0.3
+    disturbance: Annotated[float, Field(ge=0, le=100)] = 0.15
     """Standard deviation of the disturbance, V (as for `noise`)."""
     disturbance_memory: Annotated[float, Field(ge=0.01, le=1e6)] = 0.5
     """Time in which the disturbance wanders by that, s."""
-    filter: Annotated[float, Field(ge=0.01, le=2)] = 0.07
+    filter: Annotated[float, Field(ge=0.01, le=2)] = 0.03
     """Time constant of each of the two filters on voltage and motion, s."""
-    step: Annotated[float, Field(ge=0, le=1)] = 0.01
+    step: Annotated[float, Field(ge=0, le=1)] = 0.015
     """Share of the feedback that the tracking term moves into the feedforward each control period, as for `rls`."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
     """Feedback below this moves nothing, V (as for `noise`)."""
@@ -159,29 +163,45 @@ def _times(covariance, vector, out):  # noqa: ANN001, ANN202
 
 
 @njit
-def _reset(prior, disturbance, covariance):  # noqa: ANN001, ANN202
-    """P of a and d as at the start."""
+def _give_up(prior, disturbance, weights, covariance):  # noqa: ANN001, ANN202
+    """Takes certainty away after a change of the plant: P ← P₀ + a aᵀ; the weights stay.
+
+    Covariance resetting (Goodwin and Sin, 1984). The second term is what would be if the plant changed back.
+    """
     n = prior.shape[0]
     for i in range(n):
         covariance[i, n] = covariance[n, i] = 0.0
         for j in range(n):
-            covariance[i, j] = prior[i, j]
+            covariance[i, j] = prior[i, j] + weights[i] * weights[j]
     covariance[n, n] = disturbance * disturbance
 
 
 @guvectorize(
-    [(float64[:], float64, float64[:], float64, float64[:], float64[:, :], float64[:], float64[:], float64[:, :])],
-    "(n),(),(n),(),(s),(n,n),(k),(m),(m,m)",
+    [
+        (
+            float64[:],
+            float64,
+            float64[:],
+            float64,
+            float64,
+            float64[:],
+            float64[:, :],
+            float64[:],
+            float64[:],
+            float64[:, :],
+        )
+    ],  # fmt: skip
+    "(n),(),(n),(),(),(s),(n,n),(k),(m),(m,m)",
     writable_args=("usual", "weights", "covariance"),
     cache=True,
 )
-def adapt(measured, residual, commanded, feedback, settings, prior, usual, weights, covariance):  # noqa: ANN001, ANN201
+def adapt(  # noqa: ANN201
+    measured, residual, commanded, feedback, noise, settings, prior, usual, weights, covariance  # noqa: ANN001
+):  # fmt: skip
     """One composite step for one channel of one robot.
 
     Prediction: the Kalman filter for residual = φ a + d. Its innovation counts for no more than 3 standard deviations
-    (Huber). Between samples a ← f a, P ← f² P + (1 − f²) P₀, likewise for d. When the innovations are suddenly much
-    larger than usual, the plant has changed: what was certain is so no more, P ← P₀ (covariance resetting; Goodwin and
-    Sin, 1984), and the weights stay.
+    (Huber). Between samples a ← f a, P ← f² P + (1 − f²) P₀, likewise for d.
     Tracking: a ← a + P φ_c e · step/(φ_cᵀ P φ_c), which moves φ_c a by `step` times the feedback e.
 
     Args:
@@ -189,28 +209,29 @@ def adapt(measured, residual, commanded, feedback, settings, prior, usual, weigh
         residual: Filtered voltage less the model's, V.
         commanded: φ_c at the command that the feedback belongs to `(n,)`.
         feedback: V.
-        settings: Noise, f of a, f of d, standard deviation of d, step, dead zone, weight of a new sample in the brief
-            and the lasting mean, `(8,)`.
+        noise: Variance of a sample, V².
+        settings: f of a, f of d, standard deviation of d, step, dead zone, weight of a new sample in the brief and the
+            lasting mean, `(7,)`.
         prior: P₀ of a, `(n, n)`.
         usual: In and out: brief and lasting mean square of the innovations, V², `(2,)`.
         weights: In and out: a, and d last, `(n + 1,)`.
         covariance: In and out: P of both, `(n + 1, n + 1)`.
     """
     n = measured.shape[0]
-    slow, fast, step = settings[1], settings[2], settings[4]
+    slow, fast, step = settings[0], settings[1], settings[3]
     x, gain = np.empty(n + 1), np.empty(n + 1)
     for i in range(n):
         x[i] = measured[i]
     x[n] = 1.0
     _times(covariance, x, gain)
-    total, innovation = settings[0] * settings[0], residual
+    total, innovation = noise, residual
     for i in range(n + 1):
         total += x[i] * gain[i]
         innovation -= x[i] * weights[i]
     bound = OUTLIER * np.sqrt(total)
     innovation = max(-bound, min(bound, innovation))
     for i in range(2):
-        usual[i] += settings[6 + i] * (innovation * innovation - usual[i])
+        usual[i] += settings[5 + i] * (innovation * innovation - usual[i])
     innovation /= total
     for i in range(n):
         weights[i] = slow * (weights[i] + gain[i] * innovation)
@@ -222,18 +243,15 @@ def adapt(measured, residual, commanded, feedback, settings, prior, usual, weigh
         covariance[n, i] = across
     weights[n] = fast * (weights[n] + gain[n] * innovation)
     posterior = covariance[n, n] - gain[n] * gain[n] / total
-    covariance[n, n] = fast * fast * posterior + (1 - fast * fast) * settings[3] * settings[3]
-    if abs(feedback) > settings[5]:
+    covariance[n, n] = fast * fast * posterior + (1 - fast * fast) * settings[2] * settings[2]
+    if abs(feedback) > settings[4]:
         _times(covariance, commanded, gain)
         power = 0.0
         for i in range(n):
             power += commanded[i] * gain[i]
-        if power > 0:
+        if power > NOTHING:
             for i in range(n):
                 weights[i] += step / power * feedback * gain[i]
-    if usual[0] > CHANGE * usual[1]:
-        usual[1] = usual[0]
-        _reset(prior, settings[3], covariance)
 
 
 _features, _basis, _adapt = one(features), one(basis), one(adapt)
@@ -242,12 +260,14 @@ _features, _basis, _adapt = one(features), one(basis), one(adapt)
 SENT, TWIST, HEADING = slice(0, 2), slice(2, 4), slice(4, 6)
 SIGNALS = 6
 
-# What is kept of one robot; `once` and `twice` are the filtered signals.
+# What is kept of one robot; `once` and `twice` are the filtered signals, `last` the last two twists, `variance` that of
+# their noise, and `noise` what a sample has of its own, V, and per m/s of that.
 STATE = np.dtype(
     [
-        ("settings", "f8", (CHANNELS, 8)), ("share", "f8"), ("rigid", "f8"),
+        ("settings", "f8", (CHANNELS, 7)), ("share", "f8"), ("rigid", "f8"),
         ("command", "f8", CHANNELS), ("phi", "f8", FEATURES), ("output", "f8", CHANNELS), ("added", "f8", CHANNELS),
         ("age", "f8"), ("heading", "f8"), ("signals", "f8", SIGNALS), ("once", "f8", SIGNALS), ("twice", "f8", SIGNALS),
+        ("last", "f8", (2, CHANNELS)), ("variance", "f8", CHANNELS), ("noise", "f8", (CHANNELS, 2)),
         ("usual", "f8", (CHANNELS, 2)), ("weights", "f8", (CHANNELS, FEATURES + 1)),
         ("covariance", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)), ("norm", "f8", (1,)),
     ],
@@ -299,6 +319,11 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
                 s.once[j] += s.share * (s.signals[j] - s.once[j])
                 s.twice[j] += s.share * (s.once[j] - s.twice[j])
             for k in range(CHANNELS):
+                if s.age == 0:
+                    s.last[0, k] = s.last[1, k] = twist[i, k]
+                kink = twist[i, k] - 2 * s.last[0, k] + s.last[1, k]  # of independent noise: six times its variance
+                s.variance[k] += s.settings[k, 6] * (kink * kink / 6 - s.variance[k])
+                s.last[1, k], s.last[0, k] = s.last[0, k], twist[i, k]
                 rate[k] = (s.once[2 + k] - s.twice[2 + k]) * s.share / (1 - s.share) / period
                 s.signals[k] = voltage[i, k]
             s.signals[1] += s.rigid * s.command[1]
@@ -312,15 +337,20 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
                     residual = s.twice[k]
                     for j in range(INPUTS):
                         residual -= model[k, j] * x[j]
+                    noise = s.noise[k, 0] ** 2 + s.noise[k, 1] ** 2 * s.variance[k]
                     before = _learned(s.weights[k], s.phi)
                     _adapt(
-                        phi, residual, s.phi, feedback[i, k], s.settings[k], priors[k], s.usual[k], s.weights[k],
+                        phi, residual, s.phi, feedback[i, k], noise, s.settings[k], priors[k], s.usual[k], s.weights[k],
                         s.covariance[k],
                     )  # fmt: skip
                     s.added[k] = _learned(s.weights[k], s.phi) - before
+                if (s.usual[:, 0] > CHANGE * s.usual[:, 1]).any():
+                    for k in range(CHANNELS):
+                        s.usual[k, 1] = max(s.usual[k])
+                        _give_up(priors[k], s.settings[k, 2], s.weights[k], s.covariance[k])
             else:  # only the disturbance fades
                 for k in range(CHANNELS):
-                    s.weights[k, FEATURES] *= s.settings[k, 2]
+                    s.weights[k, FEATURES] *= s.settings[k, 1]
                     s.added[k] = 0.0
             s.norm[0] = np.sqrt((s.weights[:, :FEATURES] ** 2).sum())
 
@@ -335,6 +365,7 @@ class CompositeAdaptation:
 
     Attributes:
         state: `weights` `(B, 2, 27)`, a and d of both channels, and their `covariance` `(B, 2, 27, 27)`.
+        measured_noise: Variance that the measured V and θ̇ are seen to have, (m/s)² and (rad/s)², `(B, 2)`.
         weight_norm: Euclidean norm of a, `(B,)`.
         weight_volts: The weights are in volts.
     """
@@ -363,10 +394,13 @@ class CompositeAdaptation:
         for row, s in enumerate(settings):
             memories = np.exp(-period / np.array([s.memory, s.disturbance_memory]))
             means = period / (period + np.array([BRIEF, LASTING]))
-            common = np.array([s.noise, *memories, s.disturbance, s.step, s.dead_zone, *means])
-            second = common * [STEERING_SCALE, 1, 1, STEERING_DISTURBANCE, STEERING_SHARE, STEERING_SCALE, 1, 1]
+            common = np.array([*memories, s.disturbance, s.step, s.dead_zone, *means])
+            second = common * [1, 1, STEERING_DISTURBANCE, STEERING_SHARE, STEERING_SCALE, 1, 1]
             state["settings"][row] = common, second if rigid else common
+            scale = STEERING_SCALE if rigid else 1.0
+            state["noise"][row] = [s.noise, SCATTER], [scale * s.noise, scale * SCATTER * robot.half_track]
         self._output, self._added, self.weight_norm = state["output"], state["added"], state["norm"][:, 0]
+        self.measured_noise = state["variance"]
         self.restore(np.arange(len(settings)))
 
     def restore(self, rows: NDArray[np.intp]) -> None:
@@ -376,8 +410,8 @@ class CompositeAdaptation:
         for row in rows:
             state["covariance"][row] = 0.0
             state["covariance"][row, :, :FEATURES, :FEATURES] = self._priors
-            state["covariance"][row, :, FEATURES, FEATURES] = state["settings"][row, :, 3] ** 2
-            state["usual"][row] = state["settings"][row, :, :1] ** 2
+            state["covariance"][row, :, FEATURES, FEATURES] = state["settings"][row, :, 2] ** 2
+            state["usual"][row] = state["noise"][row, :, :1] ** 2
 
     def output(self, command: Array, derivative: Array) -> Array:
         """The model, what is adapted at the commanded motion, and the disturbance."""

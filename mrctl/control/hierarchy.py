@@ -28,6 +28,7 @@ from mrctl.scenario import Scenario
 Array = NDArray[np.float64]
 
 _kanayama, _limit, _pid, _allocate = one(kanayama), one(limit), one(pid), one(allocate)
+SLIPS = 0.1  # slip ratio beyond which a wheel's voltage says nothing about the motion
 HALF_TRACK = 4  # where it is in `steering.parameters`
 _features, _linear, _guard = one(features), one(linear), one(guard)
 
@@ -36,7 +37,7 @@ _features, _linear, _guard = one(features), one(linear), one(guard)
 # One array of these is one argument of a compiled loop, and a call costs by the argument.
 STATE = np.dtype(
     [
-        ("kanayama", "f8", 3), ("prefilter", "f8"), ("pid_gains", "f8", (2, 4)), ("frozen", "f8"),
+        ("kanayama", "f8", 3), ("prefilter", "f8"), ("pid_gains", "f8", (2, 4)), ("frozen", "f8"), ("slips", "f8"),
         ("correction", "f8", 2), ("limiter", "f8", 4), ("pid", "f8", 7), ("steering", "f8", 2), ("excess", "f8", 2),
         ("error", "f8", 3), ("request", "f8", 2), ("command", "f8", 2), ("derivative", "f8", 2),
         ("feedback", "f8", 2), ("parts", "f8", 4), ("output", "f8", 4), ("voltage", "f8", 2),
@@ -65,8 +66,8 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
             _limit(wish, v, acceleration, limits, s.prefilter, period, s.limiter, s.command, s.derivative)
             _pid(s.command, twist[i], s.pid_gains, period, s.excess, s.pid, s.feedback)
 
-    @njit((GIVEN, ANY, EACH, OWN, float64, rows(STATE)), cache=True)
-    def follow(feedforward, norm, robot, inverse, period, state):  # noqa: ANN001, ANN202
+    @njit((GIVEN, ANY, ANY, EACH, OWN, float64, rows(STATE)), cache=True)
+    def follow(feedforward, norm, slip, robot, inverse, period, state):  # noqa: ANN001, ANN202
         """Feedback and feedforward to voltages and steering.
 
         Returns whether all of them are finite, and whether a guard wants a learner to forget.
@@ -89,7 +90,8 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
             )  # fmt: skip
             for k in range(2):
                 s.voltage[k] = s.feedback[k] + s.guard.output[k] + s.excess[k]
-            s.idle = max(s.saturated[0], s.frozen, s.guard.idle)
+            s.slips = 1.0 if slip[i] > SLIPS else 0.0
+            s.idle = max(s.saturated[0], s.frozen, s.guard.idle, s.slips)
             for k in range(4):
                 finite &= np.isfinite(s.parts[k])
         return finite, restore
@@ -251,13 +253,14 @@ class Hierarchy:
         if self._steering:
             self._steering.tell("reset", steering_angle, self._period)
 
-    def update(self, pose: Array, twist: Array, reference: Array) -> Array:
+    def update(self, pose: Array, twist: Array, reference: Array, slip: Array) -> Array:
         """One control tick.
 
         Args:
             pose: Measured posture `(B, 3)`.
             twist: Measured twist `(B, 2)`.
             reference: Reference posture, twist and its derivative side by side, `(B, 7)`.
+            slip: Slip ratio of the driven wheels `(B,)`; see `measurement.watch_slip`.
 
         Returns:
             `output`, `(B, 4)`.
@@ -274,7 +277,7 @@ class Hierarchy:
         self._tick += 1
         feedforward = self._forward(self.command, self.derivative)
         self.finite, forget = _follow(
-            feedforward, self.weight_norm, self._parameters, self._nominal.coefficients[0], self._period, state
+            feedforward, self.weight_norm, slip, self._parameters, self._nominal.coefficients[0], self._period, state
         )
         if self._steering:
             self._steer(self._steering)
@@ -332,7 +335,7 @@ class Hierarchy:
             state["excess"][:, 1] = np.where(beyond, made - wish[:, 1], 0.0)
             self.saturated[:] = beyond | clipped
             self._voltage[:, 1] = wish[:, 1] - self.command[:, 1] + state["excess"][:, 1]
-            self._idle[:] = np.maximum(self.saturated, np.maximum(state["frozen"], state["guard"]["idle"]))
+            self._idle[:] = np.max([self.saturated, state["frozen"], state["guard"]["idle"], state["slips"]], axis=0)
 
     def _sound(self, own: Own, answer: Array) -> Array:
         """An answer without the rows that are not finite, which are noted."""

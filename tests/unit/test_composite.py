@@ -45,7 +45,7 @@ def spd(root):
 )  # fmt: skip
 def test_one_step(x, command, weights, root, prior_root, residual, feedback, noise, step):
     """Correction, prediction to the stationary prior, tracking: each as in the books, in matrices."""
-    settings = np.array([noise, 0.99, 0.9, 0.5, step, 0.1, 0.0, 0.0])
+    settings = np.array([0.99, 0.9, 0.5, step, 0.1, 0.0, 0.0])
     covariance, prior = spd(root), spd(prior_root)
     h, f = np.append(x, 1), np.append(np.full(N, 0.99), 0.9)
     stationary = np.block([[prior, np.zeros((N, 1))], [np.zeros((1, N)), np.array([[0.25]])]])
@@ -57,10 +57,10 @@ def test_one_step(x, command, weights, root, prior_root, residual, feedback, noi
     posterior = joseph @ covariance @ joseph.T + noise**2 * np.outer(gain, gain)
     predicted = np.diag(f) @ posterior @ np.diag(f) + stationary - np.diag(f) @ stationary @ np.diag(f)
     direction = predicted[:N, :N] @ command
-    if abs(feedback) > 0.1 and command @ direction > 0:
+    if abs(feedback) > 0.1 and command @ direction > 1e-9:
         expected[:N] += step * feedback * direction / (command @ direction)
     found, spread = weights.copy(), covariance.copy()
-    adapt(x, residual, command, feedback, settings, prior, np.ones(2), found, spread)
+    adapt(x, residual, command, feedback, noise**2, settings, prior, np.ones(2), found, spread)
     np.testing.assert_allclose(spread, predicted, atol=1e-9)
     np.testing.assert_allclose(found, expected, atol=1e-7, rtol=1e-7)
 
@@ -71,9 +71,9 @@ def test_covariance(inputs, root, forgetting):
     prior = spd(root)
     stationary = np.block([[prior, np.zeros((N, 1))], [np.zeros((1, N)), np.array([[0.25]])]])
     covariance, weights, usual = stationary.copy(), np.zeros(N + 1), np.ones(2)
-    settings = np.array([0.5, forgetting, 0.9, 0.5, 0.02, 0, 0.1, 0.01])
+    settings = np.array([forgetting, 0.9, 0.5, 0.02, 0, 0.1, 0.01])
     for x in inputs:
-        adapt(x, 1.0, x, 1.0, settings, prior, usual, weights, covariance)
+        adapt(x, 1.0, x, 1.0, 0.25, settings, prior, usual, weights, covariance)
         np.testing.assert_array_equal(covariance, covariance.T)
         assert np.linalg.eigvalsh(covariance).min() > 0
         assert np.linalg.eigvalsh(stationary - covariance).min() > -1e-9
@@ -84,32 +84,10 @@ def test_outlier():
     moved = []
     for residual in (3 * np.sqrt(1.25 + N), 1e4):
         weights, covariance = np.zeros(N + 1), np.diag([*np.ones(N), 0.25])
-        settings = np.array([1, 1, 1, 0.5, 0, 0, 0.1, 0.1])
-        adapt(np.ones(N), residual, np.zeros(N), 0.0, settings, np.eye(N), np.ones(2), weights, covariance)
+        settings = np.array([1, 1, 0.5, 0, 0, 0.1, 0.1])
+        adapt(np.ones(N), residual, np.zeros(N), 0.0, 1.0, settings, np.eye(N), np.ones(2), weights, covariance)
         moved.append(weights)
     np.testing.assert_allclose(moved[0], moved[1], rtol=1e-12)
-
-
-@pytest.mark.parametrize("change", [0.0, 1.0])
-def test_change_of_the_plant(change):
-    """Certainty grows with what is seen, in noise too; when the weights jump it is given up, and they follow."""
-    random = np.random.default_rng(3)
-    settings = np.array([0.5, 0.99999, 0.9, 0.1, 0, 0, PERIOD / 0.26, PERIOD / 4.01])
-    truth, prior = np.array([1.0, -0.5, 0.3, 0.8]), np.eye(N)
-    weights, covariance, usual = np.zeros(N + 1), np.diag([*np.ones(N), 0.01]), np.full(2, 0.25)
-    spread = []
-    for tick in range(4000):
-        x = random.standard_normal(N)
-        y = x @ (truth + change * (tick >= 3000)) + 0.05 * random.standard_normal()
-        adapt(x, y, x, 0.0, settings, prior, usual, weights, covariance)
-        spread.append(np.trace(covariance))
-    jumps = 1 + np.flatnonzero(np.diff(spread) > 0.5)
-    assert max(spread[2900:2999]) < 0.02
-    if change:
-        assert 3000 <= jumps[0] < 3030 and len(jumps) < 4
-        np.testing.assert_allclose(weights[:N], truth + 1, atol=0.03)
-    else:
-        assert not len(jumps)
 
 
 @given(numbers(PHYSICAL), numbers(UNITS, INPUTS + 1))
@@ -139,10 +117,15 @@ def test_begins_as_model(robot, rigid):
     assert not pupil.weight_norm.any()
 
 
-def drive(pupil, plant, seconds, disturbance=0.0):
-    """Equation (3) under the stage and a proportional feedback along a rich motion; returns its feedback."""
-    twist, log = np.array([0.8, 0.0]), []
-    for tick in range(round(seconds / PERIOD)):
+def drive(pupil, plant, seconds, disturbance=0.0, noise=0.0, watch=None):
+    """Equation (3) under the stage and a proportional feedback along a rich motion; returns its feedback.
+
+    Noise is that of the measured V, m/s. The time goes on from where the last drive of this pupil ended.
+    """
+    random = np.random.default_rng(3)
+    start, twist = getattr(pupil, "driven", (0, np.array([0.8, 0.0])))
+    log = []
+    for tick in range(start, start + round(seconds / PERIOD)):
         t = PERIOD * tick
         w = np.array([[0.9, 2.3], [1.3, 3.1]])
         a = np.array([[0.25, 0.15], [0.8, 0.4]])
@@ -151,12 +134,50 @@ def drive(pupil, plant, seconds, disturbance=0.0):
         feedforward = pupil.output(command[None], derivative[None])[0]
         feedback = np.array([10.0, 2.0]) * (command - twist)
         voltage = feedback + feedforward
-        pupil.learn(feedback[None], np.zeros(1), twist[None], voltage[None])
+        measured = twist + [noise * random.standard_normal(), 0.0]
+        pupil.learn(feedback[None], np.zeros(1), measured[None], voltage[None])
+        if watch:
+            watch(tick)
         log.append(feedback)
         for _ in range(4):
             sides = left_right(voltage - disturbance)
             twist = twist + PERIOD / 4 * accelerations(twist, sides, plant, sign_speed=0.05)
+    pupil.driven = tick + 1, twist
     return np.array(log)
+
+
+def certainty(pupil):
+    """How much of what plants differ in is still open in the two channels, `(2,)`."""
+    return np.trace(pupil.state["covariance"][0], axis1=1, axis2=2)
+
+
+@pytest.mark.parametrize("changed", [{}, {"resistance": 3.0}, {"com_offset": 0.2}])
+def test_change_of_the_plant(robot, changed):
+    """Certainty grows with what is seen; both channels give it up when the plant changes, in whichever it shows."""
+    pupil = stage(robot)
+    plant = robot.model_copy(update={"supply": 1e3})
+    drive(pupil, plant, 20)
+    settled, spread = certainty(pupil), []
+    assert (settled < 0.5 * certainty(stage(robot))).all()
+    drive(pupil, plant.model_copy(update=changed), 3, watch=lambda _: spread.append(certainty(pupil)))
+    if changed:
+        jumps = [1 + np.flatnonzero(np.diff(one) > one[0]) for one in np.transpose(spread)]
+        assert jumps[0][0] == jumps[1][0] < 100
+        # What was learned may be undone: a direction in which nothing is thought to vary is open along a.
+        assert (np.max(spread, axis=0) > certainty(stage(robot)) * 0.99).all()
+    else:
+        assert (np.array(spread) <= settled * 1.01).all()
+
+
+def test_noise_counts(robot):
+    """Noise of the measurement is found from second differences alone, and slows what is learned from a sample."""
+    plant = robot.model_copy(update={"supply": 1e3})
+    quiet, noisy = stage(robot), stage(robot)
+    drive(quiet, plant, 10)
+    drive(noisy, plant, 10, noise=0.02)
+    assert np.sqrt(noisy.measured_noise[0, 0]) == pytest.approx(0.02, rel=0.2)
+    assert np.sqrt(quiet.measured_noise[0]) == pytest.approx([0, 0], abs=4e-4)
+    assert certainty(noisy)[0] > 2 * certainty(quiet)[0]
 
 
 def test_finds_the_plant(robot, tmp_path):
@@ -169,8 +190,8 @@ def test_finds_the_plant(robot, tmp_path):
     flat[:, range(INPUTS), range(INPUTS)] = 4.0
     save_training(tmp_path / "flat.safetensors", Training(np.zeros((UNITS, INPUTS + 1)), flat), {})
     pupil = stage(robot, weights=str(tmp_path / "flat.safetensors"), noise=0.05, disturbance=0, step=0.002, memory=1e6)
-    feedback = drive(pupil, plant, 40)
-    assert np.sqrt((feedback[-1000:] ** 2).mean()) < 0.05 * np.sqrt((feedback[:100] ** 2).mean())
+    feedback, untaught = drive(pupil, plant, 40), drive(InverseDynamics([robot], False), plant, 40)
+    assert np.sqrt((feedback[-1000:] ** 2).mean()) < 0.07 * np.sqrt((untaught[-1000:] ** 2).mean())
     missing = ((inverse_coefficients(plant) - inverse_coefficients(robot)) * feature_scale(robot)[:, None]).T
     found = pupil.state["weights"][0]
     # The signs hardly move at these speeds and share a constant with V; half a period of hold is taken for inertia.

@@ -33,7 +33,7 @@ def signals(size, ticks, seed=0):
     pose = reference + 0.05 * rng.normal(size=reference.shape)
     twist = np.stack([v, omega], -1)
     motion = np.concatenate([reference, twist, np.stack([v_dot, omega_dot], -1)], axis=-1)
-    return pose, twist + 0.1 * rng.normal(size=twist.shape), motion
+    return pose, twist + 0.1 * rng.normal(size=twist.shape), motion, np.zeros((ticks, size))
 
 
 def drive(hierarchy, inputs):
@@ -65,10 +65,10 @@ def test_feedforwards(robot, name, kind):
 @pytest.mark.parametrize("name", ["model", "oracle"])
 def test_nothing_wrong(robot, name):
     """Where posture and twist are the reference's, the voltages are the inverse dynamics and the feedback is silent."""
-    _, _, motion = signals(1, 300)
+    _, _, motion, slip = signals(1, 300)
     reference, twist, acceleration = np.split(motion, [3, 5], axis=-1)
     hierarchy = build(robot, feedforward=name)
-    log = drive(hierarchy, (reference, twist, motion))[:, 0]
+    log = drive(hierarchy, (reference, twist, motion, slip))[:, 0]
     expected = inverse_dynamics(twist[:, 0], acceleration[:, 0], robot, sign_speed=0.05)
     np.testing.assert_allclose(log[:, :2], expected, atol=1e-9)
     np.testing.assert_allclose(log[:, 7:11], np.hstack([twist[:, 0], acceleration[:, 0]]), atol=1e-12)
@@ -78,7 +78,7 @@ def test_nothing_wrong(robot, name):
 def test_slow_motion_controller(robot):
     """A motion controller of 50 ms answers every fifth tick; between, its correction rides on the live reference."""
     hierarchy = build(robot, 2, feedforward="none", motion_period=0.05, prefilter=0.01)
-    inputs = pose, _, motion = signals(2, 43)
+    inputs = pose, _, motion, _ = signals(2, 43)
     reference, twist = motion[..., :3], motion[..., 3:5]
     log = drive(hierarchy, inputs)
     gains = np.array([3.0, 25.0, 10.0])
@@ -151,16 +151,31 @@ def test_learning_switch(robot, name):
     assert (hierarchy.feedforward.state[key][0] != learned[0]).any()
 
 
+@pytest.mark.parametrize("name", ["fel", "rls", "composite"])
+def test_slip_freezes(robot, name):
+    """The voltage of a wheel that slips says nothing about the motion: nobody learns from it, the neighbour goes on."""
+    hierarchy = build(robot, 2, feedforward=name)
+    key = "coefficients" if name == "rls" else "weights"
+    kept = slice(26) if name == "composite" else slice(None)  # a disturbance fades, the weights stay
+    early, late = ([signal[part] for signal in signals(2, 240)] for part in np.split(np.arange(240), 2))
+    drive(hierarchy, early)
+    learned = hierarchy.feedforward.state[key].copy()
+    late[-1][:] = [0.11, 0.09]
+    drive(hierarchy, late)
+    np.testing.assert_array_equal(hierarchy.feedforward.state[key][0, ..., kept], learned[0, ..., kept])
+    assert (hierarchy.feedforward.state[key][1] != learned[1]).any()
+
+
 def test_saturation_freezes(robot):
     """A voltage that cannot act teaches nothing, and does not wind the integral up."""
     weak = robot.model_copy(update={"supply": 0.5})
     hierarchy = build(weak, 1, feedforward="fel")
     still, pose, ahead, wanted = np.zeros((1, 2)), np.zeros((1, 3)), np.array([[0.5, 0, 0]]), np.array([[0.5, 0]])
     for _ in range(10):  # until the command has risen beyond reach
-        hierarchy.update(pose, still, np.hstack([ahead, wanted, still]))
+        hierarchy.update(pose, still, np.hstack([ahead, wanted, still]), np.zeros(1))
     before = hierarchy.feedforward.state["weights"].copy()
     for _ in range(400):
-        output = hierarchy.update(pose, still, np.hstack([ahead, wanted, still]))
+        output = hierarchy.update(pose, still, np.hstack([ahead, wanted, still]), np.zeros(1))
         assert hierarchy.saturated[0] == 1
     np.testing.assert_array_equal(output[0, :2], 0.5)
     np.testing.assert_array_equal(hierarchy.feedforward.state["weights"], before)
@@ -192,7 +207,7 @@ def test_rolling_start(robot, name):
     hierarchy = build(robot, feedforward=name)
     hierarchy.reset(twist, acceleration, np.array([0.2]))
     pose = np.array([[1.0, 2.0, 0.5]])
-    output = hierarchy.update(pose, twist, np.hstack([pose, twist, acceleration]))
+    output = hierarchy.update(pose, twist, np.hstack([pose, twist, acceleration]), np.zeros(1))
     np.testing.assert_allclose(hierarchy.command, twist, atol=1e-12)
     np.testing.assert_allclose(hierarchy.derivative, acceleration, atol=1e-12)
     steady = inverse_dynamics(twist, acceleration, robot, sign_speed=0.05)
@@ -211,7 +226,7 @@ def test_take_over(robot):
     integrals = []
     for stage in (Learner(1), NoFeedforward(1)):
         hierarchy = Hierarchy([Scenario(feedforward="none")], robot, stage)
-        hierarchy.update(np.zeros((1, 3)), np.zeros((1, 2)), np.array([[0, 0, 0, 1.0, 1.0, 0, 0]]))
+        hierarchy.update(np.zeros((1, 3)), np.zeros((1, 2)), np.array([[0, 0, 0, 1.0, 1.0, 0, 0]]), np.zeros(1))
         integrals.append(hierarchy.state["pid"][:, :2].copy())
     np.testing.assert_allclose(integrals[1] - integrals[0], TAKE_OVER * Learner.taken, atol=1e-14)
 
@@ -221,10 +236,10 @@ def test_lag_of_the_fork(robot):
     hierarchy = build(robot, feedforward="none")
     twist, still, pose = np.array([[0.8, 0.5]]), np.zeros((1, 2)), np.zeros((1, 3))
     hierarchy.reset(twist, still, np.array([0.4]))
-    first = hierarchy.update(pose, twist, np.hstack([pose, twist, still]))[0, 2]
+    first = hierarchy.update(pose, twist, np.hstack([pose, twist, still]), np.zeros(1))[0, 2]
     settled = first
     for _ in range(200):
-        settled = hierarchy.update(pose, twist, np.hstack([pose, twist, still]))[0, 2]
+        settled = hierarchy.update(pose, twist, np.hstack([pose, twist, still]), np.zeros(1))[0, 2]
     assert settled < first < 0.4
     assert first > settled + 0.5 * (0.4 - settled)
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mrctl.measurement import observe
+from mrctl.measurement import SLIP_FILTER, observe, watch_slip
 
 
 def numbers(*shape, bound=5.0):
@@ -106,3 +106,35 @@ def test_rows(true_pose, true_twist, noise, odometry, speed, pose, twist):
     together = answer(slice(None), lost=[1])
     for i in (0, 2, 3):
         assert together[i].tobytes() == answer(slice(i, i + 1))[0].tobytes()
+
+
+def slip_of(wheels, twist, ticks=400):
+    """What is seen of a slip that lasts."""
+    seen = np.zeros(1)
+    for _ in range(ticks):
+        watch_slip(np.array(wheels, float), np.array(twist, float), 0.2, 0.01, seen)
+    return seen[0]
+
+
+@given(numbers(2))
+def test_rolling_is_no_slip(twist):
+    """Wheels that turn as the motion carries them do not slip, whichever way it goes."""
+    v, omega = twist
+    assert slip_of([v - 0.2 * omega, v + 0.2 * omega], twist) == pytest.approx(0, abs=1e-12)
+
+
+def test_slip_ratio():
+    """The field's slip ratio, driving and braking, of either wheel, forwards and backwards; not of noise at rest."""
+    for sign in (1, -1):
+        assert slip_of([sign * 1.0, sign * 1.25], [sign * 1.0, 0.0]) == pytest.approx(0.2)
+        assert slip_of([sign * 0.8, sign * 1.0], [sign * 1.0, 0.0]) == pytest.approx(0.2)
+    assert slip_of([0.8, 1.2], [1.0, 0.0]) == pytest.approx(0.2)  # a robot that does not turn as its wheels do
+    assert slip_of([0.015, 0.0], [0.0, 0.0]) == pytest.approx(0.05)
+
+
+def test_slip_lasts():
+    """A slip that has ended fades with the filter's time constant."""
+    seen = np.array([1.0])
+    for _ in range(round(SLIP_FILTER / 0.001)):
+        watch_slip(np.ones(2), np.array([1.0, 0.0]), 0.2, 0.001, seen)
+    assert seen[0] == pytest.approx(np.exp(-1), rel=0.01)
