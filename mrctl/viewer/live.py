@@ -28,7 +28,7 @@ from mrctl.viewer.session import CHANGEABLE, Session, changed
 WINDOW = 12.0  # s that the plots show
 SAMPLES = 300  # in a curve
 TIDY = 10.0  # s at least between two times that freed memory is handed back, which may take half a second
-UNMARKED = 3  # plots for each point of the trails, which cost a browser more
+UNMARKED = 3  # plots for each point of the trails
 BEHIND = 0.25  # s of wall time that are caught up with; what is more is lost
 # What the buttons do to the robots: label of the group, button, change of the perturbation or a push.
 BUTTONS: dict[str, dict[str, dict[str, Any]]] = {

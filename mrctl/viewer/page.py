@@ -17,7 +17,7 @@ import viser
 from mrctl.record import InputError
 from mrctl.viewer.server import Server
 
-FRAME, REFRESH = 1 / 30, 1 / 12  # s of wall time between pictures, and between plots
+FRAME, REFRESH = 1 / 25, 1 / 15  # s of wall time between pictures, and between plots
 SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "as fast as it goes": float("inf")}
 
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
+import trimesh
 import viser
 from mjviser.conversions import merge_geoms
 from numpy.typing import NDArray
@@ -28,7 +29,9 @@ COLOURS: list[Colour] = [
 ]  # fmt: skip
 REFERENCE: Colour = (110, 115, 122)
 TRAIL = 240  # points of the way that a robot has come
-TRAILS = 800  # and of all together: a browser builds them anew for each picture of them
+TRAILS = 1600  # and of all together
+SEEN_FROM, SEEN_AT = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])  # in sizes of the reference
+NEAR = 1.2  # m that a view shows at least
 SEEN = 2  # the last geom group that is for the eye
 
 
@@ -53,7 +56,7 @@ class Scene:
         """
         self.size = len(labels)
         self._scene = server.scene
-        server.initial_camera.position, server.initial_camera.look_at = (0.0, -3.7, 2.7), (0.0, 0.3, 0.0)
+        self._camera = server.initial_camera
         self._model, self._data = mjcf.clone(model), mujoco.MjData(model)
         round_ends = self._model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
         self._model.geom_type[round_ends] = mujoco.mjtGeom.mjGEOM_CYLINDER  # which take thousands of triangles each
@@ -75,9 +78,8 @@ class Scene:
             "/world/robot/chassis/payload", (120, 72, 40), (0.1, 0.1, 0.1), cast_shadow=False, visible=False
         )
         self._shown = None
-        self._trails = np.zeros((self.size, max(2, min(TRAIL, TRAILS // self.size)), 3))
-        self._trail = None
-        self._reference = None
+        self._trails: Array | None = None
+        self._ribbons: list[viser.MeshHandle] = []
 
     def _draw_world(self) -> None:
         model, data = self._model, self._data
@@ -117,8 +119,9 @@ class Scene:
             mesh = merge_geoms(model, geoms)
             self._scene.add_mesh_trimesh(f"/world/robot/{name}/mesh", mesh, cast_shadow=False, receive_shadow=False)
             if others:
+                rough = _rough(model, geoms)
                 handle = self._scene.add_batched_meshes_simple(
-                    f"/world/ghosts/{name}", mesh.vertices, mesh.faces, self._turn[1:, k], self._place[1:, k],
+                    f"/world/ghosts/{name}", rough.vertices, rough.faces, self._turn[1:, k], self._place[1:, k],
                     batched_colors=np.array([colour_of(row + 1) for row in range(others)], np.uint8),
                     opacity=0.4, lod="off", cast_shadow=False, receive_shadow=False,
                 )  # fmt: skip
@@ -126,14 +129,22 @@ class Scene:
         return solid, ghosts
 
     def show_reference(self, scenario: Scenario) -> None:
-        """Draws a lap of each reference of a scenario on the ground."""
+        """Draws a lap of each reference of a scenario on the ground, and lets who comes see all of it."""
         lines = []
         for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
             pose = reference.sample(np.linspace(0, reference.period, 401)).pose
             heights = [self._height(x, y) + 0.006 for x, y in pose[:, :2]]
-            lines.append(_segments(np.column_stack([pose[:, :2], heights])))
-        self._reference = self._scene.add_line_segments(
-            "/world/reference", np.concatenate(lines), REFERENCE, thickness=0.025
+            lines.append(np.column_stack([pose[:, :2], heights]))
+        self._lay("/world/reference", np.stack(lines), 0.025, REFERENCE)
+        low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
+        middle, size = (low + high) / 2, max(NEAR, *(high - low))
+        self._camera.position, self._camera.look_at = middle + size * SEEN_FROM, middle + size * SEEN_AT
+
+    def _lay(self, name: str, lines: Array, width: float, colour: Colour) -> viser.MeshHandle:
+        """Lays lines `(B, n, 3)` on the ground as ribbons: viser's thick lines cost as much a segment as a mesh."""
+        vertices, faces = _ribbons(lines, width)
+        return self._scene.add_mesh_simple(
+            name, vertices, faces, color=colour, side="double", cast_shadow=False, receive_shadow=False
         )
 
     def show_recordings(self, recordings: Sequence[Recording]) -> None:
@@ -188,32 +199,58 @@ class Scene:
     def mark_trails(self) -> None:
         """Adds where the robots are to the ways that they have come."""
         here = self._place[:, self._chassis] - [0, 0, self._radius - 0.01]
-        if self._trail is None:
-            self._trails[:] = here[:, None]
+        if self._trails is None:
+            self._trails = np.repeat(here[:, None], min(TRAIL, TRAILS // self.size), axis=1)
         self._trails = np.concatenate([self._trails[:, 1:], here[:, None]], axis=1)
         self.show_trails(self._trails)
 
     def show_trails(self, ways: Array) -> None:
         """Draws ways, `(B, n, 3)` in m."""
-        points = np.concatenate([_segments(way) for way in ways])
-        if self._trail is None or len(self._trail.points) != len(points):
-            colours = np.repeat([colour_of(row) for row in range(self.size)], ways.shape[1] - 1, axis=0)
-            colours = np.repeat(colours[:, None], 2, axis=1).astype(np.uint8)
-            self._trail = self._scene.add_line_segments("/world/trail", points, colours, thickness=0.012)
-        else:
-            self._trail.points = points.astype(np.float32)
+        groups = [ways[k :: len(COLOURS)] for k in range(min(self.size, len(COLOURS)))]
+        if not self._ribbons:
+            self._ribbons = [self._lay(f"/world/trail/{k}", group, 0.012, COLOURS[k]) for k, group in enumerate(groups)]
+            return
+        for ribbon, group in zip(self._ribbons, groups, strict=True):
+            ribbon.vertices = _ribbons(group, 0.012)[0]
 
     def forget_trails(self) -> None:
         """Begins the ways anew."""
-        if self._trail is not None:
-            self._trail.remove()
-        self._trail = None
+        for ribbon in self._ribbons:
+            ribbon.remove()
+        self._trails, self._ribbons = None, []
 
     def remove(self) -> None:
         """Takes everything away."""
         self._root.remove()
 
 
-def _segments(line: Array) -> Array:
-    """A polyline `(n, 3)` as segments `(n - 1, 2, 3)`."""
-    return np.stack([line[:-1], line[1:]], axis=1)
+def _rough(model: mujoco.MjModel, geoms: Sequence[int]) -> trimesh.Trimesh:
+    """The geoms of one body without colours; what is round has few corners, since there may be many ghosts."""
+    sphere, ellipsoid = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
+    round_ones = [g for g in geoms if model.geom_type[g] in (sphere, ellipsoid)]
+    parts = [merge_geoms(model, rest)] if (rest := [g for g in geoms if g not in round_ones]) else []
+    for geom in round_ones:
+        ball, turn = trimesh.creation.icosphere(subdivisions=1), np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+        size = model.geom_size[geom]
+        scale = size if model.geom_type[geom] == ellipsoid else np.repeat(size[0], 3)
+        vertices = (ball.vertices * scale) @ turn.reshape(3, 3).T + model.geom_pos[geom]
+        parts.append(trimesh.Trimesh(vertices, ball.faces, process=False))
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + start for part, start in zip(parts, first, strict=False)]
+    return trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), process=False)
+
+
+def _ribbons(lines: Array, width: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Vertices `(2Bn, 3)` and triangles `(2B(n − 1), 3)` of level ribbons along lines `(B, n, 3)`."""
+    along = np.gradient(lines[..., :2], axis=1)
+    length = np.linalg.norm(along, axis=-1, keepdims=True)
+    across = np.stack([-along[..., 1], along[..., 0]], axis=-1) / np.where(length > 0, length, 1)
+    half = np.zeros_like(lines)
+    half[..., :2] = width / 2 * across
+    vertices = np.stack([lines - half, lines + half], axis=2).reshape(-1, 3)
+    right = 2 * np.arange(lines.shape[0] * lines.shape[1]).reshape(lines.shape[:2])[:, :-1].ravel()
+    faces = np.concatenate(
+        [np.stack([right, right + 2, right + 1], -1), np.stack([right + 1, right + 2, right + 3], -1)]
+    )
+    return vertices.astype(np.float32), faces.astype(np.uint32)
