@@ -1,4 +1,6 @@
-"""Fixtures for every test."""
+"""Fixtures for every test, and how they share the machine."""
+
+import os
 
 import pytest
 from hypothesis import settings
@@ -9,6 +11,11 @@ from mrctl.robot import Robot
 settings.register_profile("mrctl", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None, print_blob=True)
 settings.load_profile("mrctl")
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than cores: many tests wait, for other processes and for browsers."""
+    return len(os.sched_getaffinity(0)) + 1
 
 
 @pytest.fixture(scope="session")

@@ -44,7 +44,7 @@ class Feedforward(Protocol):
 
         Args:
             feedback: Feedback of the two channels `(B, 2)`, units as `output`.
-            saturated: 1 where a limit acted, or where this robot must not learn, `(B,)`.
+            saturated: 1 where a limit acted, a driven wheel slips, or this robot must not learn, `(B,)`.
             twist: Measured V in m/s and θ̇ in rad/s, on which `voltage` has not acted yet, `(B, 2)`.
             voltage: What is sent from now on, after the limits, in the channels and units of `output`, `(B, 2)`.
 

@@ -5,6 +5,8 @@ import pytest
 
 from mrctl import PERTURBATIONS, Event, Lemniscate, Perturbation, Scenario, per_lap, simulate
 
+pytestmark = pytest.mark.xdist_group("composite_loop")  # what its tests share is made once
+
 LAP = 12.0
 NAMES = ("model", "oracle", "observer", "rls", "composite")
 METRICS = ("v_rmse", "omega_rmse", "position_rmse")

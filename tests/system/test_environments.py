@@ -1,5 +1,7 @@
 """Environments: what their own makers' checkers ask for, and the very physics of `simulate`, bit for bit."""
 
+import subprocess
+import sys
 import warnings
 
 import gymnasium
@@ -285,3 +287,10 @@ def test_scenario_file(tmp_path):
     file = tmp_path / "scenario.toml"
     file.write_text(BUSY.to_toml())
     assert TrackingEnv(file).episodes.scenarios == SUITE["residual"](str(file)).task.episodes.scenarios == [BUSY]
+
+
+def test_without_gymnasium():
+    """Who has not installed it is told how."""
+    code = "import sys; sys.modules['gymnasium'] = None\nimport mrctl.gym"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert found.stderr.strip().endswith("mrctl.gym needs Gymnasium: pip install 'mrctl[env]'")
