@@ -14,12 +14,12 @@ over its time constant: nothing is differentiated. With one filter V̇_f would c
 on a regressor biases its weight toward zero.
 
 The weights are taken to wander as an Ornstein-Uhlenbeck process whose stationary covariance P₀ is how they scatter over
-the plants of the training: it tells the filter what plants differ in, and P stays below P₀ where nothing is excited. d
-does the same, fast: what is no function of the motion, such as a push, goes there. When the innovations of one channel
-grow at once, the plant has changed, and P of both begins again. How noisily the motion is measured shows in its second
-differences, which mass keeps small; the noisier, the less a sample counts. The heading that slope features need is dead
-reckoning; from where it counts does not matter. The tracking term moves a along P φ(x) by a share of the feedback
-voltage, like `rls`.
+the plants of the training: it tells the filter what plants differ in, and P returns to P₀, no further, where nothing is
+excited. d does the same, fast: what is no function of the motion, such as a push, goes there. When the innovations of
+one channel grow at once, the plant has changed, and P of both begins again. How noisily the motion is measured shows in
+its second differences, which mass keeps small; the noisier, the less a sample counts. The heading that slope features
+need is dead reckoning; from where it counts does not matter. The tracking term moves a along P φ(x) by a share of the
+feedback voltage, like `rls`.
 
 Under `rigid` steering the second channel is treated alike: what is asked of the steering stands for the voltage, its
 nominal inverse is the rotation itself, and U is what has to be added to the command.
