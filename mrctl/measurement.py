@@ -55,9 +55,10 @@ def watch_slip(wheel_speeds, twist, half_track, period, slip):  # noqa: ANN001, 
     """Slip ratio of the driven wheels of one robot, of the one that slips more.
 
     |v_i − u_i| over the larger of |v_i| and |u_i|, where u = V ∓ D θ̇ is how fast the measured motion carries the wheel
-    over the floor; behind a first-order low-pass, so that noise does not pass for slip, and a slip lasts until what a
+    over the floor; behind a first-order low-pass, so that a jolt does not pass for slip, and a slip lasts until what a
     learner's filters hold of it is gone. Odometry, whose V is the mean of the encoders, shows about half of what one
-    wheel slips.
+    wheel slips. A radius that is wrong by some percent is a slip of as much, and noise one of 0.8 of its standard
+    deviation over the speed.
 
     Args:
         wheel_speeds: v left and right, by the encoders and the nominal wheel radius in m/s, `(2,)`.

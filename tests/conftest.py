@@ -15,7 +15,7 @@ settings.load_profile("mrctl")
 
 def pytest_xdist_auto_num_workers() -> int:
     """One more than cores: many tests wait, for other processes and for browsers."""
-    return len(os.sched_getaffinity(0)) + 1
+    return int(os.environ.get("PYTEST_XDIST_AUTO_NUM_WORKERS", (os.cpu_count() or 1) + 1))
 
 
 @pytest.fixture(scope="session")

@@ -90,7 +90,7 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
             )  # fmt: skip
             for k in range(2):
                 s.voltage[k] = s.feedback[k] + s.guard.output[k] + s.excess[k]
-            s.slips = 1.0 if slip[i] > SLIPS else 0.0
+            s.slips = 0.0 if slip[i] <= SLIPS else 1.0  # NaN is no rolling
             s.idle = max(s.saturated[0], s.frozen, s.guard.idle, s.slips)
             for k in range(4):
                 finite &= np.isfinite(s.parts[k])

@@ -141,7 +141,7 @@ class Scene:
         self._camera.position, self._camera.look_at = middle + size * SEEN_FROM, middle + size * SEEN_AT
 
     def _lay(self, name: str, lines: Array, width: float, colour: Colour) -> viser.MeshHandle:
-        """Lays lines `(B, n, 3)` on the ground as ribbons: viser's thick lines cost as much a segment as a mesh."""
+        """Lays lines `(B, n, 3)` on the ground as one mesh; of viser's thick lines each segment costs about as much."""
         vertices, faces = _ribbons(lines, width)
         return self._scene.add_mesh_simple(
             name, vertices, faces, color=colour, side="double", cast_shadow=False, receive_shadow=False
