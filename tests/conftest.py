@@ -1,6 +1,4 @@
-"""Fixtures for every test, and how they share the machine."""
-
-import os
+"""Fixtures for every test."""
 
 import pytest
 from hypothesis import settings
@@ -11,11 +9,6 @@ from mrctl.robot import Robot
 settings.register_profile("mrctl", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None, print_blob=True)
 settings.load_profile("mrctl")
-
-
-def pytest_xdist_auto_num_workers() -> int:
-    """One more than cores: many tests wait, for other processes and for browsers."""
-    return int(os.environ.get("PYTEST_XDIST_AUTO_NUM_WORKERS", (os.cpu_count() or 1) + 1))
 
 
 @pytest.fixture(scope="session")

@@ -177,7 +177,8 @@ def test_goes_on_where_it_stopped(whole: Path, tmp_path: Path) -> None:
         time.sleep(0.01)
     os.kill(victim.pid, signal.SIGINT)
     complaint = victim.communicate(timeout=60)[1]
-    assert victim.returncode == 130 and "mrctl: interrupted" in complaint.splitlines()[-1]
+    assert victim.returncode == 130
+    assert any(line.startswith("mrctl: interrupted") for line in complaint.splitlines())  # tqdm may complain after it
     assert not (out / "report.html").exists()
     stamp = done.stat().st_mtime_ns
     assert cli.main(arguments(out, "--workers", 2)) == 0
