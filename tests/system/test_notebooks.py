@@ -62,8 +62,11 @@ def test_notebook(path, tmp_path):
         replay.evaluate("frame => frame.scrollIntoView()")
         curves = replay.content_frame()
         scene = curves.wait_for_selector("#scene", timeout=PATIENCE).content_frame()
-        x, y, _ = scene.wait_for_function(ROBOT, timeout=PATIENCE).json_value()
-        curves.evaluate("seek(4)")  # and pause
+        scene.wait_for_function(ROBOT, timeout=PATIENCE)
+        curves.evaluate("seek(1)")  # and pause, wherever it has come meanwhile
+        seen.wait_for_timeout(3000)
+        x, y, _ = scene.evaluate(ROBOT)
+        curves.evaluate("seek(4)")
         scene.wait_for_function(f"Math.hypot({ROBOT}[0] - {x}, {ROBOT}[1] - {y}) > 0.5", timeout=PATIENCE)
         curves.wait_for_function("document.getElementById('time').textContent.startsWith('4.0')", timeout=PATIENCE)
         shown = np.asarray(Image.open(io.BytesIO(seen.screenshot(timeout=PATIENCE))).convert("RGB"))
