@@ -178,21 +178,11 @@ def _give_up(prior, disturbance, weights, covariance):  # noqa: ANN001, ANN202
     covariance[n, n] = disturbance * disturbance
 
 
+VECTOR, MATRIX = float64[:], float64[:, :]
+
+
 @guvectorize(
-    [
-        (
-            float64[:],
-            float64,
-            float64[:],
-            float64,
-            float64,
-            float64[:],
-            float64[:, :],
-            float64[:],
-            float64[:],
-            float64[:, :],
-        )
-    ],  # fmt: skip
+    [(VECTOR, float64, VECTOR, float64, float64, VECTOR, MATRIX, VECTOR, VECTOR, MATRIX)],
     "(n),(),(n),(),(),(s),(n,n),(k),(m),(m,m)",
     writable_args=("usual", "weights", "covariance"),
     cache=True,

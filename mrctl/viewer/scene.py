@@ -227,18 +227,20 @@ class Scene:
 def _rough(model: mujoco.MjModel, geoms: Sequence[int]) -> trimesh.Trimesh:
     """The geoms of one body without colours; what is round has few corners, since there may be many ghosts."""
     sphere, ellipsoid = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
-    round_ones = [g for g in geoms if model.geom_type[g] in (sphere, ellipsoid)]
-    parts = [merge_geoms(model, rest)] if (rest := [g for g in geoms if g not in round_ones]) else []
-    for geom in round_ones:
-        ball, turn = trimesh.creation.icosphere(subdivisions=1), np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-        size = model.geom_size[geom]
-        scale = size if model.geom_type[geom] == ellipsoid else np.repeat(size[0], 3)
-        vertices = (ball.vertices * scale) @ turn.reshape(3, 3).T + model.geom_pos[geom]
-        parts.append(trimesh.Trimesh(vertices, ball.faces, process=False))
-    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    faces = [part.faces + start for part, start in zip(parts, first, strict=False)]
-    return trimesh.Trimesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces), process=False)
+    parts = []
+    for geom in geoms:
+        if model.geom_type[geom] not in (sphere, ellipsoid):
+            shape = merge_geoms(model, [geom])
+            parts.append(trimesh.Trimesh(shape.vertices, shape.faces, process=False))
+            continue
+        ball, size = trimesh.creation.icosphere(subdivisions=1), model.geom_size[geom]
+        place = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])
+        place[:3, 3] = model.geom_pos[geom]
+        ball.apply_scale(size if model.geom_type[geom] == ellipsoid else size[0])
+        parts.append(ball.apply_transform(place))
+    whole = trimesh.util.concatenate(parts)
+    assert isinstance(whole, trimesh.Trimesh)  # the types of trimesh allow any geometry
+    return whole
 
 
 def _ribbons(lines: Array, width: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
