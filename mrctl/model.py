@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Mapping, Sequence
+from inspect import getmembers
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -608,7 +609,11 @@ def clone(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def digest(model: mujoco.MjModel) -> str:
-    """Tells whether two compiled models are the same, byte for byte."""
-    buffer = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return hashlib.sha256(buffer.tobytes()).hexdigest()
+    """Tells whether two compiled models are the same, byte for byte, wherever the files lie that they came from."""
+    arrays = [(name, value) for name, value in getmembers(model) if isinstance(value, np.ndarray)]
+    options = [(name, value) for name, value in getmembers(model.opt) if isinstance(value, (np.ndarray, int, float))]
+    found = hashlib.sha256()
+    for name, value in arrays + options:
+        if not name.endswith(("pathadr", "_sizes")):  # those tell how long the files' names are
+            found.update(name.encode() + np.asarray(value).tobytes())
+    return found.hexdigest()

@@ -15,11 +15,14 @@ on a regressor biases its weight toward zero.
 
 The weights are taken to wander as an Ornstein-Uhlenbeck process whose stationary covariance P₀ is how they scatter over
 the plants of the training: it tells the filter what plants differ in, and P returns to P₀, no further, where nothing is
-excited. d does the same, fast: what is no function of the motion, such as a push, goes there. When the innovations of
-one channel grow at once, the plant has changed, and P of both begins again. How noisily the motion is measured shows in
-its second differences, which mass keeps small; the noisier, the less a sample counts. The heading that slope features
-need is dead reckoning; from where it counts does not matter. The tracking term moves a along P φ(x) by a share of the
-feedback voltage, like `rls`.
+excited. d does the same, fast: what is no function of the motion, such as a push, goes there. How noisily the motion is
+measured shows in its second differences, which mass keeps small; the noisier, the less a sample counts. The heading
+that slope features need is dead reckoning; from where it counts does not matter. The tracking term moves a along P φ(x)
+by a share of the feedback voltage, like `rls`.
+
+When the innovations of one channel grow at once, the plant has changed. What was known of it is kept, and P of both
+channels begins again. Two such plants are remembered, and predict along (multiple models, Narendra and Balakrishnan,
+1997): when one of them predicts again, for it is back or has never gone, all that was known of it is taken up.
 
 Under `rigid` steering the second channel is treated alike: what is asked of the steering stands for the voltage, its
 nominal inverse is the rotation itself, and U is what has to be added to the command.
@@ -50,30 +53,33 @@ STEERING_DISTURBANCE = 0.03  # rad/s of disturbance per volt: less, since the ge
 OUTLIER = 3.0  # standard deviations beyond which a sample pulls no harder: a tyre slips, a wheel lost its load
 SLOW = 0.1  # m/s of the faster wheel; below it stiction, not the motion, decides about the voltage
 BRIEF, LASTING = 0.25, 4.0  # s over which innovations are averaged, to see a change of the plant
-CHANGE = 6.0  # times the lasting mean square of the innovations that the brief one of a changed plant exceeds
+CHANGE = 5.0  # times the lasting mean square of the innovations that the brief one of a changed plant exceeds
 NOTHING = 1e-9  # V² or (rad/s)²: features that vary less are none that a feedback could be put down to
 # V of noise that a sample is taken to have per m/s by which the measured wheel speed scatters; tuned with sensor noise
 # of 10 mm/s and 20 mrad/s behind filters of 0.03 s, at 10 ms.
 SCATTER = 300.0
 SETTLED = 6.0  # time constants until two filters have forgotten how they began
+LEARNED = 12.0  # s of learning that make what is known of a plant worth keeping; as long a former one is looked for
+LOOK = 2.0  # s over which mispredictions of former plants are averaged
+BACK = 0.2  # times what the other one mispredicts, or the noise where that is more: the former plant is back
 SHIPPED = Path(__file__).with_suffix(".safetensors")
 
 
 class Composite(Record):
     """Settings of the `composite` feedforward; one setting serves every robot, steering and perturbation."""
 
-    noise: Annotated[float, Field(gt=0, le=100)] = 0.35
+    noise: Annotated[float, Field(gt=0, le=100)] = 0.2
     """Standard deviation of one sample of the regression, V (a tenth of it in rad/s on a steering channel), where the
     motion is measured without noise; what noise the measured motion shows is added."""
     memory: Annotated[float, Field(ge=1, le=1e6)] = 1000.0
     """Time in which the weights are taken to wander by as much as plants differ, s."""
     disturbance: Annotated[float, Field(ge=0, le=100)] = 0.15
     """Standard deviation of the disturbance, V (as for `noise`)."""
-    disturbance_memory: Annotated[float, Field(ge=0.01, le=1e6)] = 0.5
+    disturbance_memory: Annotated[float, Field(ge=0.01, le=1e6)] = 0.15
     """Time in which the disturbance wanders by that, s."""
     filter: Annotated[float, Field(ge=0.01, le=2)] = 0.03
     """Time constant of each of the two filters on voltage and motion, s."""
-    step: Annotated[float, Field(ge=0, le=1)] = 0.015
+    step: Annotated[float, Field(ge=0, le=1)] = 0.025
     """Share of the feedback that the tracking term moves into the feedforward each control period, as for `rls`."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
     """Feedback below this moves nothing, V (as for `noise`)."""
@@ -248,10 +254,13 @@ def adapt(  # noqa: ANN201
 
 _features, _basis, _adapt = one(features), one(basis), one(adapt)
 
+KEPT = 2  # former plants
 SIGNALS = 6  # pass the filters: what was sent in the two channels, the twist, cosine and sine of the heading
 
 # What is kept of one robot; `once` and `twice` are the filtered signals, `last` the last two twists, `variance` that of
-# their noise, and `noise` what a sample has of its own, V, and per m/s of that.
+# their noise, and `noise` what a sample has of its own, V, and per m/s of that. `since` is for how long the plant has
+# been learned, s, `place` where what is known of it will be kept, `back` whether it was taken from there, `known`
+# whether a former plant is there, `misfit` the mean square of what that one mispredicts, in variances of the noise.
 STATE = np.dtype(
     [
         ("settings", "f8", (CHANNELS, 7)), ("share", "f8"), ("rigid", "f8"),
@@ -260,6 +269,9 @@ STATE = np.dtype(
         ("last", "f8", (2, CHANNELS)), ("variance", "f8", CHANNELS), ("noise", "f8", (CHANNELS, 2)),
         ("usual", "f8", (CHANNELS, 2)), ("weights", "f8", (CHANNELS, FEATURES + 1)),
         ("covariance", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)), ("norm", "f8", (1,)),
+        ("since", "f8"), ("place", "i8"), ("back", "f8"), ("known", "f8", KEPT), ("misfit", "f8", KEPT),
+        ("kept", "f8", (KEPT, CHANNELS, FEATURES + 1)),
+        ("kept_covariance", "f8", (KEPT, CHANNELS, FEATURES + 1, FEATURES + 1)),
     ],
     align=True,
 )  # fmt: skip
@@ -272,6 +284,32 @@ def _learned(weights, phi):  # noqa: ANN001, ANN202
     for i in range(phi.shape[0]):
         total += weights[i] * phi[i]
     return total
+
+
+@njit
+def _switch(period, priors, misfit, s):  # noqa: ANN001, ANN202
+    """Sees whether the plant of one robot has changed, or a former one is back."""
+    settled, before = SETTLED * period * (1 / s.share - 1), s.since
+    s.since += period
+    changed = (s.usual[:, 0] > CHANGE * s.usual[:, 1]).any()
+    if changed:
+        s.usual[:, 1] = np.maximum(s.usual[:, 0], s.usual[:, 1])
+        if s.since > LEARNED:
+            s.kept[s.place], s.kept_covariance[s.place], s.known[s.place] = s.weights, s.covariance, 1.0
+        if s.since > LEARNED or s.back > 0:
+            s.place = 1 - s.place
+        s.since = s.back = 0.0
+    if changed or before < settled <= s.since:  # once more when the filters hold nothing of the plant before
+        for k in range(CHANNELS):
+            _give_up(priors[k], s.settings[k, 2], s.weights[k], s.covariance[k])
+        s.misfit[:] = 0.0
+    elif s.since < LEARNED and s.back == 0:
+        s.misfit += period / (period + LOOK) * (misfit - s.misfit)
+        j = int(s.known[1] > 0 and (s.known[0] == 0 or s.misfit[1] < s.misfit[0]))
+        other = max(1.0, s.known[1 - j] * s.misfit[1 - j])
+        if s.since > LOOK and s.known[j] > 0 and s.misfit[j] < BACK * other:
+            s.weights[:], s.covariance[:] = s.kept[j], s.kept_covariance[j]
+            s.place, s.back = j, 1.0
 
 
 def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -297,7 +335,7 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     def teach(  # noqa: ANN202
         feedback, twist, voltage, idle, half_track, period, scale, model, units, priors, state  # noqa: ANN001
     ):  # fmt: skip
-        x, phi, rate = np.empty(PHYSICAL), np.empty(FEATURES), np.empty(CHANNELS)
+        x, phi, rate, misfit = np.empty(PHYSICAL), np.empty(FEATURES), np.empty(CHANNELS), np.empty(KEPT)
         for i in range(len(state)):
             s = state[i]
             s.heading += period * twist[i, 1]
@@ -323,10 +361,13 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
                 _features(s.twice[2:4], rate, half_track, scale, x)
                 x[8], x[9] = s.twice[4], s.twice[5]
                 _basis(x, units, phi)
+                misfit[:] = 0.0
                 for k in range(CHANNELS):
                     residual = s.twice[k]
                     for j in range(INPUTS):
                         residual -= model[k, j] * x[j]
+                    for j in range(KEPT):
+                        misfit[j] += ((residual - _learned(s.kept[j, k], phi)) / s.noise[k, 0]) ** 2
                     noise = s.noise[k, 0] ** 2 + s.noise[k, 1] ** 2 * s.variance[k]
                     before = _learned(s.weights[k], s.phi)
                     _adapt(
@@ -334,10 +375,7 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
                         s.covariance[k],
                     )  # fmt: skip
                     s.added[k] = _learned(s.weights[k], s.phi) - before
-                if (s.usual[:, 0] > CHANGE * s.usual[:, 1]).any():
-                    for k in range(CHANNELS):
-                        s.usual[k, 1] = max(s.usual[k])
-                        _give_up(priors[k], s.settings[k, 2], s.weights[k], s.covariance[k])
+                _switch(period, priors, misfit, s)
             else:  # only the disturbance fades
                 for k in range(CHANNELS):
                     s.weights[k, FEATURES] *= s.settings[k, 1]
@@ -396,7 +434,8 @@ class CompositeAdaptation:
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Takes robots back to what they knew at the start."""
         state = self._rows
-        state["weights"][rows], self.weight_norm[rows] = 0.0, 0.0
+        state["weights"][rows], state["known"][rows], state["back"][rows], self.weight_norm[rows] = 0, 0, 0, 0
+        state["since"][rows] = SETTLED * self._period * (1 / state["share"][rows] - 1)
         for row in rows:
             state["covariance"][row] = 0.0
             state["covariance"][row, :, :FEATURES, :FEATURES] = self._priors

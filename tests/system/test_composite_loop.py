@@ -5,8 +5,6 @@ import pytest
 
 from mrctl import PERTURBATIONS, Event, Lemniscate, Perturbation, Scenario, per_lap, simulate
 
-pytestmark = pytest.mark.xdist_group("composite_loop")  # what its tests share is made once
-
 LAP = 12.0
 NAMES = ("model", "oracle", "observer", "rls", "composite")
 METRICS = ("v_rmse", "omega_rmse", "position_rmse")
@@ -48,15 +46,15 @@ def test_observer(errors):
 
 
 def test_slope():
-    """No function of the motion explains a slope: features of the heading do, to a third of what an observer leaves."""
+    """No function of the motion explains a slope: features of the heading do, to half of what an observer leaves."""
     uphill = Perturbation(slope=0.17)
     laps = per_lap(simulate([scenario(name, uphill) for name in ("observer", "composite")])).isel(lap=2)
-    assert float(laps.position_rmse[1]) < float(laps.position_rmse[0]) / 3
+    assert float(laps.position_rmse[1]) < float(laps.position_rmse[0]) / 2
 
 
 @pytest.fixture(scope="module")
 def steps():
-    """Position error lap by lap of runs in which something changes in lap 5 and back in lap 9."""
+    """Errors lap by lap of runs in which something changes in lap 5 and back in lap 9, `(lap, 3)`."""
     names = ("mass +50 %", "supply -20 %", "payload aside", "left tyre on ice")
     runs = []
     for name in names:
@@ -64,14 +62,16 @@ def steps():
             Event(time=4 * LAP, perturbation=PERTURBATIONS[name]), Event(time=8 * LAP, perturbation=Perturbation()),
         )  # fmt: skip
         runs.append(scenario("composite", Perturbation(), laps=10, events=events))
-    return dict(zip(names, per_lap(simulate(runs)).position_rmse.values, strict=True))
+    laps = per_lap(simulate(runs))
+    return dict(zip(names, np.stack([laps[metric].values for metric in METRICS], axis=-1), strict=True))
 
 
 def test_recovery(steps):
-    """Within one lap of a change the error is near the one at which it settles, and on return at that of before."""
+    """Within one lap of a change the errors are near those at which they settle, and on return they are as before."""
     for error in (steps[name] for name in ("mass +50 %", "supply -20 %", "payload aside")):
-        assert error[5] < 1.2 * error[7] < 1.5 * error[3]
-        assert error[9] < 1.1 * error[3]
+        assert (error[5] < np.array([1.2, 1.35, 1.15]) * error[7]).all()
+        assert error[7, 2] < 1.3 * error[3, 2]
+        assert (error[9] < 1.05 * error[3]).all()
 
 
 def test_slip_teaches_nothing(steps):
@@ -85,8 +85,8 @@ def test_slip_teaches_nothing(steps):
     still = np.diff(mine.weight_norm.values, prepend=np.nan) == 0
     assert still[slips].mean() > 0.99 and still[~slips][1200:].mean() < 0.3  # a norm is logged a tick late
     error = steps["left tyre on ice"]
-    assert error[5:8].max() < 1.1 * float(per_lap(result).position_rmse[1, 3])
-    assert error[9] < 1.2 * error[3]
+    assert error[5:8, 2].max() < 1.1 * float(per_lap(result).position_rmse[1, 3])
+    assert (error[9] < 1.05 * error[3]).all()
 
 
 @pytest.mark.parametrize("steering", ["caster", "rigid"])

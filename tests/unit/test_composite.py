@@ -176,6 +176,44 @@ def test_change_of_the_plant(robot, changed):
         assert (np.array(spread) <= settled * 1.01).all()
 
 
+@pytest.mark.parametrize("back", ["nominal", "heavy", "aside"])
+def test_former_plant(robot, back):
+    """A plant that was known is known again seconds after it is back, and no other is taken for one of the former."""
+    nominal = robot.model_copy(update={"supply": 1e3})
+    plants = {
+        "nominal": nominal,
+        "heavy": nominal.model_copy(update={"mass": 30.0, "yaw_inertia": 1.2}),
+        "aside": nominal.model_copy(update={"resistance": 3.0}),
+    }
+    pupil, known = stage(robot), {}
+    for name in ("nominal", "heavy"):
+        known[name] = drive(pupil, plants[name], 30), pupil.state["weights"][0, :, :FEATURES].copy(), openness(pupil)
+    drive(pupil, plants["aside" if back == "heavy" else back], 0.5)  # the way back to `heavy` is short
+    spread = []
+    drive(pupil, plants[back], 6, watch=lambda _: spread.append(openness(pupil)))
+    taken_up = (np.array(spread[1:]) < 0.5 * np.array(spread[:-1])).all(1)
+    assert taken_up.sum() == (back in known)
+    if back in known:
+        feedback, weights, certain = known[back]
+        assert (openness(pupil) < 1.2 * certain).all()
+        found, other = pupil.state["weights"][0, :, :FEATURES], known["heavy" if back == "nominal" else "nominal"][1]
+        assert np.linalg.norm(found - weights) < 0.2 * np.linalg.norm(found - other)
+        again = drive(pupil, plants[back], 20)
+        assert (again.std(0) < 1.1 * feedback[-2000:].std(0)).all()
+
+
+def test_push(robot):
+    """What looks like another plant for a moment, and is none, takes nothing of what was known."""
+    pupil, plant = stage(robot), robot.model_copy(update={"mass": 30.0, "supply": 1e3})
+    drive(pupil, plant, 30)
+    weights, certain = pupil.state["weights"][0, :, :FEATURES].copy(), openness(pupil)
+    drive(pupil, plant, 0.3, disturbance=0.3)
+    assert (openness(pupil) > 5 * certain).all()
+    drive(pupil, plant, 5)
+    assert (openness(pupil) < 1.1 * certain).all()
+    assert np.linalg.norm(pupil.state["weights"][0, :, :FEATURES] - weights) < 0.2 * np.linalg.norm(weights)
+
+
 @pytest.mark.parametrize("rigid", [False, True])
 @pytest.mark.parametrize("channel", [0, 1])
 def test_noise_counts(robot, channel, rigid):
@@ -250,7 +288,8 @@ def test_gates(robot):
         for _ in range(50):
             assert not pupil.learn(np.ones((1, 2)), np.full(1, idle), twist, np.ones((1, 2))).any()
         np.testing.assert_array_equal(pupil.state["weights"][..., :FEATURES], kept[..., :FEATURES])
-        np.testing.assert_allclose(pupil.state["weights"][..., FEATURES], 0.2 * np.exp(-1), rtol=1e-9)
+        faded = 0.2 * np.exp(-50 * PERIOD / Composite().disturbance_memory)
+        np.testing.assert_allclose(pupil.state["weights"][..., FEATURES], faded, rtol=1e-9)
 
 
 def test_what_it_added(robot):

@@ -132,6 +132,19 @@ def test_steering(steering, stiffness, damping):
         assert data.qfrc_actuator[fork.dofadr[0]] == pytest.approx(torque)
 
 
+def test_digest(tmp_path):
+    """The same world read from another folder is the same; a bump more, or another time step, is not."""
+    names = "rough.xml", "rough.png", "car.xml", "scenery.xml"
+    for name in names:
+        shutil.copy(mjcf.models_folder() / name, tmp_path / name)
+    own = mjcf.digest(mjcf.load("rough"))
+    assert mjcf.digest(mjcf.load(str(tmp_path / "rough.xml"))) == own
+    higher = (tmp_path / "rough.xml").read_text().replace("0.03 0.05", "0.031 0.05")
+    (tmp_path / "higher.xml").write_text(higher)
+    others = mjcf.load(str(tmp_path / "higher.xml")), mjcf.load("rough", timestep=5e-4)
+    assert len({own, *map(mjcf.digest, others)}) == 3
+
+
 def test_timestep():
     """The file's own, or another."""
     assert NOMINAL.opt.timestep == 0.002
