@@ -610,10 +610,13 @@ def clone(model: mujoco.MjModel) -> mujoco.MjModel:
 
 def digest(model: mujoco.MjModel) -> str:
     """Tells whether two compiled models are the same, byte for byte, wherever the files lie that they came from."""
-    arrays = [(name, value) for name, value in getmembers(model) if isinstance(value, np.ndarray)]
-    options = [(name, value) for name, value in getmembers(model.opt) if isinstance(value, (np.ndarray, int, float))]
     found = hashlib.sha256()
-    for name, value in arrays + options:
-        if not name.endswith(("pathadr", "_sizes")):  # those tell how long the files' names are
-            found.update(name.encode() + np.asarray(value).tobytes())
+    for part in (model, model.opt, model.stat):
+        for name, value in getmembers(part):
+            # Names of files, how long they are, and where the model lies in memory.
+            if name.startswith("_") or name in ("paths", "npaths") or name.endswith("pathadr"):
+                continue
+            if isinstance(value, (np.ndarray, int, float, bytes)):
+                array = np.asarray(value)
+                found.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
     return found.hexdigest()

@@ -22,7 +22,8 @@ by a share of the feedback voltage, like `rls`.
 
 When the innovations of one channel grow at once, the plant has changed. What was known of it is kept, and P of both
 channels begins again. Two such plants are remembered, and predict along (multiple models, Narendra and Balakrishnan,
-1997): when one of them predicts again, for it is back or has never gone, all that was known of it is taken up.
+1997): when one of them predicts again within seconds, for it is back or has never gone, all that was known of it is
+taken up. With a noisy measurement none is told from the noise, and the plant is learned anew.
 
 Under `rigid` steering the second channel is treated alike: what is asked of the steering stands for the voltage, its
 nominal inverse is the rotation itself, and U is what has to be added to the command.
@@ -59,9 +60,9 @@ NOTHING = 1e-9  # V² or (rad/s)²: features that vary less are none that a feed
 # of 10 mm/s and 20 mrad/s behind filters of 0.03 s, at 10 ms.
 SCATTER = 300.0
 SETTLED = 6.0  # time constants until two filters have forgotten how they began
-LEARNED = 12.0  # s of learning that make what is known of a plant worth keeping; as long a former one is looked for
-LOOK = 2.0  # s over which mispredictions of former plants are averaged
-BACK = 0.2  # times what the other one mispredicts, or the noise where that is more: the former plant is back
+LEARNED = 12.0  # s of learning that make what is known of a plant worth keeping, and for which a former one is sought
+LOOK = 2.0  # s over which what former plants mispredict is averaged, and for which they are watched at least
+BACK = 0.2  # variances of `noise`, of both channels together, below whose mean square a former plant is back
 SHIPPED = Path(__file__).with_suffix(".safetensors")
 
 
@@ -260,7 +261,7 @@ SIGNALS = 6  # pass the filters: what was sent in the two channels, the twist, c
 # What is kept of one robot; `once` and `twice` are the filtered signals, `last` the last two twists, `variance` that of
 # their noise, and `noise` what a sample has of its own, V, and per m/s of that. `since` is for how long the plant has
 # been learned, s, `place` where what is known of it will be kept, `back` whether it was taken from there, `known`
-# whether a former plant is there, `misfit` the mean square of what that one mispredicts, in variances of the noise.
+# whether a former plant is there, `misfit` the mean square of what that one mispredicts, in variances of `noise`.
 STATE = np.dtype(
     [
         ("settings", "f8", (CHANNELS, 7)), ("share", "f8"), ("rigid", "f8"),
@@ -289,7 +290,7 @@ def _learned(weights, phi):  # noqa: ANN001, ANN202
 @njit
 def _switch(period, priors, misfit, s):  # noqa: ANN001, ANN202
     """Sees whether the plant of one robot has changed, or a former one is back."""
-    settled, before = SETTLED * period * (1 / s.share - 1), s.since
+    n, settled, before = FEATURES, SETTLED * period * (1 / s.share - 1), s.since
     s.since += period
     changed = (s.usual[:, 0] > CHANGE * s.usual[:, 1]).any()
     if changed:
@@ -303,13 +304,16 @@ def _switch(period, priors, misfit, s):  # noqa: ANN001, ANN202
         for k in range(CHANNELS):
             _give_up(priors[k], s.settings[k, 2], s.weights[k], s.covariance[k])
         s.misfit[:] = 0.0
-    elif s.since < LEARNED and s.back == 0:
+    elif s.back == 0 and settled < s.since < settled + LEARNED:
         s.misfit += period / (period + LOOK) * (misfit - s.misfit)
         j = int(s.known[1] > 0 and (s.known[0] == 0 or s.misfit[1] < s.misfit[0]))
-        other = max(1.0, s.known[1 - j] * s.misfit[1 - j])
-        if s.since > LOOK and s.known[j] > 0 and s.misfit[j] < BACK * other:
-            s.weights[:], s.covariance[:] = s.kept[j], s.kept_covariance[j]
+        if s.known[j] > 0 and s.misfit[j] < BACK and s.since > settled + LOOK:
             s.place, s.back = j, 1.0
+            for k in range(CHANNELS):
+                s.weights[k, :n], s.weights[k, n] = s.kept[j, k, :n], 0.0
+                s.covariance[k] = s.kept_covariance[j, k]
+                s.covariance[k, n, :n] = s.covariance[k, :n, n] = 0.0
+                s.covariance[k, n, n] = s.settings[k, 2] ** 2
 
 
 def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -369,13 +373,14 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
                     for j in range(KEPT):
                         misfit[j] += ((residual - _learned(s.kept[j, k], phi)) / s.noise[k, 0]) ** 2
                     noise = s.noise[k, 0] ** 2 + s.noise[k, 1] ** 2 * s.variance[k]
-                    before = _learned(s.weights[k], s.phi)
+                    s.added[k] = _learned(s.weights[k], s.phi)
                     _adapt(
                         phi, residual, s.phi, feedback[i, k], noise, s.settings[k], priors[k], s.usual[k], s.weights[k],
                         s.covariance[k],
                     )  # fmt: skip
-                    s.added[k] = _learned(s.weights[k], s.phi) - before
                 _switch(period, priors, misfit, s)
+                for k in range(CHANNELS):
+                    s.added[k] = _learned(s.weights[k], s.phi) - s.added[k]
             else:  # only the disturbance fades
                 for k in range(CHANNELS):
                     s.weights[k, FEATURES] *= s.settings[k, 1]

@@ -36,7 +36,7 @@ class Observer(Record):
 
     time_constant: Annotated[float, Field(ge=0.02, le=10)] = 0.055
     """Time constant T of Q, s: the shortest, to 5 ms, that keeps the sensitivity below 2 with a delay of 20 ms, a hold
-    of half a period and λ = 0.15 s. The phase margin is 43° there, 72° without delay, and 14° with 40 ms."""
+    of half a period and λ = 0.15 s. With that hold the phase margin is 43° there, 72° without delay, 14° with 40 ms."""
 
 
 _features, _ONES = one(features), np.ones(8)

@@ -17,6 +17,8 @@ from mrctl.experiments import bench
 sys.path.append(str(Path(__file__).parent))
 import long_sweep  # noqa: E402
 
+pytestmark = pytest.mark.xdist_group("bench")  # what its tests share is made once
+
 
 @pytest.fixture(scope="module")
 def figures():

@@ -9,6 +9,8 @@ from mrctl import Circle, Event, Fel, Kanayama, LaneChange, Lemniscate, Line, Pe
 from mrctl.plant import BatchPlant, PhysicsPlant
 from mrctl.simulate import Simulation, simulate
 
+pytestmark = pytest.mark.xdist_group("batch_equals_single")  # what its tests share is made once
+
 COUNT = 60
 REFERENCES = (  # four seconds each, so that they share batches, but for the last two
     Circle(period=4, radius=0.5),

@@ -5,6 +5,8 @@ import pytest
 
 from mrctl import PERTURBATIONS, Event, Lemniscate, Perturbation, Scenario, per_lap, simulate
 
+pytestmark = pytest.mark.xdist_group("composite_loop")  # what its tests share is made once
+
 LAP = 12.0
 NAMES = ("model", "oracle", "observer", "rls", "composite")
 METRICS = ("v_rmse", "omega_rmse", "position_rmse")
@@ -91,10 +93,10 @@ def test_slip_teaches_nothing(steps):
 
 @pytest.mark.parametrize("steering", ["caster", "rigid"])
 def test_alone_or_together(steering):
-    """A robot of a batch is the same scenario run alone, bit for bit, through a change of the plant."""
-    change = Event(time=1.0, perturbation=PERTURBATIONS["all"])
+    """A robot of a batch is the same scenario run alone, bit for bit, through a change of the plant and its return."""
+    change = Event(time=14.0, perturbation=PERTURBATIONS["all"]), Event(time=16.0, perturbation=Perturbation())
     some = [
-        scenario(name, Perturbation(rotation_noise=0.02 * seed), steering=steering, laps=1, events=(change,), seed=seed)
+        scenario(name, Perturbation(rotation_noise=0.02 * seed), steering=steering, laps=2, events=change, seed=seed)
         for name in ("composite", "observer") for seed in range(2)
     ]  # fmt: skip
     together = simulate(some)

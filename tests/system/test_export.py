@@ -21,6 +21,8 @@ from mrctl.cli import main
 from mrctl.export import export
 from mrctl.result import SIGNALS
 
+pytestmark = pytest.mark.xdist_group("export")  # what its tests share is made once
+
 SHORT = Scenario(reference=Circle(period=3, radius=0.4), laps=1, feedforward="none")
 FAILS = SHORT.model_copy(update={"seed": 1, "events": (Event(time=1.0, push=(1e12, 0.0, 1e15)),)})
 ROS = get_typestore(Stores.ROS2_HUMBLE)

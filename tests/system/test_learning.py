@@ -6,6 +6,8 @@ import pytest
 from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Scenario, per_lap, save_weights, simulate
 from mrctl.control.fel import initial_weights, unflatten
 
+pytestmark = pytest.mark.xdist_group("learning")  # what its tests share is made once
+
 BASE = Scenario(
     reference=Lemniscate(), laps=3, feedforward="fel", initial_spread=(0, 0, 0), perturbation=PERTURBATIONS["all"]
 )

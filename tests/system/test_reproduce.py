@@ -10,6 +10,8 @@ from matplotlib.image import imread
 from mrctl import cli
 from mrctl.experiments import kanayama
 
+pytestmark = pytest.mark.xdist_group("reproduce")  # what its tests share is made once
+
 FIGURES = (
     "figure2_posture", "figure3_structure", "figure4a_linear_velocity", "figure4b_rotation_velocity",
     "figure4c_tracking_errors", "figure5_pid_against_network", "figure6_feedforward_outputs", "path", "voltages",

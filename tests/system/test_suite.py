@@ -25,6 +25,8 @@ from mrctl import cli, plots
 from mrctl.experiments import report, suite, tuning
 from mrctl.experiments.cases import Case
 
+pytestmark = pytest.mark.xdist_group("suite")  # what its tests share is made once
+
 LAP = 4.0
 GAIN = """
 class Gain:

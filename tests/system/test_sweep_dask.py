@@ -15,6 +15,8 @@ from test_sweeps import FILE, children, content, failures, poisoned, refused, un
 from mrctl import Sweep, cli, jobs
 from mrctl.store import Store
 
+pytestmark = pytest.mark.xdist_group("sweep_dask")  # what its tests share is made once
+
 pytest.importorskip("distributed")
 LONG = FILE.replace("runs = 12", "runs = 40").replace("chunk = 5", "chunk = 2").replace("length = 0.8", "length = 1.6")
 

@@ -202,6 +202,16 @@ def test_former_plant(robot, back):
         assert (again.std(0) < 1.1 * feedback[-2000:].std(0)).all()
 
 
+def test_between(robot):
+    """A plant between two former ones is neither, though much nearer to one of them."""
+    pupil, spread = stage(robot), []
+    for mass, seconds in ((20.0, 20), (100.0, 16), (80.0, 0.5)):
+        plant = robot.model_copy(update={"mass": mass, "supply": 1e3})
+        drive(pupil, plant, seconds)
+    drive(pupil, plant, 6, watch=lambda _: spread.append(openness(pupil)))
+    assert not (np.array(spread[1:]) < 0.5 * np.array(spread[:-1])).any()  # learned bit by bit
+
+
 def test_push(robot):
     """What looks like another plant for a moment, and is none, takes nothing of what was known."""
     pupil, plant = stage(robot), robot.model_copy(update={"mass": 30.0, "supply": 1e3})

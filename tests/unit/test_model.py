@@ -133,16 +133,18 @@ def test_steering(steering, stiffness, damping):
 
 
 def test_digest(tmp_path):
-    """The same world read from another folder is the same; a bump more, or another time step, is not."""
-    names = "rough.xml", "rough.png", "car.xml", "scenery.xml"
-    for name in names:
+    """The same world read from another folder is the same; with another bump, name, scale or time step it is not."""
+    for name in ("rough.xml", "rough.png", "car.xml", "scenery.xml"):
         shutil.copy(mjcf.models_folder() / name, tmp_path / name)
-    own = mjcf.digest(mjcf.load("rough"))
-    assert mjcf.digest(mjcf.load(str(tmp_path / "rough.xml"))) == own
-    higher = (tmp_path / "rough.xml").read_text().replace("0.03 0.05", "0.031 0.05")
-    (tmp_path / "higher.xml").write_text(higher)
-    others = mjcf.load(str(tmp_path / "higher.xml")), mjcf.load("rough", timestep=5e-4)
-    assert len({own, *map(mjcf.digest, others)}) == 3
+    text, world = (tmp_path / "rough.xml").read_text(), tmp_path / "another.xml"
+    found = [mjcf.digest(mjcf.load("rough")), mjcf.digest(mjcf.load("rough", timestep=5e-4))]
+    for old, new in (
+        ("0.03 0.05", "0.031 0.05"), ('"rough"', '"bumpy"'), ("<asset>", '<statistic meaninertia="2"/><asset>'),
+    ):  # fmt: skip
+        world.write_text(text.replace(old, new))
+        found.append(mjcf.digest(mjcf.load(str(world))))
+    assert len(set(found)) == 5
+    assert mjcf.digest(mjcf.load(str(tmp_path / "rough.xml"))) == found[0]
 
 
 def test_timestep():
