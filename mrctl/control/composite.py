@@ -288,7 +288,7 @@ def _learned(weights, phi):  # noqa: ANN001, ANN202
 
 
 @njit
-def _switch(period, priors, misfit, s):  # noqa: ANN001, ANN202
+def _switch(period, phi, residual, priors, s):  # noqa: ANN001, ANN202
     """Sees whether the plant of one robot has changed, or a former one is back."""
     n, settled, before = FEATURES, SETTLED * period * (1 / s.share - 1), s.since
     s.since += period
@@ -304,8 +304,12 @@ def _switch(period, priors, misfit, s):  # noqa: ANN001, ANN202
         for k in range(CHANNELS):
             _give_up(priors[k], s.settings[k, 2], s.weights[k], s.covariance[k])
         s.misfit[:] = 0.0
-    elif s.back == 0 and settled < s.since < settled + LEARNED:
-        s.misfit += period / (period + LOOK) * (misfit - s.misfit)
+    elif s.back == 0 and s.known.any() and settled < s.since < settled + LEARNED:
+        for j in range(KEPT):
+            misfit = 0.0
+            for k in range(CHANNELS):
+                misfit += ((residual[k] - _learned(s.kept[j, k], phi)) / s.noise[k, 0]) ** 2
+            s.misfit[j] += period / (period + LOOK) * (misfit - s.misfit[j])
         j = int(s.known[1] > 0 and (s.known[0] == 0 or s.misfit[1] < s.misfit[0]))
         if s.known[j] > 0 and s.misfit[j] < BACK and s.since > settled + LOOK:
             s.place, s.back = j, 1.0
@@ -339,7 +343,7 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     def teach(  # noqa: ANN202
         feedback, twist, voltage, idle, half_track, period, scale, model, units, priors, state  # noqa: ANN001
     ):  # fmt: skip
-        x, phi, rate, misfit = np.empty(PHYSICAL), np.empty(FEATURES), np.empty(CHANNELS), np.empty(KEPT)
+        x, phi, rate, residual = np.empty(PHYSICAL), np.empty(FEATURES), np.empty(CHANNELS), np.empty(CHANNELS)
         for i in range(len(state)):
             s = state[i]
             s.heading += period * twist[i, 1]
@@ -365,20 +369,17 @@ def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
                 _features(s.twice[2:4], rate, half_track, scale, x)
                 x[8], x[9] = s.twice[4], s.twice[5]
                 _basis(x, units, phi)
-                misfit[:] = 0.0
                 for k in range(CHANNELS):
-                    residual = s.twice[k]
+                    residual[k] = s.twice[k]
                     for j in range(INPUTS):
-                        residual -= model[k, j] * x[j]
-                    for j in range(KEPT):
-                        misfit[j] += ((residual - _learned(s.kept[j, k], phi)) / s.noise[k, 0]) ** 2
+                        residual[k] -= model[k, j] * x[j]
                     noise = s.noise[k, 0] ** 2 + s.noise[k, 1] ** 2 * s.variance[k]
                     s.added[k] = _learned(s.weights[k], s.phi)
                     _adapt(
-                        phi, residual, s.phi, feedback[i, k], noise, s.settings[k], priors[k], s.usual[k], s.weights[k],
-                        s.covariance[k],
+                        phi, residual[k], s.phi, feedback[i, k], noise, s.settings[k], priors[k], s.usual[k],
+                        s.weights[k], s.covariance[k],
                     )  # fmt: skip
-                _switch(period, priors, misfit, s)
+                _switch(period, phi, residual, priors, s)
                 for k in range(CHANNELS):
                     s.added[k] = _learned(s.weights[k], s.phi) - s.added[k]
             else:  # only the disturbance fades

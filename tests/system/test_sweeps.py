@@ -456,6 +456,8 @@ def instantly(path, job):
 
 
 def resident():
+    """Memory of this process in MB, without what Arrow's pool holds in reserve."""
+    pa.default_memory_pool().release_unused()
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
@@ -465,7 +467,7 @@ def test_memory_of_the_sweep_is_flat(tmp_path):
     for runs in (10_000, 10_000, 1_000_000):
         jobs.run(Sweep.from_dict({"runs": runs, "chunk": 10_000}), tmp_path / str(len(used)), 1, work=instantly)
         used.append(resident())
-    assert used[2] - used[1] < 50, used
+    assert used[2] - used[1] < 30, used
     assert pq.read_metadata(tmp_path / "2" / "runs.parquet").num_rows == 1_000_000
 
 
