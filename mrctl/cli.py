@@ -15,8 +15,9 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from mrctl.record import InputError
-from mrctl.robot import CAR, PERTURBATIONS, Perturbation, RobotFile
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
+from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
+from mrctl.theory.robot import CAR, RobotFile
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -141,9 +142,9 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
 
 def _repeat(store: Path | None, number: int, out: Path | None, json: bool) -> None:
     """`mrctl run STORE --run K`."""
-    from mrctl import jobs
     from mrctl.experiments import single
-    from mrctl.store import Store
+    from mrctl.sweep import jobs
+    from mrctl.sweep.store import Store
 
     if store is None:
         raise InputError("run: needs the store of a sweep in front of it")
@@ -171,8 +172,8 @@ def sweep(
         workers: Processes on this machine; by default one a core.
         scheduler: Address of a Dask scheduler to use instead, such as tcp://127.0.0.1:8786.
     """
-    from mrctl import jobs
-    from mrctl.sweep import Sweep
+    from mrctl.sweep import jobs
+    from mrctl.sweep.plan import Sweep
 
     report = jobs.run(Sweep.from_toml(file), out, workers, scheduler, progress=True)
     print(f"{report.runs} runs, {report.failed} failed; table: {out / 'runs.parquet'}")
@@ -298,7 +299,7 @@ def check(
         chassis: Body that carries them; by default the root.
         json: Print JSON.
     """
-    from mrctl.experiments import check as checking
+    from mrctl.checks import command as checking
 
     text, verdict = checking.run(robot, wheels, steering, chassis, json)
     print(text)
@@ -337,9 +338,9 @@ def view(
         host: Address to listen on; other than 127.0.0.1 lets others in, without asking them who they are.
         port: Port to listen on.
     """
-    from mrctl import viewer
+    from mrctl.viewer.view import view as show
 
-    viewer.view(file, compare, number, export, host, port)
+    show(file, compare, number, export, host, port)
 
 
 def export(
@@ -357,9 +358,10 @@ def export(
         out: File to write.
         number: One run; by default all, numbered in a column or before each topic.
     """
-    from mrctl import export as exporting
+    from mrctl.results import export as exporting
+    from mrctl.sweep import store
 
-    count = exporting.export(file, to, out, number)
+    count = exporting.export(store.open(file), to, out, number)
     print(f"{out}: {count} {'run' if count == 1 else 'runs'}")
 
 

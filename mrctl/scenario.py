@@ -14,13 +14,13 @@ from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
 from mrctl.record import Record
-from mrctl.references import Lemniscate, Reference
-from mrctl.robot import CAR, Perturbation, RobotFile
+from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.references import Lemniscate, Reference
+from mrctl.theory.robot import CAR, RobotFile, Steering
 
 FeedforwardName = Literal["none", "model", "oracle", "observer", "fel", "rls", "composite"]
 FEEDFORWARDS: tuple[FeedforwardName, ...] = ("none", "model", "oracle", "observer", "fel", "rls", "composite")
 LONGEST = 10_000_000  # control periods in a run; its record takes 290 bytes each
-STEERINGS: tuple[Literal["compliant", "caster", "rigid"], ...] = ("compliant", "caster", "rigid")
 
 
 Spread = Annotated[float, Field(ge=0, le=0.2)]
@@ -56,7 +56,7 @@ class Scenario(Record):
     """`flat`, `slope`, `rough`, `patch`, or the path of an MJCF file."""
     robot: RobotFile = CAR
     """Whose robot drives there; by default the world's own."""
-    steering: Literal["compliant", "caster", "rigid"] = "compliant"
+    steering: Steering = "compliant"
     """Steering arrangement of the front wheel."""
     reference: Reference = Lemniscate()
     """What the robot shall follow."""

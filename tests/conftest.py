@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import settings
 
-from mrctl.robot import Robot
+from mrctl.theory.robot import Robot
 
 # The same examples for everyone, no deadline (shared machines stall); `--hypothesis-profile=explore` looks further.
 settings.register_profile("mrctl", deadline=None, derandomize=True)

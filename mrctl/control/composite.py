@@ -42,9 +42,9 @@ from pydantic import Field
 
 from mrctl.control.chain import ANY, EACH, GIVEN, OWN, one, rows, stamp
 from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features
-from mrctl.dynamics import inverse_coefficients
 from mrctl.record import InputError, Record
-from mrctl.robot import Robot
+from mrctl.theory.dynamics import inverse_coefficients
+from mrctl.theory.robot import Robot
 
 INPUTS, UNITS, CHANNELS = 8, 16, 2
 PHYSICAL = INPUTS + 2  # and gravity on a slope

@@ -9,8 +9,8 @@ import numpy as np
 from numba import float64, guvectorize
 from numpy.typing import NDArray
 
-from mrctl.dynamics import inverse_coefficients
-from mrctl.robot import Robot
+from mrctl.theory.dynamics import inverse_coefficients
+from mrctl.theory.robot import Robot
 
 Array = NDArray[np.float64]
 FEATURES = ("V", "ω", "V̇", "ω̇", "Vω", "ω²", "sgn V_l", "sgn V_r")

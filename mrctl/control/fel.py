@@ -19,7 +19,7 @@ from pydantic import Field
 from mrctl.control.chain import ANY, EACH, GIVEN, OWN, one, rows, stamp
 from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features
 from mrctl.record import InputError, Record
-from mrctl.robot import Robot
+from mrctl.theory.robot import Robot
 
 INPUTS, OUTPUTS = 8, 2
 # Gains of hidden units and bias beside the direct links. A normalised step is shared out by squared regressor, so these

@@ -12,7 +12,7 @@ from torch.func import functional_call, stack_module_state, vjp, vmap
 
 from mrctl.control.feedforward import Array, feature_scale, features
 from mrctl.control.fel import BIAS_GAIN, HIDDEN_GAIN, INPUTS, OUTPUTS, REGULARISATION, Fel
-from mrctl.robot import Robot
+from mrctl.theory.robot import Robot
 
 
 class Network(nn.Module):

@@ -26,9 +26,9 @@ from pydantic import Field
 
 from mrctl.control.chain import one
 from mrctl.control.feedforward import Array, InverseDynamics, features
-from mrctl.dynamics import inverse_coefficients
 from mrctl.record import Record
-from mrctl.robot import Robot
+from mrctl.theory.dynamics import inverse_coefficients
+from mrctl.theory.robot import Robot
 
 
 class Observer(Record):

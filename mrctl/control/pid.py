@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.record import Record
-from mrctl.robot import Robot
+from mrctl.theory.robot import Robot
 
 
 class Pid(Record):

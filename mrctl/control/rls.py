@@ -11,7 +11,7 @@ from pydantic import Field
 
 from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features, linear
 from mrctl.record import Record
-from mrctl.robot import Robot
+from mrctl.theory.robot import Robot
 
 
 class Rls(Record):

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from mrctl.control.feedforward import Feedforward
 from mrctl.record import InputError
-from mrctl.robot import Robot
+from mrctl.theory.robot import Robot
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 from numba import float64, guvectorize
 from numpy.typing import NDArray
 
-from mrctl.robot import Robot
+from mrctl.theory.robot import Robot
 
 REST = 0.02  # m/s; below it the fork holds its angle
 SIGN_SPEED = 0.05  # m/s over which the smooth sign of the losses turns

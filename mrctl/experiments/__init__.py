@@ -1,1 +1,4 @@
-"""The published results that mrctl reproduces, and the comparisons that go beyond them."""
+"""What the commands of mrctl measure: the paper, the suite, tuning, identification, training, the benchmark.
+
+Imports the loop, the results and the sweep.
+"""

@@ -20,23 +20,26 @@ import numpy as np
 import torch
 from numba import njit
 
-from mrctl import plant
-from mrctl.control import fel, hierarchy
+from mrctl.control import fel
 from mrctl.control.chain import one
 from mrctl.control.feedforward import feature_scale
 from mrctl.control.kanayama import kanayama
 from mrctl.control.limiter import limit
 from mrctl.control.pid import pid
 from mrctl.experiments.tables import markdown, number
-from mrctl.kinematics import steering_angle
-from mrctl.model import load, read_robot
-from mrctl.plant import BatchPlant, CarPhysics
-from mrctl.result import SIGNALS, versions
+from mrctl.loop import hierarchy
+from mrctl.loop.simulation import Simulation
+from mrctl.physics import plant
+from mrctl.physics.mjcf import load
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.plant import BatchPlant, CarPhysics
+from mrctl.physics.stand import stand
+from mrctl.results.dataset import SIGNALS, versions
 from mrctl.scenario import Scenario
-from mrctl.simulate import Simulation
+from mrctl.theory.kinematics import steering_angle
 
 kanayama_law, limit_law, pid_law = one(kanayama), one(limit), one(pid)
-loop = import_module("mrctl.simulate")  # `mrctl.simulate` itself is the function of that name
+loop = import_module("mrctl.loop.simulation")  # `mrctl.simulate` itself is the function of that name
 
 SIZES = (1, 16, 64, 256, 1024)
 REPETITIONS = 41  # many short turns: neighbours share what else the machine does
@@ -318,7 +321,7 @@ def autograd_loop(ticks: int, stretches: int) -> Iterator[tuple[float, float]]:
     torch.nn.init.zeros_(last.bias)
     network = torch.nn.Sequential(torch.nn.Linear(8, 24), torch.nn.Tanh(), last)
     optimizer = torch.optim.SGD(network.parameters(), lr=1e-3)
-    start = plant.mjcf.stand(physics.model.ptr, reference[0, :3], reference[0, 3:5])
+    start = stand(physics.model.ptr, reference[0, :3], reference[0, 3:5])
     with physics.reset_context():
         physics.data.qpos[:], physics.data.qvel[:] = start
     correction, integral, fork = np.zeros(2), np.zeros(2), physics.steering_angle()

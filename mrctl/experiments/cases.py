@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from mrctl import model as mjcf
 from mrctl.control.pid import PIDS
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
-from mrctl.references import Lemniscate, Waypoints
-from mrctl.robot import GRAVITY, PERTURBATIONS, Perturbation, Robot
-from mrctl.scenario import STEERINGS, Event, Scenario
+from mrctl.scenario import Event, Scenario
+from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
+from mrctl.theory.references import Lemniscate, Waypoints
+from mrctl.theory.robot import GRAVITY, STEERINGS, Robot
 
 LADDER = ("nominal", "mass +50 %", "supply -20 %", "all")  # of every steering arrangement
 STEPS = (
@@ -120,7 +122,7 @@ def cases(seeds: int, random: int, quick: bool) -> list[Case]:
 
 def random_scenarios(count: int) -> list[Scenario]:
     """The first of an endless list of random scenarios, each a pure function of its place."""
-    robot = mjcf.read_robot(mjcf.load())
+    robot = read_robot(mjcf.load())
     return sorted((random_scenario(seed, robot) for seed in range(count)), key=lambda s: s.ticks)
 
 

@@ -30,12 +30,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from mrctl import model as mjcf
-from mrctl.checks import on_skid
+from mrctl.checks.catalogue import on_skid
 from mrctl.experiments.tables import json_text, markdown
-from mrctl.plant import OMEGA, V, build
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.plant import OMEGA, V, build
 from mrctl.record import InputError
-from mrctl.robot import CAR, PERTURBATIONS, Perturbation, Robot, RobotFile
+from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
+from mrctl.theory.robot import CAR, Robot, RobotFile
 
 Array = NDArray[np.float64]
 
@@ -126,7 +128,7 @@ def identify(
     """
     own = mjcf.arrangement(robot)
     model = mjcf.load(world, "rigid" if own == "compliant" else own, robot=robot)
-    nominal = mjcf.read_robot(model)
+    nominal = read_robot(model)
     tau = min(nominal.velocity_time_constant, nominal.rotation_time_constant)
     model.opt.timestep = TICK / max(5, int(np.ceil(FINE * TICK / tau)))
     random = np.random.default_rng([seed, 3])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mrctl.control.kanayama import kanayama
 from mrctl.control.limiter import limit
-from mrctl.kinematics import pose_rates
+from mrctl.theory.kinematics import pose_rates
 
 STEP = 1e-4  # s
 SPEED = 0.30  # m/s

@@ -10,14 +10,14 @@ from typing import Any
 
 import xarray as xr
 
-from mrctl import metrics, plots
 from mrctl.experiments import kanayama
 from mrctl.experiments.tables import markdown, number, output_folder, write_json
-from mrctl.references import Lemniscate
-from mrctl.result import versions
-from mrctl.robot import PERTURBATIONS
+from mrctl.loop.simulation import simulate
+from mrctl.results import metrics, plots
+from mrctl.results.dataset import versions
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
-from mrctl.simulate import simulate
+from mrctl.theory.perturbation import PERTURBATIONS
+from mrctl.theory.references import Lemniscate
 
 # What the figures show: PID alone, and PID with the network, on a robot that nobody modelled.
 CASE = "all"

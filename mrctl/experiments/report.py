@@ -12,18 +12,19 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from mrctl import controller, metrics, plots
-from mrctl.comparison import superiority
 from mrctl.control.feedforward import InverseDynamics
 from mrctl.control.pid import PIDS
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
 from mrctl.experiments.cases import BAND, Outcome
 from mrctl.experiments.tables import number
-from mrctl.plots import InverseMap
-from mrctl.result import SIGNALS, versions
+from mrctl.loop import controller
+from mrctl.loop.simulation import Simulation
+from mrctl.results import metrics, plots
+from mrctl.results.comparison import superiority
+from mrctl.results.dataset import SIGNALS, versions
+from mrctl.results.plots import InverseMap
 from mrctl.scenario import Scenario
-from mrctl.simulate import Simulation
 
 KNOWING = ("none", "model", "oracle")  # feedforwards that do not learn
 GRID = 41  # points a side of a heat map

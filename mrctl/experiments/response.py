@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from mrctl.control.fel import STEERING_SCALE
-from mrctl.control.hierarchy import TAKE_OVER
+from mrctl.loop.hierarchy import TAKE_OVER
+from mrctl.loop.simulation import Simulation
 from mrctl.record import InputError
-from mrctl.references import Line
 from mrctl.scenario import Scenario
-from mrctl.simulate import Simulation
+from mrctl.theory.references import Line
 
 Array = NDArray[np.float64]
 Response = NDArray[np.complex128]

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from mrctl import controller, metrics, plots
 from mrctl.control.fel import save_weights
 from mrctl.control.stages import Stages
 from mrctl.experiments.tables import markdown, number, output_folder
+from mrctl.loop import controller
+from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
-from mrctl.result import save, versions
+from mrctl.results import metrics, plots
+from mrctl.results.dataset import save, versions
 from mrctl.scenario import Scenario
-from mrctl.simulate import simulate
 
 COLUMNS = {
     "longitudinal_rmse": ("x error, mm", 1e3),
@@ -35,7 +36,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         scenario: What to run.
         out: Folder for `result.zarr`, figures and learned weights, or None.
         as_json: JSON instead of a table.
-        own: Stages of your own; see `mrctl.controller`.
+        own: Stages of your own; see `mrctl.loop.controller`.
 
     Returns:
         The metrics, a row a lap.

@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from mrctl import controller, jobs, metrics
-from mrctl.comparison import bootstrap_interval, cvar, paired_ratio, superiority
 from mrctl.experiments import report
 from mrctl.experiments.cases import BAND, PARTS, Case, Laps, Outcome, cases
 from mrctl.experiments.tables import markdown, number, output_folder, write_json
+from mrctl.loop import controller
 from mrctl.record import InputError
-from mrctl.result import versions
+from mrctl.results import metrics
+from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority
+from mrctl.results.dataset import versions
 from mrctl.scenario import FeedforwardName, Scenario
-from mrctl.store import open_store
-from mrctl.sweep import Sweep
+from mrctl.sweep import jobs, store
+from mrctl.sweep.plan import Sweep
 
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
 TITLES = {"none": "PID"}  # of feedforwards in the tables
@@ -40,7 +41,7 @@ def suite(
 
     Args:
         feedforwards: Which to compare.
-        controllers: Controllers of your own, as `my_file.py:MyController`; see `mrctl.controller`.
+        controllers: Controllers of your own, as `my_file.py:MyController`; see `mrctl.loop.controller`.
         seeds: Runs of each case, seeds 0 to `seeds` − 1 for everyone.
         random: How many random scenarios.
         quick: A selection with fewer laps.
@@ -86,7 +87,7 @@ def run(chosen: Sequence[Case], who: Mapping[str, dict[str, Any]], workers: int 
         sweep = Sweep.of(scenarios, record="laps", chunk=chunk, controller=choice.get("controller"))
         print(f"{name} ({place} of {len(who)})", file=sys.stderr)
         ended = jobs.run(sweep, out / name, workers, progress=True)
-        laps[name] = open_store(out / name)
+        laps[name] = store.open(out / name)
         if ended.aside:
             lost, why = sum(map(len, ended.aside)), next(iter(ended.aside.values()))
             aside.append(f"{lost} runs of {name} could not be done ({why})")

@@ -21,17 +21,19 @@ import torch
 from scipy.signal import lfilter
 from torch import Tensor
 
-from mrctl import model as mjcf
 from mrctl.control.composite import INPUTS, PHYSICAL, UNITS, Array, Composite, Training, save_training
 from mrctl.control.feedforward import feature_scale, features
-from mrctl.dynamics import inverse_coefficients
 from mrctl.experiments.tables import markdown, number, output_folder
+from mrctl.loop.simulation import simulate
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
-from mrctl.references import Circle, Lemniscate, Reference, RoundedSquare, Waypoints, check
-from mrctl.result import versions
-from mrctl.robot import Perturbation, Robot
-from mrctl.scenario import STEERINGS, Scenario
-from mrctl.simulate import simulate
+from mrctl.results.dataset import versions
+from mrctl.scenario import Scenario
+from mrctl.theory.dynamics import inverse_coefficients
+from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.references import Circle, Lemniscate, Reference, RoundedSquare, Waypoints, check
+from mrctl.theory.robot import STEERINGS, Robot
 
 DRIVE = 24.0  # s along each reference, in one to three laps
 EVERY = 20  # control periods between samples of the regression
@@ -88,7 +90,7 @@ def train(out: Path, plants: int, seed: int) -> str:
         raise InputError(f"out: {out} is a folder, not a file")
     output_folder(out.parent)
     start = time.perf_counter()
-    robot = mjcf.read_robot(mjcf.load("flat"))
+    robot = read_robot(mjcf.load("flat"))
     seen, unseen = (drive(draw(robot, n, [seed, k]), robot) for k, n in enumerate((plants, plants // 3)))
     units = fit(seen, seed)
     training = Training(units, priors(seen, units))

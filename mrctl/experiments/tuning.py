@@ -10,14 +10,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from mrctl import model as mjcf
-from mrctl import plots
-from mrctl.control.hierarchy import TAKE_OVER
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.pid import Gains, Pid, learning_ratio, margins, sampled_loop
 from mrctl.experiments.response import Array, Response, measure, refine, safety
 from mrctl.experiments.tables import json_text, markdown, number, output_folder
+from mrctl.loop.hierarchy import TAKE_OVER
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
+from mrctl.results import plots
 from mrctl.scenario import Scenario
 
 CHANNELS = (("common", "V/(m/s)", "V/m"), ("differential", "V/(rad/s)", "V/rad"))
@@ -90,7 +91,7 @@ def design(world: str, pid: Pid, delays: Sequence[float]) -> dict[str, Any]:
         for motion in (Kanayama(k_x=0, k_y=0, k_theta=0), Kanayama())
         for delay in delays
     ]
-    robot = mjcf.read_robot(mjcf.load(world))
+    robot = read_robot(mjcf.load(world))
     period = scenarios[0].control_period
     plants = (
         (robot.velocity_gain, robot.velocity_time_constant),

@@ -7,8 +7,8 @@ import html
 import numpy as np
 import xarray as xr
 
-from mrctl.metrics import as_runs
 from mrctl.record import InputError
+from mrctl.results.metrics import as_runs
 
 HEIGHT = 480  # pixels
 LONGEST = 60.0  # s; the page of a minute of two robots takes a few megabytes

@@ -16,8 +16,8 @@ import viser
 from typing_extensions import override
 
 from mrctl.record import InputError
-from mrctl.robot import Perturbation
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
+from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.controls import Controls
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots

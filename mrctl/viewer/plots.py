@@ -11,7 +11,7 @@ import viser
 from numpy.typing import NDArray
 from viser import uplot
 
-from mrctl.result import SIGNALS
+from mrctl.results.dataset import SIGNALS
 from mrctl.viewer.scene import REFERENCE, Colour, colour_of
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ def charts(log: Array, labels: Sequence[str], period: float) -> list[Chart]:
     """The charts of a record.
 
     Args:
-        log: `(T, B, signals)`, columns as in `mrctl.result.SIGNALS`.
+        log: `(T, B, signals)`, columns as in `mrctl.results.dataset.SIGNALS`.
         labels: A name a robot.
         period: Time between samples in s.
     """

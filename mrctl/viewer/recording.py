@@ -15,14 +15,17 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from mrctl import model as mjcf
-from mrctl.metrics import summary
+from mrctl.loop.simulation import simulate
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.stand import front_rates, stand, steer
 from mrctl.record import InputError
-from mrctl.result import SIGNALS, scenarios_of
-from mrctl.robot import Perturbation
+from mrctl.results.dataset import SIGNALS, scenarios_of
+from mrctl.results.metrics import summary
 from mrctl.scenario import Scenario
-from mrctl.simulate import simulate
-from mrctl.store import Store, open_store
+from mrctl.sweep import store
+from mrctl.sweep.store import Store
+from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.session import state
 
 Array = NDArray[np.float64]
@@ -74,9 +77,9 @@ class Recording:
     def _turned(self) -> dict[str, Array]:
         """How far each wheel has turned at the samples, rad."""
         signal = {name: self.log[:, column] for name, column in COLUMN.items()}
-        robot, steering = mjcf.read_robot(self.model), signal["steering_angle"]
+        robot, steering = read_robot(self.model), signal["steering_angle"]
         rates = {wheel: signal[name] for wheel, name in WHEELS.items()}
-        rates |= mjcf.front_rates(self.model, robot, signal["v"], signal["omega"], steering)
+        rates |= front_rates(self.model, robot, signal["v"], signal["omega"], steering)
         return {wheel: self.period * np.cumsum(rate) for wheel, rate in rates.items()}
 
     def perturbation(self, time: float) -> Perturbation:
@@ -93,8 +96,8 @@ class Recording:
         """Where the robot stood at a sample, `(nq,)`: on the ground, as recorded in the plane."""
         row = self.log[index]
         pose, twist = row[[COLUMN[n] for n in ("x", "y", "theta")]], row[[COLUMN[n] for n in ("v", "omega")]]
-        qpos = mjcf.stand(self.model, pose, twist).qpos
-        mjcf.steer(self.model, qpos, row[COLUMN["steering_angle"]])
+        qpos = stand(self.model, pose, twist).qpos
+        steer(self.model, qpos, row[COLUMN["steering_angle"]])
         for wheel, angle in self._turned.items():
             qpos[self.model.joint(wheel).qposadr[0]] = angle[index]
         return qpos
@@ -142,7 +145,7 @@ class Library:
             Store(path)  # refuses what is none
             self.table = pd.read_parquet(path / "runs.parquet").set_index("run", drop=False)
         else:
-            result = open_store(path)
+            result = store.open(path)
             self._result = result if "run" in result.dims else result.expand_dims("run")
             self.table = summary(self._result).set_index(np.arange(self._result.sizes["run"]))
         if self.table.empty:
@@ -158,6 +161,6 @@ class Library:
             raise InputError(f"run: {self._path} has no run {run}")
         if self._result is not None:
             return Recording(self._result.isel(run=run))
-        from mrctl import jobs
+        from mrctl.sweep import jobs
 
         return Recording(simulate([jobs.scenario_of(self._path, run)]).isel(run=0))

@@ -14,10 +14,12 @@ import viser
 from mjviser.conversions import merge_geoms
 from numpy.typing import NDArray
 
-from mrctl import model as mjcf
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.stand import ground
 from mrctl.record import InputError
-from mrctl.robot import Perturbation
 from mrctl.scenario import Scenario
+from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.recording import Recording
 
 Array = NDArray[np.float64]
@@ -60,7 +62,7 @@ class Scene:
         self._model, self._data = mjcf.clone(model), mujoco.MjData(model)
         round_ends = self._model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
         self._model.geom_type[round_ends] = mujoco.mjtGeom.mjGEOM_CYLINDER  # which take thousands of triangles each
-        self._radius = mjcf.read_robot(model).wheel_radius
+        self._radius = read_robot(model).wheel_radius
         self._root = self._scene.add_frame("/world", show_axes=False)
         chassis = model.body("chassis").id
         self._bodies = [b for b in range(model.nbody) if model.body_rootid[b] == chassis]
@@ -154,7 +156,7 @@ class Scene:
 
     def _height(self, x: float, y: float) -> float:
         try:
-            return float(mjcf.ground(self._model, self._data, x, y)[2])
+            return float(ground(self._model, self._data, x, y)[2])
         except InputError:
             return 0.0
 

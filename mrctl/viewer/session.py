@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.loop.simulation import batches
 from mrctl.record import InputError, Record
 from mrctl.scenario import Event, Scenario
-from mrctl.simulate import batches
 
 HOUR = 3600.0  # s of simulated time that a session has room for
 ALIKE = ("world", "robot", "steering", "control_period", "physics_step")

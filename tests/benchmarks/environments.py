@@ -13,8 +13,8 @@ from collections.abc import Callable
 import numpy as np
 
 from mrctl import Line, Scenario
-from mrctl.gym import TrackingVectorEnv
-from mrctl.simulate import Simulation
+from mrctl.envs.gym import TrackingVectorEnv
+from mrctl.loop.simulation import Simulation
 
 TURNS, TICKS = 41, 1500  # turns, and control periods of one over all robots
 

@@ -6,9 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from mrctl.checks import CHECKS, Check, CheckFailed, Comparison, between, compare
-from mrctl.model import clone, load, perturb, read_robot
-from mrctl.robot import Perturbation
+from mrctl.checks.catalogue import CHECKS, Check, CheckFailed, Comparison, between, compare
+from mrctl.physics.mjcf import clone, load
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.perturb import perturb
+from mrctl.theory.perturbation import Perturbation
 
 ON_LEVEL = [c for c in CHECKS if c.world == "flat"]
 

@@ -4,8 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mrctl.checks import CHECKS, CheckFailed
-from mrctl.model import load, read_robot
+from mrctl.checks.catalogue import CHECKS, CheckFailed
+from mrctl.physics.mjcf import load
+from mrctl.physics.parameters import read_robot
 
 MOTORS = ("motor_left", "motor_right")
 REAR = ("wheel_left", "wheel_right")

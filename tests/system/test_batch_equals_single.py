@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mrctl import Circle, Event, Fel, Kanayama, LaneChange, Lemniscate, Line, Perturbation, Pid, Scenario, StopAndGo
-from mrctl.plant import BatchPlant, PhysicsPlant
-from mrctl.simulate import Simulation, simulate
+from mrctl.loop.simulation import Simulation, simulate
+from mrctl.physics.plant import BatchPlant, PhysicsPlant
 
 pytestmark = pytest.mark.xdist_group("batch_equals_single")  # what its tests share is made once
 
@@ -144,7 +144,7 @@ def test_equal(scenarios, alone, chunk):
 @pytest.mark.parametrize("threads", [1, 2])
 def test_threads(scenarios, alone, threads, monkeypatch):
     """The number of threads changes nothing; a batch of one is no special case either."""
-    loop = import_module("mrctl.simulate")
+    loop = import_module("mrctl.loop.simulation")
     monkeypatch.setattr(loop, "build", lambda model, size, substeps, _: BatchPlant(model, size, substeps, threads))
     rows = range(0, COUNT, 3)
     whole = simulate([scenarios[row] for row in rows])

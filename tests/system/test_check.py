@@ -7,11 +7,12 @@ import sys
 
 import pytest
 
-from mrctl.checks import CHECKS
+from mrctl.checks.catalogue import CHECKS
+from mrctl.checks.command import examination
+from mrctl.checks.diagnosis import BASICS, Examination, suspects
 from mrctl.cli import main
-from mrctl.diagnosis import BASICS, Examination, suspects
-from mrctl.experiments.check import examination
-from mrctl.model import load, models_folder
+from mrctl.physics.files import models_folder
+from mrctl.physics.mjcf import load
 
 
 def wheel(side, attributes):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mrctl import PERTURBATIONS, Event, Lemniscate, Observer, Perturbation, Scenario, per_lap, simulate
+from mrctl import PERTURBATIONS, Event, Lemniscate, Observer, Perturbation, Scenario, per_lap
+from mrctl.loop.simulation import simulate
 
 pytestmark = pytest.mark.xdist_group("composite_loop")  # what its tests share is made once
 

@@ -13,11 +13,12 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from mrctl import PERTURBATIONS, Circle, Event, InputError, Line, Perturbation, Scenario, simulate
-from mrctl.environment import SUITE, Environment, Tracking, register
-from mrctl.episodes import ACTIONS, OBSERVATIONS, Episodes
-from mrctl.gym import TrackingEnv, TrackingVectorEnv
-from mrctl.result import SIGNALS
+from mrctl import PERTURBATIONS, Circle, Event, InputError, Line, Perturbation, Scenario
+from mrctl.envs.dm_env import SUITE, Environment, Tracking, register
+from mrctl.envs.episodes import ACTIONS, OBSERVATIONS, Episodes
+from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
+from mrctl.loop.simulation import simulate
+from mrctl.results.dataset import SIGNALS
 
 IDS = [f"mrctl/{action.capitalize()}Tracking-v0" for action in ACTIONS]
 SHORT = Scenario(reference=Circle(period=2.2, radius=0.3), laps=1)
@@ -291,6 +292,6 @@ def test_scenario_file(tmp_path):
 
 def test_without_gymnasium():
     """Who has not installed it is told how."""
-    code = "import sys; sys.modules['gymnasium'] = None\nimport mrctl.gym"
+    code = "import sys; sys.modules['gymnasium'] = None\nimport mrctl.envs.gym"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert found.stderr.strip().endswith("mrctl.gym needs Gymnasium: pip install 'mrctl[env]'")
+    assert found.stderr.strip().endswith("mrctl.envs.gym needs Gymnasium: pip install 'mrctl[env]'")

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from mrctl import Circle, Event, Fel, InputError, Kanayama, Line, Perturbation, Pid, Scenario, simulate
-from mrctl import model as mjcf
-from mrctl.dynamics import inverse_coefficients
-from mrctl.result import SIGNALS
-from mrctl.simulate import Simulation
+from mrctl import Circle, Event, Fel, InputError, Kanayama, Line, Perturbation, Pid, Scenario
+from mrctl.loop.simulation import Simulation, simulate
+from mrctl.physics import mjcf
+from mrctl.physics.perturb import fields
+from mrctl.results.dataset import SIGNALS
+from mrctl.theory.dynamics import inverse_coefficients
 
 PERIOD = 0.01
 BASE = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="model")
@@ -75,7 +76,7 @@ def test_payload_is_taken_off_again(size):
     """Dropped and removed: every parameter of the plant is the nominal one again, to the bit, and so is the oracle."""
     events = (Event(time=0.1, perturbation=PAYLOAD), Event(time=0.2, perturbation=Perturbation()))
     simulation = Simulation([with_events(*events, feedforward="oracle")] * size)
-    nominal = mjcf.fields(mjcf.load())
+    nominal = fields(mjcf.load())
     masses = []
     for _ in range(40):
         simulation.step()
@@ -83,7 +84,7 @@ def test_payload_is_taken_off_again(size):
         masses.append(model.body_subtreemass[model.body("chassis").id])
     assert masses == pytest.approx([20] * 10 + [25] * 10 + [20] * 20)
     for name, value in nominal.items():
-        assert np.array_equal(mjcf.fields(model)[name], value), name
+        assert np.array_equal(fields(model)[name], value), name
     assert np.array_equal(model.dof_invweight0, mjcf.load().dof_invweight0)
     assert simulation.plant.truth[-1] == simulation.plant.robot
 

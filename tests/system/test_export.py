@@ -16,10 +16,12 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import mrctl
-from mrctl import Circle, Event, InputError, Scenario, Sweep, jobs, save, simulate
+from mrctl import Circle, Event, InputError, Scenario, Sweep, save
 from mrctl.cli import main
-from mrctl.export import export
-from mrctl.result import SIGNALS
+from mrctl.loop.simulation import simulate
+from mrctl.results.dataset import SIGNALS
+from mrctl.results.export import export
+from mrctl.sweep import jobs
 
 pytestmark = pytest.mark.xdist_group("export")  # what its tests share is made once
 
@@ -54,7 +56,7 @@ def messages(file: Path):
 def test_mcap(result, path, tmp_path):
     """Odometry, twists, joints and IMU: values to the bit, stamps to the nanosecond."""
     out = tmp_path / "run.mcap"
-    assert export(path, "mcap", out, 0) == 1
+    assert export(mrctl.open(path), "mcap", out, 0) == 1
     found = messages(out)
     assert {topic: kind for topic, (kind, _, _) in found.items()} == {
         "/odom": "nav_msgs/msg/Odometry", "/reference": "nav_msgs/msg/Odometry",
@@ -92,7 +94,7 @@ def test_mcap(result, path, tmp_path):
 def test_derived(result, path, tmp_path):
     """What is not recorded but follows: a wheel has rolled as far as P has come, a circle presses with v ω."""
     out = tmp_path / "run.mcap"
-    export(path, "mcap", out, 0)
+    export(mrctl.open(path), "mcap", out, 0)
     found, run = messages(out), result.isel(run=0)
     rolled = np.mean([m.position[:2] for m in found["/joint_states"][2]], axis=1) * 0.098
     np.testing.assert_allclose(rolled[-1], np.trapezoid(run.v, run.time), rtol=0.01)
@@ -105,7 +107,7 @@ def test_derived(result, path, tmp_path):
 def test_definitions(path, tmp_path):
     """The definitions in the file are those of ROS: read by them alone, the messages are the same."""
     out = tmp_path / "run.mcap"
-    export(path, "mcap", out, 0)
+    export(mrctl.open(path), "mcap", out, 0)
     theirs = messages(out)
     with open(out, "rb") as file:
         decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
@@ -128,7 +130,7 @@ def test_definitions(path, tmp_path):
 def test_several(result, path, tmp_path):
     """All runs of a result: a name before each topic, and a run that failed ends where it failed."""
     out = tmp_path / "runs.mcap"
-    assert export(path, "mcap", out) == 2
+    assert export(mrctl.open(path), "mcap", out) == 2
     found = messages(out)
     assert {topic.split("/")[1] for topic in found} == {"run0", "run1"} and len(found) == 12
     driven = int(np.isfinite(result.x[1]).sum())
@@ -144,14 +146,14 @@ def long(result):
 def test_csv(result, path, tmp_path):
     """Every number in full, with its unit in the first line."""
     out = tmp_path / "runs.csv"
-    export(path, "csv", out)
+    export(mrctl.open(path), "csv", out)
     with open(out, newline="") as file:
         header = next(csv.reader(file))
         table = [[float(cell) for cell in row] for row in csv.reader(file)]
     assert header[:4] == ["run", "time [s]", "x [m]", "y [m]"] and "power [W]" in header and "saturated" in header
     assert [name.split(" ")[0] for name in header] == list(long(result).columns)
     assert np.array_equal(table, long(result).to_numpy())
-    export(path, "csv", tmp_path / "one.csv", 1)
+    export(mrctl.open(path), "csv", tmp_path / "one.csv", 1)
     one = pd.read_csv(tmp_path / "one.csv")
     assert "run" not in one and len(one) == (long(result)["run"] == 1).sum()
 
@@ -159,7 +161,7 @@ def test_csv(result, path, tmp_path):
 def test_parquet(result, path, tmp_path):
     """The same with units on the columns, and what was run beside them."""
     out = tmp_path / "runs.parquet"
-    export(path, "parquet", out)
+    export(mrctl.open(path), "parquet", out)
     table = pq.read_table(out)
     pd.testing.assert_frame_equal(table.to_pandas(), long(result), check_exact=True)
     for name, (unit, meaning) in SIGNALS.items():
@@ -171,7 +173,7 @@ def test_parquet(result, path, tmp_path):
 def test_npz(result, path, tmp_path):
     """Arrays a run and sample, read without pickle."""
     out = tmp_path / "runs.npz"
-    export(path, "npz", out)
+    export(mrctl.open(path), "npz", out)
     with np.load(out, allow_pickle=False) as arrays:
         units = json.loads(str(arrays["units"]))
         for name, (unit, _) in SIGNALS.items():
@@ -185,13 +187,13 @@ def test_run_alone(result, tmp_path, kind):
     """A result of one scenario, which has no dimension for runs."""
     save(result.isel(run=0), tmp_path / "alone.zarr")
     out, other = tmp_path / f"alone.{kind}", tmp_path / f"first.{kind}"
-    assert export(tmp_path / "alone.zarr", kind, out) == 1
+    assert export(mrctl.open(tmp_path / "alone.zarr"), kind, out) == 1
     if kind == "npz":
         with np.load(out) as arrays:
             assert np.array_equal(arrays["v"], result["v"].values[:1]) and arrays["label"].tolist() == ["none"]
     else:
         save(result, tmp_path / "both.zarr")
-        export(tmp_path / "both.zarr", kind, other, 0)
+        export(mrctl.open(tmp_path / "both.zarr"), kind, other, 0)
         assert out.read_bytes() == other.read_bytes()
 
 
@@ -201,12 +203,12 @@ def test_sweep(tmp_path):
     for record in ("decimated", "metrics"):
         jobs.run(Sweep.from_dict(sweep | {"record": record}), tmp_path / record, workers=1)
     out = tmp_path / "sweep.parquet"
-    assert export(tmp_path / "decimated", "parquet", out) == 3
+    assert export(mrctl.open(tmp_path / "decimated"), "parquet", out) == 3
     table, signals = pd.read_parquet(out), mrctl.open(tmp_path / "decimated")
     assert table["run"].value_counts().to_dict() == {0: 30, 1: 30, 2: 30}
     assert np.array_equal(table["omega"].to_numpy().reshape(3, 30), signals.omega.values)
     with pytest.raises(InputError, match="holds metrics only"):
-        export(tmp_path / "metrics", "csv", tmp_path / "none.csv")
+        export(mrctl.open(tmp_path / "metrics"), "csv", tmp_path / "none.csv")
 
 
 def test_command(path, tmp_path, capsys):
@@ -231,5 +233,5 @@ def test_without_library(path, tmp_path, monkeypatch):
     """Without the library for MCAP one line says which to install, and the others work."""
     monkeypatch.setitem(sys.modules, "mcap_ros2.writer", None)
     with pytest.raises(InputError, match=r"mrctl\[mcap\]"):
-        export(path, "mcap", tmp_path / "run.mcap")
+        export(mrctl.open(path), "mcap", tmp_path / "run.mcap")
     assert not list(tmp_path.iterdir())

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from mrctl import Circle, Event, Guard, Line, Perturbation, Scenario, simulate
+from mrctl import Circle, Event, Guard, Line, Perturbation, Scenario
 from mrctl.control.feedforward import NoFeedforward
-from mrctl.result import SIGNALS
+from mrctl.loop.simulation import simulate
+from mrctl.results.dataset import SIGNALS
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 PERIOD = 0.01

@@ -21,7 +21,7 @@ from mrctl import (
 )
 from mrctl.control.feedforward import NoFeedforward
 from mrctl.experiments import single
-from mrctl.result import SIGNALS
+from mrctl.results.dataset import SIGNALS
 
 OFF = Guard(on=False)
 ERRORS = ("position_rmse", "v_rmse", "omega_rmse")

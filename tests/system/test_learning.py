@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Scenario, per_lap, save_weights, simulate
+from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Scenario, per_lap, save_weights
 from mrctl.control.fel import initial_weights, unflatten
+from mrctl.loop.simulation import simulate
 
 pytestmark = pytest.mark.xdist_group("learning")  # what its tests share is made once
 

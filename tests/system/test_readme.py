@@ -7,7 +7,7 @@ import pytest
 
 from mrctl import cli
 from mrctl.scenario import Scenario
-from mrctl.sweep import Sweep
+from mrctl.sweep.plan import Sweep
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", README.read_text(), re.MULTILINE | re.DOTALL)

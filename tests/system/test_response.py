@@ -5,13 +5,14 @@ import pytest
 from scipy import signal
 
 import mrctl
-from mrctl.control.hierarchy import TAKE_OVER
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.pid import PIDS, Gains, sampled_loop
 from mrctl.experiments.response import SAMPLES, Shaker, estimate, lines, measure, multisine, refine, safety
 from mrctl.experiments.tuning import design, statement
-from mrctl.model import load, read_robot
-from mrctl.simulate import Simulation
+from mrctl.loop.hierarchy import TAKE_OVER
+from mrctl.loop.simulation import Simulation
+from mrctl.physics.mjcf import load
+from mrctl.physics.parameters import read_robot
 
 H = 0.01
 NO_MOTION_CONTROLLER = Kanayama(k_x=0, k_y=0, k_theta=0)

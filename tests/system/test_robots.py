@@ -100,7 +100,7 @@ def test_kept_with_the_result(tmp_path):
     # A replay turns the wheels: the outer front wheel farthest, and all by the way over the radius.
     turned = {w: a[-1] for w, a in recording._turned.items()}
     assert turned["front_right"] > turned["front_left"] > turned["wheel_left"]
-    radius = float(mrctl.model.read_robot(recording.model).wheel_radius)
+    radius = float(mrctl.physics.parameters.read_robot(recording.model).wheel_radius)
     way = 2 * np.pi * 1.5
     assert turned["wheel_left"] == pytest.approx(way * (1 - 0.12065 / 1.5) / radius, rel=0.05)
     qpos = recording.qpos(400)
@@ -115,7 +115,7 @@ def test_sweep(tmp_path):
     ]
     sweep = mrctl.Sweep.of([Scenario.from_dict({**pair, "laps": 1, "feedforward": "none"}) for pair in pairs])
     assert {robot.path for _, _, robot in sweep.worlds} == set(COURSES)
-    from mrctl import jobs
+    from mrctl.sweep import jobs
 
     report = jobs.run(sweep, tmp_path / "store", workers=1)
     assert report.failed == 0 and not report.aside

@@ -5,8 +5,9 @@ import sys
 import numpy as np
 import pytest
 
-from mrctl import Circle, Event, InputError, Perturbation, RoundedSquare, Scenario, simulate
-from mrctl.result import SIGNALS
+from mrctl import Circle, Event, InputError, Perturbation, RoundedSquare, Scenario
+from mrctl.loop.simulation import simulate
+from mrctl.results.dataset import SIGNALS
 from mrctl.viewer.session import Session, changed
 
 BASE = Scenario(reference=Circle(period=4, radius=0.5), seed=3)
@@ -127,7 +128,7 @@ def test_blocks(monkeypatch):
         BASE.model_copy(update={"reference": Circle(radius=0.6, period=4)}),
     ]
     whole = simulate(scenarios)
-    monkeypatch.setattr(sys.modules["mrctl.simulate"], "BLOCK", 97)  # `mrctl.simulate` itself is the function
+    monkeypatch.setattr(sys.modules["mrctl.loop.simulation"], "BLOCK", 97)  # `mrctl.simulate` itself is the function
     parts = simulate(scenarios)
     for name in ("x_ref", "omega_ref", "x", "voltage_left"):
         assert parts[name].values.tobytes() == whole[name].values.tobytes()

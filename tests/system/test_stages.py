@@ -5,13 +5,15 @@ import pytest
 import torch
 
 import mrctl
-from mrctl import Circle, InputError, Lemniscate, Scenario, Sweep, jobs, simulate
+from mrctl import Circle, InputError, Lemniscate, Scenario, Sweep
 from mrctl.cli import main
 from mrctl.control.kanayama import kanayama, posture_error
 from mrctl.control.pid import pid
 from mrctl.control.stages import METHODS
 from mrctl.control.steering import allocate, parameters
-from mrctl.result import SIGNALS
+from mrctl.loop.simulation import simulate
+from mrctl.results.dataset import SIGNALS
+from mrctl.sweep import jobs
 
 SHORT = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
 THREE = [SHORT.model_copy(update={"seed": seed}) for seed in range(3)]

@@ -21,9 +21,10 @@ from PIL import Image
 from scipy import stats
 
 import mrctl
-from mrctl import cli, plots
+from mrctl import cli
 from mrctl.experiments import report, suite, tuning
 from mrctl.experiments.cases import Case
+from mrctl.results import plots
 
 pytestmark = pytest.mark.xdist_group("suite")  # what its tests share is made once
 
@@ -219,7 +220,7 @@ def test_page_stands_alone(whole: Path) -> None:
         image = Image.open(io.BytesIO(base64.b64decode(source.split(",")[1], validate=True)))
         image.load()
         assert image.width > 150
-    for word in ("39 runs", "payload", f"mujoco {mrctl.result.versions()['mujoco']}", "phase margin"):
+    for word in ("39 runs", "payload", f"mujoco {mrctl.results.dataset.versions()['mujoco']}", "phase margin"):
         assert word in page.words
     again = next(line for line in page.words.splitlines() if line.startswith("mrctl suite --"))
     assert again == "mrctl suite --feedforward none model rls --seeds 2 --random 3"

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 from test_sweeps import FILE, children, content, failures, poisoned, refused, until
 
-from mrctl import Sweep, cli, jobs
-from mrctl.store import Store
+from mrctl import Sweep, cli
+from mrctl.sweep import jobs
+from mrctl.sweep.store import Store
 
 pytestmark = pytest.mark.xdist_group("sweep_dask")  # what its tests share is made once
 
@@ -128,7 +129,7 @@ def test_lost_scheduler(tmp_path_factory, tmp_path):
 
 def test_no_scheduler(tmp_path, capsys, monkeypatch):
     """One line that names the address."""
-    monkeypatch.setattr("mrctl.pool.PATIENCE", 1.0)
+    monkeypatch.setattr("mrctl.sweep.pool.PATIENCE", 1.0)
     file = tmp_path / "sweep.toml"
     file.write_text(FILE)
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):

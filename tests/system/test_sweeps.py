@@ -19,11 +19,13 @@ import pyarrow.parquet as pq
 import pytest
 
 import mrctl
-from mrctl import InputError, Sweep, cli, jobs, simulate
-from mrctl.jobs import compute
-from mrctl.pool import Outcome
-from mrctl.result import SIGNALS
-from mrctl.store import Store
+from mrctl import InputError, Sweep, cli
+from mrctl.loop.simulation import simulate
+from mrctl.results.dataset import SIGNALS
+from mrctl.sweep import jobs
+from mrctl.sweep.jobs import compute
+from mrctl.sweep.pool import Outcome
+from mrctl.sweep.store import Store
 
 KILLS = int(os.environ.get("MRCTL_KILLS", "2"))  # random moments for each victim; 20 in a release
 FILE = """
@@ -143,7 +145,7 @@ def test_every_lap(tmp_path):
     jobs.run(sweep, tmp_path / "store", 1)
     opened = mrctl.open(tmp_path / "store")
     direct = mrctl.per_lap(simulate([sweep.scenario(run) for run in range(4)]))
-    for name in mrctl.metrics.METRICS:
+    for name in mrctl.results.metrics.METRICS:
         np.testing.assert_array_equal(opened[name], direct[name])
         assert opened[name].attrs["units"] == direct[name].attrs["units"]
     assert opened["laps"].values.tolist() == [1, 1, 3, 3] and opened["lap"].values.tolist() == [1, 2, 3]
@@ -201,9 +203,9 @@ def test_changed_sweep(file, sweep, tmp_path, capsys, whole):
     assert "begun with another sweep.runs (12, now 13)" in refused(capsys, "sweep", file, "--out", store)
     file.write_text("# a remark changes nothing\n" + FILE)
     assert cli.main(["sweep", str(file), "--out", str(store)]) == 0
-    with mock.patch("mrctl.jobs.versions", lambda: {**mrctl.result.versions(), "mujoco": "9"}):
+    with mock.patch("mrctl.sweep.jobs.versions", lambda: {**mrctl.results.dataset.versions(), "mujoco": "9"}):
         assert 'versions.mujoco ("3.17.0", now "9")' in refused(capsys, "sweep", file, "--out", store)
-    with mock.patch("mrctl.model.digest", lambda model: "another"):
+    with mock.patch("mrctl.physics.mjcf.digest", lambda model: "another"):
         assert "models.flat, compliant" in refused(capsys, "sweep", file, "--out", store)
     assert content(store) == whole
 
@@ -243,7 +245,7 @@ def test_two_at_once(file, sweep, tmp_path, capsys):
     assert f"process {os.getpid()} on" in message and "is running this sweep" in message
     code = f"""
 import os, pathlib
-from mrctl.store import Store
+from mrctl.sweep.store import Store
 with Store.locked(pathlib.Path({str(store)!r})):
     os.kill(os.getpid(), 9)
 """
@@ -277,7 +279,7 @@ def test_poison(file, sweep, tmp_path, whole, capsys):
     report = jobs.run(sweep, store, 2, work=poisoned)
     assert report.aside == {range(5, 10): "its worker died (signal 9)"}
     assert report.failed == len({*failures(sweep), *range(5, 10)})
-    with mock.patch("mrctl.jobs.compute", poisoned):
+    with mock.patch("mrctl.sweep.jobs.compute", poisoned):
         message = refused(capsys, "sweep", file, "--out", store, status=1)
     assert "1 jobs set aside: runs 5 to 9 (its worker died (signal 9))" in message
     table = pd.read_parquet(store / "runs.parquet")
@@ -298,7 +300,7 @@ def test_shaky(sweep, tmp_path, whole):
 def full_disk(path, job):
     """From job 2 on nothing reaches the disk."""
     error = OSError(errno.ENOSPC, "No space left on device")
-    with mock.patch("mrctl.store.os.fsync", side_effect=error if job >= 2 else None):
+    with mock.patch("mrctl.sweep.store.os.fsync", side_effect=error if job >= 2 else None):
         return compute(path, job)
 
 
@@ -313,11 +315,11 @@ def small_files(path, job):
 def test_disk_full(file, sweep, tmp_path, whole, capsys, work, reason):
     """One line; what was done is kept, nothing half-written counts, and the sweep goes on when there is space."""
     store = tmp_path / "store"
-    with mock.patch("mrctl.jobs.compute", work):
+    with mock.patch("mrctl.sweep.jobs.compute", work):
         assert f"{reason}; what was done is kept" in refused(capsys, "sweep", file, "--out", store, "--workers", 1)
     assert Store(store).done() == {0, 1}
     assert mrctl.open(store).sizes["run"] == 10 and mrctl.open(store).attrs["unfinished"] == 14
-    with mock.patch("mrctl.store.os.fsync", side_effect=OSError(errno.ENOSPC, "No space left on device")):
+    with mock.patch("mrctl.sweep.store.os.fsync", side_effect=OSError(errno.ENOSPC, "No space left on device")):
         refused(capsys, "sweep", file, "--out", store, "--workers", 1)
     jobs.run(sweep, store, 1)
     assert content(store) == whole
@@ -326,9 +328,9 @@ def test_disk_full(file, sweep, tmp_path, whole, capsys, work, reason):
 def test_disk_full_at_the_start_and_the_end(file, sweep, tmp_path, whole, capsys):
     """Neither a store that could not be begun nor a table that could not be written is in the way later."""
     store, full = tmp_path / "store", OSError(errno.ENOSPC, "No space left on device")
-    with mock.patch("mrctl.store.os.fsync", side_effect=full):
+    with mock.patch("mrctl.sweep.store.os.fsync", side_effect=full):
         assert "No space left" in refused(capsys, "sweep", file, "--out", store)
-    with mock.patch("mrctl.store.pq.ParquetWriter", side_effect=full):
+    with mock.patch("mrctl.sweep.store.pq.ParquetWriter", side_effect=full):
         assert "No space left" in refused(capsys, "sweep", file, "--out", store)
     assert len(Store(store).done()) == 5 and not Store(store).table.exists()
     jobs.run(sweep, store, 1)

@@ -7,15 +7,16 @@ import pytest
 from safetensors import safe_open
 
 from mrctl import cli
-from mrctl import model as mjcf
 from mrctl.control.composite import SHIPPED, Composite, load_training
 from mrctl.experiments import train
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
 
 
 def test_reduced(monkeypatch):
     """On plants not seen less is left than by the physical features alone; the same seed trains the same units."""
     monkeypatch.setattr(train, "EPOCHS", 40)
-    robot = mjcf.read_robot(mjcf.load("flat"))
+    robot = read_robot(mjcf.load("flat"))
     seen, unseen = (train.drive(train.draw(robot, plants, [3, plants]), robot) for plants in (24, 8))
     units = train.fit(seen, 3)
     np.testing.assert_array_equal(units, train.fit(seen, 3))

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mrctl import Circle, Event, Perturbation, Scenario, Sweep, jobs, save, simulate
+from mrctl import Circle, Event, Perturbation, Scenario, Sweep, save
 from mrctl.cli import main
+from mrctl.loop.simulation import simulate
+from mrctl.sweep import jobs
 from mrctl.viewer.live import Live
 from mrctl.viewer.recording import Library
 from mrctl.viewer.replay import Replay

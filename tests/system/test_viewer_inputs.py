@@ -5,7 +5,7 @@ import typing
 import pytest
 
 from mrctl import Scenario
-from mrctl.references import Reference
+from mrctl.theory.references import Reference
 from mrctl.viewer import live as module
 from mrctl.viewer.live import Live
 from mrctl.viewer.server import Server

@@ -125,7 +125,7 @@ def test_bad_files(tmp_path, capsys):
         assert main(["view", str(tmp_path / arguments[0]), *arguments[1:]]) == 2
         assert capsys.readouterr().err.count("\n") == 1
     with pytest.raises(InputError, match="several"):
-        from mrctl.viewer import view
+        from mrctl.viewer.view import view
 
         view(None, (), 3, None, "127.0.0.1", 0)
 

@@ -6,9 +6,13 @@ import pytest
 
 import mrctl
 from mrctl import InputError, Perturbation, Robot, RobotFile
-from mrctl import model as mjcf
-from mrctl.adopt import models_folder
-from mrctl.plant import OMEGA, V, build
+from mrctl.physics import mjcf
+from mrctl.physics.elements import fronts
+from mrctl.physics.files import models_folder
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.perturb import perturb
+from mrctl.physics.plant import OMEGA, V, build
+from mrctl.physics.stand import front_rates, stand, steer
 
 MOTOR = '<dcmotor name="{0}" joint="{0}" gear="{1}" motorconst="0.02 0.02" resistance="2" ctrlrange="-12 12" {2}/>'
 FLOOR = '<light pos="0 0 3"/><geom name="floor" type="plane" size="5 5 .1"/>'
@@ -59,7 +63,7 @@ def file(tmp_path):
 def read(path, **names):
     robot = mrctl.load_robot(path, **names)
     model = mjcf.load("flat", mjcf.arrangement(robot), robot=robot)
-    return mjcf.read_robot(model), model
+    return read_robot(model), model
 
 
 def test_by_hand(file):
@@ -151,7 +155,7 @@ def test_steered(file, body):
     assert reading[V] / reading[OMEGA] == pytest.approx(0.5 / np.tan(phi), rel=0.01)
     if body is CAR:
         qpos = np.zeros(model.nq)
-        mjcf.steer(model, qpos, phi)
+        steer(model, qpos, phi)
         left, right = (qpos[model.joint(f"steering_front_{s}").qposadr[0]] for s in ("left", "right"))
         assert 1 / np.tan(right) - 1 / np.tan(left) == pytest.approx(0.4 / 0.5, rel=2e-3) and left > phi > right
 
@@ -161,7 +165,7 @@ def test_front_rates(file):
     robot, model = read(file(document(CAR, MOTORS + SERVO.format("s1") + SERVO.format("s2"))))
     phi, v = 0.25, 0.6
     turn = 0.5 / np.tan(phi)
-    rates = mjcf.front_rates(model, robot, np.array(v), np.array(v / turn), np.array(phi))
+    rates = front_rates(model, robot, np.array(v), np.array(v / turn), np.array(phi))
     for name, y in (("front_left", 0.2), ("front_right", -0.2)):
         assert rates[name] == pytest.approx(v / turn * np.hypot(turn - y, 0.5) / 0.1, rel=1e-3)
 
@@ -169,8 +173,8 @@ def test_front_rates(file):
 def test_ours_as_a_stranger():
     """The default robot, brought in from its own file, is the default robot, steered by its servo."""
     robot = mrctl.load_robot(models_folder() / "car.xml")
-    found = mjcf.read_robot(mjcf.load("flat", "rigid", robot=robot))
-    own = mjcf.read_robot(mjcf.load("flat"))
+    found = read_robot(mjcf.load("flat", "rigid", robot=robot))
+    own = read_robot(mjcf.load("flat"))
     different = {n for n in Robot.model_fields if getattr(found, n) != pytest.approx(getattr(own, n), rel=1e-9)}
     assert different == {"tyre_friction"}  # which the world says, not the robot's file
 
@@ -181,9 +185,9 @@ def test_every_world(name, world):
     """Robots stand in every world, on all their wheels, and roll."""
     robot = RobotFile(path=name)
     model = mjcf.load(world, mjcf.arrangement(robot), robot=robot)
-    expected = mjcf.read_robot(mjcf.load("flat", mjcf.arrangement(robot), robot=robot))
-    assert mjcf.read_robot(model).model_dump() == pytest.approx(expected.model_dump(), rel=1e-9)
-    state = mjcf.stand(model, np.array([-2.0, 0.3, 0.4]), np.array([0.3, 0.0]))
+    expected = read_robot(mjcf.load("flat", mjcf.arrangement(robot), robot=robot))
+    assert read_robot(model).model_dump() == pytest.approx(expected.model_dump(), rel=1e-9)
+    state = stand(model, np.array([-2.0, 0.3, 0.4]), np.array([0.3, 0.0]))
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = state
     start = data.qpos[:3].copy()
@@ -191,7 +195,7 @@ def test_every_world(name, world):
     touching = {model.geom(g).name for pair in data.contact.geom for g in pair} - {"floor"}
     assert np.abs(data.qpos[:3] - start).max() < 0.1  # rolled on a little, and did not fall
     if world != "rough":
-        assert {"wheel_left", "wheel_right", *mjcf.fronts(model)} <= touching
+        assert {"wheel_left", "wheel_right", *fronts(model)} <= touching
 
 
 def test_slippery_in_proportion():
@@ -229,8 +233,8 @@ def test_slow_casters_tip_nobody(file):
     p = Perturbation(
         mass_factor=1.5, resistance_factor=1.3, left_radius_factor=1.04, drive_friction_factor=3, payload=2
     )
-    mjcf.perturb(model, changed, p)
-    robot = mjcf.read_robot(changed)
+    perturb(model, changed, p)
+    robot = read_robot(changed)
     assert robot.mass == pytest.approx(1.5 * 14 + 2) and robot.resistance == pytest.approx(2.6)
     assert robot.wheel_radius == pytest.approx(0.102) and robot.drive_loss == pytest.approx(0.3)
 

@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 
 from mrctl import PERTURBATIONS, InputError, Scenario
-from mrctl import model as mjcf
 from mrctl.experiments import cases
-from mrctl.references import check
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.perturb import perturb
+from mrctl.theory.references import check
 
 
 @pytest.fixture(scope="module")
 def robot():
-    return mjcf.read_robot(mjcf.load())
+    return read_robot(mjcf.load())
 
 
 @pytest.mark.parametrize("quick", [False, True])
@@ -77,6 +79,6 @@ def test_random_robots_can_follow_and_stand(robot):
             with pytest.raises(InputError):
                 check(quick, careful, reverse=False)
         for one in (scenario.perturbation, *(event.perturbation for event in scenario.events)):
-            mjcf.perturb(nominal, mjcf.clone(nominal), one)
+            perturb(nominal, mjcf.clone(nominal), one)
             factors = [value for name, value in one.model_dump().items() if name.endswith("_factor")]
             assert np.all(np.abs(np.array(factors) - 1) <= 0.9)

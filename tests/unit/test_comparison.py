@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mrctl import comparison
 from mrctl.record import InputError
+from mrctl.results import comparison
 
 
 def test_bootstrap_normal():

@@ -24,8 +24,8 @@ from mrctl.control.composite import (
     save_training,
 )  # fmt: skip
 from mrctl.control.feedforward import InverseDynamics, feature_scale
-from mrctl.dynamics import accelerations, inverse_coefficients, left_right
 from mrctl.record import InputError
+from mrctl.theory.dynamics import accelerations, inverse_coefficients, left_right
 
 RNG = np.random.default_rng(8)
 PERIOD = 0.01

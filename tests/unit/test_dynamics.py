@@ -6,8 +6,8 @@ import sympy as sp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mrctl import dynamics as d
-from mrctl.kinematics import wheel_rates
+from mrctl.theory import dynamics as d
+from mrctl.theory.kinematics import wheel_rates
 
 RNG = np.random.default_rng(0)
 TWISTS = RNG.uniform([-1.5, -3], [1.5, 3], (60, 2))

@@ -5,7 +5,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mrctl import dynamics
 from mrctl.control.feedforward import (
     FEATURES,
     SIGN_SPEED,
@@ -15,7 +14,8 @@ from mrctl.control.feedforward import (
     features,
     linear,
 )
-from mrctl.references import Lemniscate
+from mrctl.theory import dynamics
+from mrctl.theory.references import Lemniscate
 
 RNG = np.random.default_rng(3)
 COMMANDS, DERIVATIVES = RNG.uniform([-1.5, -3], [1.5, 3], (50, 2)), RNG.uniform([-1.5, -6], [1.5, 6], (50, 2))

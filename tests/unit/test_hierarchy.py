@@ -6,14 +6,14 @@ import pytest
 from mrctl.control.composite import CompositeAdaptation
 from mrctl.control.feedforward import InverseDynamics, NoFeedforward
 from mrctl.control.fel import FeedbackErrorLearning, Fel
-from mrctl.control.hierarchy import TAKE_OVER, Hierarchy, feedforward_of
 from mrctl.control.kanayama import Kanayama, kanayama
 from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import Pid
 from mrctl.control.rls import RecursiveLeastSquares
-from mrctl.dynamics import inverse_dynamics
-from mrctl.robot import Robot
-from mrctl.scenario import FEEDFORWARDS, STEERINGS, Scenario
+from mrctl.loop.hierarchy import TAKE_OVER, Hierarchy, feedforward_of
+from mrctl.scenario import FEEDFORWARDS, Scenario
+from mrctl.theory.dynamics import inverse_dynamics
+from mrctl.theory.robot import STEERINGS, Robot
 
 
 def build(robot: Robot, size=1, **settings):

@@ -5,7 +5,7 @@ import pytest
 
 from mrctl.experiments import identify
 from mrctl.experiments.identify import TICK, Drive, drive_constants, signals, turn_constants
-from mrctl.robot import Robot
+from mrctl.theory.robot import Robot
 
 
 def integrate(robot: Robot, volts, start):

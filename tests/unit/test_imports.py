@@ -9,20 +9,20 @@ import mrctl
 
 PACKAGE = Path(mrctl.__file__).parent
 
-# From the bottom up: a module imports from its own layer and from those above it in this list. `laws` stands for
-# everything in `control` but the wiring.
-LAYERS = (
-    {"record", "robot", "kinematics", "dynamics"},
-    {"laws", "references"},
+# From the bottom up: a room imports from its own floor's modules and from the floors below it.
+FLOORS = (
+    {"record", "kernel"},
+    {"theory"},
+    {"control", "sensing", "physics"},
     {"scenario"},
-    {"control.hierarchy", "measurement", "comparison", "metrics", "plots", "result"},
-    {"adopt", "model", "plant"},
-    {"simulate", "checks"},
-    {"diagnosis", "episodes"},
-    {"experiments", "controller", "sweep", "store", "pool", "jobs", "viewer", "environment", "gym", "export"},
-    {"cli", "pytest_plugin"},
+    {"checks", "results"},
+    {"loop"},
+    {"navigation"},
+    {"sweep", "envs"},
+    {"experiments", "viewer"},
+    {"cli"},
 )
-ENGINE = {"adopt", "model", "plant", "checks", "diagnosis", "viewer", "environment", "experiments"}
+ENGINE = {"physics", "checks", "viewer", "envs", "experiments"}  # who may import MuJoCo and dm_control
 
 
 def module_of(path: Path) -> str:
@@ -34,11 +34,14 @@ def module_of(path: Path) -> str:
 MODULES = {name: path for path in sorted(PACKAGE.rglob("*.py")) if (name := module_of(path))}
 
 
-def layer(name: str) -> int:
-    """Index of a module's layer."""
-    top = name.split(".")[0]
-    key = name if name == "control.hierarchy" else "laws" if top == "control" else top
-    found = [k for k, members in enumerate(LAYERS) if key in members]
+def room(name: str) -> str:
+    """The folder or file of `mrctl/` that a module belongs to."""
+    return name.split(".")[0]
+
+
+def floor(name: str) -> int:
+    """Index of the floor of a module's room."""
+    found = [k for k, rooms in enumerate(FLOORS) if room(name) in rooms]
     assert found, f"{name} has no place in the architecture"
     return found[0]
 
@@ -58,61 +61,84 @@ def imports(path: Path) -> set[str]:
 
 def inside(names: set[str]) -> set[str]:
     """Those that are modules of the package, without the prefix."""
-    return {name.removeprefix("mrctl.") for name in names} & MODULES.keys() - {"control", "experiments", "viewer"}
+    return {name.removeprefix("mrctl.") for name in names} & MODULES.keys()
 
 
-def test_walk():
+def test_walk() -> None:
     """The walk sees what is known to be there."""
-    assert {"control.fel", "plant", "scenario"} <= MODULES.keys()
-    assert {"record", "robot"} <= inside(imports(MODULES["references"]))
-    assert {"model", "result", "plant"} <= inside(imports(MODULES["simulate"]))
+    assert {"control.fel", "physics.plant", "scenario"} <= MODULES.keys()
+    assert {"record", "theory.robot"} <= inside(imports(MODULES["theory.references"]))
+    assert {"physics.mjcf", "results.dataset", "physics.plant"} <= inside(imports(MODULES["loop.simulation"]))
 
 
-def test_arrows():
-    """Imports point one way."""
+def test_arrows() -> None:
+    """Imports point down, between floors and between the rooms of one floor."""
+    arrows = set()
     for name, path in MODULES.items():
-        for other in inside(imports(path)):
-            assert layer(other) <= layer(name), f"{name} imports {other}"
+        if not name:
+            continue  # the package itself names its public objects, and loads them when they are used
+        for other in inside(imports(path)) - {""}:
+            assert floor(other) <= floor(name), f"{name} imports {other}"
+            arrows.add((room(name), room(other)))
+    both = {(a, b) for a, b in arrows if a != b and (b, a) in arrows}
+    assert not both, both
 
 
-def test_no_circles():
-    """Within a layer too."""
-    graph = {name: inside(imports(path)) for name, path in MODULES.items()}
+def test_no_circles() -> None:
+    """Among modules too."""
+    graph = {name: inside(imports(path)) - {name.rpartition(".")[0], ""} for name, path in MODULES.items()}
     while free := {name for name, others in graph.items() if not others & graph.keys()}:
         graph = {name: others for name, others in graph.items() if name not in free}
     assert not graph
 
 
-def test_engine():
-    """Only the boundary, the checks and what draws know MuJoCo."""
+def test_rooms() -> None:
+    """`ls mrctl` stays short, and every room says at its door what lives there."""
+    boxes = {path.name for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert len(boxes) <= 16
+    for path in PACKAGE.glob("*/__init__.py"):
+        assert len((ast.get_docstring(ast.parse(path.read_text())) or "").splitlines()) >= 3, path
+
+
+def test_engine() -> None:
+    """Only four rooms know MuJoCo."""
     users = set()
     for name, path in MODULES.items():
         if {other.split(".")[0] for other in imports(path)} & {"mujoco", "dm_control", "mjviser"}:
-            users.add(name.split(".")[0])
-    assert {"model", "plant"} <= users <= ENGINE
+            users.add(room(name))
+    assert users == ENGINE
 
 
-def test_global_callbacks():
+def test_global_callbacks() -> None:
     """`mjcb_control` is process-wide: nobody sets it."""
     for path in MODULES.values():
         assert "mjcb" not in path.read_text(), path
 
 
-def test_light():
-    """Importing the package loads neither torch nor what only figures, commands, viewer and environment need."""
-    heavy = ("torch", "matplotlib", "tyro", "viser", "gymnasium", "dask")
-    code = f"import sys, mrctl; print([m for m in {heavy} if m in sys.modules])"
+def loaded(code: str, suspects: tuple[str, ...]) -> list[str]:
+    """Which of some modules a fresh interpreter has loaded after running `code`, which must print nothing."""
+    code += f"\nimport sys; print(*[m for m in {suspects} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip() == "[]" and out.stderr == ""
+    assert out.stderr == ""
+    return out.stdout.split()
 
 
-def test_laws_without_physics():
-    """The laws, references and scenarios are usable where no engine is: importing them loads none."""
-    block = "import sys; sys.modules['mujoco'] = sys.modules['dm_control'] = None; import types; "
-    package = f"p = types.ModuleType('mrctl'); p.__path__ = [{str(PACKAGE)!r}]; sys.modules['mrctl'] = p; "
-    code = (
-        block
-        + package
-        + "import mrctl.control.hierarchy, mrctl.references, mrctl.metrics, mrctl.result, mrctl.dynamics"
+def test_light() -> None:
+    """`import mrctl` loads nothing heavy; a simulation loads neither torch nor figures, commands and viewer."""
+    assert not loaded("import mrctl", ("numpy", "numba", "mujoco", "xarray", "torch"))
+    assert not loaded(
+        "import mrctl; mrctl.Simulation, mrctl.simulate, mrctl.summary",
+        ("torch", "matplotlib", "scipy.stats", "tyro", "viser", "gymnasium", "dask"),
     )
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_settings_are_data() -> None:
+    """A scenario is read where there is neither Numba, MuJoCo nor torch."""
+    code = "import mrctl; mrctl.Scenario(); mrctl.Sweep"
+    assert not loaded(code, ("mujoco", "dm_control", "torch"))
+
+
+def test_laws_without_physics() -> None:
+    """The laws, the hierarchy and the results are usable where no engine is."""
+    block = "import sys; sys.modules['mujoco'] = sys.modules['dm_control'] = None\n"
+    loaded(block + "import mrctl.loop.hierarchy, mrctl.results.metrics, mrctl.results.dataset", ())

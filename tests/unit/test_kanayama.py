@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from mrctl.control.kanayama import Kanayama, kanayama
-from mrctl.kinematics import pose_rates
+from mrctl.theory.kinematics import pose_rates
 
 GAINS = np.array([3.0, 25.0, 10.0])
 

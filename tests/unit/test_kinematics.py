@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mrctl import kinematics as k
+from mrctl.theory import kinematics as k
 
 RNG = np.random.default_rng(0)
 STATES = RNG.uniform(-1.3, 1.3, (40, 7))

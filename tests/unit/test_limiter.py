@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mrctl.control.limiter import limit
-from mrctl.references import Lemniscate
+from mrctl.theory.references import Lemniscate
 
 LIMITS = np.array([1.5, 3.0, 1.5, 6.0])
 

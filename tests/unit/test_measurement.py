@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mrctl.measurement import SLIP_FILTER, observe, watch_slip
+from mrctl.sensing.sensors import SLIP_FILTER, observe, watch_slip
 
 
 def numbers(*shape, bound=5.0):

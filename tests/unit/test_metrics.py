@@ -6,10 +6,10 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mrctl import metrics
 from mrctl.control.feedforward import feature_scale
 from mrctl.record import InputError
-from mrctl.references import Circle, Lemniscate
+from mrctl.results import metrics
+from mrctl.theory.references import Circle, Lemniscate
 
 DT, LAP = 0.01, 2.0
 

@@ -9,13 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mrctl import model as mjcf
-from mrctl.kinematics import scrub_free_angle
+from mrctl.physics import mjcf
+from mrctl.physics.files import models_folder
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.perturb import fields, perturb, write
+from mrctl.physics.stand import stand
 from mrctl.record import InputError
-from mrctl.robot import GRAVITY, Perturbation, Robot
+from mrctl.theory.kinematics import scrub_free_angle
+from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.robot import GRAVITY, Robot
 
 NOMINAL = mjcf.load()
-BASE = mjcf.read_robot(NOMINAL)
+BASE = read_robot(NOMINAL)
 
 PUBLISHED = {
     "mass": 20,
@@ -56,13 +61,13 @@ PUBLISHED = {
 def perturbed(**values) -> mujoco.MjModel:
     """A perturbed copy of the nominal model."""
     model = mjcf.clone(NOMINAL)
-    mjcf.perturb(NOMINAL, model, Perturbation(**values))
+    perturb(NOMINAL, model, Perturbation(**values))
     return model
 
 
 def changes(**values) -> dict[str, float]:
     """The robot's parameters that a perturbation changes, as ratios to the nominal ones."""
-    after, before = mjcf.read_robot(perturbed(**values)).model_dump(), BASE.model_dump()
+    after, before = read_robot(perturbed(**values)).model_dump(), BASE.model_dump()
     return {name: after[name] / before[name] for name in before if not math.isclose(after[name], before[name])}
 
 
@@ -105,7 +110,7 @@ def test_inertia_by_physics():
 @pytest.mark.parametrize("steering", ["compliant", "caster", "rigid"])
 def test_worlds(world, steering):
     """The same robot in every world; only the trail, and what swings with the wheel, depends on the steering."""
-    robot = mjcf.read_robot(mjcf.load(world, steering)).model_dump()
+    robot = read_robot(mjcf.load(world, steering)).model_dump()
     moved = {"trail", "com_offset", "yaw_inertia"} if steering == "rigid" else set()
     for name, value in BASE.model_dump().items():
         if name not in moved:
@@ -135,7 +140,7 @@ def test_steering(steering, stiffness, damping):
 def test_digest(tmp_path):
     """The same world read from another folder is the same; with another bump, name, scale or time step it is not."""
     for name in ("rough.xml", "rough.png", "car.xml", "scenery.xml"):
-        shutil.copy(mjcf.models_folder() / name, tmp_path / name)
+        shutil.copy(models_folder() / name, tmp_path / name)
     text, world = (tmp_path / "rough.xml").read_text(), tmp_path / "another.xml"
     found = [mjcf.digest(mjcf.load("rough")), mjcf.digest(mjcf.load("rough", timestep=5e-4))]
     for old, new in (
@@ -159,7 +164,7 @@ def test_timestep():
 @pytest.fixture
 def folder(tmp_path):
     """A copy of the models to break."""
-    return shutil.copytree(mjcf.models_folder(), tmp_path / "models")
+    return shutil.copytree(models_folder(), tmp_path / "models")
 
 
 def broken(folder, old, new, file="car.xml"):
@@ -182,7 +187,7 @@ def refuses(world, *words, steering="compliant"):
 
 def test_found():
     """The shipped worlds come with the checkout."""
-    assert {"car", "flat", "slope", "rough", "patch"} <= {path.stem for path in mjcf.models_folder().glob("*.xml")}
+    assert {"car", "flat", "slope", "rough", "patch"} <= {path.stem for path in models_folder().glob("*.xml")}
 
 
 def test_missing_file(tmp_path):
@@ -258,9 +263,9 @@ def test_no_perturbation():
     """The default is a no-op, to the bit, also after another perturbation."""
     model = perturbed(mass_factor=1.7, payload=3, left_radius_factor=1.1, motor_constant_factor=0.8, slope=0.2)
     for candidate in (perturbed(), model):
-        mjcf.perturb(NOMINAL, candidate, Perturbation())
-        for name, value in mjcf.fields(NOMINAL).items():
-            assert np.array_equal(mjcf.fields(candidate)[name], value), name
+        perturb(NOMINAL, candidate, Perturbation())
+        for name, value in fields(NOMINAL).items():
+            assert np.array_equal(fields(candidate)[name], value), name
         for name in ("body_invweight0", "dof_invweight0", "body_subtreemass", "actuator_acc0", "dof_M0"):
             assert np.array_equal(getattr(candidate, name), getattr(NOMINAL, name)), name
 
@@ -273,7 +278,7 @@ def test_every_changed_field_is_listed():
         supply_factor=1.2, tyre_friction_factor=0.5, slope=0.1,
     )  # fmt: skip
     copied = mjcf.clone(NOMINAL)
-    mjcf.write(copied, mjcf.fields(model))
+    write(copied, fields(model))
     names = [n for n in dir(model) if not n.startswith("_") and isinstance(getattr(model, n), np.ndarray)]
     assert len(names) > 300
     for name in names:
@@ -307,7 +312,7 @@ def test_one_tyre_on_ice():
     left = [nominal.geom("wheel_left").id in (nominal.pair_geom1[k], nominal.pair_geom2[k]) for k in range(len(pairs))]
     assert sum(left) == 5
     model = mjcf.clone(nominal)
-    mjcf.perturb(nominal, model, Perturbation(left_tyre_friction_factor=0.2, tyre_friction_factor=0.5))
+    perturb(nominal, model, Perturbation(left_tyre_friction_factor=0.2, tyre_friction_factor=0.5))
     expected = nominal.pair_friction[:, :2] * np.where(left, 0.1, 0.5)[:, None]
     assert model.pair_friction[:, :2] == pytest.approx(expected)
     assert np.array_equal(model.pair_friction[:, 2:], nominal.pair_friction[:, 2:])
@@ -316,7 +321,7 @@ def test_one_tyre_on_ice():
 def test_drive_friction():
     """τ_loss grows, rolling does not; without any, nothing but rolling is left."""
     for factor in (0.0, 3.0, 20.0):
-        robot = mjcf.read_robot(perturbed(drive_friction_factor=factor))
+        robot = read_robot(perturbed(drive_friction_factor=factor))
         assert robot.drive_loss == pytest.approx(factor * BASE.drive_loss, abs=1e-12)
         assert robot.rolling_force == pytest.approx(BASE.rolling_force)
 
@@ -337,7 +342,7 @@ def test_rolling_follows_load():
 
 def test_inertia_factor():
     """The chassis' own 0.4275 kg·m² about the vertical, and nothing else."""
-    robot = mjcf.read_robot(perturbed(inertia_factor=1.5))
+    robot = read_robot(perturbed(inertia_factor=1.5))
     assert robot.yaw_inertia - BASE.yaw_inertia == pytest.approx(0.5 * 0.427509)
     assert changes(inertia_factor=1.5).keys() == {"yaw_inertia"}
 
@@ -349,7 +354,7 @@ def test_inertia_factor():
 def test_payload(payload, x, y, z, factor):
     """A point mass: total, centre of mass, and yaw inertia by the parallel-axis theorem."""
     model = perturbed(payload=payload, payload_x=x, payload_y=y, payload_z=z, mass_factor=factor)
-    robot, mass = mjcf.read_robot(model), factor * BASE.mass
+    robot, mass = read_robot(model), factor * BASE.mass
     total = mass + payload
     com = (mass * np.array([BASE.com_offset, 0, BASE.com_height]) + payload * np.array([x, y, z])) / total
     assert robot.mass == pytest.approx(total)
@@ -386,7 +391,7 @@ def test_radii():
     assert model.geom_aabb[left.id, 3:] == pytest.approx([left.size[0]] * 3)
     assert right.size[0] == right.rbound[0] == 0.098
     assert changes(left_radius_factor=1.05, right_radius_factor=1.05).keys() == {"wheel_radius", "com_height"}
-    robot = mjcf.read_robot(model)
+    robot = read_robot(model)
     assert robot.wheel_radius == pytest.approx(0.098 * 1.025) and robot.front_wheel_radius == 0.075
 
 
@@ -399,9 +404,9 @@ def test_slope():
 
 def test_supply():
     """A drive on a stronger supply must be able to pass it on; the controller's limit stays nominal."""
-    assert mjcf.read_robot(NOMINAL, 0.8).drive_gain == 0.8
-    assert mjcf.read_robot(perturbed(supply_factor=0.8)).supply == 24
-    assert mjcf.read_robot(perturbed(supply_factor=1.25)).supply == pytest.approx(30)
+    assert read_robot(NOMINAL, 0.8).drive_gain == 0.8
+    assert read_robot(perturbed(supply_factor=0.8)).supply == 24
+    assert read_robot(perturbed(supply_factor=1.25)).supply == pytest.approx(30)
 
 
 FIELDS = {
@@ -421,7 +426,7 @@ def test_any_perturbation(values):
     except InputError as error:
         assert "tip over" in str(error) or "below the ground" in str(error)
         return
-    robot = mjcf.read_robot(model, values.get("supply_factor", 1.0))
+    robot = read_robot(model, values.get("supply_factor", 1.0))
     assert isinstance(robot, Robot)
     assert robot.drive_loss == pytest.approx(values.get("drive_friction_factor", 1) * BASE.drive_loss, abs=1e-9)
     assert robot.rolling_coefficient == pytest.approx(BASE.rolling_coefficient)
@@ -440,9 +445,9 @@ def test_inductance(inductive):
     """It is read from the file, and stays the same behind another resistance."""
     nominal = mjcf.load(inductive)
     model = mjcf.clone(nominal)
-    mjcf.perturb(nominal, model, Perturbation(resistance_factor=1.5))
+    perturb(nominal, model, Perturbation(resistance_factor=1.5))
     for candidate, resistance in ((nominal, 2.32), (model, 3.48)):
-        robot = mjcf.read_robot(candidate)
+        robot = read_robot(candidate)
         assert robot.inductance == pytest.approx(2.4e-4)
         assert robot.resistance == pytest.approx(resistance)
 
@@ -483,8 +488,8 @@ def test_stands_on_planes(world, radii, x, y, theta, v, omega):
     """Three wheels touch to a nanometre, whatever the radii; the posture is the one asked for."""
     nominal = WORLDS[world]
     model = mjcf.clone(nominal)
-    mjcf.perturb(nominal, model, Perturbation(left_radius_factor=radii[0], right_radius_factor=radii[1]))
-    state = mjcf.stand(model, np.array([x, y, theta]), np.array([v, omega]))
+    perturb(nominal, model, Perturbation(left_radius_factor=radii[0], right_radius_factor=radii[1]))
+    state = stand(model, np.array([x, y, theta]), np.array([v, omega]))
     assert gaps(model, state) == pytest.approx(0, abs=1e-9)
     assert tuple(state.qpos[:2]) == (x, y)
     assert math.remainder(heading(state) - theta, 2 * math.pi) == pytest.approx(0, abs=1e-9)
@@ -497,7 +502,7 @@ WORLDS = {world: mjcf.load(world) for world in ("flat", "slope", "rough", "patch
 @settings(max_examples=30)
 def test_stands_on_bumps(x, y, theta):
     """On uneven ground nothing penetrates, one wheel touches, the others hover by no more than the bumps allow."""
-    state = mjcf.stand(WORLDS["rough"], np.array([x, y, theta]), np.array([0.5, 0.0]))
+    state = stand(WORLDS["rough"], np.array([x, y, theta]), np.array([0.5, 0.0]))
     gap = gaps(WORLDS["rough"], state)
     assert gap.min() > -1e-6 and gap.min() < 2e-3 and gap.max() < 0.01
     assert math.remainder(heading(state) - theta, 2 * math.pi) == pytest.approx(0, abs=1e-9)
@@ -508,7 +513,7 @@ def test_stands_on_bumps(x, y, theta):
 def test_rolls(v, omega, left, right):
     """Wheel rates of equation (1), each wheel on its own radius; the fork rolls without scrub."""
     model = perturbed(left_radius_factor=left, right_radius_factor=right)
-    state = mjcf.stand(model, np.zeros(3), np.array([v, omega]))
+    state = stand(model, np.zeros(3), np.array([v, omega]))
     steering = state.qpos[model.joint("steering").qposadr[0]]
     free = float(scrub_free_angle(np.array([v, omega]), BASE))
     assert steering == pytest.approx(np.clip(free, -BASE.steering_limit, BASE.steering_limit))
@@ -531,4 +536,4 @@ def test_rolls(v, omega, left, right):
 def test_no_ground():
     """Beyond the edge of the height field."""
     with pytest.raises(InputError, match=r"^initial_pose: there is no ground below \(20\.\d\d, "):
-        mjcf.stand(WORLDS["rough"], np.array([20.0, 0.0, 0.0]), np.zeros(2))
+        stand(WORLDS["rough"], np.array([20.0, 0.0, 0.0]), np.zeros(2))

@@ -5,7 +5,7 @@ import pytest
 
 from mrctl.control.feedforward import InverseDynamics
 from mrctl.control.observer import DisturbanceObserver, Observer
-from mrctl.dynamics import accelerations, left_right
+from mrctl.theory.dynamics import accelerations, left_right
 
 PERIOD = 0.01
 T = Observer().time_constant

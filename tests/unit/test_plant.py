@@ -7,13 +7,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from mrctl import Circle, Scenario, simulate
-from mrctl import model as mjcf
-from mrctl.plant import BatchPlant, CarPhysics, PhysicsPlant, build, read
-from mrctl.robot import Perturbation
+from mrctl import Circle, Scenario
+from mrctl.loop.simulation import simulate
+from mrctl.physics import mjcf
+from mrctl.physics.files import models_folder
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.plant import BatchPlant, CarPhysics, PhysicsPlant, build, read
+from mrctl.physics.stand import stand
+from mrctl.theory.perturbation import Perturbation
 
 MODEL = mjcf.load()
-ROBOT = mjcf.read_robot(MODEL)
+ROBOT = read_robot(MODEL)
 SUBSTEPS = 5
 
 
@@ -39,7 +43,7 @@ def test_build():
 def test_readouts(world):
     """Posture, twist, wheel rates and steering are what the engine's sensors measure at P, on a wild drive."""
     physics = CarPhysics.from_world(world)
-    state = mjcf.stand(physics.model.ptr, np.array([0.1, 0.2, 2.5]), np.array([0.4, 0.8]))
+    state = stand(physics.model.ptr, np.array([0.1, 0.2, 2.5]), np.array([0.4, 0.8]))
     with physics.reset_context():
         physics.data.qpos[:], physics.data.qvel[:] = state
     rng = np.random.default_rng(0)
@@ -237,7 +241,7 @@ def test_same_bits():
 @pytest.fixture
 def inductive(tmp_path):
     """The flat world with the winding's 0.24 mH."""
-    folder = shutil.copytree(mjcf.models_folder(), tmp_path / "models")
+    folder = shutil.copytree(models_folder(), tmp_path / "models")
     text = (folder / "car.xml").read_text()
     (folder / "car.xml").write_text(text.replace('resistance="2.32"', 'resistance="2.32" inductance="2.4e-4 0"'))
     return str(folder / "flat.xml")
@@ -248,7 +252,7 @@ def test_inductance(inductive):
     model = mjcf.load(inductive, timestep=1e-5)
     physics = CarPhysics.from_compiled(model)
     assert physics.data.act.size == 2
-    physics.data.qpos[:], physics.data.qvel[:] = mjcf.stand(model, np.zeros(3), np.zeros(2))
+    physics.data.qpos[:], physics.data.qvel[:] = stand(model, np.zeros(3), np.zeros(2))
     physics.data.ctrl[:2] = 6.0, 3.0
     for _ in range(40):
         physics.step()

@@ -8,8 +8,8 @@ import pytest
 import xarray as xr
 from matplotlib.image import imread
 
-from mrctl import metrics, plots
 from mrctl.record import InputError
+from mrctl.results import metrics, plots
 
 LAP = 2.0
 

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mrctl.record import InputError, Record
-from mrctl.references import Line, Waypoints
-from mrctl.robot import Perturbation
 from mrctl.scenario import Event, Scenario
+from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.references import Line, Waypoints
 
 
 class Inner(Record):

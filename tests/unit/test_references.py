@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
 from mrctl.record import InputError, describe
-from mrctl.references import (
+from mrctl.theory.references import (
     Circle,
     LaneChange,
     Lemniscate,
@@ -22,7 +22,7 @@ from mrctl.references import (
     check,
     from_curve,
 )
-from mrctl.robot import Robot
+from mrctl.theory.robot import Robot
 
 ROBOT = Robot(
     mass=20, yaw_inertia=0.6, com_offset=0.1, com_height=0.12, wheel_radius=0.098, front_wheel_radius=0.075,

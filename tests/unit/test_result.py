@@ -8,9 +8,10 @@ import pytest
 import xarray as xr
 
 import mrctl
-from mrctl import Circle, Event, Fel, Perturbation, Scenario, simulate
+from mrctl import Circle, Event, Fel, Perturbation, Scenario
+from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
-from mrctl.result import SIGNALS, open_result, save, scenarios_of, versions
+from mrctl.results.dataset import SIGNALS, open_result, save, scenarios_of, versions
 
 CIRCLE = Circle(period=4, radius=0.5)
 SCENARIOS = [

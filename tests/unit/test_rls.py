@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from mrctl.control.feedforward import InverseDynamics, feature_scale, features
 from mrctl.control.rls import RecursiveLeastSquares, Rls, update
-from mrctl.dynamics import inverse_coefficients
+from mrctl.theory.dynamics import inverse_coefficients
 
 RNG = np.random.default_rng(5)
 

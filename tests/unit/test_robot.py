@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mrctl.record import InputError, Record
-from mrctl.robot import GRAVITY, PERTURBATIONS, Perturbation, Robot
+from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
+from mrctl.theory.robot import GRAVITY, Robot
 
 numbers = st.floats() | st.floats(-2, 2) | st.integers() | st.sampled_from([None, True, "", "x", "1\n", "nan", [1.0]])
 

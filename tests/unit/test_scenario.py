@@ -8,11 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mrctl import Composite, Event, Fel, Kanayama, Observer, Perturbation, Pid, Rls, Scenario, simulate
+from mrctl import Composite, Event, Fel, Kanayama, Observer, Perturbation, Pid, Rls, Scenario
 from mrctl.control.feedforward import NoFeedforward
+from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
-from mrctl.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
 from mrctl.scenario import LONGEST, whole
+from mrctl.theory.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
 
 values = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.floats(0, 1) | st.text(max_size=5)

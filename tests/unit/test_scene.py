@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mjviser.conversions import merge_geoms
 
-from mrctl import model as mjcf
-from mrctl.robot import CAR, RobotFile
+from mrctl.physics import mjcf
+from mrctl.theory.robot import CAR, RobotFile
 from mrctl.viewer.scene import SEEN, _ribbons, _rough
 
 

@@ -6,10 +6,10 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mrctl import kinematics
 from mrctl.control.steering import REST, allocate, parameters
-from mrctl.dynamics import common_differential, inverse_dynamics, left_right
-from mrctl.references import Lemniscate, StopAndGo
+from mrctl.theory import kinematics
+from mrctl.theory.dynamics import common_differential, inverse_dynamics, left_right
+from mrctl.theory.references import Lemniscate, StopAndGo
 
 ZERO = np.zeros(2)
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from mrctl import Circle, Event, InputError, Perturbation, RobotFile, Scenario, Sweep
-from mrctl import store as folder
-from mrctl.result import SIGNALS
+from mrctl.results.dataset import SIGNALS
+from mrctl.sweep import store as folder
 
 BASE = {"laps": 1, "feedforward": "none", "reference": {"kind": "line", "length": 0.4}}
 MASS = {"field": "perturbation.mass_factor", "uniform": [0.8, 1.5]}

@@ -1,0 +1,144 @@
+"""`mrctl check`: the physics checks on a robot, as a table or as JSON, with the causes of what fails."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+import json as jsonlib
+import math
+import unicodedata
+from collections.abc import Sequence
+
+import mujoco
+
+from mrctl.checks.catalogue import Comparison
+from mrctl.checks.diagnosis import Examination, Finding, excess
+from mrctl.physics.elements import has
+from mrctl.physics.files import SHIPPED, world_path
+from mrctl.physics.mjcf import arrangement, load, load_robot, steerings
+from mrctl.record import InputError
+
+UNEXPLAINED = "nothing odd in the model explains this, nor does a shorter time step"
+
+
+def examination(
+    path: str = "flat", wheels: Sequence[str] = (), steering: Sequence[str] = (), chassis: str = ""
+) -> Examination:
+    """Gets a robot ready to be checked.
+
+    Args:
+        path: A world with its robot, or a robot, which gets a level floor (see `mrctl.physics.mjcf.load_robot`).
+        wheels: Joints of the two driven wheels of a robot without a world.
+        steering: Joints of what it steers.
+        chassis: Body that carries them.
+
+    Raises:
+        InputError: It cannot be loaded.
+    """
+    if not (wheels or steering or chassis) and _is_world(path):
+        return Examination(lambda arranged: load(path, arranged or "compliant"))
+    robot = load_robot(path, wheels, steering, chassis)
+    own = arrangement(robot)
+    offered = steerings(load(steering=own, robot=robot))
+    return Examination(lambda arranged: load(steering=arranged if arranged in offered else own, robot=robot))
+
+
+def _is_world(path: str) -> bool:
+    """Whether a file brings its own floor, and wheels under our names on it."""
+    if path in SHIPPED:
+        return False
+    try:
+        model = mujoco.MjModel.from_xml_path(str(world_path(path)))
+    except ValueError as error:
+        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
+    return model.npair > 0 and has(model, "geom", "wheel_left")
+
+
+def run(
+    path: str = "flat",
+    wheels: Sequence[str] = (),
+    steering: Sequence[str] = (),
+    chassis: str = "",
+    json: bool = False,
+) -> tuple[str, str]:
+    """Runs all checks that suit a robot.
+
+    Args:
+        path: As in `examination`, like what follows.
+        wheels: Joints of the driven wheels.
+        steering: Joints of what is steered.
+        chassis: Body that carries them.
+        json: Return JSON.
+
+    Returns:
+        The report, and "3 of 22 checks failed", empty if none did.
+
+    Raises:
+        InputError: The robot cannot be loaded.
+    """
+    patient = examination(path, wheels, steering, chassis)
+    findings = [patient.look(check) for check in patient.checks]
+    failed = sum(finding.status == "failed" for finding in findings)
+    verdict = f"{failed} of {len(findings)} checks failed" if failed else ""
+    if json:
+        report = {"robot": path, "failed": failed, "checks": [as_data(finding) for finding in findings]}
+        return jsonlib.dumps(report, indent=2, ensure_ascii=False, allow_nan=False), verdict
+    return table(findings), verdict
+
+
+def as_data(finding: Finding) -> dict[str, object]:
+    """A finding for machines; what is no number is null."""
+
+    def number(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    return {
+        "check": finding.check.name,
+        "status": finding.status,
+        "reason": finding.reason,
+        "values": [
+            {k: number(v) if isinstance(v, float) else v for k, v in c._asdict().items()} | {"passed": c.passed}
+            for c in finding.report
+        ],
+        "causes": [cause._asdict() for cause in finding.causes],
+    }
+
+
+def table(findings: list[Finding]) -> str:
+    """A line for each check with the value that is nearest to its tolerance, one for each that failed, and causes."""
+    rows = [("check", "value", "measured", "expected", "")]
+    for finding in (f for f in findings if not f.reason):
+        name = finding.check.name
+        shown = [c for c in finding.report if not c.passed] or [max(finding.report, key=excess)]
+        rows += [(name, *_cells(c)) for c in shown[:1]] + [("", *_cells(c)) for c in shown[1:]]
+        if finding.status == "failed":
+            rows += [("", line, "", "", "") for line in because(finding)]
+    widths = [max(_width(row[k]) for row in rows if row[2]) for k in range(4)]
+    lines = [
+        "  ".join(c + " " * (w - _width(c)) for c, w in zip(row, [*widths, 0], strict=True)).rstrip() for row in rows
+    ]
+    for reason in dict.fromkeys(f.reason for f in findings if f.reason):
+        lines.append(f"skipped, {reason}: {', '.join(f.check.name for f in findings if f.reason == reason)}")
+    texts = {cause.cause: cause.text for finding in findings for cause in finding.causes}
+    if texts:
+        lines += ["", "Likely causes in the model:", *(f"- {cause}: {text}" for cause, text in texts.items())]
+    counts = [(sum(f.status == s for f in findings), s) for s in ("passed", "failed", "skipped")]
+    return "\n".join([*lines, "", ", ".join(f"{count} {status}" for count, status in counts if count)])
+
+
+def because(finding: Finding) -> list[str]:
+    """Lines that say why a check failed."""
+    if not finding.causes:
+        return [UNEXPLAINED]
+    return [f"because of {', '.join(c.cause for c in finding.causes)}; repaired, {finding.causes[0].evidence}"]
+
+
+def _width(cell: str) -> int:
+    """Columns that a cell takes: the dot of θ̇ takes none."""
+    return sum(not unicodedata.combining(letter) for letter in cell)
+
+
+def _cells(c: Comparison) -> tuple[str, str, str, str]:
+    expected = f"{c.expected:.4g} ± {c.tolerance:.2g} {c.unit}".strip()
+    return c.quantity, f"{c.measured:.4g}", expected, "pass" if c.passed else "FAIL"

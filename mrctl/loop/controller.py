@@ -1,0 +1,111 @@
+"""Stages of your own, named by their files: `my_file.py:MyController`, `motion=my_file.py:PurePursuit`.
+
+A name stands for a factory as `simulate` takes it; without a stage in front it is the feedforward's. Several are joined
+by commas. Loading runs the files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import sys
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mrctl.control.stages import METHODS, Stages
+from mrctl.loop.simulation import Simulation
+from mrctl.record import InputError
+from mrctl.scenario import Scenario
+
+
+class Part(NamedTuple):
+    """One stage of a controller."""
+
+    stage: str
+    path: Path
+    attribute: str
+
+
+def parts(name: str) -> list[Part]:
+    """What a name consists of.
+
+    Raises:
+        InputError: It is not of the form above, names no stage or one twice, or there is no such file.
+    """
+    found: list[Part] = []
+    for part in name.split(","):
+        before, separator, place = part.partition("=")
+        stage, place = (before, place) if separator else ("feedforward", part)
+        file, _, attribute = place.rpartition(":")
+        if not file.endswith(".py") or not attribute.isidentifier():
+            raise InputError(f"controller: {part!r} is not of the form my_file.py:MyController")
+        if stage not in METHODS:
+            raise InputError(f"controller: {stage!r} is no stage; there are {', '.join(METHODS)}")
+        if stage in {one.stage for one in found}:
+            raise InputError(f"controller: {stage} is there twice")
+        if not Path(file).is_file():
+            raise InputError(f"controller: no file {file}")
+        found.append(Part(stage, Path(file).absolute(), attribute))
+    return found
+
+
+def absolute(name: str) -> str:
+    """The same with whole paths, in the same words for the same controller."""
+    return ",".join(f"{part.stage}={part.path}:{part.attribute}" for part in parts(name)).removeprefix("feedforward=")
+
+
+def digest(name: str) -> str:
+    """Tells whether two controllers have the same files.
+
+    Raises:
+        InputError: As `parts`.
+    """
+    return hashlib.sha256(b"".join(part.path.read_bytes() for part in parts(name))).hexdigest()
+
+
+@lru_cache
+def load(name: str) -> Stages:
+    """Runs the files and returns the factories by stage, as keywords for `simulate`.
+
+    Raises:
+        InputError: As `parts`; a file fails; it has no such name, or one that cannot be called.
+    """
+    factories: Any = {part.stage: _factory(part) for part in parts(name)}
+    return factories
+
+
+def _factory(part: Part) -> Any:  # noqa: ANN401
+    path, attribute = part.path, part.attribute
+    module_name = f"mrctl_controller_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    assert spec and spec.loader
+    module = sys.modules[module_name] = importlib.util.module_from_spec(spec)  # dataclasses look there
+    sys.path.insert(0, str(path.parent))  # as for a script: what lies beside it can be imported
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        raise InputError(" ".join(f"controller: {path}: {type(error).__name__}: {error}".split())) from None
+    finally:
+        sys.path.remove(str(path.parent))
+    if not callable(getattr(module, attribute, None)):
+        raise InputError(f"controller: {path.name} has no {attribute} that can be called with a robot and a size")
+    return getattr(module, attribute)
+
+
+def trial(name: str, scenario: Scenario) -> None:
+    """Tries factories and stages on two robots for a few ticks, before much is computed.
+
+    Raises:
+        InputError: As `load`; the scenario is bad; or whatever went wrong in the controller.
+    """
+    stages = load(name)
+    Simulation([scenario])  # what is wrong with the scenario is no fault of the controller
+    try:
+        simulation = Simulation([scenario, scenario], **stages)
+    except InputError as error:
+        raise InputError(f"controller: {error}") from None
+    for _ in range(min(3, simulation.ticks)):
+        simulation.step()
+        for fault in simulation.hierarchy.faults.values():
+            raise InputError(f"controller: {fault}")

@@ -1,0 +1,503 @@
+"""What a result is worth: errors per lap, learning, recovery, and their means over seeds.
+
+Pure functions of the dataset that `simulate` returns. Errors are against the ORIGINAL reference. A run that failed is
+counted, never dropped: its metrics are NaN from the lap in which it failed on, and every statistic says how many it
+lost. Laps are numbered from 1. A sample is held for one control period, so an integral over time is a sum times that
+period.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import NDArray
+
+from mrctl.control.feedforward import features
+from mrctl.control.guard import ACTIONS, LIMIT, NONE, REASONS
+from mrctl.record import InputError
+from mrctl.results.comparison import Interval, bootstrap_interval
+
+Array = NDArray[np.float64]
+
+METRICS: dict[str, tuple[str, str]] = {
+    "longitudinal_rmse": ("m", "RMS longitudinal error"),
+    "longitudinal_max": ("m", "largest longitudinal error"),
+    "lateral_rmse": ("m", "RMS lateral error"),
+    "lateral_max": ("m", "largest lateral error"),
+    "heading_rmse": ("rad", "RMS heading error"),
+    "heading_max": ("rad", "largest heading error"),
+    "position_rmse": ("m", "RMS distance to the reference"),
+    "v_rmse": ("m/s", "RMS error of the linear velocity"),
+    "omega_rmse": ("rad/s", "RMS error of the rotation velocity"),
+    "v_iae": ("m", "integral of the absolute error of the linear velocity"),
+    "omega_iae": ("rad", "integral of the absolute error of the rotation velocity"),
+    "v_itae": ("m s", "the same, weighted by the time since the lap began"),
+    "omega_itae": ("rad s", "the same, weighted by the time since the lap began"),
+    "feedback_share": ("1", "RMS feedback voltage over RMS voltage"),
+    "voltage_variation": ("V", "total variation of the voltage, both wheels"),
+    "saturation_time": ("s", "time in saturation"),
+    "energy": ("J", "electrical energy"),
+    "weight_norm": ("1", "norm of the learner's weights at the end of the lap"),
+    "guard_actions": ("1", "times the guard on the learner stepped in, or took a stronger measure"),
+    "excitation": ("1", "smallest eigenvalue of the Gram matrix of the physical features at the commanded motion"),
+}
+"""Name of a metric -> (unit, description)."""
+
+ROUNDING = 1e-10  # singular values of the features below this share of the largest come of rounding alone
+PER_RUN = ("label", "feedforward", "steering", "seed", "lap_time")
+SAMPLED = (
+    "x", "y", "x_ref", "y_ref", "v", "omega", "v_ref", "omega_ref", "longitudinal_error", "lateral_error",
+    "heading_error", "v_command", "omega_command", "feedback_left", "feedback_right", "voltage_left", "voltage_right",
+    "saturated", "power", "weight_norm", "guard",
+)  # fmt: skip
+
+
+class Laps(NamedTuple):
+    """How one run divides into laps."""
+
+    edges: NDArray[np.intp]
+    """First sample of each lap, and the end of the last one (laps + 1,)."""
+    failed: int | None
+    """Index of the lap in which the run failed, if it did."""
+
+
+def as_runs(result: xr.Dataset) -> xr.Dataset:
+    """The dataset with a `run` dimension and per-run coordinates, also for a single run that was squeezed."""
+    if "run" not in result.dims:
+        single = result.expand_dims("run" if "run" in result.coords else {"run": [0]})
+        result = single.assign_coords(
+            {name: ("run", [result[name].item()]) for name in PER_RUN if name in result.coords}
+        )
+    if "label" not in result.coords:
+        result = result.assign_coords(label=("run", [f"run {run}" for run in result["run"].values]))
+    return result
+
+
+def control_period(result: xr.Dataset) -> float:
+    """Seconds between the samples of a result.
+
+    Raises:
+        InputError: The result has neither two samples nor the attribute `control_period`.
+    """
+    time = result["time"].values
+    if len(time) > 1:
+        return float((time[-1] - time[0]) / (len(time) - 1))
+    if "control_period" not in result.attrs:
+        raise InputError("control_period: a result with fewer than two samples must give it")
+    return float(result.attrs["control_period"])
+
+
+def laps_of(run: xr.Dataset) -> Laps:
+    """Divides one run (no `run` dimension) into whole laps; one that ends before its first lap does counts as one lap.
+
+    What follows the last whole lap is left out, but a failure in it is charged to that lap.
+
+    Raises:
+        InputError: `lap_time` is shorter than the control period.
+    """
+    period = control_period(run)
+    alive = np.isfinite(run["x"].values)
+    failed, samples = _failed(run), _end(run)
+    lap = float(run["lap_time"]) / period if "lap_time" in run.coords else np.inf
+    if lap < 1:
+        raise InputError(f"lap_time: {lap * period:g} s is shorter than the control period of {period:g} s")
+    count = int(samples / lap + 1e-6) if np.isfinite(lap) else 0
+    edges = np.rint(np.arange(count + 1) * lap).astype(np.intp) if count else np.array([0, samples])
+    if not failed:
+        return Laps(edges, None)
+    dead = len(alive) if alive.all() else int(np.argmin(alive))
+    time = float(run["failure_time"]) if "failure_time" in run else np.nan
+    if np.isfinite(time):
+        dead = min(dead, int((time - float(run["time"][0])) / period + 1e-6))
+    return Laps(edges, int(np.clip(np.searchsorted(edges, dead, side="right") - 1, 0, len(edges) - 2)))
+
+
+def _failed(run: xr.Dataset) -> bool:
+    """Whether one run failed."""
+    return bool(run["failed"]) if "failed" in run else not bool(np.isfinite(run["x"]).all())
+
+
+def _end(run: xr.Dataset) -> int:
+    """Samples of one run: shorter runs are padded with NaN where results are put together, failed ones are not cut."""
+    alive = np.flatnonzero(np.isfinite(run["x"].values))
+    return len(run["time"]) if _failed(run) or not len(alive) else int(alive[-1]) + 1
+
+
+def per_lap(result: xr.Dataset) -> xr.Dataset:
+    """The metrics of every lap of every run.
+
+    Args:
+        result: What `simulate` returns, variables (run, time), or one run of it.
+
+    Returns:
+        `METRICS` with dims (run, lap), units in attrs; `laps`, how many each run has (NaN beyond them); `failed` and
+        `failure_time` as in the result. Coordinate `lap` counts from 1.
+
+    Raises:
+        InputError: The result lacks a variable, or a lap is shorter than the control period.
+    """
+    for name in ("time", *SAMPLED):
+        if name not in result.variables:
+            raise InputError(f"{name}: the result has no such variable")
+    runs = as_runs(result)
+    size = runs.sizes["run"]
+    period = control_period(runs)
+    narrow = runs[[name for name in ("x", "failed", "failure_time") if name in runs]]
+    divisions = [laps_of(narrow.isel(run=row)) for row in range(size)]
+    counts = [len(laps.edges) - 1 for laps in divisions]
+    scaled = {"half_track", "feature_scale"} <= set(runs.variables)
+    data = {name: runs[name].transpose("run", "time").values.astype(float) for name in SAMPLED}
+    values = {name: np.full((size, max(counts, default=0)), np.nan) for name in METRICS}
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for row, laps in enumerate(divisions):
+        groups.setdefault(tuple(laps.edges), []).append(row)
+    for edges, rows in groups.items():
+        for lap, (start, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+            rates = {name: data[name][rows, start:end] for name in SAMPLED}
+            # The step into a lap belongs to it, so that the variation of all laps adds up to that of the run.
+            stepping = ("voltage_left", "voltage_right", "guard")
+            steps = {name: data[name][rows, max(start - 1, 0) : end] for name in stepping}
+            for name, value in _lap_metrics(rates, steps, period).items():
+                values[name][rows, lap] = value
+            if scaled and end - start > 1:
+                command = np.stack([rates["v_command"], rates["omega_command"]], axis=-1)
+                half_track, scale = runs["half_track"].values[rows], runs["feature_scale"].values[rows]
+                values["excitation"][rows, lap] = excitation(command, period, half_track, scale)
+    for row, laps in enumerate(divisions):
+        if laps.failed is not None:
+            for value in values.values():
+                value[row, laps.failed :] = np.nan
+    variables: dict[str, tuple] = {
+        name: (("run", "lap"), values[name], {"units": unit, "long_name": text})
+        for name, (unit, text) in METRICS.items()
+    }
+    variables["laps"] = ("run", counts, {"units": "1", "long_name": "whole laps"})
+    variables["failed"] = ("run", [laps.failed is not None for laps in divisions])
+    nan = np.full(size, np.nan)
+    variables["failure_time"] = ("run", runs["failure_time"].values if "failure_time" in runs else nan, {"units": "s"})
+    coords = {name: ("run", runs[name].values) for name in ("run", *PER_RUN) if name in runs.coords}
+    return xr.Dataset(variables, {**coords, "lap": np.arange(1, max(counts, default=0) + 1)}, dict(result.attrs))
+
+
+def _lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float) -> dict[str, Array]:
+    """The metrics (rows,) of one lap, from its samples (rows, n)."""
+    found: dict[str, Array] = {}
+    for name in ("longitudinal", "lateral", "heading"):
+        error = data[f"{name}_error"]
+        found[f"{name}_rmse"] = _rms(error)
+        found[f"{name}_max"] = np.abs(error).max(-1)
+    found["position_rmse"] = np.hypot(_rms(data["x_ref"] - data["x"]), _rms(data["y_ref"] - data["y"]))
+    for name in ("v", "omega"):
+        error = np.abs(data[name] - data[f"{name}_ref"])
+        middle = (np.arange(error.shape[-1]) + 0.5) * period
+        found[f"{name}_rmse"] = _rms(error)
+        found[f"{name}_iae"] = error.sum(-1) * period
+        found[f"{name}_itae"] = (error * middle).sum(-1) * period
+    feedback = np.hypot(_rms(data["feedback_left"]), _rms(data["feedback_right"]))
+    voltage = np.hypot(_rms(data["voltage_left"]), _rms(data["voltage_right"]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found["feedback_share"] = np.where(feedback == 0, 0.0, feedback / voltage)  # at rest nobody works
+    variations = [np.abs(np.diff(steps[name])).sum(-1) for name in ("voltage_left", "voltage_right")]
+    found["voltage_variation"] = variations[0] + variations[1]
+    found["saturation_time"] = data["saturated"].sum(-1) * period
+    found["energy"] = data["power"].sum(-1) * period
+    found["weight_norm"] = data["weight_norm"][:, -1]
+    found["guard_actions"] = (np.diff(steps["guard"]) > 0).sum(-1).astype(float)
+    return found
+
+
+def excitation(command: Array, period: float, half_track: Array, scale: Array) -> Array:
+    """Smallest eigenvalue of the Gram matrix XᵀX/n of the 8 physical features X `(n, 8)` over some stretch of motion.
+
+    How well the least excited combination of coefficients can be told from what was driven: at zero a learner may hold
+    anything there (persistency of excitation; Ioannou and Sun 1996, section 4.3).
+
+    Args:
+        command: Commanded twist in m/s, rad/s, `(…, n, 2)`; its derivative is taken by central differences.
+        period: Seconds between the samples.
+        half_track: Of the nominal robot in m, `(…,)`.
+        scale: What the features are divided by, as from `feature_scale`, `(…, 8)`.
+
+    Returns:
+        `(…,)`; NaN where the motion is not finite.
+    """
+    n = command.shape[-2]
+    x = np.empty((*command.shape[:-1], scale.shape[-1]))
+    features(command, np.gradient(command, period, axis=-2), half_track[..., None], scale[..., None, :], x)
+    finite = np.asarray(np.isfinite(x).all(axis=(-2, -1)))
+    # Squared singular values resolve what eigenvalues of the product, rounded to 1e-16 of the largest, do not.
+    triangle = np.linalg.qr(np.where(finite[..., None, None], x, 0.0), mode="r")
+    sizes = np.linalg.svd(triangle, compute_uv=False)
+    least, largest = sizes[..., -1], sizes[..., 0]
+    least = np.where((least > ROUNDING * largest) & (n >= x.shape[-1]), least, 0.0)
+    return np.where(finite, np.square(least) / n, np.nan)
+
+
+def _rms(signal: Array) -> Array:
+    """Root of the mean square along the last axis."""
+    return np.sqrt(np.mean(np.square(signal), axis=-1))
+
+
+def guard_events(result: xr.Dataset) -> pd.DataFrame:
+    """What the guard on the learner did, in order of time, run by run.
+
+    Args:
+        result: What `simulate` returns, or one run of it.
+
+    Returns:
+        A row an event: run, time in s, action (limit, freeze, fallback, or resume after the last two), and the reason
+        in words.
+    """
+    runs = as_runs(result)
+    rows = []
+    for row, number in enumerate(runs["run"].values):
+        action, reason = (np.nan_to_num(runs[name].values[row]).astype(int) for name in ("guard", "guard_reason"))
+        for k in np.flatnonzero(np.diff(action, prepend=0)):
+            before = action[k - 1] if k else 0
+            if action[k] == NONE and before == LIMIT or np.isnan(runs["guard"].values[row, k]):
+                continue  # a limit ends by itself, a run that failed has no guard
+            name = ACTIONS[action[k]] if action[k] != NONE else "resume"
+            rows.append((number, float(runs["time"][k]), name, REASONS[reason[k]]))
+    return pd.DataFrame(rows, columns=["run", "time", "action", "reason"])
+
+
+def laps_to_converge(laps: xr.Dataset, metric: str, factor: float = 1.2) -> xr.DataArray:
+    """The first lap from which on the metric stays within `factor` of its value in the run's last lap.
+
+    Args:
+        laps: What `per_lap` returns.
+        metric: One of `METRICS`.
+        factor: How close counts as converged, at least 1.
+
+    Returns:
+        The lap's number (run,), from 1; NaN for a run that failed.
+
+    Raises:
+        InputError: No such metric, or a factor below 1.
+    """
+    known(metric)
+    if not factor >= 1:
+        raise InputError(f"factor: {factor} is below 1")
+    number = np.full(laps.sizes["run"], np.nan)
+    for row, count in enumerate(laps["laps"].values):
+        value = laps[metric].values[row, :count]
+        if np.isfinite(value[-1]):
+            outside = np.flatnonzero(~(value <= factor * value[-1]))
+            number[row] = 1 if not len(outside) else outside[-1] + 2
+    attrs = {"units": "1", "long_name": f"laps to {factor:g}× the final {METRICS[metric][1]}"}
+    return xr.DataArray(number, {"run": laps["run"].values}, ("run",), "laps_to_converge", attrs)
+
+
+def recovery_time(
+    result: xr.Dataset,
+    event_time: float,
+    error: str = "lateral_error",
+    window: float | None = None,
+    factor: float = 1.2,
+    until: float | None = None,
+) -> xr.DataArray:
+    """Time after a step change until the moving RMS error is back, to stay, within `factor` of its value before.
+
+    Args:
+        result: What `simulate` returns.
+        event_time: When the change came, s.
+        error: An error variable of the result, or "v" or "omega" for the error of that velocity.
+        window: Length of the trailing window, s; one lap of the run if not given.
+        factor: How close counts as recovered.
+        until: Look no further than this, s (the next change); the end of the run if not given.
+
+    Returns:
+        Seconds (run,): 0 if the error never left the band, infinite if it is outside at the end, NaN if the run failed.
+
+    Raises:
+        InputError: The event is outside the run, or the error unknown.
+    """
+    runs, period = as_runs(result), control_period(result)
+    stop = len(runs["time"]) if until is None else _sample(runs, until, "until")
+    event = _sample(runs, event_time, "event_time")
+    if not 0 < event < stop:
+        raise InputError(f"event_time: {event_time:g} s leaves no samples on both of its sides")
+    narrow = runs[[name for name in ("x", "failed") if name in runs]]
+    squares = np.square(_error(runs, error))
+    seconds = np.full(len(squares), np.nan)
+    for row, length in enumerate(_windows(runs, window)):
+        end = min(stop, _end(narrow.isel(run=row)))
+        square = squares[row, :end]
+        if end <= event or not np.isfinite(square).all():
+            continue
+        total = np.concatenate([[0.0], np.cumsum(square)])
+        last = np.arange(event, end + 1)  # the first value is the one before the event
+        first = np.maximum(last - length, 0)
+        moving = np.sqrt(np.maximum(total[last] - total[first], 0) / (last - first))
+        outside = np.flatnonzero(moving > factor * moving[0] + 1e-12)
+        back = outside[-1] + 1 if len(outside) else 0
+        seconds[row] = back * period if back < len(moving) else np.inf
+    attrs = {"units": "s", "long_name": f"time until the RMS of {error} is back within {factor:g}×"}
+    return xr.DataArray(seconds, {"run": runs["run"].values}, ("run",), "recovery_time", attrs)
+
+
+def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor: float = 1.2) -> xr.DataArray:
+    """Laps after a change until the metric of whole laps is back, to stay, within `factor` of the lap before it.
+
+    Args:
+        laps: What `per_lap` returns.
+        metric: One of `METRICS`.
+        change: The number of the lap in whose beginning the change came, from 2.
+        until: Number of the last lap to look at, before the next change.
+        factor: How close counts as recovered.
+
+    Returns:
+        Laps (run,): 0 if the lap of the change itself is within, infinite if the last one is not, NaN if it failed.
+
+    Raises:
+        InputError: No such metric, or laps that are not there.
+    """
+    known(metric)
+    if not 2 <= change <= until <= laps.sizes["lap"]:
+        raise InputError(f"change: lap {change} and lap {until} are not in order within 2 to {laps.sizes['lap']}")
+    values = laps[metric].transpose("run", "lap").values[:, change - 2 : until]
+    outside = ~(values[:, 1:] <= factor * values[:, :1])
+    last = outside.shape[1] - np.argmax(outside[:, ::-1], axis=1)
+    back = np.where(outside[:, -1], np.inf, np.where(outside.any(axis=1), last, 0))
+    number = np.where(np.isfinite(values).all(axis=1), back, np.nan)
+    attrs = {"units": "1", "long_name": f"laps until {METRICS[metric][1]} is back within {factor:g}×"}
+    return xr.DataArray(number, {"run": laps["run"].values}, ("run",), "recovery_laps", attrs)
+
+
+def error_on_return(
+    result: xr.Dataset,
+    event_time: float,
+    return_time: float,
+    error: str = "lateral_error",
+    window: float | None = None,
+) -> xr.DataArray:
+    """Forgetting: RMS error just after the old conditions return, over that just before they changed.
+
+    Args:
+        result: What `simulate` returns.
+        event_time: When the conditions changed, s.
+        return_time: When they changed back, s.
+        error: As in `recovery_time`.
+        window: Seconds before and after; one lap of the run if not given.
+
+    Returns:
+        The ratio (run,); 1 is a learner that forgot nothing, NaN a run that failed.
+
+    Raises:
+        InputError: The times are out of order or outside the run, or the error is unknown.
+    """
+    runs = as_runs(result)
+    event, back = _sample(runs, event_time, "event_time"), _sample(runs, return_time, "return_time")
+    if not 0 < event < back < len(runs["time"]):
+        raise InputError(f"return_time: {return_time:g} s must follow event_time {event_time:g} s, within the run")
+    signal = _error(runs, error)
+    ratio = [
+        float(np.divide(_rms(signal[row, back : back + length]), _rms(signal[row, max(event - length, 0) : event])))
+        for row, length in enumerate(_windows(runs, window))
+    ]
+    attrs = {"units": "1", "long_name": f"RMS of {error} on return over that before"}
+    return xr.DataArray(ratio, {"run": runs["run"].values}, ("run",), "error_on_return", attrs)
+
+
+def _sample(runs: xr.Dataset, time: float, field: str) -> int:
+    """Index of the first sample at or after a time."""
+    if not np.isfinite(time):
+        raise InputError(f"{field}: {time} is not a time")
+    return int(np.searchsorted(runs["time"].values, time - 1e-6 * control_period(runs)))
+
+
+def _windows(runs: xr.Dataset, window: float | None) -> list[int]:
+    """Window length of each run in samples."""
+    period = control_period(runs)
+    if window is None and "lap_time" not in runs.coords:
+        raise InputError("window: must be given, the result has no lap_time")
+    seconds = runs["lap_time"].values if window is None else np.full(runs.sizes["run"], window)
+    if not (seconds >= period).all():
+        raise InputError(f"window: shorter than the control period of {period:g} s")
+    return [int(min(np.rint(one / period), len(runs["time"]))) for one in seconds]
+
+
+def _error(runs: xr.Dataset, name: str) -> Array:
+    """An error signal (run, time): a variable, or a velocity minus its reference."""
+    if name in ("v", "omega"):
+        signal = runs[name] - runs[f"{name}_ref"]
+    elif name.endswith("_error") and name in runs:
+        signal = runs[name]
+    else:
+        names = ", ".join(["v", "omega", *(str(key) for key in runs.data_vars if str(key).endswith("_error"))])
+        raise InputError(f"error: {name!r} is not one of {names}")
+    return signal.transpose("run", "time").values.astype(float)
+
+
+def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
+    """A row per run: what it was, whether it failed, and its metrics in one lap.
+
+    Args:
+        result: What `simulate` or `per_lap` returns.
+        lap: Number of the lap from 1, or from the run's end from −1. NaN where a run has no such lap.
+
+    Returns:
+        Columns label, feedforward, steering, seed (those there are), laps, failed, failure_time and `METRICS`;
+        `attrs["failed"]` is the number of failed runs, `attrs["units"]` the units by column.
+
+    Raises:
+        InputError: No run has that lap.
+    """
+    laps = result if "lap" in result.dims else per_lap(result)
+    counts = laps["laps"].values
+    index = np.where(lap > 0, lap - 1, counts + lap)
+    there = (index >= 0) & (index < counts)
+    if lap == 0 or not there.any():
+        raise InputError(f"lap: {lap} is not in 1 to {counts.max(initial=0)}, nor counted from the end by −1, −2, …")
+    rows = np.arange(len(counts))
+    columns = {name: laps[name].values for name in PER_RUN[:-1] if name in laps.coords}
+    columns |= {name: laps[name].values for name in ("laps", "failed", "failure_time")}
+    columns |= {name: np.where(there, laps[name].values[rows, np.where(there, index, 0)], np.nan) for name in METRICS}
+    table = pd.DataFrame(columns, index=pd.Index(laps["run"].values, name="run"))
+    table.attrs = {"failed": int(laps["failed"].sum()), "units": {name: unit for name, (unit, _) in METRICS.items()}}
+    return table
+
+
+def statistics(
+    table: pd.DataFrame, metrics: Iterable[str] | None = None, by: str = "label", level: float = 0.95, seed: int = 0
+) -> pd.DataFrame:
+    """Means over the runs that share a label, with bootstrap intervals and the number of failures.
+
+    Args:
+        table: What `summary` returns.
+        metrics: Some of `METRICS`, or all.
+        by: The column that names the groups.
+        level: Confidence level.
+        seed: Of the bootstrap.
+
+    Returns:
+        Columns of `Interval`, indexed by (group, metric), groups in order of appearance.
+
+    Raises:
+        InputError: An unknown metric or column.
+    """
+    if by not in table:
+        raise InputError(f"by: the table has no column {by!r}")
+    names = [known(name) for name in (METRICS if metrics is None else metrics)]
+    rows = {
+        (group, name): bootstrap_interval(rows[name].to_numpy(), level, seed=seed)
+        for group, rows in table.groupby(by, sort=False)
+        for name in names
+    }
+    index = pd.MultiIndex.from_tuples(rows, names=[by, "metric"])
+    return pd.DataFrame(list(rows.values()), index=index, columns=pd.Index(Interval._fields))
+
+
+def known(metric: str) -> str:
+    """The name itself, if it is one of `METRICS`.
+
+    Raises:
+        InputError: It is not; the message lists those that are.
+    """
+    if metric not in METRICS:
+        raise InputError(f"metric: {metric!r} is not one of {', '.join(METRICS)}")
+    return metric

@@ -1,0 +1,710 @@
+"""Figures of a result, fit to print: 88 mm or 180 mm wide, Okabe and Ito's colours, units on every axis.
+
+Each function returns a matplotlib `Figure` and shows nothing. Results may hold several runs or one that was squeezed;
+runs with the same `label` share a colour and one entry in the legend, which counts those that failed. A cross marks
+where a run failed. `window` is a pair of times in s, `lap` a lap's number from 1, or from the run's end from −1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Any, NamedTuple, ParamSpec
+
+import matplotlib as mpl
+import numpy as np
+import xarray as xr
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Polygon
+
+from mrctl.record import InputError
+from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap
+
+COLUMN, PAGE = 88 / 25.4, 180 / 25.4  # inches
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000")
+REFERENCE: dict[str, Any] = {"color": "0.25", "lw": 0.8, "ls": (0, (4, 2)), "zorder": 3}
+FORMATS = ("png", "pdf")
+STYLE: dict[Any, Any] = {
+    "font.family": "STIXGeneral",
+    "mathtext.fontset": "stix",
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "legend.fontsize": 8,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "axes.linewidth": 0.6,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.formatter.limits": (-3, 4),
+    "axes.formatter.use_mathtext": True,
+    "axes.prop_cycle": cycler(color=COLOURS),
+    "grid.color": "0.9",
+    "grid.linewidth": 0.5,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "lines.linewidth": 1.0,
+    "legend.frameon": False,
+    "legend.handlelength": 1.6,
+    "figure.dpi": 120,
+    "savefig.dpi": 200,
+    "pdf.fonttype": 42,
+}
+ERRORS = {
+    "longitudinal_error": "longitudinal\nerror (m)",
+    "lateral_error": "lateral\nerror (m)",
+    "heading_error": "heading\nerror (rad)",
+}
+
+P = ParamSpec("P")
+Point = Sequence[float] | np.ndarray
+
+
+class Curve(NamedTuple):
+    """One run, cut to what is to be seen, and how to draw it."""
+
+    data: xr.Dataset
+    label: str
+    style: dict[str, Any]
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Draws in the style of this module and leaves the user's settings alone."""
+
+    @wraps(draw)
+    def inner(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with mpl.rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return inner
+
+
+def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
+    """Writes a figure as PNG (200 dpi) and PDF.
+
+    Args:
+        figure: Any figure.
+        folder: Where to; created if need be.
+        name: File name without suffix.
+
+    Returns:
+        The paths written.
+
+    Raises:
+        InputError: The folder cannot be created or written to.
+    """
+    paths = [Path(folder) / f"{name}.{suffix}" for suffix in FORMATS]
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        with mpl.rc_context({"pdf.fonttype": STYLE["pdf.fonttype"]}):
+            figure.savefig(paths[0], dpi=STYLE["savefig.dpi"])
+            figure.savefig(paths[1], metadata={"CreationDate": None})  # the same figure, the same file
+    except OSError as error:
+        raise InputError(f"{folder}: cannot write figures there: {error.strerror or error}") from None
+    return paths
+
+
+@styled
+def path(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
+    """The way P went, over the reference; a dot marks the start."""
+    figure, (axes,) = _figure(COLUMN, COLUMN * 0.95)
+    curves = _curves(result, window, lap)
+    _references(axes, curves, "x_ref", "y_ref")
+    for data, _, style in curves:
+        x, y = data["x"].values, data["y"].values
+        axes.plot(x, y, **style)
+        axes.plot(x[:1], y[:1], "o", ms=3.5, color=style["color"], zorder=4)
+        _cross(axes, data, x, y)
+    axes.set(xlabel="$x$ (m)", ylabel="$y$ (m)", aspect="equal")
+    axes.set_adjustable("datalim")
+    _legend(figure, curves, reference=True)
+    return figure
+
+
+@styled
+def velocities(
+    result: xr.Dataset,
+    signals: Sequence[str] = ("v", "omega"),
+    window: tuple[float, float] | None = None,
+    lap: int | None = None,
+) -> Figure:
+    """Linear and rotation velocity over time, or one of them, with the original reference (the paper's figure 4)."""
+    figure, axes = _figure(COLUMN, (0.1 + 0.4 * len(signals)) * COLUMN, rows=len(signals))
+    curves = _curves(result, window, lap)
+    texts = {"v": r"$V_{AV}$ (m/s)", "omega": r"$\dot\theta$ (rad/s)"}
+    for one, name in zip(axes, signals, strict=True):
+        _references(one, curves, "time", f"{name}_ref")
+        _signals(one, curves, name, texts[name])
+    _legend(figure, curves, reference=True)
+    return figure
+
+
+@styled
+def errors(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
+    """Longitudinal, lateral and heading error over time."""
+    return _errors(_curves(result, window, lap))
+
+
+@styled
+def compare_errors(
+    result_pid: xr.Dataset,
+    result_nn: xr.Dataset,
+    labels: tuple[str, str] = ("PID", "PID + neural feedforward"),
+    window: tuple[float, float] | None = None,
+    lap: int | None = None,
+) -> Figure:
+    """Tracking errors of two controllers in the same axes, with their RMS values (the paper's figure 5).
+
+    Args:
+        result_pid: Runs of the one, conventional PID in the paper.
+        result_nn: Runs of the other, with neural feedforward in the paper.
+        labels: What to call them.
+        window: Times to show, s.
+        lap: Or the lap to show.
+    """
+    curves = []
+    for result, label, colour in zip((result_pid, result_nn), labels, COLOURS, strict=False):
+        for data, _, style in _curves(result, window, lap):
+            curves.append(Curve(data, label, {**style, "color": colour}))
+    figure = _errors(curves)
+    for axes, name in zip(figure.axes, ERRORS, strict=True):
+        for row, label in enumerate(labels):
+            colour = COLOURS[row]
+            squares = np.concatenate([np.square(data[name].values) for data, other, _ in curves if other == label])
+            text = f"RMS {np.sqrt(squares.mean()):.2g}" if np.isfinite(squares).all() else "failed"
+            axes.text(1 - 0.26 * (1 - row), 1.0, text, color=colour, fontsize=8, ha="right", va="bottom",
+                      transform=axes.transAxes)  # fmt: skip
+    return figure
+
+
+@styled
+def voltages(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
+    """Feedback, feedforward and total voltage of each wheel over time; a column per run."""
+    curves = _curves(result, window, lap)
+    count = len(curves)
+    width = COLUMN if count == 1 else max(PAGE, 60 / 25.4 * count)
+    figure, axes = _figure(width, 0.95 * COLUMN, rows=2, columns=count, sharey=True)
+    # The total lies wide and pale under whichever part makes it up.
+    parts = (("voltage", "0.75", 3.0), ("feedback", COLOURS[1], 1.0), ("feedforward", COLOURS[2], 1.0))
+    for column, (data, label, _) in enumerate(curves):
+        for row, wheel in enumerate(("left", "right")):
+            one = axes[row * count + column]
+            for name, colour, line in parts:
+                signal = data[f"{name}_{wheel}"].values
+                one.plot(data["time"].values, signal, color=colour, lw=line)
+                _cross(one, data, data["time"].values, signal)
+            if column == 0:
+                one.set_ylabel(f"$U_{wheel[0]}$ (V)")
+            if row == 0 and count > 1:
+                one.set_title(label)
+            if row == 1:
+                one.set_xlabel("time (s)")
+    handles = [Line2D([], [], color=colour, lw=line) for _, colour, line in parts]
+    figure.legend(handles, ["total", "feedback", "feedforward"], loc="outside upper center", ncols=3)
+    return figure
+
+
+@styled
+def feedforward_outputs(
+    result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None
+) -> Figure:
+    """What the feedforward asks of the left and the right motor, over time (the paper's figure 6)."""
+    figure, axes = _figure(COLUMN, 0.9 * COLUMN, rows=2, sharey=True)
+    curves = _curves(result, window, lap)
+    for one, wheel in zip(axes, ("left", "right"), strict=True):
+        _signals(one, curves, f"feedforward_{wheel}", rf"$U_{{ff,{wheel[0]}}}$ (V)")
+    _legend(figure, curves)
+    return figure
+
+
+@styled
+def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omega_rmse")) -> Figure:
+    """Metrics lap by lap on a log axis: a thin line per run, a thick one for the mean of the runs that share a label.
+
+    Args:
+        result: What `simulate` or `metrics.per_lap` returns.
+        metrics: Some of `METRICS`, a panel each.
+
+    Raises:
+        InputError: An unknown metric, or none.
+    """
+    if not metrics:
+        raise InputError("metrics: none given")
+    names = [known(name) for name in metrics]
+    laps = as_runs(result if "lap" in result.dims else per_lap(result))
+    columns = min(2, len(names))
+    rows = -(-len(names) // columns)
+    figure, axes = _figure(COLUMN if columns == 1 else PAGE, 0.75 * rows * COLUMN, rows=rows, columns=columns)
+    number = laps["lap"].values
+    labels = [str(label) for label in laps["label"].values]
+    for unused in axes[len(names) :]:
+        unused.remove()
+    for one, name in zip(axes, names, strict=False):
+        ends: list[tuple[float, float, str, str]] = []
+        for order, label in enumerate(dict.fromkeys(labels)):
+            rows = [row for row, other in enumerate(labels) if other == label]
+            values, colour = laps[name].values[rows], COLOURS[order % len(COLOURS)]
+            finite = np.isfinite(values)
+            some = finite.any(0)
+            mean = np.where(finite, values, 0).sum(0)[some] / finite.sum(0)[some]
+            if len(rows) > 1:
+                one.plot(number, values.T, color=colour, lw=0.5, alpha=0.4)
+            one.plot(number[some], mean, "o-", ms=2.5, lw=1.2, color=colour)
+            failed = int(laps["failed"].values[rows].sum())
+            at = (number[some][-1], mean[-1]) if some.any() else (number[0], np.nan)
+            ends.append((float(at[0]), float(at[1]), _counted(label, failed, len(rows)), colour))
+        unit, text = METRICS[name]
+        one.set(xlabel="lap", ylabel=text if unit == "1" else f"{text} ({unit})", yscale="log")
+        one.xaxis.get_major_locator().set_params(integer=True)
+        _label_ends(one, ends)
+    return figure
+
+
+@styled
+def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence[int] = ()) -> Figure:
+    """A metric lap by lap on a log axis, a panel a case: the mean of the runs that share a label, and their range.
+
+    Args:
+        cases: What `metrics.per_lap` returns, by title.
+        metric: One of `METRICS`.
+        changes: Laps in whose beginning something changes: dotted lines.
+
+    Raises:
+        InputError: An unknown metric, or no case.
+    """
+    unit, text = METRICS[known(metric)]
+    if not cases:
+        raise InputError("cases: none given")
+    columns = 2 if len(cases) in (2, 4) else min(3, len(cases))
+    rows = -(-len(cases) // columns)
+    figure, axes = _figure(PAGE, (0.12 + 0.55 * rows) * COLUMN, rows=rows, columns=columns, sharey=True)
+    order: list[str] = []
+    for one, (title, laps) in zip(axes, cases.items(), strict=False):
+        number, labels = laps["lap"].values, [str(label) for label in laps["label"].values]
+        for label in dict.fromkeys(labels):
+            order += [label] if label not in order else []
+            values = laps[metric].values[[row for row, other in enumerate(labels) if other == label]]
+            some = np.isfinite(values).any(0)
+            line = _line(order.index(label))
+            if some.any():
+                low, mean, high = (f(values[:, some], 0) for f in (np.nanmin, np.nanmean, np.nanmax))
+                one.fill_between(number[some], low, high, color=line["color"], alpha=0.15, lw=0)
+                one.plot(number[some], mean, marker=".", ms=3, **line)
+        for lap in changes:
+            one.axvline(lap - 0.5, color="0.4", lw=0.8, ls=":")
+        one.set(title=title, yscale="log")
+        one.xaxis.get_major_locator().set_params(integer=True)
+    for place, one in enumerate(axes):
+        one.set_xlabel("lap" if place + columns >= len(cases) else "")
+        one.tick_params(labelbottom=place + columns >= len(cases))
+        if place % columns == 0:
+            one.set_ylabel(text if unit == "1" else f"{text} ({unit})", fontsize=8)
+    for unused in axes[len(cases) :]:
+        unused.remove()
+    handles = [Line2D([], [], **_line(k)) for k in range(len(order))]
+    figure.legend(handles, order, loc="outside upper center", ncols=min(8, len(order)))
+    return figure
+
+
+@styled
+def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
+    """The share of runs below each value, on a log axis; runs that are not finite never count as below.
+
+    Args:
+        samples: Positive numbers, one a run, by name.
+        label: What they are, with its unit.
+    """
+    figure, (axes,) = _figure(COLUMN, 0.8 * COLUMN)
+    for order, values in enumerate(samples.values()):
+        finite = np.sort(values[np.isfinite(values)])
+        axes.step(finite, np.arange(1, len(finite) + 1) / max(1, len(values)), where="post", **_line(order))
+    axes.axvline(1, color="0.4", lw=0.8, ls=":")
+    axes.set(xlabel=label, ylabel="share of runs", xscale="log", ylim=(0, 1.02))
+    handles = [Line2D([], [], **_line(k)) for k in range(len(samples))]
+    figure.legend(handles, list(samples), loc="outside upper center", ncols=4)
+    return figure
+
+
+class InverseMap(NamedTuple):
+    """A feedforward in steady motion, beside the truth."""
+
+    v: np.ndarray
+    """Speeds in m/s (n,)."""
+    omega: np.ndarray
+    """Rotation velocities in rad/s (m,)."""
+    learned: np.ndarray
+    """U_Σ and U_Δ in V (m, n, 2)."""
+    true: np.ndarray
+    """The same of the true inverse dynamics."""
+    path: np.ndarray
+    """Where it was trained: commanded twists (T, 2)."""
+
+
+@styled
+def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
+    """Learned against true inverse dynamics as heat maps over the twist: a row a learner; true, learned, error in V.
+
+    The white line is where the robot drove while learning.
+
+    Raises:
+        InputError: No map.
+    """
+    if not maps:
+        raise InputError("maps: none given")
+    figure, axes = _figure(PAGE, (0.1 + 0.36 * len(maps)) * PAGE, rows=len(maps), columns=6, sharey=True)
+    true = np.stack([one.true for one in maps.values()])
+    for row, (name, one) in enumerate(maps.items()):
+        for channel, symbol in enumerate((r"\Sigma", r"\Delta")):
+            bound = float(np.abs(true[..., channel]).max())
+            error = one.learned[..., channel] - one.true[..., channel]
+            columns = ((one.true[..., channel], "true", "RdBu_r"), (one.learned[..., channel], "learned", "RdBu_r"),
+                       (error, "error", "PuOr_r"))  # fmt: skip
+            for column, (values, what, colours) in enumerate(columns):
+                panel = axes[6 * row + 3 * channel + column]
+                limit = bound / (4 if what == "error" else 1)
+                look: dict[str, Any] = {"cmap": colours, "vmin": -limit, "vmax": limit, "rasterized": True}
+                image = panel.pcolormesh(one.v, one.omega, values, **look)
+                panel.plot(*one.path.T, color="white", lw=0.5)
+                panel.grid(False)
+                panel.set(xlim=one.v[[0, -1]], ylim=one.omega[[0, -1]])
+                if row == 0:
+                    panel.set_title(f"$U_{symbol}$ {what} (V)", fontsize=8)
+                if row == len(maps) - 1:
+                    panel.set_xlabel("$V$ (m/s)")
+                    figure.colorbar(image, ax=axes[3 * channel + column :: 6], orientation="horizontal", aspect=12)
+                if column == channel == 0:
+                    panel.set_ylabel(f"{name}\n$\\dot\\theta$ (rad/s)")
+    return figure
+
+
+def _line(order: int) -> dict[str, Any]:
+    """Colour and dashes of the label in that place; colours come again with other dashes."""
+    again, colour = divmod(order, len(COLOURS))
+    return {"color": COLOURS[colour], "ls": ("-", "--", ":")[again % 3]}
+
+
+def _figure(width: float, height: float, rows: int = 1, columns: int = 1, sharey: bool = False) -> tuple[Figure, list]:
+    """A figure and its axes, row by row. No pyplot: nothing to close, and no figure shown twice in a notebook."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=rows > 1, sharey=sharey, squeeze=False)
+    return figure, list(axes.flat)
+
+
+def _curves(result: xr.Dataset, window: tuple[float, float] | None, lap: int | None) -> list[Curve]:
+    """The runs of a result, cut to a window or a lap, with their labels and colours."""
+    if window is not None and lap is not None:
+        raise InputError("window: give a window or a lap, not both")
+    runs = as_runs(result)
+    labels = [str(label) for label in runs["label"].values]
+    order = list(dict.fromkeys(labels))
+    curves = []
+    for row, label in enumerate(labels):
+        many = labels.count(label) > 1
+        style: dict[str, Any] = {"color": COLOURS[order.index(label) % len(COLOURS)], "lw": 0.7 if many else 1.0}
+        if many:
+            style["alpha"] = 0.7
+        curves.append(Curve(_cut(runs.isel(run=row), window, lap), label, style))
+    if not any(curve.data.sizes["time"] for curve in curves):
+        raise InputError(f"window: no samples in {window}" if window else "result: no samples")
+    return curves
+
+
+def _cut(run: xr.Dataset, window: tuple[float, float] | None, lap: int | None) -> xr.Dataset:
+    """The samples of one run within a window or a lap."""
+    if window is not None:
+        start, end = window
+        if not start < end:
+            raise InputError(f"window: {start:g} s is not before {end:g} s")
+        time = run["time"].values
+        return run.isel(time=(time >= start) & (time <= end))
+    if lap is None:
+        return run
+    edges = laps_of(run).edges
+    index = lap - 1 if lap > 0 else len(edges) - 1 + lap
+    if lap == 0 or not 0 <= index < len(edges) - 1:
+        raise InputError(f"lap: {lap} is not in 1 to {len(edges) - 1}, nor counted from the end by −1, −2, …")
+    return run.isel(time=slice(edges[index], edges[index + 1]))
+
+
+def _signals(axes: Axes, curves: Iterable[Curve], name: str, label: str) -> None:
+    """One variable of every run over time."""
+    for data, _, style in curves:
+        time, signal = data["time"].values, data[name].values
+        axes.plot(time, signal, **style)
+        _cross(axes, data, time, signal)
+    axes.set_ylabel(label)
+    place = axes.get_subplotspec()
+    if place is not None and place.is_last_row():
+        axes.set_xlabel("time (s)")
+
+
+def _references(axes: Axes, curves: Iterable[Curve], x: str, y: str) -> None:
+    """The references, each once where runs share one."""
+    seen = set()
+    for data, _, _ in curves:
+        points = np.column_stack([data[x].values, data[y].values])
+        if (key := points.tobytes()) not in seen:
+            seen.add(key)
+            axes.plot(*points.T, **REFERENCE)
+
+
+def _cross(axes: Axes, data: xr.Dataset, x: np.ndarray, y: np.ndarray) -> None:
+    """Marks the last sample of a run that fails within view."""
+    dead = ~np.isfinite(x + y)
+    if "failed" in data and bool(data["failed"]) and dead.any() and not dead[0]:
+        last = int(np.argmax(dead)) - 1
+        axes.plot(x[last], y[last], "X", ms=5, color="black", mec="white", mew=0.5, zorder=5)
+
+
+def _counted(label: str, failed: int, count: int) -> str:
+    """A label that says how many of its runs failed."""
+    if not failed:
+        return label
+    return f"{label} (failed)" if count == 1 else f"{label} ({failed} of {count} failed)"
+
+
+def _legend(figure: Figure, curves: Sequence[Curve], reference: bool = False) -> None:
+    """An entry per label, above the axes, with the number of failures."""
+    entries: dict[str, list[Curve]] = {}
+    for curve in curves:
+        entries.setdefault(curve.label, []).append(curve)
+    handles = [Line2D([], [], color=group[0].style["color"]) for group in entries.values()]
+    failed = [sum(bool(data["failed"]) for data, _, _ in group if "failed" in data) for group in entries.values()]
+    names = [_counted(name, lost, len(entries[name])) for name, lost in zip(entries, failed, strict=True)]
+    if reference:
+        dashes = {key: value for key, value in REFERENCE.items() if key != "zorder"}
+        handles, names = [Line2D([], [], **dashes), *handles], ["reference", *names]
+    columns = 2 if sum(map(len, names)) > 36 and figure.get_figwidth() < PAGE else 4
+    figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), columns))
+
+
+def _errors(curves: Sequence[Curve]) -> Figure:
+    """Three panels of errors."""
+    figure, axes = _figure(COLUMN, 1.15 * COLUMN, rows=3)
+    for one, (name, label) in zip(axes, ERRORS.items(), strict=True):
+        one.axhline(0, color="0.6", lw=0.6)
+        _signals(one, curves, name, label)
+    figure.align_ylabels()
+    _legend(figure, curves)
+    return figure
+
+
+def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> None:
+    """Names each line at its end, spread so that no two names overlap."""
+    low, high = np.log10(axes.get_ylim())
+    gap = 0.075  # of the axis: a line of 8 pt in a panel of 50 mm
+    shown = sorted((e for e in ends if np.isfinite(e[1]) and e[1] > 0), key=lambda end: end[1])
+    heights = np.array([(np.log10(y) - low) / (high - low) for _, y, _, _ in shown])
+    places = heights.copy()
+    for _ in range(200):
+        short = gap - np.diff(places)
+        if not (short > 1e-3).any():
+            break
+        push = np.where(short > 0, short / 2, 0)
+        places[:-1] -= push
+        places[1:] += push
+    for (x, y, label, colour), place in zip(shown, places, strict=True):
+        axes.annotate(
+            label, (x, y), xytext=(1.03, place), textcoords="axes fraction", color=colour, fontsize=8, va="center",
+            annotation_clip=False, arrowprops={"arrowstyle": "-", "color": colour, "lw": 0.4, "shrinkB": 2},
+        )  # fmt: skip
+    lost = [label for _, y, label, _ in ends if not np.isfinite(y)]
+    if lost:
+        axes.text(0.02, 0.02, ", ".join(lost), fontsize=8, transform=axes.transAxes)
+
+
+# The paper's drawings
+
+
+def _canvas(width: float, height: float, limits: tuple[float, float, float, float]) -> tuple[Figure, Axes]:
+    """An empty sheet with equal axes and the given limits (x0, x1, y0, y1)."""
+    figure = Figure(figsize=(width, height))
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set(xlim=limits[:2], ylim=limits[2:], aspect="equal")
+    axes.set_axis_off()
+    return figure, axes
+
+
+def _arrow(axes: Axes, start: Point, end: Point, style: str = "-|>", **options: object) -> None:
+    """An arrow between two points."""
+    look: dict[str, Any] = {"mutation_scale": 8, "lw": 0.8, "color": "black", "shrinkA": 0, "shrinkB": 0, **options}
+    axes.add_patch(FancyArrowPatch((start[0], start[1]), (end[0], end[1]), arrowstyle=style, **look))
+
+
+@styled
+def posture_definition() -> Figure:
+    """Posture of the car-like robot in the world frame, drawn (the paper's figure 2)."""
+    figure, axes = _canvas(COLUMN, 0.82 * COLUMN, (-0.75, 6.35, -0.7, 5.122))
+    theta, phi, wheelbase, half_track = np.deg2rad(28), np.deg2rad(30), 2.4, 0.8
+    p = np.array([1.9, 1.75])
+
+    def along(angle: float) -> np.ndarray:
+        return np.array([np.cos(angle), np.sin(angle)])
+
+    forward, left = along(theta), along(theta + np.pi / 2)
+
+    def at(x: float, y: float) -> np.ndarray:
+        return p + x * forward + y * left
+
+    def wheel(centre: np.ndarray, angle: float) -> None:
+        a, b = 0.36 * along(angle), 0.11 * along(angle + np.pi / 2)
+        corners = [centre + a + b, centre + a - b, centre - a - b, centre - a + b]
+        axes.add_patch(Polygon(corners, fc="0.3", ec="black", lw=0.6, joinstyle="round", zorder=3))
+
+    def text(place: Point, string: str, colour: str = "black") -> None:
+        axes.text(place[0], place[1], string, ha="center", va="center", fontsize=10, color=colour, zorder=6)
+
+    thin = {"color": "0.45", "lw": 0.6}
+    dashed = {**thin, "ls": (0, (4, 2.5))}
+    # World frame
+    _arrow(axes, (0, 0), (5.9, 0))
+    _arrow(axes, (0, 0), (0, 4.75))
+    text((5.95, -0.28), "$x_0$")
+    text((-0.28, 4.65), "$y_0$")
+    text((-0.28, -0.28), "$O_0$")
+    axes.plot([p[0], p[0], 0], [0, p[1], p[1]], **dashed)
+    text((p[0], -0.28), "$x$")
+    text((-0.28, p[1]), "$y$")
+    # Body, wheels
+    outline = [at(-0.55, 0.55), at(3.0, 0.55), at(3.0, -0.55), at(-0.55, -0.55)]
+    axes.add_patch(Polygon(outline, fc="#E3EEF6", ec="0.4", lw=0.8, joinstyle="round", zorder=1))
+    axes.plot(*np.array([at(0, half_track), at(0, -half_track)]).T, color="black", lw=1.4, zorder=2)
+    wheel(at(0, half_track), theta)
+    wheel(at(0, -half_track), theta)
+    front = at(wheelbase, 0)
+    # Body frame and angles
+    axes.plot(*np.array([p, at(4.05, 0)]).T, color="black", lw=0.7, zorder=2)
+    _arrow(axes, at(3.9, 0), at(4.3, 0))
+    _arrow(axes, p, at(0, 2.35), zorder=4)
+    text(at(4.22, -0.27), "$x_r$")
+    text(at(0.27, 2.25), "$y_r$")
+    axes.plot([p[0], p[0] + 2.9], [p[1], p[1]], **dashed, zorder=2)
+    axes.add_patch(Arc((p[0], p[1]), 3.5, 3.5, theta1=0, theta2=np.rad2deg(theta), lw=0.8, zorder=4))
+    text(p + 2.0 * along(theta / 2), r"$\theta$")
+    wheel(front, theta + phi)
+    axes.plot(*np.array([front, front + 1.5 * along(theta + phi)]).T, **dashed, zorder=2)
+    angles = np.rad2deg([theta, theta + phi])
+    axes.add_patch(Arc((front[0], front[1]), 2.3, 2.3, theta1=angles[0], theta2=angles[1], lw=0.8, zorder=4))
+    text(front + 1.36 * along(theta + phi / 2), r"$\phi$")
+    # Dimensions
+    axes.plot(*np.array([at(0, -half_track - 0.2), at(0, -1.52)]).T, **thin)
+    axes.plot(*np.array([at(wheelbase, -0.65), at(wheelbase, -1.52)]).T, **thin)
+    _arrow(axes, at(0, -1.42), at(wheelbase, -1.42), "<|-|>", lw=0.6, mutation_scale=6)
+    text(at(wheelbase / 2, -1.65), "$L$")
+    for side in (half_track, -half_track):
+        axes.plot(*np.array([at(-0.45, side), at(-1.02, side)]).T, **thin)
+    _arrow(axes, at(-0.92, half_track), at(-0.92, -half_track), "<|-|>", lw=0.6, mutation_scale=6)
+    text(at(-1.2, 0), "$2D$")
+    # Velocities
+    _arrow(axes, p, at(1.45, 0), color=COLOURS[1], lw=1.8, mutation_scale=11, zorder=5)
+    text(at(0.95, 0.29), "$V_{AV}$", colour=COLOURS[1])
+    turn = theta + np.deg2rad(115)
+    _arrow(axes, p + 1.25 * along(turn - 0.55), p + 1.25 * along(turn + 0.25), color=COLOURS[1], lw=1.2,
+           connectionstyle="arc3,rad=0.2", zorder=5)  # fmt: skip
+    text(p + 1.52 * along(turn + 0.2), r"$\dot\theta$", colour=COLOURS[1])
+    axes.add_patch(Circle(tuple(p), 0.07, fc="white", ec="black", lw=0.8, zorder=6))
+    text(at(-0.27, -0.27), "$P$")
+    return figure
+
+
+@styled
+def control_structure() -> Figure:
+    """The two-level hierarchy of motion and velocity control, drawn (the paper's figure 3)."""
+    figure, axes = _canvas(PAGE, PAGE * 82 / 180, (0, 180, 2, 84))  # data in mm
+    middle, top = 40, 66
+
+    def box(x: float, y: float, width: float, height: float, string: str, colour: str = "white") -> None:
+        axes.add_patch(
+            FancyBboxPatch(
+                (x, y - height / 2),
+                width,
+                height,
+                boxstyle="round,pad=0,rounding_size=1.2",
+                fc=colour,
+                ec="black",
+                lw=0.9,
+                zorder=3,
+            )  # fmt: skip
+        )
+        axes.text(x + width / 2, y, string, ha="center", va="center", zorder=4, linespacing=1.25)
+
+    def text(x: float, y: float, string: str, **options: object) -> None:
+        look: dict[str, Any] = {"ha": "center", "va": "bottom", **options}
+        axes.text(x, y, string, **look)
+
+    def wire(*points: tuple[float, float], **options: object) -> None:
+        """A line through the points, with an arrow head at its end."""
+        xs, ys = zip(*points, strict=True)
+        look: dict[str, Any] = {"color": "black", "lw": 0.9, **options}
+        axes.plot(xs, ys, solid_joinstyle="miter", zorder=2, **look)
+        (x0, y0), (x1, y1) = points[-2:]
+        step = 2.5 / np.hypot(x1 - x0, y1 - y0)
+        start = (x1 - step * (x1 - x0), y1 - step * (y1 - y0))
+        _arrow(axes, start, (x1, y1), color=look["color"], lw=0.9, zorder=2)
+
+    def node(x: float, y: float) -> None:
+        axes.add_patch(Circle((x, y), 0.75, fc="black", zorder=4))
+
+    def adder(x: float, y: float) -> None:
+        axes.add_patch(Circle((x, y), 3, fc="white", ec="black", lw=0.9, zorder=3))
+        axes.text(x, y - 0.15, r"$\Sigma$", ha="center", va="center", zorder=4)
+
+    def level(x: float, y: float, width: float, height: float, name: str) -> None:
+        axes.add_patch(
+            FancyBboxPatch(
+                (x, y),
+                width,
+                height,
+                boxstyle="round,pad=0,rounding_size=1.5",
+                fc="0.97",
+                ec="0.55",
+                lw=0.7,
+                ls=(0, (4, 2.5)),
+                zorder=0,
+            )  # fmt: skip
+        )
+        text(x + 1.5, y + height - 1.2, name, ha="left", va="top", color="0.35", style="italic")
+
+    level(30.5, 27, 27, 29.5, "Motion control")
+    level(60.5, 27, 73.5, 54, "Velocity control")
+    box(2, middle, 18, 14, "Reference\ntrajectory")
+    box(33, middle, 22, 16, "Tracking law\n(Kanayama)")
+    box(84, middle, 25, 14, "PID\n(feedback)", "#E3EEF6")
+    box(84, top, 25, 16, "Neural network\n(feedforward)", "#FBE9DC")
+    box(147, middle, 14, 16, "DC\nmotors")
+    box(166, middle, 12, 16, "Robot")
+    adder(74, middle)
+    adder(127, middle)
+    # Forward
+    wire((20, middle), (33, middle))
+    text(25.2, middle + 0.8, r"$\xi_r,\,\eta_r$")
+    wire((55, middle), (71, middle))
+    text(62.6, middle + 0.8, r"$\eta_c$")
+    node(66.5, middle)
+    wire((66.5, middle), (66.5, top), (84, top))
+    wire((77, middle), (84, middle))
+    wire((109, middle), (124, middle))
+    text(119.3, middle + 0.8, "$U_{fb}$")
+    wire((109, top), (127, top), (127, middle + 3))
+    text(118, top + 0.8, "$U_{ff}$")
+    wire((130, middle), (147, middle))
+    text(140.5, middle + 0.8, "$U_l,\\,U_r$")
+    wire((161, middle), (166, middle))
+    # Learning: the feedback voltage is the teaching signal
+    node(113.5, middle)
+    wire((113.5, middle), (113.5, 51.5), (96.5, 51.5), (96.5, top - 8), color=COLOURS[1], ls=(0, (4, 2)))
+    text(105.2, 52.2, "learning", color=COLOURS[1], fontsize=8)
+    # Back
+    wire((170, middle - 8), (170, 18), (74, 18), (74, middle - 3))
+    text(122, 18.8, r"velocities $\eta=(V_{AV},\,\dot\theta)$")
+    wire((174, middle - 8), (174, 7), (44, 7), (44, middle - 8))
+    text(122, 7.8, r"posture $\xi=(x,\,y,\,\theta)$")
+    for x, y, sign in ((69.2, 36.5, "+"), (71.9, 34.2, "$-$"), (122.2, 36.5, "+"), (124.9, 44.2, "+")):
+        text(x, y, sign, va="center", fontsize=8)
+    return figure

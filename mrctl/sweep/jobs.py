@@ -1,0 +1,303 @@
+"""Runs a sweep, job by job, and single runs of it again."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter, deque
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from mrctl.control.stages import METHODS, Stages
+from mrctl.loop import controller
+from mrctl.loop.simulation import Simulation, simulate
+from mrctl.physics import mjcf
+from mrctl.record import InputError
+from mrctl.results import metrics
+from mrctl.results.dataset import SIGNALS, versions
+from mrctl.scenario import Scenario
+from mrctl.sweep.plan import Sweep
+from mrctl.sweep.pool import Cluster, Outcome, Pool, Processes, Work
+from mrctl.sweep.store import Store
+from mrctl.theory.robot import CAR
+
+TOLERANCE = 1e-9  # of a run that is computed again, relative
+ASIDE = "set aside: "
+
+
+class Report(NamedTuple):
+    """How a sweep ended."""
+
+    runs: int
+    failed: int
+    """Runs that failed, those set aside included."""
+    aside: dict[range, str]
+    """The runs of jobs that could not be done, and why."""
+
+
+def run(
+    sweep: Sweep,
+    out: str | Path,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: bool = False,
+    work: Work | None = None,
+) -> Report:
+    """Runs a sweep, or what is left of it.
+
+    The store holds the same values for any number of workers and any interruptions. In a script, call this under
+    `if __name__ == "__main__":`, for the workers import the script.
+
+    Args:
+        sweep: What to run.
+        out: Folder of the store.
+        workers: Processes on this machine, one core each; by default as many as there are cores.
+        scheduler: Address of a Dask scheduler to use instead.
+        progress: Shows a progress bar.
+        work: What a worker does with a job; by default `compute`.
+
+    Raises:
+        InputError: A bad sweep; a folder that is not this sweep's, is in use or cannot be written; no scheduler.
+    """
+    if workers is not None and (scheduler or workers < 1):
+        raise InputError("workers: not together with a scheduler" if scheduler else f"workers: {workers} is below 1")
+    work, path = work or compute, Path(out).absolute()
+    try:
+        Store.prepare(path)
+        with Store.locked(path):
+            store = Store.begin(path, _manifest(sweep))
+            pending = sorted(set(range(store.jobs)) - store.done())
+            aside = {}
+            if pending:
+                count = workers or len(os.sched_getaffinity(0))
+                pool = Cluster(work, str(path), scheduler) if scheduler else Processes(work, str(path), count)
+                try:
+                    aside = _drive(store, pending, pool, progress)
+                finally:
+                    pool.close()
+            if pending or not store.complete:
+                lost = {job: [_row(sweep, k, ASIDE + why) for k in store.runs(job)] for job, why in aside.items()}
+                rows = (_table(sweep, lost[job]) if job in lost else store.rows(job) for job in range(store.jobs))
+                store.finish(sweep.columns, rows, complete=not aside)
+            failed = _failed([store.table])
+            return Report(store.size, failed, {store.runs(job): why for job, why in sorted(aside.items())})
+    except OSError as error:
+        raise InputError(f"{out}: {error.strerror or error}; what was done is kept") from None
+
+
+def _drive(store: Store, pending: Sequence[int], pool: Pool, progress: bool) -> dict[int, str]:
+    """Has jobs done; those that kill their worker or raise are tried again alone, after the others, then set aside."""
+    fresh, again = deque(pending), deque[int]()
+    tries, aside, flying = Counter[int](), dict[int, str](), 0
+    kept = store.size - sum(len(store.runs(job)) for job in pending)
+    failed = _failed(store.path.glob("parts/[0-9]*.parquet")) if kept and progress else 0
+    with tqdm(total=store.size, initial=kept, unit="run", disable=not progress) as bar:
+        bar.set_postfix(failed=failed)
+        try:
+            while fresh or again or flying:
+                room = pool.room()
+                while (fresh and flying < room) or (again and not fresh and not flying):
+                    pool.submit((fresh or again).popleft())
+                    flying += 1
+                for outcome in pool.wait():
+                    flying -= 1
+                    tries[outcome.job] += 1
+                    if outcome.fatal:
+                        raise InputError(f"{outcome.error}; what was done is kept")
+                    if outcome.error and tries[outcome.job] < pool.tries:
+                        again.append(outcome.job)
+                        continue
+                    size = len(store.runs(outcome.job))
+                    if outcome.error:
+                        aside[outcome.job] = outcome.error
+                    failed += size if outcome.error else outcome.failed
+                    bar.set_postfix(failed=failed, refresh=False)
+                    bar.update(size)
+        except KeyboardInterrupt:
+            pool.close()  # or a worker would finish another job behind the count
+            done = sum(len(store.runs(job)) for job in store.done())
+            raise KeyboardInterrupt(f"{done} of {store.size} runs are done; the same command goes on") from None
+    return aside
+
+
+def _failed(tables: Iterable[Path]) -> int:
+    """How many runs failed."""
+    return sum(pq.read_table(table, columns=["failed"])["failed"].to_numpy().sum() for table in tables)
+
+
+def _manifest(sweep: Sweep) -> dict[str, Any]:
+    """What a store must agree on. Fails for a sweep whose worlds do not compile or whose robot cannot follow."""
+    models = _models(sweep)
+    if scenario := sweep.valid(0):
+        if sweep.controller:
+            controller.trial(sweep.controller, scenario)
+        else:
+            Simulation([scenario])
+    return {
+        "sweep": sweep.model_dump(mode="json"),
+        "versions": versions(),
+        "models": models,
+        "size": sweep.size,
+        "chunk": sweep.chunk_size,
+        "samples": sweep.samples,
+        "stride": sweep.stride,
+        "control_period": sweep.base.control_period,
+    }
+
+
+def _models(sweep: Sweep) -> dict[str, str]:
+    """Digests of the compiled worlds with the robot, and of the files of a controller."""
+    worlds = {
+        f"{world}, {steering}" + (f", {robot.path}" if robot != CAR else ""): mjcf.digest(
+            mjcf.load(world, steering, robot=robot)
+        )
+        for world, steering, robot in sweep.worlds
+    }
+    return worlds | ({sweep.controller: controller.digest(sweep.controller)} if sweep.controller else {})
+
+
+def compute(path: str, job: int) -> Outcome:
+    """What a worker does: computes the runs of a job and keeps them in the store."""
+    try:
+        store = Store(path)
+        sweep = _agreed(json.dumps(store.manifest))
+        rows, signals = _compute(sweep, store.runs(job), store.samples)
+        store.write(job, _table(sweep, rows), signals)
+        return Outcome(job, failed=sum(row["failed"] for row in rows))
+    except InputError as error:
+        return Outcome(job, error=str(error), fatal=True)
+    except OSError as error:
+        return Outcome(job, error=f"{path}: {error.strerror or error}", fatal=True)
+    except Exception as error:  # noqa: BLE001 (whatever it is, the other jobs go on)
+        return Outcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))
+
+
+@lru_cache(1)
+def _agreed(manifest: str) -> Sweep:
+    """The sweep of a store.
+
+    Raises:
+        InputError: This worker has other versions or other worlds than who began the store.
+    """
+    agreed = json.loads(manifest)
+    sweep = Sweep.from_dict(agreed["sweep"], "sweep")
+    for what, here in (("versions", versions()), ("models", _models(sweep))):
+        if unlike := sorted(name for name in here if here[name] != agreed[what].get(name)):
+            raise InputError(f"worker {os.getpid()} on {os.uname().nodename}: {unlike[0]} is not the store's")
+    return sweep
+
+
+def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict[str, Any]], NDArray | None]:
+    """Rows of the table, and signals `(runs, samples, signals)` if any are kept."""
+    rows: dict[int, dict[str, Any]] = {}
+    signals = np.full((len(runs), samples, len(SIGNALS)), np.nan) if samples else None
+    batches: dict[float, dict[int, Scenario]] = {}
+    for run in runs:
+        try:
+            scenario = sweep.scenario(run)
+            batches.setdefault(scenario.control_period, {})[run] = scenario
+        except InputError as error:  # drawn out of range
+            rows[run] = _row(sweep, run, str(error).removeprefix(f"run {run}: "))
+    stages: Stages = controller.load(sweep.controller) if sweep.controller else {}
+    queue = list(batches.values())
+    for batch in queue:
+        try:
+            result = simulate(list(batch.values()), threads=1, **stages)
+        except InputError as error:
+            if len(batch) == 1:
+                rows |= {run: _row(sweep, run, str(error)) for run in batch}
+            else:  # one that cannot be run shall not cost the others
+                queue.extend({run: scenario} for run, scenario in batch.items())
+            continue
+        if stages and len(batch) > 1 and any(str(why).startswith((*METHODS,)) for why in result["failure"].values):
+            # A stage that raises ends its whole group; alone, each run is what it is in any company.
+            queue.extend({run: scenario} for run, scenario in batch.items())
+            continue
+        laps = metrics.per_lap(result)
+        table = metrics.summary(laps).assign(lap_time=laps["lap_time"].values, failure=result["failure"].values)
+        if sweep.record == "laps":
+            for name in metrics.METRICS:
+                table[f"{name}_per_lap"] = [v[:n] for v, n in zip(laps[name].values, laps["laps"].values, strict=True)]
+        for run, found in zip(batch, table.to_dict("records"), strict=True):
+            rows[run] = _row(sweep, run, **{str(name): value for name, value in found.items()})
+        if signals is not None:
+            kept = np.stack([result[name].values[:, :: sweep.stride] for name in SIGNALS], axis=-1)
+            signals[[run - runs[0] for run in batch], : kept.shape[1]] = kept
+    return [rows[run] for run in runs], signals
+
+
+def _row(sweep: Sweep, run: int, failure: str = "", **found: object) -> dict[str, Any]:
+    """A row of the table: what the run was and what was found, NaN where nothing was."""
+    values, valid = sweep.values(run), sweep.valid(run)
+    scenario = valid or sweep.base
+    row: dict[str, Any] = {name: np.nan for name in (*metrics.METRICS, "lap_time")}
+    row |= {name: [] for name in sweep.columns.names if name.endswith("_per_lap")}
+    row |= {"run": run, "label": scenario.name or scenario.feedforward, "feedforward": scenario.feedforward}
+    row |= {"steering": scenario.steering, "seed": valid.seed if valid else values["seed"], "laps": 0}
+    row |= {"failed": bool(failure), "failure": failure, "failure_time": 0.0 if failure else np.nan}
+    return row | found | {axis.field: axis.cell(values[axis.field]) for axis in sweep.axes}
+
+
+def _table(sweep: Sweep, rows: Sequence[dict[str, Any]]) -> pa.Table:
+    return pa.Table.from_pylist(list(rows), schema=sweep.columns)
+
+
+class Repeat(NamedTuple):
+    """A run of a sweep, computed again."""
+
+    verdict: str
+    """`bit-identical`, `within tolerance`, or `departs`, and where."""
+    same: bool
+    """Whether it does not depart."""
+
+
+def scenario_of(out: str | Path, run: int) -> Scenario:
+    """The scenario of one run of a stored sweep.
+
+    Raises:
+        InputError: No store, no such run, or what was drawn for it is out of range.
+    """
+    return Sweep.from_dict(Store(out).manifest["sweep"], str(out)).scenario(run)
+
+
+def repeat(out: str | Path, run: int) -> Repeat:
+    """Runs one run of a sweep alone and compares it with what the store has.
+
+    Raises:
+        InputError: No store, no such run, or it is not done yet.
+    """
+    store = Store(out)
+    sweep = Sweep.from_dict(store.manifest["sweep"], str(out))
+    sweep.values(run)  # there is such a run
+    if (stored := store.row(run)) is None:
+        raise InputError(f"run: {run} is not done yet")
+    if stored["failure"].startswith(ASIDE):
+        raise InputError(f"run: {run} was {stored['failure']}; there is nothing to compare with")
+    (row,), signals = _compute(sweep, [run], store.samples)
+    reasons = [one["failure"] or "it finished" for one in (row, stored)]
+    if reasons[0] != reasons[1]:
+        return Repeat(f"departs: {reasons[0]}, in the store {reasons[1]}", False)
+    names = [*metrics.METRICS, "failure_time", *(name for name in row if name.endswith("_per_lap"))]
+    pairs = {name: (np.array(row[name], float, ndmin=1), np.array(stored[name], float, ndmin=1)) for name in names}
+    if signals is not None:
+        kept = store.signals(run)
+        pairs |= {f"signal {name}": (signals[0, :, k], kept[:, k]) for k, name in enumerate(SIGNALS)}
+    if all(new.tobytes() == old.tobytes() for new, old in pairs.values()):
+        return Repeat("bit-identical", True)
+    scale = {name: TOLERANCE * np.abs(old).max(initial=0, where=np.isfinite(old)) for name, (_, old) in pairs.items()}
+    off = {name: ~np.isclose(*pair, rtol=0, atol=scale[name], equal_nan=True) for name, pair in pairs.items()}
+    if not any(one.any() for one in off.values()):
+        return Repeat(f"within tolerance ({TOLERANCE:g} of each signal's and metric's size)", True)
+    name = min((name for name in off if off[name].any()), key=lambda name: (len(off[name]) == 1, off[name].argmax()))
+    place = int(off[name].argmax())
+    when = f" at t = {store.times[place]:g} s" if name.startswith("signal") else ""
+    new, old = (float(one[place]) for one in pairs[name])
+    return Repeat(f"departs: {name} is {new!r}{when}, in the store {old!r}", False)

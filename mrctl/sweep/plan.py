@@ -1,0 +1,314 @@
+"""Thousands of runs as data: a sweep file in, one scenario a run out. `sweep.jobs` runs them, `sweep.store` keeps them.
+
+Run i is a pure function of the sweep and i. The runs are the product of the axes that list their values, in the order
+of the file, the first one slowest; each combination is drawn `runs` times, and that number changes fastest. Draw d of
+a combination sets the scenario's seed and the value of every distribution from a stream of its own, so neither the
+order nor the company in which a run is computed can change it. Combinations that differ in `paired` axes alone share
+their draws.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import product
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+import pyarrow as pa
+from pydantic import Field, model_validator
+
+from mrctl.record import InputError, Record
+from mrctl.results.dataset import SIGNALS
+from mrctl.results.metrics import METRICS
+from mrctl.scenario import Scenario
+from mrctl.theory.robot import RobotFile
+
+CHUNK_BYTES = 2**27  # what the signals of a job may take in memory
+TRIED = 20  # runs of which at least one must make sense
+WHOLE = "scenario"  # the field of an axis whose values are tables of changes to the scenario
+
+
+class Grid(Record):
+    """Evenly spaced numbers, both ends included."""
+
+    start: float
+    stop: float
+    count: Annotated[int, Field(ge=1, le=10_000)]
+
+
+class Axis(Record):
+    """One field of the scenario and what it takes: values, a grid, or a distribution."""
+
+    field: Annotated[str, Field(min_length=1)]
+    """Dotted path into the scenario, such as `perturbation.mass_factor` or `events.0.time`; or `scenario`, whose values
+    are tables of what changes in it, such as `{ laps = 4, perturbation = { payload = 5.0 } }`."""
+    values: Annotated[tuple[Any, ...], Field(min_length=1)] | None = None
+    """A list; a value may be a whole table, such as a perturbation."""
+    grid: Grid | None = None
+    """`{ start, stop, count }`."""
+    uniform: tuple[float, float] | None = None
+    """Lowest and highest."""
+    normal: tuple[float, Annotated[float, Field(gt=0)]] | None = None
+    """Mean and standard deviation."""
+    loguniform: tuple[Annotated[float, Field(gt=0)], float] | None = None
+    """Lowest and highest; uniform in the logarithm."""
+    paired: bool = False
+    """A comparison: every value sees the same seeds and the same draws."""
+    zip: str = ""
+    """Axes with the same word here move together, value by value."""
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Axis:
+        kinds = ("values", "grid", "uniform", "normal", "loguniform")
+        if sum(getattr(self, kind) is not None for kind in kinds) != 1:
+            raise ValueError(f"{self.field}: needs exactly one of {', '.join(kinds)}")
+        if not self.listed and (self.paired or self.zip):
+            raise ValueError(f"{self.field}: only values and grids can be paired or zipped")
+        for low, high in filter(None, (self.uniform, self.loguniform)):
+            if not low < high:
+                raise ValueError(f"{self.field}: {low:g} is not below {high:g}")
+        return self
+
+    @cached_property
+    def listed(self) -> tuple[Any, ...]:
+        """The values of a list or grid; none of a distribution."""
+        if self.grid is not None:
+            return tuple(np.linspace(self.grid.start, self.grid.stop, self.grid.count).tolist())
+        return self.values or ()
+
+    @property
+    def middle(self) -> float:
+        """A value in the middle of the distribution."""
+        if self.normal is not None:
+            return self.normal[0]
+        return sum(self.uniform or self.loguniform or ()) / 2
+
+    def draw(self, random: np.random.Generator) -> float:
+        """A number from the distribution."""
+        if self.uniform is not None:
+            return float(random.uniform(*self.uniform))
+        if self.normal is not None:
+            return float(random.normal(*self.normal))
+        assert self.loguniform is not None
+        low, high = self.loguniform
+        return float(np.clip(np.exp(random.uniform(np.log(low), np.log(high))), low, high))
+
+    @cached_property
+    def type(self) -> pa.DataType:
+        """How a table holds the values; tables and mixtures as JSON."""
+        kinds = {type(value) for value in self.listed}
+        for kind, found in ((pa.bool_(), {bool}), (pa.int64(), {int}), (pa.float64(), {int, float})):
+            if kinds <= found and kinds:
+                return kind
+        return pa.string() if kinds else pa.float64()
+
+    def cell(self, value: object) -> object:
+        """The value as a table holds it."""
+        return json.dumps(value) if self.type == pa.string() and not isinstance(value, str) else value
+
+
+class Sweep(Record):
+    """Many runs: a base scenario and what varies."""
+
+    base: Scenario = Scenario()
+    """What the runs have in common; its seed is replaced unless `seed` is an axis."""
+    axes: tuple[Axis, ...] = ()
+    """What varies. Put first what makes batches differ (feedforward, steering, world): batches of equals are fast."""
+    runs: Annotated[int, Field(ge=1, le=100_000_000)] = 1
+    """Draws of seed and distributions for each combination of the listed values."""
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    """Of all draws."""
+    record: Literal["metrics", "laps", "decimated", "full"] = "metrics"
+    """What to keep: metrics of the last lap; those and the metrics of every lap, as lists in the table; or those of the
+    last lap and every so many samples of the signals, or all of them."""
+    every: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
+    """Control periods from one kept sample to the next, where the record is decimated; by default 10."""
+    chunk: Annotated[int, Field(ge=1, le=65536)] | None = None
+    """Runs in a job; by default 64, or fewer where the runs are long."""
+    controller: str | None = None
+    """A feedforward of your own instead of the named one, as `my_file.py:MyController`, or other stages, as
+    `motion=my_file.py:PurePursuit`; see `mrctl.loop.controller`."""
+
+    @classmethod
+    def of(cls, scenarios: Sequence[Scenario], **settings: Any) -> Self:  # noqa: ANN401
+        """A sweep whose run i is `scenarios[i]`; settings are the fields of a sweep but `base` and `axes`."""
+        usual = Scenario().model_dump(mode="json")
+        every = [s.model_dump(mode="json") for s in scenarios]
+        changes = [{k: v for k, v in one.items() if k == "seed" or v != usual[k]} for one in every]
+        return cls.from_dict({**settings, "axes": [{"field": WHOLE, "values": changes}]}, "sweep")
+
+    @model_validator(mode="after")
+    def _runnable(self) -> Sweep:
+        fields = [axis.field for axis in self.axes]
+        for name in fields:
+            if fields.count(name) > 1:
+                raise ValueError(f"axes: {name} is there twice")
+        if self.every and self.record != "decimated":
+            raise ValueError('every: only where record = "decimated"')
+        for group in self._dimensions:
+            if len({len(self.axes[a].listed) for a in group}) > 1 or len({self.axes[a].paired for a in group}) > 1:
+                names = ", ".join(self.axes[a].field for a in group)
+                raise ValueError(f"axes: {names} are zipped, but differ in length or in `paired`")
+        if self.size > 100_000_000:
+            raise ValueError(f"runs: {self.size:,} of them, at most 100,000,000")
+        self._check_values()
+        return self
+
+    def _check_values(self) -> None:
+        """Each listed value and each end of a range must make a scenario with the other axes in the middle."""
+        middle = {"seed": 0} | {axis.field: axis.listed[0] if axis.listed else axis.middle for axis in self.axes}
+        trials = [{}]
+        for group in self._dimensions:
+            trials += [{self.axes[a].field: self.axes[a].listed[k] for a in group} for k in range(self._length(group))]
+        trials += [{axis.field: end} for axis in self.axes for end in axis.uniform or axis.loguniform or ()]
+        periods = {self._assemble(middle | trial).control_period for trial in trials}
+        if len(periods) > 1 and self.record in ("decimated", "full"):
+            raise ValueError("control_period: signals share their time axis; keep it, or record metrics")
+        first = range(min(self.size, TRIED))
+        if not any(self.valid(run) for run in first):
+            self.scenario(0)  # says why not
+
+    @cached_property
+    def _dimensions(self) -> list[list[int]]:
+        """Axes that move together, in the order of the file."""
+        groups: dict[str, list[int]] = {}
+        for number, axis in enumerate(self.axes):
+            if axis.listed:
+                groups.setdefault(axis.zip or f"axis {number}", []).append(number)
+        return list(groups.values())
+
+    @cached_property
+    def _shape(self) -> tuple[int, ...]:
+        """Values of each dimension, then draws."""
+        return (*map(self._length, self._dimensions), self.runs)
+
+    def _length(self, group: list[int]) -> int:
+        return len(self.axes[group[0]].listed)
+
+    @property
+    def size(self) -> int:
+        """How many runs."""
+        return int(np.prod(self._shape, dtype=object))
+
+    @cached_property
+    def chunk_size(self) -> int:
+        """Runs in a job, a function of the file alone."""
+        return self.chunk or int(np.clip(CHUNK_BYTES // (8 * len(SIGNALS) * self.base.ticks), 1, 64))
+
+    @property
+    def stride(self) -> int:
+        """Control periods from one kept sample to the next."""
+        return self.every or 10 if self.record == "decimated" else 1
+
+    @cached_property
+    def samples(self) -> int:
+        """Samples of the longest run that the store keeps; 0 where it keeps metrics only."""
+        if self.record in ("metrics", "laps"):
+            return 0
+        ticks = self.base.ticks
+        if any(axis.field.startswith((WHOLE, "laps", "reference", "control_period")) for axis in self.axes):
+            ticks = max((scenario.ticks for run in range(self.size) if (scenario := self.valid(run))), default=ticks)
+        return -(-ticks // self.stride)
+
+    def values(self, run: int) -> dict[str, Any]:
+        """What each axis is in one run, and the seed.
+
+        Raises:
+            InputError: There is no such run.
+        """
+        if not 0 <= run < self.size:
+            raise InputError(f"run: {run} is not in 0 to {self.size - 1}")
+        *place, draw = (int(k) for k in np.unravel_index(run, self._shape))
+        unpaired = [k for k, group in enumerate(self._dimensions) if not self.axes[group[0]].paired]
+        key = [place[k] for k in unpaired] + [draw]
+        stream = int(np.ravel_multi_index(key, [self._shape[k] for k in unpaired] + [self.runs]))
+        values: dict[str, Any] = {"seed": int(np.random.SeedSequence((self.seed, stream)).generate_state(1)[0])}
+        where = {a: k for k, group in zip(place, self._dimensions, strict=True) for a in group}
+        for number, axis in enumerate(self.axes):
+            if number in where:
+                values[axis.field] = axis.listed[where[number]]
+            else:
+                key = np.random.SeedSequence((self.seed, stream, number))
+                values[axis.field] = axis.draw(np.random.Generator(np.random.Philox(key)))
+        return values
+
+    def scenario(self, run: int) -> Scenario:
+        """The scenario of one run.
+
+        Raises:
+            InputError: There is no such run, or what was drawn for it is out of range.
+        """
+        return self._assemble(self.values(run), f"run {run}")
+
+    def valid(self, run: int) -> Scenario | None:
+        """The scenario of one run, or None where what was drawn for it is out of range."""
+        try:
+            return self.scenario(run)
+        except InputError:
+            return None
+
+    def _assemble(self, values: dict[str, Any], source: str = "") -> Scenario:
+        data = copy.deepcopy(self._plain)
+        for field, value in values.items():
+            if field == WHOLE and isinstance(value, dict):
+                data |= value
+            else:
+                _put(data, field, value)
+            if isinstance(value, dict):  # a table, completed so that later axes find its fields
+                data = Scenario.from_dict(data, source).model_dump(mode="json")
+        return Scenario.from_dict(data, source)
+
+    @cached_property
+    def _plain(self) -> dict[str, Any]:
+        return self.base.model_dump(mode="json")
+
+    @cached_property
+    def worlds(self) -> list[tuple[str, Any, RobotFile]]:
+        """Worlds, steering arrangements and robots that the runs may combine."""
+        listed = {axis.field: axis.listed for axis in self.axes}
+        names = ("world", "steering", "robot")
+        found = set()
+        for whole in listed.get(WHOLE, ({},)):
+            worlds, steerings, robots = (listed.get(n, (whole.get(n, getattr(self.base, n)),)) for n in names)
+            files = [RobotFile.model_validate(robot) for robot in robots]
+            files = [f.model_copy(update={"path": p}) for f in files for p in listed.get("robot.path", (f.path,))]
+            found |= set(product(worlds, steerings, files))
+        return sorted(found, key=str)
+
+    @cached_property
+    def columns(self) -> pa.Schema:
+        """Columns of the table: the run, its axes, what became of it, and its metrics, lap by lap too."""
+        columns: dict[str, tuple[pa.DataType, str]] = {"run": (pa.int64(), "1")}
+        columns |= {axis.field: (axis.type, "") for axis in self.axes}
+        for name, kind, unit in (
+            ("label", pa.string(), ""), ("feedforward", pa.string(), ""), ("steering", pa.string(), ""),
+            ("seed", pa.int64(), "1"), ("lap_time", pa.float64(), "s"), ("laps", pa.int64(), "1"),
+            ("failed", pa.bool_(), "1"), ("failure_time", pa.float64(), "s"), ("failure", pa.string(), ""),
+        ):  # fmt: skip
+            columns.setdefault(name, (kind, unit))
+        columns |= {name: (pa.float64(), unit) for name, (unit, _) in METRICS.items()}
+        if self.record == "laps":
+            columns |= {f"{name}_per_lap": (pa.list_(pa.float64()), unit) for name, (unit, _) in METRICS.items()}
+        return pa.schema([pa.field(name, kind, metadata={"units": u}) for name, (kind, u) in columns.items()])
+
+
+def _put(data: Any, field: str, value: object) -> None:  # noqa: ANN401
+    """Sets a field of nested tables and lists by its dotted path.
+
+    Raises:
+        InputError: There is no such field.
+    """
+    node, parts = data, field.split(".")
+    for depth, part in enumerate(parts):
+        known = dict(enumerate(node)) if isinstance(node, list) else node if isinstance(node, dict) else {}
+        names = {str(key): key for key in known}
+        if part not in names:
+            where = ".".join(parts[:depth]) or "the scenario"
+            raise InputError(f"{field}: no {part!r} in {where}" + (f", which has {', '.join(names)}" if names else ""))
+        if depth == len(parts) - 1:
+            node[names[part]] = value
+        else:
+            node = node[names[part]]

@@ -1,0 +1,358 @@
+"""Where a sweep is kept: a folder that survives being killed at any moment.
+
+    STORE/sweep.json        the sweep, versions, digests of the compiled worlds; written first, whole or not at all
+    STORE/runs.parquet      the table, a row a run in order; written when no job is left
+    STORE/parts/000012.parquet   rows of job 12; folded into the table, and removed once every job is in it
+    STORE/signals.zarr      (run, time, signal), NaN where nothing was recorded; shard 12 is the record of job 12
+    STORE/lock              held, through the operating system, by the one process that runs the sweep
+
+One job owns one shard and one part. Each file is written under another name, synchronised and renamed, the part last:
+a part that is there says that its job is done. A job that is computed twice writes the same bytes twice.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import shutil
+import socket
+import uuid
+from collections.abc import Iterable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import xarray as xr
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import BloscCodec
+
+from mrctl.record import InputError
+from mrctl.results.dataset import SIGNALS, open_result
+from mrctl.results.metrics import METRICS
+
+KIND, FORMAT = "mrctl sweep", 1
+ROW_GROUP = 16384  # rows of the table that are in memory at once
+INNER = 16  # runs that are compressed together, signal by signal
+COMPLETE = b"complete"  # in the table's metadata: whether every job is in it
+
+
+class Store:
+    """The folder of one sweep.
+
+    Attributes:
+        path: The folder.
+        manifest: What `sweep.json` holds: `sweep`, `versions`, `models`, `size`, `chunk`, `samples`,
+            `stride` (control periods between samples), `control_period`.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Opens a store that exists.
+
+        Raises:
+            InputError: There is none, or it was written by a version with another layout.
+        """
+        self.path = Path(path).absolute()
+        try:
+            self.manifest: dict[str, Any] = json.loads((self.path / "sweep.json").read_bytes())
+            found = self.manifest[KIND]
+        except (OSError, ValueError, KeyError, TypeError):
+            raise InputError(f"{path}: not a sweep's store") from None
+        if found != FORMAT:
+            raise InputError(f"{path}: a sweep's store of format {found}, this version reads format {FORMAT}")
+
+    @staticmethod
+    def prepare(path: Path) -> None:
+        """Makes the folder, if need be.
+
+        Raises:
+            InputError: What is there is not a sweep's store; nothing was touched.
+        """
+        if not path.exists():
+            path.mkdir(parents=True)
+        elif not path.is_dir():
+            raise InputError(f"{path}: a file, not a sweep's store")
+        elif not (path / "sweep.json").is_file():
+            # Of a sweep that was killed before it could say what it is there is no more than this.
+            if foreign := sorted(e.name for e in path.iterdir() if e.name != "lock" and not _temporary(e)):
+                raise InputError(f"{path}: holds {foreign[0]} and is not a sweep's store; nothing was touched")
+        else:
+            Store(path)
+
+    @classmethod
+    def begin(cls, path: Path, manifest: dict[str, Any]) -> Store:
+        """Starts or continues a sweep in a folder whose lock is held.
+
+        Raises:
+            InputError: The folder belongs to another sweep or to other versions.
+        """
+        manifest = json.loads(json.dumps({KIND: FORMAT, **manifest}))
+        if not (path / "sweep.json").exists():
+            with _whole(path / "sweep.json") as file:
+                file.write(json.dumps(manifest, indent=1).encode())
+        store = cls(path)
+        if difference := _difference(store.manifest, manifest):
+            raise InputError(f"{path}: begun with another {difference}; finish it as it was or choose another folder")
+        for left in [*path.glob(".*.tmp"), *path.glob("parts/.*.tmp"), *path.glob("signals.zarr/**/*.partial")]:
+            left.unlink(missing_ok=True)
+        if store.samples and not (path / "signals.zarr" / "signals" / "zarr.json").exists():
+            store._create_signals()
+        return store
+
+    @staticmethod
+    @contextlib.contextmanager
+    def locked(path: Path) -> Iterator[None]:
+        """Holds the folder; the system lets go of it when this process ends, however it ends.
+
+        Raises:
+            InputError: Another process holds it.
+        """
+        import fcntl  # not on Windows
+
+        with (path / "lock").open("a+b") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.seek(0)
+                holder = file.read(200).decode(errors="replace").strip() or "another process"
+                raise InputError(f"{path}: {holder} is running this sweep") from None
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}".encode())
+            file.flush()
+            yield
+
+    @property
+    def size(self) -> int:
+        """How many runs."""
+        return self.manifest["size"]
+
+    @property
+    def samples(self) -> int:
+        """Samples of each signal a run."""
+        return self.manifest["samples"]
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Times of the samples in s."""
+        return self.manifest["control_period"] * (self.manifest["stride"] * np.arange(self.samples))
+
+    @property
+    def jobs(self) -> int:
+        """How many jobs."""
+        return math.ceil(self.size / self.manifest["chunk"])
+
+    def runs(self, job: int) -> range:
+        """The runs of a job."""
+        chunk = self.manifest["chunk"]
+        return range(job * chunk, min((job + 1) * chunk, self.size))
+
+    @property
+    def table(self) -> Path:
+        """The file with a row a run."""
+        return self.path / "runs.parquet"
+
+    @property
+    def complete(self) -> bool:
+        """Whether the table holds every job."""
+        return self.table.exists() and pq.read_schema(self.table).metadata.get(COMPLETE) == b"1"
+
+    def done(self) -> set[int]:
+        """Jobs that are done."""
+        if self.complete:
+            return set(range(self.jobs))
+        return {int(part.stem) for part in (self.path / "parts").glob("[0-9]*.parquet")}
+
+    def _part(self, job: int) -> Path:
+        return self.path / "parts" / f"{job:06d}.parquet"
+
+    def write(self, job: int, rows: pa.Table, signals: NDArray[np.float64] | None) -> None:
+        """Keeps what a job found: the signals `(runs, samples, signals)`, then the rows, which say that it is done."""
+        if signals is not None:
+            runs = self.runs(job)
+            self._signals[runs.start : runs.stop] = signals  # zarr renames a whole shard into its place
+            if (shard := self.path / "signals.zarr" / "signals" / "c" / str(job) / "0" / "0").exists():
+                _synchronise(shard)  # zarr keeps no shard that is all NaN
+        self._part(job).parent.mkdir(exist_ok=True)
+        buffer = pa.BufferOutputStream()
+        pq.write_table(rows, buffer)
+        with _whole(self._part(job)) as file:
+            file.write(buffer.getvalue())
+
+    def rows(self, job: int) -> pa.Table:
+        """What a job that is done has found."""
+        return pq.read_table(self._part(job))
+
+    def row(self, run: int) -> dict[str, Any] | None:
+        """What one run has found, if it is done."""
+        job = run // self.manifest["chunk"]
+        source = self._part(job) if self._part(job).exists() else self.table
+        found = pq.read_table(source, filters=[("run", "=", run)]).to_pylist() if source.exists() else []
+        return found[0] if found else None
+
+    def signals(self, run: int) -> NDArray[np.float64]:
+        """The record of one run `(samples, signals)`, where one is kept."""
+        return np.asarray(self._signals[run])
+
+    def finish(self, schema: pa.Schema, rows: Iterable[pa.Table], complete: bool) -> None:
+        """Folds the parts into the table, a bounded number of rows in memory.
+
+        Args:
+            schema: Of the rows.
+            rows: Those of every job in turn.
+            complete: Whether all jobs were done.
+        """
+        schema = schema.with_metadata({COMPLETE: b"1" if complete else b"0"})
+        with _whole(self.table) as file, pq.ParquetWriter(file, schema) as writer:
+            for group in _regroup(rows):
+                writer.write_table(group.cast(schema), ROW_GROUP)
+        if complete:
+            shutil.rmtree(self.path / "parts")
+
+    @cached_property
+    def _signals(self) -> zarr.Array:
+        return zarr.open_array(self.path / "signals.zarr" / "signals", mode="r+")
+
+    def _create_signals(self) -> None:
+        chunk = self.manifest["chunk"]
+        zarr.open_group(self.path / "signals.zarr", mode="a").create_array(
+            "signals",
+            shape=(self.size, self.samples, len(SIGNALS)),
+            shards=(chunk, self.samples, len(SIGNALS)),
+            chunks=(math.gcd(chunk, INNER), self.samples, 1),
+            dtype="float64",
+            fill_value=np.nan,
+            compressors=BloscCodec(cname="zstd", clevel=3, shuffle="shuffle"),
+            dimension_names=("run", "time", "signal"),
+        )
+
+    def frame(self) -> pd.DataFrame:
+        """The table, of the runs that are done.
+
+        Raises:
+            InputError: None is.
+        """
+        if self.table.exists():
+            return pd.read_parquet(self.table)
+        if not (jobs := sorted(self.done())):
+            raise InputError(f"{self.path}: no job is done yet")
+        return pa.concat_tables(self.rows(job) for job in jobs).to_pandas()
+
+    def dataset(self) -> xr.Dataset:
+        """The runs that are done as one dataset, labelled as `mrctl.simulate` does; signals are read when used."""
+        frame = self.frame()
+        units = {"lap_time": "s", "failure_time": "s"} | {name: unit for name, (unit, _) in METRICS.items()}
+
+        def columns(names: Iterable[str]) -> dict[str, Any]:
+            attrs = {name: {"units": unit} for name, unit in units.items()}
+            return {name: ("run", _plain(frame, name), attrs.get(name, {})) for name in names}
+
+        axes = [axis["field"] for axis in self.manifest["sweep"]["axes"]]
+        coords = columns(["run", *axes, "label", "feedforward", "steering", "seed", "lap_time"])
+        outcome = columns(["failed", "failure", "failure_time"])
+        attrs = {name: json.dumps(self.manifest[name]) for name in ("sweep", "versions")}
+        period = self.manifest["control_period"] * self.manifest["stride"]
+        attrs |= {"control_period": period, "unfinished": self.size - len(frame)}
+        if self.manifest["sweep"]["record"] == "laps":
+            counts = frame["laps"].to_numpy()
+            number = np.arange(1, counts.max(initial=0) + 1)
+            found = {}
+            for name in METRICS:
+                values = np.full((len(frame), len(number)), np.nan)
+                for row, laps in enumerate(frame[f"{name}_per_lap"]):
+                    values[row, : len(laps)] = laps
+                found[name] = (("run", "lap"), values, {"units": units[name]})
+            coords.pop("laps", None)  # where it is an axis too
+            return xr.Dataset(outcome | columns(["laps"]) | found, coords | {"lap": number}, attrs)
+        if not self.samples:
+            return xr.Dataset(outcome | columns(METRICS), coords, attrs)
+        whole = xr.open_zarr(self.path / "signals.zarr", chunks=None, consolidated=False)["signals"]
+        signals = whole.isel(run=frame["run"].to_numpy()).assign_coords(signal=list(SIGNALS)).to_dataset("signal")
+        for name, (unit, meaning) in SIGNALS.items():
+            signals[name].attrs = {"units": unit, "long_name": meaning}
+        coords["time"] = ("time", self.times, {"units": "s"})
+        return signals.assign(outcome).assign_coords(coords).assign_attrs(attrs)
+
+
+def open(path: str | Path) -> xr.Dataset:
+    """Opens what `mrctl sweep`, `mrctl run --out` or `mrctl.save` wrote.
+
+    A sweep opens as one dataset of the runs that are done, axes as coordinates on `run`: with its signals (run, time)
+    where they were recorded, as what `per_lap` returns (run, lap) where laps were, and else with the metrics of the
+    last lap (run,). The table is `runs.parquet` in it.
+
+    Raises:
+        InputError: There is neither at this path.
+    """
+    path = Path(path)
+    if (path / "sweep.json").is_file():
+        return Store(path).dataset()
+    return open_result(path / "result.zarr" if (path / "result.zarr").exists() else path)
+
+
+def _plain(frame: pd.DataFrame, name: str) -> NDArray:
+    """A column as NumPy has it, text as objects."""
+    column = frame[name].to_numpy()
+    return column if column.dtype.kind in "bif" else column.astype(object)
+
+
+@contextlib.contextmanager
+def _whole(path: Path) -> Iterator[BinaryIO]:
+    """A file that appears whole, on the disk, or not at all."""
+    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        with partial.open("xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    _synchronise(path.parent)
+
+
+def _synchronise(path: Path) -> None:
+    """Makes sure that a file or folder has reached the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _temporary(path: Path) -> bool:
+    return path.name.startswith(".sweep.json.") and path.name.endswith(".tmp")
+
+
+def _regroup(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
+    """The same rows in tables of `ROW_GROUP`."""
+    held: list[pa.Table] = []
+    for table in tables:
+        held.append(table)
+        while sum(map(len, held)) >= ROW_GROUP:
+            whole = pa.concat_tables(held)
+            yield whole.slice(0, ROW_GROUP)
+            held = [whole.slice(ROW_GROUP)]
+    if held:
+        yield pa.concat_tables(held)
+
+
+def _difference(old: object, new: object, where: str = "") -> str:
+    """Where two trees of plain data first differ, or ""."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        pairs = [(str(key), old.get(key), new.get(key)) for key in {**old, **new}]
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        pairs = [(str(k), *pair) for k, pair in enumerate(zip(old, new, strict=True))]
+    else:
+        return "" if old == new else f"{where} ({_short(old)}, now {_short(new)})"
+    return next(filter(None, (_difference(a, b, f"{where}.{key}".strip(".")) for key, a, b in pairs)), "")
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 40 else text[:36] + " ..."

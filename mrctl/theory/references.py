@@ -1,0 +1,415 @@
+"""Analytic reference trajectories: where the robot should be, how fast, and how that changes.
+
+The plane is complex here, p = x + i y: a path with heading θ has the tangent e^{iθ}, a rotation is a product, and the
+logarithmic derivative p''/p' = v̇/v + i θ̇ holds everything that a car needs to know about a curve. Nothing is
+differenced numerically, and every sample depends on its own time alone, headings included.
+
+Each kind starts at the origin along +x unless it says otherwise. A new kind is a `Record` with `kind`, `period` and
+`sample`, added to `Reference`.
+"""
+
+from __future__ import annotations
+
+import cmath
+from functools import cached_property, lru_cache
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from numpy.polynomial import Polynomial
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+from scipy.interpolate import CubicHermiteSpline, make_interp_spline
+
+from mrctl.record import InputError, Record
+from mrctl.theory.robot import GRAVITY, Robot
+
+Array = NDArray[np.float64]
+Plane = NDArray[np.complexfloating]
+
+Length = Annotated[float, Field(gt=0, le=1000)]
+Speed = Annotated[float, Field(ge=0.01, le=20)]
+Duration = Annotated[float, Field(ge=0.1, le=3600)]
+Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
+
+# Steps from 0 to 1 whose first 2 (quintic) or 3 (septic) derivatives vanish at both ends.
+_QUINTIC = Polynomial([0, 0, 0, 10, -15, 6])
+_SEPTIC = Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
+# Gauss-Legendre quadrature on (0, 1): exact to rounding for a corner of the square and for a short piece of a spline.
+_CORNER_NODES, _CORNER_WEIGHTS = (np.polynomial.legendre.leggauss(24) + np.array([[1], [0]])) / 2
+_PIECE_NODES, _PIECE_WEIGHTS = (np.polynomial.legendre.leggauss(6) + np.array([[1], [0]])) / 2
+
+
+class Motion(NamedTuple):
+    """A reference at T times."""
+
+    pose: Array
+    """x [m], y [m], θ [rad] of P, θ continuous in time. Shape (T, 3)."""
+    twist: Array
+    """V [m/s], negative in reverse, and θ̇ [rad/s]. Shape (T, 2)."""
+    acceleration: Array
+    """V̇ [m/s²] and θ̈ [rad/s²]. Shape (T, 2)."""
+
+
+def from_curve(p: Plane, d1: Plane, d2: Plane, d3: Plane, heading: Array | None = None) -> Motion:
+    """The motion of a robot driving forward along a regular curve p(t).
+
+    Args:
+        p: Position x + i y in m. Shape (T,).
+        d1: Its velocity in m/s, nowhere zero. Shape (T,).
+        d2: Its acceleration in m/s². Shape (T,).
+        d3: Its jerk in m/s³. Shape (T,).
+        heading: arg d1 on a continuous branch in rad; by default the principal one. Shape (T,).
+    """
+    log = d2 / d1
+    v = np.abs(d1)
+    theta = np.angle(d1) if heading is None else heading
+    return _motion(p, theta, v, log.imag, v * log.real, (d3 / d1 - log**2).imag)
+
+
+def along_path(
+    p: Plane, heading: ArrayLike, curvature: ArrayLike, sharpness: ArrayLike, speed: ArrayLike, acceleration: ArrayLike
+) -> Motion:
+    """The motion of a robot that follows a path p(s) by a time law s(t), which may rest (ṡ = 0) or reverse (ṡ < 0).
+
+    θ̇ = κ ṡ and θ̈ = κ s̈ + κ' ṡ²: nothing is divided by the speed.
+
+    Args:
+        p: Position x + i y in m. Shape (T,).
+        heading: θ in rad, continuous. Shape (T,) or ().
+        curvature: κ in 1/m. Shape (T,) or ().
+        sharpness: κ' = dκ/ds in 1/m². Shape (T,) or ().
+        speed: ṡ in m/s. Shape (T,) or ().
+        acceleration: s̈ in m/s². Shape (T,) or ().
+    """
+    k, dk, v, a = (np.asarray(value, float) for value in (curvature, sharpness, speed, acceleration))
+    return _motion(p, heading, v, k * v, a, k * a + dk * v**2)
+
+
+def _motion(p: Plane, *rest: ArrayLike) -> Motion:
+    """Stacks x, y, θ | V, θ̇ | V̇, θ̈, each (T,) or ()."""
+    columns = np.stack([np.broadcast_to(column, p.shape) for column in (p.real, p.imag, *rest)], -1)
+    return Motion(columns[:, :3], columns[:, 3:5], columns[:, 5:])
+
+
+class Line(Record):
+    """A straight line at constant speed; it goes on after its length."""
+
+    kind: Literal["line"] = "line"
+    speed: Speed = 0.8
+    """Speed in m/s."""
+    length: Length = 8.0
+    """Length of one pass in m."""
+    heading: Annotated[float, Field(ge=-np.pi, le=np.pi)] = 0.0
+    """Direction in rad."""
+
+    @property
+    def period(self) -> float:
+        """Time of one pass in s."""
+        return self.length / self.speed
+
+    def sample(self, t: Array) -> Motion:
+        """Samples the line at the times t [s], shape (T,)."""
+        return along_path(cmath.rect(self.speed, self.heading) * t, self.heading, 0, 0, self.speed, 0)
+
+
+class Circle(Record):
+    """A circle at constant speed, to the left of its start unless clockwise."""
+
+    kind: Literal["circle"] = "circle"
+    radius: Length = 1.0
+    """Radius in m."""
+    period: Duration = 8.0
+    """Time of one lap in s."""
+    clockwise: bool = False
+    """Turns to the right."""
+
+    def sample(self, t: Array) -> Motion:
+        """Samples the circle at the times t [s], shape (T,)."""
+        turn = -1.0 if self.clockwise else 1.0
+        theta = turn * 2 * np.pi / self.period * t
+        p = turn * 1j * self.radius * (1 - np.exp(1j * theta))
+        return along_path(p, theta, turn / self.radius, 0, 2 * np.pi * self.radius / self.period, 0)
+
+
+class Lemniscate(Record):
+    """The figure of eight of Gerono, x = a sin s, y = a sin s cos s, s = 2πt/period; it starts at 45°."""
+
+    kind: Literal["lemniscate"] = "lemniscate"
+    size: Length = 1.5
+    """Half the length of the figure [a] in m; it is as wide as it is half long."""
+    period: Duration = 12.0
+    """Time of one lap in s."""
+
+    def sample(self, t: Array) -> Motion:
+        """Samples the lemniscate at the times t [s], shape (T,)."""
+        a, w = self.size, 2 * np.pi / self.period
+        s = w * t
+        p, d1, d2, d3 = (
+            a * w**n * (np.sin(s + n * np.pi / 2) + 0.5j * 2**n * np.sin(2 * s + n * np.pi / 2)) for n in range(4)
+        )
+        # θ swings between 45° and -225°, so the branch that is cut along +y is continuous.
+        return from_curve(p, d1, d2, d3, np.angle(1j * d1) - np.pi / 2)
+
+
+class LaneChange(Record):
+    """A septic step to the left at constant speed along x; straight on afterwards. θ̈ is continuous."""
+
+    kind: Literal["lane_change"] = "lane_change"
+    length: Length = 4.0
+    """Length of the change along x in m."""
+    shift: Annotated[float, Field(ge=-1000, le=1000)] = 1.0
+    """Shift to the left in m, negative to the right."""
+    speed: Speed = 0.8
+    """Speed along x in m/s; along the path it is higher during the change."""
+
+    @property
+    def period(self) -> float:
+        """Time of the change in s."""
+        return self.length / self.speed
+
+    def sample(self, t: Array) -> Motion:
+        """Samples the lane change at the times t [s], shape (T,)."""
+        u = np.clip(t / self.period, 0, 1)
+        y, y1, y2, y3 = (self.shift * _SEPTIC.deriv(n)(u) / self.period**n for n in range(4))
+        return from_curve(self.speed * t + 1j * y, self.speed + 1j * y1, 1j * y2, 1j * y3)
+
+
+class RoundedSquare(Record):
+    """A square at constant speed, counter-clockwise from the middle of its lower side.
+
+    Along a corner θ is a quintic step of arc length, so curvature rises from zero and returns smoothly, like a
+    clothoid without its kinks: θ̈ is continuous. The position is the Fresnel-like integral of e^{iθ}, which
+    Gauss quadrature gives to machine precision.
+    """
+
+    kind: Literal["rounded_square"] = "rounded_square"
+    side: Length = 2.0
+    """Side of the square in m."""
+    radius: Length = 0.4
+    """Tightest radius of a corner in m; the corner takes up 1.73 times as much of each side."""
+    speed: Speed = 0.5
+    """Speed in m/s."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> RoundedSquare:
+        if self._reach > self.side / 2:
+            most = self.radius * self.side / 2 / self._reach
+            raise ValueError(f"radius: corners do not fit a side of {self.side:g} m; at most {most:.4g} m")
+        return self
+
+    @property
+    def _corner(self) -> float:
+        """Arc length of a corner in m, from κ_max = (π/2) S'(1/2) / length."""
+        return np.pi / 2 * self.radius * float(_QUINTIC.deriv()(0.5))
+
+    @property
+    def _reach(self) -> float:
+        """What a corner takes up of each side in m."""
+        return self._corner * float(_turn(np.ones(1))[0].real)
+
+    @property
+    def period(self) -> float:
+        """Time of one lap in s."""
+        return 4 * (self.side - 2 * self._reach + self._corner) / self.speed
+
+    def sample(self, t: Array) -> Motion:
+        """Samples the square at the times t [s], shape (T,)."""
+        corner, straight = self._corner, self.side / 2 - self._reach
+        quarter, s = np.divmod(self.speed * t, 2 * straight + corner)
+        u = np.clip((s - straight) / corner, 0, 1)
+        p = np.minimum(s, straight) + corner * _turn(u) + 1j * np.maximum(s - straight - corner, 0)
+        centre, turn = 1j * self.side / 2, np.pi / 2
+        return along_path(
+            centre + (p - centre) * 1j**quarter,
+            turn * (quarter + _QUINTIC(u)),
+            turn * _QUINTIC.deriv()(u) / corner,
+            turn * _QUINTIC.deriv(2)(u) / corner**2,
+            self.speed,
+            0,
+        )
+
+
+def _turn(u: Array) -> Plane:
+    """Position after the part u (T,) of a left corner of length one: ∫ exp(i π/2 S(w)) dw from 0 to u."""
+    theta = np.pi / 2 * _QUINTIC(np.multiply.outer(u, _CORNER_NODES))
+    return u * (np.cos(theta) @ _CORNER_WEIGHTS + 1j * (np.sin(theta) @ _CORNER_WEIGHTS))
+
+
+class StopAndGo(Record):
+    """From rest to rest along a straight line, over and over; V̇ is continuous."""
+
+    kind: Literal["stop_and_go"] = "stop_and_go"
+    distance: Length = 2.0
+    """Distance between stops in m."""
+    move_time: Duration = 3.0
+    """Time from stop to stop in s; the speed peaks at 1.875 distance / move_time."""
+    pause: Annotated[float, Field(ge=0, le=3600)] = 1.0
+    """Time at rest after each move in s."""
+    reverse: bool = True
+    """Every second move goes back to the start; otherwise all go forward."""
+
+    @property
+    def period(self) -> float:
+        """Time of one cycle in s: there, pause, and if it reverses back, pause."""
+        return (2 if self.reverse else 1) * (self.move_time + self.pause)
+
+    def sample(self, t: Array) -> Motion:
+        """Samples the moves at the times t [s], shape (T,)."""
+        move, since = np.divmod(t, self.move_time + self.pause)
+        u = np.clip(since / self.move_time, 0, 1)
+        back = (move % 2 == 1) if self.reverse else np.zeros(t.shape, bool)
+        start, sign = np.where(back, 1, 0 if self.reverse else move), np.where(back, -1, 1)
+        x, v, a = (sign * self.distance * _QUINTIC.deriv(n)(u) / self.move_time**n for n in range(3))
+        return along_path(start * self.distance + x + 0j, 0, 0, 0, v, a)
+
+
+_LOOP = ((0.0, 0.0), (1.5, 0.0), (3.0, 0.8), (2.5, 2.2), (1.0, 1.6), (-0.8, 2.0), (-1.2, 0.6))
+
+
+class Waypoints(Record):
+    """A quintic spline through points at constant speed, from the first point on.
+
+    A closed one is periodic and smooth (C⁴) all around; an open one is straight at both ends and comes to rest on its
+    last point, where it stays.
+    """
+
+    kind: Literal["waypoints"] = "waypoints"
+    points: tuple[tuple[Coordinate, Coordinate], ...] = _LOOP
+    """Points (x, y) in m, in order; a closed curve returns to the first by itself."""
+    speed: Speed = 0.6
+    """Speed in m/s."""
+    closed: bool = True
+    """The curve is a lap."""
+    stop_time: Duration = 2.0
+    """Time to come to rest at the end of an open curve in s."""
+
+    @model_validator(mode="after")
+    def _regular(self) -> Waypoints:
+        least = 3 if self.closed else 2
+        if len(self.points) < least:
+            raise ValueError(f"points: {'a closed' if self.closed else 'an open'} curve needs at least {least}")
+        gaps = np.abs(np.diff(_plane(self.points, self.closed)))
+        if gaps.min() < 1e-3:
+            first = int(gaps.argmin())
+            raise ValueError(f"points: {first} and {(first + 1) % len(self.points)} coincide")
+        path = _spline(self.points, self.closed)
+        # The parameter is chord length, so a regular curve has |dp/du| near one.
+        slow = np.abs(path.derivative(path.u, 1))
+        if slow.min() < 0.02:
+            where = path.derivative(path.u, 0)[slow.argmin()]
+            raise ValueError(f"points: the curve turns on the spot near ({where.real:.2f}, {where.imag:.2f})")
+        if not self.closed and self.speed * self.stop_time / 2 > path.length:
+            raise ValueError(f"stop_time: too long to stop from {self.speed:g} m/s within {path.length:.2f} m")
+        return self
+
+    @property
+    def period(self) -> float:
+        """Time of one lap, or until rest, in s."""
+        return _spline(self.points, self.closed).length / self.speed + (0 if self.closed else self.stop_time / 2)
+
+    def sample(self, t: Array) -> Motion:
+        """Samples the spline at the times t [s], shape (T,)."""
+        s, v, a = self.speed * t, np.full(t.shape, self.speed), np.zeros(t.shape)
+        if not self.closed:
+            brake = self.period - self.stop_time
+            u = np.clip((t - brake) / self.stop_time, 0, 1)
+            s = self.speed * (np.minimum(t, brake) + self.stop_time * (u - _QUINTIC.integ()(u)))
+            v, a = self.speed * (1 - _QUINTIC(u)), -self.speed * _QUINTIC.deriv()(u) / self.stop_time
+        return along_path(*_spline(self.points, self.closed).at(s), v, a)
+
+
+def _plane(points: tuple[tuple[float, float], ...], closed: bool) -> Plane:
+    return np.array([complex(*point) for point in (*points, *points[: int(closed)])])
+
+
+class _Spline:
+    """A planar spline by arc length; u is its own parameter, the accumulated chord length."""
+
+    def __init__(self, points: tuple[tuple[float, float], ...], closed: bool) -> None:
+        p = _plane(points, closed)
+        knots = np.append(0, np.cumsum(np.abs(np.diff(p))))
+        straight = [(2, np.zeros(2)), (3, np.zeros(2))]
+        ends = "periodic" if closed else (straight, straight)
+        curve = make_interp_spline(knots, np.stack([p.real, p.imag], -1), k=5, bc_type=ends)  # type: ignore[arg-type]
+        self.curves = [curve, *(curve.derivative(n) for n in (1, 2, 3))]
+        self.u = np.append(np.linspace(knots[:-1], knots[1:], 64, endpoint=False).T, knots[-1])
+        self.s = np.append(0, np.cumsum(self.arc(self.u[:-1], self.u[1:])))
+        self.length = float(self.s[-1])
+        self.heading = np.unwrap(np.angle(self.derivative(self.u, 1)))
+        self.closed = closed
+
+    @cached_property
+    def parameter(self) -> CubicHermiteSpline:
+        """u(s), good to the fourth power of a piece."""
+        return CubicHermiteSpline(self.s, self.u, 1 / np.abs(self.derivative(self.u, 1)))
+
+    def derivative(self, u: Array, n: int) -> Plane:
+        """The n-th derivative of x + i y with respect to u, n = 0 to 3."""
+        x, y = np.moveaxis(self.curves[n](u), -1, 0)
+        return x + 1j * y
+
+    def arc(self, start: Array, end: Array) -> Array:
+        """Arc length [m] from start to end, (T,), both within one piece."""
+        u = start[:, None] + (end - start)[:, None] * _PIECE_NODES
+        return (end - start) * (np.abs(self.derivative(u, 1)) @ _PIECE_WEIGHTS)
+
+    def at(self, s: Array) -> tuple[Plane, Array, Array, Array]:
+        """Position [m], heading [rad], curvature [1/m] and sharpness [1/m²] at the arc lengths s [m], each (T,)."""
+        lap, s = np.divmod(s, self.length) if self.closed else (np.zeros(s.shape), np.minimum(s, self.length))
+        piece = np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
+        u = self.parameter(s)
+        # One step of Newton's method takes the table's error to rounding.
+        u = u - (self.s[piece] + self.arc(self.u[piece], u) - s) / np.abs(self.derivative(u, 1))
+        p, d1, d2, d3 = (self.derivative(u, n) for n in range(4))
+        log, step = d2 / d1, np.abs(d1)
+        sharpness = ((d3 / d1 - log**2).imag - log.imag * log.real) / step**2
+        # The tabulated heading chooses the branch of the exact one.
+        near, exact = np.interp(u, self.u, self.heading), np.angle(d1)
+        heading = exact + 2 * np.pi * np.round((near - exact) / (2 * np.pi))
+        return p, heading + lap * (self.heading[-1] - self.heading[0]), log.imag / step, sharpness
+
+
+_spline = lru_cache(maxsize=64)(_Spline)
+
+
+Reference = Annotated[
+    Line | Circle | Lemniscate | LaneChange | RoundedSquare | StopAndGo | Waypoints, Field(discriminator="kind")
+]
+
+
+def check(reference: Reference, robot: Robot, reverse: bool) -> None:
+    """Refuses a reference that the robot cannot follow.
+
+    Args:
+        reference: Any of the kinds above.
+        robot: Its limits on speed, acceleration, steering and grip.
+        reverse: The steering in use can drive backwards.
+
+    Raises:
+        InputError: One line with the kind, the quantity, its peak, when, and the limit.
+    """
+    # At least every 10 ms, so that no move hides between long pauses.
+    t = np.linspace(0, reference.period, int(np.clip(100 * reference.period, 2000, 500_000)) + 1)
+    _, (v, omega), (v_dot, omega_dot) = (part.T for part in reference.sample(t))
+    if not reverse and v.min() < -1e-9:
+        when = t[np.argmax(v < -1e-9)]
+        raise InputError(
+            f"reference {reference.kind}: reverses at t = {when:.2f} s, "
+            "which steering = compliant or caster cannot; use rigid"
+        )
+    # atan2 keeps the ratio θ̇/V all the way to rest, and is zero there: a pause asks for no steering angle.
+    steering = np.arctan2(abs(robot.wheelbase) * np.abs(omega), np.abs(v))
+    for name, values, unit, limit, bound in (
+        ("speed", v, "m/s", "max_speed", robot.max_speed),
+        ("rotation", omega, "rad/s", "max_rotation", robot.max_rotation),
+        ("acceleration", v_dot, "m/s²", "max_acceleration", robot.max_acceleration),
+        ("rotation acceleration", omega_dot, "rad/s²", "max_rotation_acceleration", robot.max_rotation_acceleration),
+        ("steering angle", steering, "rad", "steering_limit", robot.steering_limit),
+        ("lateral acceleration", v * omega, "m/s²", "tyre_friction times gravity,", robot.tyre_friction * GRAVITY),
+    ):
+        worst = int(np.argmax(np.abs(values)))
+        if (peak := abs(values[worst])) > bound * (1 + 1e-9):
+            raise InputError(
+                f"reference {reference.kind}: {name} {peak:.3g} {unit} at t = {t[worst]:.2f} s "
+                f"exceeds the robot's {limit} {bound:.3g} {unit}"
+            )

@@ -1,0 +1,180 @@
+"""The robot as equations (1) to (3) know it, and what can be wrong with it.
+
+No MuJoCo here: `mrctl.physics.mjcf` reads a `Robot` from a compiled MJCF and applies a `Perturbation` to one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from mrctl.record import Record
+
+GRAVITY = 9.81  # m/s²
+ANY_ANGLE = math.pi / 2  # rad, the steering limit of what is not steered
+Steering = Literal["compliant", "caster", "rigid"]
+STEERINGS: tuple[Steering, ...] = ("compliant", "caster", "rigid")
+
+Positive = Annotated[float, Field(ge=1e-9, le=1e9)]
+NonNegative = Annotated[float, Field(ge=0, le=1e9)]
+
+
+class Robot(Record):
+    """Parameters of a car-like robot, SI units (symbols of the paper in brackets).
+
+    P is the midpoint of the rear axle; the body's x axis points forward, y to the left.
+    """
+
+    mass: Positive
+    """Total mass [M] in kg."""
+    yaw_inertia: Positive
+    """Yaw inertia of the whole robot about its centre of mass [J] in kg·m²."""
+    com_offset: float
+    """Centre of mass ahead of P [c] in m."""
+    com_height: NonNegative
+    """Height of the centre of mass above the ground in m."""
+    wheel_radius: Positive
+    """Rear wheel radius [r] in m."""
+    front_wheel_radius: Positive
+    """Front wheel radius in m."""
+    half_track: Positive
+    """Half the distance between the rear wheels [D] in m."""
+    wheelbase: float
+    """Rear axle to steering axis [L] in m; to the caster where nothing is steered, negative if it is behind."""
+    trail: NonNegative
+    """Front contact point behind the steering axis [t] in m."""
+    steering_limit: Annotated[float, Field(gt=0, le=ANY_ANGLE)]
+    """Largest steering angle in rad; π/2 for a differential drive, which turns on the spot."""
+    resistance: Positive
+    """Terminal resistance [R_a] in Ω."""
+    inductance: NonNegative
+    """Armature inductance [L_a] in H; 0 where the current follows the voltage at once."""
+    torque_constant: Positive
+    """Motor constant [k_M] in N·m/A, and [k_E] in V·s/rad: in SI they are the same number."""
+    gear_ratio: Positive
+    """Motor turns per wheel turn [N]."""
+    rotor_inertia: NonNegative
+    """Rotor inertia at the motor shaft [J_m] in kg·m²."""
+    no_load_current: NonNegative
+    """No-load current [I_0] in A."""
+    gear_loss: NonNegative
+    """Coulomb friction of one gearbox, at the wheel, in N·m."""
+    rolling_coefficient: NonNegative
+    """Rolling resistance over load."""
+    wheel_inertia: Positive
+    """Spin inertia of one rear wheel [J_w] in kg·m²."""
+    front_wheel_inertia: NonNegative
+    """Spin inertia of the front wheel, or of both, in kg·m²."""
+    supply: Positive
+    """Supply voltage [U_max] in V."""
+    drive_gain: Positive = 1.0
+    """Applied volt per commanded volt; below 1 for a PWM drive on a sagging supply."""
+    tyre_friction: Positive
+    """Coulomb coefficient between tyre and floor."""
+    max_speed: Positive
+    """Limit on |V| for references and commands in m/s."""
+    max_rotation: Positive
+    """Limit on |θ̇| in rad/s."""
+    max_acceleration: Positive
+    """Limit on |V̇| in m/s²."""
+    max_rotation_acceleration: Positive
+    """Limit on |θ̈| in rad/s²."""
+
+    @model_validator(mode="after")
+    def _geometry(self) -> Robot:
+        if self.wheelbase <= 0 and self.steering_limit < ANY_ANGLE:
+            raise ValueError("wheelbase: steered wheels must be ahead of the driven ones")
+        if self.trail >= abs(self.wheelbase):
+            raise ValueError("trail: must be shorter than the wheelbase")
+        if not 0 <= self.com_offset / (self.wheelbase - self.trail) < 1:
+            raise ValueError("com_offset: the centre of mass must lie between the rear axle and the front contact")
+        return self
+
+    @property
+    def motor_gain(self) -> float:
+        """Stall torque at the wheel per volt, N k_M / R_a, in N·m/V."""
+        return self.gear_ratio * self.torque_constant / self.resistance
+
+    @property
+    def back_emf(self) -> float:
+        """Back-EMF per wheel rate, k_E N, in V·s/rad."""
+        return self.gear_ratio * self.torque_constant
+
+    @property
+    def drive_loss(self) -> float:
+        """Coulomb torque τ_loss of one drive at the wheel, N k_M I_0 + gearbox, in N·m."""
+        return self.back_emf * self.no_load_current + self.gear_loss
+
+    @property
+    def rolling_force(self) -> float:
+        """Rolling resistance of all wheels on level ground, F_roll, in N."""
+        return self.rolling_coefficient * self.mass * GRAVITY
+
+    @property
+    def front_load(self) -> float:
+        """Share of the weight on the front wheel at rest, by the lever rule."""
+        return self.com_offset / (self.wheelbase - self.trail)
+
+    @property
+    def drive_inertia(self) -> float:
+        """Inertia of one rear wheel with its reflected rotor, J_w + N² J_m, in kg·m²."""
+        return self.wheel_inertia + self.gear_ratio**2 * self.rotor_inertia
+
+    @property
+    def effective_mass(self) -> float:
+        """Mass that the motors accelerate, M_e, in kg: robot, spinning rear drives, spinning front wheel."""
+        return (
+            self.mass
+            + 2 * self.drive_inertia / self.wheel_radius**2
+            + self.front_wheel_inertia / self.front_wheel_radius**2
+        )
+
+    @property
+    def effective_inertia(self) -> float:
+        """Yaw inertia about P that the motors accelerate, J_e, in kg·m²."""
+        return (
+            self.yaw_inertia
+            + self.mass * self.com_offset**2
+            + 2 * self.half_track**2 * self.drive_inertia / self.wheel_radius**2
+        )
+
+    @property
+    def velocity_gain(self) -> float:
+        """Static gain of the common channel, V per U_Σ, in m/s/V."""
+        return self.wheel_radius / self.back_emf
+
+    @property
+    def rotation_gain(self) -> float:
+        """Static gain of the differential channel, θ̇ per U_Δ, in rad/s/V."""
+        return self.velocity_gain / self.half_track
+
+    @property
+    def velocity_time_constant(self) -> float:
+        """Time constant of V under U_Σ in s."""
+        return self.effective_mass * self.wheel_radius**2 / (2 * self.motor_gain * self.back_emf)
+
+    @property
+    def rotation_time_constant(self) -> float:
+        """Time constant of θ̇ under U_Δ in s."""
+        damping = 2 * self.half_track**2 * self.motor_gain * self.back_emf / self.wheel_radius**2
+        return self.effective_inertia / damping
+
+
+class RobotFile(Record):
+    """Whose robot drives: an MJCF, and what its parts are called. What has no name is found where it is unambiguous."""
+
+    path: str = "car"
+    """`car`, `turtlebot`, `racecar`, or the path of an MJCF file with the robot."""
+    wheels: tuple[str, ...] = ()
+    """Joints of the two driven wheels; by default the two joints with a <dcmotor>."""
+    steering: tuple[str, ...] = ()
+    """Joint of the steered wheel, or of both; by default the upright joints with an actuator, so none for a
+    differential drive."""
+    chassis: str = ""
+    """Body that carries the rest; by default the one at the root of the wheels."""
+
+
+CAR = RobotFile()
+"""The robot that a world has by itself."""

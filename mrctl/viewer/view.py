@@ -1,0 +1,72 @@
+"""The command `mrctl view`: which page shows what, and the server under it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mrctl.loop.simulation import simulate
+from mrctl.record import InputError
+from mrctl.scenario import FeedforwardName, Scenario
+
+if TYPE_CHECKING:
+    from mrctl.viewer.page import Page
+    from mrctl.viewer.server import Server
+
+
+def view(
+    file: Path | None, compare: Sequence[FeedforwardName], run: int | None, export: Path | None, host: str, port: int
+) -> None:
+    """Shows robots in the browser: a live session, or the replay of a result or a sweep.
+
+    Args:
+        file: Scenario, or folder of a result or sweep; None for the default scenario.
+        compare: Feedforwards of the ghosts beside a scenario.
+        run: Run of a result or sweep to begin with.
+        export: File to write instead of serving a page.
+        host: Address to listen on.
+        port: Port to listen on.
+
+    Raises:
+        InputError: What `mrctl.simulate` and `mrctl.open` refuse, an address that cannot be listened on, or options
+            that do not go together.
+    """
+    from mrctl.viewer.export import export as write
+    from mrctl.viewer.live import Live
+    from mrctl.viewer.recording import FEW, Library, Recording, names
+    from mrctl.viewer.replay import Replay
+
+    if file is not None and file.is_dir():
+        if compare:
+            raise InputError("compare: a replay shows what was run; ghosts are chosen in the page")
+        library = Library(file)
+        table = library.table
+        shown = [int(table.index[0]) if run is None else run]
+        if run is None and len(table) <= FEW:
+            shown = [int(k) for k in table.index]
+        if export is not None:
+            recordings = [library.recording(k) for k in shown]
+            return write(recordings, names(recordings, shown), export)
+        return _serve(lambda server: Replay(library, shown, server), host, port)
+    if run is not None:
+        raise InputError("run: only a result or a sweep has several")
+    scenario = Scenario() if file is None else Scenario.from_toml(file)
+    ghosts = [scenario.model_copy(update={"feedforward": name, "name": ""}) for name in compare]
+    if export is not None:
+        result = simulate([scenario, *ghosts], progress=True)
+        recordings = [Recording(result.isel(run=k)) for k in range(result.sizes["run"])]
+        return write(recordings, names(recordings, range(len(recordings))), export)
+    return _serve(lambda server: Live([scenario, *ghosts], server), host, port)
+
+
+def _serve(page: Callable[[Server], Page], host: str, port: int) -> None:
+    from mrctl.viewer.server import Server
+
+    server = Server(host, port)
+    try:
+        built = page(server)
+        print(server.announce(), flush=True)
+        built.run()
+    finally:
+        server.stop()
