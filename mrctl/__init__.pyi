@@ -1,11 +1,11 @@
 from .control.composite import Composite as Composite
 from .control.fel import Fel as Fel
-from .control.fel import save_weights as save_weights
 from .control.guard import Guard as Guard
 from .control.kanayama import Kanayama as Kanayama
 from .control.observer import Observer as Observer
 from .control.pid import Pid as Pid
 from .control.rls import Rls as Rls
+from .control.weights import save_weights as save_weights
 from .loop.simulation import Simulation as Simulation
 from .loop.simulation import simulate as simulate
 from .physics.mjcf import load_robot as load_robot

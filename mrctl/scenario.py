@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import ceil
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -45,6 +46,10 @@ class Event(Record):
     """New design of the velocity controller."""
     learning: bool | None = None
     """Switches learning on or off."""
+
+    def tick(self, period: float) -> int:
+        """The first control tick that is not before the event; `period` is the control period in s."""
+        return ceil(self.time / period - 1e-9)
 
 
 class Scenario(Record):

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol
+from functools import cache
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
-from numba import float64, guvectorize
 from numpy.typing import NDArray
 
+from mrctl.control.features import features, linear
+from mrctl.control.nominal import nominal
+from mrctl.kernel import Array, Kernel, Row, Rows, kernel
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
-Array = NDArray[np.float64]
-FEATURES = ("V", "ω", "V̇", "ω̇", "Vω", "ω²", "sgn V_l", "sgn V_r")
-SIGN_SPEED = 0.05  # m/s over which the smooth sign of the losses turns
 STEERING_SHARE = 0.1  # how much slower a steering channel learns: its geometry is nearly right from the start
 
 
@@ -54,74 +55,152 @@ class Feedforward(Protocol):
         ...
 
 
-@guvectorize(
-    [(float64[:], float64[:], float64, float64[:], float64[:])],
-    "(u),(u),(),(f)->(f)",
-    cache=True,
-)
-def features(command, derivative, half_track, scale, out):  # noqa: ANN001, ANN201
-    """The 8 features of the inverse dynamics (physics of equation (3)), divided by `scale`, for one robot."""
-    v, omega = command[0], command[1]
-    out[0] = v / scale[0]
-    out[1] = omega / scale[1]
-    out[2] = derivative[0] / scale[2]
-    out[3] = derivative[1] / scale[3]
-    out[4] = v * omega / scale[4]
-    out[5] = omega * omega / scale[5]
-    out[6] = np.tanh((v - half_track * omega) / SIGN_SPEED) / scale[6]
-    out[7] = np.tanh((v + half_track * omega) / SIGN_SPEED) / scale[7]
+class CompiledFeedforward(ABC):
+    """A feedforward whose two laws are kernels for one robot, so that a whole control tick is one compiled call.
 
+    `output` and `learn` call the same kernels for all robots, which makes it a `Feedforward` like any other.
 
-def feature_scale(robot: Robot) -> Array:
-    """Scales of the 8 features, `(8,)`, chosen so that each moves by about one on an ordinary lap.
-
-    Speeds are divided by the robot's limits; accelerations and products by a third of theirs, where a robot spends its
-    time; the signs, which hardly move, by three.
+    Attributes:
+        respond: `(i, command, derivative, robot, arrays, voltage)` writes the output of robot i to `voltage`, `(2,)`.
+        learn_one: `(i, command, feedback, frozen, twist, voltage, period, robot, arrays, added)` learns, writes what
+            that added to the output of robot i to `added`, `(2,)`, and returns the norm of what it has learned.
+        arrays: What the kernels keep and share, a plain tuple of arrays.
+        guarded: Whether the guard has anything to watch.
+        weight_norm: Norm of what was learned, `(B,)`.
+        weight_volts: What weights of norm one make of features of one, in V; 0 where there are no weights.
     """
-    v, omega = robot.max_speed, robot.max_rotation
-    fast = np.array([robot.max_acceleration, robot.max_rotation_acceleration, v * omega, omega**2]) / 3
-    return np.array([v, omega, *fast, 3.0, 3.0])
 
+    respond: ClassVar[Kernel]
+    learn_one: ClassVar[Kernel]
+    guarded: ClassVar[bool] = True
+    arrays: tuple[Any, ...]
+    weight_volts: Array | float = 0.0
 
-@guvectorize([(float64[:], float64[:, :], float64[:])], "(f),(f,u)->(u)", cache=True)
-def linear(x, coefficients, out):  # noqa: ANN001, ANN201
-    """Features `(8,)` times coefficients `(8, 2)` for one robot; a plain sum in a fixed order."""
-    for k in range(2):
-        total = 0.0
-        for i in range(x.shape[0]):
-            total += x[i] * coefficients[i, k]
-        out[k] = total
+    def __init__(self, robot: Robot, size: int, rigid: bool, period: float) -> None:
+        """Takes the nominal robot, the number of robots, whether channel two is steering, and the period in s."""
+        self.robot, self.period = nominal(robot, rigid), period
+        self.weight_norm = np.zeros(size)
+        self._command, self._voltage, self._added = np.zeros((3, size, 2))
 
+    @abstractmethod
+    def restore(self, rows: NDArray[np.intp]) -> None:
+        """Takes the robots with these indices back to what they knew at the start."""
 
-class NoFeedforward:
-    """PID alone, the paper's baseline."""
-
-    def __init__(self, size: int) -> None:
-        """Takes the number of robots."""
-        self._zero = np.zeros((size, 2))
+    def take(self, row: int, other: CompiledFeedforward) -> None:
+        """Copies what the same stage for one robot keeps into a row of this one."""
+        size = len(self.weight_norm)
+        self.weight_norm[row] = other.weight_norm[0]
+        for mine, theirs in zip(_flat(self.arrays), _flat(other.arrays), strict=True):
+            if len(mine) == size and len(theirs) == 1:
+                mine[row] = theirs[0]
 
     def output(self, command: Array, derivative: Array) -> Array:
-        """Zero volts."""
-        return self._zero
+        """See `Feedforward.output`."""
+        self._command[:] = command
+        _respond_all(type(self))(self._command, _own(derivative), self.robot, self.arrays, self._voltage)
+        return self._voltage
 
-    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> None:
-        """Nothing to learn."""
+    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
+        """See `Feedforward.learn`."""
+        _learn_all(type(self))(
+            self._command, _own(feedback), _own(saturated), _own(twist), _own(voltage), self.period, self.robot,
+            self.arrays, self._added, self.weight_norm,
+        )  # fmt: skip
+        return self._added
 
 
-class InverseDynamics:
+def _flat(arrays: tuple[Any, ...]) -> list[NDArray[Any]]:
+    """The arrays in a tuple of arrays and such tuples."""
+    return [a for entry in arrays for a in (_flat(entry) if isinstance(entry, tuple) else [entry])]
+
+
+def _own(values: Array) -> Array:
+    """Contiguous float64, so that the loops below are compiled once."""
+    return np.ascontiguousarray(values, float)
+
+
+@cache
+def _respond_all(stage: type[CompiledFeedforward]) -> Kernel:
+    return respond_all.calling(respond=stage.respond)
+
+
+@cache
+def _learn_all(stage: type[CompiledFeedforward]) -> Kernel:
+    return learn_all.calling(learn_one=stage.learn_one)
+
+
+@kernel
+def nothing(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
+    """Zero volts."""
+    voltage[0] = voltage[1] = 0.0
+
+
+@kernel
+def learn_nothing(
+    i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
+    arrays: tuple[Any, ...], added: Array,
+) -> float:  # fmt: skip
+    """Adds nothing."""
+    added[0] = added[1] = 0.0
+    return 0.0
+
+
+respond, learn_one = nothing, learn_nothing  # what the loops below call, until `Kernel.calling` says otherwise
+
+
+@kernel
+def respond_all(command: Array, derivative: Array, robot: Rows, arrays: tuple[Any, ...], voltage: Array) -> None:
+    """The output of all robots."""
+    for i in range(len(voltage)):
+        respond(i, command[i], derivative[i], robot[0], arrays, voltage[i])
+
+
+@kernel
+def learn_all(
+    command: Array, feedback: Array, frozen: Array, twist: Array, voltage: Array, period: float, robot: Rows,
+    arrays: tuple[Any, ...], added: Array, norm: Array,
+) -> None:  # fmt: skip
+    """One learning step of all robots."""
+    for i in range(len(added)):
+        norm[i] = learn_one(
+            i, command[i], feedback[i], frozen[i], twist[i], voltage[i], period, robot[0], arrays, added[i]
+        )
+
+
+class NoFeedforward(CompiledFeedforward):
+    """`none`: PID alone, the paper's baseline."""
+
+    respond, learn_one, guarded = nothing, learn_nothing, False
+    arrays = ()
+
+    def restore(self, rows: NDArray[np.intp]) -> None:
+        """Has nothing to forget."""
+
+
+@kernel
+def inverse_dynamics(
+    i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array
+) -> None:
+    """Equation (3) inverted, on features without scale."""
+    half_track, coefficients, ones, x = arrays
+    features(command, derivative, half_track[i], ones, x)
+    linear(x, coefficients[i], voltage)
+
+
+class InverseDynamics(CompiledFeedforward):
     """The corrected equation (3) inverted: `model` with nominal parameters, `oracle` with the plant's own.
 
     Attributes:
         coefficients: Of the features in the two channels, `(B, 8, 2)`.
     """
 
+    respond, learn_one, guarded = inverse_dynamics, learn_nothing, False
+
     def __init__(self, robots: Sequence[Robot], rigid: bool) -> None:
         """Takes a robot a row, and whether the second channel is steering."""
-        self._half_track = np.array([robot.half_track for robot in robots])
-        self.coefficients = np.zeros((len(robots), 8, 2))
-        self._rigid = rigid
-        self._scale = np.ones(8)
-        self._features, self._output = np.zeros((len(robots), 8)), np.zeros((len(robots), 2))
+        super().__init__(robots[0], len(robots), rigid, 0.0)
+        self._half_track, self.coefficients = np.zeros(len(robots)), np.zeros((len(robots), 8, 2))
+        self.arrays = self._half_track, self.coefficients, np.ones(8), np.zeros(8)
         for row, robot in enumerate(robots):
             self.set_robot(row, robot)
 
@@ -129,14 +208,8 @@ class InverseDynamics:
         """Replaces the parameters of one row."""
         self._half_track[row] = robot.half_track
         self.coefficients[row] = inverse_coefficients(robot)
-        if self._rigid:  # the steering makes θ̇; its inverse is φ_c itself
+        if self.robot["rigid"][0]:  # the steering makes θ̇; its inverse is φ_c itself
             self.coefficients[row, :, 1] = 0.0
 
-    def output(self, command: Array, derivative: Array) -> Array:
-        """Voltages of the inverse dynamics, before the supply limit."""
-        features(command, derivative, self._half_track, self._scale, self._features)
-        linear(self._features, self.coefficients, self._output)
-        return self._output
-
-    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> None:
-        """Knows already."""
+    def restore(self, rows: NDArray[np.intp]) -> None:
+        """Has nothing to forget."""

@@ -7,26 +7,24 @@ any stateless torch module.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numba import float64, guvectorize, njit
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.chain import ANY, EACH, GIVEN, OWN, one, rows, stamp
-from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features
-from mrctl.record import InputError, Record
+from mrctl.control.features import feature_scale, features
+from mrctl.control.feedforward import STEERING_SHARE, CompiledFeedforward
+from mrctl.control.weights import INPUTS, OUTPUTS, initial_weights, load_weights
+from mrctl.kernel import Array, Row, Rows, kernel
+from mrctl.record import Record
 from mrctl.theory.robot import Robot
 
-INPUTS, OUTPUTS = 8, 2
 # Gains of hidden units and bias beside the direct links. A normalised step is shared out by squared regressor, so these
 # give most of it to the eight features. With gains of one, two dozen nearly constant units act as an integrator: slow
 # to learn what changes during a lap, quick to oscillate.
 HIDDEN_GAIN, BIAS_GAIN = 0.15, 0.1
-REGULARISATION = 1e-3  # keeps the normalised step finite at rest, where the regressor vanishes
+REGULARISATION = 1e-3  # ε: keeps the normalised step finite at rest, where the regressor vanishes
 STEERING_SCALE = 0.1  # rad/s that a steering channel corrects, per volt of the other arrangements
 
 
@@ -50,133 +48,107 @@ class Fel(Record):
     frozen: bool = False
     """Use the weights, do not change them."""
 
-    def targets(self, rigid: bool) -> Array:
-        """Output scale, dead zone and share of the step for the two channels, `(3, 2)`."""
-        second = (self.output_scale * STEERING_SCALE, self.dead_zone * STEERING_SCALE, STEERING_SHARE)
-        first = (self.output_scale, self.dead_zone, 1.0)
-        return np.array([first, second if rigid else first]).T
 
-    def steps(self) -> Array:
-        """Step, leak and weight bound, `(3,)`; zeros keep the weights as they are."""
-        return np.array([0.0 if self.frozen else self.step, 0.0 if self.frozen else self.leak, self.weight_bound])
-
-
-def shapes(hidden: int) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the weights, in the order of the flat vector; they are those of `fel_torch.Network`."""
-    return {
-        "hidden.weight": (hidden, INPUTS),
-        "hidden.bias": (hidden,),
-        "output.weight": (OUTPUTS, hidden),
-        "output.bias": (OUTPUTS,),
-        "direct.weight": (OUTPUTS, INPUTS),
-    }
+FEL = np.dtype(
+    [
+        ("scale", "f8", OUTPUTS),  # output for a network output of one, V (rad/s on a steering channel)
+        ("dead_zone", "f8", OUTPUTS),  # feedback below this teaches nothing, V (rad/s)
+        ("share", "f8", OUTPUTS),  # of the step in the two channels
+        ("step", "f8"),  # μ; 0 keeps the weights as they are
+        ("leak", "f8"),  # share of the distance to the prior that is given back each period
+        ("bound", "f8"),  # largest distance from the prior
+        ("x", "f8", INPUTS),  # scaled features of the commanded motion
+        ("output", "f8", OUTPUTS),  # feedforward at x, V (rad/s)
+        ("error", "f8", OUTPUTS),  # e: feedback in units of the network's output
+        ("norm", "f8"),  # distance of the weights from the prior
+    ],
+    align=True,
+)
 
 
-def initial_weights(hidden: int, seed: int) -> Array:
-    """Random hidden layer, everything behind it zero: learning begins as pure PID.
-
-    Returns:
-        Flat weights, `(11 hidden + 18,)`.
-    """
-    rng = np.random.default_rng([seed, 1])
-    layers = {name: np.zeros(shape) for name, shape in shapes(hidden).items()}
-    for name in ("hidden.weight", "hidden.bias"):
-        layers[name] = rng.normal(0.0, 0.5, layers[name].shape)
-    return flatten(layers)
-
-
-def flatten(layers: dict[str, Array]) -> Array:
-    """Named weights to the flat vector of the compiled network."""
-    hidden = len(layers["hidden.bias"])
-    return np.concatenate([np.ravel(layers[name]) for name in shapes(hidden)])
+def fresh(settings: list[Fel], rigid: bool) -> Rows:
+    """Records of `FEL` at the start of a run, a robot each; `rigid` says whether channel two is steering."""
+    rows = np.zeros(len(settings), FEL)
+    second = STEERING_SCALE if rigid else 1.0
+    rows["scale"] = [(s.output_scale, s.output_scale * second) for s in settings]
+    rows["dead_zone"] = [(s.dead_zone, s.dead_zone * second) for s in settings]
+    rows["share"] = 1.0, STEERING_SHARE if rigid else 1.0
+    rows["step"] = [0.0 if s.frozen else s.step for s in settings]
+    rows["leak"], rows["bound"] = [0.0 if s.frozen else s.leak for s in settings], [s.weight_bound for s in settings]
+    return rows
 
 
-def unflatten(weights: Array) -> dict[str, Array]:
-    """The flat vector to named weights."""
-    hidden = (len(weights) - OUTPUTS * (INPUTS + 1)) // (INPUTS + 1 + OUTPUTS)
-    layers, start = {}, 0
-    for name, shape in shapes(hidden).items():
-        stop = start + int(np.prod(shape))
-        layers[name], start = weights[start:stop].reshape(shape), stop
-    return layers
+@kernel
+def layers(w: Array, units: int) -> tuple[Array, Array, Array, Array, Array]:
+    """W₁ `(units, 8)`, b₁ `(units,)`, W₂ `(2, units)`, b₂ `(2,)` and W₃ `(2, 8)` as views of the flat weights."""
+    a = units * INPUTS
+    b = a + units
+    c = b + OUTPUTS * units
+    d = c + OUTPUTS
+    return w[:a].reshape((units, INPUTS)), w[a:b], w[b:c].reshape((OUTPUTS, units)), w[c:d], w[d:].reshape((2, INPUTS))
 
 
-def save_weights(path: str | Path, weights: Array) -> None:
-    """Writes flat weights `(n,)` as a safetensors file.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
-    from safetensors.numpy import save
-
-    data = save({name: np.ascontiguousarray(layer) for name, layer in unflatten(weights).items()})
-    try:
-        Path(path).write_bytes(data)
-    except OSError as error:
-        raise InputError(f"{path}: cannot write weights: {error.strerror}") from None
-
-
-def load_weights(path: str | Path, hidden: int) -> Array:
-    """Reads weights from a safetensors file or a torch state dict.
+@kernel
+def network(x: Array, w: Array, hidden: Array, scale: Array, output: Array) -> None:
+    """The network: output = scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x).
 
     Args:
-        path: `.safetensors`, else a file of `torch.save(module.state_dict())`, read with `weights_only`.
-        hidden: Hidden units that the file must hold.
-
-    Raises:
-        InputError: The file is missing, broken, of another shape, or holds non-finite numbers.
+        x: Scaled features `(8,)`.
+        w: Flat weights, in the order of `layers`.
+        hidden: Out: tanh(W₁ x + b₁), `(units,)`.
+        scale: `(2,)`.
+        output: Out: feedforward of the two channels, `(2,)`.
     """
-    if not Path(path).is_file():
-        raise InputError(f"fel.weights: no file {path}")
-    try:
-        if Path(path).suffix == ".safetensors":
-            from safetensors.numpy import load_file
-
-            layers = load_file(path)
-        else:
-            import torch
-
-            layers = {k: v.double().numpy() for k, v in torch.load(path, map_location="cpu", weights_only=True).items()}
-    except Exception as error:  # each format has its own errors; none of them is ours to tell apart
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise InputError(f"fel.weights: {path}: not a weights file: {reason}") from None
-    expected = shapes(hidden)
-    for name, shape in expected.items():
-        if name not in layers or layers[name].shape != shape:
-            found = layers[name].shape if name in layers else "nothing"
-            raise InputError(f"fel.weights: {path}: {name} is {found}, {hidden} hidden units need {shape}")
-    if unknown := set(layers) - set(expected):
-        raise InputError(f"fel.weights: {path}: unknown entry {min(unknown)!r}")
-    weights = flatten(layers).astype(float)
-    if not np.isfinite(weights).all():
-        raise InputError(f"fel.weights: {path}: non-finite weights")
-    return weights
-
-
-@njit
-def _sizes(weights, x, m):  # noqa: ANN001, ANN202
-    """Hidden units, and where b₁, W₂, b₂ and W₃ begin in the flat weights."""
-    n = x.shape[0]
-    h = (weights.shape[0] - m * (n + 1)) // (n + 1 + m)
-    return h, h * n, h * (n + 1), h * (n + 1 + m), h * (n + 1 + m) + m
-
-
-@njit
-def _activate(x, weights, m, hidden):  # noqa: ANN001, ANN202
-    """tanh(W₁ x + b₁)."""
-    h, b1, _, _, _ = _sizes(weights, x, m)
-    for j in range(h):
-        z = weights[b1 + j]
-        for i in range(x.shape[0]):
-            z += weights[j * x.shape[0] + i] * x[i]
+    units = hidden.shape[0]
+    W1, b1, W2, b2, W3 = layers(w, units)
+    for j in range(units):
+        z = b1[j]
+        for i in range(INPUTS):
+            z += W1[j, i] * x[i]
         hidden[j] = z
-    for j in range(h):
+    for j in range(units):
         hidden[j] = 1 - 2 / (np.exp(2 * hidden[j]) + 1)  # tanh, in half the time of the library's
+    for k in range(OUTPUTS):
+        y = BIAS_GAIN * b2[k]
+        for i in range(INPUTS):
+            y += W3[k, i] * x[i]
+        for j in range(units):
+            y += W2[k, j] * (HIDDEN_GAIN * hidden[j])
+        output[k] = scale[k] * y
 
 
-@njit
-def _square(vector):  # noqa: ANN001, ANN202
-    """Squared length; four sums side by side, since each addition waits for the one before."""
+@kernel
+def backpropagate(x: Array, w: Array, hidden: Array, error: Array, gradient: Array) -> None:
+    """Jᵀe: the gradient of the network's output times e with respect to the weights, in their order.
+
+    Args:
+        x: Scaled features `(8,)`.
+        w: Flat weights.
+        hidden: As from `network`, `(units,)`.
+        error: e, `(2,)`.
+        gradient: Out, as long as the weights.
+    """
+    units = hidden.shape[0]
+    _, _, W2, _, _ = layers(w, units)
+    G1, g1, G2, g2, G3 = layers(gradient, units)
+    for k in range(OUTPUTS):
+        g2[k] = BIAS_GAIN * error[k]
+        for i in range(INPUTS):
+            G3[k, i] = error[k] * x[i]
+    for j in range(units):
+        back = 0.0
+        for k in range(OUTPUTS):
+            G2[k, j] = HIDDEN_GAIN * error[k] * hidden[j]
+            back += error[k] * W2[k, j]
+        back *= HIDDEN_GAIN * (1 - hidden[j] * hidden[j])
+        g1[j] = back
+        for i in range(INPUTS):
+            G1[j, i] = back * x[i]
+
+
+@kernel
+def squared_norm(vector: Array) -> float:
+    """‖v‖²; four sums side by side, since each addition waits for the one before."""
     a = b = c = d = 0.0
     whole = vector.shape[0] // 4 * 4
     for w in range(0, whole, 4):
@@ -189,202 +161,112 @@ def _square(vector):  # noqa: ANN001, ANN202
     return (a + b) + (c + d)
 
 
-@njit
-def _network(x, hidden, weights, targets, out):  # noqa: ANN001, ANN202
-    n, m = x.shape[0], targets.shape[1]
-    h, _, w2, b2, w3 = _sizes(weights, x, m)
-    for k in range(m):
-        out[k] = BIAS_GAIN * weights[b2 + k]
-        for i in range(n):
-            out[k] += weights[w3 + k * n + i] * x[i]
-    for j in range(h):
-        z = HIDDEN_GAIN * hidden[j]
-        for k in range(m):
-            out[k] += weights[w2 + k * h + j] * z
-    for k in range(m):
-        out[k] *= targets[0, k]
+@kernel
+def update(feedback: Array, s: Row, w: Array, prior: Array, hidden: Array, gradient: Array) -> None:
+    """One normalised step of feedback-error learning, with its safeguards.
 
+        ΔW = μ Jᵀe / (‖Jᵀe‖²/‖e‖² + ε) − leak (W − W₀),    ‖W − W₀‖ ≤ bound
 
-@guvectorize([(float64[:], float64[:], float64[:, :], float64[:])], "(f),(w),(t,u)->(u)", cache=True)
-def network(x, weights, targets, out):  # noqa: ANN001, ANN201
-    """Scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x) for one robot.
+    e is the scaled feedback and J = ∂f/∂W: with one output this is normalised LMS, and the feedforward at this input
+    moves by about μ times the feedback whatever the size of the regressor.
 
     Args:
-        x: Scaled features `(8,)`.
-        weights: Flat weights, in the order of `shapes`.
-        targets: As from `Fel.targets`; the first row is the scale.
-        out: Out: feedforward of the two channels, `(2,)`.
+        feedback: Feedback of the two channels in V (rad/s on a steering channel), `(2,)`.
+        s: In and out: a record of `FEL`, whose `x` and `output` are those of the last output.
+        w: In and out: flat weights W.
+        prior: W₀, as long.
+        hidden: In and out: activations at `x`, `(units,)`.
+        gradient: Scratch, as long as the weights.
     """
-    hidden = np.empty(weights.shape[0])
-    _activate(x, weights, targets.shape[1], hidden)
-    _network(x, hidden, weights, targets, out)
-
-
-@njit
-def _update(  # noqa: ANN202
-    x, hidden, feedback, saturated, targets, steps, prior, error, gradient, weights, norm, output  # noqa: ANN001
-):  # fmt: skip
-    step, leak, bound = steps[0], steps[1], steps[2]
-    if saturated > 0 or step == 0:
-        return
-    n, m = x.shape[0], targets.shape[1]
     power = 0.0
-    for k in range(m):
-        error[k] = targets[2, k] * feedback[k] / targets[0, k] if abs(feedback[k]) > targets[1, k] else 0.0
-        power += error[k] * error[k]
+    for k in range(OUTPUTS):
+        s.error[k] = s.share[k] * feedback[k] / s.scale[k] if abs(feedback[k]) > s.dead_zone[k] else 0.0
+        power += s.error[k] * s.error[k]
     if power == 0:
         return
-    h, b1, w2, b2, w3 = _sizes(weights, x, m)
-    for k in range(m):
-        gradient[b2 + k] = BIAS_GAIN * error[k]
-        for i in range(n):
-            gradient[w3 + k * n + i] = error[k] * x[i]
-    for j in range(h):
-        z = hidden[j]
-        back = 0.0
-        for k in range(m):
-            gradient[w2 + k * h + j] = HIDDEN_GAIN * error[k] * z
-            back += error[k] * weights[w2 + k * h + j]
-        back *= HIDDEN_GAIN * (1 - z * z)
-        gradient[b1 + j] = back
-        for i in range(n):
-            gradient[j * n + i] = back * x[i]
-    rate = step / (_square(gradient) / power + REGULARISATION)
-    for w in range(weights.shape[0]):
-        weights[w] += rate * gradient[w] - leak * (weights[w] - prior[w])
-        gradient[w] = weights[w] - prior[w]  # from here on the way from the prior
-    distance = np.sqrt(_square(gradient))
-    if distance > bound:
-        for w in range(weights.shape[0]):
-            weights[w] = prior[w] + (weights[w] - prior[w]) * bound / distance
-    norm[0] = min(distance, bound)
-    _activate(x, weights, m, hidden)
-    _network(x, hidden, weights, targets, output)
+    backpropagate(s.x, w, hidden, s.error, gradient)
+    rate = s.step / (squared_norm(gradient) / power + REGULARISATION)
+    distance = gradient  # from here on W − W₀, in the same memory
+    for n in range(w.shape[0]):
+        w[n] += rate * gradient[n] - s.leak * (w[n] - prior[n])
+        distance[n] = w[n] - prior[n]
+    s.norm = np.sqrt(squared_norm(distance))
+    if s.norm > s.bound:
+        for n in range(w.shape[0]):
+            w[n] = prior[n] + (w[n] - prior[n]) * s.bound / s.norm
+        s.norm = s.bound
+    network(s.x, w, hidden, s.scale, s.output)
 
 
-@guvectorize(
-    [(float64[:], float64[:], float64, float64[:, :], float64[:], float64[:], float64[:], float64[:], float64[:])],
-    "(f),(u),(),(t,u),(s),(w),(w),(),(u)",
-    writable_args=("weights", "norm", "output"),
-    cache=True,
-)
-def update(x, feedback, saturated, targets, steps, prior, weights, norm, output):  # noqa: ANN001, ANN201
-    """One normalised step of feedback-error learning for one robot, with its safeguards.
+@kernel
+def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
+    """The network at the commanded motion; never at the measured one."""
+    rows, scale, weights, _, hidden, _ = arrays
+    s = rows[i]
+    features(command, derivative, robot.half_track, scale, s.x)
+    network(s.x, weights[i], hidden[i], s.scale, s.output)
+    voltage[0], voltage[1] = s.output[0], s.output[1]
 
-    ΔW = μ Jᵀe / (‖Jᵀe‖²/‖e‖² + ε), e the scaled feedback and J = ∂f/∂W: with one output this is normalised LMS, and the
-    feedforward at this input moves by about μ times the feedback whatever the size of the regressor.
 
-    Args:
-        x: Scaled features that the last output was computed from, `(8,)`.
-        feedback: Feedback of the two channels `(2,)`.
-        saturated: 1 freezes: the voltage that was asked for is not the one that acted.
-        targets: As from `Fel.targets`, `(3, 2)`.
-        steps: As from `Fel.steps`, `(3,)`.
-        prior: Weights that the leak and the projection refer to.
-        weights: In and out.
-        norm: Out: Euclidean distance of the weights from the prior.
-        output: In and out: feedforward at these features, `(2,)`.
+@kernel
+def learn(
+    i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
+    arrays: tuple[Any, ...], added: Array,
+) -> float:  # fmt: skip
+    """One step on the features of the last output, unless the robot must not learn.
+
+    At the bound of the weights it adds nothing that the PID may hand over: what is gained here is lost elsewhere.
     """
-    m, size = targets.shape[1], weights.shape[0]
-    hidden = np.empty(size)
-    _activate(x, weights, m, hidden)
-    error, gradient = np.empty(m), np.empty(size)
-    _update(x, hidden, feedback, saturated, targets, steps, prior, error, gradient, weights, norm, output)
+    rows, _, weights, prior, hidden, gradient = arrays
+    s = rows[i]
+    added[0] = added[1] = 0.0
+    if frozen == 0 and s.step > 0:
+        before, before_second = s.output[0], s.output[1]
+        update(feedback, s, weights[i], prior[i], hidden[i], gradient)
+        if s.norm < s.bound:
+            added[0], added[1] = s.output[0] - before, s.output[1] - before_second
+    return s.norm
 
 
-_features = one(features)
-
-# What is kept of one robot beside its weights; shapes as in `update`.
-STATE = np.dtype(
-    [("targets", "f8", (3, OUTPUTS)), ("steps", "f8", 3), ("features", "f8", INPUTS), ("output", "f8", OUTPUTS),
-     ("added", "f8", OUTPUTS), ("norm", "f8", (1,))],
-    align=True,
-)  # fmt: skip
-
-
-def _compile(version: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Output and learning step for all robots, sharing the hidden layer; see `chain.stamp` for the version."""
-
-    @njit((GIVEN, GIVEN, float64, EACH, rows(STATE), OWN, OWN), cache=True)
-    def respond(command, derivative, half_track, scale, state, weights, hidden):  # noqa: ANN001, ANN202
-        _ = version
-        for i in range(len(state)):
-            s = state[i]
-            _features(command[i], derivative[i], half_track, scale, s.features)
-            _activate(s.features, weights[i], OUTPUTS, hidden[i])
-            _network(s.features, hidden[i], weights[i], s.targets, s.output)
-
-    @njit((GIVEN, ANY, rows(STATE), *[OWN] * 3), cache=True)
-    def teach(feedback, saturated, state, prior, weights, hidden):  # noqa: ANN001, ANN202
-        error, gradient = np.empty(OUTPUTS), np.empty(weights.shape[1])
-        for i in range(len(state)):
-            s = state[i]
-            for k in range(OUTPUTS):
-                s.added[k] = s.output[k]
-            _update(
-                s.features, hidden[i], feedback[i], saturated[i], s.targets, s.steps, prior[i], error, gradient,
-                weights[i], s.norm, s.output,
-            )  # fmt: skip
-            held = s.norm[0] >= s.steps[2]  # at the bound: what is gained here is lost elsewhere
-            for k in range(OUTPUTS):
-                s.added[k] = 0.0 if held else s.output[k] - s.added[k]
-
-    return respond, teach
-
-
-_respond, _teach = _compile(stamp(features))
-
-
-class FeedbackErrorLearning:
+class FeedbackErrorLearning(CompiledFeedforward):
     """`fel` for B robots.
 
     Attributes:
-        state: `weights` `(B, n)`, flat.
+        weights: `(B, n)`, flat.
         prior: What leak and projection refer to, `(B, n)`.
         weight_norm: Euclidean distance between the two, `(B,)`.
         weight_volts: Output scale, `(B,)`.
     """
 
-    def __init__(self, robot: Robot, settings: list[Fel], seeds: list[int], rigid: bool) -> None:
-        """Takes the nominal robot (for scales alone), settings and seed a row, and whether channel two is steering.
+    respond, learn_one = respond, learn
+
+    def __init__(self, robot: Robot, settings: list[Fel], seeds: list[int], rigid: bool, period: float) -> None:
+        """Builds the networks.
+
+        Args:
+            robot: Nominal robot, for the scales alone.
+            settings: Settings of each robot; `hidden` must be the same for all.
+            seeds: Seed of the initial weights of each robot.
+            rigid: Whether channel two is steering.
+            period: Control period in s.
 
         Raises:
             InputError: A weights file is missing, broken or of another shape.
         """
-        self._half_track = robot.half_track
-        self._scale = feature_scale(robot)
-        self._rows = np.zeros(len(settings), STATE)
-        self._rows["targets"] = [s.targets(rigid) for s in settings]
-        self._rows["steps"] = [s.steps() for s in settings]
-        self._hidden = np.zeros((len(settings), settings[0].hidden))
-        self._output, self._added = self._rows["output"], self._rows["added"]
+        super().__init__(robot, len(settings), rigid, period)
         self.prior = np.array(
             [
                 load_weights(s.weights, s.hidden) if s.weights else initial_weights(s.hidden, seed)
                 for s, seed in zip(settings, seeds, strict=True)
             ]
         )
-        self.state = {"weights": self.prior.copy()}
-        self.weight_norm = self._rows["norm"][:, 0]
+        self.weights = self.prior.copy()
         self.weight_volts = np.array([s.output_scale for s in settings])
+        self.rows = fresh(settings, rigid)
+        hidden = np.zeros((len(settings), settings[0].hidden))
+        self.arrays = self.rows, feature_scale(robot), self.weights, self.prior, hidden, np.zeros(self.prior.shape[1])
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Takes robots back to their prior weights."""
-        self.state["weights"][rows] = self.prior[rows]
-        self.weight_norm[rows] = 0.0
-
-    def output(self, command: Array, derivative: Array) -> Array:
-        """The network at the commanded motion; never at the measured one."""
-        _respond(
-            command, derivative, self._half_track, self._scale, self._rows, self.state["weights"], self._hidden
-        )  # fmt: skip
-        return self._output
-
-    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
-        """One step on the features of the last output.
-
-        Returns:
-            What it added to that output; nothing at the bound of the weights, where the PID must keep what it holds.
-        """
-        _teach(feedback, saturated, self._rows, self.prior, self.state["weights"], self._hidden)
-        return self._added
+        self.weights[rows] = self.prior[rows]
+        self.rows["norm"][rows] = self.weight_norm[rows] = 0.0

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.func import functional_call, stack_module_state, vjp, vmap
 
-from mrctl.control.feedforward import Array, feature_scale, features
-from mrctl.control.fel import BIAS_GAIN, HIDDEN_GAIN, INPUTS, OUTPUTS, REGULARISATION, Fel
+from mrctl.control.features import feature_matrix, feature_scale
+from mrctl.control.fel import BIAS_GAIN, HIDDEN_GAIN, REGULARISATION, Fel, fresh
+from mrctl.control.weights import INPUTS, OUTPUTS
+from mrctl.kernel import Array
 from mrctl.theory.robot import Robot
 
 
@@ -71,8 +73,11 @@ class ModuleLearning:
             raise ValueError(f"module: maps 8 features to shape {shape}, not to 2 channels")
         self._half_track = robot.half_track
         self._scale = feature_scale(robot)
-        self._targets = torch.tensor(settings.targets(rigid))
-        self._step, self._leak, self._bound = settings.steps()
+        start = fresh([settings], rigid)[0]
+        self._output_scale, self._dead_zone, self._share = (
+            torch.tensor(start[name].copy()) for name in ("scale", "dead_zone", "share")
+        )
+        self._step, self._leak, self._bound = float(start["step"]), float(start["leak"]), float(start["bound"])
         self._features = np.zeros((size, INPUTS))
         stacked, _ = stack_module_state([self._module] * size)
         self.prior = {name: value.detach().clone() for name, value in stacked.items()}
@@ -91,15 +96,14 @@ class ModuleLearning:
 
     def output(self, command: Array, derivative: Array) -> Array:
         """The modules at the commanded motion."""
-        features(command, derivative, self._half_track, self._scale, self._features)
+        self._features = feature_matrix(command, derivative, self._half_track, self._scale)
         with torch.no_grad():
-            return (self._targets[0] * (self._forward(self.state) - self._forward(self.prior))).numpy()
+            return (self._output_scale * (self._forward(self.state) - self._forward(self.prior))).numpy()
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
         """One normalised step, by a vector-Jacobian product; see `fel.update`."""
-        scale, dead_zone, share = self._targets
         fb = torch.from_numpy(np.array(feedback))
-        error = torch.where(fb.abs() > dead_zone, share * fb / scale, 0.0)
+        error = torch.where(fb.abs() > self._dead_zone, self._share * fb / self._output_scale, 0.0)
         power = (error**2).sum(1)
         active = (power > 0) & (torch.from_numpy(np.array(saturated)) == 0) & bool(self._step > 0)
         before, pull = vjp(self._forward, self.state)[:2]
@@ -118,7 +122,7 @@ class ModuleLearning:
         norm = torch.where(active, distance.clamp_max(self._bound), torch.from_numpy(self.weight_norm))
         self.weight_norm = norm.numpy()
         with torch.no_grad():
-            added = scale * (self._forward(self.state) - before)
+            added = self._output_scale * (self._forward(self.state) - before)
         return torch.where((norm >= self._bound)[:, None], 0.0, added).numpy()
 
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 
+from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 
-ACTIONS = ("none", "limit", "freeze", "fallback")
+GUARD_ACTIONS = ("none", "limit", "freeze", "fallback")
 NONE, LIMIT, FREEZE, FALLBACK = range(4)
 REASONS = (
     "",
@@ -68,54 +68,162 @@ class Guard(Record):
     """Feedforward while the learner's is not used: nominal inverse dynamics, or PID alone."""
 
 
-# Settings and memory of the guard of one robot. Oscillation is watched in four signals: feedforward and feedback of the
-# two channels.
-WATCH = np.dtype(
+GUARD = np.dtype(
     [
-        ("on", "f8"), ("share", "f8"), ("weights", "f8"), ("oscillation", "f8"), ("growth", "f8"), ("hold", "f8"),
-        ("retries", "f8"), ("fade", "f8"), ("model", "f8"), ("rigid", "f8"), ("range", "f8", 2),
-        ("smooth", "f8", 4), ("drift", "f8", 4), ("sign", "f8", 4), ("peak", "f8", 4), ("lasted", "f8", 4),
-        ("baseline", "f8", 4), ("seen", "f8", 4), ("waves", "f8", 4), ("first", "f8", 4),
-        ("distance", "f8"), ("watched", "f8"), ("clipped", "f8"), ("saturated", "f8"), ("lacking", "f8", 2),
-        ("bump", "f8", 2), ("action", "f8"), ("reason", "f8"), ("left", "f8"), ("strikes", "f8"), ("gain", "f8"),
-        ("authority", "f8"), ("restore", "f8"), ("idle", "f8"), ("own", "f8", 2), ("output", "f8", 2),
-        ("teaching", "f8", 2),
+        # Settings, as in `Guard`
+        ("on", "?"),
+        ("share", "f8"),
+        ("weights", "f8"),  # largest norm of the weights
+        ("oscillation", "f8"),
+        ("growth", "f8"),
+        ("hold", "f8"),  # s
+        ("retries", "f8"),
+        ("fade", "f8"),  # s
+        ("model", "?"),  # whether the fallback is the nominal model, not PID alone
+        ("range", "f8", 2),  # what a channel can command: the supply in V, or the largest θ̇ in rad/s
+        # Oscillation of four signals, feedforward and feedback of the two channels, as shares of `range`
+        ("low_pass", "f8", 4),  # the signal without noise
+        ("slow_mean", "f8", 4),  # what of it is slow motion
+        ("sign", "f8", 4),  # of the present half-wave
+        ("peak", "f8", 4),  # its amplitude
+        ("half_wave_time", "f8", 4),  # how long it lasts, s
+        ("baseline", "f8", 4),  # mean amplitude of the half-waves before
+        ("baseline_time", "f8", 4),  # how long that was averaged, s
+        ("waves", "f8", 4),  # consecutive half-waves above the threshold
+        ("first", "f8", 4),  # amplitude of the first of them
+        # Other quantities that are held against a bound
+        ("mean_distance", "f8"),  # to the reference, m
+        ("observed", "f8"),  # how long that was averaged, s
+        ("limited_share", "f8"),  # of the time in which the output was limited
+        ("saturated_share", "f8"),  # of the time in which a voltage was
+        ("model_error", "f8", 2),  # mean of what was sent beyond the nominal model, V
+        # What it does
+        ("action", "f8"),
+        ("reason", "f8"),
+        ("hold_left", "f8"),  # until learning may resume, s
+        ("strikes", "f8"),  # attempts of the learner that failed
+        ("gain", "f8"),  # factor on the feedback that the learner is taught with
+        ("authority", "f8"),  # share of the learner in the output; the rest is the fallback's
+        ("bump", "f8", 2),  # what of the voltage before a fallback has not faded yet, V
+        ("forget", "?"),  # whether the learner is to go back to what it began with
+        ("frozen", "?"),  # whether it must not learn now
+        ("limited", "f8", 2),  # its output after the limit, V
+        ("output", "f8", 2),  # the feedforward to apply, V
+        ("teaching", "f8", 2),  # the feedback to learn from, V
     ],
     align=True,
-)  # fmt: skip
+)
 
 
-def watches(settings: list[Guard], supply: float, rotation: float, volts: np.ndarray, rigid: bool) -> np.ndarray:
-    """Guards that have seen nothing yet, `WATCH` a robot, `(B,)`.
+def fresh(settings: list[Guard], robot: Rows, volts: Array) -> Rows:
+    """Records of `GUARD` that have seen nothing yet, `(B,)`.
 
     Args:
         settings: A robot each.
-        supply: U_max in V.
-        rotation: Largest rotation velocity in rad/s, the range of a steering channel.
+        robot: The nominal robot, as from `nominal`.
         volts: What weights of norm one make of features of one, V, `(B,)`; 0 if unknown.
-        rigid: Whether channel two is steering.
     """
-    state = np.zeros(len(settings), WATCH)
+    rows = np.zeros(len(settings), GUARD)
     for name in ("on", "share", "oscillation", "growth", "hold", "retries", "fade"):
-        state[name] = [getattr(s, name) for s in settings]
+        rows[name] = [getattr(s, name) for s in settings]
+    supply, rotation = float(robot["supply"][0]), float(robot["max_twist"][0, 1])
     with np.errstate(divide="ignore"):
-        state["weights"] = np.array([s.weights for s in settings]) * supply / volts
-    state["model"] = [s.fallback == "model" for s in settings]
-    state["rigid"], state["range"] = rigid, (supply, rotation if rigid else supply)
-    state["gain"], state["authority"] = 1.0, 1.0
-    return state
+        rows["weights"] = np.array([s.weights for s in settings]) * supply / volts
+    rows["model"] = [s.fallback == "model" for s in settings]
+    rows["range"] = supply, rotation if robot["rigid"][0] else supply
+    rows["gain"] = rows["authority"] = 1.0
+    return rows
 
 
-@njit
-def _grows(g, k, value, period):  # noqa: ANN001, ANN202
+@kernel
+def guard(
+    g: Row, feedforward: Array, nominal: Array, error: Array, norm: float, saturated: bool, voltage: Array,
+    period: float, rigid: bool, integral: Array, feedback: Array,
+) -> None:  # fmt: skip
+    """One tick of the guard of one robot, between the feedforward stage and the allocation.
+
+    - limit: the output is scaled to its share of the supply; no learning while it is.
+    - freeze: no learning, for oscillation that begins to grow, and in saturation.
+    - fallback: nominal inverse dynamics instead of the learner, for trouble that freezing did not end. The integral
+      starts from what the model lacked on average, what is left of the old voltage fades, and the learner goes back to
+      what it began with.
+    - resume: after the hold, once nothing is wrong, with less gain each time and after a longer hold. After a fallback
+      the learner's share of the output grows from 0 to 1 as slowly as it learns, with the fallback to lean on; after
+      `retries` the fallback stays.
+
+    Args:
+        g: In and out: a record of `GUARD`; its last four fields are the result.
+        feedforward: Output of the feedforward stage in V (rad/s on a steering channel), `(2,)`.
+        nominal: Output of the nominal inverse dynamics, `(2,)`.
+        error: Posture error `(3,)` in m, m, rad.
+        norm: Norm of the learner's weights.
+        saturated: Whether a limit acted in the last tick.
+        voltage: What was sent in the last tick, in the channels, `(2,)`.
+        period: Control period in s.
+        rigid: Whether the second channel is steering.
+        integral: In and out: integrals of the PID, `(2,)`.
+        feedback: In and out: output of the PID, `(2,)`.
+    """
+    g.forget = False
+    if not g.on:
+        for k in range(2):
+            g.output[k], g.teaching[k] = feedforward[k], feedback[k]
+        return
+    broken = False
+    for k in range(2):
+        broken |= not np.isfinite(feedforward[k])
+    growing = 0.0
+    clipped = False
+    if not broken:  # else the last output, for the fallback to start from
+        for k in range(2):
+            g.limited[k] = feedforward[k]
+        clipped = limit_output(g, rigid, g.limited)
+    for k in range(2):
+        g.output[k] = g.limited[k]
+        if g.authority < 1.0:
+            given = nominal[k] if g.model else 0.0
+            g.bump[k] *= g.fade / (g.fade + period)
+            g.output[k] = given + g.authority * (g.limited[k] - given) + g.bump[k]
+        g.model_error[k] += period / (MEAN + period) * (voltage[k] - nominal[k] - g.model_error[k])
+        growing = max(growing, growing_oscillation(g, k, g.limited[k] / g.range[k], period))
+        growing = max(growing, growing_oscillation(g, 2 + k, feedback[k] / g.range[k], period))
+    g.limited_share += period / (BUSY + period) * ((1.0 if clipped else 0.0) - g.limited_share)
+    g.saturated_share += period / (STUCK + period) * ((1.0 if saturated else 0.0) - g.saturated_share)
+    distance = np.hypot(error[0], error[1])
+    g.observed = min(g.observed + period, MEMORY)
+    g.mean_distance += period / g.observed * (distance - g.mean_distance)
+    trouble = worst_trouble(g, broken, growing, distance, norm)
+
+    g.hold_left -= period
+    if g.action == FALLBACK:
+        if trouble > 0:
+            g.hold_left = max(g.hold_left, g.hold)
+        elif g.hold_left <= 0 and is_quiet(g):
+            g.action, g.reason = NONE, 0.0
+    elif trouble > 0:
+        step_in(g, trouble, growing > LARGEST * g.growth, nominal, integral, feedback)
+    elif g.hold_left <= 0 and is_quiet(g):
+        g.action, g.reason = NONE, 0.0
+    if clipped and g.action <= LIMIT:
+        g.action, g.reason, g.hold_left = LIMIT, CLIPPED, BUSY
+
+    if g.action != FALLBACK:
+        g.authority = min(1.0, g.authority + period * g.gain / RETURN)
+    g.frozen = clipped or g.action >= FREEZE
+    for k in range(2):
+        g.teaching[k] = g.gain * feedback[k]
+
+
+@kernel
+def growing_oscillation(g: Row, k: int, value: float, period: float) -> float:
     """Amplitude of signal k, a share of its range, if for `SUSTAINED` half-waves it is above its baseline; or 0."""
-    g.smooth[k] += period / (SMOOTH + period) * (value - g.smooth[k])
-    g.drift[k] += period / (DRIFT + period) * (g.smooth[k] - g.drift[k])
-    wave = g.smooth[k] - g.drift[k]
+    g.low_pass[k] += period / (SMOOTH + period) * (value - g.low_pass[k])
+    g.slow_mean[k] += period / (DRIFT + period) * (g.low_pass[k] - g.slow_mean[k])
+    wave = g.low_pass[k] - g.slow_mean[k]
     sign = 1.0 if wave >= 0 else -1.0
     grown = 0.0
-    if sign != g.sign[k] or g.lasted[k] > SLOWEST:
-        peak, lasted = g.peak[k], g.lasted[k]
+    if sign != g.sign[k] or g.half_wave_time[k] > SLOWEST:
+        peak, lasted = g.peak[k], g.half_wave_time[k]
         if lasted <= SLOWEST and peak > max(g.oscillation, g.growth * g.baseline[k]):
             g.waves[k] += 1.0
             if g.waves[k] == 1.0:
@@ -126,36 +234,36 @@ def _grows(g, k, value, period):  # noqa: ANN001, ANN202
         else:
             g.waves[k] = 0.0
         if lasted > 0:  # a mean over all that was seen, later over `MEMORY`
-            g.seen[k] = min(g.seen[k] + lasted, MEMORY)
-            g.baseline[k] += min(1.0, lasted / g.seen[k]) * (min(peak, LARGEST) - g.baseline[k])
-        g.sign[k], g.peak[k], g.lasted[k] = sign, 0.0, 0.0
+            g.baseline_time[k] = min(g.baseline_time[k] + lasted, MEMORY)
+            g.baseline[k] += min(1.0, lasted / g.baseline_time[k]) * (min(peak, LARGEST) - g.baseline[k])
+        g.sign[k], g.peak[k], g.half_wave_time[k] = sign, 0.0, 0.0
     g.peak[k] = max(g.peak[k], abs(wave))
-    g.lasted[k] += period
+    g.half_wave_time[k] += period
     return grown
 
 
-@njit
-def _trouble(g, broken, growing, distance, norm):  # noqa: ANN001, ANN202
+@kernel
+def worst_trouble(g: Row, broken: bool, growing: float, distance: float, norm: float) -> int:
     """The worst that is wrong now, or 0."""
     if broken:
         return BROKEN
     if not norm <= g.weights:
         return WEIGHTS
-    if distance > max(APART, g.growth * g.distance):
+    if distance > max(APART, g.growth * g.mean_distance):
         return FAR
     if growing > 0:
         return OSCILLATION
-    if g.clipped > 0.5:
+    if g.limited_share > 0.5:
         return OVERDONE
-    if g.saturated > 0.5:
+    if g.saturated_share > 0.5:
         return SATURATION
     return 0
 
 
-@njit
-def _limit(g, values):  # noqa: ANN001, ANN202
+@kernel
+def limit_output(g: Row, rigid: bool, values: Array) -> bool:
     """Shrinks the two channels to their share of the supply; returns whether that was needed."""
-    if g.rigid > 0:
+    if rigid:
         acted = False
         for k in range(2):
             bound = g.share * g.range[k]
@@ -172,8 +280,8 @@ def _limit(g, values):  # noqa: ANN001, ANN202
     return True
 
 
-@njit
-def _quiet(g):  # noqa: ANN001, ANN202
+@kernel
+def is_quiet(g: Row) -> bool:
     """Whether no signal is above its threshold for longer than a step takes."""
     for k in range(4):
         if g.waves[k] > 1:
@@ -181,8 +289,8 @@ def _quiet(g):  # noqa: ANN001, ANN202
     return True
 
 
-@njit
-def _step_in(g, trouble, large, nominal, integral, feedback):  # noqa: ANN001, ANN202
+@kernel
+def step_in(g: Row, trouble: int, large: bool, nominal: Array, integral: Array, feedback: Array) -> None:
     """Freezes, or falls back where freezing is not enough or was tried."""
     frozen = g.action == FREEZE
     if frozen and trouble == SATURATION:
@@ -192,92 +300,16 @@ def _step_in(g, trouble, large, nominal, integral, feedback):  # noqa: ANN001, A
         g.gain /= BACK_OFF
     hopeless = g.strikes > g.retries
     mild = trouble == SATURATION or (trouble == OSCILLATION and not (frozen or large))
-    g.left = np.inf if hopeless else g.hold * BACK_OFF ** max(g.strikes - 1.0, 0.0)
+    g.hold_left = np.inf if hopeless else g.hold * BACK_OFF ** max(g.strikes - 1.0, 0.0)
     g.reason = trouble
     if mild and not hopeless:
         g.action = FREEZE
         return
-    g.action, g.authority, g.restore, g.clipped = FALLBACK, 0.0, 1.0, 0.0
+    g.action, g.authority, g.forget, g.limited_share = FALLBACK, 0.0, True, 0.0
     for k in range(2):
-        given = nominal[k] if g.model > 0 else 0.0
-        target = g.lacking[k] + nominal[k] - given
+        given = nominal[k] if g.model else 0.0
+        target = g.model_error[k] + nominal[k] - given
         g.bump[k] = g.output[k] + integral[k] - target - given
         g.output[k] = given + g.bump[k]
         feedback[k] += target - integral[k]  # it holds the old one
         integral[k] = target
-
-
-@njit(cache=True)
-def guard(g, feedforward, nominal, error, norm, saturated, voltage, period, integral, feedback):  # noqa: ANN001, ANN201
-    """One tick of the guard of one robot, between the feedforward stage and the allocation.
-
-    - limit: the output is scaled to its share of the supply; no learning while it is.
-    - freeze: no learning, for oscillation that begins to grow, and in saturation.
-    - fallback: nominal inverse dynamics instead of the learner, for trouble that freezing did not end. The integral
-      starts from what the model lacked on average, what is left of the old voltage fades, and the learner goes back to
-      what it began with (`restore`).
-    - resume: after the hold, once nothing is wrong, with less gain each time and after a longer hold. After a fallback
-      the learner's share of the output grows from 0 to 1 as slowly as it learns, with the fallback to lean on; after
-      `retries` the fallback stays.
-
-    Args:
-        g: In and out: a record of `WATCH`. `output` and `teaching` are the feedforward to apply and the feedback to
-            learn from; `idle` is 1 where nothing may be learned; `restore` is 1 when the learner is to forget.
-        feedforward: The stage's output `(2,)`.
-        nominal: That of the nominal inverse dynamics `(2,)`.
-        error: Posture error `(3,)` in m, m, rad.
-        norm: Norm of the learner's weights.
-        saturated: 1 if a limit acted in the last tick.
-        voltage: What was sent in the last tick, in the channels, `(2,)`.
-        period: Control period in s.
-        integral: In and out: integrals of the PID, `(2,)`.
-        feedback: In and out: its output, `(2,)`.
-    """
-    g.restore = 0.0
-    if g.on == 0:
-        for k in range(2):
-            g.output[k], g.teaching[k] = feedforward[k], feedback[k]
-        return
-    broken = False
-    for k in range(2):
-        broken |= not np.isfinite(feedforward[k])
-    growing = 0.0
-    clipped = False
-    if not broken:  # else the last output, for the fallback to start from
-        for k in range(2):
-            g.own[k] = feedforward[k]
-        clipped = _limit(g, g.own)
-    for k in range(2):
-        g.output[k] = g.own[k]
-        if g.authority < 1.0:
-            given = nominal[k] if g.model > 0 else 0.0
-            g.bump[k] *= g.fade / (g.fade + period)
-            g.output[k] = given + g.authority * (g.own[k] - given) + g.bump[k]
-        g.lacking[k] += period / (MEAN + period) * (voltage[k] - nominal[k] - g.lacking[k])
-        growing = max(growing, _grows(g, k, g.own[k] / g.range[k], period))
-        growing = max(growing, _grows(g, 2 + k, feedback[k] / g.range[k], period))
-    g.clipped += period / (BUSY + period) * ((1.0 if clipped else 0.0) - g.clipped)
-    g.saturated += period / (STUCK + period) * (saturated - g.saturated)
-    distance = np.hypot(error[0], error[1])
-    g.watched = min(g.watched + period, MEMORY)
-    g.distance += period / g.watched * (distance - g.distance)
-    trouble = _trouble(g, broken, growing, distance, norm)
-
-    g.left -= period
-    if g.action == FALLBACK:
-        if trouble > 0:
-            g.left = max(g.left, g.hold)
-        elif g.left <= 0 and _quiet(g):
-            g.action, g.reason = NONE, 0.0
-    elif trouble > 0:
-        _step_in(g, trouble, growing > LARGEST * g.growth, nominal, integral, feedback)
-    elif g.left <= 0 and _quiet(g):
-        g.action, g.reason = NONE, 0.0
-    if clipped and g.action <= LIMIT:
-        g.action, g.reason, g.left = LIMIT, CLIPPED, BUSY
-
-    if g.action != FALLBACK:
-        g.authority = min(1.0, g.authority + period * g.gain / RETURN)
-    g.idle = 1.0 if clipped or g.action >= FREEZE else 0.0
-    for k in range(2):
-        g.teaching[k] = g.gain * feedback[k]

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from numba import float64, guvectorize
+import numpy as np
 
-CORRECTION, COMMAND = slice(0, 2), slice(2, 4)  # parts of the state
+from mrctl.kernel import Array, Row, kernel
 
-
-@guvectorize(
-    [(float64[:], float64[:], float64[:], float64[:], float64, float64, float64[:], float64[:], float64[:])],
-    "(u),(u),(u),(l),(),(),(m),(u),(u)",
-    writable_args=("state", "command", "derivative"),
-    cache=True,
+LIMITER = np.dtype(
+    [
+        ("time_constant", "f8"),  # of the filter on the correction, at least the control period, s
+        ("correction", "f8", 2),  # filtered part of the request beyond the reference twist, m/s and rad/s
+        ("command", "f8", 2),  # commanded V and θ̇, m/s and rad/s
+        ("derivative", "f8", 2),  # their derivatives, m/s² and rad/s²
+    ],
+    align=True,
 )
-def limit(request, twist, acceleration, limits, time_constant, period, state, command, derivative):  # noqa: ANN001, ANN201
+
+
+@kernel
+def limit(
+    request: Array, twist: Array, acceleration: Array, max_twist: Array, max_acceleration: Array, period: float, s: Row
+) -> None:
     """Limits a requested twist as Kanayama et al. (1990), each of v, ω, v̇, ω̇ by itself.
 
     Only what the request adds to the reference is low-pass filtered: the reference brings its own derivative, so it
@@ -23,22 +30,19 @@ def limit(request, twist, acceleration, limits, time_constant, period, state, co
         request: Requested v, ω, `(2,)` in m/s, rad/s.
         twist: Reference twist `(2,)`.
         acceleration: Its derivative `(2,)`.
-        limits: Largest |v|, |ω|, |v̇|, |ω̇|, `(4,)`.
-        time_constant: Of the filter on the correction, s, at least `period`.
+        max_twist: Largest |v| and |ω|, `(2,)`.
+        max_acceleration: Largest |v̇| and |ω̇|, `(2,)`.
         period: Control period, s.
-        state: In and out: filtered correction `(2,)` and last command `(2,)`.
-        command: Out: limited twist `(2,)`.
-        derivative: Out: its derivative `(2,)`.
+        s: In and out: a record of `LIMITER`, whose `command` and `derivative` are the result.
     """
-    for i in range(2):
-        rate = (request[i] - twist[i] - state[i]) / time_constant
-        wish = twist[i] + state[i] + period * rate
-        reach = limits[2 + i] * period
-        bounded = max(-limits[i], min(limits[i], max(state[2 + i] - reach, min(state[2 + i] + reach, wish))))
+    for k in range(2):
+        rate = (request[k] - twist[k] - s.correction[k]) / s.time_constant
+        wish = twist[k] + s.correction[k] + period * rate
+        reach = max_acceleration[k] * period
+        bounded = max(-max_twist[k], min(max_twist[k], max(s.command[k] - reach, min(s.command[k] + reach, wish))))
         if bounded == wish:
-            derivative[i] = max(-limits[2 + i], min(limits[2 + i], acceleration[i] + rate))
+            s.derivative[k] = max(-max_acceleration[k], min(max_acceleration[k], acceleration[k] + rate))
         else:
-            derivative[i] = (bounded - state[2 + i]) / period
-        state[i] = bounded - twist[i]
-        state[2 + i] = bounded
-        command[i] = bounded
+            s.derivative[k] = (bounded - s.command[k]) / period
+        s.correction[k] = bounded - twist[k]
+        s.command[k] = bounded

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numba import float64, guvectorize
-from numpy.typing import NDArray
 from pydantic import Field
 
+from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot
 
@@ -27,15 +26,23 @@ class Pid(Record):
     steering_ki: Annotated[float, Field(ge=0, le=50)] = 5.0
     """Its integral gain in 1/s."""
 
-    def gains(self, robot: Robot, rigid: bool) -> NDArray[np.float64]:
-        """Gains `(2, 4)`: a row a channel of K_p, K_i, K_d and the derivative filter's time constant.
+    def gains(self, robot: Robot, rigid: bool) -> dict[str, tuple[float, float]]:
+        """Settings of the record `PID` by name, for the two channels.
 
         The common channel is in volts per m/s; the second in volts per rad/s, or in rad/s per rad/s if `rigid`.
         """
+        common, second = self.channels(robot, rigid)
+        return {
+            "k_p": (common.k_p, second.k_p),
+            "k_i": (common.k_i, second.k_i),
+            "k_d": (common.k_p * self.derivative_time, second.k_p * self.derivative_time),
+            "filter": (self.derivative_filter, self.derivative_filter),
+        }
+
+    def channels(self, robot: Robot, rigid: bool) -> tuple[Gains, Gains]:
+        """Proportional and integral gains of the two channels; units as in `gains`."""
         common, differential = imc(robot, self.time_constant)
-        second = Gains(self.steering_kp, self.steering_ki) if rigid else differential
-        derivative = self.derivative_time, self.derivative_filter
-        return np.array([[g.k_p, g.k_i, g.k_p * derivative[0], derivative[1]] for g in (common, second)])
+        return common, Gains(self.steering_kp, self.steering_ki) if rigid else differential
 
     def faster(self, factor: float) -> Pid:
         """The same rule with the closed-loop time constant divided: every gain is multiplied by `factor`.
@@ -49,6 +56,49 @@ class Pid(Record):
             "steering_ki": self.steering_ki * factor,
         }
         return Pid.from_dict(self.model_dump() | changed)
+
+
+PID = np.dtype(
+    [
+        ("k_p", "f8", 2),  # gains of the two channels: V/(m/s) and V/(rad/s) (rad/s per rad/s on a steering channel)
+        ("k_i", "f8", 2),  # the same per second
+        ("k_d", "f8", 2),  # the same times seconds
+        ("filter", "f8", 2),  # time constant of the derivative's filter, s
+        ("integral", "f8", 2),  # V (rad/s on a steering channel)
+        ("slope", "f8", 2),  # filtered derivative of the error, m/s² and rad/s²
+        ("error", "f8", 2),  # last error, m/s and rad/s
+        ("started", "?"),  # whether there is a last error
+    ],
+    align=True,
+)
+
+
+@kernel
+def pid(command: Array, twist: Array, excess: Array, period: float, s: Row, feedback: Array) -> None:
+    """PID with filtered derivative and anti-windup by back-calculation, for both channels.
+
+        U = K_p e + ∫ (K_i e + K_i/K_p · excess) dt + K_d ė,    e = command − twist
+
+    Åström and Hägglund (Advanced PID Control, 2006, chapter 3): what saturation takes unwinds the integral over
+    K_p/K_i, or over a control period where K_p is smaller than K_i times that.
+
+    Args:
+        command: Commanded V and θ̇ `(2,)` in m/s, rad/s.
+        twist: Measured V and θ̇ `(2,)`.
+        excess: What saturation took from the last output, `(2,)`, in its units.
+        period: Control period, s.
+        s: In and out: a record of `PID`.
+        feedback: Out: U of the two channels in V (rad/s on a steering channel), `(2,)`.
+    """
+    for k in range(2):
+        error = command[k] - twist[k]
+        slope = (error - s.error[k]) / period if s.started else 0.0
+        s.slope[k] += period / (s.filter[k] + period) * (slope - s.slope[k])
+        unwind = s.k_i[k] / max(s.k_p[k], s.k_i[k] * period) * excess[k] if s.k_i[k] > 0 else 0.0
+        s.integral[k] += period * (s.k_i[k] * error + unwind)
+        s.error[k] = error
+        feedback[k] = s.k_p[k] * error + s.integral[k] + s.k_d[k] * s.slope[k]
+    s.started = True
 
 
 PIDS: dict[str, Pid] = {"normal": Pid(), "fast": Pid().faster(2)}
@@ -77,105 +127,3 @@ def imc(robot: Robot, time_constant: float) -> tuple[Gains, Gains]:
     )
     common, differential = (Gains(tau / (k * time_constant), 1 / (k * time_constant)) for k, tau in plants)
     return common, differential
-
-
-@guvectorize(
-    [(float64[:], float64[:], float64[:, :], float64, float64[:], float64[:], float64[:])],
-    "(u),(u),(u,g),(),(u),(m),(u)",
-    writable_args=("state", "output"),
-    cache=True,
-)
-def pid(command, twist, gains, period, excess, state, output):  # noqa: ANN001, ANN201
-    """PID with filtered derivative and anti-windup by back-calculation, for one robot and both channels.
-
-    Args:
-        command: Commanded twist `(2,)` in m/s, rad/s.
-        twist: Measured twist `(2,)`.
-        gains: `(2, 4)` as from `Pid.gains`.
-        period: Control period, s.
-        excess: What saturation took from the last output, `(2,)`; it unwinds the integral over K_p/K_i, or a period.
-        state: In and out: integrals `(2,)`, filtered derivative of the error `(2,)`, last error `(2,)`, started `(1,)`.
-        output: Out: feedback in volts, `(2,)`.
-    """
-    for i in range(2):
-        k_p, k_i, k_d, filtering = gains[i, 0], gains[i, 1], gains[i, 2], gains[i, 3]
-        error = command[i] - twist[i]
-        slope = (error - state[4 + i]) / period if state[6] > 0 else 0.0
-        state[2 + i] += period / (filtering + period) * (slope - state[2 + i])
-        unwind = k_i / max(k_p, k_i * period) * excess[i] if k_i > 0 else 0.0
-        state[i] += period * (k_i * error + unwind)
-        state[4 + i] = error
-        output[i] = k_p * error + state[i] + k_d * state[2 + i]
-    state[6] = 1.0
-
-
-def sampled_loop(
-    frequency: NDArray[np.float64], gain: float, time_constant: float, gains: Gains, period: float, delay: float
-) -> NDArray[np.complex128]:
-    """The open velocity loop L(e^(jωh)) of PI control, as `pid` computes it, of a held K/(τs + 1) behind a delay.
-
-    Args:
-        frequency: ω in rad/s, below π/h, `(F,)`.
-        gain: K.
-        time_constant: τ in s; 0 for a plant that follows within a period.
-        gains: PI gains.
-        period: Control period h in s.
-        delay: Loop delay in s beside the hold.
-    """
-    z = np.exp(1j * frequency * period)
-    decay = np.exp(-period / time_constant) if time_constant > 0 else 0.0
-    plant = gain * (1 - decay) / (z - decay)
-    control = gains.k_p + gains.k_i * period * z / (z - 1)
-    return np.asarray(control * plant * np.exp(-1j * frequency * delay), complex)
-
-
-class Margins(NamedTuple):
-    """How fast and how robust one loop is; NaN where its size is below one from the lowest frequency on.
-
-    Attributes:
-        crossover: Gain crossover in rad/s.
-        phase: Phase margin in degrees.
-        gain: Gain margin as a factor.
-        delay: Delay margin in s.
-        bandwidth: Frequency in rad/s from which on the closed loop passes less than 1/√2.
-    """
-
-    crossover: float
-    phase: float
-    gain: float
-    delay: float
-    bandwidth: float
-
-
-def margins(frequency: NDArray[np.float64], loop: NDArray[np.complex128]) -> Margins:
-    """Margins of an open loop on a fine grid of frequencies.
-
-    Args:
-        frequency: ω in rad/s, ascending, `(F,)`.
-        loop: L(jω), `(F,)`.
-    """
-    magnitude, phase = np.abs(loop), np.unwrap(np.angle(loop))
-    phase -= 2 * np.pi * np.round((phase[0] + np.pi / 2) / (2 * np.pi))  # PI control starts between 0 and −180°
-    crossover, phase_margin, bandwidth = np.nan, np.nan, np.nan
-    if magnitude[0] > 1 > magnitude[-1]:
-        crossing = int(np.argmax(magnitude < 1))
-        crossover, phase_margin = frequency[crossing], np.pi + phase[crossing]
-    passed = np.abs(loop / (1 + loop)) < np.sqrt(0.5)
-    if passed.any() and not passed[0]:
-        bandwidth = frequency[int(np.argmax(passed))]
-    inverted = np.flatnonzero((phase < -np.pi) & (magnitude < 1))
-    return Margins(
-        crossover=float(crossover),
-        phase=float(np.degrees(phase_margin)),
-        gain=float(1 / magnitude[inverted[0]]) if inverted.size else float("inf"),
-        delay=float(phase_margin / crossover),
-        bandwidth=float(bandwidth),
-    )
-
-
-def learning_ratio(gain: float, time_constant: float, gains: Gains) -> float:
-    """K_p (B + b K_p) / (M K_i) of PI control of K/(τs + 1); above 1, feedback-error learning converges without delay.
-
-    Gomi and Kawato (1993) for M V̇ + B V = b U; here M = τ, B = 1, b = K.
-    """
-    return gains.k_p * (1 + gain * gains.k_p) / (time_constant * gains.k_i)

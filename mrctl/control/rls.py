@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from numba import float64, guvectorize
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.feedforward import STEERING_SHARE, Array, feature_scale, features, linear
+from mrctl.control.features import feature_scale, features, linear
+from mrctl.control.feedforward import STEERING_SHARE, CompiledFeedforward
+from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot
 
@@ -30,95 +31,106 @@ class Rls(Record):
     """Feedback below this teaches nothing, V (rad/s on a steering channel)."""
 
 
-@guvectorize(
-    [(float64[:], float64[:], float64, float64[:], float64[:, :], float64[:, :], float64[:])],
-    "(f),(u),(),(s),(f,u),(f,f),()",
-    writable_args=("coefficients", "covariance", "norm"),
-    cache=True,
+RLS = np.dtype(
+    [
+        ("step", "f8"),  # largest share of the feedback that one period moves into the feedforward
+        ("drift", "f8"),  # variance that a coefficient gains each period
+        ("bound", "f8"),  # element of the covariance above which it gains no more
+        ("dead_zone", "f8"),  # V (rad/s on a steering channel)
+        ("share", "f8", 2),  # of the step in the two channels
+        ("x", "f8", 8),  # scaled features of the commanded motion
+        ("theta", "f8", (8, 2)),  # θ: coefficients of the features in the two channels, V
+        ("P", "f8", (8, 8)),  # covariance of θ over the variance of the feedback
+        ("gain", "f8", 8),  # P x
+        ("norm", "f8"),  # ‖θ‖, V
+    ],
+    align=True,
 )
-def update(x, feedback, saturated, settings, coefficients, covariance, norm):  # noqa: ANN001, ANN201
-    """One recursive step whose innovation is the feedback voltage, for one robot.
+
+
+@kernel
+def update(x: Array, feedback: Array, s: Row) -> None:
+    """One recursive step whose innovation is the feedback voltage e.
+
+        K = P x / max(1 + xᵀ P x, xᵀ P x / step),    θ ← θ + K eᵀ,    P ← P − K (P x)ᵀ + drift · 1
 
     Recursive least squares for drifting coefficients (Ljung 1999, section 11.2): the Kalman filter of a random walk.
     Exponential forgetting would inflate the directions that a lap never excites and starve the others at the bound.
+    The second denominator takes the measurement to be as noisy as the largest step asks.
 
     Args:
         x: Scaled features `(8,)`.
-        feedback: `(2,)`.
-        saturated: 1 freezes everything.
-        settings: Drift, covariance bound, dead zone, share of channel two, step, `(5,)`.
-        coefficients: In and out, `(8, 2)`.
-        covariance: In and out, `(8, 8)`.
-        norm: Out: Euclidean norm of the coefficients.
+        feedback: e in V (rad/s on a steering channel), `(2,)`.
+        s: In and out: a record of `RLS`.
     """
-    drift, bound, dead_zone = settings[0], settings[1], settings[2]
-    if saturated > 0 or (abs(feedback[0]) <= dead_zone and abs(feedback[1]) <= dead_zone):
+    if abs(feedback[0]) <= s.dead_zone and abs(feedback[1]) <= s.dead_zone:
         return
-    n = x.shape[0]
-    gain = np.empty(n)
     power = 0.0
-    for i in range(n):
-        gain[i] = 0.0
-        for j in range(n):
-            gain[i] += covariance[i, j] * x[j]
-        power += x[i] * gain[i]
-    total = max(1.0 + power, power / settings[4])  # the measurement is taken to be as noisy as the step asks
-    for i in range(n):
-        for j in range(n):
-            covariance[i, j] -= gain[i] * gain[j] / total
-        if covariance[i, i] < bound:
-            covariance[i, i] += drift
+    for i in range(8):
+        s.gain[i] = 0.0
+        for j in range(8):
+            s.gain[i] += s.P[i, j] * x[j]
+        power += x[i] * s.gain[i]
+    total = max(1.0 + power, power / s.step)
+    for i in range(8):
+        for j in range(8):
+            s.P[i, j] -= s.gain[i] * s.gain[j] / total
+        if s.P[i, i] < s.bound:
+            s.P[i, i] += s.drift
         for k in range(2):
-            if abs(feedback[k]) > dead_zone:
-                share = settings[3] if k == 1 else 1.0
-                coefficients[i, k] += share * gain[i] / total * feedback[k]
-    norm[0] = np.sqrt((coefficients**2).sum())
+            if abs(feedback[k]) > s.dead_zone:
+                s.theta[i, k] += s.share[k] * s.gain[i] / total * feedback[k]
+    s.norm = np.sqrt((s.theta**2).sum())
 
 
-class RecursiveLeastSquares:
-    """`rls` for B robots: U_ff = θᵀ features, θ from zero.
+@kernel
+def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
+    """U = θᵀ x at the commanded motion."""
+    rows, scale = arrays
+    features(command, derivative, robot.half_track, scale, rows[i].x)
+    linear(rows[i].x, rows[i].theta, voltage)
+
+
+@kernel
+def learn(
+    i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
+    arrays: tuple[Any, ...], added: Array,
+) -> float:  # fmt: skip
+    """One recursive step on the features of the last output, unless the robot must not learn."""
+    s = arrays[0][i]
+    linear(s.x, s.theta, added)
+    before, before_second = added[0], added[1]
+    if frozen == 0:
+        update(s.x, feedback, s)
+        linear(s.x, s.theta, added)
+    added[0] -= before
+    added[1] -= before_second
+    return s.norm
+
+
+class RecursiveLeastSquares(CompiledFeedforward):
+    """`rls` for B robots: U_ff = θᵀ x, θ from zero.
 
     Attributes:
-        state: `coefficients` `(B, 8, 2)` and `covariance` `(B, 8, 8)`.
-        weight_norm: Euclidean norm of the coefficients, `(B,)`.
+        rows: One record of `RLS` a robot.
         weight_volts: The coefficients are in volts.
     """
 
+    respond, learn_one = respond, learn
     weight_volts = 1.0
 
-    def __init__(self, robot: Robot, settings: list[Rls], rigid: bool) -> None:
-        """Takes the nominal robot (for the scales alone), settings a row, and whether channel two is steering."""
-        size = len(settings)
-        self._half_track = robot.half_track
-        self._scale = feature_scale(robot)
-        share = STEERING_SHARE if rigid else 1.0
-        self._settings = np.array([[s.drift, s.covariance_bound, s.dead_zone, share, s.step] for s in settings])
-        self._features, self._output = np.zeros((size, 8)), np.zeros((size, 2))
-        self.weight_norm = np.zeros(size)
+    def __init__(self, robot: Robot, settings: list[Rls], rigid: bool, period: float) -> None:
+        """Takes the nominal robot, settings a row, whether channel two is steering, and the period in s."""
+        super().__init__(robot, len(settings), rigid, period)
+        self.rows = rows = np.zeros(len(settings), RLS)
+        rows["step"], rows["drift"] = [s.step for s in settings], [s.drift for s in settings]
+        rows["bound"], rows["dead_zone"] = [s.covariance_bound for s in settings], [s.dead_zone for s in settings]
+        rows["share"] = 1.0, STEERING_SHARE if rigid else 1.0
         self._covariance = np.array([s.initial_covariance * np.eye(8) for s in settings])
-        self.state = {
-            "coefficients": np.zeros((size, 8, 2)),
-            "covariance": self._covariance.copy(),
-        }
+        rows["P"] = self._covariance
+        self.arrays = rows, feature_scale(robot)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Takes robots back to the start."""
-        self.state["coefficients"][rows], self.weight_norm[rows] = 0.0, 0.0
-        self.state["covariance"][rows] = self._covariance[rows]
-
-    def output(self, command: Array, derivative: Array) -> Array:
-        """θᵀ features of the commanded motion."""
-        features(command, derivative, self._half_track, self._scale, self._features)
-        linear(self._features, self.state["coefficients"], self._output)
-        return self._output
-
-    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
-        """One recursive step; returns what it added to the last output."""
-        state = self.state
-        update(
-            self._features, feedback, saturated, self._settings, state["coefficients"], state["covariance"],
-            self.weight_norm,
-        )  # fmt: skip
-        before = self._output.copy()
-        linear(self._features, state["coefficients"], self._output)
-        return self._output - before
+        """Takes robots back to no coefficients and the initial covariance."""
+        self.rows["theta"][rows], self.rows["norm"][rows], self.weight_norm[rows] = 0.0, 0.0, 0.0
+        self.rows["P"][rows] = self._covariance[rows]

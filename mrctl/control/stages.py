@@ -16,19 +16,12 @@ feedforward stay what they are.
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Protocol, TypedDict, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Protocol, TypedDict, TypeVar
 
 from mrctl.control.feedforward import Feedforward
-from mrctl.record import InputError
+from mrctl.kernel import Array
 from mrctl.theory.robot import Robot
-
-Array = NDArray[np.float64]
 
 
 class Motion(Protocol):
@@ -128,82 +121,3 @@ class Stages(TypedDict, total=False):
 
 
 METHODS = {name: ("output", "learn" if name == "feedforward" else "reset") for name in Stages.__annotations__}
-
-
-class StageError(InputError):
-    """Somebody's own stage raised, or did not return what it should; one line that names it."""
-
-
-class Own:
-    """Somebody's own stage, asked with care.
-
-    Attributes:
-        stage: The object.
-        title: Its stage and name.
-    """
-
-    def __init__(self, name: str, factory: Factory[Any], robot: Robot, size: int) -> None:
-        """Makes the stage.
-
-        Args:
-            name: Which stage it is.
-            factory: As the user gave it.
-            robot: The nominal robot.
-            size: B.
-
-        Raises:
-            StageError: There is no such stage, the factory raised, or what it made lacks a method.
-        """
-        if name not in METHODS:
-            raise StageError(f"{name}: no such stage; there are {', '.join(METHODS)}")
-        self.title = f"{name} {getattr(factory, '__name__', type(factory).__name__)}"
-        self._size = size
-        try:
-            self.stage: Any = factory(robot, size)
-        except Exception as error:  # noqa: BLE001 (it is somebody else's code, here and below)
-            raise self._raised(error) from error
-        for method in METHODS[name]:
-            if not callable(getattr(self.stage, method, None)):
-                raise StageError(f"{self.title}: has no method {method}")
-
-    def tell(self, method: str, *values: Any) -> Any:  # noqa: ANN401
-        """Calls a method with copies of arrays, zero in the rows of robots that have blown up.
-
-        Raises:
-            StageError: It raised.
-        """
-        floats = [isinstance(v, np.ndarray) and v.dtype.kind == "f" for v in values]
-        copies = [np.where(np.isfinite(v), v, 0.0) if real else v for v, real in zip(values, floats, strict=True)]
-        try:
-            answer = getattr(self.stage, method)(*copies)
-            return answer.detach() if hasattr(answer, "detach") else answer
-        except Exception as error:  # noqa: BLE001
-            raise self._raised(error) from error
-
-    def ask(self, method: str, *values: Any) -> Array:  # noqa: ANN401
-        """The same for a method that answers with two numbers a robot, `(B, 2)`.
-
-        Raises:
-            StageError: It raised, or the answer has another shape.
-        """
-        return self.fitting(self.tell(method, *values), (self._size, 2), method)
-
-    def fitting(self, answer: object, shape: tuple[int, ...], what: str) -> Array:
-        """An answer as the compiled loops rely on it.
-
-        Raises:
-            StageError: It has another shape, or is no array of numbers.
-        """
-        try:
-            array = np.asarray(answer, float)
-        except Exception as error:  # noqa: BLE001
-            raise self._raised(error) from error
-        if answer is None or array.shape != shape:
-            found = "nothing" if answer is None else f"shape {array.shape}"
-            raise StageError(f"{self.title}: {what} is {found}, expected shape {shape}")
-        return array
-
-    def _raised(self, error: Exception) -> StageError:
-        frames = traceback.extract_tb(error.__traceback__)[1:2]  # the line of the stage's own method
-        place = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in frames)
-        return StageError(" ".join(f"{self.title}: {type(error).__name__}: {error}{place}".split()))

@@ -1,105 +1,111 @@
-"""Allocation: how the velocity controller's two channels reach motors and fork, for each steering arrangement."""
+"""Allocation: how the two channels of the velocity controller reach motors and fork, for each steering arrangement."""
 
 from __future__ import annotations
 
 import numpy as np
-from numba import float64, guvectorize
-from numpy.typing import NDArray
 
-from mrctl.theory.robot import Robot
+from mrctl.control.features import SIGN_SPEED
+from mrctl.kernel import Array, Row, kernel
 
 REST = 0.02  # m/s; below it the fork holds its angle
-SIGN_SPEED = 0.05  # m/s over which the smooth sign of the losses turns
 
-
-def parameters(robot: Robot, rigid: bool) -> NDArray[np.float64]:
-    """What `allocate` needs of the robot, `(8,)`: L, t, φ_max, U_max, D, k_E N/r, loss voltage, rigid."""
-    return np.array(
-        [
-            robot.wheelbase,
-            robot.trail,
-            robot.steering_limit,
-            robot.supply,
-            robot.half_track,
-            robot.back_emf / robot.wheel_radius,
-            robot.drive_loss / robot.motor_gain,
-            float(rigid),
-        ]
-    )
-
-
-@guvectorize(
-    [(*[float64[:]] * 5, float64, *[float64[:]] * 5)],
-    "(u),(u),(u),(u),(k),(),(m),(c),(c),(u),()",
-    writable_args=("state", "command", "parts", "excess", "saturated"),
-    cache=True,
+ALLOCATION = np.dtype(
+    [
+        ("angle", "f8"),  # steering angle φ_c of the fork at the end of the last period, rad
+        ("rate", "f8"),  # its rate, rad/s
+        ("feedback", "f8", 2),  # share of the feedback in the voltages left and right, V
+        ("feedforward", "f8", 2),  # share of the feedforward, V; it includes the differential of `rigid` steering
+        ("command", "f8", 4),  # voltages left and right in V, steering angle in rad, steering rate in rad/s
+        ("excess", "f8", 2),  # what the limits took from the two channels, V (rad/s on a steering channel)
+        ("saturated", "?"),  # whether a limit acted
+    ],
+    align=True,
 )
-def allocate(twist, acceleration, feedback, feedforward, robot, period, state, command, parts, excess, saturated):  # noqa: ANN001, ANN201
-    """Voltages and steering from feedback plus feedforward, for one robot.
 
-    `compliant` and `caster`: U_r,l = U_Σ ± U_Δ, and the fork goes where its wheel rolls without scrub, with
-    φ_c = atan(L θ̇/V) − asin(t θ̇/√(V² + L²θ̇²)) of the commanded twist and the derivative of that as velocity set-point.
-    `rigid`: the second channel is a correction of θ̇ inside φ_c, and U_Δ is the electronic differential
-    k_E N D θ̇/r plus half the difference of the loss terms.
+
+@kernel
+def scrub_free(v: float, omega: float, v_dot: float, omega_dot: float, period: float, robot: Row, s: Row) -> None:
+    """Angle at which a trailing front wheel rolls without scrub, and its rate, with the fork's own motion in it.
+
+        speed · sin(direction − φ) = t (θ̇ + φ̇),    speed² = V² + (L θ̇)²,    tan direction = L θ̇ / V
+
+    so φ is the quasi-static φ_c = atan(L θ̇/V) − asin(t θ̇/speed) behind a lag of t/speed: the front contact trails the
+    axis by t and swings with the fork. At rest the angle is held. In reverse V and L θ̇ change their signs.
 
     Args:
-        twist: Commanded V, θ̇, `(2,)`.
-        acceleration: Their derivatives `(2,)`.
-        feedback: `(2,)`, volts (second channel rad/s if rigid).
-        feedforward: `(2,)`, the same units.
-        robot: As from `parameters`.
+        v: V in m/s.
+        omega: θ̇ in rad/s.
+        v_dot: V̇ in m/s².
+        omega_dot: θ̈ in rad/s².
         period: Control period in s.
-        state: In and out: steering angle and rate, `(2,)`; held at rest.
-        command: Out: voltages left and right in V, steering angle in rad and rate in rad/s, `(4,)`.
-        parts: Out: feedback left and right, feedforward left and right in V, `(4,)`; the differential of `rigid`
-            steering comes from the model and counts as feedforward.
-        excess: Out: what the limits took from the two channels, `(2,)`.
-        saturated: Out: 1 where a limit acted, else 0.
+        robot: The nominal robot, a record of `NOMINAL`.
+        s: In and out: a record of `ALLOCATION`, whose `angle` and `rate` are the result, without limits.
     """
-    wheelbase, trail, steering_max, supply, half_track, emf, loss, rigid = robot
-    v, omega, v_dot, omega_dot = twist[0], twist[1], acceleration[0], acceleration[1]
-    excess[1] = 0.0
-    saturated[0] = 0.0
-    if rigid > 0:
-        omega += feedback[1] + feedforward[1]
-        left, right = v - half_track * twist[1], v + half_track * twist[1]
-        apart = emf * half_track * twist[1] + loss / 2 * (np.tanh(right / SIGN_SPEED) - np.tanh(left / SIGN_SPEED))
-        parts[0], parts[1] = feedback[0], feedback[0]
-    else:
-        apart = feedforward[1]
-        parts[0], parts[1] = feedback[0] - feedback[1], feedback[0] + feedback[1]
-    parts[2], parts[3] = feedforward[0] - apart, feedforward[0] + apart
-    # The front contact trails the axis by t and swings with the fork, so it rolls without scrub where
-    # speed · sin(direction − φ) = t (θ̇ + φ̇): the quasi-static angle behind a lag of t/speed.
     sense = 1.0 if v >= 0 else -1.0
-    forward, side = sense * v, sense * wheelbase * omega
+    forward, side = sense * v, sense * robot.wheelbase * omega
+    if not forward > REST:
+        s.rate = 0.0
+        return
     speed = np.hypot(forward, side)
-    angle, rate = state[0], 0.0
-    if forward > REST:
-        forward_dot, side_dot = sense * v_dot, sense * wheelbase * omega_dot
-        s = sense * trail * omega / speed  # trail < wheelbase, so the arcsine exists
-        static = np.arctan2(side, forward) - np.arcsin(s)
-        speed_dot = (forward * forward_dot + side * side_dot) / speed
-        static_rate = (forward * side_dot - side * forward_dot) / speed**2
-        static_rate -= (sense * trail * omega_dot - s * speed_dot) / speed / np.sqrt(1 - s * s)
-        lag = trail / speed
-        angle = (lag * state[0] + period * static) / (lag + period)  # implicit Euler: exact on a ramp
-        rate = (lag * state[1] + period * static_rate) / (lag + period * (1 - lag * speed_dot / speed))
-        if abs(angle) > steering_max:
-            angle = steering_max if angle > 0 else -steering_max
-            rate = 0.0
-            if rigid > 0:
-                excess[1] = v * np.tan(angle) / wheelbase - omega
-                saturated[0] = 1.0
-    state[0], state[1] = angle, rate
-    left, right = parts[0] + parts[2], parts[1] + parts[3]
-    command[0] = max(-supply, min(supply, left))
-    command[1] = max(-supply, min(supply, right))
-    middle = angle + rate * period / 2  # the set-point is held for a period
-    command[2], command[3] = max(-steering_max, min(steering_max, middle)), rate
-    lost_left, lost_right = command[0] - left, command[1] - right
-    excess[0] = (lost_left + lost_right) / 2
-    if not rigid > 0:
-        excess[1] = (lost_right - lost_left) / 2
+    forward_dot, side_dot = sense * v_dot, sense * robot.wheelbase * omega_dot
+    sine = sense * robot.trail * omega / speed  # the trail is shorter than the wheelbase, so the arcsine exists
+    static = np.arctan2(side, forward) - np.arcsin(sine)
+    speed_dot = (forward * forward_dot + side * side_dot) / speed
+    static_dot = (forward * side_dot - side * forward_dot) / speed**2
+    static_dot -= (sense * robot.trail * omega_dot - sine * speed_dot) / speed / np.sqrt(1 - sine * sine)
+    lag = robot.trail / speed
+    s.angle = (lag * s.angle + period * static) / (lag + period)  # implicit Euler: exact on a ramp
+    s.rate = (lag * s.rate + period * static_dot) / (lag + period * (1 - lag * speed_dot / speed))
+
+
+@kernel
+def allocate(
+    twist: Array, acceleration: Array, feedback: Array, feedforward: Array, period: float, robot: Row, s: Row
+) -> None:
+    """Voltages and steering from feedback plus feedforward.
+
+    - `compliant` and `caster`: U_r,l = U_Σ ± U_Δ, and the fork goes where its wheel rolls without scrub.
+    - `rigid`: the second channel corrects θ̇ inside the steering angle, and U_Δ is the electronic differential
+      k_E N D θ̇/r plus half the difference of the loss terms.
+
+    Args:
+        twist: Commanded V in m/s and θ̇ in rad/s, `(2,)`.
+        acceleration: Their derivatives `(2,)`.
+        feedback: U_Σ and U_Δ of the feedback in V (the second in rad/s if rigid), `(2,)`.
+        feedforward: Those of the feedforward, `(2,)`.
+        period: Control period in s.
+        robot: The nominal robot, a record of `NOMINAL`.
+        s: In and out: a record of `ALLOCATION`.
+    """
+    v, omega = twist[0], twist[1]
+    s.excess[1], s.saturated = 0.0, False
+    if robot.rigid:
+        left, right = v - robot.half_track * omega, v + robot.half_track * omega
+        losses = np.tanh(right / SIGN_SPEED) - np.tanh(left / SIGN_SPEED)
+        differential = robot.emf * robot.half_track * omega + robot.loss / 2 * losses
+        s.feedback[0], s.feedback[1] = feedback[0], feedback[0]
+        omega += feedback[1] + feedforward[1]
+    else:
+        differential = feedforward[1]
+        s.feedback[0], s.feedback[1] = feedback[0] - feedback[1], feedback[0] + feedback[1]
+    s.feedforward[0], s.feedforward[1] = feedforward[0] - differential, feedforward[0] + differential
+
+    scrub_free(v, omega, acceleration[0], acceleration[1], period, robot, s)
+    if abs(s.angle) > robot.steering_limit:
+        s.angle = robot.steering_limit if s.angle > 0 else -robot.steering_limit
+        s.rate = 0.0
+        if robot.rigid:
+            s.excess[1] = v * np.tan(s.angle) / robot.wheelbase - omega
+            s.saturated = True
+    middle = s.angle + s.rate * period / 2  # the set-point is held for a period
+    s.command[2], s.command[3] = max(-robot.steering_limit, min(robot.steering_limit, middle)), s.rate
+
+    left, right = s.feedback[0] + s.feedforward[0], s.feedback[1] + s.feedforward[1]
+    s.command[0] = max(-robot.supply, min(robot.supply, left))
+    s.command[1] = max(-robot.supply, min(robot.supply, right))
+    lost_left, lost_right = s.command[0] - left, s.command[1] - right
+    s.excess[0] = (lost_left + lost_right) / 2
+    if not robot.rigid:
+        s.excess[1] = (lost_right - lost_left) / 2
     if lost_left != 0 or lost_right != 0:
-        saturated[0] = 1.0
+        s.saturated = True

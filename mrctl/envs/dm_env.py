@@ -19,7 +19,7 @@ from dm_control.rl import control
 from dm_control.utils import containers
 from dm_env import specs
 
-from mrctl.envs.episodes import ACTIONS, OBSERVATIONS, Action, Array, Episodes, read
+from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Action, Array, Episodes, read
 from mrctl.physics.plant import PhysicsPlant
 from mrctl.scenario import Scenario
 
@@ -55,10 +55,11 @@ class Tracking(control.Task):
     def before_step(self, action: Array, physics: Physics) -> None:
         """Events, measurement, control."""
         self.episodes.act(np.asarray(action, float)[None])
-        self.episodes.decide()
+        self.episodes.plant.send(self.episodes.decide())
 
     def after_step(self, physics: Physics) -> None:
         """Readouts, record, failures."""
+        self.episodes.plant.look()
         self.episodes.settle()
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
@@ -117,7 +118,7 @@ def _add(action: Action) -> None:
     SUITE.add("tracking")(task)
 
 
-for _action in ACTIONS:
+for _action in ACTION_KINDS:
     _add(_action)
 
 

@@ -25,7 +25,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mrctl.envs.episodes import ACTIONS, OBSERVATIONS, Action, Array, Episodes, read
+from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Action, Array, Episodes, read
 from mrctl.scenario import Scenario
 
 SEEDS = 2**32  # of a scenario
@@ -140,7 +140,7 @@ class TrackingVectorEnv(VectorEnv):
         return seen, reward, terminated, truncated, info
 
 
-for _action in ACTIONS:
+for _action in ACTION_KINDS:
     gymnasium.register(
         id=f"mrctl/{_action.capitalize()}Tracking-v0",
         entry_point="mrctl.envs.gym:TrackingEnv",

@@ -12,51 +12,38 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from importlib import import_module
 from typing import Any
 from unittest import mock
 
 import numpy as np
 import torch
-from numba import njit
 
-from mrctl.control import fel
-from mrctl.control.chain import one
-from mrctl.control.feedforward import feature_scale
-from mrctl.control.kanayama import kanayama
-from mrctl.control.limiter import limit
-from mrctl.control.pid import pid
+from mrctl.control.features import feature_scale
 from mrctl.experiments.tables import markdown, number
-from mrctl.loop import hierarchy
+from mrctl.loop import hierarchy, log
 from mrctl.loop.simulation import Simulation
 from mrctl.physics import plant
 from mrctl.physics.mjcf import load
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.plant import BatchPlant, CarPhysics
 from mrctl.physics.stand import stand
-from mrctl.results.dataset import SIGNALS, versions
+from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
+from mrctl.sensing import sensors
 from mrctl.theory.kinematics import steering_angle
-
-kanayama_law, limit_law, pid_law = one(kanayama), one(limit), one(pid)
-loop = import_module("mrctl.loop.simulation")  # `mrctl.simulate` itself is the function of that name
 
 SIZES = (1, 16, 64, 256, 1024)
 REPETITIONS = 41  # many short turns: neighbours share what else the machine does
 CHUNK = 1500  # control periods of one turn, summed over the robots: a twentieth of a second
 WARM = 20  # control periods before the clock starts
-CONTROLS = [list(SIGNALS).index(n) for n in ("voltage_left", "voltage_right", "steering_command")]
-CONTROLS.append(list(SIGNALS).index("steering_rate_command"))
+CONTROLS = ["voltage_left", "voltage_right", "steering_command", "steering_rate_command"]
 PARTS: dict[str, tuple[Any, str]] = {
     "physics": (BatchPlant, "_advance"),
-    "actuation (delay, supply)": (plant, "_drive"),
-    "readout, currents": (plant, "_look"),
-    "measurement, true error": (loop, "_sense"),
-    "motion controller, limiter, PID": (hierarchy, "_lead"),
-    "feedforward (fel)": (fel, "_respond"),
-    "allocation": (hierarchy, "_follow"),
-    "learning (fel)": (fel, "_teach"),
-    "record": (loop, "_record"),
+    "measurement": (sensors, "measure"),
+    "control and learning": (hierarchy.Hierarchy, "update"),
+    "actuation (delay, supply)": (plant, "drive"),
+    "readout, currents": (plant, "look"),
+    "record": (log, "record"),
 }
 
 
@@ -135,7 +122,7 @@ def build(size: int, ticks: int, threads: int = 1) -> Simulation:
         threads: Threads of the batch engine.
     """
     laps = math.ceil((WARM + ticks) / Scenario(laps=1).ticks)
-    with mock.patch.object(loop, "build", BatchPlant):
+    with mock.patch("mrctl.loop.simulation.build", BatchPlant):
         simulation = Simulation([Scenario(seed=seed, laps=laps) for seed in range(size)], threads=threads)
     for _ in range(WARM):
         simulation.step()
@@ -161,7 +148,8 @@ def turn(simulation: Simulation, ticks: int) -> tuple[float, float, bool]:
         simulation.step()
     closed = time.perf_counter() - start
     after, qpos = batch.state.copy(), physics.qpos.copy()
-    controls = simulation.log[first : first + ticks, :, CONTROLS].transpose(1, 0, 2)
+    recorded = simulation.log.ticks[first : first + ticks]
+    controls = np.stack([recorded[name].T for name in CONTROLS], axis=-1)
     held = np.repeat(controls, physics.substeps, axis=1)
     batch.state[:] = before
     start = time.perf_counter()
@@ -228,49 +216,7 @@ def _parts(size: int, chunk: int) -> dict[str, float]:
             whole.append(time.perf_counter() - start)
     medians = {name: 1e6 * statistics.median(spent) for name, spent in seconds.items()}
     rest = 1e6 * statistics.median(whole) - sum(medians.values())
-    return medians | {"the rest": rest} | _laws(simulation.hierarchy, max(2, 20 * chunk // size))
-
-
-def _laws(controllers: hierarchy.Hierarchy, times: int) -> dict[str, float]:
-    """µs a control period by law, of those that one compiled loop runs in turn."""
-    size, period = len(controllers.state), Scenario().control_period
-    error, reference, limits = np.full((size, 3), 0.01), np.zeros((size, 7)), np.array([1.5, 3.0, 1.5, 6.0])
-
-    @njit
-    def motion(times, state, error, reference, limits):  # noqa: ANN001, ANN202
-        for _ in range(times):
-            for i in range(len(state)):
-                s = state[i]
-                kanayama_law(error[i], reference[i, :3], reference[i, 3:5], s.kanayama, s.error, s.request)
-
-    @njit
-    def limiter(times, state, error, reference, limits):  # noqa: ANN001, ANN202
-        for _ in range(times):
-            for i in range(len(state)):
-                s = state[i]
-                limit_law(
-                    s.request, reference[i, 3:5], reference[i, 5:], limits, s.prefilter, period, s.limiter, s.command,
-                    s.derivative,
-                )  # fmt: skip
-
-    @njit
-    def feedback(times, state, error, reference, limits):  # noqa: ANN001, ANN202
-        for _ in range(times):
-            for i in range(len(state)):
-                s = state[i]
-                pid_law(s.command, s.request, s.pid_gains, period, s.excess, s.pid, s.feedback)
-
-    costs = {}
-    for name, law in (("motion controller", motion), ("limiter", limiter), ("PID", feedback)):
-        state = controllers.state.copy()
-        law(1, state, error, reference, limits)
-        spent = []
-        for _ in range(5):
-            start = time.perf_counter()
-            law(times, state, error, reference, limits)
-            spent.append(time.perf_counter() - start)
-        costs[f"· {name} alone"] = 1e6 * statistics.median(spent) / times
-    return costs
+    return medians | {"the rest": rest}
 
 
 @contextmanager
@@ -313,7 +259,9 @@ def autograd_loop(ticks: int, stretches: int) -> Iterator[tuple[float, float]]:
     robot = read_robot(load(scenario.world))
     motion = scenario.reference.sample(period * np.arange(ticks * stretches + 1, dtype=float))
     reference = np.hstack(motion)
-    gains, (k_x, k_y, k_theta) = scenario.pid.gains(robot, False), scenario.kanayama.model_dump().values()
+    gains = scenario.pid.gains(robot, rigid=False)
+    k_p, k_i = np.array(gains["k_p"]), np.array(gains["k_i"])
+    k_x, k_y, k_theta = scenario.kanayama.model_dump().values()
     smooth = period / scenario.prefilter
     scale = feature_scale(robot)
     last = torch.nn.Linear(24, 2)
@@ -346,8 +294,8 @@ def autograd_loop(ticks: int, stretches: int) -> Iterator[tuple[float, float]]:
         correction = correction + smooth * (request - wanted - correction)
         command, derivative = wanted + correction, acceleration + rate
         deviation = command - twist
-        integral = integral + period * gains[:, 1] * deviation
-        feedback = gains[:, 0] * deviation + integral
+        integral = integral + period * k_i * deviation
+        feedback = k_p * deviation + integral
         v, omega = command
         wheels = np.tanh((v + np.array([-1, 1]) * robot.half_track * omega) / 0.05)
         features = np.array([v, omega, *derivative, v * omega, omega**2, *wheels]) / scale

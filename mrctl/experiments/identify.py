@@ -34,7 +34,7 @@ from mrctl.checks.catalogue import on_skid
 from mrctl.experiments.tables import json_text, markdown
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.plant import OMEGA, V, build
+from mrctl.physics.plant import build
 from mrctl.record import InputError
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, Robot, RobotFile
@@ -203,7 +203,7 @@ def excite(
     """Drives robots open loop; returns what was measured of each, and the robot as it truly is."""
     period = np.stack([signals(robot, random, turns) for _ in range(REPEATS)], axis=1)  # (N, B, 2)
     samples = len(period)
-    plant = build(model, REPEATS, round(TICK / model.opt.timestep), threads=1)
+    plant = build(model, robot, REPEATS, round(TICK / model.opt.timestep), threads=1)
     for row in range(REPEATS):
         plant.perturb(row, perturbation, round(perturbation.control_delay / TICK))
     plant.reset(np.zeros((REPEATS, 3)), np.tile([robot.max_speed / 2, 0.0], (REPEATS, 1)))
@@ -213,10 +213,10 @@ def excite(
     for k in range(ticks):
         common, differential = period[k % samples].T
         command[:, 0], command[:, 1] = common - differential, common + differential
-        twist[k] = plant.reading[:, [V, OMEGA]]
+        twist[k] = plant.reading["twist"]
         plant.step(command)
         voltage[k], current[k] = plant.applied, plant.current()
-    twist[ticks] = plant.reading[:, [V, OMEGA]]
+    twist[ticks] = plant.reading["twist"]
     if plant.failed.any():
         raise InputError(f"identify: {next(filter(None, plant.failure))} on the way")
     twist += random.standard_normal(twist.shape) * [perturbation.velocity_noise, perturbation.rotation_noise]

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.control.kanayama import kanayama
-from mrctl.control.limiter import limit
+from mrctl.control.kanayama import GAINS, kanayama, posture_error
+from mrctl.control.limiter import LIMITER, limit
+from mrctl.kernel import Array, Rows, kernel
 from mrctl.theory.kinematics import pose_rates
 
 STEP = 1e-4  # s
@@ -71,6 +72,22 @@ def _cases() -> list[Case]:
 CASES = _cases()
 
 
+CASE = np.dtype([("k", GAINS), ("error", "f8", 3), ("request", "f8", 2), ("limiter", LIMITER)], align=True)
+
+
+@kernel
+def control(
+    pose: Array, reference: Array, twist: Array, zero: Array, max_twist: Array, max_acceleration: Array, period: float,
+    rows: Rows,
+) -> None:  # fmt: skip
+    """The motion controller and, on its request, the limiter, for all cases."""
+    for i in range(len(rows)):
+        s = rows[i]
+        posture_error(pose[i], reference, s.error)
+        kanayama(s.error, twist, s.k, s.request)
+        limit(s.request, zero, zero, max_twist, max_acceleration, period, s.limiter)
+
+
 def paths(cases: list[Case], period: float = STEP) -> NDArray[np.float64]:
     """Postures along every case.
 
@@ -83,12 +100,11 @@ def paths(cases: list[Case], period: float = STEP) -> NDArray[np.float64]:
     """
     size, hold = len(cases), round(period / STEP)
     pose = np.array([[0.0, case.offset, case.turn] for case in cases])
-    gains = np.array([[K_X, K_Y, case.k_theta] for case in cases])
+    rows = np.zeros(size, CASE)
+    for row, case in zip(rows, cases, strict=True):
+        row["k"] = K_X, K_Y, case.k_theta
     limited = np.array([[case.limited] for case in cases])
-    state = np.tile([0.0, 0.0, SPEED, 0.0], (size, 1))
-    zero, reference_twist = np.zeros(2), np.array([SPEED, 0.0])
-    error, request = np.zeros((size, 3)), np.zeros((size, 2))
-    command, derivative = np.zeros((size, 2)), np.zeros((size, 2))
+    rows["limiter"]["time_constant"], rows["limiter"]["command"] = period, (SPEED, 0.0)
     twist = np.zeros((size, 2))
     steps = round(DURATION / STEP)
     record = np.empty((steps, size, 3))
@@ -96,9 +112,8 @@ def paths(cases: list[Case], period: float = STEP) -> NDArray[np.float64]:
         record[k] = pose
         if k % hold == 0:
             reference = np.array([SPEED * STEP * k, 0.0, 0.0])
-            kanayama(pose, reference, reference_twist, gains, error, request)
-            limit(request, zero, zero, LIMITS, period, period, state, command, derivative)
-            twist = np.where(limited, command, request)
+            control(pose, reference, np.array([SPEED, 0.0]), np.zeros(2), LIMITS[:2], LIMITS[2:], period, rows)
+            twist = np.where(limited, rows["limiter"]["command"], rows["request"])
         middle = pose + STEP / 2 * pose_rates(pose, twist)
         pose = pose + STEP * pose_rates(middle, twist)
     return record

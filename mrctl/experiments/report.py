@@ -18,11 +18,11 @@ from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
 from mrctl.experiments.cases import BAND, Outcome
 from mrctl.experiments.tables import number
-from mrctl.loop import controller
+from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation
 from mrctl.results import metrics, plots
 from mrctl.results.comparison import superiority
-from mrctl.results.dataset import SIGNALS, versions
+from mrctl.results.dataset import versions
 from mrctl.results.plots import InverseMap
 from mrctl.scenario import Scenario
 
@@ -120,14 +120,13 @@ def _labelled(runs: Mapping[str, xr.Dataset]) -> xr.Dataset:
 
 def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
     """Drives a scenario once more and asks the feedforward what it makes of steady motion."""
-    stages: Stages = controller.load(choice["controller"]) if "controller" in choice else {}
+    stages: Stages = user_files.load(choice["controller"]) if "controller" in choice else {}
     scenario = scenario.model_copy(update={"feedforward": choice.get("feedforward", "none")})
     simulation = Simulation([scenario], **stages)
     while simulation.running:
         simulation.step()
-    names = list(SIGNALS)
-    columns = [names.index(name) for name in ("v_command", "omega_command")]
-    path = simulation.log[-round(scenario.reference.period / scenario.control_period) :, 0, columns]
+    lap = simulation.log.ticks[-round(scenario.reference.period / scenario.control_period) :, 0]
+    path = np.stack([lap["v_command"], lap["omega_command"]], axis=1)
     v, omega, shape = np.linspace(0, 1.2, GRID), np.linspace(-2, 2, GRID), (GRID, GRID, 2)
     truth = InverseDynamics([simulation.plant.truth[0]], rigid=scenario.steering == "rigid")
     mine, true = (

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from mrctl.control.fel import save_weights
 from mrctl.control.stages import Stages
+from mrctl.control.weights import save_weights
 from mrctl.experiments.tables import markdown, number, output_folder
-from mrctl.loop import controller
+from mrctl.loop import user_files
 from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
 from mrctl.results import metrics, plots
@@ -36,7 +36,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         scenario: What to run.
         out: Folder for `result.zarr`, figures and learned weights, or None.
         as_json: JSON instead of a table.
-        own: Stages of your own; see `mrctl.loop.controller`.
+        own: Stages of your own; see `mrctl.loop.user_files`.
 
     Returns:
         The metrics, a row a lap.
@@ -46,7 +46,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     """
     if out is not None and (output_folder(out) / "result.zarr").exists():
         raise InputError(f"out: {out} holds a result already; nothing was overwritten")
-    stages: Stages = controller.load(own) if own else {}
+    stages: Stages = user_files.load(own) if own else {}
     result = simulate([scenario], progress=True, **stages)
     laps = metrics.per_lap(result)
     if out is not None:

@@ -13,7 +13,7 @@ import xarray as xr
 from mrctl.experiments import report
 from mrctl.experiments.cases import BAND, PARTS, Case, Laps, Outcome, cases
 from mrctl.experiments.tables import markdown, number, output_folder, write_json
-from mrctl.loop import controller
+from mrctl.loop import user_files
 from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority
@@ -41,7 +41,7 @@ def suite(
 
     Args:
         feedforwards: Which to compare.
-        controllers: Controllers of your own, as `my_file.py:MyController`; see `mrctl.loop.controller`.
+        controllers: Controllers of your own, as `my_file.py:MyController`; see `mrctl.loop.user_files`.
         seeds: Runs of each case, seeds 0 to `seeds` − 1 for everyone.
         random: How many random scenarios.
         quick: A selection with fewer laps.
@@ -55,11 +55,11 @@ def suite(
         raise InputError("seeds: at least one run of at least one feedforward")
     who: dict[str, dict[str, Any]] = {name: {"feedforward": name} for name in feedforwards}
     for one in controllers:
-        name = "+".join(part.attribute for part in controller.parts(one))
+        name = "+".join(part.attribute for part in user_files.parts(one))
         if name in who:
             raise InputError(f"controller: the name {name} is taken")
-        who[name] = {"controller": controller.absolute(one)}
-        controller.trial(who[name]["controller"], Scenario(laps=1))
+        who[name] = {"controller": user_files.absolute(one)}
+        user_files.trial(who[name]["controller"], Scenario(laps=1))
     output_folder(out)
     chosen = cases(seeds, random, quick)
     laps, aside = run(chosen, who, workers, out / "runs")

@@ -21,9 +21,11 @@ import torch
 from scipy.signal import lfilter
 from torch import Tensor
 
-from mrctl.control.composite import INPUTS, PHYSICAL, UNITS, Array, Composite, Training, save_training
-from mrctl.control.feedforward import feature_scale, features
+from mrctl.control.composite import Composite
+from mrctl.control.features import feature_matrix, feature_scale
+from mrctl.control.weights import INPUTS, PHYSICAL, UNITS, Training, save_training
 from mrctl.experiments.tables import markdown, number, output_folder
+from mrctl.kernel import Array
 from mrctl.loop.simulation import simulate
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
@@ -206,8 +208,7 @@ def drive(scenarios: Sequence[Scenario], robot: Robot) -> Drives:
     signals, rate = twice[..., settled], rate[..., settled]
     scale = feature_scale(robot)
     twist, rate = np.moveaxis(signals[2:4], 0, -1), np.moveaxis(rate, 0, -1)
-    x = np.empty((*twist.shape[:-1], INPUTS))
-    features(twist, rate, robot.half_track, scale, x)
+    x = feature_matrix(twist, rate, robot.half_track, scale)
     model = inverse_coefficients(robot) * scale[:, None]
     steers = model.copy()
     steers[:, 1] = 0.0

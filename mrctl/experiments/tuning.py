@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from mrctl.control.kanayama import Kanayama
-from mrctl.control.pid import Gains, Pid, learning_ratio, margins, sampled_loop
+from mrctl.control.margins import learning_ratio, margins, sampled_loop
+from mrctl.control.pid import Pid
 from mrctl.experiments.response import Array, Response, measure, refine, safety
 from mrctl.experiments.tables import json_text, markdown, number, output_folder
 from mrctl.loop.hierarchy import TAKE_OVER
@@ -98,15 +99,14 @@ def design(world: str, pid: Pid, delays: Sequence[float]) -> dict[str, Any]:
         (robot.rotation_gain, robot.rotation_time_constant),
     )
     table: dict[str, Any] = {"time_constant": pid.time_constant, "loops": [], "responses": []}
-    for (name, *_), (gain, tau), row in zip(CHANNELS, plants, pid.gains(robot, rigid=False), strict=True):
-        gains = Gains(*row[:2])
+    for (name, *_), (gain, tau), gains in zip(CHANNELS, plants, pid.channels(robot, rigid=False), strict=True):
         table[name] = {"static_gain": gain, "plant_time_constant": tau, **gains._asdict()}
         table[name]["ratio"] = learning_ratio(gain, tau, gains)
     for steering, channel in LOOPS:
         frequency, measured = measure([s.model_copy(update={"steering": steering}) for s in scenarios], channel)
         rigid = steering == "rigid"
         plant = (1.0, 0.0) if rigid else plants[channel]  # the steering is taken to do what it is asked to
-        gains = Gains(*pid.gains(robot, rigid)[channel, :2])
+        gains = pid.channels(robot, rigid)[channel]
         for k, delay in enumerate(delays):
             loop = sampled_loop(frequency, *plant, gains, period, delay)
             found = dict(zip(RESPONSES, (loop / (1 + loop), measured[k], measured[len(delays) + k]), strict=True))

@@ -33,12 +33,12 @@ NUMERICS = {"no_load_current": 1, "limits": 4}  # and how many values they hold
 
 
 
-def load(
+def build(
     world: str = "flat",
     steering: Steering = "compliant",
     timestep: float | None = None,
     robot: RobotFile = CAR,
-) -> mujoco.MjModel:
+) -> tuple[mujoco.MjModel, Robot]:
     """Compiles a world with the robot in one of the three steering arrangements.
 
     Args:
@@ -48,6 +48,9 @@ def load(
             one arrangement: see `steerings`.
         timestep: Time step of the physics in s; by default the file's own.
         robot: Whose robot drives there; by default the world's own.
+
+    Returns:
+        The compiled model, and the parameters of its robot.
 
     Raises:
         InputError: The file is missing, does not compile, lacks a named element, or holds a robot that makes no sense.
@@ -66,12 +69,23 @@ def load(
         nominal = read_robot(model)
         if steering != "compliant" and len(offered) > 1:
             _rearrange(model, nominal, steering)
+            nominal = read_robot(model)
     except ValueError as error:
         raise InputError(f"{source}: {' '.join(str(error).split())}") from None
     if timestep is not None:
         model.opt.timestep = timestep
-    return model
+    return model, nominal
 
+
+
+def load(
+    world: str = "flat",
+    steering: Steering = "compliant",
+    timestep: float | None = None,
+    robot: RobotFile = CAR,
+) -> mujoco.MjModel:
+    """The compiled model alone; see `build` for the arguments and errors."""
+    return build(world, steering, timestep, robot)[0]
 
 
 def load_robot(

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
-# Name: (unit, meaning), in the order in which the loop records. A sample at time t holds the state at t, the commands
-# computed from it, and the currents and power at the end of the control period that these commands were held for.
+# Name: (unit, meaning). A sample at time t holds the state at t, the commands computed from it, and the currents and
+# power at the end of the control period that these commands were held for.
 SIGNALS: dict[str, tuple[str, str]] = {
     "x": ("m", "position of P along the world's x axis"),
     "y": ("m", "position of P along the world's y axis"),
@@ -57,6 +57,13 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "guard_reason": ("1", "why, as an index into `mrctl.control.guard.REASONS`"),
 }
 
+TICK = np.dtype([(name, "f8") for name in SIGNALS])  # the signals of one robot at one control tick
+
+
+def blank(*shape: int) -> NDArray[np.void]:
+    """Records of `TICK` that are all NaN."""
+    return np.full((*shape, len(SIGNALS)), np.nan).view(TICK)[..., 0]
+
 
 def versions() -> dict[str, str]:
     """Versions of everything that can change a number."""
@@ -67,7 +74,7 @@ def dataset(
     scenarios: Sequence[Scenario],
     labels: Sequence[str],
     feedforwards: Sequence[str],
-    log: NDArray[np.float64],
+    log: NDArray[np.void],
     failure: Sequence[str],
     failure_time: NDArray[np.float64],
     weights: NDArray[np.float64] | None,
@@ -78,21 +85,21 @@ def dataset(
         scenarios: A scenario a run.
         labels: What to call a run that has no name.
         feedforwards: Name of the feedforward a run.
-        log: `(B, ticks, signals)`.
+        log: One record of `TICK` a tick and robot, `(ticks, B)`.
         failure: Why a run stopped early, or "".
         failure_time: When, s, or NaN.
         weights: Final weights of the network a run, `(B, n)`, or None.
     """
     period = scenarios[0].control_period
     variables: dict[str, tuple] = {
-        name: (("run", "time"), log[:, :, column], {"units": unit, "long_name": meaning})
-        for column, (name, (unit, meaning)) in enumerate(SIGNALS.items())
+        name: (("run", "time"), log[name].T, {"units": unit, "long_name": meaning})
+        for name, (unit, meaning) in SIGNALS.items()
     }
     variables["failed"] = ("run", np.array([bool(reason) for reason in failure]))
     variables["failure"] = ("run", np.array(failure, dtype=object))
     variables["failure_time"] = ("run", failure_time, {"units": "s"})
     coords: dict[str, object] = {
-        "time": ("time", period * np.arange(log.shape[1]), {"units": "s"}),
+        "time": ("time", period * np.arange(len(log)), {"units": "s"}),
         "run": np.arange(len(scenarios)),
         "label": ("run", np.array([s.name or label for s, label in zip(scenarios, labels, strict=True)], object)),
         "feedforward": ("run", np.array(feedforwards, object)),

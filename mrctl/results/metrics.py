@@ -16,8 +16,8 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from mrctl.control.feedforward import features
-from mrctl.control.guard import ACTIONS, LIMIT, NONE, REASONS
+from mrctl.control.features import feature_matrix
+from mrctl.control.guard import GUARD_ACTIONS, LIMIT, NONE, REASONS
 from mrctl.record import InputError
 from mrctl.results.comparison import Interval, bootstrap_interval
 
@@ -226,8 +226,7 @@ def excitation(command: Array, period: float, half_track: Array, scale: Array) -
         `(…,)`; NaN where the motion is not finite.
     """
     n = command.shape[-2]
-    x = np.empty((*command.shape[:-1], scale.shape[-1]))
-    features(command, np.gradient(command, period, axis=-2), half_track[..., None], scale[..., None, :], x)
+    x = feature_matrix(command, np.gradient(command, period, axis=-2), half_track[..., None], scale[..., None, :])
     finite = np.asarray(np.isfinite(x).all(axis=(-2, -1)))
     # Squared singular values resolve what eigenvalues of the product, rounded to 1e-16 of the largest, do not.
     triangle = np.linalg.qr(np.where(finite[..., None, None], x, 0.0), mode="r")
@@ -260,7 +259,7 @@ def guard_events(result: xr.Dataset) -> pd.DataFrame:
             before = action[k - 1] if k else 0
             if action[k] == NONE and before == LIMIT or np.isnan(runs["guard"].values[row, k]):
                 continue  # a limit ends by itself, a run that failed has no guard
-            name = ACTIONS[action[k]] if action[k] != NONE else "resume"
+            name = GUARD_ACTIONS[action[k]] if action[k] != NONE else "resume"
             rows.append((number, float(runs["time"][k]), name, REASONS[reason[k]]))
     return pd.DataFrame(rows, columns=["run", "time", "action", "reason"])
 

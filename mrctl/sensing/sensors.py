@@ -2,74 +2,120 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-from numba import float64, guvectorize
 
-SLIP_FILTER = 0.1  # s
-SLIP_SPEED = 0.3  # m/s that a slip is held against at least: noise is no slip of a wheel that stands
+from mrctl.kernel import Array, Row, Rows, kernel
+from mrctl.sensing.slip import slip_ratio
+from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.robot import Robot
 
-
-@guvectorize(
-    [(float64[:], float64[:], float64[:], float64, float64, float64, float64[:], float64[:])],
-    "(p),(u),(n),(),(),(),(p),(u)",
-    writable_args=("pose", "twist"),
-    cache=True,
+SEEN = np.dtype(
+    [
+        ("pose", "f8", 3),  # measured x and y in m, θ in rad
+        ("twist", "f8", 2),  # measured V in m/s and θ̇ in rad/s
+        ("slip", "f8"),  # slip ratio of the driven wheel that slips more
+        ("odometry", "?"),  # whether posture and twist come from encoders and gyro
+        ("noise_scale", "f8", 5),  # standard deviations of the noise of x, y, θ, V, θ̇
+        ("noise", "f8", 5),  # its samples in this period
+        ("wheel_speeds", "f8", 2),  # left and right, by the encoders and the nominal wheel radius, m/s
+        ("elapsed", "f8"),  # since the last measurement, s; 0 at the start
+    ],
+    align=True,
 )
-def observe(true_pose, true_twist, noise, odometry, slip_free_speed, period, pose, twist):  # noqa: ANN001, ANN201
+
+
+@kernel
+def observe(true_pose: Array, true_twist: Array, s: Row) -> None:
     """Measured posture and twist of one robot.
 
-    Odometry takes V from the encoders and θ̇ from the gyro and integrates them at the control rate, the heading at its
-    midpoint (second-order Runge-Kutta); it starts from the true posture.
+    Odometry takes V from the encoders and θ̇ from the gyro and integrates them, the heading at its midpoint
+    (second-order Runge-Kutta); it starts from the true posture.
 
     Args:
-        true_pose: `(3,)` in m, m, rad.
-        true_twist: `(2,)` in m/s, rad/s.
-        noise: Samples for x, y, θ, V, θ̇ in their units, `(5,)`.
-        odometry: 1 for odometry, 0 for truth.
-        slip_free_speed: V by the encoders and the nominal wheel radius in m/s.
-        period: Control period in s.
-        pose: In and out: measured posture `(3,)`; odometry continues from what it holds.
-        twist: In and out: measured twist `(2,)`.
+        true_pose: x and y in m, θ in rad, `(3,)`.
+        true_twist: V in m/s and θ̇ in rad/s, `(2,)`.
+        s: In and out: a record of `SEEN`.
     """
-    if odometry > 0:
-        v, omega = slip_free_speed + noise[3], true_twist[1] + noise[4]
-        mean_v, mean_omega = (v + twist[0]) / 2, (omega + twist[1]) / 2
-        heading = pose[2] + period * mean_omega / 2
-        pose[0] += period * mean_v * np.cos(heading)
-        pose[1] += period * mean_v * np.sin(heading)
-        pose[2] += period * mean_omega
-        twist[0], twist[1] = v, omega
-    else:
-        for i in range(3):
-            pose[i] = true_pose[i] + noise[i]
-        twist[0], twist[1] = true_twist[0] + noise[3], true_twist[1] + noise[4]
+    if not s.odometry:
+        for k in range(3):
+            s.pose[k] = true_pose[k] + s.noise[k]
+        s.twist[0], s.twist[1] = true_twist[0] + s.noise[3], true_twist[1] + s.noise[4]
+        return
+    v = (s.wheel_speeds[0] + s.wheel_speeds[1]) / 2 + s.noise[3]
+    omega = true_twist[1] + s.noise[4]
+    mean_v, mean_omega = (v + s.twist[0]) / 2, (omega + s.twist[1]) / 2
+    heading = s.pose[2] + s.elapsed * mean_omega / 2
+    s.pose[0] += s.elapsed * mean_v * np.cos(heading)
+    s.pose[1] += s.elapsed * mean_v * np.sin(heading)
+    s.pose[2] += s.elapsed * mean_omega
+    s.twist[0], s.twist[1] = v, omega
 
 
-@guvectorize(
-    [(float64[:], float64[:], float64, float64, float64[:])],
-    "(w),(u),(),(),()",
-    writable_args=("slip",),
-    cache=True,
-)
-def watch_slip(wheel_speeds, twist, half_track, period, slip):  # noqa: ANN001, ANN201
-    """Slip ratio of the driven wheels of one robot, of the one that slips more.
+@kernel
+def measure(plant: Rows, wheel_radius: float, half_track: float, period: float, seen: Rows) -> None:
+    """Measures all robots; `plant` and `seen` hold a record of `PLANT` and of `SEEN` each."""
+    for i in range(len(seen)):
+        true, s = plant[i].reading, seen[i]
+        for k in range(2):
+            s.wheel_speeds[k] = wheel_radius * true.wheel_rates[k]
+        observe(true.pose, true.twist, s)
+        s.slip = slip_ratio(s.wheel_speeds, s.twist, half_track, period, s.slip)
+        s.elapsed = period
 
-    |v_i − u_i| over the larger of |v_i| and |u_i|, where u = V ∓ D θ̇ is how fast the measured motion carries the wheel
-    over the floor; behind a first-order low-pass, so that a jolt does not pass for slip, and a slip lasts until what a
-    learner's filters hold of it is gone. Odometry, whose V is the mean of the encoders, shows about half of what one
-    wheel slips. A radius that is wrong by some percent is a slip of as much, and noise one of 0.8 of its standard
-    deviation over the speed.
 
-    Args:
-        wheel_speeds: v left and right, by the encoders and the nominal wheel radius in m/s, `(2,)`.
-        twist: Measured V in m/s and θ̇ in rad/s `(2,)`.
-        half_track: D in m.
-        period: Control period in s.
-        slip: In and out.
+class Sensors:
+    """The sensors of B robots.
+
+    Attributes:
+        seen: One record of `SEEN` a robot, as of the last measurement.
     """
-    worst = 0.0
-    for k in range(2):
-        carried = twist[0] + (2 * k - 1) * half_track * twist[1]
-        speed = max(abs(wheel_speeds[k]), abs(carried), SLIP_SPEED)
-        worst = max(worst, abs(wheel_speeds[k] - carried) / speed)
-    slip[0] += period / (period + SLIP_FILTER) * (worst - slip[0])
+
+    def __init__(self, odometry: Sequence[bool], seeds: Sequence[int], robot: Robot, period: float) -> None:
+        """Builds the sensors.
+
+        Args:
+            odometry: Whether posture and twist of a robot come from its encoders and gyro.
+            seeds: Seed of the noise of each robot.
+            robot: The nominal robot.
+            period: Control period in s.
+        """
+        self.seen = np.zeros(len(seeds), SEEN)
+        self.seen["odometry"] = odometry
+        self._constants = robot.wheel_radius, robot.half_track, period
+        self._random = [np.random.default_rng([seed, 2]) for seed in seeds]
+        self._noisy: list[int] = []
+
+    def set_noise(self, row: int, perturbation: Perturbation) -> None:
+        """Gives the sensors of one robot the noise of a perturbation."""
+        p = perturbation
+        scale = p.position_noise, p.position_noise, p.heading_noise, p.velocity_noise, p.rotation_noise
+        self.seen["noise_scale"][row], self.seen["noise"][row] = scale, 0.0
+        self._noisy = np.flatnonzero(self.seen["noise_scale"].any(axis=1)).tolist()
+
+    def start(self, reading: Rows, rows: int | slice = slice(None)) -> None:
+        """Lets odometry start from the true posture and twist of robots, `READING` each."""
+        for name in ("pose", "twist"):
+            self.seen[name][rows] = reading[name][rows]
+        self.seen["elapsed"][rows] = self.seen["slip"][rows] = 0.0
+
+    def restart(self, row: int, seed: int, reading: Rows) -> None:
+        """Starts the sensors of one robot again, with the noise of another seed."""
+        self._random[row] = np.random.default_rng([seed, 2])
+        self.seen["noise"][row] = 0.0
+        self.start(reading, row)
+
+    def measure(self, plant: Rows) -> Rows:
+        """Measures all robots.
+
+        Args:
+            plant: One record of `PLANT` a robot.
+
+        Returns:
+            `seen`.
+        """
+        for row in self._noisy:
+            self.seen["noise"][row] = self.seen["noise_scale"][row] * self._random[row].standard_normal(5)
+        measure(plant, *self._constants, self.seen)
+        return self.seen

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from mrctl.control.stages import METHODS, Stages
-from mrctl.loop import controller
+from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation, simulate
 from mrctl.physics import mjcf
 from mrctl.record import InputError
@@ -138,7 +138,7 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
     models = _models(sweep)
     if scenario := sweep.valid(0):
         if sweep.controller:
-            controller.trial(sweep.controller, scenario)
+            user_files.trial(sweep.controller, scenario)
         else:
             Simulation([scenario])
     return {
@@ -161,7 +161,7 @@ def _models(sweep: Sweep) -> dict[str, str]:
         )
         for world, steering, robot in sweep.worlds
     }
-    return worlds | ({sweep.controller: controller.digest(sweep.controller)} if sweep.controller else {})
+    return worlds | ({sweep.controller: user_files.digest(sweep.controller)} if sweep.controller else {})
 
 
 def compute(path: str, job: int) -> Outcome:
@@ -206,7 +206,7 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
             batches.setdefault(scenario.control_period, {})[run] = scenario
         except InputError as error:  # drawn out of range
             rows[run] = _row(sweep, run, str(error).removeprefix(f"run {run}: "))
-    stages: Stages = controller.load(sweep.controller) if sweep.controller else {}
+    stages: Stages = user_files.load(sweep.controller) if sweep.controller else {}
     queue = list(batches.values())
     for batch in queue:
         try:

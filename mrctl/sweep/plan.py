@@ -130,7 +130,7 @@ class Sweep(Record):
     """Runs in a job; by default 64, or fewer where the runs are long."""
     controller: str | None = None
     """A feedforward of your own instead of the named one, as `my_file.py:MyController`, or other stages, as
-    `motion=my_file.py:PurePursuit`; see `mrctl.loop.controller`."""
+    `motion=my_file.py:PurePursuit`; see `mrctl.loop.user_files`."""
 
     @classmethod
     def of(cls, scenarios: Sequence[Scenario], **settings: Any) -> Self:  # noqa: ANN401

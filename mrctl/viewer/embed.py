@@ -51,7 +51,7 @@ def replay(*results: xr.Dataset) -> Replay:
         raise InputError("results: no run to show")
     recordings = [Recording(run) for run in runs]
     for recording in recordings:
-        if not np.isfinite(recording.log[0]).any():
+        if not np.isfinite(recording.log["x"][0]):
             raise InputError(f"results: {recording.label} had failed before {recording.start:g} s")
         if recording.duration > LONGEST:
             raise InputError(

@@ -11,12 +11,12 @@ import viser
 from numpy.typing import NDArray
 from viser import uplot
 
-from mrctl.results.dataset import SIGNALS
+from mrctl.kernel import Rows
+from mrctl.results.dataset import blank
 from mrctl.viewer.scene import REFERENCE, Colour, colour_of
 
 Array = NDArray[np.float64]
 
-COLUMN = {name: k for k, name in enumerate(SIGNALS)}
 SHARE_WINDOW = 1.0  # s over which the share of feedback is taken
 CURSOR: Colour = (150, 155, 160)
 MOST = 4  # robots whose curves are drawn
@@ -38,18 +38,18 @@ class Chart(NamedTuple):
     curves: list[Curve]
 
 
-def charts(log: Array, labels: Sequence[str], period: float) -> list[Chart]:
+def charts(log: Rows, labels: Sequence[str], period: float) -> list[Chart]:
     """The charts of a record.
 
     Args:
-        log: `(T, B, signals)`, columns as in `mrctl.results.dataset.SIGNALS`.
+        log: One record of `results.dataset.TICK` a sample and robot, `(T, B)`.
         labels: A name a robot.
         period: Time between samples in s.
     """
     shown = range(min(len(labels), MOST))
 
     def signal(name: str, row: int) -> Array:
-        return log[:, row, COLUMN[name]]
+        return log[name][:, row]
 
     def each(quantity: str, values: Sequence[Array], dashed: bool = False) -> list[Curve]:
         return [Curve(f"{labels[r]} {quantity}", colour_of(r), dashed, values[r]) for r in shown]
@@ -74,7 +74,6 @@ def charts(log: Array, labels: Sequence[str], period: float) -> list[Chart]:
     with np.errstate(invalid="ignore", divide="ignore"):
         shares = [np.sqrt(squares("feedback", r) / squares("voltage", r)) for r in shown]
     position = [1e3 * np.hypot(signal("longitudinal_error", r), signal("lateral_error", r)) for r in shown]
-    limits = [name for name in ("saturated", "guard") if name in COLUMN]
     return [
         tracked("V, m/s", "v"),
         tracked("θ̇, rad/s", "omega"),
@@ -84,7 +83,9 @@ def charts(log: Array, labels: Sequence[str], period: float) -> list[Chart]:
         voltages("Δ: feedback (solid), feedforward (dashed), V", -1.0),
         Chart("what has been learned, ‖W‖", each("weight norm", [signal("weight_norm", r) for r in shown])),
         Chart(
-            ", ".join(limits), [c for k, n in enumerate(limits) for c in each(n, [signal(n, r) for r in shown], k > 0)]
+            "saturated, guard (dashed)",
+            each("saturated", [signal("saturated", r) for r in shown])
+            + each("guard", [signal("guard", r) for r in shown], dashed=True),
         ),
     ]
 
@@ -121,7 +122,7 @@ class Plots:
         self._legend.content = legend(labels)
         size = min(len(labels), MOST)
         if size not in self._sets:
-            empty = charts(np.full((2, size, len(SIGNALS)), np.nan), labels[:size], period)
+            empty = charts(blank(2, size), labels[:size], period)
             with self._tab:
                 self._sets[size] = [_add(self._gui, chart, self._cursor) for chart in empty]
         for count, handles in self._sets.items():
@@ -129,13 +130,13 @@ class Plots:
                 handle.visible = count == size
         self._handles = self._sets[size]
 
-    def show(self, time: Array, log: Array, step: int, cursor: float | None = None) -> None:
+    def show(self, time: Array, log: Rows, step: int, cursor: float | None = None) -> None:
         """Draws a record.
 
         Args:
             time: Of the samples in s, `(T,)`.
-            log: `(T, B, signals)`.
-            step: Every how manyeth sample is drawn.
+            log: One record of `TICK` a sample and robot, `(T, B)`.
+            step: Samples from one that is drawn to the next.
             cursor: Where a vertical line stands, in s.
         """
         for handle, chart in zip(self._handles, charts(log, self._labels, self._period), strict=True):

@@ -15,12 +15,13 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
+from mrctl.kernel import Rows
 from mrctl.loop.simulation import simulate
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.stand import front_rates, stand, steer
 from mrctl.record import InputError
-from mrctl.results.dataset import SIGNALS, scenarios_of
+from mrctl.results.dataset import SIGNALS, blank, scenarios_of
 from mrctl.results.metrics import summary
 from mrctl.scenario import Scenario
 from mrctl.sweep import store
@@ -29,7 +30,6 @@ from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.session import state
 
 Array = NDArray[np.float64]
-COLUMN = {name: k for k, name in enumerate(SIGNALS)}
 FEW = 4  # runs of a result that are all shown at once
 WHEELS = {"wheel_left": "wheel_rate_left", "wheel_right": "wheel_rate_right"}
 
@@ -42,7 +42,7 @@ class Recording:
         label: Its name.
         period: Time between samples in s.
         start: Time of the first sample in the run, s; the times below are counted from there.
-        log: What was recorded, `(T, signals)`; as long as the robot drove.
+        log: What was recorded, one record of `TICK` a sample, `(T,)`; as long as the robot drove.
         failure: Why it stopped early, or "".
     """
 
@@ -52,10 +52,11 @@ class Recording:
         self.label = str(run["label"].values)
         self.period = float(run.attrs["control_period"])
         self.start = float(run["time"][0])
-        log = np.stack(
-            [run[name].values if name in run else np.full(run.sizes["time"], np.nan) for name in SIGNALS], -1
-        )
-        driven = np.flatnonzero(np.isfinite(log[:, COLUMN["x"]]))
+        log = blank(run.sizes["time"])
+        for name in SIGNALS:
+            if name in run:
+                log[name] = run[name].values
+        driven = np.flatnonzero(np.isfinite(log["x"]))
         self.log = log[: 1 + driven[-1]] if driven.size else log[:1]
         self.failure = str(run["failure"].values)
 
@@ -76,10 +77,9 @@ class Recording:
     @cached_property
     def _turned(self) -> dict[str, Array]:
         """How far each wheel has turned at the samples, rad."""
-        signal = {name: self.log[:, column] for name, column in COLUMN.items()}
-        robot, steering = read_robot(self.model), signal["steering_angle"]
-        rates = {wheel: signal[name] for wheel, name in WHEELS.items()}
-        rates |= front_rates(self.model, robot, signal["v"], signal["omega"], steering)
+        log, robot = self.log, read_robot(self.model)
+        rates = {wheel: log[name] for wheel, name in WHEELS.items()}
+        rates |= front_rates(self.model, robot, log["v"], log["omega"], log["steering_angle"])
         return {wheel: self.period * np.cumsum(rate) for wheel, rate in rates.items()}
 
     def perturbation(self, time: float) -> Perturbation:
@@ -90,22 +90,22 @@ class Recording:
         """The way that P went, a little above the ground, `(points, 3)` in m."""
         rows = self.log[np.linspace(0, len(self.log) - 1, points).astype(int)]
         height = self.qpos(0)[2] - self.model.geom("wheel_left").size[0] + 0.01
-        return np.column_stack([rows[:, COLUMN["x"]], rows[:, COLUMN["y"]], np.full(points, height)])
+        return np.column_stack([rows["x"], rows["y"], np.full(points, height)])
 
     def qpos(self, index: int) -> Array:
         """Where the robot stood at a sample, `(nq,)`: on the ground, as recorded in the plane."""
-        row = self.log[index]
-        pose, twist = row[[COLUMN[n] for n in ("x", "y", "theta")]], row[[COLUMN[n] for n in ("v", "omega")]]
+        now = self.log[index]
+        pose, twist = (np.array([now[name] for name in names]) for names in (("x", "y", "theta"), ("v", "omega")))
         qpos = stand(self.model, pose, twist).qpos
-        steer(self.model, qpos, row[COLUMN["steering_angle"]])
+        steer(self.model, qpos, now["steering_angle"])
         for wheel, angle in self._turned.items():
             qpos[self.model.joint(wheel).qposadr[0]] = angle[index]
         return qpos
 
 
-def together(recordings: Sequence[Recording]) -> tuple[Array, Array]:
-    """Times `(T,)` in s and records `(T, B, signals)` of several runs, NaN where one has ended."""
-    log = np.full((max(len(r.log) for r in recordings), len(recordings), len(COLUMN)), np.nan)
+def together(recordings: Sequence[Recording]) -> tuple[Array, Rows]:
+    """Times `(T,)` in s and records of several runs, one of `TICK` a sample and run, `(T, B)`; NaN after its end."""
+    log = blank(max(len(r.log) for r in recordings), len(recordings))
     for k, r in enumerate(recordings):
         log[: len(r.log), k] = r.log
     return recordings[0].period * np.arange(len(log), dtype=float), log

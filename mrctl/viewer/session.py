@@ -9,8 +9,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.kernel import Rows
 from mrctl.loop.simulation import batches
 from mrctl.record import InputError, Record
+from mrctl.results.dataset import blank
 from mrctl.scenario import Event, Scenario
 
 HOUR = 3600.0  # s of simulated time that a session has room for
@@ -95,11 +97,11 @@ class Session:
         whole = [self._place[row][0].scenarios[self._place[row][1]] for row in range(self.size)]
         return [s.model_copy(update={"laps": max(1, ceil(self.time / s.reference.period - 1e-9))}) for s in whole]
 
-    def log(self, first: int = 0) -> NDArray[np.float64]:
-        """What was recorded from a tick on, `(ticks, B, signals)`; NaN of a robot that has stopped."""
-        parts = np.full((self.tick - first, self.size, self.simulations[0][1].log.shape[2]), np.nan)
+    def log(self, first: int = 0) -> Rows:
+        """What was recorded from a tick on, one record of `TICK` a tick and robot; NaN of a robot that has stopped."""
+        parts = blank(self.tick - first, self.size)
         for rows, sim in self.simulations:
-            done = sim.log[first : sim.tick]
+            done = sim.log.ticks[first : sim.tick]
             parts[: len(done), rows] = done
         return parts
 

@@ -107,5 +107,5 @@ def trial(name: str, scenario: Scenario) -> None:
         raise InputError(f"controller: {error}") from None
     for _ in range(min(3, simulation.ticks)):
         simulation.step()
-        for fault in simulation.hierarchy.faults.values():
-            raise InputError(f"controller: {fault}")
+        for fault in filter(None, simulation.plant.failure):
+            raise InputError(f"controller: {fault.removesuffix(f', tick {simulation.tick - 1}')}")

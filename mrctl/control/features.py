@@ -1,0 +1,77 @@
+"""The 8 physical features, in which the inverse of equation (3) is linear, and their scales."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mrctl.kernel import Array, kernel
+from mrctl.theory.robot import Robot
+
+FEATURES = ("V", "ω", "V̇", "ω̇", "Vω", "ω²", "sgn V_l", "sgn V_r")
+SIGN_SPEED = 0.05  # m/s over which the smooth sign of the losses turns
+
+
+@kernel
+def features(command: Array, derivative: Array, half_track: float, scale: Array, x: Array) -> None:
+    """The 8 features of the inverse dynamics (physics of equation (3)), divided by their scales.
+
+        x = (V, ω, V̇, ω̇, V ω, ω², tanh(V_l/0.05), tanh(V_r/0.05)) / scale,    V_l,r = V ∓ D ω
+
+    Args:
+        command: V in m/s and ω in rad/s, `(2,)`.
+        derivative: V̇ in m/s² and ω̇ in rad/s², `(2,)`.
+        half_track: D in m.
+        scale: As from `feature_scale`, `(8,)`.
+        x: Out, `(8,)`.
+    """
+    v, omega = command[0], command[1]
+    x[0] = v / scale[0]
+    x[1] = omega / scale[1]
+    x[2] = derivative[0] / scale[2]
+    x[3] = derivative[1] / scale[3]
+    x[4] = v * omega / scale[4]
+    x[5] = omega * omega / scale[5]
+    x[6] = np.tanh((v - half_track * omega) / SIGN_SPEED) / scale[6]
+    x[7] = np.tanh((v + half_track * omega) / SIGN_SPEED) / scale[7]
+
+
+@kernel
+def features_of_rows(command: Array, derivative: Array, half_track: Array, scale: Array, x: Array) -> None:
+    """`features` of many motions: `(n, 2)`, `(n, 2)`, `(n,)` and `(n, 8)` in, `(n, 8)` out."""
+    for i in range(len(x)):
+        features(command[i], derivative[i], half_track[i], scale[i], x[i])
+
+
+def feature_matrix(command: Array, derivative: Array, half_track: ArrayLike, scale: Array) -> Array:
+    """`features` of motions with any leading axes, which broadcast: `(…, 2)`, `(…, 2)`, `(…)`, `(…, 8)` to `(…, 8)`."""
+    shape = np.broadcast_shapes(command.shape[:-1], np.shape(half_track), scale.shape[:-1])
+    size = int(np.prod(shape))
+    x = np.empty((size, 8))
+    rows = [
+        np.array(np.broadcast_to(values, shape + tail)).reshape(size, *tail)
+        for values, tail in ((command, (2,)), (derivative, (2,)), (half_track, ()), (scale, (8,)))
+    ]
+    features_of_rows(rows[0], rows[1], rows[2], rows[3], x)
+    return x.reshape(*shape, 8)
+
+
+@kernel
+def linear(x: Array, coefficients: Array, voltage: Array) -> None:
+    """Features `(n,)` times coefficients `(n, 2)`: volts of the two channels, `(2,)`; sums run in a fixed order."""
+    for k in range(2):
+        total = 0.0
+        for i in range(x.shape[0]):
+            total += x[i] * coefficients[i, k]
+        voltage[k] = total
+
+
+def feature_scale(robot: Robot) -> Array:
+    """Scales of the 8 features, `(8,)`, chosen so that each moves by about one on an ordinary lap.
+
+    Speeds are divided by the robot's limits; accelerations and products by a third of theirs, where a robot spends its
+    time; the signs, which hardly move, by three.
+    """
+    v, omega = robot.max_speed, robot.max_rotation
+    products = np.array([robot.max_acceleration, robot.max_rotation_acceleration, v * omega, omega**2]) / 3
+    return np.array([v, omega, *products, 3.0, 3.0])

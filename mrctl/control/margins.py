@@ -1,0 +1,82 @@
+"""How fast and how robust a velocity loop is, and whether feedback-error learning converges in it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrctl.control.pid import Gains
+
+
+def sampled_loop(
+    frequency: NDArray[np.float64], gain: float, time_constant: float, gains: Gains, period: float, delay: float
+) -> NDArray[np.complex128]:
+    """The open velocity loop L(e^(jωh)) of PI control, as `pid` computes it, of a held K/(τs + 1) behind a delay.
+
+    Args:
+        frequency: ω in rad/s, below π/h, `(F,)`.
+        gain: K.
+        time_constant: τ in s; 0 for a plant that follows within a period.
+        gains: PI gains.
+        period: Control period h in s.
+        delay: Loop delay in s beside the hold.
+    """
+    z = np.exp(1j * frequency * period)
+    decay = np.exp(-period / time_constant) if time_constant > 0 else 0.0
+    plant = gain * (1 - decay) / (z - decay)
+    control = gains.k_p + gains.k_i * period * z / (z - 1)
+    return np.asarray(control * plant * np.exp(-1j * frequency * delay), complex)
+
+
+class Margins(NamedTuple):
+    """How fast and how robust one loop is; NaN where its size is below one from the lowest frequency on.
+
+    Attributes:
+        crossover: Gain crossover in rad/s.
+        phase: Phase margin in degrees.
+        gain: Gain margin as a factor.
+        delay: Delay margin in s.
+        bandwidth: Frequency in rad/s from which on the closed loop passes less than 1/√2.
+    """
+
+    crossover: float
+    phase: float
+    gain: float
+    delay: float
+    bandwidth: float
+
+
+def margins(frequency: NDArray[np.float64], loop: NDArray[np.complex128]) -> Margins:
+    """Margins of an open loop on a fine grid of frequencies.
+
+    Args:
+        frequency: ω in rad/s, ascending, `(F,)`.
+        loop: L(jω), `(F,)`.
+    """
+    magnitude, phase = np.abs(loop), np.unwrap(np.angle(loop))
+    phase -= 2 * np.pi * np.round((phase[0] + np.pi / 2) / (2 * np.pi))  # PI control starts between 0 and −180°
+    crossover, phase_margin, bandwidth = np.nan, np.nan, np.nan
+    if magnitude[0] > 1 > magnitude[-1]:
+        crossing = int(np.argmax(magnitude < 1))
+        crossover, phase_margin = frequency[crossing], np.pi + phase[crossing]
+    passed = np.abs(loop / (1 + loop)) < np.sqrt(0.5)
+    if passed.any() and not passed[0]:
+        bandwidth = frequency[int(np.argmax(passed))]
+    inverted = np.flatnonzero((phase < -np.pi) & (magnitude < 1))
+    return Margins(
+        crossover=float(crossover),
+        phase=float(np.degrees(phase_margin)),
+        gain=float(1 / magnitude[inverted[0]]) if inverted.size else float("inf"),
+        delay=float(phase_margin / crossover),
+        bandwidth=float(bandwidth),
+    )
+
+
+def learning_ratio(gain: float, time_constant: float, gains: Gains) -> float:
+    """K_p (B + b K_p) / (M K_i) of PI control of K/(τs + 1); above 1, feedback-error learning converges without delay.
+
+    Gomi and Kawato (1993) for M V̇ + B V = b U; here M = τ, B = 1, b = K.
+    """
+    return gains.k_p * (1 + gain * gains.k_p) / (time_constant * gains.k_i)

@@ -1,0 +1,152 @@
+"""What learners start from, as files: the weights of `fel`, and what `mrctl train` found for `composite`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from mrctl.kernel import Array
+from mrctl.record import InputError
+
+INPUTS, OUTPUTS = 8, 2  # of the network of `fel`: physical features, and channels
+UNITS = 16  # tanh units of `composite`
+PHYSICAL = INPUTS + 2  # its physical features: the eight, and gravity on a slope
+FEATURES = PHYSICAL + UNITS
+SHIPPED = Path(__file__).with_name("composite.safetensors")
+
+
+def shapes(hidden: int) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the weights, in the order of the flat vector; they are those of `fel_torch.Network`."""
+    return {
+        "hidden.weight": (hidden, INPUTS),
+        "hidden.bias": (hidden,),
+        "output.weight": (OUTPUTS, hidden),
+        "output.bias": (OUTPUTS,),
+        "direct.weight": (OUTPUTS, INPUTS),
+    }
+
+
+def initial_weights(hidden: int, seed: int) -> Array:
+    """Random hidden layer, everything behind it zero: learning begins as pure PID.
+
+    Returns:
+        Flat weights, `(11 hidden + 18,)`.
+    """
+    rng = np.random.default_rng([seed, 1])
+    layers = {name: np.zeros(shape) for name, shape in shapes(hidden).items()}
+    for name in ("hidden.weight", "hidden.bias"):
+        layers[name] = rng.normal(0.0, 0.5, layers[name].shape)
+    return flatten(layers)
+
+
+def flatten(layers: dict[str, Array]) -> Array:
+    """Named weights to the flat vector of the compiled network."""
+    hidden = len(layers["hidden.bias"])
+    return np.concatenate([np.ravel(layers[name]) for name in shapes(hidden)])
+
+
+def unflatten(weights: Array) -> dict[str, Array]:
+    """The flat vector to named weights."""
+    hidden = (len(weights) - OUTPUTS * (INPUTS + 1)) // (INPUTS + 1 + OUTPUTS)
+    layers, start = {}, 0
+    for name, shape in shapes(hidden).items():
+        stop = start + int(np.prod(shape))
+        layers[name], start = weights[start:stop].reshape(shape), stop
+    return layers
+
+
+def save_weights(path: str | Path, weights: Array) -> None:
+    """Writes flat weights of `fel`, `(n,)`, as a safetensors file.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    _write(path, unflatten(weights))
+
+
+def load_weights(path: str | Path, hidden: int) -> Array:
+    """Reads weights of `fel` from a safetensors file or a torch state dict.
+
+    Args:
+        path: `.safetensors`, else a file of `torch.save(module.state_dict())`, read with `weights_only`.
+        hidden: Hidden units that the file must hold.
+
+    Returns:
+        Flat weights, `(11 hidden + 18,)`.
+
+    Raises:
+        InputError: The file is missing, broken, of another shape, or holds non-finite numbers.
+    """
+    return flatten(_read(path, "fel.weights", shapes(hidden)))
+
+
+class Training(NamedTuple):
+    """What `mrctl train` found.
+
+    Attributes:
+        units: Weights and, last, bias of the tanh units on the scaled features, `(16, 9)`.
+        priors: Covariance P₀ of the weights of φ, in V² for the common and the differential channel and in (rad/s)² for
+            a steering channel, `(3, 26, 26)`.
+    """
+
+    units: Array
+    priors: Array
+
+
+def save_training(path: str | Path, training: Training, recipe: dict[str, str]) -> None:
+    """Writes a training as a safetensors file with its recipe as metadata.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    _write(path, training._asdict(), recipe)
+
+
+def load_training(path: str | Path = SHIPPED) -> Training:
+    """Reads a file of `mrctl train`.
+
+    Raises:
+        InputError: The file is missing, broken, of another shape, or holds non-finite numbers.
+    """
+    expected = {"units": (UNITS, INPUTS + 1), "priors": (3, FEATURES, FEATURES)}
+    return Training(**_read(path, "composite.weights", expected))
+
+
+def _write(path: str | Path, arrays: Mapping[str, Array], metadata: dict[str, str] | None = None) -> None:
+    from safetensors.numpy import save
+
+    data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata=metadata)
+    try:
+        Path(path).write_bytes(data)
+    except OSError as error:
+        raise InputError(f"{path}: cannot write weights: {error.strerror}") from None
+
+
+def _read(path: str | Path, field: str, expected: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
+    """Arrays of these names and shapes, as float64; errors name the field that gave the path."""
+    if not Path(path).is_file():
+        raise InputError(f"{field}: no file {path}")
+    try:
+        if Path(path).suffix == ".safetensors":
+            from safetensors.numpy import load_file
+
+            arrays = load_file(path)
+        else:
+            import torch
+
+            arrays = {k: v.double().numpy() for k, v in torch.load(path, map_location="cpu", weights_only=True).items()}
+    except Exception as error:  # each format has its own errors; none of them is ours to tell apart
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise InputError(f"{field}: {path}: not a weights file: {reason}") from None
+    for name, shape in expected.items():
+        if name not in arrays or arrays[name].shape != shape:
+            found = arrays[name].shape if name in arrays else "missing"
+            raise InputError(f"{field}: {path}: {name} is {found}, it must have shape {shape}")
+    if unknown := set(arrays) - set(expected):
+        raise InputError(f"{field}: {path}: unknown entry {min(unknown)!r}")
+    if not all(np.isfinite(array).all() for array in arrays.values()):
+        raise InputError(f"{field}: {path}: non-finite weights")
+    return {name: arrays[name].astype(float) for name in expected}

@@ -1,0 +1,74 @@
+"""What happens to the robots during a run: perturbations, pushes, new gains, learning switched on or off."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+
+from mrctl.loop.hierarchy import Hierarchy
+from mrctl.physics.plant import Plant
+from mrctl.scenario import Event, Scenario
+from mrctl.sensing.sensors import Sensors
+from mrctl.theory.perturbation import Perturbation
+
+
+class Events:
+    """The events of a group of runs, in the order of their ticks. New references are `Courses`' business."""
+
+    def __init__(
+        self, scenarios: Sequence[Scenario], plant: Plant, hierarchy: Hierarchy, sensors: Sensors, period: float
+    ) -> None:
+        """Perturbs the robots as their scenarios say, and schedules their events.
+
+        Args:
+            scenarios: A scenario a robot.
+            plant: Where perturbations and pushes act.
+            hierarchy: Whose gains change.
+            sensors: Whose noise changes with a perturbation.
+            period: Control period in s.
+        """
+        self._plant, self._hierarchy, self._sensors, self._period = plant, hierarchy, sensors, period
+        self._schedule: dict[int, list[tuple[int, Event]]] = defaultdict(list)
+        for row, scenario in enumerate(scenarios):
+            self.perturb(row, scenario.perturbation)
+            self._enter(row, scenario, 0)
+
+    def _enter(self, row: int, scenario: Scenario, tick: int) -> None:
+        for event in sorted(scenario.events, key=lambda e: e.time):
+            self._schedule[tick + event.tick(self._period)].append((row, event))
+
+    def add(self, event: Event) -> None:
+        """Lets an event happen to every robot."""
+        self._schedule[event.tick(self._period)] += enumerate([event] * self._plant.size)
+
+    def restart(self, row: int, scenario: Scenario, tick: int) -> None:
+        """Starts the events of one robot again, from this tick on."""
+        coming = {t: [e for e in some if e[0] != row] for t, some in self._schedule.items() if t >= tick}
+        self._schedule = defaultdict(list, coming)
+        self._enter(row, scenario, tick)
+        if any(event.perturbation for event in scenario.events):
+            self.perturb(row, scenario.perturbation)
+        else:
+            self._hierarchy.set_truth(row, self._plant.truth[row])
+
+    def apply(self, tick: int) -> None:
+        """Lets the events of a control tick happen."""
+        for row, event in self._schedule.get(tick, ()):
+            if event.perturbation is not None:
+                self.perturb(row, event.perturbation)
+            if event.push is not None:
+                self._plant.push(row, np.array(event.push), max(1, round(event.push_duration / self._period)))
+            if event.kanayama is not None:
+                self._hierarchy.set_kanayama(row, event.kanayama)
+            if event.pid is not None:
+                self._hierarchy.set_pid(row, event.pid)
+            if event.learning is not None:
+                self._hierarchy.set_learning(row, event.learning)
+
+    def perturb(self, row: int, perturbation: Perturbation) -> None:
+        """Replaces the perturbation of one robot, from now on."""
+        self._plant.perturb(row, perturbation, round(perturbation.control_delay / self._period))
+        self._sensors.set_noise(row, perturbation)
+        self._hierarchy.set_truth(row, self._plant.truth[row])

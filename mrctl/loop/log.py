@@ -1,0 +1,79 @@
+"""The record of a run: one `TICK` of signals a robot and control tick."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrctl.control.kanayama import posture_error
+from mrctl.kernel import Rows, kernel
+from mrctl.results.dataset import SIGNALS, TICK
+
+DIVERGED = 1.0  # m of lateral error
+
+
+@kernel
+def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, ticks: Rows) -> bool:
+    """Writes the signals of one control tick of all robots; returns whether all are near their references.
+
+    A sample at time t holds the state at t, the commands computed from it, and the currents and power at the end of the
+    control period that these commands were held for.
+
+    Args:
+        plant: One record of `PLANT` a robot, after the control period.
+        seen: One record of `SEEN` a robot.
+        goal: One record of `GOAL` a robot.
+        control: One record of `CONTROL` a robot.
+        ticks: Out: one record of `TICK` a robot.
+    """
+    near = True
+    error = np.empty(3)
+    for i in range(len(ticks)):
+        t, p, s, g, c = ticks[i], plant[i], seen[i], goal[i], control[i]
+        state = p.before
+        t.x, t.y, t.theta = state.pose[0], state.pose[1], state.pose[2]
+        t.v, t.omega, t.v_lateral = state.twist[0], state.twist[1], state.v_lateral
+        t.wheel_rate_left, t.wheel_rate_right = state.wheel_rates[0], state.wheel_rates[1]
+        t.steering_angle = state.steering_angle
+        t.x_ref, t.y_ref, t.theta_ref = g.pose[0], g.pose[1], g.pose[2]
+        t.v_ref, t.omega_ref = g.twist[0], g.twist[1]
+        posture_error(state.pose, g.pose, error)
+        t.longitudinal_error, t.lateral_error, t.heading_error = error[0], error[1], error[2]
+        t.v_measured, t.omega_measured, t.slip = s.twist[0], s.twist[1], s.slip
+        t.v_command, t.omega_command = c.limiter.command[0], c.limiter.command[1]
+        a = c.allocation
+        t.feedback_left, t.feedback_right = a.feedback[0], a.feedback[1]
+        t.feedforward_left, t.feedforward_right = a.feedforward[0], a.feedforward[1]
+        t.voltage_left, t.voltage_right = a.command[0], a.command[1]
+        t.steering_command, t.steering_rate_command = a.command[2], a.command[3]
+        t.saturated, t.weight_norm = 1.0 if a.saturated else 0.0, c.weight_norm
+        t.current_left, t.current_right = p.current[0], p.current[1]
+        t.power = p.applied[0] * p.current[0] + p.applied[1] * p.current[1]
+        t.guard, t.guard_reason = c.guard.action, c.guard.reason
+        near &= not abs(t.lateral_error) > DIVERGED or p.failed
+    return near
+
+
+class Log:
+    """What was recorded of B robots.
+
+    Attributes:
+        ticks: One record of `TICK` a tick and robot, `(length, B)`; beyond `length` ticks the oldest are overwritten.
+    """
+
+    def __init__(self, length: int, size: int) -> None:
+        """Takes the number of ticks that are kept and the number of robots."""
+        # A tick's records lie side by side: the loop writes one block of memory a tick, however many robots there are.
+        self.ticks = np.empty((length, size), TICK)
+
+    def at(self, tick: int) -> Rows:
+        """The records of one tick, `(B,)`."""
+        return self.ticks[tick % len(self.ticks)]
+
+    def blank(self, tick: int, rows: NDArray[np.bool] | slice) -> None:
+        """Replaces the records of robots at one tick by NaN."""
+        self.at(tick).view(float).reshape(-1, len(SIGNALS))[rows] = np.nan
+
+    def record(self, tick: int, plant: Rows, seen: Rows, goal: Rows, control: Rows) -> bool:
+        """Records a tick; see the kernel for the arguments and the result."""
+        return record(plant, seen, goal, control, self.at(tick))

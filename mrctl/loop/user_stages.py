@@ -1,0 +1,270 @@
+"""A user's own stages in the hierarchy: objects that are called in Python, with care, around the compiled laws."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrctl.control.kanayama import posture_error
+from mrctl.control.pid import pid
+from mrctl.control.stages import METHODS, Factory
+from mrctl.kernel import Array, Rows, kernel, over_rows
+from mrctl.loop.hierarchy import Hierarchy, apply_voltages, command_motion, hand_over, request_motion
+from mrctl.record import InputError
+from mrctl.scenario import Scenario
+from mrctl.theory.robot import Robot
+
+
+class StageError(InputError):
+    """A user's stage raised, or did not return what it should; one line that names it."""
+
+
+class UserStage:
+    """One stage of a user's, called with copies; what it returns is checked.
+
+    Attributes:
+        stage: The object.
+        title: Its stage and name, for messages.
+    """
+
+    def __init__(self, name: str, factory: Factory[Any], robot: Robot, size: int) -> None:
+        """Makes the stage.
+
+        Args:
+            name: Which stage it is.
+            factory: As the user gave it.
+            robot: The nominal robot.
+            size: Number of robots B.
+
+        Raises:
+            StageError: There is no such stage, the factory raised, or what it made lacks a method.
+        """
+        if name not in METHODS:
+            raise StageError(f"{name}: no such stage; there are {', '.join(METHODS)}")
+        self.title = f"{name} {getattr(factory, '__name__', type(factory).__name__)}"
+        self._size = size
+        try:
+            self.stage: Any = factory(robot, size)
+        except Exception as error:  # noqa: BLE001 (it is the user's code, here and below)
+            raise self._raised(error) from error
+        for method in METHODS[name]:
+            if not callable(getattr(self.stage, method, None)):
+                raise StageError(f"{self.title}: has no method {method}")
+
+    def call(self, method: str, *values: Any) -> Any:  # noqa: ANN401
+        """Calls a method with copies of arrays, in which the rows of robots that have blown up are zero.
+
+        Raises:
+            StageError: It raised.
+        """
+        floats = [isinstance(v, np.ndarray) and v.dtype.kind == "f" for v in values]
+        copies = [np.where(np.isfinite(v), v, 0.0) if real else v for v, real in zip(values, floats, strict=True)]
+        try:
+            answer = getattr(self.stage, method)(*copies)
+            return answer.detach() if hasattr(answer, "detach") else answer
+        except Exception as error:  # noqa: BLE001
+            raise self._raised(error) from error
+
+    def output(self, *values: Array) -> Array:
+        """Calls the method `output`, which must answer with two numbers a robot, `(B, 2)`.
+
+        Raises:
+            StageError: It raised, or the answer has another shape.
+        """
+        return self.checked(self.call("output", *values), (self._size, 2), "output")
+
+    def checked(self, answer: object, shape: tuple[int, ...], what: str) -> Array:
+        """An answer as an array of float64.
+
+        Raises:
+            StageError: It has another shape, or is no array of numbers.
+        """
+        try:
+            array = np.asarray(answer, float)
+        except Exception as error:  # noqa: BLE001
+            raise self._raised(error) from error
+        if answer is None or array.shape != shape:
+            found = "nothing" if answer is None else f"shape {array.shape}"
+            raise StageError(f"{self.title}: {what} is {found}, expected shape {shape}")
+        return array
+
+    def _raised(self, error: Exception) -> StageError:
+        frames = traceback.extract_tb(error.__traceback__)[1:2]  # the line of the stage's own method
+        place = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in frames)
+        return StageError(" ".join(f"{self.title}: {type(error).__name__}: {error}{place}".split()))
+
+
+@kernel
+def request_all(seen: Rows, goal: Rows, control: Rows) -> None:
+    """`request_motion` for all robots."""
+    for i in range(len(control)):
+        request_motion(seen[i], goal[i], control[i])
+
+
+@kernel
+def command_all(seen: Rows, goal: Rows, robot: Rows, period: float, control: Rows) -> None:
+    """Limiter, prefilter and PID for all robots."""
+    for i in range(len(control)):
+        s = control[i]
+        command_motion(goal[i], robot[0], period, s)
+        pid(s.limiter.command, seen[i].twist, s.allocation.excess, period, s.pid, s.feedback)
+
+
+@kernel
+def apply_all(
+    seen: Rows, inverse: Array, ones: Array, x: Array, robot: Rows, period: float, control: Rows
+) -> tuple[bool, bool]:
+    """`apply_voltages` for all robots; whether all are finite, and whether a guard wants a learner to forget."""
+    finite, forget = True, False
+    for i in range(len(control)):
+        finite &= apply_voltages(seen[i].slip, inverse, ones, x, robot[0], period, control[i])
+        forget |= control[i].guard.forget
+    return finite, forget
+
+
+@kernel
+def hand_over_all(control: Rows) -> None:
+    """`hand_over` for all robots."""
+    for i in range(len(control)):
+        hand_over(control[i])
+
+
+class UserHierarchy(Hierarchy):
+    """The hierarchy with some stages of a user's; a tick calls them between compiled loops over the built-in laws.
+
+    Attributes:
+        faults: The robots for which a stage gave no finite number in the last tick, and what to say of it.
+    """
+
+    def __init__(self, scenarios: Sequence[Scenario], robot: Robot, stages: dict[str, UserStage]) -> None:
+        """Wires the stages, the user's by name and the scenarios' for the rest."""
+        self._stages = stages
+        self._feedforward_stage = stages.get("feedforward")
+        super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
+        self.faults: dict[int, str] = {}
+
+    def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
+        """Starts without a bump; see `Hierarchy.reset`."""
+        self.command[rows] = twist[rows]
+        self.state["allocation"]["angle"][rows] = steering_angle[rows]
+        integral = self._nominal.output(twist, acceleration) - self._forward(twist, acceleration)
+        self.state["pid"]["integral"][rows] = integral[rows]
+        if stage := self._stages.get("feedback"):
+            stage.call("reset", integral, self._period)
+        if stage := self._stages.get("steering"):
+            stage.call("reset", steering_angle, self._period)
+
+    def update(self, seen: Rows, goal: Rows) -> Array:
+        """One control tick; see `Hierarchy.update`."""
+        self.faults.clear()
+        state, constants = self.state, (self._record, self._period)
+        if self._tick % self._every == 0:
+            if stage := self._stages.get("motion"):
+                self._request(stage, seen, goal)
+            else:
+                request_all(seen, goal, state)
+        self._tick += 1
+        command_all(seen, goal, *constants, state)
+        feedback = self._stages.get("feedback")
+        if feedback:
+            self._feed_back(feedback, seen["twist"])
+        state["feedforward"] = self._forward(self.command, self.derivative)
+        self._read_weight_norm()
+        self.finite, forget = apply_all(seen, *self._inverse, *constants, state)
+        if stage := self._stages.get("steering"):
+            self._steer(stage)
+        if (added := self._learn(seen["twist"])) is not None:
+            state["added"] = added
+            hand_over_all(state)
+        if feedback and (integral := getattr(feedback.stage, "integral", None)) is not None:
+            integral[:] = state["pid"]["integral"]
+        if forget:
+            self._forget()
+        self._read_weight_norm()
+        return self.output
+
+    def _request(self, stage: UserStage, seen: Rows, goal: Rows) -> None:
+        """Asks the user's motion controller."""
+        state = self.state
+        reference = goal.view(float).reshape(len(goal), -1)
+        if self._tick == 0:
+            stage.call("reset", seen["pose"], reference, self._period * self._every)
+        over_rows(posture_error, seen["pose"], goal["pose"], state["error"])
+        request = self._finite_rows(stage, stage.output(seen["pose"], seen["twist"], reference))
+        state["correction"] = request - goal["twist"]
+
+    def _feed_back(self, stage: UserStage, twist: Array) -> None:
+        """Asks the user's feedback, and shows its integral to guard and hand-over."""
+        state = self.state
+        self.feedback[:] = self._finite_rows(stage, stage.output(self.command, twist, state["allocation"]["excess"]))
+        integral = getattr(stage.stage, "integral", None)
+        known = 0.0 if integral is None else stage.checked(integral, self.feedback.shape, "`integral`")
+        state["pid"]["integral"] = known
+
+    def _forward(self, command: Array, derivative: Array) -> Array:
+        """The feedforward's output, the user's or a built-in one's."""
+        stage = self._feedforward_stage
+        if not stage:
+            return self.feedforward.output(command, derivative)
+        return self._finite_rows(stage, stage.output(command, derivative))
+
+    def _steer(self, stage: UserStage) -> None:
+        """Asks the user's steering, and limits it as `allocate` does."""
+        state, limit = self.state, self._robot.steering_limit
+        allocation, command = state["allocation"], self.command.copy()
+        if self._rigid:
+            command[:, 1] += self.feedback[:, 1] + state["guard"]["output"][:, 1]
+        answer = self._finite_rows(stage, stage.output(command, self.derivative))
+        angle = np.clip(answer[:, 0], -limit, limit)
+        beyond = angle != answer[:, 0]
+        rate = np.where(beyond, 0.0, answer[:, 1])
+        self.output[:, 2], self.output[:, 3] = np.clip(angle + rate * self._period / 2, -limit, limit), rate
+        if self._rigid:  # the fork is what makes θ̇, so its limit is one of the second channel
+            clipped = (self.output[:, :2] != allocation["feedback"] + allocation["feedforward"]).any(axis=1)
+            made = command[:, 0] * np.tan(angle) / self._robot.wheelbase
+            allocation["excess"][:, 1] = np.where(beyond, made - command[:, 1], 0.0)
+            allocation["saturated"] = beyond | clipped
+            state["voltage"][:, 1] = command[:, 1] - self.command[:, 1] + allocation["excess"][:, 1]
+            state["frozen"] = np.any(
+                [allocation["saturated"], state["learning_off"], state["guard"]["frozen"], state["slips"]], axis=0
+            )
+
+    def _learn(self, twist: Array) -> Array | None:
+        """Lets the feedforward learn, the user's or a built-in one; returns what that added to its output."""
+        state, stage = self.state, self._feedforward_stage
+        values = state["guard"]["teaching"], state["frozen"], twist, state["voltage"]
+        if not stage:
+            return self.feedforward.learn(*values)
+        added = stage.call("learn", *values)
+        if added is None:
+            return None
+        return self._finite_rows(stage, stage.checked(added, self.feedback.shape, "what `learn` returns"))
+
+    def _read_weight_norm(self) -> None:
+        """Reads the size of what the feedforward has learned, where it says so."""
+        norm = getattr(self.feedforward, "weight_norm", None)
+        if norm is None:
+            return
+        stage = self._feedforward_stage
+        self.weight_norm[:] = stage.checked(norm, self.weight_norm.shape, "`weight_norm`") if stage else norm
+
+    def _restore(self, rows: NDArray[np.intp]) -> bool:
+        if not getattr(self.feedforward, "restore", None):
+            return False
+        if self._feedforward_stage:
+            self._feedforward_stage.call("restore", rows)
+        else:
+            cast(Any, self.feedforward).restore(rows)
+        return True
+
+    def _finite_rows(self, stage: UserStage, answer: Array) -> Array:
+        """An answer whose rows that are not finite are zero; these robots are noted in `faults`."""
+        broken = np.any(~np.isfinite(answer), axis=1)
+        for row in np.flatnonzero(broken):
+            self.faults.setdefault(int(row), f"{stage.title}: not finite")
+        return np.where(broken[:, None], 0.0, answer) if broken.any() else answer

@@ -1,0 +1,78 @@
+"""One robot as a `dm_control` physics, with named readouts."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+import warnings
+
+import mujoco
+import numpy as np
+
+from mrctl.kernel import Array, Row
+from mrctl.physics import mjcf
+from mrctl.physics.readout import READING, addresses, inputs, motor_current, motor_parameters, read
+from mrctl.theory.robot import CAR, RobotFile, Steering
+
+with warnings.catch_warnings():  # on a machine without a display dm_control tries GLFW first, which complains
+    warnings.simplefilter("ignore")
+    from dm_control import mujoco as dm_mujoco
+    from dm_control.mujoco import wrapper
+
+
+class CarPhysics(dm_mujoco.Physics):
+    """A `dm_control` physics of a world with the car, with named readouts.
+
+    Readouts are current after every step, because they are computed from `qpos` and `qvel`.
+    """
+
+    @classmethod
+    def from_world(
+        cls, world: str = "flat", steering: Steering = "compliant", robot: RobotFile = CAR
+    ) -> CarPhysics:
+        """Loads a world by name or path with a robot (see `physics.mjcf.load`)."""
+        return cls.from_compiled(mjcf.load(world, steering, robot=robot))
+
+    @classmethod
+    def from_compiled(cls, model: mujoco.MjModel) -> CarPhysics:
+        """Wraps a compiled model that stays the caller's to edit."""
+        physics = cls.from_model(wrapper.MjModel(model))
+        physics.legacy_step = False  # plain mj_step, as the batch does
+        return physics
+
+    def reading(self) -> Row:
+        """All readouts at once, a record of `READING`."""
+        reading = np.zeros(1, READING)[0]
+        read(self.data.qpos, self.data.qvel, addresses(self.model.ptr), reading)
+        return reading
+
+    def pose(self) -> Array:
+        """Posture of P: x, y in m and heading in rad, `(3,)`."""
+        return self.reading()["pose"]
+
+    def twist(self) -> Array:
+        """V in m/s and θ̇ in rad/s in the body frame, `(2,)`."""
+        return self.reading()["twist"]
+
+    def wheel_rates(self) -> Array:
+        """Rates of the left and right rear wheel in rad/s, `(2,)`."""
+        return self.reading()["wheel_rates"]
+
+    def steering_angle(self) -> float:
+        """Angle of the fork in rad, positive to the left."""
+        return float(self.reading()["steering_angle"])
+
+    def upright(self) -> float:
+        """Cosine of the tilt from the vertical."""
+        return float(self.reading()["upright"])
+
+    def motor_current(self) -> Array:
+        """Armature currents left and right in A, `(2,)`: (U − k_E N ω)/R_a, or the current state with inductance."""
+        model = self.model.ptr
+        return motor_current(
+            self.data.ctrl[None, inputs(model)[:2]],
+            self.wheel_rates()[None],
+            np.ascontiguousarray(self.data.act)[None],
+            *motor_parameters(model),
+        )[0]

@@ -1,0 +1,98 @@
+"""What is read off a robot in physics: posture, twist, wheel rates, steering, tilt; from `qpos` and `qvel` alone."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from mrctl.kernel import Array, Row, Rows, kernel
+from mrctl.physics.elements import MOTORS, has
+
+JOINTS = ("chassis", "wheel_left", "wheel_right")
+HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) on a sane state
+
+READING = np.dtype(
+    [
+        ("pose", "f8", 3),  # x and y of P in m, heading in rad
+        ("twist", "f8", 2),  # V in m/s and θ̇ in rad/s in the body frame
+        ("v_lateral", "f8"),  # lateral velocity of P, m/s
+        ("wheel_rates", "f8", 2),  # of the rear wheels, left and right, rad/s
+        ("steering_angle", "f8"),  # rad, positive to the left; 0 where nothing is steered
+        ("steering_rate", "f8"),  # rad/s
+        ("upright", "f8"),  # cosine of the tilt from the vertical; NaN once the state has blown up
+    ]
+)
+
+
+@kernel
+def read(qpos: Array, qvel: Array, address: NDArray[np.int64], r: Row) -> None:
+    """Reads the state of one robot.
+
+    Args:
+        qpos: Generalised positions, `(nq,)`.
+        qvel: Generalised velocities, `(nv,)`.
+        address: As from `addresses`.
+        r: Out: a record of `READING`.
+    """
+    q, d = address[0], address[1]
+    w, i, j, k = qpos[q + 3], qpos[q + 4], qpos[q + 5], qpos[q + 6]
+    # Body x and y axes in the world.
+    xx, xy, xz = 1 - 2 * (j * j + k * k), 2 * (i * j + w * k), 2 * (i * k - w * j)
+    yx, yy, yz = 2 * (i * j - w * k), 1 - 2 * (i * i + k * k), 2 * (j * k + w * i)
+    r.pose[0], r.pose[1], r.pose[2] = qpos[q], qpos[q + 1], np.arctan2(xy, xx)
+    r.twist[0] = xx * qvel[d] + xy * qvel[d + 1] + xz * qvel[d + 2]
+    r.twist[1] = qvel[d + 5]
+    r.v_lateral = yx * qvel[d] + yy * qvel[d + 1] + yz * qvel[d + 2]
+    r.wheel_rates[0], r.wheel_rates[1] = qvel[address[3]], qvel[address[5]]
+    r.steering_angle = r.steering_rate = 0.0
+    if address.shape[0] > 6:
+        r.steering_angle, r.steering_rate = qpos[address[6]], qvel[address[7]]
+    r.upright = 1 - 2 * (i * i + j * j)
+    for value in qpos:
+        if not abs(value) < HUGE:
+            r.upright = np.nan
+    for value in qvel:
+        if not abs(value) < HUGE:
+            r.upright = np.nan
+
+
+@kernel
+def read_all(qpos: Array, qvel: Array, address: NDArray[np.int64], rows: Rows) -> None:
+    """`read` for a trajectory or a batch: `(n, nq)`, `(n, nv)` and one record of `READING` each."""
+    for i in range(len(rows)):
+        read(qpos[i], qvel[i], address, rows[i])
+
+
+def addresses(model: mujoco.MjModel) -> NDArray[np.int64]:
+    """Addresses in qpos and qvel of each joint in `JOINTS` and of `steering`, if there is one, alternating, `(8,)`."""
+    joints = (*JOINTS, "steering") if has(model, "joint", "steering") else JOINTS
+    return np.array([a for name in joints for a in (model.joint(name).qposadr[0], model.joint(name).dofadr[0])], int)
+
+
+def inputs(model: mujoco.MjModel) -> list[int]:
+    """Positions in ctrl of left voltage, right voltage and, unless nothing is steered, steering angle and rate."""
+    found = [int(model.actuator_ctrladr[model.actuator(name).id]) for name in MOTORS]
+    if has(model, "actuator", "steering"):
+        steering = int(model.actuator_ctrladr[model.actuator("steering").id])
+        found += [steering, steering + 1]
+    return found
+
+
+def motor_parameters(model: mujoco.MjModel) -> tuple[Array, Array, list[int]]:
+    """Resistance `(1, 2)` in Ω, back-EMF per wheel rate `(1, 2)` in V·s/rad, addresses of the current states if any."""
+    motors = [model.actuator(name).id for name in MOTORS]
+    resistance = model.actuator_gainprm[motors, 0]
+    back_emf = model.actuator_gainprm[motors, 1] * model.actuator_gear[motors, 0]
+    acts = [int(a) for a in model.actuator_actadr[motors] if a >= 0]
+    return resistance[None], back_emf[None], acts
+
+
+def motor_current(
+    voltage: Array, rates: Array, act: Array, resistance: Array, back_emf: Array, acts: list[int]
+) -> Array:
+    """Armature currents `(B, 2)` in A from applied voltages, wheel rates and activations."""
+    return act[:, acts] if acts else (voltage - back_emf * rates) / resistance
