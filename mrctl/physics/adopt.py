@@ -173,7 +173,7 @@ class _Adoption:
         wheels = {wheel.body for wheel in self.rear}
         low = [
             g for g in range(self.model.ngeom)
-            if self.chassis in (line := self._line(self.model.geom_bodyid[g])) and not wheels & set(line)
+            if self.chassis in (line := self._ancestry(self.model.geom_bodyid[g])) and not wheels & set(line)
             and self._bottom(g) - floor < LEVEL * self.radius
         ]  # fmt: skip
         casters: list[Wheel] = []
@@ -246,7 +246,7 @@ class _Adoption:
         """Returns how far a joint is to the right of P in m, by which joints are sorted from left to right."""
         return -float((self.data.joint(joint).xanchor - self.origin) @ self.left)
 
-    def _line(self, body: int) -> list[str]:
+    def _ancestry(self, body: int) -> list[str]:
         """Names a body and those that carry it, up to the root."""
         line = []
         while body:
@@ -256,7 +256,7 @@ class _Adoption:
 
     def _lineage(self, joint: str) -> list[str]:
         """Names the body of a joint and those that carry it, up to the root."""
-        return self._line(self.model.joint(joint).bodyid[0])
+        return self._ancestry(self.model.joint(joint).bodyid[0])
 
     def _bottom(self, geom: int) -> float:
         """Returns the height of the lowest point of a geom in m; infinite for one that cannot be a wheel."""
@@ -434,7 +434,7 @@ class _Adoption:
             )
             fork.mass, fork.inertia, fork.explicitinertial = 1e-6, np.full(3, 1e-9), True
             # The rack has the inertia of the wheels that it turns. The second term keeps its time constant J/k_v above
-            # the 2 ms of the default physics step, below which implicit damping is not accurate.
+            # the 2 ms of the default physics step.
             fork.add_joint(name="steering", type=HINGE, axis=UP, armature=inertia + 0.002 * kv)
             for name, anchor in zip(FRONTS[1:3], anchors, strict=True):
                 phi = np.linspace(-limit, limit, 201)
