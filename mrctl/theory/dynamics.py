@@ -199,7 +199,7 @@ def accelerations_as_printed(twist: ArrayLike, voltage: ArrayLike, robot: Robot)
     3. The factor r/(2D) of the torque belongs to kinematics; the right one is D/r.
     4. I₀ has no sign (see `wheel_torques_as_printed`).
     5. P_s,d and P_l,r are the same pair, (left, right) here; the text calls the torques inputs, but the voltages are.
-    6. Inertias of rotor and wheel, offset c, rolling loss, gearbox loss and supply limit are missing; J is `yaw_inertia`.
+    6. Rotor and wheel inertia, offset c, rolling and gearbox loss and supply limit are missing; J is `yaw_inertia`.
     7. k_E must be in V/rpm, and is converted from SI here.
 
     Args:

@@ -4,8 +4,8 @@ A position is a complex number p = x + i y. A path with heading θ then has the 
 and the logarithmic derivative p''/p' = v̇/v + i θ̇ gives acceleration and rotation at once. Nothing is differenced
 numerically, and every sample depends on its own time alone, headings included.
 
-A reference starts at the origin along +x unless its docstring says otherwise. A new kind is a `Record` with `kind`, `period`
-and the method `sample`, and is added to the union `Reference`.
+A reference starts at the origin along +x unless its docstring says otherwise. A new kind is a `Record` with `kind`,
+`period` and the method `sample`, and is added to the union `Reference`.
 """
 
 from __future__ import annotations
@@ -241,7 +241,7 @@ class StopAndGo(Record):
     distance: Length = 2.0
     """Distance between stops in m."""
     move_time: Duration = 3.0
-    """Duration of a move in s; the largest speed is 1.875 distance / duration."""
+    """Duration of a move in s; the largest speed is 1.875 distance / move_time."""
     pause: Annotated[float, Field(ge=0, le=3600)] = 1.0
     """Duration of the rest after each move in s."""
     reverse: bool = True
