@@ -87,7 +87,7 @@ class Tracking(control.Task):
 
 
 class Environment(control.Environment):
-    """The environment of `dm_control` around a `Tracking` task, which places the robot and finds its failures itself."""
+    """The environment of `dm_control` around a `Tracking` task, which itself places the robot and finds failures."""
 
     def __init__(self, task: Tracking, **settings: Any) -> None:  # noqa: ANN401
         """Builds the environment of a task.

@@ -50,7 +50,8 @@ class TrackingEnv(gymnasium.Env):
             InputError: The file or the scenario is invalid.
         """
         self.episodes = Episodes([read(scenario)], action)
-        self.observation_space, self.action_space = copy.deepcopy((OBSERVATION, ACTION))  # copies, as each has its own random numbers
+        # Each environment has copies, because a space holds its own random numbers.
+        self.observation_space, self.action_space = copy.deepcopy((OBSERVATION, ACTION))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Begins an episode.
@@ -132,7 +133,7 @@ class TrackingVectorEnv(VectorEnv):
         """Begins an episode of every robot.
 
         Args:
-            seed: A seed, to which the robot's row is added, or a sequence of B seeds; a robot without one draws its own.
+            seed: A seed, to which each robot's row is added, or B seeds; a robot without a seed draws its own.
             options: Not used.
 
         Returns:
