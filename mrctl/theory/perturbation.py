@@ -23,7 +23,7 @@ class Perturbation(Record):
     mass_factor: Factor = 1.0
     """Factor on mass and inertia of every body."""
     inertia_factor: Factor = 1.0
-    """Factor on the yaw inertia of the chassis, without its mass."""
+    """Factor on the yaw inertia of the chassis, whose mass stays."""
     payload: Annotated[float, Field(ge=0, le=200)] = 0.0
     """Payload on the chassis in kg, a point mass."""
     payload_x: Annotated[float, Field(ge=-1, le=1)] = 0.1

@@ -95,6 +95,7 @@ class Line(Record):
     """A straight line at constant speed, which goes on after its length."""
 
     kind: Literal["line"] = "line"
+    """Kind of the reference."""
     speed: Speed = 0.8
     """Speed along the line in m/s."""
     length: Length = 8.0
@@ -116,12 +117,13 @@ class Circle(Record):
     """A circle at constant speed, counter-clockwise unless `clockwise` is set."""
 
     kind: Literal["circle"] = "circle"
+    """Kind of the reference."""
     radius: Length = 1.0
     """Radius of the circle in m."""
     period: Duration = 8.0
     """Time of one lap in s."""
     clockwise: bool = False
-    """Drive clockwise."""
+    """Drive clockwise, to the right of the start."""
 
     def sample(self, t: Array) -> Motion:
         """Samples the circle at the times t in s, shape (T,)."""
@@ -135,6 +137,7 @@ class Lemniscate(Record):
     """The figure of eight of Gerono, x = a sin s, y = a sin s cos s, s = 2πt/period; it starts at 45°."""
 
     kind: Literal["lemniscate"] = "lemniscate"
+    """Kind of the reference."""
     size: Length = 1.5
     """Half the length of the figure [a] in m, which is also its whole width."""
     period: Duration = 12.0
@@ -155,6 +158,7 @@ class LaneChange(Record):
     """A lane change to the left at constant speed along x, and straight on afterwards; θ̈ is continuous."""
 
     kind: Literal["lane_change"] = "lane_change"
+    """Kind of the reference."""
     length: Length = 4.0
     """Length of the lane change along x in m."""
     shift: Annotated[float, Field(ge=-1000, le=1000)] = 1.0
@@ -178,6 +182,7 @@ class RoundedSquare(Record):
     """A square with rounded corners at constant speed, counter-clockwise from the middle of its lower side."""
 
     kind: Literal["rounded_square"] = "rounded_square"
+    """Kind of the reference."""
     side: Length = 2.0
     """Side of the square in m."""
     radius: Length = 0.4
@@ -238,6 +243,7 @@ class StopAndGo(Record):
     """Moves from rest to rest along a straight line, forward and back or always forward; V̇ is continuous."""
 
     kind: Literal["stop_and_go"] = "stop_and_go"
+    """Kind of the reference."""
     distance: Length = 2.0
     """Distance between stops in m."""
     move_time: Duration = 3.0
@@ -269,6 +275,7 @@ class Waypoints(Record):
     """A quintic spline through points at constant speed; an open one ends at rest on its last point."""
 
     kind: Literal["waypoints"] = "waypoints"
+    """Kind of the reference."""
     points: tuple[tuple[Coordinate, Coordinate], ...] = _LOOP
     """Points (x, y) in m in their order; a closed curve returns to the first by itself."""
     speed: Speed = 0.6
