@@ -1,4 +1,4 @@
-"""The commands: what they print and write, and how they refuse bad input."""
+"""The commands: output, files, help texts, and the refusal of bad input."""
 
 import json
 import os
@@ -39,7 +39,7 @@ def scenario(tmp_path: Path) -> Path:
 
 
 def refused(capsys: pytest.CaptureFixture, *arguments: str) -> str:
-    """The one line on stderr of a command that must end with status 2."""
+    """Returns the one line on stderr of a command that must end with status 2."""
     assert cli.main(list(arguments)) == 2
     captured = capsys.readouterr()
     lines = [line for line in captured.err.splitlines() if "tick" not in line]
@@ -49,7 +49,7 @@ def refused(capsys: pytest.CaptureFixture, *arguments: str) -> str:
 
 
 def test_run_prints_a_row_per_lap(capsys: pytest.CaptureFixture) -> None:
-    """The table has the laps and says which feedforward."""
+    """The table has a row for each lap and names the feedforward."""
     assert cli.main(["run", "--laps", "2", "--feedforward", "model", *SHORT[2:]]) == 0
     out = capsys.readouterr().out
     assert "feedforward model" in out
@@ -67,7 +67,7 @@ def test_run_json_is_the_simulation(capsys: pytest.CaptureFixture, scenario: Pat
 
 
 def test_flags_override_the_file(capsys: pytest.CaptureFixture, scenario: Path) -> None:
-    """What a flag says wins over the file; what no flag says is the file's."""
+    """Flags override the values of the file, and other values are the file's."""
     assert cli.main(["run", str(scenario), "--feedforward", "none", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)["scenario"]
     assert printed["feedforward"] == "none"
@@ -75,7 +75,7 @@ def test_flags_override_the_file(capsys: pytest.CaptureFixture, scenario: Path) 
 
 
 def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """`--out` writes what is needed to look, to compare and to go on; and does not overwrite it."""
+    """`--out` writes result, figures and weights, from which learning goes on, and does not overwrite them."""
     out = tmp_path / "out"
     command = ["run", "--out", str(out), "--feedforward", "fel", *SHORT]
     assert cli.main(command) == 0
@@ -181,7 +181,7 @@ REFERENCES = ("line", "circle", "lemniscate", "lane-change", "rounded-square", "
 
 
 def help_texts(capsys: pytest.CaptureFixture, *arguments: str) -> dict[str, str]:
-    """The help text of every flag and positional argument on a help screen, without the default at its end."""
+    """Returns the help text of each flag and positional argument of a help screen, without its default."""
     with pytest.raises(SystemExit) as stop:
         cli.main(list(arguments))
     assert not stop.value.code
@@ -213,7 +213,7 @@ def test_every_flag_is_explained(
 
 
 def test_short_help_of_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    """It explains what people use, and names each other flag or its group, which `--help-all` explains."""
+    """The short help explains the usual flags, and names each further flag or its group."""
     monkeypatch.setenv("COLUMNS", "80")
     short = help_texts(capsys, "run", "--help")
     for flag in ("SCENARIO.toml", "--laps", "--feedforward", "--steering", "--seed", "--out", "--json", "--controller"):
@@ -253,14 +253,14 @@ DIMENSIONLESS = r"\b([Ff]actor|[Rr]atio|[Ss]hare|[Cc]oefficient|[Nn]umber of|[Dd
 
 
 def records_of(kind: Any) -> set[type[Record]]:
-    """The records in a type, and in the fields of these."""
+    """Returns the records in a type and, recursively, in their fields."""
     if isinstance(kind, type) and issubclass(kind, Record):
         return {kind}.union(*(records_of(field.annotation) for field in kind.model_fields.values()))
     return set().union(*map(records_of, typing.get_args(kind)))
 
 
 def holds_floats(kind: Any) -> bool:
-    """Whether a type is float, or a tuple or union with floats in it."""
+    """Tells whether a type is float, or a tuple or union with floats in it."""
     return kind is float or any(map(holds_floats, typing.get_args(kind)))
 
 
@@ -279,7 +279,7 @@ def test_every_field_is_explained(record: type[Record]) -> None:
 
 
 def test_fields_are_found() -> None:
-    """The walk reaches the references and events; words that only look like a unit are none."""
+    """The fields of references and events are held too; words that only look like units do not count."""
     assert {"Scenario", "Event", "Perturbation", "RobotFile", "Lemniscate", "Waypoints"} <= {r.__name__ for r in HELD}
     assert holds_floats(Scenario.model_fields["initial_pose"].annotation)
     assert not holds_floats(Scenario.model_fields["laps"].annotation)
@@ -291,14 +291,14 @@ def test_fields_are_found() -> None:
 def test_unwritable_folder_is_refused_before_the_work(
     command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    """A folder that cannot be made costs no simulation."""
+    """A folder that cannot be made is refused before anything is computed."""
     (tmp_path / "file").write_text("kept")
     assert "out" in refused(capsys, command[0], "--out", str(tmp_path / "file" / "out"), *command[1:])
     assert (tmp_path / "file").read_text() == "kept"
 
 
 def test_installed_command_without_a_display(tmp_path: Path) -> None:
-    """The console script runs headless, its stderr is the progress bar alone."""
+    """The console script runs without a display, and its stderr has the progress bar alone."""
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "MUJOCO_GL")}
     script = Path(sys.executable).with_name("mrctl")
     done = subprocess.run(
