@@ -293,8 +293,8 @@ class _Adoption:
         for numeric in list(spec.numerics):
             spec.delete(numeric)
         self._strip()
-        self._turn()
-        names = self._names()
+        self._align()
+        names = self._renamed()
         spec.worldbody.add_frame().attach_body(self.spec.body(self.chassis), PREFIX, "")
         for kind, old, new in names:
             element = getattr(spec, kind)(PREFIX + old)
@@ -333,7 +333,7 @@ class _Adoption:
             geom.contype = geom.conaffinity = 0
             geom.group = geom.group or 1  # rays that look for the ground see only group 0
 
-    def _turn(self) -> None:
+    def _align(self) -> None:
         """Moves the chassis' frame to P, with x ahead and z up.
 
         Wheels then turn forwards, and a fork turns to the left, in the positive direction of their joints.
@@ -347,7 +347,7 @@ class _Adoption:
         for name in self.motors:
             motor = self.spec.actuator(name)
             motor.gear = np.abs(motor.gear)
-        rotation = self._in_chassis()
+        rotation = self._rotation()
         body, data = model.body(self.chassis), self.data.body(self.chassis)
         shift = rotation @ (data.xpos - self.origin)  # of the old frame in the new one
         turned = rotation @ data.xmat.reshape(3, 3)
@@ -374,7 +374,7 @@ class _Adoption:
         for joint in list(chassis.joints):
             self.spec.delete(joint)
 
-    def _in_chassis(self) -> Array:
+    def _rotation(self) -> Array:
         """Returns the rotation from the file's world to the chassis' new frame, `(3, 3)`."""
         return np.stack([self.ahead, self.left, UP])
 
@@ -393,7 +393,7 @@ class _Adoption:
             return FRONTS[:1] if len(self.steered) == 1 else FRONTS[1:3]
         return FRONTS[3 : 3 + len(self.front)]
 
-    def _names(self) -> Iterable[tuple[str, str, str]]:
+    def _renamed(self) -> Iterable[tuple[str, str, str]]:
         """Lists the elements that get another name: kind, old name, new name."""
         yield "body", self.chassis, "chassis"
         wheels = (*zip(REAR, self.rear, strict=True), *zip(self._front_names(), self.front, strict=True))
@@ -424,7 +424,7 @@ class _Adoption:
         limit = min(float(np.abs(r).min()) for r in ranges)
         if not 0 < limit < np.pi / 2:
             raise InputError(f"steering: {_listed(self.steered)} needs a range below 90° on either side of straight on")
-        anchors = [self._in_chassis() @ (self.data.joint(name).xanchor - self.origin) for name in self.steered]
+        anchors = [self._rotation() @ (self.data.joint(name).xanchor - self.origin) for name in self.steered]
         if len(anchors) == 2:
             length, track = float(np.mean([a[0] for a in anchors])), float(anchors[0][1] - anchors[1][1])
             limit = float(np.arctan(length / (length / np.tan(limit) + track / 2)))

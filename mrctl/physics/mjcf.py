@@ -31,7 +31,7 @@ REQUIRED = {
     "geom": ("wheel_left", "wheel_right", "front_wheel"),
     "actuator": (*MOTORS, "steering"),
 }
-"""Names that a world gives to its own robot, by kind of element; `mrctl.physics.adopt` names those of any other."""
+"""Names that the parts of a world's own robot must have, by kind; `mrctl.physics.adopt` gives them to any other."""
 
 
 def load(
