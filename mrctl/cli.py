@@ -37,8 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The command line without the program's name; `sys.argv` by default.
 
     Returns:
-        The exit status. It is 0 on success, 1 where a run of a sweep failed or differed, jobs were set aside, or a
-        robot failed a check, 2 on bad input, and 130 after Ctrl-C. Except on success, one line on stderr says why.
+        The exit status: 0 on success, 1 where jobs of a sweep were set aside, a repeated run differs from its store or
+        a robot fails a check, 2 on bad input, and 130 after Ctrl-C. Except on success, one line on stderr says why.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if arguments == ["--version"]:
