@@ -1,4 +1,7 @@
-"""The commands."""
+"""The commands of `mrctl`, whose flags tyro derives from the functions below and from the records that they take.
+
+The docstring of a field or argument is the help text of its flag.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,24 @@ import io
 import json as jsonlib
 import re
 import sys
+import textwrap
+import typing
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
+from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import pydantic
 import tyro
 
-from mrctl.record import InputError
+from mrctl.record import InputError, Record
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, RobotFile
+
+FIRST = ("name", "world", "steering", "reference", "laps", "feedforward", "measurement", "seed")
+"""Fields of `Scenario` that `mrctl run --help` explains; it lists the others, which `mrctl run --help-all` explains."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -27,30 +37,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The command line without the program's name; `sys.argv` by default.
 
     Returns:
-        0 on success, 2 on bad input, with one line on stderr that names the field or file; 1 if a sweep ends with
-        jobs set aside, a run of it does not repeat, or a robot fails a check; 130 on Ctrl-C.
+        The exit status: 0 on success, 1 where jobs of a sweep were set aside, a repeated run differs from its store or
+        a robot fails a check, 2 on bad input, and 130 after Ctrl-C. Except on success, one line on stderr says why.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if arguments == ["--version"]:
+        print(f"mrctl {metadata.version('mrctl')}")
+        return 0
     try:
-        _parse(arguments)
+        _parse(arguments)()
     except InputError as error:
         print(f"mrctl: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as stop:
         print(": ".join(["mrctl: interrupted", *map(str, stop.args)]), file=sys.stderr)
         return 130
-    except _Incomplete as left:
-        print(f"mrctl: {left}", file=sys.stderr)
+    except _Incomplete as error:
+        print(f"mrctl: {error}", file=sys.stderr)
         return 1
     return 0
 
 
 class _Incomplete(Exception):
-    """Done, but not all of it, or not as it should have come out."""
+    """A command has ended, but a part of its work failed; the message says which part."""
 
 
-def _parse(arguments: list[str]) -> None:
-    """Lets tyro turn flags into a call of one of the commands below, its complaints into one line."""
+def _parse(arguments: list[str]) -> Callable[[], Any]:
+    """Turns the command line into a call of one of the commands below.
+
+    Raises:
+        InputError: An argument is invalid.
+        SystemExit: Help was asked for and has been printed.
+    """
     commands: dict[str, Callable[..., Any]] = {
         "run": _run_with(arguments),
         "reproduce": reproduce,
@@ -67,21 +85,23 @@ def _parse(arguments: list[str]) -> None:
     complaints = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaints):
-            command = tyro.extras.subcommand_cli_from_dict(
+            return tyro.extras.subcommand_cli_from_dict(
                 {name: _deferred(function) for name, function in commands.items()},
                 prog="mrctl",
-                description="A physics testbed for adaptive control of a car-like robot.",
-                args=arguments,
+                description="A physics testbed for adaptive control of a car-like robot. "
+                "mrctl COMMAND --help explains a command, mrctl --version prints the version.",
+                args=["--help" if argument == "--help-all" else argument for argument in arguments],
             )
     except SystemExit as stop:
-        if not stop.code:
-            raise
-        raise InputError(_one_line(complaints.getvalue())) from None
-    command()
+        if stop.code:
+            raise InputError(_one_line(complaints.getvalue())) from None
+        if _is_short_help(arguments):
+            print(_further_flags())
+        raise
 
 
 def _deferred(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
-    """The function with its call put off, so that only parsing happens while stderr is caught."""
+    """Wraps a command so that its call returns the call itself, and stderr is caught only while tyro parses."""
 
     @wraps(function)
     def inner(*args: object, **kwargs: object) -> Callable[[], Any]:
@@ -91,22 +111,54 @@ def _deferred(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
 
 
 def _one_line(box: str) -> str:
-    """The message in one of tyro's boxes, in Unicode or ASCII; pydantic's own as `field: what is wrong`."""
+    """Returns the message in one of tyro's boxes as one line.
+
+    The box is drawn in Unicode or ASCII. A message of pydantic becomes `field: reason`.
+    """
     titled = "╭" not in box  # without box characters the title is a part of its own
     lines = [line.strip("│| ") for line in box.splitlines() if not line.startswith(("╭", "╰", "+"))]
     parts = re.split(r"(?:^|\n)[-─]{8,}(?:\n|$)", "\n".join(lines).strip())
     parts = [" ".join(part.split()) for part in parts if part.strip()]
     text = parts[min(titled, len(parts) - 1)] if parts else "bad arguments"
     pattern = r"Error parsing (\S*): \d+ validation errors? for \w+ (?:([\w.]+) (?=[A-Z]))?(.*?) \[type="
-    if not (found := re.match(pattern, text)):
+    if not (match := re.match(pattern, text)):
         return text
-    path = [part for part in found[1].split(".") if part not in ("__tyro-dummy-inner__", "scenario", "")]
-    field = ".".join([*path, *([found[2]] if found[2] else [])])
-    return ": ".join(part for part in (field, found[3].removeprefix("Value error, ")) if part)
+    path = [part for part in match[1].split(".") if part not in ("__tyro-dummy-inner__", "scenario", "")]
+    field = ".".join([*path, *([match[2]] if match[2] else [])])
+    return ": ".join(part for part in (field, match[3].removeprefix("Value error, ")) if part)
+
+
+def _is_short_help(arguments: Sequence[str]) -> bool:
+    """Tells whether a command line asks for the short help of `run`; that of a reference is short in itself."""
+    asked = bool({"-h", "--help"} & set(arguments))
+    return arguments[0] == "run" and asked and not any(a.startswith("reference:") for a in arguments)
+
+
+def _short(scenario: Scenario) -> Record:
+    """Returns a record of the fields in `FIRST` alone, from which tyro makes the short help of `run`."""
+    types = typing.get_type_hints(Scenario, include_extras=True)
+    helps = {name: field.description for name, field in Scenario.model_fields.items()}
+    fields: dict[str, Any] = {
+        name: (types[name], pydantic.Field(getattr(scenario, name), description=helps[name])) for name in FIRST
+    }
+    return pydantic.create_model("Short", __base__=Record, **fields)()
+
+
+def _further_flags() -> str:
+    """Lists the flags of `run` that its short help leaves out: each field or group of fields with its description."""
+    # Perturbations are what people change most. Events have no flags: they come from a scenario file.
+    left_out = [name for name in Scenario.model_fields if name not in (*FIRST, "events")]
+    names = sorted(left_out, key=lambda name: name != "perturbation")
+    lines = ["Further flags, which `mrctl run --help-all` explains one by one:"]
+    for name in names:
+        field = Scenario.model_fields[name]
+        flag = f"--{name.replace('_', '-')}" + (".*" if isinstance(field.default, Record) else "")
+        lines += textwrap.wrap(field.description or "", 80, initial_indent=f"  {flag:<17} ", subsequent_indent=" " * 20)
+    return "\n".join(lines)
 
 
 def _run_with(arguments: list[str]) -> Callable[..., None]:
-    """The `run` command, whose flags take their defaults from the scenario file, if one is given."""
+    """Returns the `run` command, whose flags take their defaults from the scenario file where one is given."""
     file = next((a for a in arguments[1:] if a.endswith(".toml")), None) if arguments[0] == "run" else None
     default = Scenario.from_toml(file) if file else Scenario()
 
@@ -122,32 +174,36 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         """Runs one scenario and prints its metrics lap by lap.
 
         Args:
-            file: Scenario file; flags override what it says. Or the store of a sweep, with --run.
+            file: Scenario file, whose values flags override; or with --run the store of a sweep.
             scenario: The scenario.
             out: Folder for the result, the figures and the learned weights.
-            json: Print JSON.
-            controller: Stages of your own, as my_file.py:MyFeedforward, or motion=my_file.py:MyMotion,feedback=...
-            number: Run of the sweep to run again and to compare with the store.
+            json: Print JSON instead of a table.
+            controller: Stages of your own, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion,feedback=...
+            number: Number of a run in the store, which is run again and compared with what is stored.
         """
         if number is not None:
             return _repeat(file, number, out, json)
         if file is not None and file.is_dir():
-            raise InputError(f"run: which one of {file}? give its number with --run")
+            raise InputError(f"run: {file} is a store; give the number of one of its runs with --run")
         from mrctl.experiments import single
 
         print(single.run(scenario, out, json, controller))
 
+    if _is_short_help(arguments):
+        short = _short(default)
+        run.__annotations__["scenario"] = Annotated[type(short), tyro.conf.arg(name="")]
+        run.__defaults__ = (None, short, *(run.__defaults__ or ())[2:])
     return run
 
 
 def _repeat(store: Path | None, number: int, out: Path | None, json: bool) -> None:
-    """`mrctl run STORE --run K`."""
+    """Runs one run of a sweep again and compares it with the store: `mrctl run STORE --run K`."""
     from mrctl.experiments import single
     from mrctl.sweep import jobs
     from mrctl.sweep.store import Store
 
     if store is None:
-        raise InputError("run: needs the store of a sweep in front of it")
+        raise InputError("run: --run needs the store of a sweep, as in mrctl run STORE --run 3")
     if out is not None or json:
         print(single.run(jobs.scenario_of(store, number), out, json, Store(store).manifest["sweep"]["controller"]))
     repeated = jobs.repeat(store, number)
@@ -164,12 +220,12 @@ def sweep(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> None:
-    """Runs the many runs of a sweep file; the same command again goes on where it stopped.
+    """Computes the runs of a sweep file in parallel; the same command resumes after an interrupt.
 
     Args:
-        file: Sweep file.
+        file: Sweep file, with the scenarios and what varies in them.
         out: Folder of the store, which `mrctl.open` opens.
-        workers: Processes on this machine; by default one a core.
+        workers: Number of processes on this machine; by default one for each core.
         scheduler: Address of a Dask scheduler to use instead, such as tcp://127.0.0.1:8786.
     """
     from mrctl.sweep import jobs
@@ -186,7 +242,7 @@ def reproduce(out: Path = Path("reproduction")) -> None:
     """Reproduces the paper's figures, Kanayama's table and the comparison of PID with the neural feedforward.
 
     Args:
-        out: Folder for figures (PNG and PDF) and `table.json` with every number.
+        out: Folder for the figures in PNG and PDF, and for `table.json` with every number.
     """
     from mrctl.experiments import paper
 
@@ -202,25 +258,26 @@ def suite(
     workers: int | None = None,
     out: Path = Path("suite"),
 ) -> None:
-    """Drives every feedforward through every uncertainty, with paired seeds; the same command goes on where it stopped.
+    """Compares feedforwards under every uncertainty, with the same seeds; the same command resumes after an interrupt.
 
     Args:
-        feedforward: Which to compare.
-        controller: Controllers of your own beside them, as my_file.py:MyFeedforward or motion=my_file.py:MyMotion.
-        seeds: Runs of each case; by default 10, 3 if quick.
-        random: Random scenarios; by default 300, 20 if quick.
-        quick: A selection of cases with fewer laps: two minutes instead of half an hour.
-        workers: Processes on this machine; by default one a core.
-        out: Folder for report.html, the tables as Markdown and JSON, the figures and the runs.
+        feedforward: Feedforwards to compare.
+        controller: Controllers of your own to compare, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion.
+        seeds: Number of runs of each case; by default 10, or 3 with --quick.
+        random: Number of random scenarios; by default 300, or 20 with --quick.
+        quick: Run a selection of cases with fewer laps, in two minutes instead of half an hour.
+        workers: Number of processes on this machine; by default one for each core.
+        out: Folder for report.html, the tables in Markdown and JSON, the figures and the runs.
     """
     from mrctl.experiments import suite as uncertainty
 
-    usual = (3, 20) if quick else (10, 300)
-    runs = (usual[0] if seeds is None else seeds), (usual[1] if random is None else random)
-    found = uncertainty.suite(feedforward, controller, *runs, quick, workers, out)
+    default_seeds, default_random = (3, 20) if quick else (10, 300)
+    seeds = default_seeds if seeds is None else seeds
+    random = default_random if random is None else random
+    report = uncertainty.suite(feedforward, controller, seeds, random, quick, workers, out)
     print(f"{(out / 'table.md').read_text()}\nReport: {out / 'report.html'}")
-    if found.aside:
-        raise _Incomplete(f"{found.aside}; the same command tries them again")
+    if report.aside:
+        raise _Incomplete(f"{report.aside}; the same command tries them again")
 
 
 def tune(
@@ -233,11 +290,11 @@ def tune(
     """Designs the velocity PID from equation (3), measures its loops on the physics, and says where learning is safe.
 
     Args:
-        world: World or MJCF file with the robot.
-        time_constant: Closed-loop time constant in s.
-        delay: Loop delays in s beside the hold, whole control periods.
+        world: World to measure in: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file.
+        time_constant: Time constant of the closed velocity loop in s.
+        delay: Delays of the loop in s beside the sample and hold, each a multiple of the control period.
         out: Folder for the table, the measured responses and a figure of them.
-        json: Print JSON.
+        json: Print JSON instead of a table.
     """
     from mrctl.experiments import tuning
 
@@ -251,14 +308,14 @@ def identify(
     seed: int = 0,
     json: bool = False,
 ) -> None:
-    """Identifies the constants of equation (3) from two drives, with intervals, beside those of the model.
+    """Identifies the constants of equation (3) from two drives, with intervals, and compares them with the model's.
 
     Args:
-        world: Level world to drive in.
-        robot: Whose constants.
-        perturbation: How the plant differs from its model, and the noise of its sensors.
-        seed: Of signals and noise.
-        json: Print JSON.
+        world: World to drive in, which must be level: `flat`, or the path of an MJCF file.
+        robot: Robot to identify; by default the world's own.
+        perturbation: Differences of the plant from its model, and the noise of its sensors.
+        seed: Seed of the test signals and of the noise.
+        json: Print JSON instead of a table.
     """
     from mrctl.experiments import identify as identification
 
@@ -266,14 +323,14 @@ def identify(
 
 
 def train(out: Path = Path("composite.safetensors"), plants: int = 120, seed: int = 0) -> None:
-    """Trains the features of `composite` and their prior on randomised plants; under five minutes.
+    """Trains the features of the `composite` feedforward on randomised plants, in less than five minutes.
 
-    A run takes the file with --composite.weights; without, it takes the one that ships with the package.
+    `mrctl run --composite.weights FILE` uses them; by default a run uses the features that come with mrctl.
 
     Args:
-        out: File for the weights.
-        plants: Randomised plants; a third as many more are held out.
-        seed: Of plants, references and initial network.
+        out: File for the trained features and their prior.
+        plants: Number of randomised plants to train on; a third as many more are held out for validation.
+        seed: Seed of the plants, the references and the initial network.
     """
     from mrctl.experiments import train as training
 
@@ -288,16 +345,16 @@ def check(
     chassis: str = "",
     json: bool = False,
 ) -> None:
-    """Runs the physics checks on a robot and says what in its model is the likely cause of a failure; under a minute.
+    """Runs the physics checks on a robot in less than a minute, and names the likely cause of a failure in its model.
 
-    Exit status 1 if a check fails.
+    The exit status is 1 if a check fails.
 
     Args:
-        robot: MJCF file of a robot, with a level floor or without; by default the shipped one.
-        wheels: Joints of the driven wheels, left and right; by default the two with a <dcmotor>.
-        steering: Joints of what is steered; by default the upright ones with an actuator.
-        chassis: Body that carries them; by default the root.
-        json: Print JSON.
+        robot: MJCF file of a robot, with or without a level floor; by default the robot that comes with mrctl.
+        wheels: Joints of the two driven wheels, left and right; by default the two with a <dcmotor>.
+        steering: Joints of the steered wheels, at most two; by default the upright joints with an actuator.
+        chassis: Body that carries the wheels; by default the one at their root.
+        json: Print JSON instead of a table.
     """
     from mrctl.checks import command as checking
 
@@ -308,10 +365,10 @@ def check(
 
 
 def bench(json: bool = False) -> None:
-    """Measures the closed loop with on-line learning beside the engine's own speed on this machine; under two minutes.
+    """Measures the speed of the closed loop with on-line learning and of the engine alone, in less than two minutes.
 
     Args:
-        json: Print JSON.
+        json: Print JSON instead of a table.
     """
     from mrctl.experiments import bench as benchmark
 
@@ -331,12 +388,12 @@ def view(
     """Shows robots in the browser: a live session of a scenario, or the replay of a result or sweep.
 
     Args:
-        file: Scenario file, or what `mrctl run --out` or `mrctl sweep` wrote; by default the default scenario, live.
-        compare: Feedforwards that drive ghosts beside the scenario's own, with the same seed and events.
-        number: Run of a result or sweep to begin with.
-        export: Writes one HTML file that plays by itself, instead of serving a page.
-        host: Address to listen on; other than 127.0.0.1 lets others in, without asking them who they are.
-        port: Port to listen on.
+        file: Scenario file, or result of `mrctl run --out` or `mrctl sweep`; by default a live default scenario.
+        compare: Feedforwards of further robots, which are shown as ghosts with the same seed and events.
+        number: Number of the run to show first, in a result or sweep.
+        export: HTML file to write instead of serving a page; it plays without a server.
+        host: Address to listen on; an address other than 127.0.0.1 lets others in without a password.
+        port: Number of the port to listen on.
     """
     from mrctl.viewer.view import view as show
 
@@ -353,10 +410,10 @@ def export(
     """Writes a result for other tools: ROS 2 messages, a table, or NumPy arrays.
 
     Args:
-        file: What `mrctl run --out` or `mrctl sweep` wrote.
-        to: Format.
+        file: Result of `mrctl run --out` or `mrctl sweep`.
+        to: Format of the file: ROS 2 messages (`mcap`), a table (`csv`, `parquet`) or NumPy arrays (`npz`).
         out: File to write.
-        number: One run; by default all, numbered in a column or before each topic.
+        number: Number of the run to write; by default all runs, whose numbers are in a column or before each topic.
     """
     from mrctl.results import export as exporting
     from mrctl.sweep import store

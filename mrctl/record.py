@@ -1,4 +1,4 @@
-"""Typed, frozen configuration: the base of everything that is read from a file."""
+"""The base class of all settings: typed and frozen records that are read from TOML and validated."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 
 class InputError(ValueError):
-    """Bad input from outside: one line that names the field or the file."""
+    """Input from outside is invalid; the message is one line that names the field or the file."""
 
 
 class Record(BaseModel):
-    """A frozen record: unknown keys and non-finite numbers are refused by name."""
+    """A frozen record of settings, which refuses unknown keys and numbers that are not finite.
+
+    The docstring under a field is its description in help texts and in the viewer.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
@@ -24,11 +27,11 @@ class Record(BaseModel):
         """Validates plain data.
 
         Args:
-            values: What a TOML or JSON file holds.
-            source: Where it came from, for the message.
+            values: A dictionary of the fields, as read from a TOML or JSON file.
+            source: Name of the file or of the record, which begins the error message.
 
         Raises:
-            InputError: One line that names the first offending field.
+            InputError: A field is unknown, missing or out of range; the message names the first one.
         """
         try:
             return cls.model_validate(values)
@@ -40,7 +43,7 @@ class Record(BaseModel):
         """Reads and validates a TOML file.
 
         Raises:
-            InputError: The file cannot be read, is not TOML, or names a bad field.
+            InputError: The file cannot be read, is not TOML, or has an invalid field.
         """
         try:
             text = Path(path).read_bytes().decode()
@@ -53,7 +56,10 @@ class Record(BaseModel):
         return cls.from_dict(values, str(path))
 
     def to_toml(self) -> str:
-        """The record as `from_toml` reads it, complete, a field a line and an element of a list a line."""
+        """Returns all fields as TOML that `from_toml` reads back, with one line for each field.
+
+        A list of records has one line for each of its elements.
+        """
         return "".join(
             f"{name} = {_toml(value, nested=False)}\n"
             for name, value in self.model_dump(mode="json", exclude_none=True).items()
@@ -61,7 +67,7 @@ class Record(BaseModel):
 
 
 def _toml(value: Any, nested: bool = True) -> str:  # noqa: ANN401
-    """A value in TOML, whose numbers, booleans and, but for one character, strings are JSON's."""
+    """Returns a value as TOML; numbers, booleans and strings are written as in JSON, except for one character."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list) and not nested and any(isinstance(item, dict) for item in value):
@@ -72,7 +78,7 @@ def _toml(value: Any, nested: bool = True) -> str:  # noqa: ANN401
 
 
 def describe(error: ValidationError, source: str = "") -> str:
-    """One line for a pydantic error: `source: field.subfield: what is wrong`."""
+    """Returns a pydantic error as one line: `source: field.subfield: reason`."""
     first, *rest = error.errors()
     field = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")

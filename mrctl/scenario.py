@@ -1,4 +1,7 @@
-"""The complete description of a run, as data: read from TOML, edited from Python, source of the command-line flags."""
+"""The complete description of a run as data.
+
+A `Scenario` is read from TOML or made in Python; its fields are the flags of `mrctl run` and the viewer's controls.
+"""
 
 from __future__ import annotations
 
@@ -21,31 +24,31 @@ from mrctl.theory.robot import CAR, RobotFile, Steering
 
 FeedforwardName = Literal["none", "model", "oracle", "observer", "fel", "rls", "composite"]
 FEEDFORWARDS: tuple[FeedforwardName, ...] = ("none", "model", "oracle", "observer", "fel", "rls", "composite")
-LONGEST = 10_000_000  # control periods in a run; its record takes 290 bytes each
-
+LONGEST = 10_000_000
+"""Largest number of control periods in a run; the record of one takes 290 bytes."""
 
 Spread = Annotated[float, Field(ge=0, le=0.2)]
 
 
 class Event(Record):
-    """Something that happens at one moment of a run. What is left out stays as it is."""
+    """A change at one moment of a run; fields that are left out change nothing."""
 
     time: Annotated[float, Field(ge=0, le=1e8)]
-    """When, in s; takes effect at the first control tick that is not before."""
+    """Time of the event in s; it takes effect at the first control tick that is not earlier."""
     perturbation: Perturbation | None = None
-    """The plant's complete perturbation from now on."""
+    """Perturbation of the plant from then on, which replaces the one before."""
     push: tuple[float, float, float] | None = None
-    """Forces along the world's x and y on the chassis in N, torque about z in N·m."""
+    """Push on the chassis: forces along the world's x and y in N, and a torque about z in N·m."""
     push_duration: Annotated[float, Field(gt=0, le=10)] = 0.1
-    """How long the push lasts in s."""
+    """Duration of the push in s."""
     reference: Reference | None = None
-    """What to follow from now on, from its own start; laps are still counted by the first reference."""
+    """Reference from then on, which begins at its own start; laps are still counted by the scenario's reference."""
     kanayama: Kanayama | None = None
-    """New gains of the motion controller."""
+    """Gains of the motion controller from then on."""
     pid: Pid | None = None
-    """New design of the velocity controller."""
+    """Settings of the velocity PID from then on."""
     learning: bool | None = None
-    """Switches learning on or off."""
+    """Whether the feedforward learns from then on."""
 
     def tick(self, period: float) -> int:
         """The first control tick that is not before the event; `period` is the control period in s."""
@@ -53,28 +56,28 @@ class Event(Record):
 
 
 class Scenario(Record):
-    """One run. A run is a pure function of its scenario."""
+    """One run of a robot along a reference; the same scenario gives the same result, bit for bit."""
 
     name: str = ""
-    """Label of the run in tables and figures; by default the feedforward's name."""
+    """Label of the run in tables and figures; by default the name of the feedforward."""
     world: str = "flat"
-    """`flat`, `slope`, `rough`, `patch`, or the path of an MJCF file."""
+    """World to drive in: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file."""
     robot: RobotFile = CAR
-    """Whose robot drives there; by default the world's own."""
+    """Robot that drives; by default the world's own."""
     steering: Steering = "compliant"
-    """Steering arrangement of the front wheel."""
+    """Servo of the front wheel: soft (`compliant`), none, so that the wheel trails (`caster`), or stiff (`rigid`)."""
     reference: Reference = Lemniscate()
-    """What the robot shall follow."""
+    """Reference trajectory that the robot follows."""
     laps: Annotated[int, Field(ge=1, le=10_000)] = 8
-    """How often."""
+    """Number of laps."""
     feedforward: FeedforwardName = "fel"
-    """Feedforward of the velocity controller."""
+    """Feedforward that is added to the velocity PID; `none` is PID alone."""
     measurement: Literal["truth", "odometry"] = "truth"
-    """What the controller sees: the true pose and twist, or encoders and gyro."""
+    """Measurement that the controller receives: true pose and twist, or odometry from wheel encoders and a gyro."""
     kanayama: Kanayama = Kanayama()
-    """Motion controller."""
+    """Gains of the motion controller."""
     pid: Pid = Pid()
-    """Feedback part of the velocity controller."""
+    """Settings of the velocity PID."""
     fel: Fel = Fel()
     """Settings of the `fel` feedforward."""
     rls: Rls = Rls()
@@ -84,25 +87,25 @@ class Scenario(Record):
     composite: Composite = Composite()
     """Settings of the `composite` feedforward."""
     guard: Guard = Guard()
-    """Watchdog on a feedforward that learns."""
+    """Settings of the guard, which limits or stops a learner that makes the loop worse."""
     perturbation: Perturbation = Perturbation()
-    """How the plant differs from the model, from the start."""
+    """Differences of the plant from its model from the start, such as a mass factor or a payload."""
     events: tuple[Event, ...] = ()
-    """What happens during the run."""
+    """Changes during the run."""
     initial_pose: tuple[float, float, float] | None = None
-    """Posture at the start in m, m, rad; by default the reference's own."""
+    """Pose at the start: x and y in m, θ in rad; by default that of the reference."""
     initial_spread: tuple[Spread, Spread, Annotated[float, Field(ge=0, le=0.5)]] = (0.02, 0.02, 0.03)
-    """Standard deviations of the seeded offset from that posture in m, m, rad."""
+    """Standard deviations of a random offset from that pose: x and y in m, θ in rad."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    """Seed of the initial offset, the initial weights and the sensor noise."""
+    """Seed of the random numbers: initial offset, initial weights and sensor noise."""
     prefilter: Annotated[float, Field(ge=0.01, le=1)] = 0.05
-    """Time constant of the filter on what the motion controller adds to the reference, s."""
+    """Time constant in s of the filter on the velocities that the motion controller adds to the reference."""
     physics_step: Annotated[float, Field(ge=1e-5, le=0.01)] = 0.002
-    """Time step of the physics in s."""
+    """Duration of one physics step in s."""
     control_period: Annotated[float, Field(ge=1e-3, le=0.1)] = 0.01
-    """Period of the velocity controller, a multiple of `physics_step`, s."""
+    """Period of the velocity controller in s, a multiple of the physics step."""
     motion_period: Annotated[float, Field(ge=1e-3, le=1)] = 0.01
-    """Period of the motion controller, a multiple of `control_period`, s."""
+    """Period of the motion controller in s, a multiple of the control period."""
 
     @model_validator(mode="after")
     def _multiples(self) -> Scenario:
@@ -117,10 +120,10 @@ class Scenario(Record):
         return self
 
     def with_event(self, event: Event) -> Scenario:
-        """The same run with one event more.
+        """Returns the scenario with one more event.
 
         Raises:
-            InputError: It does not fit the run.
+            InputError: The event does not fit the run.
         """
         values = {name: getattr(self, name) for name in Scenario.model_fields}
         return Scenario.from_dict(values | {"events": (*self.events, event)})
@@ -132,15 +135,21 @@ class Scenario(Record):
 
     @property
     def ticks(self) -> int:
-        """Control periods in the run."""
+        """Number of control periods in the run."""
         return round(self.duration / self.control_period)
 
 
 def whole(value: float, unit: float, name: str, unit_name: str) -> int:
-    """How many `unit` fit in `value`.
+    """Returns the whole number of units in a duration.
+
+    Args:
+        value: Duration in s.
+        unit: Duration of one unit in s.
+        name: Name of the duration for the message.
+        unit_name: Name of the unit for the message.
 
     Raises:
-        ValueError: It is no whole number.
+        ValueError: The duration is not a whole multiple of the unit, to 1 part in 10⁹.
     """
     count = round(value / unit)
     if abs(count * unit - value) > 1e-9 * max(unit, value):

@@ -1,4 +1,4 @@
-"""The closed loop as environments for reinforcement learning: `dm_env` and Gymnasium.
+"""The closed loop as environments for reinforcement learning, for `dm_env` and for Gymnasium.
 
-Imports the loop.
+Imports the floors up to `mrctl.loop`.
 """

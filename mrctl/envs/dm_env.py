@@ -1,4 +1,4 @@
-"""Tracking as `dm_env` tasks, through `dm_control.rl.control.Environment`, in the manner of a suite domain.
+"""Tracking as `dm_env` environments, built on `dm_control.rl.control` like a domain of `dm_control.suite`.
 
 `SUITE["residual"]()` makes an environment; after `register()`, so does `dm_control.suite.load("mrctl", "residual")`.
 """
@@ -27,7 +27,9 @@ SUITE = containers.TaggedTasks()
 
 
 class Tracking(control.Task):
-    """Follow the reference of a scenario. The first episode has the scenario's seed, the others draw theirs.
+    """A task in which one robot follows the reference of a scenario.
+
+    The first episode has the seed of the scenario; each later one draws a seed.
 
     Attributes:
         episodes: The closed loop.
@@ -37,9 +39,12 @@ class Tracking(control.Task):
         """Stands the robot on its reference.
 
         Args:
-            scenario: Whose physics, reference, controllers and events.
-            action: As for `Episodes`.
-            random: For the seeds of the later episodes; by default seeded by the scenario.
+            scenario: The scenario.
+            action: Meaning of an action, as for `mrctl.envs.episodes.Episodes`.
+            random: Seed or generator that the seeds of the later episodes are drawn from; by default the scenario's.
+
+        Raises:
+            InputError: The scenario is invalid.
         """
         self.episodes = Episodes([scenario], action)
         seed = scenario.seed if random is None else random
@@ -48,51 +53,59 @@ class Tracking(control.Task):
         self.visualize_reward = False
 
     def initialize_episode(self, physics: Physics) -> None:
-        """Begins again with the next seed."""
+        """Begins an episode with the next seed."""
         self.episodes.begin_all([self._next])
         self._next = int(self._random.randint(2**32, dtype=np.uint32))
 
     def before_step(self, action: Array, physics: Physics) -> None:
-        """Events, measurement, control."""
+        """Applies the events, measures, and sends the commands of one control period; the action has shape `(2,)`."""
         self.episodes.act(np.asarray(action, float)[None])
         self.episodes.plant.send(self.episodes.decide())
 
     def after_step(self, physics: Physics) -> None:
-        """Readouts, record, failures."""
+        """Reads the state after the physics steps, records it, and finds failures."""
         self.episodes.plant.look()
         self.episodes.settle()
 
     def action_spec(self, physics: Physics) -> specs.BoundedArray:
-        """Two numbers; see `Episodes`."""
+        """Returns the bounds of an action, `(2,)`, in the units of `mrctl.envs.episodes.Episodes`."""
         bound = self.episodes.bound
         return specs.BoundedArray((2,), float, -bound, bound, name="action")
 
     def get_observation(self, physics: Physics) -> dict[str, Array]:
-        """As named in `mrctl.envs.episodes.OBSERVATIONS`."""
+        """Returns the quantities of `mrctl.envs.episodes.OBSERVATIONS` by name."""
         seen = self.episodes.observe()[0][0]
         ends = np.cumsum(list(OBSERVATIONS.values()))
         return dict(zip(OBSERVATIONS, np.split(seen, ends[:-1]), strict=True))
 
     def get_reward(self, physics: Physics) -> float:
-        """See `Episodes.observe`."""
+        """Returns the reward of the last control period, from 0 to 1; see `mrctl.envs.episodes.Episodes.observe`."""
         return float(self.episodes.observe()[1][0])
 
     def get_termination(self, physics: Physics) -> float | None:
-        """Discount 0 where the robot has failed, 1 at the end of the scenario, None before."""
+        """Returns discount 0 where the robot has failed, 1 at the end of the scenario, and None before."""
         return 0.0 if self.episodes.plant.failed[0] else 1.0 if self.episodes.over()[0] else None
 
 
 class Environment(control.Environment):
-    """`dm_control`'s environment for a robot that stands up by itself, and whose task judges its state."""
+    """The environment of `dm_control` around a `Tracking` task, which itself places the robot and finds failures."""
 
     def __init__(self, task: Tracking, **settings: Any) -> None:  # noqa: ANN401
-        """Takes a task, and what `dm_control.rl.control.Environment` takes beside physics and rates."""
+        """Builds the environment of a task.
+
+        Args:
+            task: The task.
+            settings: Further arguments of `dm_control.rl.control.Environment`, such as `flat_observation`.
+        """
         plant = task.episodes.plant
         assert isinstance(plant, PhysicsPlant)
         super().__init__(plant.physics, task, n_sub_steps=plant.substeps, legacy_step=False, **settings)
 
     def reset(self) -> dm_env.TimeStep:
-        """Begins an episode. The context that the base class resets in would leave forces in the solver's memory."""
+        """Begins an episode.
+
+        The method of the base class is not used, because it would leave forces of the last episode in the solver.
+        """
         self._reset_next_step = False
         self._step_count = 0
         self._task.initialize_episode(self._physics)
@@ -100,12 +113,13 @@ class Environment(control.Environment):
         return dm_env.restart(control.flatten_observation(observation) if self._flat_observation else observation)
 
     def step(self, action: Array) -> dm_env.TimeStep:
-        """One control period."""
+        """Runs one control period; a state that blows up ends the episode instead of raising an error."""
         with self._physics.suppress_physics_errors():
             return super().step(action)
 
 
 def _add(action: Action) -> None:
+    """Adds the task with this meaning of an action to the suite."""
     def task(
         scenario: Scenario | str | Path | None = None,
         random: int | np.random.RandomState | None = None,
@@ -114,7 +128,7 @@ def _add(action: Action) -> None:
         return Environment(Tracking(read(scenario), action, random), **(environment_kwargs or {}))
 
     task.__name__ = action
-    task.__doc__ = f"Tracking where the action is the {action}; one lap by default."
+    task.__doc__ = f"Makes an environment in which an action is a {action}; the scenario is one lap by default."
     SUITE.add("tracking")(task)
 
 
@@ -123,7 +137,7 @@ for _action in ACTION_KINDS:
 
 
 def register() -> None:
-    """Makes the tasks known to `dm_control.suite` as the domain `mrctl`; importing that takes seconds."""
+    """Registers the tasks as the domain `mrctl` of `dm_control.suite`, whose import takes seconds."""
     from dm_control import suite
 
-    suite._DOMAINS["mrctl"] = sys.modules[__name__]  # which is how its own domains are found
+    suite._DOMAINS["mrctl"] = sys.modules[__name__]  # as the suite does with its own domains

@@ -1,5 +1,5 @@
-"""The robot in MuJoCo: MJCF files, compiled models, perturbations of them, and the plant that is stepped.
+"""The robot in MuJoCo, from its MJCF file to the plant that the control loop steps.
 
-One robot runs through dm_control, many on `mujoco.batch`, with the same bits.
-Imports `mrctl.kernel` and `mrctl.theory`.
+One robot runs through dm_control and many run on `mujoco.batch`; both give the same bits.
+Imports `mrctl.kernel`, `mrctl.record` and `mrctl.theory`.
 """

@@ -1,9 +1,9 @@
-"""Somebody's robot on one of our floors: any MJCF with two driven wheels, under the names of `physics.elements`.
+"""Brings the robot of any MJCF file with two driven wheels into a world, under the names of `mrctl.physics.elements`.
 
-The file is taken apart, not changed: its robot moves into the world with P at the origin of `chassis`, x ahead and z
-up; driven wheels turn forwards under positive voltage and touch the floor with spheres of their own radius, because
-cylinders scrub on their edges; a caster that does not roll is without friction, because a contact that slides hops;
-no other geom collides.
+The robot of the world is replaced; both files stay as they are. In the compiled model P is the origin of the body
+`chassis`, with x ahead and z up, and the driven wheels turn forwards under positive voltage. The wheels touch the floor
+with spheres of their own radius, because cylinders scrub on their edges. A caster that does not roll is frictionless,
+because a contact that slides hops. No other geom of the robot collides.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -19,39 +19,44 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.physics.elements import FRONTS, MOTORS, REAR, RIGID, has
+from mrctl.physics.elements import FRONTS, MOTORS, NUMERICS, REAR, RIGID, has
 from mrctl.physics.files import robot_path
 from mrctl.record import InputError
 from mrctl.theory.robot import RobotFile
 
 Array = NDArray[np.float64]
 
-PREFIX = "robot/"  # of whatever keeps its name
+PREFIX = "robot/"  # put before each name of the robot's file that is not replaced
 UP = np.array([0.0, 0.0, 1.0])
-LEVEL = 0.1  # of the wheel radius: how near to the floor a caster reaches
+LEVEL = 0.1  # tolerance, as a share of the wheel radius, within which a caster is on the floor or two are one
 HINGE = mujoco.mjtJoint.mjJNT_HINGE
 DCMOTOR = '<dcmotor joint="{}" gear="N" motorconst="k k" resistance="R" armature="J" ctrlrange="-U U"/>'
 
 
-
-
-
-
 class Wheel(NamedTuple):
-    """Something on the floor: where it touches, in the world of the file as it stands."""
+    """A wheel or caster of the robot's file."""
 
     body: str
-    joint: str  # that it rolls on; empty if it slides, without friction
+    """Name of its body."""
+    joint: str
+    """Name of the joint on which it rolls; empty for a caster that slides."""
     centre: Array
+    """Its centre in the file's world in m, `(3,)`."""
     radius: float
+    """Distance of the centre from the floor in m."""
     friction: float
+    """Coulomb coefficient of its geom."""
 
 
 def compiled(robot: RobotFile, world: Path) -> mujoco.MjModel:
-    """Compiles a world with another robot than its own.
+    """Compiles a world with the robot of another file in place of its own.
+
+    Args:
+        robot: The robot's file, and the names of those parts that are ambiguous in it.
+        world: Path of the world's MJCF file.
 
     Raises:
-        InputError: The file is no MJCF, the robot has not what it needs, or more than one of it and no name; one line.
+        InputError: A file is no MJCF, or a part of the robot is missing, ambiguous or impossible.
     """
     path = robot_path(robot)
     try:
@@ -61,7 +66,10 @@ def compiled(robot: RobotFile, world: Path) -> mujoco.MjModel:
 
 
 class _Adoption:
-    """A robot's file, what was found in it, and how it is changed; left and right are as the robot drives."""
+    """A robot's MJCF file, the parts that were identified in it, and the changes that bring it into a world.
+
+    Left and right are those of the robot as it drives ahead.
+    """
 
     def __init__(self, robot: RobotFile, path: Path) -> None:
         self.spec = mujoco.MjSpec.from_file(str(path))
@@ -81,57 +89,65 @@ class _Adoption:
         self.motors = [self._motor(name) for name in self.wheels]
         self.front = [self._steered_wheel(name) for name in self.steered] or self._casters()
 
-    # -- what the file holds ----------------------------------------------------------------------------------------
+    # -- identification of the parts -----------------------------------------------------------------------------------
 
     def _driven(self, names: Sequence[str]) -> list[str]:
-        found = list(names) or [
+        """Returns the joints of the two driven wheels: those named, or those with a `<dcmotor>`."""
+        joints = list(names) or [
             a.target for a in self.spec.actuators if a.gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR and self._is_hinge(a)
         ]
-        if len(set(found)) != 2:
-            hinges = [j for j in self._hinges() if abs(self._axis(j)[2]) < 0.5]
+        if len(set(joints)) != 2:
+            level = [j for j in self._hinges() if abs(self._axis(j)[2]) < 0.5]
             raise InputError(
-                f"wheels: {len(found)} joints have a <dcmotor>; name the joints of the two driven wheels, "
-                f"of {_listed(hinges)}, and give each {DCMOTOR.format('JOINT')}"
+                f"wheels: {len(joints)} joints have a <dcmotor>; name the joints of the two driven wheels, "
+                f"of {_listed(level)}, and give each {DCMOTOR.format('JOINT')}"
             )
-        return [self._hinge(name, "wheels") for name in found]
+        return [self._hinge(name, "wheels") for name in joints]
 
     def _steered(self, names: Sequence[str]) -> list[str]:
+        """Returns the joints of the steered wheels, at most two: those named, or the upright ones with an actuator."""
         moved = {a.target for a in self.spec.actuators if self._is_hinge(a)}
         upright = [name for name in self._hinges() if abs(self._axis(name)[2]) > 0.9 and name in moved]
-        found = list(names) or upright
-        if len(found) > 2:
-            raise InputError(f"steering: {_listed(found)} are upright joints with an actuator; name one or two of them")
-        return [self._hinge(name, "steering") for name in found]
+        joints = list(names) or upright
+        if len(joints) > 2:
+            raise InputError(
+                f"steering: {_listed(joints)} are upright joints with an actuator; name one or two of them"
+            )
+        return [self._hinge(name, "steering") for name in joints]
 
     def _carrier(self, name: str, wheels: Sequence[str]) -> str:
+        """Returns the body that carries both wheels: the one named, or their root."""
         bodies = [body.name for body in self.spec.bodies]
         if name and name not in bodies:
-            raise InputError(f"chassis: no body {name!r}, but {_listed(bodies[1:])}")
+            raise InputError(f"chassis: no body {name!r}; the file has {_listed(bodies[1:])}")
         roots = {self._lineage(joint)[-1] for joint in wheels}
-        found = name or roots.pop()
-        if any(found not in self._lineage(joint) for joint in wheels):
-            raise InputError(f"chassis: the wheels {_listed(wheels)} do not both hang on {found!r}")
-        if found in (self._lineage(joint)[0] for joint in wheels):
-            raise InputError(f"chassis: the wheel {_listed(wheels)} is a body without a chassis")
-        return found
+        chassis = name or roots.pop()
+        if any(chassis not in self._lineage(joint) for joint in wheels):
+            raise InputError(f"chassis: the body {chassis!r} does not carry both wheels, {_listed(wheels)}")
+        if chassis in (self._lineage(joint)[0] for joint in wheels):
+            raise InputError(f"chassis: the body {chassis!r} is moved by a wheel joint, of {_listed(wheels)}, itself")
+        return chassis
 
     def _directions(self, wheels: Sequence[str], steered: Sequence[str]) -> tuple[Array, Array]:
-        """Where ahead and left are, level unit vectors: to what is steered, or along the chassis' x axis."""
+        """Returns the level unit vectors ahead and to the left in the file's world, `(3,)` each.
+
+        Ahead is where the steered wheels are, or the side of the chassis' x axis where none is steered.
+        """
         axle = self._axis(wheels[0])
         if abs(axle @ self._axis(wheels[1])) < 0.99 or abs(axle[2]) > 0.1:
             raise InputError(f"wheels: the axes of {_listed(wheels)} are not one level axle")
         ahead = np.cross(axle, UP) / np.linalg.norm(np.cross(axle, UP))
         if steered:
             anchors = [np.mean([self.data.joint(n).xanchor for n in names], axis=0) for names in (steered, wheels)]
-            there = anchors[0] - anchors[1]
+            front = anchors[0] - anchors[1]
         else:
-            there = self.data.body(self.chassis).xmat.reshape(3, 3)[:, 0]
-        if there @ ahead < -1e-6:
+            front = self.data.body(self.chassis).xmat.reshape(3, 3)[:, 0]
+        if front @ ahead < -1e-6:
             ahead = -ahead
         return ahead, np.cross(UP, ahead)
 
     def _wheel(self, joint: str) -> Wheel:
-        """A wheel by the lowest of its body's geoms."""
+        """Describes a wheel, whose radius and friction are those of the lowest geom of its body."""
         body = self._lineage(joint)[0]
         geoms = [g for g in range(self.model.ngeom) if self.model.geom_bodyid[g] == self.model.body(body).id]
         if not geoms:
@@ -139,42 +155,45 @@ class _Adoption:
         return self._contact(min(geoms, key=self._bottom), body, joint)
 
     def _steered_wheel(self, steering: str) -> Wheel:
-        """The wheel that rolls below a steered joint."""
+        """Describes the wheel that rolls below a steered joint."""
         fork = self._lineage(steering)[0]
         rolling = [
             name for name in self._hinges() if fork in self._lineage(name) and abs(self._axis(name) @ self.left) > 0.9
         ]
         if len(rolling) != 1:
-            raise InputError(f"steering: below joint {steering!r} are {len(rolling)} joints to roll on, not one")
+            raise InputError(f"steering: joint {steering!r} carries {len(rolling)} rolling joints, not one")
         return self._wheel(rolling[0])
 
     def _casters(self) -> list[Wheel]:
-        """What else reaches the floor: colliding geoms, or any if there are none; one where several share a place."""
+        """Describes the one or two casters: geoms beside the wheels that reach the floor.
+
+        Geoms that collide are preferred to those that do not, and geoms at the same place count as one.
+        """
         floor = np.mean([wheel.centre[2] - wheel.radius for wheel in self.rear])
-        own = {wheel.body for wheel in self.rear}
+        wheels = {wheel.body for wheel in self.rear}
         low = [
             g for g in range(self.model.ngeom)
-            if self.chassis in (line := self._line(self.model.geom_bodyid[g])) and not own & set(line)
+            if self.chassis in (line := self._ancestry(self.model.geom_bodyid[g])) and not wheels & set(line)
             and self._bottom(g) - floor < LEVEL * self.radius
         ]  # fmt: skip
-        found: list[Wheel] = []
+        casters: list[Wheel] = []
         colliding = [g for g in low if self.model.geom_contype[g] or self.model.geom_conaffinity[g]]
         for g in colliding or low:
             body = self.model.body(self.model.geom_bodyid[g])
-            at = self.data.geom_xpos[g]
-            if all(np.hypot(*(at - other.centre)[:2]) > LEVEL * self.radius for other in found):
+            centre = self.data.geom_xpos[g]
+            if all(np.hypot(*(centre - other.centre)[:2]) > LEVEL * self.radius for other in casters):
                 caster = self._contact(g, body.name, self._roller(body.name))
-                found.append(caster._replace(radius=at[2] - floor))  # wherever its own lowest point is
-        across = [(w.centre - self.origin) @ self.ahead for w in found]
-        if not found:
+                casters.append(caster._replace(radius=centre[2] - floor))  # so that it touches the wheels' floor
+        if not casters:
             raise InputError("caster: beside the driven wheels nothing reaches the floor, and nothing is steered")
-        if len(found) > 2 or min(across) * max(across) < 0:
-            names = _listed([w.body for w in found])
+        distances = [(caster.centre - self.origin) @ self.ahead for caster in casters]
+        if len(casters) > 2 or min(distances) * max(distances) < 0:
+            names = _listed([caster.body for caster in casters])
             raise InputError(f"caster: at most two, both ahead of the axle or both behind, not on {names}")
-        return sorted(found, key=lambda w: -(w.centre @ self.left))
+        return sorted(casters, key=lambda caster: -(caster.centre @ self.left))
 
     def _roller(self, body: str) -> str:
-        """The joint on which a caster's body rolls, a ball or a level hinge; empty if it only slides."""
+        """Returns the joint on which a caster's body rolls, a ball or a level hinge; empty where it slides."""
         joints = [j for j in range(self.model.njnt) if self.model.jnt_bodyid[j] == self.model.body(body).id]
         if body == self.chassis or len(joints) != 1 or not self.model.joint(joints[0]).name:
             return ""
@@ -183,46 +202,52 @@ class _Adoption:
         return self.model.joint(joints[0]).name if ball or (kind == HINGE and level) else ""
 
     def _contact(self, geom: int, body: str, joint: str) -> Wheel:
+        """Describes a wheel by one of its geoms, whose height above its lowest point is the radius."""
         centre = self.data.geom_xpos[geom].copy()
         return Wheel(body, joint, centre, centre[2] - self._bottom(geom), float(self.model.geom_friction[geom, 0]))
 
     def _motor(self, joint: str) -> str:
-        moved = [a for a in self.spec.actuators if self._is_hinge(a) and a.target == joint]
-        if len(moved) != 1 or moved[0].gaintype != mujoco.mjtGain.mjGAIN_DCMOTOR:
-            what = (
-                "has no actuator" if not moved else f"is driven by {_listed([a.name or 'an actuator' for a in moved])}"
-            )
-            raise InputError(
-                f"motor: wheel {joint!r} {what}, not by one <dcmotor>; mrctl commands volts: {DCMOTOR.format(joint)}"
-            )
-        moved[0].name = moved[0].name or f"motor of {joint}"
-        index = moved[0].id
+        """Returns the name of the one `<dcmotor>` that drives a wheel."""
+        actuators = [a for a in self.spec.actuators if self._is_hinge(a) and a.target == joint]
+        if len(actuators) != 1 or actuators[0].gaintype != mujoco.mjtGain.mjGAIN_DCMOTOR:
+            names = _listed([a.name or "an actuator" for a in actuators])
+            drive = f"is driven by {names}, not by one <dcmotor>" if actuators else "has no actuator"
+            raise InputError(f"motor: wheel {joint!r} {drive}; mrctl commands volts: {DCMOTOR.format(joint)}")
+        motor = actuators[0]
+        motor.name = motor.name or f"motor of {joint}"
+        index = motor.id
         resistance, constant = self.model.actuator_gainprm[index, :2]
         supply = self.model.actuator_ctrlrange[self.model.actuator_ctrladr[index], 1]
         for name, value in (("resistance", resistance), ("motorconst", constant), ("ctrlrange", supply)):
             if not value > 0:
-                raise InputError(f"motor: {moved[0].name!r} has no {name}: {DCMOTOR.format(joint)}")
-        return moved[0].name
+                raise InputError(f"motor: {motor.name!r} has no {name}: {DCMOTOR.format(joint)}")
+        return motor.name
 
     def _is_hinge(self, actuator: Any) -> bool:  # noqa: ANN401
+        """Tells whether an actuator moves a hinge joint with a name."""
         return actuator.trntype == mujoco.mjtTrn.mjTRN_JOINT and actuator.target in self._hinges()
 
     def _hinges(self) -> list[str]:
+        """Names all hinge joints of the file."""
         joints = (self.model.joint(j) for j in range(self.model.njnt))
         return [joint.name for joint in joints if joint.type[0] == HINGE]
 
     def _hinge(self, name: str, field: str) -> str:
+        """Returns the name of a hinge joint, or refuses the field that holds it."""
         if name not in self._hinges():
-            raise InputError(f"{field}: no hinge joint {name!r}, but {_listed(self._hinges())}")
+            raise InputError(f"{field}: no hinge joint {name!r}; the file has {_listed(self._hinges())}")
         return name
 
     def _axis(self, joint: str) -> Array:
+        """Returns the axis of a hinge in the file's world, a unit vector `(3,)`."""
         return self.data.joint(joint).xaxis
 
     def _side(self, joint: str) -> float:
+        """Returns how far a joint is to the right of P in m, by which joints are sorted from left to right."""
         return -float((self.data.joint(joint).xanchor - self.origin) @ self.left)
 
-    def _line(self, body: int) -> list[str]:
+    def _ancestry(self, body: int) -> list[str]:
+        """Names a body and those that carry it, up to the root."""
         line = []
         while body:
             line.append(self.model.body(body).name)
@@ -230,11 +255,11 @@ class _Adoption:
         return line
 
     def _lineage(self, joint: str) -> list[str]:
-        """The body of a joint and those that carry it, up to the root."""
-        return self._line(self.model.joint(joint).bodyid[0])
+        """Names the body of a joint and those that carry it, up to the root."""
+        return self._ancestry(self.model.joint(joint).bodyid[0])
 
     def _bottom(self, geom: int) -> float:
-        """Height of the lowest point of a geom."""
+        """Returns the height of the lowest point of a geom in m; infinite for one that cannot be a wheel."""
         size, up = self.model.geom_size[geom], np.round(self.data.geom_xmat[geom].reshape(3, 3)[2], 6)
         height, kind, shape = self.data.geom_xpos[geom][2], self.model.geom_type[geom], mujoco.mjtGeom
         if kind == shape.mjGEOM_SPHERE:
@@ -253,23 +278,23 @@ class _Adoption:
             return height - np.abs(up) @ size
         return np.inf
 
-    # -- how it is changed ------------------------------------------------------------------------------------------
+    # -- changes -------------------------------------------------------------------------------------------------------
 
     def into(self, world: Path) -> mujoco.MjModel:
-        """The world with this robot instead of its own."""
+        """Compiles a world with this robot in place of its own."""
         spec = mujoco.MjSpec.from_file(str(world))
         if (own := spec.body("chassis")) is None:
-            raise InputError(f"world: {world} has no body 'chassis' whose place another robot could take")
+            raise InputError(f"world: {world} has no body 'chassis', which another robot could replace")
         floors = [(p.geomname1, p.name, np.array(p.friction)) for p in spec.pairs if p.geomname2 == "wheel_left"]
-        pattern = next(p for p in spec.pairs if p.geomname2 == "wheel_left")
-        tyre = {n: np.array(getattr(pattern, n)) for n in ("solref", "solreffriction", "solimp")}
-        usual = next(friction[0] for _, name, friction in floors if name == "tyre_left")
+        pair = next(p for p in spec.pairs if p.geomname2 == "wheel_left")
+        solver = {n: np.array(getattr(pair, n)) for n in ("solref", "solreffriction", "solimp")}
+        ordinary = next(friction[0] for _, name, friction in floors if name == "tyre_left")
         spec.delete(own)
         for numeric in list(spec.numerics):
             spec.delete(numeric)
         self._strip()
-        self._turn()
-        names = self._names()
+        self._align()
+        names = self._renamed()
         spec.worldbody.add_frame().attach_body(self.spec.body(self.chassis), PREFIX, "")
         for kind, old, new in names:
             element = getattr(spec, kind)(PREFIX + old)
@@ -279,11 +304,11 @@ class _Adoption:
         spec.body("chassis").add_freejoint(name="chassis")
         if self.steered:
             self._add_steering(spec)
-        # Friction is a tyre's own on an ordinary floor; what the world says is slippery stays so in proportion.
+        # A tyre has its own friction on the ordinary floor, and less in proportion where the world is slippery.
         for geom, wheel in (*zip(REAR, self.rear, strict=True), *zip(self._front_names(), self.front, strict=True)):
             for floor, name, friction in floors:
-                mu = wheel.friction * friction[0] / usual
-                pair = spec.add_pair(geomname1=floor, geomname2=geom, condim=3 if wheel.joint else 1, **tyre)
+                mu = wheel.friction * friction[0] / ordinary
+                pair = spec.add_pair(geomname1=floor, geomname2=geom, condim=3 if wheel.joint else 1, **solver)
                 pair.friction[:] = mu, mu, *friction[2:]
                 pair.name = name.replace("left", geom.removeprefix("wheel_")) if name else ""
         self._add_numbers(spec)
@@ -294,19 +319,25 @@ class _Adoption:
         return spec.compile()
 
     def _strip(self) -> None:
-        """Leaves out what belongs to the file's own world, or names what gets another name."""
+        """Removes what the robot does not need: sensors, key frames, contacts, and its own steering actuators.
+
+        Couplings of steered or driven wheels go too, as the linkage and the floor replace them.
+        """
         spec = self.spec
         steering = [a for a in spec.actuators if a.target in self.steered]
         coupled = [e for e in spec.equalities if {e.name1, e.name2} & {*self.steered, *self.wheels}]
         for element in [*spec.sensors, *spec.keys, *spec.pairs, *spec.excludes, *steering, *coupled]:
             spec.delete(element)
-        spec.compiler.inertiafromgeom = 2  # auto: inertias that were found once stay
+        spec.compiler.inertiafromgeom = 2  # auto: an inertial that is written, as that of the moved chassis, is kept
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = 0
-            geom.group = geom.group or 1  # rays that look for the ground see group 0
+            geom.group = geom.group or 1  # rays that look for the ground see only group 0
 
-    def _turn(self) -> None:
-        """Moves the chassis' frame to P, x ahead, z up; positive turns of wheels and fork are ahead and left."""
+    def _align(self) -> None:
+        """Moves the chassis' frame to P, with x ahead and z up.
+
+        Wheels then turn forwards, and a fork turns to the left, in the positive direction of their joints.
+        """
         chassis, model = self.spec.body(self.chassis), self.model
         for name in (*self.wheels, *self.steered, *(w.joint for w in self.front if w.joint)):
             joint = self.spec.joint(name)
@@ -316,11 +347,10 @@ class _Adoption:
         for name in self.motors:
             motor = self.spec.actuator(name)
             motor.gear = np.abs(motor.gear)
-        place, turn = self._in_chassis(), np.zeros(4)
-        mujoco.mju_mat2Quat(turn, place.T.ravel())
+        rotation = self._rotation()
         body, data = model.body(self.chassis), self.data.body(self.chassis)
-        shift = place @ (data.xpos - self.origin)  # of the old frame in the new one
-        turned = place @ data.xmat.reshape(3, 3)
+        shift = rotation @ (data.xpos - self.origin)  # of the old frame in the new one
+        turned = rotation @ data.xmat.reshape(3, 3)
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, turned.ravel())
         for name, wheel in (*zip(REAR, self.rear, strict=True), *zip(self._front_names(), self.front, strict=True)):
@@ -344,25 +374,27 @@ class _Adoption:
         for joint in list(chassis.joints):
             self.spec.delete(joint)
 
-    def _in_chassis(self) -> Array:
-        """Rotation from the file's world to the chassis' new frame, `(3, 3)`."""
+    def _rotation(self) -> Array:
+        """Returns the rotation from the file's world to the chassis' new frame, `(3, 3)`."""
         return np.stack([self.ahead, self.left, UP])
 
     def _add_contact(self, name: str, wheel: Wheel) -> None:
+        """Adds the sphere with which a wheel touches the floor."""
         body = self.data.body(wheel.body)
-        at = body.xmat.reshape(3, 3).T @ (wheel.centre - body.xpos)
+        position = body.xmat.reshape(3, 3).T @ (wheel.centre - body.xpos)
         self.spec.body(wheel.body).add_geom(
-            name=f"contact {name}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[wheel.radius, 0, 0], pos=at, mass=0,
+            name=f"contact {name}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[wheel.radius, 0, 0], pos=position, mass=0,
             contype=0, conaffinity=0, group=3, rgba=[1, 0.5, 0, 0.3],
         )  # fmt: skip
 
     def _front_names(self) -> tuple[str, ...]:
+        """Returns the names, of `FRONTS`, that the steered wheels or casters get."""
         if self.steered:
             return FRONTS[:1] if len(self.steered) == 1 else FRONTS[1:3]
         return FRONTS[3 : 3 + len(self.front)]
 
-    def _names(self) -> Iterable[tuple[str, str, str]]:
-        """What gets another name: kind, old and new."""
+    def _renamed(self) -> Iterable[tuple[str, str, str]]:
+        """Lists the elements that get another name: kind, old name, new name."""
         yield "body", self.chassis, "chassis"
         wheels = (*zip(REAR, self.rear, strict=True), *zip(self._front_names(), self.front, strict=True))
         for name, wheel in wheels:
@@ -379,19 +411,20 @@ class _Adoption:
             yield "joint", joint, f"steering_{name}"
 
     def _add_steering(self, spec: mujoco.MjSpec) -> None:
-        """A servo with position and rate set-points; two wheels hang on it by a linkage of Ackermann's geometry.
+        """Adds a servo with set-points of angle and rate, and the linkage of two steered wheels.
 
-        With the middle of the front axle at φ, a wheel at y to the left is at atan(L tan φ/(L − y tan φ)).
+        Ackermann's geometry turns a wheel at y to the left by atan(L tan φ/(L − y tan φ)), where φ is the steering
+        angle of the middle of the front axle and L the wheelbase.
         """
-        servos = [k for k in range(len(self.model.actuator_trntype)) if self._trains(k)]
+        servos = [k for k in range(len(self.model.actuator_trntype)) if self._turns_steering(k)]
         kp, kv = (sum(-self.model.actuator_biasprm[k, i] for k in servos) for i in (1, 2))
         if not kp > 0:
             raise InputError(f"steering: {_listed(self.steered)} needs a <position> or <pid> actuator with a kp")
         ranges = [self.model.joint(name).range for name in self.steered]
         limit = min(float(np.abs(r).min()) for r in ranges)
         if not 0 < limit < np.pi / 2:
-            raise InputError(f"steering: {_listed(self.steered)} needs a range on both sides of straight on, below 90°")
-        anchors = [self._in_chassis() @ (self.data.joint(name).xanchor - self.origin) for name in self.steered]
+            raise InputError(f"steering: {_listed(self.steered)} needs a range below 90° on either side of straight on")
+        anchors = [self._rotation() @ (self.data.joint(name).xanchor - self.origin) for name in self.steered]
         if len(anchors) == 2:
             length, track = float(np.mean([a[0] for a in anchors])), float(anchors[0][1] - anchors[1][1])
             limit = float(np.arctan(length / (length / np.tan(limit) + track / 2)))
@@ -400,7 +433,8 @@ class _Adoption:
                 name="fork", pos=(length, 0.0, float(np.mean([a[2] for a in anchors])))
             )
             fork.mass, fork.inertia, fork.explicitinertial = 1e-6, np.full(3, 1e-9), True
-            # A rack as heavy as what it moves, and slower than the 2 ms in which the engine damps implicitly.
+            # The rack has the inertia of the wheels that it turns. The second term keeps its time constant J/k_v above
+            # the 2 ms of the default physics step.
             fork.add_joint(name="steering", type=HINGE, axis=UP, armature=inertia + 0.002 * kv)
             for name, anchor in zip(FRONTS[1:3], anchors, strict=True):
                 phi = np.linspace(-limit, limit, 201)
@@ -420,17 +454,18 @@ class _Adoption:
         spec.add_text(name=RIGID, data="the wheels go where the servo says")
 
     def _in_degrees(self, steered: int) -> bool:
-        """Whether the joint `steering` is one of the file's own, and the file counts in degrees."""
+        """Tells whether the joint `steering` is one of the file's own and its file gives angles in degrees."""
         return steered == 1 and bool(self.spec.compiler.degree)
 
-    def _trains(self, actuator: int) -> bool:
+    def _turns_steering(self, actuator: int) -> bool:
+        """Tells whether an actuator moves a steered joint."""
         joints = [self.model.joint(name).id for name in self.steered]
-        joint = self.model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
-        return bool(joint) and self.model.actuator_trnid[actuator, 0] in joints
+        on_joint = self.model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+        return bool(on_joint) and self.model.actuator_trnid[actuator, 0] in joints
 
     def _add_numbers(self, spec: mujoco.MjSpec) -> None:
-        """What an MJCF does not know by itself, from its numerics, or nothing."""
-        for name, count in (("no_load_current", 1), ("limits", 4)):
+        """Copies the file's numerics for what MJCF has no element for, with zeros where the file has none."""
+        for name, count in NUMERICS.items():
             values = self.model.numeric(name).data if has(self.model, "numeric", name) else np.zeros(count)
             if len(values) != count:
                 raise InputError(f"numeric {name} needs {count} value{'s' * (count > 1)}")
@@ -438,4 +473,5 @@ class _Adoption:
 
 
 def _listed(names: Iterable[str]) -> str:
+    """Returns the names in quotes for a message, or `none`."""
     return ", ".join(repr(name) for name in names) or "none"

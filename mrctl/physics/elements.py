@@ -1,4 +1,4 @@
-"""Names of the elements that a compiled robot has, and look-ups by name."""
+"""The names that bodies, joints, geoms and actuators of a compiled robot have, and look-ups by these names."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -12,56 +12,68 @@ import numpy as np
 from numpy.typing import NDArray
 
 REAR = ("wheel_left", "wheel_right")
+"""Names of the driven wheels: of body, joint and geom alike."""
 
 MOTORS = ("motor_left", "motor_right")
+"""Names of the actuators of the driven wheels."""
 
-# What else a robot may stand on: one steered wheel, two, or casters.
 FRONTS = ("front_wheel", "front_left", "front_right", "caster_left", "caster_right")
+"""Geoms on which a robot may stand beside the driven wheels: one steered wheel, two of them, or casters."""
 
-RIGID = "servo_steering"  # text in a model whose wheels are steered by servos, not by the road
+NUMERICS = {"no_load_current": 1, "limits": 4}
+"""Numerics that every model holds, with their lengths: the no-load current in A, and the robot's limits on V in m/s, on
+θ̇ in rad/s, on V̇ in m/s² and on θ̈ in rad/s²."""
 
+RIGID = "servo_steering"
+"""Name of the text element in an adopted model whose steered wheels are held by servos."""
 
 
 def has(model: mujoco.MjModel, kind: str, name: str) -> bool:
-    """Whether a model has an element of that name."""
+    """Tells whether a model has an element of this kind (`body`, `joint`, `geom`, …) and name."""
     return mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name) >= 0
 
 
-
 def fronts(model: mujoco.MjModel) -> list[str]:
-    """What else the robot stands on: geoms of one front wheel, of two, or of casters."""
+    """Names those geoms of `FRONTS` that the model has."""
     return [name for name in FRONTS if has(model, "geom", name)]
 
 
-
 def rolling_fronts(model: mujoco.MjModel) -> list[str]:
-    """Those of `fronts` that roll instead of sliding."""
+    """Names those geoms of `fronts` that roll on a joint of the same name; a caster without one slides."""
     return [name for name in fronts(model) if has(model, "joint", name)]
 
 
-
 def bodies_of(model: mujoco.MjModel) -> list[int]:
-    """The bodies of the robot."""
+    """Lists the indices of the robot's bodies, which are the chassis and all that it carries."""
     chassis = model.body("chassis").id
     return [body for body in range(model.nbody) if model.body_rootid[body] == chassis]
 
 
-
 def centres(model: mujoco.MjModel, data: mujoco.MjData, wheels: Sequence[str]) -> NDArray[np.float64]:
-    """Centres of wheels from P in the chassis' frame, `(n, 3)` in m, to the picometre."""
+    """Returns the centres of wheels from P in the chassis' frame, to the picometre.
+
+    Args:
+        model: Compiled model.
+        data: Its data, with kinematics computed.
+        wheels: Names of n geoms.
+
+    Returns:
+        Positions in m, `(n, 3)`.
+    """
     chassis = data.body("chassis")
     return np.array([rounded(chassis.xmat.reshape(3, 3).T @ (data.geom(w).xpos - chassis.xpos)) for w in wheels])
 
 
-
-def rounded(position: NDArray) -> NDArray:
-    """Positions in m to the picometre."""
-    return np.round(position, 12)  # 0.40 − 0.37 is 0.03
-
+def rounded(length: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rounds lengths in m, of any shape, to the picometre: an MJCF's 0.40 − 0.37 is to be 0.03."""
+    return np.round(length, 12)
 
 
-def tyre_pairs(model: mujoco.MjModel) -> list[int]:
-    """The contact pairs of the rear left wheel, the named tyre pair first."""
+def left_tyre_pairs(model: mujoco.MjModel) -> list[int]:
+    """Lists the indices of the rear left wheel's contact pairs with the floors.
+
+    The pair `tyre_left`, which is the one with the ordinary floor, comes first.
+    """
     wheel = model.geom("wheel_left").id
     pairs = [p for p in range(model.npair) if wheel in (model.pair_geom1[p], model.pair_geom2[p])]
     return sorted(pairs, key=lambda p: model.pair(p).name != "tyre_left")

@@ -1,4 +1,4 @@
-"""The shipped MJCF files, and the paths that stand for them."""
+"""Finds MJCF files: the worlds and robots that come with mrctl by their names, and others by their paths."""
 
 from __future__ import annotations
 
@@ -8,28 +8,26 @@ from pathlib import Path
 from mrctl.record import InputError
 from mrctl.theory.robot import RobotFile
 
-SHIPPED = ("car", "turtlebot", "racecar")  # robots among the models, which are no worlds
-
+SHIPPED = ("car", "turtlebot", "racecar")
+"""Names of the shipped robots; the other shipped files are worlds, and `scenery`, which the worlds include."""
 
 
 def models_folder() -> Path:
-    """The folder of the shipped MJCF files, in a checkout and in an installed wheel."""
+    """Returns the folder of the shipped MJCF files, in a checkout and in an installed wheel."""
     inside = Path(str(resources.files("mrctl"))) / "models"
     return inside if inside.is_dir() else Path(__file__).resolve().parents[2] / "models"
 
 
-
 def find(name: str) -> Path:
-    """The file of a shipped name, or the path itself if it ends in `.xml`."""
+    """Returns the path of a shipped file by its name, or `name` itself where it ends in `.xml`; it need not exist."""
     return Path(name) if name.endswith(".xml") else models_folder() / f"{name}.xml"
 
 
-
 def robot_path(robot: RobotFile) -> Path:
-    """The file of a robot.
+    """Returns the path of a robot's MJCF file.
 
     Raises:
-        InputError: There is none; the message lists the shipped robots.
+        InputError: The file does not exist or is no robot; the message lists the shipped robots.
     """
     path = find(robot.path)
     if not path.is_file() or not (robot.path.endswith(".xml") or robot.path in SHIPPED):
@@ -37,12 +35,14 @@ def robot_path(robot: RobotFile) -> Path:
     return path
 
 
-
 def world_path(world: str) -> Path:
-    """The file of a world: one of the shipped names, or a path that ends in `.xml`.
+    """Returns the path of a world's MJCF file.
+
+    Args:
+        world: The name of a shipped world, or a path that ends in `.xml`.
 
     Raises:
-        InputError: No such file; the message lists the shipped worlds.
+        InputError: The file does not exist or is a robot; the message lists the shipped worlds.
     """
     if world in SHIPPED:
         raise InputError(f"world: {world} is a robot; name it as robot.path")

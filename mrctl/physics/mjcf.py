@@ -1,4 +1,8 @@
-"""MJCF in, compiled model out: a world, the robot that drives in it, and its steering arrangement."""
+"""Compiles a world with a robot in one of its steering arrangements, and refuses a model that cannot be driven.
+
+The other files of this folder work on the compiled model: `elements` names its parts, `parameters` reads the constants
+of equations (1) to (3) from it, `perturb` changes them, `stand` places the robot, and `plant` steps it.
+"""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -15,22 +19,19 @@ import mujoco
 import numpy as np
 
 from mrctl.physics import adopt
-from mrctl.physics.elements import MOTORS, RIGID, fronts, has, tyre_pairs
+from mrctl.physics.elements import MOTORS, NUMERICS, RIGID, fronts, has, left_tyre_pairs
 from mrctl.physics.files import robot_path, world_path
 from mrctl.physics.parameters import load_torques, read_robot
 from mrctl.record import InputError
 from mrctl.theory.robot import ANY_ANGLE, CAR, GRAVITY, STEERINGS, Robot, RobotFile, Steering
 
-# Elements that the robot of a world must name; `load_robot` names those of any other.
 REQUIRED = {
     "body": ("chassis", "wheel_left", "wheel_right", "fork", "front_wheel"),
     "joint": ("chassis", "wheel_left", "wheel_right", "steering", "front_wheel"),
     "geom": ("wheel_left", "wheel_right", "front_wheel"),
     "actuator": (*MOTORS, "steering"),
 }
-
-NUMERICS = {"no_load_current": 1, "limits": 4}  # and how many values they hold
-
+"""Names that the parts of a world's own robot must have, by kind; `mrctl.physics.adopt` gives them to any other."""
 
 
 def build(
@@ -39,33 +40,34 @@ def build(
     timestep: float | None = None,
     robot: RobotFile = CAR,
 ) -> tuple[mujoco.MjModel, Robot]:
-    """Compiles a world with the robot in one of the three steering arrangements.
+    """Compiles a world with a robot in one of its steering arrangements.
 
     Args:
         world: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file.
-        steering: `compliant` is the MJCF as it stands; `caster` and `rigid` take their stiffness, damping and trail
-            from the model's numerics `steering_caster` and `steering_rigid`. A robot that is not the world's own has
-            one arrangement: see `steerings`.
+        steering: Steering arrangement, one of `steerings`. The default robot is `compliant` as its MJCF stands;
+            `caster` and `rigid` take stiffness (N·m/rad), damping (N·m·s/rad) and trail (m) of the fork from the
+            numerics `steering_caster` and `steering_rigid`.
         timestep: Time step of the physics in s; by default the file's own.
-        robot: Whose robot drives there; by default the world's own.
+        robot: The robot that drives there; by default the world's own.
 
     Returns:
         The compiled model, and the parameters of its robot.
 
     Raises:
-        InputError: The file is missing, does not compile, lacks a named element, or holds a robot that makes no sense.
+        InputError: A file is missing or does not compile, an element is missing, the robot is not driven with this
+            steering, or a parameter of the robot is out of range.
     """
     path = world_path(world)
-    foreign = None if robot == CAR else adopt.compiled(robot, path)
-    source = path if foreign is None else robot_path(robot)
+    adopted = None if robot == CAR else adopt.compiled(robot, path)
+    source = path if adopted is None else robot_path(robot)
     try:
-        model = foreign or mujoco.MjModel.from_xml_path(str(path))
+        model = adopted or mujoco.MjModel.from_xml_path(str(path))
         offered = steerings(model)
-        if foreign and steering not in offered:
+        if adopted and steering not in offered:
             raise InputError(f"steering: {robot.path} is driven with {' or '.join(offered)}, not {steering}")
-        _complete(model, steering)
-        if foreign:
-            _limit(model)
+        _check_elements(model, steering)
+        if adopted and not np.any(model.numeric("limits").data):
+            _derive_limits(model)
         nominal = read_robot(model)
         if steering != "compliant" and len(offered) > 1:
             _rearrange(model, nominal, steering)
@@ -75,7 +77,6 @@ def build(
     if timestep is not None:
         model.opt.timestep = timestep
     return model, nominal
-
 
 
 def load(
@@ -91,21 +92,21 @@ def load(
 def load_robot(
     path: str | Path, wheels: Sequence[str] = (), steering: str | Sequence[str] = (), chassis: str = ""
 ) -> RobotFile:
-    """Names the robot of any MJCF file for `Scenario.robot`, after trying it on a level floor.
+    """Describes the robot of an MJCF file for `Scenario.robot`, and compiles it on a level floor as a check.
 
-    Two wheels must be driven by a `<dcmotor>` each, whose `ctrlrange` is the supply. One wheel may be steered, or two
-    by Ackermann's geometry, by a `<position>` or `<pid>` actuator; without, it is a differential drive, and what else
-    touches the floor is its caster, without friction unless it rolls. The file's own floor is left out, and wheels roll
-    on spheres of their radius.
+    Two wheels must be driven by one `<dcmotor>` each, whose `ctrlrange` is the supply. One wheel may be steered by a
+    `<position>` or `<pid>` actuator, or two by Ackermann's geometry. A robot without a steered wheel is a differential
+    drive, and whatever else touches the floor is its caster, which is frictionless unless it rolls. The file's own
+    floor is left out, and the wheels roll on spheres of their radius.
 
     Args:
-        path: `turtlebot`, `racecar`, or an MJCF file.
+        path: `turtlebot`, `racecar`, or the path of an MJCF file.
         wheels: Joints of the two driven wheels; by default the two with a `<dcmotor>`.
-        steering: Joint or joints of what is steered; by default the upright ones with an actuator.
-        chassis: The body that carries them; by default the root.
+        steering: Joint or joints of the steered wheels; by default the upright joints with an actuator.
+        chassis: Body that carries the wheels; by default the root of the wheels.
 
     Raises:
-        InputError: One line that says what is missing or ambiguous, or cannot be.
+        InputError: The file has no such robot; the message says which part is missing, ambiguous or impossible.
     """
     steered = (steering,) if isinstance(steering, str) else tuple(steering)
     values = {"path": str(path), "wheels": tuple(wheels), "steering": steered, "chassis": chassis}
@@ -114,44 +115,38 @@ def load_robot(
     return robot
 
 
-
 def arrangement(robot: RobotFile) -> Steering:
-    """The steering arrangement that a robot is driven with unless one asks for another.
+    """Returns the steering arrangement that a robot is driven with by default.
 
     Raises:
-        InputError: As `load`.
+        InputError: The file has no robot that can be driven.
     """
     return "compliant" if robot == CAR else steerings(adopt.compiled(robot, world_path("flat")))[0]
 
 
-
 def steerings(model: mujoco.MjModel) -> tuple[Steering, ...]:
-    """The arrangements that a compiled robot can be driven with, its own first.
+    """Lists the steering arrangements that a compiled robot can be driven with, the default one first.
 
-    A differential drive is `caster`: the torque difference alone makes θ̇. An adopted robot whose wheels are held by
-    servos is `rigid`. The default robot has all three.
+    A differential drive is `caster`, because the torque difference alone makes θ̇. An adopted robot whose wheels are
+    steered by servos is `rigid`. The default robot has all three.
     """
     if not has(model, "joint", "steering"):
         return ("caster",)
     return ("rigid",) if has(model, "text", RIGID) else STEERINGS
 
 
-
 def reverses(model: mujoco.MjModel, steering: Steering) -> bool:
-    """Whether a robot can be driven backwards: a trailing fork would jackknife."""
+    """Tells whether a robot can be driven backwards; a fork that trails would jackknife."""
     return steering == "rigid" or not has(model, "joint", "steering")
 
 
+def _derive_limits(model: mujoco.MjModel) -> None:
+    """Derives the numeric `limits` of a robot whose file has none from its motors and its grip.
 
-def _limit(model: mujoco.MjModel) -> None:
-    """Gives a robot whose file has no numeric `limits` some, from its motors and its grip.
-
-    With the default robot's numbers they come out near its own: 64 % of the no-load speed, a sixth of the acceleration
-    at stall, a fifth (along) and half (across) of the tyres' grip.
+    The shares are chosen so that the default robot's numbers come out near its own limits: 64 % of the no-load speed,
+    a sixth of the acceleration at stall, and of the tyres' grip a fifth along and a half across.
     """
-    if np.any(model.numeric("limits").data):
-        return
-    model.numeric("limits").data[:] = 1.0
+    model.numeric("limits").data[:] = 1.0  # so that the robot is valid and can be read
     robot = read_robot(model)
     grip = robot.tyre_friction * GRAVITY
     speed = 0.64 * robot.velocity_gain * robot.supply
@@ -163,12 +158,11 @@ def _limit(model: mujoco.MjModel) -> None:
     model.numeric("limits").data[:] = speed, rotation, acceleration, 2 * rotation * acceleration / speed
 
 
-
-def _complete(model: mujoco.MjModel, steering: Steering) -> None:
-    """Refuses a model without the elements that the rest of this module reads by name.
+def _check_elements(model: mujoco.MjModel, steering: Steering) -> None:
+    """Refuses a model without the elements that the other files of this folder read by name.
 
     Raises:
-        InputError: The first that is missing or of another kind.
+        InputError: An element is missing or of the wrong type; the message names the first one.
     """
     arranged = steering == "compliant" or len(steerings(model)) == 1
     numerics = NUMERICS if arranged else NUMERICS | {f"steering_{steering}": 3}
@@ -187,13 +181,15 @@ def _complete(model: mujoco.MjModel, steering: Steering) -> None:
             raise InputError(f"actuator {name} must be a <dcmotor>")
     if required and model.actuator_ctrlnum[model.actuator("steering").id] != 2:
         raise InputError("actuator steering must be a <pid> with position and velocity inputs")
-    if not tyre_pairs(model):
+    if not left_tyre_pairs(model):
         raise InputError("no contact pair between the wheels and a floor")
 
 
-
 def _rearrange(model: mujoco.MjModel, robot: Robot, steering: Steering) -> None:
-    """Gives the fork another stiffness, damping and trail; rolling losses follow the load that the trail moves."""
+    """Gives the fork the stiffness, damping and trail of another steering arrangement.
+
+    The trail moves load between the wheels, and the rolling losses in their frictionloss follow the load.
+    """
     before = load_torques(model)
     stiffness, damping, trail = model.numeric(f"steering_{steering}").data
     model.actuator("steering").biasprm[1:3] = -stiffness, -damping
@@ -203,22 +199,23 @@ def _rearrange(model: mujoco.MjModel, robot: Robot, steering: Steering) -> None:
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-
 def clone(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy that can be perturbed."""
+    """Returns a copy of a model, which can be perturbed while the original stays nominal."""
     return copy.copy(model)
 
 
-
 def digest(model: mujoco.MjModel) -> str:
-    """Tells whether two compiled models are the same, byte for byte, wherever the files lie that they came from."""
-    found = hashlib.sha256()
+    """Returns a SHA-256 digest of a compiled model, equal where two models hold the same bytes.
+
+    Names and paths of the files that the model was compiled from are left out.
+    """
+    sha256 = hashlib.sha256()
     for part in (model, model.opt, model.stat):
         for name, value in getmembers(part):
-            # Names of files, how long they are, and where the model lies in memory.
+            # Paths of files, their lengths and addresses, and private attributes, which differ between equal models.
             if name.startswith("_") or name in ("paths", "npaths") or name.endswith("pathadr"):
                 continue
             if isinstance(value, (np.ndarray, int, float, bytes)):
                 array = np.asarray(value)
-                found.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
-    return found.hexdigest()
+                sha256.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
+    return sha256.hexdigest()

@@ -1,4 +1,4 @@
-"""Reads the parameters of equations (1) to (3) out of a compiled model."""
+"""Reads the parameters of equations (1) to (3), and the load on each wheel, out of a compiled model."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -9,31 +9,35 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.physics.elements import REAR, bodies_of, centres, fronts, has, rolling_fronts, rounded, tyre_pairs
+from mrctl.physics.elements import REAR, bodies_of, centres, fronts, has, left_tyre_pairs, rolling_fronts, rounded
 from mrctl.record import InputError
 from mrctl.theory.robot import ANY_ANGLE, GRAVITY, Robot
 
 
 def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
-    """Reads the parameters of equations (1) to (3) out of a compiled model, by element name.
+    """Reads the parameters of equations (1) to (3) out of a compiled model, by element name; it takes a millisecond.
 
-    The rolling coefficient follows from the front wheel's frictionloss (nothing else brakes that wheel; a caster that
-    slides has none); what is left of a rear wheel's frictionloss after rolling and no-load loss is the gearbox.
+    The front wheel's frictionloss is rolling loss alone and gives the rolling coefficient, which is 0 for a caster that
+    slides. A rear wheel's frictionloss is the sum of rolling loss, no-load loss and gearbox loss, which gives the last.
+
+    Args:
+        model: Compiled model.
+        drive_gain: Applied volt per commanded volt, which no model holds.
 
     Raises:
-        InputError: A value that `Robot` refuses, or a rear frictionloss below rolling and no-load loss.
+        InputError: A parameter is out of range, the centre of mass lies outside the wheels, or a rear wheel's
+            frictionloss is smaller than its rolling and no-load losses.
     """
     data, com = at_rest(model)
     bodies = bodies_of(model)
-    masses, centres = model.body_mass[bodies], data.xipos[bodies, :2]
-    inertia = np.sum(masses[:, None] * (centres - np.average(centres, axis=0, weights=masses)) ** 2)
+    masses, positions = model.body_mass[bodies], data.xipos[bodies, :2]
+    inertia = np.sum(masses[:, None] * (positions - np.average(positions, axis=0, weights=masses)) ** 2)
     for body in bodies:
         up = data.ximat[body].reshape(3, 3)[2]
         inertia += up**2 @ model.body_inertia[body]
     radius = np.mean([model.geom(wheel).size[0] for wheel in REAR])
     half_track, wheelbase, trail = _layout(model, data)
-    front = fronts(model)
-    turning = rolling_fronts(model)
+    front_wheels = rolling_fronts(model)
     motor = model.actuator("motor_left")
     gear, constant = motor.gear[0], motor.gainprm[1]
     no_load = model.numeric("no_load_current").data[0]
@@ -41,8 +45,9 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
     if min(load.values()) <= 0:
         raise InputError("com_offset: the centre of mass must lie over the triangle of the wheels")
     rolling = 0.0
-    if turning:
-        rolling = sum(model.joint(f).frictionloss[0] for f in turning) / sum(load[f] for f in turning)
+    if front_wheels:
+        losses = sum(model.joint(wheel).frictionloss[0] for wheel in front_wheels)
+        rolling = losses / sum(load[wheel] for wheel in front_wheels)
     drives = [model.joint(wheel).frictionloss[0] - rolling * load[wheel] for wheel in REAR]
     gear_loss = np.mean(drives) - gear * constant * no_load
     if gear_loss < -1e-9:
@@ -55,7 +60,7 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
             "com_offset": com[0],
             "com_height": com[2] + radius,
             "wheel_radius": radius,
-            "front_wheel_radius": model.geom(front[0]).size[0],
+            "front_wheel_radius": model.geom(fronts(model)[0]).size[0],
             "half_track": half_track,
             "wheelbase": wheelbase,
             "trail": trail,
@@ -69,10 +74,10 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
             "gear_loss": max(0.0, gear_loss),
             "rolling_coefficient": rolling,
             "wheel_inertia": _spin_inertia(model, "wheel_left"),
-            "front_wheel_inertia": sum(_spin_inertia(model, wheel) for wheel in turning),
+            "front_wheel_inertia": sum(_spin_inertia(model, wheel) for wheel in front_wheels),
             "supply": model.actuator_ctrlrange[model.actuator_ctrladr[motor.id], 1],
             "drive_gain": drive_gain,
-            "tyre_friction": model.pair_friction[tyre_pairs(model)[0], 0],
+            "tyre_friction": model.pair_friction[left_tyre_pairs(model)[0], 0],
             "max_speed": limits[0],
             "max_rotation": limits[1],
             "max_acceleration": limits[2],
@@ -82,9 +87,12 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
     )
 
 
-
 def at_rest(model: mujoco.MjModel) -> tuple[mujoco.MjData, NDArray[np.float64]]:
-    """Kinematics as the file places the robot, and its centre of mass from P in the chassis' frame, `(3,)` in m."""
+    """Computes the kinematics of the robot as its file places it.
+
+    Returns:
+        The model's data at that state, and the robot's centre of mass from P in the chassis' frame, `(3,)` in m.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     bodies, chassis = bodies_of(model), data.body("chassis")
@@ -92,9 +100,8 @@ def at_rest(model: mujoco.MjModel) -> tuple[mujoco.MjData, NDArray[np.float64]]:
     return data, chassis.xmat.reshape(3, 3).T @ (com - chassis.xpos)
 
 
-
 def _layout(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float, float]:
-    """Half track, wheelbase and trail in m."""
+    """Returns half track, wheelbase and trail in m; the data holds the kinematics of the robot at rest."""
     (left, right), front = centres(model, data, REAR)[:, 1], centres(model, data, fronts(model))[:, 0].mean()
     axis = front
     if has(model, "joint", "steering"):
@@ -103,9 +110,11 @@ def _layout(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float, f
     return (left - right) / 2, float(axis), float(rounded(axis - front))
 
 
-
 def load_torques(model: mujoco.MjModel) -> dict[str, float]:
-    """Static load on each wheel times its radius in N·m, by the lever rule on level ground."""
+    """Returns the static load on each wheel times its radius in N·m, by geom name.
+
+    The load follows from the lever rule on level ground. It is not positive where the robot would tip over.
+    """
     data, com = at_rest(model)
     half_track, wheelbase, trail = _layout(model, data)
     front, side = com[0] / (wheelbase - trail), com[1] / (2 * half_track)
@@ -115,9 +124,8 @@ def load_torques(model: mujoco.MjModel) -> dict[str, float]:
     return {wheel: float(weight * share * model.geom(wheel).size[0]) for wheel, share in shares.items()}
 
 
-
 def _spin_inertia(model: mujoco.MjModel, wheel: str) -> float:
-    """Inertia of a wheel about its own axle, with the joint's armature but not the motor's."""
+    """Returns the inertia of a wheel about its axle in kg·m², with the joint's armature but without the motor's."""
     body, joint = model.body(wheel), model.joint(wheel)
     frame = np.zeros(9)
     mujoco.mju_quat2Mat(frame, body.iquat)
@@ -125,8 +133,7 @@ def _spin_inertia(model: mujoco.MjModel, wheel: str) -> float:
     return float(axis**2 @ body.inertia + joint.armature[0])
 
 
-
 def _inductance(model: mujoco.MjModel) -> float:
-    """Armature inductance; MuJoCo keeps the electrical time constant L/R as the first dynamics parameter."""
+    """Returns the armature inductance in H; MuJoCo keeps L/R in s as a motor's first dynamics parameter."""
     motor = model.actuator("motor_left")
     return float(model.actuator_dynprm[motor.id, 0] * motor.gainprm[0])

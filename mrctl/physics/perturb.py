@@ -1,4 +1,4 @@
-"""Writes a `Perturbation` into a compiled model."""
+"""Writes a `Perturbation` into a compiled model, and copies the fields that it changes from model to model."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -11,107 +11,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.physics.elements import MOTORS, REAR, bodies_of, rolling_fronts, tyre_pairs
+from mrctl.physics.elements import MOTORS, REAR, bodies_of, left_tyre_pairs, rolling_fronts
 from mrctl.physics.parameters import at_rest, load_torques, read_robot
 from mrctl.record import InputError
 from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.robot import Robot
 
-Fields = dict[str, NDArray]
-
-
-
-def perturb(nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Perturbation) -> None:
-    """Writes `nominal` changed by `perturbation` into `model`, a copy of it, and the constants that follow.
-
-    Rolling losses follow the load: a wheel's share of frictionloss that is rolling grows with the static load on it.
-    Supply, delay and noise are no fields of a model; `mrctl.physics.plant` and `mrctl.sensing.sensors` apply them.
-
-    Raises:
-        InputError: The perturbed robot could not stand (centre of mass outside its wheels or below the ground).
-    """
-    p = perturbation
-    base = read_robot(nominal)
-    chassis, bodies = nominal.body("chassis").id, bodies_of(nominal)
-    model.body_mass[:] = nominal.body_mass
-    model.body_inertia[:] = nominal.body_inertia
-    model.body_mass[bodies] *= p.mass_factor
-    model.body_inertia[bodies] *= p.mass_factor
-    model.body_inertia[chassis, _upright_axis(nominal, chassis)] *= p.inertia_factor
-    model.body_ipos[chassis] = nominal.body_ipos[chassis]
-    model.body_iquat[chassis] = nominal.body_iquat[chassis]
-    if p.payload > 0:
-        at = np.array([p.payload_x, p.payload_y, p.payload_z - base.wheel_radius])
-        _add_point_mass(model, chassis, p.payload, at)
-    for wheel, factor in (("wheel_left", p.left_radius_factor), ("wheel_right", p.right_radius_factor)):
-        geom = nominal.geom(wheel).id
-        model.geom_size[geom] = nominal.geom_size[geom] * factor
-        model.geom_rbound[geom] = nominal.geom_rbound[geom] * factor
-        model.geom_aabb[geom] = nominal.geom_aabb[geom] * factor
-    motors = [nominal.actuator(name).id for name in MOTORS]
-    model.actuator_gainprm[motors] = nominal.actuator_gainprm[motors]
-    model.actuator_gainprm[motors, 0] *= p.resistance_factor
-    model.actuator_gainprm[motors, 1] *= p.motor_constant_factor
-    # A dcmotor keeps L/R: the winding's inductance is the same behind another resistance.
-    model.actuator_dynprm[motors] = nominal.actuator_dynprm[motors]
-    model.actuator_dynprm[motors, 0] /= p.resistance_factor
-    inputs = nominal.actuator_ctrladr[motors]
-    model.actuator_ctrlrange[inputs] = nominal.actuator_ctrlrange[inputs] * max(1.0, p.supply_factor)
-    # The no-load torque k_M I_0 is part of the losses: it grows with them, not with the motor constant.
-    no_load = nominal.numeric("no_load_current").data * p.drive_friction_factor / p.motor_constant_factor
-    model.numeric("no_load_current").data[:] = no_load
-    model.pair_friction[:] = nominal.pair_friction
-    model.pair_friction[:, :2] *= p.tyre_friction_factor
-    model.pair_friction[tyre_pairs(nominal), :2] *= p.left_tyre_friction_factor
-    gx, gy, gz = nominal.opt.gravity
-    c, s = np.cos(p.slope), np.sin(p.slope)
-    model.opt.gravity[:] = c * gx + s * gz, gy, c * gz - s * gx
-    before, after = load_torques(nominal), load_torques(model)
-    if min(after.values()) <= 0:
-        raise InputError("perturbation.payload: the centre of mass lies outside the wheels, the robot would tip over")
-    height = at_rest(model)[1][2] + np.mean([model.geom(wheel).size[0] for wheel in REAR])
-    if height < 0:
-        raise InputError("perturbation.payload_z: the centre of mass lies below the ground")
-    for wheel in (*REAR, *rolling_fronts(nominal)):
-        dof = nominal.joint(wheel).dofadr[0] + np.arange(len(nominal.joint(wheel).frictionloss))
-        drive = 0.0 if wheel not in REAR else base.drive_loss * (p.drive_friction_factor - 1)
-        rolling = base.rolling_coefficient * (after[wheel] - before[wheel])
-        model.dof_frictionloss[dof] = nominal.dof_frictionloss[dof] + drive + rolling
-    mujoco.mj_setConst(model, mujoco.MjData(model))
-
-
-
-def _upright_axis(model: mujoco.MjModel, body: int) -> int:
-    """Which principal axis of a body is nearest to its frame's vertical."""
-    frame = np.zeros(9)
-    mujoco.mju_quat2Mat(frame, model.body_iquat[body])
-    return int(np.argmax(np.abs(frame[6:])))
-
-
-
-def _add_point_mass(model: mujoco.MjModel, body: int, mass: float, at: NDArray) -> None:
-    """Adds a point mass to a body's inertial frame: parallel axes, then principal axes again."""
-    own = model.body_mass[body]
-    frame = np.zeros(9)
-    mujoco.mju_quat2Mat(frame, model.body_iquat[body])
-    frame = frame.reshape(3, 3)
-    centre = model.body_ipos[body].copy()
-    total = own + mass
-    joint = (own * centre + mass * at) / total
-    tensor = frame * model.body_inertia[body] @ frame.T
-    for m, position in ((own, centre), (mass, at)):
-        d = position - joint
-        tensor = tensor + m * (d @ d * np.eye(3) - np.outer(d, d))
-    principal, axes = np.linalg.eigh(tensor)
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, axes.ravel())
-    model.body_mass[body] = total
-    model.body_ipos[body] = joint
-    model.body_inertia[body] = principal
-    model.body_iquat[body] = quat
-
-# Everything that `perturb` and the constants after it can change, as `mujoco.batch` names the fields.
 PERTURBED = (
     "body_mass",
     "body_inertia",
@@ -128,22 +33,123 @@ PERTURBED = (
     "numeric_data",
     "opt.gravity",
 )
+"""The fields of a model that `perturb` writes, as `mujoco.batch` names them."""
 
 
+def perturb(
+    nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Perturbation, robot: Robot | None = None
+) -> None:
+    """Writes the nominal model, changed by a perturbation, into another model, and recomputes its constants.
 
-def fields(model: mujoco.MjModel) -> Fields:
-    """Copies of the fields named in `PERTURBED`."""
+    What an earlier perturbation changed in that model is undone. The rolling loss in a wheel's frictionloss grows with
+    the static load on the wheel. Drive gain, delay and noise are no fields of a model: `mrctl.physics.plant` and
+    `mrctl.sensing.sensors` apply them.
+
+    Args:
+        nominal: The nominal model, which is only read.
+        model: A copy of it, which is written.
+        perturbation: The complete perturbation.
+        robot: The parameters of the nominal model, where they are known; by default they are read from it.
+
+    Raises:
+        InputError: The perturbed robot could not stand: its centre of mass lies outside its wheels or below the ground.
+    """
+    p = perturbation
+    robot = robot or read_robot(nominal)
+    chassis, bodies = nominal.body("chassis").id, bodies_of(nominal)
+    model.body_mass[:] = nominal.body_mass
+    model.body_inertia[:] = nominal.body_inertia
+    model.body_mass[bodies] *= p.mass_factor
+    model.body_inertia[bodies] *= p.mass_factor
+    model.body_inertia[chassis, _upright_axis(nominal, chassis)] *= p.inertia_factor
+    model.body_ipos[chassis] = nominal.body_ipos[chassis]
+    model.body_iquat[chassis] = nominal.body_iquat[chassis]
+    if p.payload > 0:
+        position = np.array([p.payload_x, p.payload_y, p.payload_z - robot.wheel_radius])
+        _add_point_mass(model, chassis, p.payload, position)
+    for wheel, factor in (("wheel_left", p.left_radius_factor), ("wheel_right", p.right_radius_factor)):
+        geom = nominal.geom(wheel).id
+        model.geom_size[geom] = nominal.geom_size[geom] * factor
+        model.geom_rbound[geom] = nominal.geom_rbound[geom] * factor
+        model.geom_aabb[geom] = nominal.geom_aabb[geom] * factor
+    motors = [nominal.actuator(name).id for name in MOTORS]
+    model.actuator_gainprm[motors] = nominal.actuator_gainprm[motors]
+    model.actuator_gainprm[motors, 0] *= p.resistance_factor
+    model.actuator_gainprm[motors, 1] *= p.motor_constant_factor
+    # A <dcmotor> holds L/R; the winding keeps its inductance L when its resistance changes.
+    model.actuator_dynprm[motors] = nominal.actuator_dynprm[motors]
+    model.actuator_dynprm[motors, 0] /= p.resistance_factor
+    inputs = nominal.actuator_ctrladr[motors]
+    model.actuator_ctrlrange[inputs] = nominal.actuator_ctrlrange[inputs] * max(1.0, p.supply_factor)
+    # The no-load torque k_M I_0 is a loss: it grows with the drive friction, and not with the motor constant.
+    no_load = nominal.numeric("no_load_current").data * p.drive_friction_factor / p.motor_constant_factor
+    model.numeric("no_load_current").data[:] = no_load
+    model.pair_friction[:] = nominal.pair_friction
+    model.pair_friction[:, :2] *= p.tyre_friction_factor
+    model.pair_friction[left_tyre_pairs(nominal), :2] *= p.left_tyre_friction_factor
+    gx, gy, gz = nominal.opt.gravity
+    c, s = np.cos(p.slope), np.sin(p.slope)
+    model.opt.gravity[:] = c * gx + s * gz, gy, c * gz - s * gx
+    before, after = load_torques(nominal), load_torques(model)
+    if min(after.values()) <= 0:
+        raise InputError("perturbation.payload: the centre of mass lies outside the wheels, the robot would tip over")
+    height = at_rest(model)[1][2] + np.mean([model.geom(wheel).size[0] for wheel in REAR])
+    if height < 0:
+        raise InputError("perturbation.payload_z: the centre of mass lies below the ground")
+    for wheel in (*REAR, *rolling_fronts(nominal)):
+        dof = nominal.joint(wheel).dofadr[0] + np.arange(len(nominal.joint(wheel).frictionloss))
+        drive = 0.0 if wheel not in REAR else robot.drive_loss * (p.drive_friction_factor - 1)
+        rolling = robot.rolling_coefficient * (after[wheel] - before[wheel])
+        model.dof_frictionloss[dof] = nominal.dof_frictionloss[dof] + drive + rolling
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def _upright_axis(model: mujoco.MjModel, body: int) -> int:
+    """Returns the index of the principal axis of a body that is nearest to the z axis of its frame."""
+    frame = np.zeros(9)
+    mujoco.mju_quat2Mat(frame, model.body_iquat[body])
+    return int(np.argmax(np.abs(frame[6:])))
+
+
+def _add_point_mass(model: mujoco.MjModel, body: int, mass: float, position: NDArray[np.float64]) -> None:
+    """Adds a point mass in kg to a body, at a position `(3,)` in m in the body's frame.
+
+    The parallel-axis theorem gives the tensor about the new centre of mass, whose principal axes MuJoCo stores.
+    """
+    own = model.body_mass[body]
+    frame = np.zeros(9)
+    mujoco.mju_quat2Mat(frame, model.body_iquat[body])
+    frame = frame.reshape(3, 3)
+    own_centre = model.body_ipos[body].copy()
+    total = own + mass
+    centre = (own * own_centre + mass * position) / total
+    tensor = frame * model.body_inertia[body] @ frame.T
+    for m, point in ((own, own_centre), (mass, position)):
+        d = point - centre
+        tensor = tensor + m * (d @ d * np.eye(3) - np.outer(d, d))
+    principal, axes = np.linalg.eigh(tensor)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, axes.ravel())
+    model.body_mass[body] = total
+    model.body_ipos[body] = centre
+    model.body_inertia[body] = principal
+    model.body_iquat[body] = quat
+
+
+def fields(model: mujoco.MjModel) -> dict[str, NDArray]:
+    """Returns copies of the fields named in `PERTURBED`, by name."""
     return {name: np.array(_get(model, name)) for name in PERTURBED}
 
 
-
 def _get(model: mujoco.MjModel, name: str) -> NDArray:
+    """Returns a view of a field, whose name begins with `opt.` where it belongs to the options."""
     return getattr(model.opt, name[4:]) if name.startswith("opt.") else getattr(model, name)
 
 
-
 def write(model: mujoco.MjModel, values: Mapping[str, NDArray]) -> None:
-    """Writes `fields` back and recomputes the constants that follow from them."""
+    """Writes fields, as `fields` returns them, into a model and recomputes the constants that follow from them."""
     for name, value in values.items():
         _get(model, name)[...] = value
     mujoco.mj_setConst(model, mujoco.MjData(model))

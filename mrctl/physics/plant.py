@@ -148,7 +148,7 @@ class Plant(ABC):
         if self._nominal_robots[robot] and perturbation == Perturbation():
             return
         self._nominal_robots[robot] = False
-        perturb(self._nominal, self._scratch, perturbation)
+        perturb(self._nominal, self._scratch, perturbation, self.robot)
         self._write(robot, self._scratch)
         self.truth[robot] = read_robot(self._scratch, perturbation.supply_factor)
         resistance, back_emf, _ = motor_parameters(self._scratch)
@@ -161,7 +161,7 @@ class Plant(ABC):
         Raises:
             InputError: Why.
         """
-        perturb(self._nominal, self._scratch, perturbation)
+        perturb(self._nominal, self._scratch, perturbation, self.robot)
 
     def reset(self, pose: Array, twist: Array) -> None:
         """Stands every robot on the ground, rolling.

@@ -1,4 +1,7 @@
-"""Stands a robot on the ground, rolling, and turns what is steered."""
+"""Computes the state of a robot that stands on the ground and rolls, with its steered wheels turned.
+
+The plant starts a run from that state, and the viewer draws robots in it.
+"""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -19,24 +22,26 @@ from mrctl.theory.robot import Robot
 
 
 class State(NamedTuple):
-    """Generalised positions `(nq,)` and velocities `(nv,)` of one robot."""
+    """Generalised positions `(nq,)` and velocities `(nv,)` of one model, as MuJoCo orders them."""
 
     qpos: NDArray[np.float64]
     qvel: NDArray[np.float64]
 
 
-
 def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | None = None) -> State:
-    """Stands the robot with its wheels on the ground, rolling with a given twist.
+    """Computes the state of a robot that stands on the ground and rolls without slip.
 
-    Rays find the ground under the driven wheels and in the middle under the others; the plane through those three
-    points decides height, roll and pitch.
+    Rays find the ground below each driven wheel, and below the middle of the other wheels. The plane through these
+    three points decides height, roll and pitch. Steered wheels are at the angle at which they do not scrub.
 
     Args:
-        model: Compiled world.
-        pose: Posture `(3,)` of P in m, m, rad.
+        model: Compiled world with the robot.
+        pose: x and y of P in m, and θ in rad, `(3,)`.
         twist: V in m/s and θ̇ in rad/s, `(2,)`.
-        robot: What `read_robot` makes of the model, where that is known.
+        robot: The parameters of the model, where they are known; by default they are read from it.
+
+    Returns:
+        The state, in which no wheel is below the ground.
 
     Raises:
         InputError: There is no ground below the pose.
@@ -46,34 +51,35 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | N
     x, y, theta = pose
     ahead, left = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
     steering = float(np.clip(scrub_free_angle(twist, robot), -robot.steering_limit, robot.steering_limit))
-    reach = robot.wheelbase - robot.trail * np.cos(steering)
-    aside = -robot.trail * np.sin(steering)
+    # The front contact point from P: along the body's x axis and along its y axis.
+    contact_x = robot.wheelbase - robot.trail * np.cos(steering)
+    contact_y = -robot.trail * np.sin(steering)
     floor = np.array(
         [
             ground(model, data, *(np.array([x, y]) + offset))
-            for offset in (robot.half_track * left, -robot.half_track * left, reach * ahead + aside * left)
+            for offset in (robot.half_track * left, -robot.half_track * left, contact_x * ahead + contact_y * left)
         ]
     )
     normal = np.cross(floor[1] - floor[0], floor[2] - floor[0])
     normal /= np.linalg.norm(normal) * np.sign(normal[2])
-    # Distances from that plane: each wheel's centre at its radius. In the body frame the rear centres are (0, ±D, 0).
+    # `up` is the plane's normal in the body frame, where the rear centres are (0, ±D, 0). Each wheel's centre is its
+    # radius away from the plane, which is linear in `up`; the iteration keeps |up| = 1.
     radius_left, radius_right = model.geom("wheel_left").size[0], model.geom("wheel_right").size[0]
     height = (radius_left + radius_right) / 2
     up = np.array([0.0, (radius_left - radius_right) / (2 * robot.half_track), 1.0])
     mujoco.mj_kinematics(model, data)
-    front = fronts(model)
-    centre = np.array([reach, aside, centres(model, data, front)[:, 2].mean()])
+    centre = np.array([contact_x, contact_y, centres(model, data, fronts(model))[:, 2].mean()])
     for _ in range(8):
         up[2] = np.sqrt(1 - up[0] ** 2 - up[1] ** 2)
         up[0] = (robot.front_wheel_radius - height - up[1:] @ centre[1:]) / centre[0]
-    # World from body: `up` becomes `normal`, and body x rises so that it lies over the heading.
+    # The rotation from body to world takes `up` to `normal`, and the body's x axis to one above the heading.
     slope = normal[:2] @ ahead
     rise = np.arcsin(up[0] / np.hypot(slope, normal[2])) - np.arctan2(slope, normal[2])
     body_x = np.append(np.cos(rise) * ahead, np.sin(rise))
     frame = _frame(normal, body_x) @ _frame(up, np.array([1.0, 0.0, 0.0])).T
-    point = floor[:2].mean(axis=0)
-    origin_z = (height - normal[:2] @ (np.array([x, y]) - point[:2])) / normal[2] + point[2]
-    data.qpos[:3] = x, y, origin_z
+    middle = floor[:2].mean(axis=0)
+    z = (height - normal[:2] @ (np.array([x, y]) - middle[:2])) / normal[2] + middle[2]
+    data.qpos[:3] = x, y, z
     mujoco.mju_mat2Quat(data.qpos[3:7], frame.ravel())
     steer(model, data.qpos, steering)
     v, omega = twist
@@ -85,68 +91,79 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | N
         data.qvel[model.joint(wheel).dofadr[0]] = rate
     mujoco.mj_forward(model, data)
     if data.ncon:
-        data.qpos[2] -= min(0.0, data.contact.dist.min())  # bumps between the three points
+        data.qpos[2] -= min(0.0, data.contact.dist.min())  # lifts it off bumps between the three points
     return State(data.qpos.copy(), data.qvel.copy())
 
 
-
 def _knuckles(model: mujoco.MjModel) -> list[str]:
-    """Joints of two steered wheels, which an equality couples to the joint `steering`."""
+    """Names the joints of two steered wheels, each of which an equality couples to the joint `steering`."""
     return [f"steering_{wheel}" for wheel in fronts(model) if has(model, "joint", f"steering_{wheel}")]
 
 
-
 def _linkage(model: mujoco.MjModel, knuckle: str, angle: NDArray) -> NDArray:
-    """Angle of a knuckle in rad at a steering angle."""
+    """Returns the angles of a knuckle at steering angles, both in rad and of the same shape."""
     return np.polynomial.polynomial.polyval(angle, model.equality(knuckle).data[:5])
 
 
-
 def steer(model: mujoco.MjModel, qpos: NDArray, angle: float) -> None:
-    """Turns what is steered to a steering angle in rad, in `qpos` `(nq,)`."""
+    """Writes a steering angle in rad into `qpos`, `(nq,)`: the joint of the fork or rack, and those of the knuckles."""
     if has(model, "joint", "steering"):
         qpos[model.joint("steering").qposadr[0]] = angle
     for knuckle in _knuckles(model):
         qpos[model.joint(knuckle).qposadr[0]] = _linkage(model, knuckle, np.array(angle))
 
 
-
 def front_rates(
     model: mujoco.MjModel, robot: Robot, v: NDArray, omega: NDArray, steering: NDArray
 ) -> dict[str, NDArray]:
-    """Rates in rad/s of the steered wheels that roll without slip, by name; shapes as those of the arguments.
+    """Computes the rates at which the steered wheels roll without slip.
 
     Args:
-        model: Compiled world.
-        robot: The robot.
-        v: V in m/s.
-        omega: θ̇ in rad/s.
-        steering: φ in rad.
+        model: Compiled world with the robot.
+        robot: The parameters of the model.
+        v: V in m/s, of any shape.
+        omega: θ̇ in rad/s, of the same shape.
+        steering: Steering angle φ in rad, of the same shape.
+
+    Returns:
+        Rates in rad/s of that shape by wheel; empty for a robot without a steered wheel.
     """
     if not has(model, "joint", "steering"):
         return {}
-    along = v * np.cos(steering) + robot.wheelbase * omega * np.sin(steering)  # of the middle of the front axle
+    along = v * np.cos(steering) + robot.wheelbase * omega * np.sin(steering)  # speed of the middle of the front axle
     rates = {wheel: along / robot.front_wheel_radius for wheel in fronts(model)}
-    for knuckle in _knuckles(model):  # seen from the turning point a wheel is as fast as it is far away
+    # A wheel's speed is proportional to its distance from the turning point, which is L/sin of its angle.
+    for knuckle in _knuckles(model):
         angle, wheel = _linkage(model, knuckle, steering), knuckle.removeprefix("steering_")
-        far = np.where(np.abs(steering) > 1e-6, np.sin(steering), 1.0) / np.where(
+        distance = np.where(np.abs(steering) > 1e-6, np.sin(steering), 1.0) / np.where(
             np.abs(angle) > 1e-6, np.sin(angle), 1.0
-        )
-        rates[wheel] = rates[wheel] * far
+        )  # as a ratio to the middle's
+        rates[wheel] = rates[wheel] * distance
     return rates
 
 
-
 def _frame(up: NDArray, ahead: NDArray) -> NDArray:
-    """Rotation matrix `(3, 3)` whose z axis is `up` and whose x axis is nearest to `ahead`."""
+    """Returns the rotation `(3, 3)` whose z axis is the unit vector `up` and whose x axis is nearest to `ahead`."""
     side = np.cross(up, ahead)
     side /= np.linalg.norm(side)
     return np.column_stack([np.cross(side, up), side, up])
 
 
-
 def ground(model: mujoco.MjModel, data: mujoco.MjData, x: float, y: float) -> NDArray:
-    """The ground point below (x, y); the robot itself (geom groups above 0) is transparent to the ray."""
+    """Finds the ground below a point of the plane; the ray passes through the robot, whose geoms are not in group 0.
+
+    Args:
+        model: Compiled world.
+        data: Its data, whose kinematics are computed anew.
+        x: World coordinate in m.
+        y: World coordinate in m.
+
+    Returns:
+        The point on the ground in m, `(3,)`.
+
+    Raises:
+        InputError: There is no ground below (x, y).
+    """
     mujoco.mj_kinematics(model, data)
     groups = np.array([1, 0, 0, 0, 0, 0], np.uint8)
     start = np.array([x, y, 50.0])

@@ -1,4 +1,4 @@
-"""The robot on paper: its parameters, equations (1) to (3), the references it follows, and what can be wrong with it.
+"""The robot on paper: its parameters, equations (1) to (3), reference trajectories, and perturbations as data.
 
-Arrays and formulas alone; nothing here knows MuJoCo or a controller. Imports `mrctl.record` and nothing else of mrctl.
+This folder holds formulas on arrays, without MuJoCo and without controllers. It imports `mrctl.record` alone.
 """

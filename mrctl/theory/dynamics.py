@@ -1,7 +1,8 @@
-"""Equation (3) of the paper, as printed and corrected, and its inverse, which the network has to discover.
+"""Equation (3) of the paper, as printed and corrected, and its inverse, which the neural feedforward learns.
 
 Every function works on arrays with any leading batch dimensions. A twist is (V, θ̇) of P in (m/s, rad/s), an
-acceleration is (V̇, θ̈), voltages and torques are (left, right) as commanded and at the wheel, in V and N·m.
+acceleration is (V̇, θ̈) in (m/s², rad/s²). Voltages are those commanded, (left, right) in V, and torques those at the
+wheels, (left, right) in N·m.
 
 The corrected model, with the centre of mass c ahead of P and the front wheel free to follow:
 
@@ -9,14 +10,14 @@ The corrected model, with the centre of mass c ahead of P and the front wheel fr
     J_e θ̈ = (D/r)(P_d − P_s) − m c V θ̇ − τ_f,     τ_f = D (1 − f) F_roll (s_d − s_s)/2
     P_i   = (N k_M/R_a)(g U_i − k_E N ω_i) − τ_loss s_i,     ω_i = V_i/r,  V_d,s = V ± D θ̇
 
-where g is `drive_gain`, U is limited to ±`supply`, and the losses follow one convention that keeps the inverse linear:
-s_i is the sign of V_i, rear wheel by rear wheel, so that no loss drives a robot at rest (sgn 0 = 0). A rear wheel bears
-(1 − f)/2 of the load, and its rolling loss acts on it like the gear's; the front wheel bears the rest, f, and the mean
-of the two signs stands for its own. So F_roll is the full force wherever both wheels turn the same way, and the turning
-resistance τ_f has no parameter of its own: it is the rolling loss of wheels that turn against each other. The scrub of
-the contact patches, which would need one, is left out.
+where g is `drive_gain` and U is limited to ±`supply`. The losses are modelled so that the inverse is linear in its
+parameters. s_i is the sign of the speed V_i of a rear wheel, and sgn 0 = 0, so that no loss drives a robot at rest. A
+rear wheel bears (1 − f)/2 of the load, and its rolling loss acts on it as the gearbox loss does. The front wheel bears
+the share f, and its sign is taken as the mean of the two others. F_roll is therefore the full force where both wheels
+turn the same way, and the turning resistance τ_f, the rolling loss of wheels that turn against each other, needs no
+parameter of its own. The scrub of the contact patches, which would need one, is left out.
 
-The signs may be smoothed to tanh(V_i/`sign_speed`), which a controller needs near rest.
+A controller near rest needs the signs smoothed to tanh(V_i/`sign_speed`).
 """
 
 from __future__ import annotations
@@ -31,31 +32,34 @@ RPM = 2 * np.pi / 60  # rad/s
 
 
 def common_differential(voltage: ArrayLike) -> NDArray[np.float64]:
-    """(left, right) to (U_Σ, U_Δ), U_r,l = U_Σ ± U_Δ; both of shape (…, 2)."""
+    """Common and differential voltage (U_Σ, U_Δ) of (left, right), with U_r,l = U_Σ ± U_Δ; both in V, shape (…, 2)."""
     left, right = split(voltage)
     return stack((right + left) / 2, (right - left) / 2)
 
 
 def left_right(mixed: ArrayLike) -> NDArray[np.float64]:
-    """(U_Σ, U_Δ) to (left, right), the inverse of `common_differential`."""
+    """Voltages (left, right) of (U_Σ, U_Δ), the inverse of `common_differential`; both in V, shape (…, 2)."""
     common, differential = split(mixed)
     return stack(common - differential, common + differential)
 
 
 def wheel_signs(twist: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> NDArray[np.float64]:
-    """Direction of travel of the rear wheels (left, right), shape (…, 2).
+    """Signs s_i of the rear wheels' speeds V_i.
 
     Args:
         twist: (V, θ̇), shape (…, 2).
         robot: The robot.
-        sign_speed: 0 for sgn V_i with sgn 0 = 0, else tanh(V_i/sign_speed), m/s.
+        sign_speed: 0 for sgn V_i with sgn 0 = 0; a positive speed in m/s for tanh(V_i/sign_speed).
+
+    Returns:
+        (left, right), dimensionless, shape (…, 2).
     """
     speeds = robot.wheel_radius * wheel_rates(twist, robot)
     return np.tanh(speeds / sign_speed) if sign_speed > 0 else np.sign(speeds)
 
 
 def wheel_torques(voltage: ArrayLike, twist: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> NDArray[np.float64]:
-    """Torques P of the two drives at their wheels, losses of motor and gear taken off.
+    """Torques P of the two drives at their wheels, less the losses of motor and gearbox.
 
     Args:
         voltage: Commanded (left, right), V, shape (…, 2); limited to the supply.
@@ -72,9 +76,15 @@ def wheel_torques(voltage: ArrayLike, twist: ArrayLike, robot: Robot, sign_speed
 
 
 def rolling_losses(twist: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> NDArray[np.float64]:
-    """Rolling resistance as (force along x in N, turning resistance τ_f about P in N·m), shape (…, 2).
+    """Rolling resistance against the motion.
 
-    Arguments as in `wheel_signs`; both oppose the motion and are subtracted.
+    Args:
+        twist: (V, θ̇), shape (…, 2).
+        robot: The robot.
+        sign_speed: See `wheel_signs`.
+
+    Returns:
+        Force along x in N and turning resistance τ_f about P in N·m, shape (…, 2); both are subtracted in (3).
     """
     mean, difference = split(common_differential(wheel_signs(twist, robot, sign_speed)))
     return robot.rolling_force * stack(mean, robot.half_track * (1 - robot.front_load) * difference)
@@ -104,7 +114,7 @@ def accelerations(twist: ArrayLike, voltage: ArrayLike, robot: Robot, sign_speed
 def inverse_dynamics(
     twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_speed: float = 0.0
 ) -> NDArray[np.float64]:
-    """The commanded voltages that give the acceleration: `accelerations` solved for them, before the supply limit.
+    """Commanded voltages that give an acceleration: `accelerations` solved for them, without the supply limit.
 
     Args:
         twist: (V, θ̇), shape (…, 2).
@@ -127,9 +137,16 @@ def inverse_dynamics(
 
 
 def regressor(twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> NDArray[np.float64]:
-    """The 8 features in which the inverse dynamics is linear: V, θ̇, V̇, θ̈, V θ̇, θ̇², s_l, s_r; shape (…, 8).
+    """The 8 features in which the inverse dynamics is linear: V, θ̇, V̇, θ̈, V θ̇, θ̇², s_l, s_r.
 
-    Arguments as in `inverse_dynamics`. Of the robot only the half track is used.
+    Args:
+        twist: (V, θ̇), shape (…, 2).
+        acceleration: (V̇, θ̈), shape (…, 2).
+        robot: The robot, of which only the half track matters, for the signs.
+        sign_speed: See `wheel_signs`.
+
+    Returns:
+        Features in SI units, shape (…, 8).
     """
     v, omega = split(twist)
     v_dot, omega_dot = split(acceleration)
@@ -138,9 +155,9 @@ def regressor(twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_spee
 
 
 def inverse_coefficients(robot: Robot) -> NDArray[np.float64]:
-    """Coefficients (8, 2) with regressor @ coefficients = (U_Σ, U_Δ) of `inverse_dynamics`."""
+    """Coefficients, shape (8, 2), with `regressor` @ coefficients = (U_Σ, U_Δ) of `inverse_dynamics` in V."""
     r, d = robot.wheel_radius, robot.half_track
-    volts = r / (2 * robot.motor_gain)  # per newton on both wheels together
+    volts = r / (2 * robot.motor_gain)  # U_Σ per newton along x
     lever = volts * robot.mass * robot.com_offset
     loss = robot.drive_loss / (2 * robot.motor_gain)
     rolling = volts * robot.rolling_force / 2
@@ -157,7 +174,7 @@ def wheel_torques_as_printed(
     """The third line of equation (3) as printed: P = N (k_M U/R_a − k_M k_E/R_a · 60 N V/(2 π r) − k_M I₀).
 
     60 N V/(2πr) is the motor's speed in rpm, so the term is right only with k_E in V/rpm. The no-load current has no
-    sign: a resting robot is driven backwards. Neither supply limit nor gear loss.
+    sign, so that it drives a resting robot backwards. The equation has neither supply limit nor gearbox loss.
 
     Args:
         voltage: Terminal voltages (left, right), V, shape (…, 2).
@@ -175,15 +192,15 @@ def wheel_torques_as_printed(
 
 
 def accelerations_as_printed(twist: ArrayLike, voltage: ArrayLike, robot: Robot) -> NDArray[np.float64]:
-    """Equation (3) as printed, solved for its two left-hand derivatives; kept for comparison, wrong in seven ways.
+    """Equation (3) as printed, solved for its two left-hand derivatives, and kept for comparison. It has seven errors.
 
-    1. The first is printed V̈, though M V̈ = (P_d + P_s)/(2r) has the dimension of M V̇: the value is an acceleration.
-    2. 1/(2r) halves it: 1/r is right.
-    3. r/(2D) is the factor of kinematics: that of torques is D/r.
+    1. The first derivative is printed V̈, but (P_d + P_s)/(2r) has the dimension of M V̇; the value is an acceleration.
+    2. The factor 1/(2r) of the force is half of the right one, 1/r.
+    3. The factor r/(2D) of the torque belongs to kinematics; the right one is D/r.
     4. I₀ has no sign (see `wheel_torques_as_printed`).
-    5. P_s,d and P_l,r name one pair, (left, right) here, and the text calls the torques the inputs: the voltages are.
-    6. No rotor or wheel inertia, offset c, rolling loss, gear loss or supply limit; J is the `yaw_inertia`.
-    7. k_E must be in V/rpm; it is converted here from SI.
+    5. P_s,d and P_l,r are the same pair, (left, right) here; the text calls the torques inputs, but the voltages are.
+    6. Rotor and wheel inertia, offset c, rolling and gearbox loss and supply limit are missing; J is `yaw_inertia`.
+    7. k_E must be in V/rpm, and is converted from SI here.
 
     Args:
         twist: (V, θ̇), shape (…, 2).
@@ -191,7 +208,7 @@ def accelerations_as_printed(twist: ArrayLike, voltage: ArrayLike, robot: Robot)
         robot: The robot.
 
     Returns:
-        (printed V̈, θ̈), shape (…, 2).
+        (printed V̈, θ̈), m/s² and rad/s², shape (…, 2).
     """
     wheel_speed = robot.wheel_radius * wheel_rates(twist, robot)
     left, right = split(wheel_torques_as_printed(voltage, wheel_speed, robot, robot.torque_constant * RPM))

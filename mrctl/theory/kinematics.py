@@ -13,24 +13,25 @@ from mrctl.theory.robot import Robot
 
 
 def split(array: ArrayLike) -> NDArray[np.float64]:
-    """The components of the last axis, ready to be unpacked."""
+    """Moves the last axis to the front, so that the components along it can be unpacked."""
     return np.moveaxis(np.asarray(array, float), -1, 0)
 
 
 def stack(*components: ArrayLike) -> NDArray[np.float64]:
-    """Components, broadcast against each other, along a new last axis: the inverse of `split`."""
+    """Broadcasts components against each other and stacks them along a new last axis: the inverse of `split`."""
     return np.stack(np.broadcast_arrays(*components), axis=-1)
 
 
 def state_rates(state: ArrayLike, u: ArrayLike, robot: Robot) -> NDArray[np.float64]:
     """Equation (1), corrected: the rate of the kinematic state.
 
-    Against the print, ẏ and the two rear wheels are turned counter-clockwise, and the front wheel has its own radius.
-    It holds for a front wheel whose contact lies under the steering axis (no trail).
+    The printed equation is corrected in three places: ẏ and the two rear wheels take counter-clockwise angles, and the
+    front wheel has its own radius. The equation holds for a front wheel without trail, whose contact point lies below
+    the steering axis.
 
     Args:
-        state: (x, y, θ, φ, φ_c, φ_s, φ_d), shape (…, 7): pose, steering angle, rotation of the front, left and right
-            wheel, in m and rad.
+        state: (x, y, θ, φ, φ_c, φ_s, φ_d), shape (…, 7): pose, steering angle, and rotation angles of the front, left
+            and right wheel, in m and rad.
         u: Ground speed of the front wheel in m/s and steering rate in rad/s, shape (…, 2).
         robot: The robot.
 
@@ -48,8 +49,8 @@ def state_rates(state: ArrayLike, u: ArrayLike, robot: Robot) -> NDArray[np.floa
 def state_rates_as_printed(state: ArrayLike, u: ArrayLike, robot: Robot) -> NDArray[np.float64]:
     """Equation (1) as printed: `state_rates` with θ and φ counted clockwise, and one radius r for all wheels.
 
-    Kept for comparison. It contradicts (2) and (3), which are counter-clockwise: a positive turn drives y down and
-    the left wheel is the faster one. Arguments and result as in `state_rates`.
+    It is kept for comparison. It contradicts (2) and (3), which are counter-clockwise: in a positive turn y decreases
+    and the left wheel is the faster one. Arguments and result are those of `state_rates`.
     """
     _, _, theta, phi, _, _, _ = split(state)
     u1, u2 = split(u)
@@ -90,14 +91,30 @@ def twist_from_front_wheel(u1: ArrayLike, phi: ArrayLike, robot: Robot) -> NDArr
 
 
 def wheel_rates(twist: ArrayLike, robot: Robot) -> NDArray[np.float64]:
-    """Rates of the rolling rear wheels, (V ∓ D θ̇) / r, as (left, right), shape (…, 2), rad/s."""
+    """Rates (left, right) of the rolling rear wheels, (V ∓ D θ̇) / r, in rad/s.
+
+    Args:
+        twist: (V, θ̇), shape (…, 2).
+        robot: The robot.
+
+    Returns:
+        (left, right), rad/s, shape (…, 2).
+    """
     v, omega = split(twist)
     across = robot.half_track * omega
     return stack(v - across, v + across) / robot.wheel_radius
 
 
 def twist_from_wheel_rates(rates: ArrayLike, robot: Robot) -> NDArray[np.float64]:
-    """Odometry, the inverse of `wheel_rates`: (left, right) in rad/s to the twist, both of shape (…, 2)."""
+    """Odometry: the twist of rolling rear wheels, the inverse of `wheel_rates`.
+
+    Args:
+        rates: (left, right), rad/s, shape (…, 2).
+        robot: The robot.
+
+    Returns:
+        (V, θ̇), m/s and rad/s, shape (…, 2).
+    """
     left, right = split(rates) * robot.wheel_radius
     return stack((left + right) / 2, (right - left) / (2 * robot.half_track))
 
@@ -105,8 +122,8 @@ def twist_from_wheel_rates(rates: ArrayLike, robot: Robot) -> NDArray[np.float64
 def steering_angle(twist: ArrayLike, robot: Robot) -> NDArray[np.float64]:
     """The textbook steering angle atan(L θ̇ / V), for either sign of V, without trail.
 
-    The control law in `mrctl.control.steering` holds the last angle at rest; without a memory, rest is 0 here, and
-    turning on the spot is ±π/2 (the limit from V > 0). The steering limit is not applied.
+    The angle is 0 at rest, where the control law in `mrctl.control.steering` holds the last angle, and ±π/2 for a turn
+    on the spot, which is the limit from V > 0. The steering limit is not applied.
 
     Args:
         twist: (V, θ̇), shape (…, 2).
@@ -120,11 +137,11 @@ def steering_angle(twist: ArrayLike, robot: Robot) -> NDArray[np.float64]:
 
 
 def scrub_free_angle(twist: ArrayLike, robot: Robot) -> NDArray[np.float64]:
-    """The steering angle at which the contact point, a trail t behind the steering axis, is not dragged sideways.
+    """The steering angle at which a contact point with trail t behind the steering axis is not dragged sideways.
 
-    The lateral velocity of the contact, L θ̇ cos φ − V sin φ − t θ̇, vanishes (steering rate taken as zero) at
-    φ = atan(L θ̇ / V) − sgn(V) asin(t θ̇ / √(V² + L² θ̇²)). Of the two roots this is the one near straight ahead;
-    for V < 0 it is where a caster would NOT stay by itself.
+    At constant φ the lateral velocity of the contact point, L θ̇ cos φ − V sin φ − t θ̇, vanishes at
+    φ = atan(L θ̇ / V) − sgn(V) asin(t θ̇ / √(V² + L² θ̇²)). Of the two roots this is the one near straight ahead,
+    which is an unstable equilibrium of a caster for V < 0.
 
     Args:
         twist: (V, θ̇), shape (…, 2).

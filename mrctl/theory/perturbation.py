@@ -1,4 +1,4 @@
-"""What can be wrong with a robot that the controller is not told.
+"""Differences between the plant and the model that the controller has of it.
 
 A `Perturbation` is data; `mrctl.physics.perturb` writes it into a compiled model.
 """
@@ -11,57 +11,55 @@ from pydantic import Field
 
 from mrctl.record import Record
 
-LONGEST_DELAY = 0.5  # s, of a command on its way to the motors
+LONGEST_DELAY = 0.5
+"""Longest delay of a command on its way to the motors in s."""
 
 Factor = Annotated[float, Field(ge=0.05, le=20)]
 
 
 class Perturbation(Record):
-    """What the plant does that the controller is not told. The default changes nothing.
-
-    Factors multiply the nominal value; the rest is added to it.
-    """
+    """Differences of the plant from its model, which the controller does not know; the default changes nothing."""
 
     mass_factor: Factor = 1.0
-    """Every body denser: mass and inertia of chassis, wheels and fork."""
+    """Factor on mass and inertia of every body."""
     inertia_factor: Factor = 1.0
-    """Yaw inertia of the chassis alone."""
+    """Factor on the yaw inertia of the chassis, whose mass stays."""
     payload: Annotated[float, Field(ge=0, le=200)] = 0.0
-    """Point mass on the chassis in kg."""
+    """Payload on the chassis in kg, a point mass."""
     payload_x: Annotated[float, Field(ge=-1, le=1)] = 0.1
-    """Payload ahead of P in m."""
+    """Position of the payload ahead of the rear axle in m."""
     payload_y: Annotated[float, Field(ge=-1, le=1)] = 0.0
-    """Payload to the left of the robot's axis in m."""
+    """Position of the payload to the left of the robot's axis in m."""
     payload_z: Annotated[float, Field(ge=0, le=1)] = 0.2
-    """Payload above the ground in m."""
+    """Height of the payload above the ground in m."""
     left_radius_factor: Annotated[float, Field(ge=0.8, le=1.2)] = 1.0
-    """Rear left wheel radius."""
+    """Factor on the radius of the rear left wheel."""
     right_radius_factor: Annotated[float, Field(ge=0.8, le=1.2)] = 1.0
-    """Rear right wheel radius."""
+    """Factor on the radius of the rear right wheel."""
     drive_friction_factor: Annotated[float, Field(ge=0, le=20)] = 1.0
-    """Loss of gearboxes and motors, τ_loss."""
+    """Factor on the friction of gearboxes and motors, τ_loss."""
     resistance_factor: Factor = 1.0
-    """Terminal resistance R_a."""
+    """Factor on the motors' terminal resistance R_a."""
     motor_constant_factor: Factor = 1.0
-    """Motor constant, k_M and k_E together."""
+    """Factor on the motor constants k_M and k_E together."""
     supply_factor: Annotated[float, Field(gt=0, le=2)] = 1.0
-    """Applied over commanded voltage: a PWM drive on another supply."""
+    """Factor from commanded to applied voltage: a PWM drive on a supply of another voltage."""
     tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
-    """Friction of every tyre on the floor."""
+    """Factor on the friction of every tyre on the floor."""
     left_tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
-    """Friction of the rear left tyre on the floor, beside the factor of all."""
+    """Further factor on the friction of the rear left tyre."""
     slope: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
-    """Inclination in rad, uphill along the world's +x, as gravity seen in the slope's own frame."""
+    """Inclination of the ground in rad, uphill along the world's +x; gravity is turned, not the floor."""
     control_delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] = 0.0
-    """Delay of voltages and steering in s, in whole control periods."""
+    """Delay of voltages and steering commands in s, a multiple of the control period."""
     velocity_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Standard deviation of the measured V in m/s."""
+    """Standard deviation of the noise on the measured V in m/s."""
     rotation_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Standard deviation of the measured θ̇ in rad/s."""
+    """Standard deviation of the noise on the measured θ̇ in rad/s."""
     position_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Standard deviation of the measured x and y in m (`truth` only: odometry integrates its own)."""
+    """Standard deviation of the noise on the measured x and y in m; odometry has none, as it integrates V and θ̇."""
     heading_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Standard deviation of the measured θ in rad (`truth` only)."""
+    """Standard deviation of the noise on the measured θ in rad; odometry has none, as it integrates θ̇."""
 
 
 PERTURBATIONS: dict[str, Perturbation] = {
@@ -85,4 +83,4 @@ PERTURBATIONS: dict[str, Perturbation] = {
     "sensor noise": Perturbation(velocity_noise=0.01, rotation_noise=0.02, position_noise=0.002, heading_noise=0.002),
     "all": Perturbation(mass_factor=1.5, supply_factor=0.8, drive_friction_factor=3.0, resistance_factor=1.3),
 }
-"""What can be wrong with the default robot, one thing at a time; `all` is the combination of the published targets."""
+"""Named perturbations of the default robot, each of one kind; `all` combines four of them."""

@@ -1,11 +1,11 @@
-"""Analytic reference trajectories: where the robot should be, how fast, and how that changes.
+"""Analytic reference trajectories: pose, twist and acceleration of the robot at every time.
 
-The plane is complex here, p = x + i y: a path with heading θ has the tangent e^{iθ}, a rotation is a product, and the
-logarithmic derivative p''/p' = v̇/v + i θ̇ holds everything that a car needs to know about a curve. Nothing is
-differenced numerically, and every sample depends on its own time alone, headings included.
+A position is a complex number p = x + i y. A path with heading θ then has the tangent e^{iθ}, a rotation is a product,
+and the logarithmic derivative p''/p' = v̇/v + i θ̇ gives acceleration and rotation at once. Nothing is differenced
+numerically, and every sample depends on its own time alone, headings included.
 
-Each kind starts at the origin along +x unless it says otherwise. A new kind is a `Record` with `kind`, `period` and
-`sample`, added to `Reference`.
+A reference starts at the origin along +x unless its docstring says otherwise. A new kind is a `Record` with `kind`,
+`period` and the method `sample`, and is added to the union `Reference`.
 """
 
 from __future__ import annotations
@@ -31,34 +31,34 @@ Speed = Annotated[float, Field(ge=0.01, le=20)]
 Duration = Annotated[float, Field(ge=0.1, le=3600)]
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 
-# Steps from 0 to 1 whose first 2 (quintic) or 3 (septic) derivatives vanish at both ends.
+# Polynomials that rise from 0 to 1 on (0, 1); the first 2 (quintic) or 3 (septic) derivatives vanish at both ends.
 _QUINTIC = Polynomial([0, 0, 0, 10, -15, 6])
 _SEPTIC = Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
-# Gauss-Legendre quadrature on (0, 1): exact to rounding for a corner of the square and for a short piece of a spline.
+# Gauss-Legendre quadrature on (0, 1), exact to rounding: for a corner of the square, and for a piece of a spline.
 _CORNER_NODES, _CORNER_WEIGHTS = (np.polynomial.legendre.leggauss(24) + np.array([[1], [0]])) / 2
 _PIECE_NODES, _PIECE_WEIGHTS = (np.polynomial.legendre.leggauss(6) + np.array([[1], [0]])) / 2
 
 
 class Motion(NamedTuple):
-    """A reference at T times."""
+    """Samples of a reference at T times."""
 
     pose: Array
-    """x [m], y [m], θ [rad] of P, θ continuous in time. Shape (T, 3)."""
+    """x in m, y in m and θ in rad of P, with θ continuous in time. Shape (T, 3)."""
     twist: Array
-    """V [m/s], negative in reverse, and θ̇ [rad/s]. Shape (T, 2)."""
+    """V in m/s, negative in reverse, and θ̇ in rad/s. Shape (T, 2)."""
     acceleration: Array
-    """V̇ [m/s²] and θ̈ [rad/s²]. Shape (T, 2)."""
+    """V̇ in m/s² and θ̈ in rad/s². Shape (T, 2)."""
 
 
 def from_curve(p: Plane, d1: Plane, d2: Plane, d3: Plane, heading: Array | None = None) -> Motion:
-    """The motion of a robot driving forward along a regular curve p(t).
+    """Computes the motion of a robot that drives forward along a regular curve p(t).
 
     Args:
         p: Position x + i y in m. Shape (T,).
-        d1: Its velocity in m/s, nowhere zero. Shape (T,).
-        d2: Its acceleration in m/s². Shape (T,).
-        d3: Its jerk in m/s³. Shape (T,).
-        heading: arg d1 on a continuous branch in rad; by default the principal one. Shape (T,).
+        d1: First derivative in m/s, nowhere zero. Shape (T,).
+        d2: Second derivative in m/s². Shape (T,).
+        d3: Third derivative in m/s³. Shape (T,).
+        heading: θ = arg d1 in rad on a continuous branch; by default the principal branch. Shape (T,).
     """
     log = d2 / d1
     v = np.abs(d1)
@@ -69,9 +69,9 @@ def from_curve(p: Plane, d1: Plane, d2: Plane, d3: Plane, heading: Array | None 
 def along_path(
     p: Plane, heading: ArrayLike, curvature: ArrayLike, sharpness: ArrayLike, speed: ArrayLike, acceleration: ArrayLike
 ) -> Motion:
-    """The motion of a robot that follows a path p(s) by a time law s(t), which may rest (ṡ = 0) or reverse (ṡ < 0).
+    """Computes the motion of a robot that follows a path p(s) by a time law s(t).
 
-    θ̇ = κ ṡ and θ̈ = κ s̈ + κ' ṡ²: nothing is divided by the speed.
+    The robot may rest (ṡ = 0) or reverse (ṡ < 0), because θ̇ = κ ṡ and θ̈ = κ s̈ + κ' ṡ² do not divide by the speed.
 
     Args:
         p: Position x + i y in m. Shape (T,).
@@ -86,21 +86,22 @@ def along_path(
 
 
 def _motion(p: Plane, *rest: ArrayLike) -> Motion:
-    """Stacks x, y, θ | V, θ̇ | V̇, θ̈, each (T,) or ()."""
+    """Stacks position, θ, V, θ̇, V̇ and θ̈, each of shape (T,) or (), into a `Motion`."""
     columns = np.stack([np.broadcast_to(column, p.shape) for column in (p.real, p.imag, *rest)], -1)
     return Motion(columns[:, :3], columns[:, 3:5], columns[:, 5:])
 
 
 class Line(Record):
-    """A straight line at constant speed; it goes on after its length."""
+    """A straight line at constant speed, which goes on after its length."""
 
     kind: Literal["line"] = "line"
+    """Kind of the reference."""
     speed: Speed = 0.8
-    """Speed in m/s."""
+    """Speed along the line in m/s."""
     length: Length = 8.0
     """Length of one pass in m."""
     heading: Annotated[float, Field(ge=-np.pi, le=np.pi)] = 0.0
-    """Direction in rad."""
+    """Direction of the line in rad, counter-clockwise from +x."""
 
     @property
     def period(self) -> float:
@@ -108,23 +109,24 @@ class Line(Record):
         return self.length / self.speed
 
     def sample(self, t: Array) -> Motion:
-        """Samples the line at the times t [s], shape (T,)."""
+        """Samples the line at the times t in s, shape (T,)."""
         return along_path(cmath.rect(self.speed, self.heading) * t, self.heading, 0, 0, self.speed, 0)
 
 
 class Circle(Record):
-    """A circle at constant speed, to the left of its start unless clockwise."""
+    """A circle at constant speed, counter-clockwise unless `clockwise` is set."""
 
     kind: Literal["circle"] = "circle"
+    """Kind of the reference."""
     radius: Length = 1.0
-    """Radius in m."""
+    """Radius of the circle in m."""
     period: Duration = 8.0
     """Time of one lap in s."""
     clockwise: bool = False
-    """Turns to the right."""
+    """Drive clockwise, to the right of the start."""
 
     def sample(self, t: Array) -> Motion:
-        """Samples the circle at the times t [s], shape (T,)."""
+        """Samples the circle at the times t in s, shape (T,)."""
         turn = -1.0 if self.clockwise else 1.0
         theta = turn * 2 * np.pi / self.period * t
         p = turn * 1j * self.radius * (1 - np.exp(1j * theta))
@@ -135,13 +137,14 @@ class Lemniscate(Record):
     """The figure of eight of Gerono, x = a sin s, y = a sin s cos s, s = 2πt/period; it starts at 45°."""
 
     kind: Literal["lemniscate"] = "lemniscate"
+    """Kind of the reference."""
     size: Length = 1.5
-    """Half the length of the figure [a] in m; it is as wide as it is half long."""
+    """Half the length of the figure [a] in m, which is also its whole width."""
     period: Duration = 12.0
     """Time of one lap in s."""
 
     def sample(self, t: Array) -> Motion:
-        """Samples the lemniscate at the times t [s], shape (T,)."""
+        """Samples the lemniscate at the times t in s, shape (T,)."""
         a, w = self.size, 2 * np.pi / self.period
         s = w * t
         p, d1, d2, d3 = (
@@ -152,15 +155,16 @@ class Lemniscate(Record):
 
 
 class LaneChange(Record):
-    """A septic step to the left at constant speed along x; straight on afterwards. θ̈ is continuous."""
+    """A lane change to the left at constant speed along x, and straight on afterwards; θ̈ is continuous."""
 
     kind: Literal["lane_change"] = "lane_change"
+    """Kind of the reference."""
     length: Length = 4.0
-    """Length of the change along x in m."""
+    """Length of the lane change along x in m."""
     shift: Annotated[float, Field(ge=-1000, le=1000)] = 1.0
-    """Shift to the left in m, negative to the right."""
+    """Shift to the left in m; a negative shift is to the right."""
     speed: Speed = 0.8
-    """Speed along x in m/s; along the path it is higher during the change."""
+    """Speed along x in m/s; the speed along the path is higher during the change."""
 
     @property
     def period(self) -> float:
@@ -168,27 +172,23 @@ class LaneChange(Record):
         return self.length / self.speed
 
     def sample(self, t: Array) -> Motion:
-        """Samples the lane change at the times t [s], shape (T,)."""
+        """Samples the lane change at the times t in s, shape (T,)."""
         u = np.clip(t / self.period, 0, 1)
         y, y1, y2, y3 = (self.shift * _SEPTIC.deriv(n)(u) / self.period**n for n in range(4))
         return from_curve(self.speed * t + 1j * y, self.speed + 1j * y1, 1j * y2, 1j * y3)
 
 
 class RoundedSquare(Record):
-    """A square at constant speed, counter-clockwise from the middle of its lower side.
-
-    Along a corner θ is a quintic step of arc length, so curvature rises from zero and returns smoothly, like a
-    clothoid without its kinks: θ̈ is continuous. The position is the Fresnel-like integral of e^{iθ}, which
-    Gauss quadrature gives to machine precision.
-    """
+    """A square with rounded corners at constant speed, counter-clockwise from the middle of its lower side."""
 
     kind: Literal["rounded_square"] = "rounded_square"
+    """Kind of the reference."""
     side: Length = 2.0
     """Side of the square in m."""
     radius: Length = 0.4
-    """Tightest radius of a corner in m; the corner takes up 1.73 times as much of each side."""
+    """Smallest radius of curvature of a corner in m; a corner takes up 1.73 times as much of each side."""
     speed: Speed = 0.5
-    """Speed in m/s."""
+    """Speed along the path in m/s."""
 
     @model_validator(mode="after")
     def _fits(self) -> RoundedSquare:
@@ -204,7 +204,7 @@ class RoundedSquare(Record):
 
     @property
     def _reach(self) -> float:
-        """What a corner takes up of each side in m."""
+        """Length that one corner takes up of each of its sides in m."""
         return self._corner * float(_turn(np.ones(1))[0].real)
 
     @property
@@ -213,7 +213,11 @@ class RoundedSquare(Record):
         return 4 * (self.side - 2 * self._reach + self._corner) / self.speed
 
     def sample(self, t: Array) -> Motion:
-        """Samples the square at the times t [s], shape (T,)."""
+        """Samples the square at the times t in s, shape (T,).
+
+        Along a corner θ is a quintic step of arc length, so that curvature rises from zero and returns smoothly, and θ̈
+        is continuous. The position is the integral of e^{iθ}, by Gauss quadrature to machine precision.
+        """
         corner, straight = self._corner, self.side / 2 - self._reach
         quarter, s = np.divmod(self.speed * t, 2 * straight + corner)
         u = np.clip((s - straight) / corner, 0, 1)
@@ -230,31 +234,32 @@ class RoundedSquare(Record):
 
 
 def _turn(u: Array) -> Plane:
-    """Position after the part u (T,) of a left corner of length one: ∫ exp(i π/2 S(w)) dw from 0 to u."""
+    """Position along a left corner of unit arc length, ∫ exp(i π/2 S(w)) dw from 0 to u; u and result of shape (T,)."""
     theta = np.pi / 2 * _QUINTIC(np.multiply.outer(u, _CORNER_NODES))
     return u * (np.cos(theta) @ _CORNER_WEIGHTS + 1j * (np.sin(theta) @ _CORNER_WEIGHTS))
 
 
 class StopAndGo(Record):
-    """From rest to rest along a straight line, over and over; V̇ is continuous."""
+    """Moves from rest to rest along a straight line, forward and back or always forward; V̇ is continuous."""
 
     kind: Literal["stop_and_go"] = "stop_and_go"
+    """Kind of the reference."""
     distance: Length = 2.0
     """Distance between stops in m."""
     move_time: Duration = 3.0
-    """Time from stop to stop in s; the speed peaks at 1.875 distance / move_time."""
+    """Duration of a move in s; the largest speed is 1.875 distance / move_time."""
     pause: Annotated[float, Field(ge=0, le=3600)] = 1.0
-    """Time at rest after each move in s."""
+    """Duration of the rest after each move in s."""
     reverse: bool = True
-    """Every second move goes back to the start; otherwise all go forward."""
+    """Drive every second move backwards to the start."""
 
     @property
     def period(self) -> float:
-        """Time of one cycle in s: there, pause, and if it reverses back, pause."""
+        """Time of one cycle in s: a move and a rest, or two of each where it reverses."""
         return (2 if self.reverse else 1) * (self.move_time + self.pause)
 
     def sample(self, t: Array) -> Motion:
-        """Samples the moves at the times t [s], shape (T,)."""
+        """Samples the moves at the times t in s, shape (T,)."""
         move, since = np.divmod(t, self.move_time + self.pause)
         u = np.clip(since / self.move_time, 0, 1)
         back = (move % 2 == 1) if self.reverse else np.zeros(t.shape, bool)
@@ -267,27 +272,24 @@ _LOOP = ((0.0, 0.0), (1.5, 0.0), (3.0, 0.8), (2.5, 2.2), (1.0, 1.6), (-0.8, 2.0)
 
 
 class Waypoints(Record):
-    """A quintic spline through points at constant speed, from the first point on.
-
-    A closed one is periodic and smooth (C⁴) all around; an open one is straight at both ends and comes to rest on its
-    last point, where it stays.
-    """
+    """A quintic spline through points at constant speed; an open one ends at rest on its last point."""
 
     kind: Literal["waypoints"] = "waypoints"
+    """Kind of the reference."""
     points: tuple[tuple[Coordinate, Coordinate], ...] = _LOOP
-    """Points (x, y) in m, in order; a closed curve returns to the first by itself."""
+    """Points (x, y) in m in their order; a closed curve returns to the first by itself."""
     speed: Speed = 0.6
-    """Speed in m/s."""
+    """Speed along the path in m/s."""
     closed: bool = True
-    """The curve is a lap."""
+    """Close the curve from the last point to the first."""
     stop_time: Duration = 2.0
-    """Time to come to rest at the end of an open curve in s."""
+    """Duration of the braking at the end of an open curve in s."""
 
     @model_validator(mode="after")
     def _regular(self) -> Waypoints:
         least = 3 if self.closed else 2
         if len(self.points) < least:
-            raise ValueError(f"points: {'a closed' if self.closed else 'an open'} curve needs at least {least}")
+            raise ValueError(f"points: {'a closed' if self.closed else 'an open'} curve needs at least {least} points")
         gaps = np.abs(np.diff(_plane(self.points, self.closed)))
         if gaps.min() < 1e-3:
             first = int(gaps.argmin())
@@ -308,7 +310,10 @@ class Waypoints(Record):
         return _spline(self.points, self.closed).length / self.speed + (0 if self.closed else self.stop_time / 2)
 
     def sample(self, t: Array) -> Motion:
-        """Samples the spline at the times t [s], shape (T,)."""
+        """Samples the spline at the times t in s, shape (T,).
+
+        A closed spline is periodic with four continuous derivatives. An open one has no curvature at its ends.
+        """
         s, v, a = self.speed * t, np.full(t.shape, self.speed), np.zeros(t.shape)
         if not self.closed:
             brake = self.period - self.stop_time
@@ -319,11 +324,12 @@ class Waypoints(Record):
 
 
 def _plane(points: tuple[tuple[float, float], ...], closed: bool) -> Plane:
+    """Returns the points as complex numbers in m, with the first one again at the end of a closed curve."""
     return np.array([complex(*point) for point in (*points, *points[: int(closed)])])
 
 
 class _Spline:
-    """A planar spline by arc length; u is its own parameter, the accumulated chord length."""
+    """A planar quintic spline by arc length s; its own parameter u is the accumulated chord length, both in m."""
 
     def __init__(self, points: tuple[tuple[float, float], ...], closed: bool) -> None:
         p = _plane(points, closed)
@@ -340,30 +346,33 @@ class _Spline:
 
     @cached_property
     def parameter(self) -> CubicHermiteSpline:
-        """u(s), good to the fourth power of a piece."""
+        """Approximation of u(s), whose error falls with the fourth power of the length of a piece."""
         return CubicHermiteSpline(self.s, self.u, 1 / np.abs(self.derivative(self.u, 1)))
 
     def derivative(self, u: Array, n: int) -> Plane:
-        """The n-th derivative of x + i y with respect to u, n = 0 to 3."""
+        """Returns the n-th derivative of x + i y with respect to u, for n = 0 to 3."""
         x, y = np.moveaxis(self.curves[n](u), -1, 0)
         return x + 1j * y
 
     def arc(self, start: Array, end: Array) -> Array:
-        """Arc length [m] from start to end, (T,), both within one piece."""
+        """Returns the arc length in m from u = start to u = end, shape (T,); both lie within one piece."""
         u = start[:, None] + (end - start)[:, None] * _PIECE_NODES
         return (end - start) * (np.abs(self.derivative(u, 1)) @ _PIECE_WEIGHTS)
 
     def at(self, s: Array) -> tuple[Plane, Array, Array, Array]:
-        """Position [m], heading [rad], curvature [1/m] and sharpness [1/m²] at the arc lengths s [m], each (T,)."""
+        """Returns position in m, heading in rad, curvature in 1/m and sharpness in 1/m² at the arc lengths s in m.
+
+        All have the shape (T,).
+        """
         lap, s = np.divmod(s, self.length) if self.closed else (np.zeros(s.shape), np.minimum(s, self.length))
         piece = np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
         u = self.parameter(s)
-        # One step of Newton's method takes the table's error to rounding.
+        # One step of Newton's method reduces the error of `parameter` to rounding.
         u = u - (self.s[piece] + self.arc(self.u[piece], u) - s) / np.abs(self.derivative(u, 1))
         p, d1, d2, d3 = (self.derivative(u, n) for n in range(4))
         log, step = d2 / d1, np.abs(d1)
         sharpness = ((d3 / d1 - log**2).imag - log.imag * log.real) / step**2
-        # The tabulated heading chooses the branch of the exact one.
+        # The tabulated heading selects the branch of the exact one.
         near, exact = np.interp(u, self.u, self.heading), np.angle(d1)
         heading = exact + 2 * np.pi * np.round((near - exact) / (2 * np.pi))
         return p, heading + lap * (self.heading[-1] - self.heading[0]), log.imag / step, sharpness
@@ -381,23 +390,24 @@ def check(reference: Reference, robot: Robot, reverse: bool) -> None:
     """Refuses a reference that the robot cannot follow.
 
     Args:
-        reference: Any of the kinds above.
-        robot: Its limits on speed, acceleration, steering and grip.
-        reverse: The steering in use can drive backwards.
+        reference: The reference.
+        robot: The robot, whose limits on speed, acceleration, steering angle and grip are held against the reference.
+        reverse: Whether the robot can drive backwards with its steering.
 
     Raises:
-        InputError: One line with the kind, the quantity, its peak, when, and the limit.
+        InputError: The reference reverses or exceeds a limit; the message has the quantity, its peak, the time of the
+            peak and the limit.
     """
-    # At least every 10 ms, so that no move hides between long pauses.
+    # Samples are at most 10 ms apart up to a period of 5000 s, so that short moves between long rests are seen.
     t = np.linspace(0, reference.period, int(np.clip(100 * reference.period, 2000, 500_000)) + 1)
     _, (v, omega), (v_dot, omega_dot) = (part.T for part in reference.sample(t))
     if not reverse and v.min() < -1e-9:
         when = t[np.argmax(v < -1e-9)]
         raise InputError(
             f"reference {reference.kind}: reverses at t = {when:.2f} s, "
-            "which steering = compliant or caster cannot; use rigid"
+            "which compliant and caster steering cannot do; use rigid"
         )
-    # atan2 keeps the ratio θ̇/V all the way to rest, and is zero there: a pause asks for no steering angle.
+    # atan2 keeps the ratio θ̇/V as the robot comes to rest, and is zero at rest, which needs no steering angle.
     steering = np.arctan2(abs(robot.wheelbase) * np.abs(omega), np.abs(v))
     for name, values, unit, limit, bound in (
         ("speed", v, "m/s", "max_speed", robot.max_speed),

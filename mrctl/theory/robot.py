@@ -1,6 +1,6 @@
-"""The robot as equations (1) to (3) know it, and what can be wrong with it.
+"""The parameters of a robot in equations (1) to (3), and the file that a robot comes from.
 
-No MuJoCo here: `mrctl.physics.mjcf` reads a `Robot` from a compiled MJCF and applies a `Perturbation` to one.
+`mrctl.physics.parameters.read_robot` reads a `Robot` from a compiled MJCF.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from mrctl.record import Record
 
 GRAVITY = 9.81  # m/s²
-ANY_ANGLE = math.pi / 2  # rad, the steering limit of what is not steered
+ANY_ANGLE = math.pi / 2  # rad, the steering limit of a robot without a steered wheel
 Steering = Literal["compliant", "caster", "rigid"]
 STEERINGS: tuple[Steering, ...] = ("compliant", "caster", "rigid")
 
@@ -32,60 +32,60 @@ class Robot(Record):
     yaw_inertia: Positive
     """Yaw inertia of the whole robot about its centre of mass [J] in kg·m²."""
     com_offset: float
-    """Centre of mass ahead of P [c] in m."""
+    """Distance of the centre of mass ahead of P [c] in m."""
     com_height: NonNegative
     """Height of the centre of mass above the ground in m."""
     wheel_radius: Positive
-    """Rear wheel radius [r] in m."""
+    """Radius of the rear wheels [r] in m."""
     front_wheel_radius: Positive
-    """Front wheel radius in m."""
+    """Radius of the front wheel in m."""
     half_track: Positive
     """Half the distance between the rear wheels [D] in m."""
     wheelbase: float
-    """Rear axle to steering axis [L] in m; to the caster where nothing is steered, negative if it is behind."""
+    """Distance of the steering axis ahead of the rear axle [L] in m; without one, of the caster, negative if behind."""
     trail: NonNegative
-    """Front contact point behind the steering axis [t] in m."""
+    """Distance of the front contact point behind the steering axis [t] in m."""
     steering_limit: Annotated[float, Field(gt=0, le=ANY_ANGLE)]
     """Largest steering angle in rad; π/2 for a differential drive, which turns on the spot."""
     resistance: Positive
-    """Terminal resistance [R_a] in Ω."""
+    """Terminal resistance of a motor [R_a] in Ω."""
     inductance: NonNegative
-    """Armature inductance [L_a] in H; 0 where the current follows the voltage at once."""
+    """Armature inductance of a motor [L_a] in H; 0 where the current follows the voltage at once."""
     torque_constant: Positive
-    """Motor constant [k_M] in N·m/A, and [k_E] in V·s/rad: in SI they are the same number."""
+    """Motor constant in N·m/A [k_M] and in V·s/rad [k_E], which in SI are the same number."""
     gear_ratio: Positive
-    """Motor turns per wheel turn [N]."""
+    """Gear ratio [N], motor turns per wheel turn."""
     rotor_inertia: NonNegative
     """Rotor inertia at the motor shaft [J_m] in kg·m²."""
     no_load_current: NonNegative
-    """No-load current [I_0] in A."""
+    """No-load current of a motor [I_0] in A."""
     gear_loss: NonNegative
     """Coulomb friction of one gearbox, at the wheel, in N·m."""
     rolling_coefficient: NonNegative
-    """Rolling resistance over load."""
+    """Rolling resistance coefficient, the ratio of resistance to load."""
     wheel_inertia: Positive
     """Spin inertia of one rear wheel [J_w] in kg·m²."""
     front_wheel_inertia: NonNegative
-    """Spin inertia of the front wheel, or of both, in kg·m²."""
+    """Spin inertia of all front wheels together in kg·m²."""
     supply: Positive
     """Supply voltage [U_max] in V."""
     drive_gain: Positive = 1.0
-    """Applied volt per commanded volt; below 1 for a PWM drive on a sagging supply."""
+    """Ratio of applied to commanded voltage; below 1 for a PWM drive on a sagging supply."""
     tyre_friction: Positive
-    """Coulomb coefficient between tyre and floor."""
+    """Coulomb friction coefficient between tyre and floor."""
     max_speed: Positive
     """Limit on |V| for references and commands in m/s."""
     max_rotation: Positive
-    """Limit on |θ̇| in rad/s."""
+    """Limit on |θ̇| for references and commands in rad/s."""
     max_acceleration: Positive
-    """Limit on |V̇| in m/s²."""
+    """Limit on |V̇| for references and commands in m/s²."""
     max_rotation_acceleration: Positive
-    """Limit on |θ̈| in rad/s²."""
+    """Limit on |θ̈| for references and commands in rad/s²."""
 
     @model_validator(mode="after")
     def _geometry(self) -> Robot:
         if self.wheelbase <= 0 and self.steering_limit < ANY_ANGLE:
-            raise ValueError("wheelbase: steered wheels must be ahead of the driven ones")
+            raise ValueError("wheelbase: must be positive, with the steered wheels ahead of the driven ones")
         if self.trail >= abs(self.wheelbase):
             raise ValueError("trail: must be shorter than the wheelbase")
         if not 0 <= self.com_offset / (self.wheelbase - self.trail) < 1:
@@ -94,17 +94,17 @@ class Robot(Record):
 
     @property
     def motor_gain(self) -> float:
-        """Stall torque at the wheel per volt, N k_M / R_a, in N·m/V."""
+        """Stall torque of one drive at the wheel per volt, N k_M / R_a, in N·m/V."""
         return self.gear_ratio * self.torque_constant / self.resistance
 
     @property
     def back_emf(self) -> float:
-        """Back-EMF per wheel rate, k_E N, in V·s/rad."""
+        """Back-EMF of one drive per wheel rate, N k_E, in V·s/rad."""
         return self.gear_ratio * self.torque_constant
 
     @property
     def drive_loss(self) -> float:
-        """Coulomb torque τ_loss of one drive at the wheel, N k_M I_0 + gearbox, in N·m."""
+        """Coulomb torque of one drive at the wheel, τ_loss = N k_M I_0 + gearbox loss, in N·m."""
         return self.back_emf * self.no_load_current + self.gear_loss
 
     @property
@@ -114,7 +114,7 @@ class Robot(Record):
 
     @property
     def front_load(self) -> float:
-        """Share of the weight on the front wheel at rest, by the lever rule."""
+        """Share of the weight that the front wheel bears at rest, by the lever rule, f = c/(L − t)."""
         return self.com_offset / (self.wheelbase - self.trail)
 
     @property
@@ -124,7 +124,7 @@ class Robot(Record):
 
     @property
     def effective_mass(self) -> float:
-        """Mass that the motors accelerate, M_e, in kg: robot, spinning rear drives, spinning front wheel."""
+        """Effective mass M_e in kg: the robot's mass, and the spin inertias of its drives and front wheel."""
         return (
             self.mass
             + 2 * self.drive_inertia / self.wheel_radius**2
@@ -133,7 +133,7 @@ class Robot(Record):
 
     @property
     def effective_inertia(self) -> float:
-        """Yaw inertia about P that the motors accelerate, J_e, in kg·m²."""
+        """Effective yaw inertia about P, J_e, in kg·m²: the robot's, and the spin inertias of its drives."""
         return (
             self.yaw_inertia
             + self.mass * self.com_offset**2
@@ -163,18 +163,17 @@ class Robot(Record):
 
 
 class RobotFile(Record):
-    """Whose robot drives: an MJCF, and what its parts are called. What has no name is found where it is unambiguous."""
+    """The MJCF file of a robot, and the names of its parts where they are ambiguous in the file."""
 
     path: str = "car"
-    """`car`, `turtlebot`, `racecar`, or the path of an MJCF file with the robot."""
+    """Robot that drives: `car`, `turtlebot`, `racecar`, or the path of an MJCF file."""
     wheels: tuple[str, ...] = ()
     """Joints of the two driven wheels; by default the two joints with a <dcmotor>."""
     steering: tuple[str, ...] = ()
-    """Joint of the steered wheel, or of both; by default the upright joints with an actuator, so none for a
-    differential drive."""
+    """Joints of the steered wheels, at most two; by default the upright joints with an actuator."""
     chassis: str = ""
-    """Body that carries the rest; by default the one at the root of the wheels."""
+    """Body that carries the wheels; by default the one at their root."""
 
 
 CAR = RobotFile()
-"""The robot that a world has by itself."""
+"""The robot of the world itself."""

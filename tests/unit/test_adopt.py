@@ -1,4 +1,4 @@
-"""Robots of other files: whatever they call their parts and wherever these stand, the same robot comes out."""
+"""Robots of other MJCF files: the same robot comes out whatever the file calls its parts and wherever these are."""
 
 import mujoco
 import numpy as np
@@ -19,7 +19,7 @@ FLOOR = '<light pos="0 0 3"/><geom name="floor" type="plane" size="5 5 .1"/>'
 
 
 def wheel(joint, at, axis="0 1 0", extra="", loss=0.1):
-    """A solid cylinder of 0.1 m by 0.04 m and 2 kg with its joint."""
+    """A wheel: a solid cylinder of radius 0.1 m, width 0.04 m and 2 kg with its joint."""
     return f"""<body pos="{at}">
       <joint name="{joint}" axis="{axis}" frictionloss="{loss}"/>
       <geom type="cylinder" size="0.1 0.02" euler="90 0 0" mass="2" friction="0.8"/>{extra}
@@ -67,7 +67,7 @@ def read(path, **names):
 
 
 def test_by_hand(file):
-    """Every parameter against what the file says: a box, two solid wheels, a massless caster."""
+    """Every parameter of a box with two solid wheels and a massless caster is that of its file."""
     robot, model = read(file(document(DIFF, MOTORS)))
     spin, yaw = 2 * 0.1**2 / 2, 10 * (0.4**2 + 0.2**2) / 12 + 10 * (0.1 - 10 * 0.1 / 14) ** 2
     across = 2 * (0.1**2 / 4 + 0.04**2 / 12)
@@ -108,7 +108,7 @@ VARIANTS = {
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_the_same_robot(file, name):
-    """However the file puts it, the robot is the same, and voltages drive it along the same path."""
+    """The same robot written in different ways has the same parameters, and voltages drive it along the same path."""
     ideal, plain = read(file(document(DIFF, MOTORS)))
     robot, model = read(file(VARIANTS[name]))
     assert robot.model_dump() == pytest.approx(ideal.model_dump(), rel=1e-6, abs=1e-9)
@@ -141,7 +141,7 @@ def test_caster_behind(file):
 
 @pytest.mark.parametrize("body", [CAR, TRICYCLE], ids=["two wheels", "one wheel"])
 def test_steered(file, body):
-    """Driven with the electronic differential, it goes round L/tan φ; the inner wheel turns farther, by Ackermann."""
+    """With an electronic differential the robot drives a circle of radius L/tan φ; the inner wheel turns farther."""
     servos = SERVO.format("s1") + (SERVO.format("s2") if "s2" in body else "")
     robot, model = read(file(document(body, MOTORS + servos)))
     assert mjcf.steerings(model) == ("rigid",) and robot.wheelbase == 0.5 and robot.trail == 0
@@ -161,7 +161,7 @@ def test_steered(file, body):
 
 
 def test_front_rates(file):
-    """Steered wheels roll as fast as their distance from the turning point says."""
+    """Steered wheels roll at rates proportional to their distances from the turning point."""
     robot, model = read(file(document(CAR, MOTORS + SERVO.format("s1") + SERVO.format("s2"))))
     phi, v = 0.25, 0.6
     turn = 0.5 / np.tan(phi)
@@ -170,8 +170,8 @@ def test_front_rates(file):
         assert rates[name] == pytest.approx(v / turn * np.hypot(turn - y, 0.5) / 0.1, rel=1e-3)
 
 
-def test_ours_as_a_stranger():
-    """The default robot, brought in from its own file, is the default robot, steered by its servo."""
+def test_default_robot_adopted():
+    """The default robot, adopted from its own file, has the default robot's parameters but the tyres' friction."""
     robot = mrctl.load_robot(models_folder() / "car.xml")
     found = read_robot(mjcf.load("flat", "rigid", robot=robot))
     own = read_robot(mjcf.load("flat"))
@@ -182,7 +182,7 @@ def test_ours_as_a_stranger():
 @pytest.mark.parametrize("world", ["flat", "slope", "rough", "patch"])
 @pytest.mark.parametrize("name", ["turtlebot", "racecar"])
 def test_every_world(name, world):
-    """Robots stand in every world, on all their wheels, and roll."""
+    """Adopted robots stand on all their wheels in every world, and roll."""
     robot = RobotFile(path=name)
     model = mjcf.load(world, mjcf.arrangement(robot), robot=robot)
     expected = read_robot(mjcf.load("flat", mjcf.arrangement(robot), robot=robot))
@@ -199,14 +199,14 @@ def test_every_world(name, world):
 
 
 def test_slippery_in_proportion():
-    """The icy patch is as much more slippery for another tyre as for ours."""
+    """The friction on the icy patch falls by the same factor for the tyres of an adopted robot."""
     model = mjcf.load("patch", "rigid", robot=RobotFile(path="racecar"))
     friction = {model.pair(p).name: model.pair_friction[p, 0] for p in range(model.npair)}
     assert friction["tyre_left"] == pytest.approx(1.0489) and friction["ice_left"] == pytest.approx(1.0489 / 9)
 
 
 def test_published():
-    """The two robots have the numbers of their sources."""
+    """The TurtleBot and the racing car have the numbers of their published sources."""
     turtle, _ = read("turtlebot")
     assert (turtle.mass, turtle.wheel_radius, 2 * turtle.half_track) == pytest.approx((6.3, 0.035, 0.23))
     # Kobuki: 0.7 m/s at most; no-load speed of the motor 9960 rpm ± 15 %, 6545/132.
@@ -219,7 +219,7 @@ def test_published():
 
 
 def test_limits(file):
-    """Without a numeric `limits`, those of the default robot would come out near what was chosen for it."""
+    """The limits derived for a robot without a numeric `limits` are near the default robot's own."""
     text = (models_folder() / "car.xml").read_text().replace('<numeric name="limits" data="1.5 3 1.5 6"/>', "")
     robot, _ = read(file(text))
     found = robot.max_speed, robot.max_rotation, robot.max_acceleration, robot.max_rotation_acceleration
@@ -227,7 +227,7 @@ def test_limits(file):
 
 
 def test_slow_casters_tip_nobody(file):
-    """Perturbations reach an adopted robot: mass, motor, wheel, and losses."""
+    """A perturbation changes mass, motor, wheel and losses of an adopted robot."""
     _, model = read(file(document(DIFF, MOTORS)))
     changed = mjcf.clone(model)
     p = Perturbation(
@@ -267,7 +267,7 @@ ERRORS = {
 
 @pytest.mark.parametrize("name", ERRORS)
 def test_refused(file, name):
-    """What is missing is said in one line, with the file."""
+    """A robot that cannot be adopted is refused with one line that names the file and the part."""
     text, names, words = ERRORS[name]
     with pytest.raises(InputError) as refusal:
         mrctl.load_robot(file(text), **names)
@@ -277,7 +277,7 @@ def test_refused(file, name):
 
 
 def test_refused_elsewhere():
-    """A file that is not there, a robot as a world, and a way to steer that a robot has not."""
+    """A missing file, a robot named as a world, and a steering that a robot does not have are refused."""
     for scenario, words in (
         (mrctl.Scenario(robot=RobotFile(path="none.xml")), ("robot.path", "turtlebot")),
         (mrctl.Scenario(robot=RobotFile(path="flat")), ("robot.path", "turtlebot")),

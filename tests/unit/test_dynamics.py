@@ -23,13 +23,13 @@ smoothing = st.sampled_from([0.0, 0.05])
 
 @pytest.fixture(scope="module")
 def lossless(robot):
-    """The robot without friction."""
+    """Returns the robot without friction."""
     return robot.model_copy(update=LOSSLESS)
 
 
 @pytest.fixture(scope="module")
 def bare(robot):
-    """The robot that the printed equation describes: a mass and two motors, without friction."""
+    """Returns the robot that the printed equation describes: a mass and two motors, without friction."""
     return robot.model_copy(update=BARE)
 
 
@@ -140,14 +140,14 @@ def test_mix():
 
 
 def test_rest(robot):
-    """Friction at rest does not drive; nor does it, in any motion, feed the robot."""
+    """Friction does not drive a robot at rest, and adds no energy in any motion."""
     np.testing.assert_array_equal(d.accelerations([0, 0], [0, 0], robot), 0)
     coasting = d.accelerations(TWISTS, [0, 0], robot)
     assert np.all(np.sum(coasting * TWISTS * [robot.effective_mass, robot.effective_inertia], axis=-1) < 0)
 
 
 def test_turning_on_the_spot(robot):
-    """Wheels that turn against each other feel their own share of the rolling loss as a torque, and no force."""
+    """For wheels that turn against each other the rolling loss is a torque, and no force."""
     force, torque = d.rolling_losses([0.0, 1.0], robot)
     assert force == 0
     assert torque == pytest.approx(0.188 * 0.015 * 20 * 9.81 * (1 - 0.1 / 0.37))
@@ -161,7 +161,7 @@ def test_sign_smoothing(robot):
 
 
 def settle(robot, mixed, seconds=6.0, step=1e-3):
-    """The twist from rest under constant (U_Σ, U_Δ), every step, by Euler."""
+    """Returns the twist from rest under constant (U_Σ, U_Δ) at every step, by Euler's method."""
     twist, path = np.zeros(2), []
     for _ in range(round(seconds / step)):
         twist = twist + step * d.accelerations(twist, d.left_right(mixed), robot)
@@ -270,7 +270,7 @@ def test_defect_5_names(robot):
     ],
 )  # fmt: skip
 def test_defect_6_left_out(robot, change):
-    """What the printed equation does not know changes the corrected one."""
+    """Parameters that are missing in the printed equation change the corrected one."""
     other = robot.model_copy(update=change)
     twist, voltage = [0.5, 1.0], [10.0, 14.0]
     printed, corrected = d.accelerations_as_printed, d.accelerations

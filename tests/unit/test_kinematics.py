@@ -1,4 +1,4 @@
-"""Equations (1) and (2) against rigid-body geometry: what each wheel's contact point does on the floor."""
+"""Equations (1) and (2) against rigid-body geometry: the velocity of each wheel's contact point on the floor."""
 
 import numpy as np
 import pytest
@@ -88,7 +88,7 @@ def test_printed_contradicts_2(robot):
 
 
 def test_wheel_rates(robot):
-    """The rear wheels cover the ground under them; odometry undoes it."""
+    """The rear wheels roll at the speeds of their contact points; odometry is the inverse."""
     rates = k.wheel_rates(TWISTS, robot)
     points = 1j * robot.half_track * np.array([1, -1])
     ground = np.stack([contact_velocity(TWISTS, point).real for point in points], axis=-1)
@@ -125,7 +125,7 @@ def test_scrub_free_no_trail(robot):
 
 @given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
 def test_angles_finite(robot, v, omega):
-    """No NaN anywhere, and turning the other way mirrors the angle."""
+    """The angles are never NaN, and a turn the other way mirrors them."""
     for law in (k.steering_angle, k.scrub_free_angle):
         angle = law([v, omega], robot)
         assert abs(angle) <= np.pi / 2

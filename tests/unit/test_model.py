@@ -1,4 +1,4 @@
-"""The robot as read from the MJCF against the numbers of its data sheet, perturbations, and standing on the ground."""
+"""Compiled models: parameters against the data sheet, perturbations, and the state of a standing robot."""
 
 import math
 import shutil
@@ -59,14 +59,14 @@ PUBLISHED = {
 
 
 def perturbed(**values) -> mujoco.MjModel:
-    """A perturbed copy of the nominal model."""
+    """Returns a perturbed copy of the nominal model."""
     model = mjcf.clone(NOMINAL)
     perturb(NOMINAL, model, Perturbation(**values))
     return model
 
 
 def changes(**values) -> dict[str, float]:
-    """The robot's parameters that a perturbation changes, as ratios to the nominal ones."""
+    """Returns the parameters that a perturbation changes, as ratios to the nominal ones."""
     after, before = read_robot(perturbed(**values)).model_dump(), BASE.model_dump()
     return {name: after[name] / before[name] for name in before if not math.isclose(after[name], before[name])}
 
@@ -76,12 +76,12 @@ def changes(**values) -> dict[str, float]:
 
 @pytest.mark.parametrize(("name", "value"), PUBLISHED.items())
 def test_published(name, value):
-    """The MJCF holds the documented robot."""
+    """The MJCF has the documented parameters."""
     assert getattr(BASE, name) == pytest.approx(value, rel=0.02)
 
 
 def test_exact():
-    """What the file states outright is read to rounding; what is derived from it, to six digits."""
+    """Parameters that the file states are read exactly, and those derived from it to six digits."""
     for name in ("mass", "wheel_radius", "half_track", "resistance", "torque_constant", "rotor_inertia", "supply"):
         assert getattr(BASE, name) == pytest.approx(PUBLISHED[name], rel=1e-12)
     for name in ("yaw_inertia", "com_offset", "com_height", "gear_loss", "rolling_coefficient"):
@@ -89,13 +89,13 @@ def test_exact():
 
 
 def test_motor_limits():
-    """No-load speed 2.34 m/s and stall torque 10.4 N·m."""
+    """The no-load speed is 2.34 m/s and the stall torque 10.4 N·m."""
     assert BASE.supply * BASE.velocity_gain == pytest.approx(2.34, abs=5e-3)
     assert BASE.supply * BASE.motor_gain == pytest.approx(10.4, abs=0.05)
 
 
 def test_inertia_by_physics():
-    """Mass and J_z + m c² are what the engine's own mass matrix says about P."""
+    """Mass and J_z + m c² about P are those of the engine's own mass matrix."""
     model, data = mjcf.clone(NOMINAL), mujoco.MjData(NOMINAL)
     mujoco.mj_forward(model, data)
     matrix = np.zeros((model.nv, model.nv))
@@ -109,7 +109,7 @@ def test_inertia_by_physics():
 @pytest.mark.parametrize("world", ["flat", "slope", "rough", "patch"])
 @pytest.mark.parametrize("steering", ["compliant", "caster", "rigid"])
 def test_worlds(world, steering):
-    """The same robot in every world; only the trail, and what swings with the wheel, depends on the steering."""
+    """The robot is the same in every world; only trail, centre of mass and yaw inertia depend on the steering."""
     robot = read_robot(mjcf.load(world, steering)).model_dump()
     moved = {"trail", "com_offset", "yaw_inertia"} if steering == "rigid" else set()
     for name, value in BASE.model_dump().items():
@@ -122,7 +122,7 @@ def test_worlds(world, steering):
     ("steering", "stiffness", "damping"), [("compliant", 2, 0.1), ("caster", 0, 0.02), ("rigid", 40, 1)]
 )
 def test_steering(steering, stiffness, damping):
-    """Torque of the fork's servo for a position and a velocity error, from the engine."""
+    """The fork's servo has the stiffness and damping of its arrangement, by the engine's torque."""
     model = mjcf.load("flat", steering)
     fork, servo = model.joint("steering"), model.actuator("steering")
     inputs = model.actuator_ctrladr[servo.id] + np.arange(2)
@@ -138,7 +138,7 @@ def test_steering(steering, stiffness, damping):
 
 
 def test_digest(tmp_path):
-    """The same world read from another folder is the same; with another bump, name, scale or time step it is not."""
+    """A digest is the same for a copy of a world elsewhere, and differs with a bump, name, scale or time step."""
     for name in ("rough.xml", "rough.png", "car.xml", "scenery.xml"):
         shutil.copy(models_folder() / name, tmp_path / name)
     text, world = (tmp_path / "rough.xml").read_text(), tmp_path / "another.xml"
@@ -153,7 +153,7 @@ def test_digest(tmp_path):
 
 
 def test_timestep():
-    """The file's own, or another."""
+    """The time step can be set."""
     assert NOMINAL.opt.timestep == 0.002
     assert mjcf.load("flat", timestep=0.001).opt.timestep == 0.001
 
@@ -163,12 +163,12 @@ def test_timestep():
 
 @pytest.fixture
 def folder(tmp_path):
-    """A copy of the models to break."""
+    """Returns a copy of the shipped models, which a test may break."""
     return shutil.copytree(models_folder(), tmp_path / "models")
 
 
 def broken(folder, old, new, file="car.xml"):
-    """The flat world with one passage of a file replaced."""
+    """Returns the flat world with one passage of a file replaced."""
     text = (folder / file).read_text()
     assert old in text
     (folder / file).write_text(text.replace(old, new))
@@ -176,7 +176,7 @@ def broken(folder, old, new, file="car.xml"):
 
 
 def refuses(world, *words, steering="compliant"):
-    """Loading is refused with one line that names the file and these words."""
+    """Checks that a world is refused with one line that names the file and has these words."""
     with pytest.raises(InputError) as error:
         mjcf.load(world, steering)
     message = str(error.value)
@@ -191,14 +191,14 @@ def test_found():
 
 
 def test_missing_file(tmp_path):
-    """A name that is not shipped, and a path that is not there; the message lists what there is."""
+    """An unknown name and a missing path are refused; the message lists the shipped worlds."""
     for world in ("flatt", str(tmp_path / "flat.xml"), ""):
         with pytest.raises(InputError, match=r"^world: no file .*shipped worlds: flat, patch, rough, slope$"):
             mjcf.load(world)
 
 
 def test_broken_xml(folder):
-    """Neither XML nor MJCF, nor a missing include."""
+    """Files that are not XML, not MJCF, or miss an include are refused."""
     world = folder / "flat.xml"
     for text in (
         "<mujoco",
@@ -235,12 +235,12 @@ def test_broken_xml(folder):
     ],
 )
 def test_missing_element(folder, old, new, words):
-    """What the robot is read from is asked for by name."""
+    """A missing or wrong element is refused by its name."""
     refuses(broken(folder, old, new), *words)
 
 
 def test_missing_steering(folder):
-    """An arrangement that the file does not describe is refused, but only if it is asked for."""
+    """A steering arrangement that the file does not describe is refused when it is asked for."""
     world = broken(
         folder, '<numeric name="steering_rigid" data="40 1 0"/>', '<numeric name="steering_caster_" data="1"/>'
     )
@@ -250,7 +250,7 @@ def test_missing_steering(folder):
 
 
 def test_no_pair(folder):
-    """Without a pair the robot would fall through the floor."""
+    """A world without contact pairs is refused, as the robot would fall through the floor."""
     text = (folder / "flat.xml").read_text()
     (folder / "flat.xml").write_text(text[: text.index("<contact>")] + "</mujoco>")
     refuses(str(folder / "flat.xml"), "pair")
@@ -260,7 +260,7 @@ def test_no_pair(folder):
 
 
 def test_no_perturbation():
-    """The default is a no-op, to the bit, also after another perturbation."""
+    """The default perturbation gives the nominal model to the bit, also after another perturbation."""
     model = perturbed(mass_factor=1.7, payload=3, left_radius_factor=1.1, motor_constant_factor=0.8, slope=0.2)
     for candidate in (perturbed(), model):
         perturb(NOMINAL, candidate, Perturbation())
@@ -271,7 +271,7 @@ def test_no_perturbation():
 
 
 def test_every_changed_field_is_listed():
-    """No field changes outside `PERTURBED` but constants that the engine derives from them."""
+    """Outside `PERTURBED` only constants that the engine derives change."""
     model = perturbed(
         mass_factor=1.5, inertia_factor=1.2, payload=2, payload_y=0.05, left_radius_factor=1.02,
         right_radius_factor=0.98, drive_friction_factor=3, resistance_factor=1.3, motor_constant_factor=0.85,
@@ -301,12 +301,12 @@ def test_every_changed_field_is_listed():
     ],
 )
 def test_factor(perturbation, expected):
-    """Each changes what it should and nothing else; the no-load torque is a loss, whatever the motor constant."""
+    """A perturbation changes the parameters it names and no others; the no-load torque is a loss."""
     assert changes(**perturbation) == pytest.approx(expected)
 
 
 def test_one_tyre_on_ice():
-    """The left tyre loses its grip on every floor, the others keep theirs; all of them together multiply."""
+    """The factor of the left tyre acts on every floor and multiplies that of all tyres."""
     nominal = mjcf.load("patch")
     pairs = [nominal.pair(k).name or "tyre" for k in range(nominal.npair)]
     left = [nominal.geom("wheel_left").id in (nominal.pair_geom1[k], nominal.pair_geom2[k]) for k in range(len(pairs))]
@@ -319,7 +319,7 @@ def test_one_tyre_on_ice():
 
 
 def test_drive_friction():
-    """τ_loss grows, rolling does not; without any, nothing but rolling is left."""
+    """Drive friction scales τ_loss alone; at factor 0 only the rolling loss is left."""
     for factor in (0.0, 3.0, 20.0):
         robot = read_robot(perturbed(drive_friction_factor=factor))
         assert robot.drive_loss == pytest.approx(factor * BASE.drive_loss, abs=1e-12)
@@ -327,7 +327,7 @@ def test_drive_friction():
 
 
 def test_rolling_follows_load():
-    """All frictionloss of an unperturbed drive plus the rolling of the new load, wheel by wheel."""
+    """A payload adds its rolling loss to the frictionloss of each wheel."""
     model = perturbed(mass_factor=1.5)
     rear = BASE.rolling_coefficient * (1 - BASE.front_load) / 2 * 10 * GRAVITY * BASE.wheel_radius
     front = BASE.rolling_coefficient * BASE.front_load * 10 * GRAVITY * BASE.front_wheel_radius
@@ -341,7 +341,7 @@ def test_rolling_follows_load():
 
 
 def test_inertia_factor():
-    """The chassis' own 0.4275 kg·m² about the vertical, and nothing else."""
+    """The inertia factor scales the chassis' own 0.4275 kg·m² about the vertical and nothing else."""
     robot = read_robot(perturbed(inertia_factor=1.5))
     assert robot.yaw_inertia - BASE.yaw_inertia == pytest.approx(0.5 * 0.427509)
     assert changes(inertia_factor=1.5).keys() == {"yaw_inertia"}
@@ -352,7 +352,7 @@ def test_inertia_factor():
 )  # fmt: skip
 @settings(max_examples=20)
 def test_payload(payload, x, y, z, factor):
-    """A point mass: total, centre of mass, and yaw inertia by the parallel-axis theorem."""
+    """A payload adds to mass, centre of mass and yaw inertia as a point mass does."""
     model = perturbed(payload=payload, payload_x=x, payload_y=y, payload_z=z, mass_factor=factor)
     robot, mass = read_robot(model), factor * BASE.mass
     total = mass + payload
@@ -371,20 +371,20 @@ def test_payload(payload, x, y, z, factor):
 
 
 def test_payload_tips():
-    """A robot that could not stand is refused."""
+    """A payload that would tip the robot over is refused."""
     for where in ({"payload_x": -1.0}, {"payload_x": 1.0}, {"payload_y": 1.0}):
         with pytest.raises(InputError, match=r"^perturbation.payload: .*tip over$"):
             perturbed(payload=20, **where)
 
 
 def test_payload_below_ground():
-    """Small wheels let a heavy payload at the height of the floor down through it."""
+    """A centre of mass below the ground is refused: smaller wheels lower a payload at the floor's height."""
     with pytest.raises(InputError, match=r"^perturbation.payload_z: .*below the ground$"):
         perturbed(mass_factor=0.5, payload=121, payload_z=0, right_radius_factor=0.8125)
 
 
 def test_radii():
-    """One radius alone: the geom, its bounds, the mean; the other wheel and the front wheel stay."""
+    """A radius factor changes one wheel's geom and its bounds, and the mean radius of the two."""
     model = perturbed(left_radius_factor=1.05)
     left, right = model.geom("wheel_left"), model.geom("wheel_right")
     assert left.size[0] == left.rbound[0] == pytest.approx(0.098 * 1.05)
@@ -396,14 +396,26 @@ def test_radii():
 
 
 def test_slope():
-    """Gravity turns about y: uphill along +x, with its norm kept."""
+    """A slope turns gravity about y, uphill along +x, and keeps its norm."""
     gravity = perturbed(slope=0.1).opt.gravity
     assert gravity == pytest.approx(GRAVITY * np.array([-math.sin(0.1), 0, -math.cos(0.1)]))
     assert np.linalg.norm(perturbed(slope=-0.5).opt.gravity) == pytest.approx(GRAVITY)
 
 
+def test_known_robot(monkeypatch):
+    """Where the nominal robot is known it is not read again, and the perturbed model is the same to the bit."""
+    expected = perturbed(payload=5, drive_friction_factor=2)
+    model = mjcf.clone(NOMINAL)
+    monkeypatch.setattr("mrctl.physics.perturb.read_robot", None)
+    perturb(NOMINAL, model, Perturbation(payload=5, drive_friction_factor=2), BASE)
+    for name, value in fields(expected).items():
+        assert np.array_equal(fields(model)[name], value), name
+    with pytest.raises(TypeError):
+        perturb(NOMINAL, model, Perturbation())
+
+
 def test_supply():
-    """A drive on a stronger supply must be able to pass it on; the controller's limit stays nominal."""
+    """A stronger supply raises the motors' voltage range; a weaker one leaves it."""
     assert read_robot(NOMINAL, 0.8).drive_gain == 0.8
     assert read_robot(perturbed(supply_factor=0.8)).supply == 24
     assert read_robot(perturbed(supply_factor=1.25)).supply == pytest.approx(30)
@@ -420,7 +432,7 @@ FIELDS = {
 @given(st.fixed_dictionaries({}, optional={name: st.floats(*bounds) for name, bounds in FIELDS.items()}))
 @settings(max_examples=60)
 def test_any_perturbation(values):
-    """Whatever the ranges allow gives a robot, or is refused because it could not stand."""
+    """A random perturbation gives a valid robot, or is refused because the robot could not stand."""
     try:
         model = perturbed(**values)
     except InputError as error:
@@ -437,12 +449,12 @@ def test_any_perturbation(values):
 
 @pytest.fixture
 def inductive(folder):
-    """The flat world with the winding's 0.24 mH."""
+    """Returns the flat world with motors of 0.24 mH."""
     return broken(folder, 'resistance="2.32"', 'resistance="2.32" inductance="2.4e-4 0"')
 
 
 def test_inductance(inductive):
-    """It is read from the file, and stays the same behind another resistance."""
+    """The inductance is read from the file, and does not change with the resistance."""
     nominal = mjcf.load(inductive)
     model = mjcf.clone(nominal)
     perturb(nominal, model, Perturbation(resistance_factor=1.5))
@@ -458,7 +470,7 @@ WHEELS = ("wheel_left", "wheel_right", "front_wheel")
 
 
 def gaps(model, state):
-    """Signed distance of each wheel from the ground, from the engine's own collision, in m."""
+    """Returns the signed distance of each wheel from the ground in m, from the engine's own collision."""
     loose = mjcf.clone(model)
     loose.pair_margin[:] = 0.1
     data = mujoco.MjData(loose)
@@ -474,7 +486,7 @@ def gaps(model, state):
 
 
 def heading(state):
-    """Heading of the body's x axis, rad."""
+    """Returns the heading of the body's x axis in rad."""
     frame = np.zeros(9)
     mujoco.mju_quat2Mat(frame, state.qpos[3:7])
     return math.atan2(frame[3], frame[0])
@@ -485,7 +497,7 @@ def heading(state):
 @given(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1), st.floats(0.1, 1), st.floats(-1, 1))
 @settings(max_examples=8)
 def test_stands_on_planes(world, radii, x, y, theta, v, omega):
-    """Three wheels touch to a nanometre, whatever the radii; the posture is the one asked for."""
+    """On a plane three wheels of any radii touch to a nanometre, at the requested pose."""
     nominal = WORLDS[world]
     model = mjcf.clone(nominal)
     perturb(nominal, model, Perturbation(left_radius_factor=radii[0], right_radius_factor=radii[1]))
@@ -501,7 +513,7 @@ WORLDS = {world: mjcf.load(world) for world in ("flat", "slope", "rough", "patch
 @given(st.floats(-3, 3), st.floats(-3, 3), st.floats(-3.1, 3.1))
 @settings(max_examples=30)
 def test_stands_on_bumps(x, y, theta):
-    """On uneven ground nothing penetrates, one wheel touches, the others hover by no more than the bumps allow."""
+    """On uneven ground no wheel penetrates, one touches, and the others are no higher than the bumps."""
     state = stand(WORLDS["rough"], np.array([x, y, theta]), np.array([0.5, 0.0]))
     gap = gaps(WORLDS["rough"], state)
     assert gap.min() > -1e-6 and gap.min() < 2e-3 and gap.max() < 0.01
@@ -511,7 +523,7 @@ def test_stands_on_bumps(x, y, theta):
 @given(st.floats(0, 1.5), st.floats(-2, 2), st.floats(0.9, 1.1), st.floats(0.9, 1.1))
 @settings(max_examples=30)
 def test_rolls(v, omega, left, right):
-    """Wheel rates of equation (1), each wheel on its own radius; the fork rolls without scrub."""
+    """The wheels have the rates of equation (1) with their own radii, and the front wheel does not scrub."""
     model = perturbed(left_radius_factor=left, right_radius_factor=right)
     state = stand(model, np.zeros(3), np.array([v, omega]))
     steering = state.qpos[model.joint("steering").qposadr[0]]
@@ -534,6 +546,6 @@ def test_rolls(v, omega, left, right):
 
 
 def test_no_ground():
-    """Beyond the edge of the height field."""
+    """A pose beyond the edge of the height field is refused."""
     with pytest.raises(InputError, match=r"^initial_pose: there is no ground below \(20\.\d\d, "):
         stand(WORLDS["rough"], np.array([20.0, 0.0, 0.0]), np.zeros(2))

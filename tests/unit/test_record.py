@@ -1,4 +1,4 @@
-"""What comes in from outside: either a valid record, or one line that names the field."""
+"""Input from outside: it makes a valid record, or is refused with one line that names the field."""
 
 import tomllib
 
@@ -13,20 +13,20 @@ from mrctl.theory.references import Line, Waypoints
 
 
 class Inner(Record):
-    """A part."""
+    """A record inside another."""
 
     rate: float
 
 
 class Outer(Record):
-    """A whole."""
+    """A record with another one in it."""
 
     name: str = "x"
     inner: Inner = Inner(rate=1.0)
 
 
 def write(tmp_path, text):
-    """A TOML file with the text."""
+    """Writes a TOML file with the text."""
     path = tmp_path / "scenario.toml"
     path.write_text(text)
     return path
@@ -48,7 +48,7 @@ def write(tmp_path, text):
     ],
 )
 def test_bad_values(values, names):
-    """One line, with the place and the field."""
+    """Invalid values are refused with one line that names the source and the field."""
     with pytest.raises(InputError) as error:
         Outer.from_dict(values, "here")
     assert str(error.value).startswith("here: ") and names in str(error.value)
@@ -70,7 +70,7 @@ def test_bad_values(values, names):
     ],
 )
 def test_bad_toml(tmp_path, text):
-    """One line that begins with the file."""
+    """An invalid file is refused with one line that begins with its path."""
     path = write(tmp_path, text)
     with pytest.raises(InputError) as error:
         Outer.from_toml(path)
@@ -78,7 +78,7 @@ def test_bad_toml(tmp_path, text):
 
 
 def test_unreadable(tmp_path):
-    """No file, a folder, a path that cannot be one, and bytes that are not UTF-8."""
+    """A missing file, a folder, an impossible path and bytes that are not UTF-8 are refused with one line."""
     (tmp_path / "bytes.toml").write_bytes(b"name = '\xff'")
     for path in (tmp_path / "none.toml", tmp_path, tmp_path / "bytes.toml", "a\0b"):
         with pytest.raises(InputError, match=r"^[^\n]+$"):
@@ -86,14 +86,14 @@ def test_unreadable(tmp_path):
 
 
 def test_toml_matches_dict(tmp_path):
-    """A file says what its dictionary says."""
+    """A TOML file makes the same record as its dictionary."""
     text = "name = 'a'\n[inner]\nrate = 2.5\n"
     assert Outer.from_toml(write(tmp_path, text)) == Outer.from_dict(tomllib.loads(text))
     assert Outer.from_toml(str(write(tmp_path, text))).inner.rate == 2.5
 
 
 def test_frozen():
-    """A record does not change."""
+    """The fields of a record cannot be changed."""
     with pytest.raises(ValueError, match="frozen"):
         Outer().name = "y"  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -116,7 +116,7 @@ NUMBER = st.floats(-1, 1)
 
 @given(name=TEXT, x=NUMBER, time=st.floats(0, 1e8), delay=st.integers(0, 50), points=st.booleans())
 def test_toml(tmp_path_factory, name, x, time, delay, points):
-    """What is written is what is read, to the bit, with quotes, control characters and small numbers in it."""
+    """A record written to TOML is read back to the bit, with quotes, control characters and small numbers."""
     event = Event(time=time, perturbation=Perturbation(payload=abs(x), payload_x=x, control_delay=delay / 100))
     reference = Waypoints() if points else Line(heading=x)
     scenario = Scenario(name=name, reference=reference, events=(event, Event(time=1, push=(x, 0, 1e-9))))

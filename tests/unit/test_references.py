@@ -1,4 +1,4 @@
-"""The references against finite differences, analytic values, the non-holonomic constraint and their own seams."""
+"""References against finite differences, analytic values and the non-holonomic constraint, also from lap to lap."""
 
 import re
 import tomllib
@@ -42,7 +42,7 @@ each = pytest.mark.parametrize("reference", DEFAULTS, ids=lambda r: r.kind)
 
 
 def hold(reference, t, h=1e-4, tolerance=1e-6):
-    """Central differences, and the direction of motion, at the times t."""
+    """Checks twist and acceleration at the times t by central differences, and the direction of motion."""
     before, now, after = (reference.sample(t + step) for step in (-h, 0, h))
     rate = (after.pose - before.pose) / (2 * h)
     theta, (v, omega) = now.pose[:, 2], now.twist.T
@@ -75,14 +75,14 @@ size, duration, speed = st.floats(0.3, 5), st.floats(4, 30), st.floats(0.1, 2)
     )
 )
 def test_derivatives_anywhere(reference):
-    """The same for any parameters."""
+    """They are so for random parameters too."""
     hold(reference, np.linspace(0.01, 1.5 * reference.period, 200), tolerance=1e-5)
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(0.8, 1.5), min_size=3, max_size=9), speed, st.booleans())
 def test_spline_anywhere(radii, speed, closed):
-    """Star-shaped splines: derivatives, constant speed, and all points on the way."""
+    """A random star-shaped spline has the right derivatives, constant speed, and passes all its points."""
     angles = 2 * np.pi * np.arange(len(radii)) / len(radii)
     points = tuple((r * np.cos(a), r * np.sin(a)) for r, a in zip(radii, angles, strict=True))
     try:
@@ -110,7 +110,7 @@ def test_continuity(reference):
 
 @pytest.mark.parametrize("reference", CLOSED, ids=lambda r: r.kind)
 def test_closure(reference):
-    """A lap later everything repeats, the heading up to whole turns."""
+    """Everything repeats a lap later, the heading up to whole turns."""
     t = np.linspace(0, reference.period, 301)
     now, later = reference.sample(t), reference.sample(t + reference.period)
     np.testing.assert_allclose(later.pose[:, :2], now.pose[:, :2], atol=1e-9)
@@ -132,7 +132,7 @@ def test_pointwise(reference):
 
 
 def test_line():
-    """A line at 30° runs along its direction, past its length."""
+    """A line at 30° goes on along its direction after its length."""
     motion = Line(speed=0.5, length=2, heading=np.pi / 6).sample(np.array([0.0, 4, 8]))
     s = np.array([0, 2, 4])
     expected = np.stack([s * np.sqrt(3) / 2, s / 2, np.full(3, np.pi / 6)], -1)
@@ -142,7 +142,7 @@ def test_line():
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_circle(sign):
-    """Quarter points of a circle about (0, ±R)."""
+    """After a quarter of its period a circle about (0, ±R) is a quarter turn on."""
     motion = Circle(radius=2, period=8, clockwise=sign < 0).sample(np.array([0.0, 2, 4, 10]))
     expected = np.array([(0, 0, 0), (2, 2, np.pi / 2), (0, 4, np.pi), (2, 2, 2.5 * np.pi)]) * (1, sign, sign)
     np.testing.assert_allclose(motion.pose, expected, atol=1e-12)
@@ -151,7 +151,7 @@ def test_circle(sign):
 
 
 def test_lemniscate():
-    """Gerono's curve x⁴ = a²(x² - y²), its tips, and its speed a w √2 in the middle."""
+    """The lemniscate is Gerono's curve x⁴ = a²(x² - y²), with its tips, and its speed a w √2 in the middle."""
     reference = Lemniscate()
     motion = reference.sample(np.linspace(0, 24, 500))
     x, y, theta = motion.pose.T
@@ -164,7 +164,7 @@ def test_lemniscate():
 
 
 def test_lane_change():
-    """From lane to lane, symmetric about its middle, straight afterwards."""
+    """A lane change is symmetric about its middle and straight afterwards."""
     reference = LaneChange(length=4, shift=1, speed=0.8)
     motion = reference.sample(np.array([0, 2.5, 5, 9]))
     np.testing.assert_allclose(motion.pose[:, :2], [(0, 0), (2, 0.5), (4, 1), (7.2, 1)], atol=1e-12)
@@ -173,7 +173,7 @@ def test_lane_change():
 
 
 def test_rounded_square():
-    """Touches all four sides, turns no tighter than its radius, and its lap is as long as its path."""
+    """The square touches all four sides, turns no tighter than its radius, and takes as long as its path."""
     reference = RoundedSquare(side=3, radius=0.5, speed=0.5)
     t = np.linspace(0, reference.period, 20001)
     motion = reference.sample(t)
@@ -186,7 +186,7 @@ def test_rounded_square():
 
 
 def test_stop_and_go():
-    """There, rest, and back with v < 0 and the heading unchanged; the peak speed is 1.875 d / T."""
+    """It moves, rests, and moves back with V < 0 and the same heading; the peak speed is 1.875 d / T."""
     reference = StopAndGo(distance=2, move_time=3, pause=1)
     motion = reference.sample(np.array([0, 1.5, 3, 3.5, 5.5, 7, 7.5, 8, 9.5]))
     np.testing.assert_allclose(motion.pose[:, 0], [0, 1, 2, 2, 1, 0, 0, 0, 1], atol=1e-12)
@@ -211,12 +211,12 @@ def test_spline_comes_to_rest():
 
 @each
 def test_finite_at_rest(reference):
-    """Every sample is finite, rest included."""
+    """Every sample is finite, also at rest."""
     assert all(np.isfinite(part).all() for part in reference.sample(np.linspace(0, 3 * reference.period, 1000)))
 
 
 def test_from_curve():
-    """An accelerating spiral, p = t² e^{it}: its speed, and θ = t + atan(t/2)."""
+    """The accelerating spiral p = t² e^{it} has its analytic speed and θ = t + atan(t/2)."""
     t = np.linspace(0.5, 2, 50)
     spin = np.exp(1j * t)
     d = [t**2, 2 * t + 1j * t**2, 2 + 4j * t - t**2, 6j - 6 * t - 1j * t**2]
@@ -229,7 +229,7 @@ def test_from_curve():
 
 @pytest.mark.parametrize("kind", [Line, Circle, Lemniscate, LaneChange, RoundedSquare, StopAndGo, Waypoints])
 def test_defaults_pass(kind):
-    """The defaults of every kind suit the default robot."""
+    """The default robot can follow the default reference of every kind."""
     check(kind(), ROBOT, reverse=True)
 
 
@@ -247,14 +247,14 @@ def test_defaults_pass(kind):
     ],
 )
 def test_check_refuses(reference, change, words):
-    """Each limit is named, with the peak."""
+    """A reference beyond a limit is refused with the limit and the peak."""
     with pytest.raises(InputError, match=words) as refusal:
         check(reference, ROBOT.model_copy(update=change), reverse=True)
     assert "\n" not in str(refusal.value)
 
 
 def test_check_reverse():
-    """Only stop-and-go with reverse needs a steering that can."""
+    """Only a stop-and-go with reverse needs a steering that can reverse."""
     with pytest.raises(InputError, match=r"stop_and_go: reverses at t = 4.0\d s, .* use rigid"):
         check(StopAndGo(), ROBOT, reverse=False)
     for reference in (*DEFAULTS[:7], *DEFAULTS[8:]):
@@ -263,13 +263,13 @@ def test_check_reverse():
 
 @each
 def test_round_trip(reference):
-    """Through plain data and JSON."""
+    """A reference survives plain data and JSON."""
     assert KINDS.validate_python(reference.model_dump()) == reference
     assert KINDS.validate_json(reference.model_dump_json()) == reference
 
 
 def test_toml():
-    """From TOML, by kind."""
+    """A reference is read from TOML by its kind."""
     text = 'kind = "waypoints"\npoints = [[0, 0], [2, 0], [1.0, 2]]\nspeed = 0.4'
     assert KINDS.validate_python(tomllib.loads(text)) == Waypoints(points=((0, 0), (2, 0), (1, 2)), speed=0.4)
 
@@ -291,7 +291,7 @@ def test_toml():
     ],
 )
 def test_bad_field(values, words):
-    """Nonsense is refused in one line that names the field."""
+    """An invalid value is refused with one line that names the field."""
     with pytest.raises(ValidationError) as refusal:
         KINDS.validate_python(values)
     message = describe(refusal.value)

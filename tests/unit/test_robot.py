@@ -1,4 +1,4 @@
-"""The default robot's derived numbers, and nonsense thrown at the two records."""
+"""The default robot's derived parameters, and invalid values in `Robot` and `Perturbation`."""
 
 import math
 
@@ -27,12 +27,12 @@ numbers = st.floats() | st.floats(-2, 2) | st.integers() | st.sampled_from([None
     ],
 )
 def test_published(robot, name, value, tolerance):
-    """The numbers stated for the default robot."""
+    """The derived parameters are those stated for the default robot."""
     assert getattr(robot, name) == pytest.approx(value, abs=tolerance)
 
 
 def test_motor_limits(robot):
-    """No-load speed 2.34 m/s; stall 10.4 N·m before losses."""
+    """The no-load speed is 2.34 m/s, and the stall torque 10.4 N·m before losses."""
     assert robot.supply * robot.velocity_gain == pytest.approx(2.34, abs=5e-3)
     assert robot.supply * robot.motor_gain == pytest.approx(10.4, abs=0.05)
 
@@ -52,7 +52,7 @@ def test_lever_rule(robot):
 
 
 def replaced(robot: Robot, **values: object) -> dict[str, object]:
-    """The robot as a dictionary, with some values replaced."""
+    """Returns the robot as a dictionary with some values replaced."""
     return robot.model_dump() | values
 
 
@@ -71,13 +71,13 @@ def replaced(robot: Robot, **values: object) -> dict[str, object]:
     ],
 )
 def test_robot_refuses(robot, field, value):
-    """Each limit by its name."""
+    """A value out of range is refused by the name of its field."""
     with pytest.raises(InputError, match=rf"^robot: {field}: [^\n]+$"):
         Robot.from_dict(replaced(robot, **{field: value}), "robot")
 
 
 def check(record: type[Record], values: dict[str, object], changed: set[str]) -> None:
-    """Either a valid record that holds finite numbers and survives a round trip, or one line naming a changed field."""
+    """Checks that values make a valid record, which survives a round trip, or are refused by the name of a field."""
     try:
         made = record.from_dict(values)
     except InputError as error:
@@ -89,7 +89,7 @@ def check(record: type[Record], values: dict[str, object], changed: set[str]) ->
 
 @given(data=st.data())
 def test_robot_random(robot, data):
-    """Random values in up to three fields of a valid robot."""
+    """Random values in up to three fields of a robot are valid, or refused by name."""
     values = data.draw(st.dictionaries(st.sampled_from(list(Robot.model_fields)), numbers, max_size=3))
     # the two rules that join fields may be broken through one and reported under the other
     joined = {"trail", "com_offset"} if values.keys() & {"trail", "com_offset", "wheelbase"} else set()
@@ -98,12 +98,12 @@ def test_robot_random(robot, data):
 
 @given(values=st.dictionaries(st.sampled_from([*Perturbation.model_fields, "unknown"]), numbers, max_size=5))
 def test_perturbation_random(values):
-    """Random values in any fields of a perturbation."""
+    """Random values in any fields of a perturbation are valid, or refused by name."""
     check(Perturbation, values, set(values))
 
 
 def test_robot_needs_everything(robot):
-    """A missing parameter is named; only the drive gain has a default."""
+    """A missing parameter is refused by name; only the drive gain has a default."""
     for field in Robot.model_fields.keys() - {"drive_gain"}:
         values = robot.model_dump()
         del values[field]
@@ -119,7 +119,7 @@ def test_robot_toml(robot, tmp_path):
 
 
 def test_named_perturbations():
-    """The published combination; nominal changes nothing: factors 1, payload, slope, delay and noise 0."""
+    """`all` is the published combination; `nominal` has factors of 1, and no payload, slope, delay or noise."""
     assert PERTURBATIONS["all"].model_dump(exclude_defaults=True) == {
         "mass_factor": 1.5, "supply_factor": 0.8, "drive_friction_factor": 3.0, "resistance_factor": 1.3,
     }  # fmt: skip

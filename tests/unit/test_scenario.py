@@ -1,4 +1,4 @@
-"""Nonsense thrown at scenarios; files and back; what a simulation refuses; order and length of results."""
+"""Scenarios: invalid values, files, what a simulation refuses, and the order and length of its results."""
 
 import json
 import tomllib
@@ -36,7 +36,7 @@ parts = st.sampled_from(
 
 
 def refused(name: str, source: object) -> None:
-    """One line that names the field."""
+    """The source is refused with one line that begins with the field."""
     with pytest.raises(InputError) as error:
         Scenario.from_dict(source)
     message = str(error.value)
@@ -46,7 +46,7 @@ def refused(name: str, source: object) -> None:
 @given(parts, values)
 @settings(max_examples=300)
 def test_nonsense(path, value):
-    """Any value anywhere is valid, or one line says where it is not."""
+    """A random value in any field is valid, or is refused with one line that names the field."""
     *where, name = path
     if where == ["events"]:
         source = {"events": [{"time": 0.0, name: value}]}
@@ -69,7 +69,7 @@ def test_nonsense(path, value):
 
 @given(st.dictionaries(st.text(max_size=8), values, min_size=1, max_size=3))
 def test_unknown(source):
-    """What is no field is refused."""
+    """Unknown fields are refused."""
     if source.keys() <= Scenario.model_fields.keys():
         return
     with pytest.raises(InputError):
@@ -95,7 +95,7 @@ def test_unknown(source):
     ],
 )
 def test_refused(name, source):
-    """By the path of the field."""
+    """An invalid value is refused with the path of its field."""
     refused(name, source)
 
 
@@ -115,20 +115,20 @@ def test_refused(name, source):
     ],
 )
 def test_multiples(name, source):
-    """Rates that do not divide are refused by the name of the larger."""
+    """A period that is not a whole multiple of the shorter one is refused by its name."""
     refused(name, source)
 
 
 @given(st.integers(0, 10**6), st.floats(1e-5, 1))
 def test_whole(count, unit):
-    """Counts whole multiples despite rounding, and refuses the half."""
+    """`whole` counts multiples despite rounding, and refuses halves."""
     assert whole(count * unit, unit, "a", "b") == count
     with pytest.raises(ValueError, match="^a: .* whole multiple of b"):
         whole((count + 0.5) * unit, unit, "a", "b")
 
 
 def test_rates():
-    """Multiples that decimal fractions only nearly are."""
+    """Periods that are multiples up to the rounding of decimal fractions are accepted."""
     late = Perturbation(control_delay=0.021)
     scenario = Scenario(physics_step=0.001, control_period=0.007, motion_period=0.049, perturbation=late)
     assert scenario.ticks == round(96 / 0.007)
@@ -138,7 +138,7 @@ def test_rates():
 
 
 def toml(value: object) -> str:
-    """A value as inline TOML."""
+    """Writes a value as inline TOML."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key} = {toml(item)}" for key, item in value.items() if item is not None) + "}"
     if isinstance(value, list):
@@ -185,7 +185,7 @@ KINDS = (
 @pytest.mark.parametrize("reference", KINDS, ids=lambda reference: reference.kind)
 @pytest.mark.parametrize("base", [Scenario(), FULL], ids=["default", "full"])
 def test_toml(base, reference, tmp_path):
-    """Through TOML and JSON and back, events and references included, to the last bit."""
+    """A scenario with events and any reference survives TOML and JSON, to the last bit."""
     scenario = base.model_copy(update={"reference": reference})
     file = tmp_path / "scenario.toml"
     values = scenario.model_dump(mode="json", exclude_none=True)
@@ -196,7 +196,7 @@ def test_toml(base, reference, tmp_path):
 
 
 def test_bad_file(tmp_path):
-    """One line that names the file and the field."""
+    """A bad file is refused with one line that names the file and the field."""
     file = tmp_path / "scenario.toml"
     for text, words in (("laps = 0", "laps"), ("laps = ", "not TOML"), ("[[events]]\ntime = -1", "events.0.time")):
         file.write_text(text)
@@ -209,7 +209,7 @@ def test_bad_file(tmp_path):
 
 
 def test_nothing():
-    """No scenario is no result."""
+    """A simulation without scenarios is refused."""
     with pytest.raises(InputError, match="^scenarios: none"):
         simulate([])
 
@@ -233,7 +233,7 @@ FAR_AWAY = Waypoints(points=((8, 0), (10, 0), (9, 2)))
     ],
 )
 def test_simulation_refuses(words, changes):
-    """Before anything is computed, also as the last of many."""
+    """A scenario that cannot run is refused before anything is computed, also as the last of several."""
     good = Scenario(reference=Circle(period=4, radius=0.5), laps=200, initial_spread=(0, 0, 0))
     bad = Scenario.from_dict(good.model_dump() | {"laps": 1} | changes)
     for scenarios in (bad, [good, bad]):
@@ -243,13 +243,13 @@ def test_simulation_refuses(words, changes):
 
 
 def test_mixed_rates():
-    """Runs of one result share a time axis."""
+    """Runs of one result need the same control period."""
     with pytest.raises(InputError, match="^control_period"):
         simulate([Scenario(), Scenario(control_period=0.02, motion_period=0.02)])
 
 
 def test_reverse_if_rigid():
-    """The rigid arrangement may drive backwards."""
+    """The rigid steering drives backwards."""
     run = simulate(Scenario(reference=StopAndGo(distance=0.3, move_time=1.5, pause=0.2), laps=1, steering="rigid"))
     assert run.v.min() < -0.1 and not run.failed
 
@@ -258,7 +258,7 @@ def test_reverse_if_rigid():
 
 
 def test_order():
-    """Scenarios of mixed groups and lengths come back in the order given; the short end in NaN."""
+    """Runs of different kinds and lengths keep the order of their scenarios; shorter ones end in NaN."""
     kinds = (
         ("fel", "rigid", 4), ("none", "compliant", 5), ("rls", "compliant", 4), ("none", "compliant", 4),
         ("fel", "rigid", 4),
@@ -288,7 +288,7 @@ def test_order():
 
 
 def test_networks_of_different_sizes():
-    """Their weights share a table; the smaller ends in NaN."""
+    """The weights of networks of two sizes share a table; those of the smaller end in NaN."""
     scenarios = [Scenario(reference=Circle(period=4, radius=0.5), laps=1, fel=Fel(hidden=n)) for n in (4, 8)]
     weights = simulate(scenarios).weights
     assert weights.notnull().sum("weight").values.tolist() == [11 * 4 + 18, 11 * 8 + 18]
@@ -296,7 +296,7 @@ def test_networks_of_different_sizes():
 
 
 def test_label():
-    """The feedforward's name, unless the run has its own; a stage of one's own has its function's name."""
+    """A run's label is its name, or that of the feedforward, which for a user's stage is that of its function."""
     scenario = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
 
     def mine(robot, size):
