@@ -13,12 +13,13 @@ from matplotlib.lines import Line2D
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.pid import Gains, Pid, learning_ratio, margins, sampled_loop
 from mrctl.experiments.response import Array, Response, measure, refine, safety
-from mrctl.experiments.tables import json_text, markdown, number, output_folder
+from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder
 from mrctl.loop.hierarchy import TAKE_OVER
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
 from mrctl.results import plots
+from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
 
 CHANNELS = (("common", "V/(m/s)", "V/m"), ("differential", "V/(rad/s)", "V/rad"))
@@ -97,7 +98,8 @@ def design(world: str, pid: Pid, delays: Sequence[float]) -> dict[str, Any]:
         (robot.velocity_gain, robot.velocity_time_constant),
         (robot.rotation_gain, robot.rotation_time_constant),
     )
-    table: dict[str, Any] = {"time_constant": pid.time_constant, "loops": [], "responses": []}
+    table: dict[str, Any] = {"versions": versions(), "machine": machine(), "time_constant": pid.time_constant}
+    table |= {"loops": [], "responses": []}
     for (name, *_), (gain, tau), row in zip(CHANNELS, plants, pid.gains(robot, rigid=False), strict=True):
         gains = Gains(*row[:2])
         table[name] = {"static_gain": gain, "plant_time_constant": tau, **gains._asdict()}
