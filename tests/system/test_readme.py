@@ -40,6 +40,7 @@ ELSEWHERE = {
     r'python3 -m pip install -e "\.\[dev\]" && pytest': (".ci/run", ""),
     r"python3 -m pip install -e \. && mrctl reproduce": ("tests/system/test_reproduce.py::test_network_beats_pid", ""),
     r'python3 -m pip install -e "\.\[notebooks\]" && .*': ("tests/system/test_notebooks.py::test_notebook", ""),
+    r"pytest --mrctl-robot .*": ("tests/system/test_check.py::test_plugin", ""),
     r"dask .*": ("tests/system/test_sweep_dask.py::test_killed_worker", ""),
     r"python -m mrctl\.experiments\.results_page .*": ("tests/unit/test_results_page.py::test_sections", ""),
     r"mrctl sweep .* --scheduler .*": ("tests/system/test_sweep_dask.py::test_killed_worker", "mrctl.sweep.jobs.run"),
