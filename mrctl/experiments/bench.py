@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import math
 import os
-import platform
 import resource
 import statistics
 import sys
@@ -19,7 +18,7 @@ import numpy as np
 import torch
 
 from mrctl.control.features import feature_scale
-from mrctl.experiments.tables import markdown, number
+from mrctl.experiments.tables import machine, markdown, number
 from mrctl.loop import hierarchy, log
 from mrctl.loop.simulation import Simulation
 from mrctl.physics import plant
@@ -68,7 +67,7 @@ def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int
     middle = sizes[len(sizes) // 2]
     rows = [_compare(size, 1, repetitions, chunk) for size in sizes]
     return {
-        "machine": {"processor": _processor(), "cores": os.cpu_count(), **versions()},
+        "machine": {**machine(), **versions()},
         "robots": rows,
         "threads": [_compare(middle, count, repetitions, chunk) for count in threads],
         "parts": {str(size): _parts(size, 10 * chunk) for size in (sizes[0], sizes[-1])},
@@ -323,11 +322,3 @@ def _resident() -> float:
             return int(file.read().split()[1]) * resource.getpagesize()
     except OSError:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-
-
-def _processor() -> str:
-    try:
-        with open("/proc/cpuinfo") as file:
-            return next(line.partition(":")[2].strip() for line in file if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()

@@ -23,6 +23,7 @@ in, the engine's time step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -31,11 +32,12 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mrctl.checks.catalogue import on_skid
-from mrctl.experiments.tables import json_text, markdown
+from mrctl.experiments.tables import json_text, machine, markdown
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.plant import build
 from mrctl.record import InputError
+from mrctl.results.dataset import versions
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, Robot, RobotFile
 
@@ -102,14 +104,20 @@ def run(world: str, robot: RobotFile, perturbation: Perturbation, seed: int, jso
     found = identify(world, robot, perturbation, seed)
     if json:
         rows: list[dict[str, Any]] = [c._asdict() | {"error": c.error} for c in found]
-        return json_text({"world": world, "robot": robot.model_dump(), "constants": rows})
+        source = {"versions": versions(), "machine": machine(), "world": world, "robot": robot.model_dump()}
+        return json_text(source | {"constants": rows})
+    return text(found)
+
+
+def text(constants: Sequence[Constant]) -> str:
+    """The constants as a Markdown table, and which others such drives do not show."""
     header = ["constant", "unit", "estimate", "95 % interval", "true", "error"]
-    numbers = [[f"{x:.4g}" for x in (c.estimate, c.low, c.high, c.true)] for c in found]
+    numbers = [[f"{x:.4g}" for x in (c.estimate, c.low, c.high, c.true)] for c in constants]
     cells = [
         [c.name, c.unit, estimate, f"{low} to {high}", true, f"{100 * c.error:+.2f} %"]
-        for c, (estimate, low, high, true) in zip(found, numbers, strict=True)
+        for c, (estimate, low, high, true) in zip(constants, numbers, strict=True)
     ]
-    return f"{markdown(header, cells)}\n{APART}"
+    return f"{markdown(header, cells)}\n\n{APART}"
 
 
 def identify(

@@ -11,7 +11,7 @@ from typing import Any
 import xarray as xr
 
 from mrctl.experiments import kanayama
-from mrctl.experiments.tables import markdown, number, output_folder, write_json
+from mrctl.experiments.tables import machine, markdown, number, output_folder, write_json
 from mrctl.loop.simulation import simulate
 from mrctl.results import metrics, plots
 from mrctl.results.dataset import versions
@@ -77,6 +77,7 @@ def reproduce(out: Path) -> str:
         out / "table.json",
         {
             "versions": versions(),
+            "machine": machine(),
             "seconds": time.monotonic() - began,
             "kanayama": lateral,
             "last_lap": rows,

@@ -12,7 +12,7 @@ import xarray as xr
 
 from mrctl.experiments import report
 from mrctl.experiments.cases import BAND, PARTS, Case, Laps, Outcome, cases
-from mrctl.experiments.tables import markdown, number, output_folder, write_json
+from mrctl.experiments.tables import machine, markdown, number, output_folder, write_json
 from mrctl.loop import user_files
 from mrctl.record import InputError
 from mrctl.results import metrics
@@ -68,7 +68,7 @@ def suite(
     found = Outcome(quick, chosen, laps, runs, rows, aside)
     tables = as_markdown(rows)
     (out / "table.md").write_text("\n\n".join(f"## {title}\n\n{text}" for title, text in tables.items()) + "\n")
-    write_json(out / "table.json", {"versions": versions(), "rows": rows, "runs": each_run(runs)})
+    write_json(out / "table.json", {"versions": versions(), "machine": machine(), "rows": rows, "runs": each_run(runs)})
     report.write(found, who, tables, out)
     return found
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from mrctl.record import InputError
 
@@ -36,6 +39,16 @@ def output_folder(path: Path) -> Path:
     except OSError as error:
         raise InputError(f"out: {path}: cannot be written: {error.strerror}") from None
     return path
+
+
+def machine() -> dict[str, Any]:
+    """The processor's name and the number of cores of this machine, to stand beside what was measured on it."""
+    try:
+        with open("/proc/cpuinfo") as file:
+            name = next(line.partition(":")[2].strip() for line in file if line.startswith("model name"))
+    except (OSError, StopIteration):
+        name = platform.processor() or platform.machine()
+    return {"processor": name, "cores": os.cpu_count()}
 
 
 def json_text(values: object) -> str:

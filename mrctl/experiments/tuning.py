@@ -14,12 +14,13 @@ from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import learning_ratio, margins, sampled_loop
 from mrctl.control.pid import Pid
 from mrctl.experiments.response import Array, Response, measure, refine, safety
-from mrctl.experiments.tables import json_text, markdown, number, output_folder
+from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder
 from mrctl.loop.hierarchy import TAKE_OVER
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
 from mrctl.results import plots
+from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
 
 CHANNELS = (("common", "V/(m/s)", "V/m"), ("differential", "V/(rad/s)", "V/rad"))
@@ -98,7 +99,8 @@ def design(world: str, pid: Pid, delays: Sequence[float]) -> dict[str, Any]:
         (robot.velocity_gain, robot.velocity_time_constant),
         (robot.rotation_gain, robot.rotation_time_constant),
     )
-    table: dict[str, Any] = {"time_constant": pid.time_constant, "loops": [], "responses": []}
+    table: dict[str, Any] = {"versions": versions(), "machine": machine(), "time_constant": pid.time_constant}
+    table |= {"loops": [], "responses": []}
     for (name, *_), (gain, tau), gains in zip(CHANNELS, plants, pid.channels(robot, rigid=False), strict=True):
         table[name] = {"static_gain": gain, "plant_time_constant": tau, **gains._asdict()}
         table[name]["ratio"] = learning_ratio(gain, tau, gains)

@@ -1,6 +1,6 @@
 """The benchmark measures what it says; how fast it is, is for a quiet machine to say.
 
-To repeat the figures of the README on yours, with nothing else running: `mrctl bench`, or `mrctl bench --json`.
+To repeat the figures of RESULTS.md on yours, with nothing else running: `mrctl bench`, or `mrctl bench --json`.
 """
 
 import json

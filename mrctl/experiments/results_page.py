@@ -1,0 +1,197 @@
+"""The developers' command that writes `RESULTS.md` from what the commands of mrctl leave behind.
+
+    python -m mrctl.experiments.results_page --suite suite --bench bench.json --out mrctl/experiments/RESULTS.md
+
+The page is a list of sections, each under a heading of the second level. A section whose input is named is written
+anew; every other section of a page that exists already stays as it is. So one table can be renewed without the half
+hour of the suite, and the paragraphs that people wrote about the tables survive.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from mrctl.experiments import bench as benchmark
+from mrctl.experiments import identify as identification
+from mrctl.experiments import paper, tuning
+from mrctl.experiments.suite import COLUMNS, TITLES
+from mrctl.experiments.tables import markdown, number
+from mrctl.record import InputError
+
+BEGINNING = """# Results
+
+`python -m mrctl.experiments.results_page` writes the tables of this page from what the commands leave behind."""
+BENCHMARK = ("nominal", "all", "rigid, all")
+"""Cases of the suite in the short table at the head of its section."""
+
+Table = Mapping[str, Any]
+
+
+def main(
+    reproduce: Path | None = None,
+    suite: Path | None = None,
+    tune: Path | None = None,
+    identify: tuple[Path, ...] = (),
+    bench: Path | None = None,
+    out: Path = Path("RESULTS.md"),
+) -> None:
+    """Writes the sections whose inputs are named into the page of results; the other sections stay as they are.
+
+    Args:
+        reproduce: Folder that `mrctl reproduce --out` wrote.
+        suite: Folder that `mrctl suite --out` wrote.
+        tune: Folder that `mrctl tune --out` wrote.
+        identify: Files with the output of `mrctl identify --json`, one for each robot.
+        bench: File with the output of `mrctl bench --json`.
+        out: The page to write.
+
+    Raises:
+        InputError: No input is named, or one cannot be read or was not written by its command.
+    """
+    written: dict[str, str] = {}
+    if reproduce is not None:
+        table = _read(reproduce / "table.json", "last_lap", "endurance", "kanayama")
+        written["The paper"] = _section("mrctl reproduce", table, paper_text(table))
+    if suite is not None:
+        table = _read(suite / "table.json", "rows")
+        written["The uncertainty suite"] = _section("mrctl suite", table, suite_text(table, _text(suite / "table.md")))
+    if tune is not None:
+        table = _read(tune / "table.json", "loops")
+        written["Where learning is safe"] = _section("mrctl tune", table, tune_text(table))
+    if identify:
+        tables = [_read(file, "constants", "robot") for file in identify]
+        parts = [_section(f"mrctl identify --robot.path {t['robot']['path']}", t, identify_text(t)) for t in tables]
+        written["Identification"] = "\n\n".join(parts)
+    if bench is not None:
+        table = _read(bench, "robots", "threads", "parts", "today")
+        source = {"versions": {k: v for k, v in table["machine"].items() if k not in ("processor", "cores")}}
+        written["Speed"] = _section("mrctl bench", {**table, **source}, benchmark.text(dict(table)))
+    if not written:
+        raise InputError("results_page: name at least one input, such as --bench bench.json")
+    page = (sections(_text(out)) if out.exists() else {"": BEGINNING}) | written
+    parts = [f"## {title}\n\n{text}" if title else text for title, text in page.items()]
+    try:
+        out.write_text("\n\n".join(parts) + "\n")
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from None
+
+
+def sections(page: str) -> dict[str, str]:
+    """The sections of a page by their headings, in order; what stands before the first heading has the name ""."""
+    beginning, *others = f"\n{page}".split("\n## ")
+    parts = [part.partition("\n") for part in others]
+    return {"": beginning.strip()} | {title.strip(): text.strip() for title, _, text in parts}
+
+
+def paper_text(table: Table) -> str:
+    """The tables of `mrctl reproduce`: the last lap, the long runs, and Kanayama's table."""
+    last_lap, long_runs = paper.text(table["last_lap"]), paper.endurance_text(table["endurance"])
+    return "\n\n".join([last_lap, long_runs, paper.kanayama_text(table["kanayama"])])
+
+
+def suite_text(table: Table, everything: str) -> str:
+    """The tables of `mrctl suite`: a short one with the benchmark's cases, and all of them folded away.
+
+    Args:
+        table: The content of `table.json`.
+        everything: The content of `table.md`.
+    """
+    cells = [
+        [row["case"], TITLES.get(row["feedforward"], row["feedforward"]), f"{row['failed']}/{row['runs']}"]
+        + [_mean(row[metric]) for metric in COLUMNS]
+        for case in BENCHMARK
+        for row in table["rows"]
+        if row["case"] == case
+    ]
+    short = markdown(["case", "feedforward", "failed", *COLUMNS.values()], cells)
+    folded = [
+        f"<details><summary>{title}</summary>\n\n{text}\n\n</details>"
+        for title, text in sections(everything).items()
+        if title
+    ]
+    return "\n\n".join(["RMSE of the last lap, mean [95 % bootstrap interval]:", short, *folded])
+
+
+def tune_text(table: Table) -> str:
+    """The design, the table and the advice of `mrctl tune`."""
+    design, _, rest = tuning.text(dict(table)).partition("\n\n")
+    return f"```text\n{design}\n```\n\n{rest}"
+
+
+def identify_text(table: Table) -> str:
+    """The table of `mrctl identify`."""
+    fields = identification.Constant._fields
+    return identification.text([identification.Constant(*(row[f] for f in fields)) for row in table["constants"]])
+
+
+def _mean(error: Table) -> str:
+    if not error["samples"]:
+        return "–"
+    value, low, high = (number(1e3 * error[key]) for key in ("value", "low", "high"))
+    return f"{value} [{low}, {high}]"
+
+
+def _section(command: str, table: Table, text: str) -> str:
+    """A section, or a part of one, that says where its numbers come from."""
+    versions = ", ".join(f"{name} {version}" for name, version in table["versions"].items())
+    machine = table["machine"]
+    source = f"`{command}` made this with {versions}, on {machine['processor']} with {machine['cores']} cores."
+    return f"{source}\n\n{text}"
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
+
+
+def _read(path: Path, *keys: str) -> Table:
+    """The JSON that a command wrote, with NaN where it wrote null.
+
+    Raises:
+        InputError: The file cannot be read, is not JSON, or lacks one of the keys.
+    """
+    try:
+        table = _with_nan(json.loads(_text(path)))
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    missing = [key for key in (*keys, "machine") if not isinstance(table, dict) or key not in table]
+    if missing:
+        raise InputError(f"{path}: has no {missing[0]}; the command that should have written it is another one")
+    return table
+
+
+def _with_nan(value: Any) -> Any:  # noqa: ANN401
+    if isinstance(value, dict):
+        return {key: _with_nan(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_with_nan(one) for one in value]
+    return float("nan") if value is None else value
+
+
+def command(arguments: Sequence[str] | None = None) -> int:
+    """Runs `main` with the flags of a command line.
+
+    Args:
+        arguments: The flags; `sys.argv` by default.
+
+    Returns:
+        0 on success, 2 on bad input, with one line on stderr.
+    """
+    try:
+        tyro.cli(main, args=arguments, prog="python -m mrctl.experiments.results_page")
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(command())

@@ -1,0 +1,131 @@
+"""The page of results, from inputs in the form in which the commands write them."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mrctl.experiments import bench, identify, paper, results_page, tuning
+from mrctl.experiments.tables import machine, write_json
+from mrctl.results.dataset import versions
+
+SOURCE = {"versions": versions() | {"mujoco": "9.9.9"}, "machine": {"processor": "Abacus", "cores": 3}}
+MADE = "with mrctl {mrctl}, mujoco 9.9.9, dm-control".format(**SOURCE["versions"])
+
+
+def written(folder: Path, values: dict, table: str = "") -> Path:
+    folder.mkdir()
+    write_json(folder / "table.json", SOURCE | values)
+    (folder / "table.md").write_text(table)
+    return folder
+
+
+@pytest.fixture
+def suite(tmp_path: Path) -> Path:
+    error = {"value": 0.0123, "low": 0.0121, "high": float("inf"), "samples": 2}
+    lost = error | {"value": float("nan"), "samples": 0}
+    rows = [
+        {"case": case, "feedforward": name, "failed": 2 * (e is lost), "runs": 2, "v_rmse": e, "omega_rmse": e,
+         "position_rmse": e}
+        for case, name, e in (("nominal", "none", error), ("slope 10°", "fel", error), ("all", "fel", lost))
+    ]  # fmt: skip
+    return written(tmp_path / "suite", {"rows": rows}, "## Steady\n\n| case |\n| --- |\n\n## A step\n\n| step |\n")
+
+
+@pytest.fixture
+def reproduction(tmp_path: Path) -> Path:
+    row = {"steering": "rigid", "plant": "all", "lap_time": 12.0, "feedforward": "fel", "failure": ""}
+    row |= {m: 0.00321 for m in paper.METRICS} | {f"{m}_to_pid": float("nan") for m in paper.METRICS}
+    long = {"run": "fel, all", "laps": 60} | {m: {"lap_8": 0.002, "last": 0.001} for m in paper.METRICS}
+    case = {"case": "an offset", "unit": "%", "target": 9.1, "value": 9.06, "value_10ms": 8.95}
+    return written(tmp_path / "reproduction", {"last_lap": [row], "endurance": [long], "kanayama": [case]})
+
+
+@pytest.fixture
+def tune(tmp_path: Path) -> Path:
+    channel = {"static_gain": 0.1, "plant_time_constant": 0.2, "k_p": 16.0, "k_i": 68.0, "ratio": 2.5}
+    answer = {name: float("inf") for name in (*tuning.MARGINS, *tuning.SAFETY)} | {"phase": 88.5}
+    loop = {"steering": "caster", "channel": 1, "delay": 0.02} | {name: answer for name in tuning.RESPONSES}
+    values = {"time_constant": 0.15, "common": channel, "differential": channel, "loops": [loop]}
+    return written(tmp_path / "tune", values)
+
+
+@pytest.fixture
+def identified(tmp_path: Path) -> Path:
+    constant = identify.Constant("M_e", "kg", 21.32, 21.0, 21.64, 21.28)
+    values = {"robot": {"path": "racecar"}, "constants": [constant._asdict() | {"error": constant.error}]}
+    write_json(tmp_path / "identify.json", SOURCE | values)
+    return tmp_path / "identify.json"
+
+
+@pytest.fixture
+def figures(tmp_path: Path) -> Path:
+    numbers = ("steps_per_second", "limit_steps_per_second", "real_time_factor", "overhead_us_per_tick", "memory_mib")
+    row = {"robots": 16, "threads": 1, "ratio": 0.912, "replayed_exactly": True} | {name: 12345.0 for name in numbers}
+    values = {
+        "machine": SOURCE["machine"] | SOURCE["versions"],
+        "robots": [row],
+        "threads": [row],
+        "parts": {"1": {"physics": 31.4}, "16": {"physics": 500.0}},
+        "today": {"steps_per_second": 9884.0, "closed_loop_is_faster_by": 9.1},
+    }
+    (tmp_path / "bench.json").write_text(json.dumps(values))
+    return tmp_path / "bench.json"
+
+
+def test_sections(suite: Path, reproduction: Path, tune: Path, identified: Path, figures: Path, tmp_path: Path) -> None:
+    """Every input becomes a section with its numbers, and with the versions and the machine that it names."""
+    out = tmp_path / "RESULTS.md"
+    inputs = {"suite": suite, "reproduce": reproduction, "tune": tune, "identify": identified, "bench": figures}
+    words = [word for name, path in inputs.items() for word in (f"--{name}", str(path))]
+    assert results_page.command([*words, "--out", str(out)]) == 0
+    page = results_page.sections(out.read_text())
+    titles = ["The paper", "The uncertainty suite", "Where learning is safe", "Identification", "Speed"]
+    assert list(page) == ["", *titles]
+    assert all(MADE in page[title] and "on Abacus with 3 cores." in page[title] for title in titles)
+    short, *folded = page["The uncertainty suite"].split("<details>")
+    assert "| nominal | PID         | 0/2    | 12.3 [12.1, nan] |" in short and "slope" not in short
+    assert "| all     | fel         | 2/2    | –  " in short
+    assert [text.split("</summary>")[0] for text in folded] == ["<summary>Steady", "<summary>A step"]
+    assert "| fel         | 3.21    | 3.21       | 3.21         | PID fails |" in page["The paper"]
+    assert "2.00 → 1.00" in page["The paper"] and "| an offset | 9.1 %" in page["The paper"]
+    assert "| caster, second | 20 " in page["Where learning is safe"] and "88.5" in page["Where learning is safe"]
+    assert "`mrctl identify --robot.path racecar`" in page["Identification"]
+    assert "| 21.32    | 21 to 21.64   | 21.28 | +0.19 % |" in page["Identification"]
+    assert "| 0.912 |" in page["Speed"] and bench.text(json.loads(figures.read_text())) in page["Speed"]
+
+
+def test_other_sections_stay(figures: Path, tmp_path: Path) -> None:
+    """One input renews its own section in its own place; what people wrote stays, and a second time changes nothing."""
+    out = tmp_path / "RESULTS.md"
+    out.write_text("# Mine\n\nWords.\n\n## Speed\n\nOld.\n\n### More\n\nOlder.\n\n## What it says\n\nMy view.\n")
+    for _ in range(2):
+        assert results_page.command(["--bench", str(figures), "--out", str(out)]) == 0
+        text = out.read_text()
+        assert text.startswith("# Mine\n\nWords.\n\n## Speed\n\n`mrctl bench` made this")
+        assert text.endswith("\n\n## What it says\n\nMy view.\n") and "Old" not in text
+    assert text.count("## ") == 2
+
+
+def test_refused(suite: Path, figures: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """One line for what is missing or was written by something else, and the page stays as it was."""
+    out = tmp_path / "RESULTS.md"
+    (tmp_path / "no.json").write_text("{")
+    for words, says in (
+        ([], "name at least one input"),
+        (["--suite", tmp_path / "none"], "none/table.json: cannot be read"),
+        (["--bench", tmp_path / "no.json"], "no.json: Expecting"),
+        (["--bench", suite / "table.json"], "table.json: has no robots"),
+    ):
+        assert results_page.command([*map(str, words), "--out", str(out)]) == 2
+        line = capsys.readouterr().err
+        assert says in line and line.count("\n") == 1
+        assert not out.exists()
+    assert results_page.command(["--bench", str(figures), "--out", str(tmp_path / "no" / "page.md")]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_machine() -> None:
+    """The machine has a name and cores."""
+    found = machine()
+    assert found["processor"] and found["cores"] >= 1
