@@ -106,7 +106,7 @@ def as_data(finding: Finding) -> dict[str, object]:
 
 
 def table(findings: list[Finding]) -> str:
-    """A table of the checks: of one that passes the value nearest to its tolerance, of one that fails all that fail."""
+    """A table with the tightest value of each passed check, all failed values of the others, and their causes."""
     rows = [("check", "value", "measured", "expected", "")]
     for finding in (f for f in findings if not f.reason):
         name = finding.check.name

@@ -44,12 +44,8 @@ def hold_on_slope(model: mujoco.MjModel, robot: Robot) -> Report:
     """
     force, weight = holding_force(robot), robot.mass * GRAVITY
     steepest = _steepest(robot)
-    standing, rolling = (
-        Car(perturbed(model, Perturbation(slope=-float(np.arcsin(ratio * force / weight))))).drive(
-            settling_time(robot), OFF
-        )[V][-1]
-        for ratio in (0.5, steepest)
-    )
+    slopes = [Perturbation(slope=-float(np.arcsin(ratio * force / weight))) for ratio in (0.5, steepest)]
+    standing, rolling = (Car(perturbed(model, slope)).drive(settling_time(robot), OFF)[V][-1] for slope in slopes)
     terminal = (steepest - 1) * force / braking(robot)
     tolerance = 2.5e-3 * steepest * force / braking(robot)
     return [

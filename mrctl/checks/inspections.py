@@ -1,8 +1,8 @@
 """Inspections of a robot's model: each finds one fault that a model can have, and knows how to repair it.
 
-An inspection lists the parts that are out of tolerance, with a clause that gives the numbers, and the fields that
-repair such a part; `_suspect` makes a `Suspect` of them. Whether that is the cause of a failed check is found out by
-`mrctl.checks.examination`. `INSPECTIONS` lists them all.
+An inspection takes a compiled model and its parameters. It lists the parts that are out of tolerance, with a clause
+that gives the numbers, and the fields that repair such a part; `_suspect` makes a `Suspect` of them. Whether that is
+the cause of a failed check is found out by `mrctl.checks.examination`. `INSPECTIONS` lists them all.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -53,7 +53,7 @@ def suspects(model: mujoco.MjModel) -> list[Suspect]:
 def _suspect(
     cause: str, odd: dict[Part, str], advice: str, repair: Callable[[mujoco.MjModel, Part], Iterable[Assignment]]
 ) -> Suspect | None:
-    """A suspect if any part is odd.
+    """Makes a suspect if any part is odd. All new values are computed before any of them is written.
 
     Args:
         cause: Name of the fault.
@@ -107,7 +107,7 @@ def _centres(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 def _axis(model: mujoco.MjModel, joint: Part) -> NDArray[np.float64]:
-    """Axis of a joint in the frame of the body that carries the joint's own, `(3,)`."""
+    """Axis of a joint in the frame of its body's parent, `(3,)`."""
     rotated = np.zeros(3)
     mujoco.mju_rotVecQuat(rotated, model.joint(joint).axis, model.body(model.jnt_bodyid[model.joint(joint).id]).quat)
     return rotated

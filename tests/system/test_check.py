@@ -1,6 +1,7 @@
 """`mrctl check` and its pytest plugin: each broken robot fails for its own cause, and the shipped ones pass."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -241,10 +242,10 @@ def test_bad_input(tmp_path, capsys):
         assert not out and err.count("\n") == 1 and path.name in err
 
 
-def pytest_in(folder, *arguments):
+def pytest_in(folder, *arguments, **environment):
     """Runs pytest as a user would, outside of this repository."""
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    return subprocess.run(command, cwd=folder, env=os.environ | environment, capture_output=True, text=True)
 
 
 def test_plugin(robot):
@@ -267,15 +268,17 @@ def test_plugin_bad_input(tmp_path):
 
 
 def test_plugin_sleeps(tmp_path):
-    """Without the option pytest loads the plugin alone: it imports nothing heavy, and collects no MJCF file."""
+    """Without the option the plugin imports nothing heavy, and collects no MJCF file."""
     heavy = {"numpy", "mujoco", "numba", "torch", "pydantic", "mrctl.physics", "mrctl.checks.catalogue"}
     code = f"import sys\ndef test_light():\n    assert not {heavy} & sys.modules.keys()\n"
     code += "    assert 'mrctl.checks.pytest_plugin' in sys.modules\n"
     (tmp_path / "test_light.py").write_text(code)
     (tmp_path / "test_robot.xml").write_text("<mujoco/>")
-    run = pytest_in(tmp_path)
+    # Plugins of other packages may import NumPy: only that of the entry point `mrctl` is loaded.
+    run = pytest_in(tmp_path, "-p", "mrctl", PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")
     assert run.returncode == 0 and "1 passed" in run.stdout, run.stdout
-    assert "mrctl" in run.stdout  # among the plugins
+    assert "plugins: mrctl" in run.stdout
+    assert "mrctl" in pytest_in(tmp_path, "--co").stdout.partition("plugins: ")[2].partition("\n")[0]  # by default
 
 
 def test_all_checks():
