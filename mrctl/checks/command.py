@@ -1,4 +1,4 @@
-"""`mrctl check`: the physics checks on a robot, as a table or as JSON, with the causes of what fails."""
+"""The text of `mrctl check`: the checks of a robot and the causes of failures, as a table or as JSON."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -12,29 +12,29 @@ from collections.abc import Sequence
 
 import mujoco
 
-from mrctl.checks.catalogue import Comparison
-from mrctl.checks.diagnosis import Examination, Finding, excess
+from mrctl.checks.comparison import Comparison
+from mrctl.checks.examination import Examination, Finding, excess
 from mrctl.physics.elements import has
 from mrctl.physics.files import SHIPPED, world_path
 from mrctl.physics.mjcf import arrangement, load, load_robot, steerings
 from mrctl.record import InputError
 
-UNEXPLAINED = "nothing odd in the model explains this, nor does a shorter time step"
+UNEXPLAINED = "no inspection explains this, nor does a shorter time step"
 
 
 def examination(
     path: str = "flat", wheels: Sequence[str] = (), steering: Sequence[str] = (), chassis: str = ""
 ) -> Examination:
-    """Gets a robot ready to be checked.
+    """Loads a robot to be checked.
 
     Args:
         path: A world with its robot, or a robot, which gets a level floor (see `mrctl.physics.mjcf.load_robot`).
         wheels: Joints of the two driven wheels of a robot without a world.
-        steering: Joints of what it steers.
-        chassis: Body that carries them.
+        steering: Joints of its steered wheels.
+        chassis: Body that carries the wheels.
 
     Raises:
-        InputError: It cannot be loaded.
+        InputError: The robot cannot be loaded.
     """
     if not (wheels or steering or chassis) and _is_world(path):
         return Examination(lambda arranged: load(path, arranged or "compliant"))
@@ -45,7 +45,7 @@ def examination(
 
 
 def _is_world(path: str) -> bool:
-    """Whether a file brings its own floor, and wheels under our names on it."""
+    """Whether a file has a floor of its own, and on it a robot with the names of `mrctl.physics.elements`."""
     if path in SHIPPED:
         return False
     try:
@@ -62,23 +62,23 @@ def run(
     chassis: str = "",
     json: bool = False,
 ) -> tuple[str, str]:
-    """Runs all checks that suit a robot.
+    """Runs the checks on a robot.
 
     Args:
-        path: As in `examination`, like what follows.
-        wheels: Joints of the driven wheels.
-        steering: Joints of what is steered.
-        chassis: Body that carries them.
-        json: Return JSON.
+        path: A world with its robot, or a robot, as in `examination`.
+        wheels: Joints of the two driven wheels.
+        steering: Joints of the steered wheels.
+        chassis: Body that carries the wheels.
+        json: Whether the report is JSON instead of a table.
 
     Returns:
-        The report, and "3 of 22 checks failed", empty if none did.
+        The report, and a verdict such as "3 of 23 checks failed", which is empty if none failed.
 
     Raises:
         InputError: The robot cannot be loaded.
     """
-    patient = examination(path, wheels, steering, chassis)
-    findings = [patient.look(check) for check in patient.checks]
+    robot = examination(path, wheels, steering, chassis)
+    findings = [robot.examine(check) for check in robot.checks]
     failed = sum(finding.status == "failed" for finding in findings)
     verdict = f"{failed} of {len(findings)} checks failed" if failed else ""
     if json:
@@ -88,7 +88,7 @@ def run(
 
 
 def as_data(finding: Finding) -> dict[str, object]:
-    """A finding for machines; what is no number is null."""
+    """A finding as JSON data; NaN and infinity become null."""
 
     def number(value: float) -> float | None:
         return value if math.isfinite(value) else None
@@ -106,14 +106,14 @@ def as_data(finding: Finding) -> dict[str, object]:
 
 
 def table(findings: list[Finding]) -> str:
-    """A line for each check with the value that is nearest to its tolerance, one for each that failed, and causes."""
+    """A table with the tightest value of each passed check, all failed values of the others, and their causes."""
     rows = [("check", "value", "measured", "expected", "")]
     for finding in (f for f in findings if not f.reason):
         name = finding.check.name
-        shown = [c for c in finding.report if not c.passed] or [max(finding.report, key=excess)]
-        rows += [(name, *_cells(c)) for c in shown[:1]] + [("", *_cells(c)) for c in shown[1:]]
+        values = [c for c in finding.report if not c.passed] or [max(finding.report, key=excess)]
+        rows += [(name, *_cells(c)) for c in values[:1]] + [("", *_cells(c)) for c in values[1:]]
         if finding.status == "failed":
-            rows += [("", line, "", "", "") for line in because(finding)]
+            rows.append(("", cause_line(finding), "", "", ""))
     widths = [max(_width(row[k]) for row in rows if row[2]) for k in range(4)]
     lines = [
         "  ".join(c + " " * (w - _width(c)) for c, w in zip(row, [*widths, 0], strict=True)).rstrip() for row in rows
@@ -127,15 +127,15 @@ def table(findings: list[Finding]) -> str:
     return "\n".join([*lines, "", ", ".join(f"{count} {status}" for count, status in counts if count)])
 
 
-def because(finding: Finding) -> list[str]:
-    """Lines that say why a check failed."""
+def cause_line(finding: Finding) -> str:
+    """The causes of a failed check, and its worst value after their repair, in one line."""
     if not finding.causes:
-        return [UNEXPLAINED]
-    return [f"because of {', '.join(c.cause for c in finding.causes)}; repaired, {finding.causes[0].evidence}"]
+        return UNEXPLAINED
+    return f"cause: {', '.join(c.cause for c in finding.causes)}; once repaired, {finding.causes[0].evidence}"
 
 
 def _width(cell: str) -> int:
-    """Columns that a cell takes: the dot of θ̇ takes none."""
+    """Width of a cell in characters on the screen; the dot of θ̇ takes none."""
     return sum(not unicodedata.combining(letter) for letter in cell)
 
 

@@ -1,6 +1,7 @@
-"""`pytest --mrctl-robot ROBOT.xml`: each physics check of `mrctl check` as a test.
+"""The pytest plugin: `pytest --mrctl-robot ROBOT.xml` runs each physics check of `mrctl check` as a test.
 
-Everything heavy is imported when the option is given: pytest loads this file in every project of the environment.
+pytest loads this file in every project of an environment that has mrctl, so NumPy, MuJoCo and Numba are imported only
+once the option is given.
 """
 
 from __future__ import annotations
@@ -13,17 +14,19 @@ import pytest
 
 if TYPE_CHECKING:
     from mrctl.checks.catalogue import Check
-    from mrctl.checks.diagnosis import Examination
+    from mrctl.checks.examination import Examination
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """The option."""
-    text = "run mrctl's physics checks on this robot (MJCF); alone, unless files or folders are given as well"
+    """Adds the option `--mrctl-robot`."""
+    text = (
+        "run mrctl's physics checks on this robot (MJCF), and no other tests unless files or folders are given as well"
+    )
     parser.getgroup("mrctl").addoption("--mrctl-robot", metavar="ROBOT.xml", help=text)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Makes the robot one of the files to collect from."""
+    """Adds the robot's file to the files that pytest collects from, or replaces the default ones by it."""
     if robot := _robot(config):
         if config.args_source is not pytest.Config.ArgsSource.ARGS:
             config.args = []
@@ -32,59 +35,68 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
-    """Takes the robot's file."""
+    """Collects the robot's file, and no other."""
     return RobotFile.from_parent(parent, path=file_path) if file_path == _robot(parent.config) else None
 
 
 def _robot(config: pytest.Config) -> Path | None:
+    """The robot's file, if the option is given."""
     name = config.getoption("mrctl_robot")
     return (config.invocation_params.dir / name).resolve() if name else None
 
 
 class RobotFile(pytest.File):
-    """The file of a robot."""
+    """A robot's file, as a collection of tests."""
 
     def collect(self) -> Iterator[PhysicsCheck]:
-        """One test for each check."""
+        """Yields a test for each check.
+
+        Raises:
+            CollectError: The robot cannot be loaded.
+        """
         from mrctl.checks.command import examination
         from mrctl.record import InputError
 
         try:
-            patient = examination(str(self.path))
+            robot = examination(str(self.path))
         except InputError as error:
             raise self.CollectError(str(error)) from None
-        for check in patient.checks:
-            yield PhysicsCheck.from_parent(self, name=check.name, check=check, patient=patient)
+        for check in robot.checks:
+            yield PhysicsCheck.from_parent(self, name=check.name, check=check, examination=robot)
 
 
 class PhysicsCheck(pytest.Item):
-    """One check on the robot."""
+    """A check on the robot, as a test."""
 
-    def __init__(self, check: Check, patient: Examination, **kwargs: object) -> None:
+    def __init__(self, check: Check, examination: Examination, **kwargs: object) -> None:
         """Takes the check and the robot's examination."""
         super().__init__(**kwargs)  # pyright: ignore[reportArgumentType]
-        self._check, self._patient = check, patient
+        self._check, self._examination = check, examination
 
     def runtest(self) -> None:
-        """Runs it; not applicable is skipped."""
-        finding = self._patient.look(self._check)
+        """Runs the check; one that does not suit the robot is skipped.
+
+        Raises:
+            _Failed: The check failed.
+        """
+        finding = self._examination.examine(self._check)
         if finding.reason:
             pytest.skip(finding.reason)
         if finding.status == "failed":
-            from mrctl.checks.command import because
+            from mrctl.checks.command import cause_line
 
             values = [str(c) for c in finding.report if not c.passed]
             causes = [f"{cause.cause}: {cause.text}" for cause in finding.causes]
-            raise _Failed("\n".join([*values, *because(finding), *causes]))
+            raise _Failed("\n".join([*values, cause_line(finding), *causes]))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException]) -> str:  # pyright: ignore
-        """What was measured and why, without a traceback."""
+        """Measured values and causes, without a traceback."""
         return str(excinfo.value) if isinstance(excinfo.value, _Failed) else str(super().repr_failure(excinfo))
 
     def reportinfo(self) -> tuple[Path, None, str]:
-        """Where the report says that it failed."""
+        """The file and the name of the check, for pytest's report."""
         return self.path, None, f"{self.path.name}: {self.name}"
 
 
 class _Failed(AssertionError):
-    """A check failed, with its explanation."""
+    """A check failed; the message holds its values and causes."""

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from mrctl.checks.catalogue import on_skid
+from mrctl.checks.open_loop import on_skid
 from mrctl.experiments.tables import json_text, machine, markdown
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot

@@ -1,4 +1,4 @@
-"""The checks hold for the shipped robot, for other robots, and their expectations are the documented numbers."""
+"""The checks pass for the shipped robot and for variants of it, and its file holds the documented numbers."""
 
 import math
 
@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mrctl.checks.catalogue import CHECKS, Check, CheckFailed, Comparison, between, compare
+from mrctl.checks.catalogue import CHECKS, Check
+from mrctl.checks.comparison import CheckFailed, Comparison, between, compare
 from mrctl.physics.mjcf import clone, load
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
@@ -17,7 +18,7 @@ ON_LEVEL = [c for c in CHECKS if c.world == "flat"]
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.name)
 def test_shipped_robot(check):
-    """Every check holds, and each of them compares something."""
+    """Every check passes, compares at least one value, and leaves the model as it was."""
     model = load(check.world, check.steering)
     before = np.concatenate([model.body_mass, model.dof_damping, *model.pair_friction, *model.actuator_gainprm])
     assert check.run(model, read_robot(model))
@@ -25,8 +26,8 @@ def test_shipped_robot(check):
     assert np.array_equal(before, after)  # variants are made on copies
 
 
-# The design table, its data sheets, and what follows by hand: 24/(0.0234 · 43) · 0.098 m/s and so on. The checks take
-# their expectations from the model's file; this holds the file to the design. Tolerance: the digits of that table.
+# Values of the design table and its data sheets, and results by hand such as 24/(0.0234 · 43) · 0.098 m/s. The checks
+# take their expectations from the model's file; this holds the file to the design, to the digits of that table.
 DOCUMENTED = {
     "mass": (20.0, 0.05),
     "yaw_inertia": (0.60, 0.005),
@@ -55,7 +56,7 @@ DOCUMENTED = {
 
 @pytest.mark.parametrize("name", DOCUMENTED)
 def test_documented(name):
-    """The file holds the documented robot."""
+    """The file holds the documented value."""
     value, digits = DOCUMENTED[name]
     assert getattr(read_robot(load()), name) == pytest.approx(value, abs=digits)
 
@@ -76,7 +77,7 @@ def weak(model):
 
 
 def large(model):
-    """Longer and wider, on larger wheels and the same loads."""
+    """Makes the robot longer and wider, on larger wheels with the same loads."""
     model.body("fork").pos[0] *= 1.2
     for wheel in ("wheel_left", "wheel_right"):
         model.body(wheel).pos[1] *= 1.2
@@ -88,7 +89,7 @@ def large(model):
 @pytest.mark.parametrize("change", [heavy, weak, large], ids=lambda f: f.__name__)
 @pytest.mark.parametrize("check", ON_LEVEL, ids=lambda c: c.name)
 def test_other_robots(check, change):
-    """Another robot, read from its own model, obeys the same laws: nothing here is tuned to the shipped one."""
+    """Another robot, read from its own model, obeys the same laws: no check is tuned to the shipped one."""
     model = load(check.world, check.steering)
     change(model)
     check.run(model, read_robot(model))
@@ -96,7 +97,7 @@ def test_other_robots(check, change):
 
 @pytest.mark.parametrize("measured", [1.02, 0.98, math.nan, math.inf])
 def test_compare_refuses(measured):
-    """Out of tolerance, or not a number."""
+    """A value that is out of tolerance or not finite fails the check."""
 
     def speed(model, robot):
         return [compare("length", 1.0, 1.0, "m"), compare("speed", measured, 1.0, "m/s", relative=0.01)]
@@ -111,7 +112,7 @@ def test_compare_refuses(measured):
 
 
 def test_compare_accepts():
-    """Within tolerance, the edge included."""
+    """A value within the tolerance passes, bounds included."""
     comparison = compare("speed", 1.5, 1.0, "m/s", absolute=0.5)
     assert comparison == Comparison("speed", 1.5, 1.0, 0.5, "m/s") and comparison.passed
     assert between("speed", 2.0, 0.0, 2.0).passed and not between("speed", 2.1, 0.0, 2.0).passed

@@ -1,10 +1,11 @@
-"""Every check fails when the physics that it is for is broken on purpose."""
+"""Every check fails when the law that it tests is broken on purpose."""
 
 import mujoco
 import numpy as np
 import pytest
 
-from mrctl.checks.catalogue import CHECKS, CheckFailed
+from mrctl.checks.catalogue import CHECKS
+from mrctl.checks.comparison import CheckFailed
 from mrctl.physics.mjcf import load
 from mrctl.physics.parameters import read_robot
 
@@ -114,7 +115,7 @@ def gravity(m, factor):
 
 
 def level(m, radians):
-    """A floor that is not level, uphill to the left."""
+    """Tilts the floor, uphill to the left."""
     m.opt.gravity[1] = -9.81 * np.sin(radians)
 
 
@@ -127,12 +128,12 @@ def fork_stiffness(m, stiffness):
 
 
 def air(m, damping):
-    """Drag along x."""
+    """Adds drag along x."""
     m.dof_damping[0] = damping
 
 
 def contact_time(m, seconds):
-    """Spongy contacts, or stiffer ones than the step resolves: MuJoCo softens those, with each step differently."""
+    """Makes contacts soft, or shorter than the step resolves: MuJoCo softens those, depending on the step."""
     m.pair_solref[:, 0] = seconds
     m.pair_solreffriction[:] = 0  # as solref
 
@@ -145,7 +146,7 @@ def bumps(m, factor):
     m.hfield_size[0, 2] *= factor
 
 
-# Each check with the ways in which its physics can be wrong.
+# Each check, with changes that break its law.
 MUTATIONS = [
     ("stance", small_front, 0.9),
     ("stance", radius, 1.1),
@@ -256,7 +257,7 @@ MUTATIONS = [
 
 @pytest.mark.parametrize(("name", "mutate", "amount"), MUTATIONS, ids=lambda v: getattr(v, "__name__", None) or str(v))
 def test_mutation(name, mutate, amount):
-    """The check fails, and says so as a comparison: not because something else broke."""
+    """The check fails by a comparison, and not by another error."""
     check = CHECK[name]
     model = load(check.world, check.steering)
     robot = read_robot(model)
@@ -267,5 +268,5 @@ def test_mutation(name, mutate, amount):
 
 
 def test_every_check_has_a_mutation():
-    """No check is left that nothing could fail."""
+    """Every check is failed by some change."""
     assert {name for name, _, _ in MUTATIONS} == set(CHECK)

@@ -1,6 +1,7 @@
-"""`mrctl check` and its pytest plugin: broken robots are caught, each for its own cause; good ones pass."""
+"""`mrctl check` and its pytest plugin: each broken robot fails for its own cause, and the shipped ones pass."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -9,7 +10,8 @@ import pytest
 
 from mrctl.checks.catalogue import CHECKS
 from mrctl.checks.command import examination
-from mrctl.checks.diagnosis import BASICS, Examination, suspects
+from mrctl.checks.examination import PREREQUISITES, Examination
+from mrctl.checks.inspections import suspects
 from mrctl.cli import main
 from mrctl.physics.files import models_folder
 from mrctl.physics.mjcf import load
@@ -35,7 +37,7 @@ FORK = 'name="steering" axis="0 0 {}"'
 BOX = '<geom name="belly" type="box" size="0.18 0.12 0.035" pos="0.105 0 -0.0628" contype="1" conaffinity="1"/>'
 LYING = 'type="cylinder" size="0.098 0.02" euler="1.5707963 0 0"'
 
-# Faults, as passages of the robot's files with what stands there instead.
+# Faults: passages of the robot's files, each with its replacement.
 FAULTS = {
     "cylinders": [wheel("left", LYING), wheel("right", LYING)],
     "off centre": [wheel("left", 'size="0.098" pos="0.003 0 0"')],
@@ -64,11 +66,11 @@ FAULTS = {
     "fork": [(FORK.format(1), FORK.format(-1))],
     "degrees": [('"-1.0471976 1.0471976"', '"-0.018277 0.018277"')],
 }
-# Which checks it fails, for which cause, and what has to be said of it.
+# Of each fault: the checks that fail, the name of the cause, and words that its text contains.
 DIAGNOSES = {
-    "cylinders": ("rolling mirror", "cylinder scrub", "wheel_left, wheel_right"),
-    "off centre": ("rest mirror", "off-centre wheel", "wheel_left is 3 mm off"),
-    "radii": ("rest mirror", "rear wheel radii differ", "left 100 mm, right 98 mm"),
+    "cylinders": ("rolling mirror", "cylinder scrub", "wheel_right touches the ground along an edge"),
+    "off centre": ("rest mirror", "off-centre wheel", "wheel_left is 3 mm off its axle"),
+    "radii": ("rest mirror", "rear wheel radii differ", "wheel_left has a radius of 100 mm"),
     "front radius": ("stance", "wheel radius against axle height", "front_wheel ends 15 mm above"),
     "one gear": ("stall mirror", "left and right motors differ", "gear 43 left, 45 right"),
     "gear": ("limits", "wrong gear", "need one of 8 to 59"),
@@ -80,16 +82,16 @@ DIAGNOSES = {
     "load": ("rest mirror", "centre of mass off the axis", "17.2 mm to the left"),
     "belly": ("cornering", "contact beside the wheels", "belly can touch"),
     "condim": ("limits", "condim of a tyre", "wheel_right has condim 1, which has no friction"),
-    "no pair": ("stance", "missing contact pair", "pairs front_wheel"),
+    "no pair": ("stance", "missing contact pair", "joins front_wheel"),
     "axis": ("limits", "wheel axis", "wheel_right turns about (0, -1, 0)"),
     "damping": ("coast_down", "drag", "wheel_left has damping 0.02"),
-    "loss": ("stall", "left and right losses differ", "0.3 N·m left"),
+    "loss": ("stall", "left and right losses differ", "wheel_left has a frictionloss of 0.3 N·m"),
     "default contacts": ("scrub_free", "soft contacts", "solref 0.02 s"),
     "pyramid": ("cornering", "soft contacts", "pyramid"),
-    "g·cm²": ("inertias", "wheel inertia", "wheel_left is 443 times a hoop's"),
+    "g·cm²": ("inertias", "wheel inertia", "wheel_left is 443 times"),
     "moon": ("rest", "gravity", "(0, 0, -1.62)"),
     "ice": ("traction mirror", "tyres of different grip", "wheel_right has friction 0.3"),
-    "track": ("rest stall", "misplaced axle", "wheel_left at (0, 0.2, 0)"),
+    "track": ("rest stall", "misplaced axle", "wheel_left is at (0, 0.2, 0)"),
     "fork": ("circle", "steering axis", "(0, 0, -1)"),
     "degrees": ("limits", "angles in degrees", "1.05°"),
 }
@@ -97,7 +99,7 @@ DIAGNOSES = {
 
 @pytest.fixture
 def robot(tmp_path):
-    """Writes a world whose robot has some faults."""
+    """Returns a function that writes a world whose robot has some faults."""
 
     def write(*names):
         folder = shutil.copytree(models_folder(), tmp_path / "models")
@@ -112,22 +114,22 @@ def robot(tmp_path):
     return write
 
 
-def look(path, *names):
+def examine(path, *names):
     """Findings of some checks, by name."""
-    patient = examination(str(path))
-    return {check.name: patient.look(check) for check in patient.checks if check.name in names}
+    robot = examination(str(path))
+    return {check.name: robot.examine(check) for check in robot.checks if check.name in names}
 
 
 def causes(finding):
-    """Names of what is said to be the cause."""
+    """Names of the causes of a finding."""
     return {cause.cause for cause in finding.causes}
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_broken(robot, name):
-    """The fault is caught, its cause is named with the numbers of this robot, and nothing else is."""
+    """The check fails, and the only cause that is named is the fault, with the numbers of this robot."""
     checks, cause, said = DIAGNOSES[name]
-    findings = look(robot(name), *BASICS, *checks.split())
+    findings = examine(robot(name), *PREREQUISITES, *checks.split())
     for check in checks.split():
         assert findings[check].status == "failed" and causes(findings[check]) == {cause}
         assert said in findings[check].causes[0].text
@@ -137,13 +139,13 @@ def test_broken(robot, name):
 
 @pytest.mark.parametrize("name", ["flat", "turtlebot", "racecar"])
 def test_good(name):
-    """The shipped robots pass all that suits them; what does not suit them is skipped for a reason."""
-    patient = examination(name)
-    findings = [patient.look(check) for check in patient.checks]
+    """The shipped robots pass all checks that suit them; the others are skipped for a reason."""
+    robot = examination(name)
+    findings = [robot.examine(check) for check in robot.checks]
     assert {f.check.name: [str(c) for c in f.report if not c.passed] for f in findings if f.status == "failed"} == {}
     skipped = {f.check.name: f.reason for f in findings if f.status == "skipped"}
     nothing, fork = "nothing is steered", "no trailing fork"
-    servos = "servos hold the front wheels, which then leave the motors one degree of freedom"
+    servos = "servos hold the front wheels, which leaves the motors one degree of freedom"
     assert (
         skipped
         == {
@@ -155,7 +157,7 @@ def test_good(name):
 
 
 def test_nothing_odd():
-    """Inspection finds nothing in the shipped robots."""
+    """No inspection finds a fault in the shipped robots."""
     for name in ("flat", "turtlebot", "racecar"):
         assert [suspect.cause for suspect in examination(name).suspects] == []
 
@@ -176,41 +178,41 @@ def test_broken_adopted(name, tmp_path):
     text = (models_folder() / f"{name}.xml").read_text()
     assert old in text
     (tmp_path / "mine.xml").write_text(text.replace(old, new))
-    finding = look(tmp_path / "mine.xml", check)[check]
+    finding = examine(tmp_path / "mine.xml", check)[check]
     assert finding.status == "failed" and causes(finding) == {cause}
 
 
 def test_two_faults(robot):
     """Each check is explained by the fault that it shows, and by both where either is enough to fail it."""
-    findings = look(robot("off centre", "damping"), "mirror", "top_speed", "stall")
+    findings = examine(robot("off centre", "damping"), "mirror", "top_speed", "stall")
     assert causes(findings["mirror"]) == {"off-centre wheel"}
     assert causes(findings["top_speed"]) == {"off-centre wheel", "drag"}
 
 
 def test_harmless(robot):
-    """What is odd but does no harm is not named."""
+    """A fault that does no harm is not named."""
     path = robot()
     text = (path.parent / "car.xml").read_text().replace(' solimpfriction="0.99 0.99"', "")
     (path.parent / "car.xml").write_text(text)
     assert [suspect.cause for suspect in suspects(load(str(path)))] == ["creeping friction loss"]
-    findings = look(path, *BASICS, "hold_on_slope", "top_speed")
+    findings = examine(path, *PREREQUISITES, "hold_on_slope", "top_speed")
     assert {finding.status for finding in findings.values()} == {"passed"}
 
 
 def test_unexplained(robot):
-    """A fault that no inspection knows is caught, and no cause is invented."""
+    """A fault that no inspection knows fails a check, and no cause is invented."""
     path = robot()
     text = (
         (path.parent / "car.xml").read_text().replace('name="steering" axis', 'name="steering" frictionloss="2" axis')
     )
     (path.parent / "car.xml").write_text(text)
-    finding = look(path, "prediction")["prediction"]
+    finding = examine(path, "prediction")["prediction"]
     assert finding.status == "failed" and not finding.causes
 
 
 def test_others_wait(robot):
     """A robot that does not stand is not driven."""
-    findings = look(robot("no pair"), "stance", "rest", "mirror")
+    findings = examine(robot("no pair"), "stance", "rest", "mirror")
     assert [f.status for f in findings.values()] == ["failed", "skipped", "skipped"]
     assert findings["rest"].reason == "waits for stance"
 
@@ -220,7 +222,8 @@ def test_command(robot, capsys):
     path = str(robot("gear"))
     assert main(["check", path]) == 1
     out, err = capsys.readouterr()
-    assert "because of wrong gear" in out and "- wrong gear: gear 86" in out and "skipped, waits for limits" in out
+    assert "cause: wrong gear; once repaired, V at its limit" in out
+    assert "- wrong gear: gear 86" in out and "skipped, waits for limits" in out
     assert err == f"mrctl: {path}: 1 of {len(Examination.checks)} checks failed\n"
     assert main(["check", path, "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
@@ -231,7 +234,7 @@ def test_command(robot, capsys):
 
 
 def test_bad_input(tmp_path, capsys):
-    """What is no robot: exit status 2 and one line."""
+    """A file that holds no robot gives exit status 2 and one line."""
     (tmp_path / "stone.xml").write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     for path in (tmp_path / "stone.xml", tmp_path / "none.xml"):
         assert main(["check", str(path)]) == 2
@@ -239,43 +242,47 @@ def test_bad_input(tmp_path, capsys):
         assert not out and err.count("\n") == 1 and path.name in err
 
 
-def pytest_in(folder, *arguments):
+def pytest_in(folder, *arguments, **environment):
     """Runs pytest as a user would, outside of this repository."""
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    return subprocess.run(command, cwd=folder, env=os.environ | environment, capture_output=True, text=True)
 
 
 def test_plugin(robot):
-    """A test for each check, beside those that are asked for; a failure shows values and cause, and no traceback."""
+    """There is a test for each check beside the given ones; a failure shows values and cause, and no traceback."""
     folder = robot("gear").parent
     (folder / "test_mine.py").write_text("def test_mine():\n    pass\n")
     run = pytest_in(folder, "--mrctl-robot", "flat.xml", "test_mine.py", "-rs")
     assert run.returncode == 1, run.stdout + run.stderr
-    others = len(Examination.checks) - len(BASICS)
-    assert f"1 failed, {len(BASICS)} passed, {others} skipped" in run.stdout
+    others = len(Examination.checks) - len(PREREQUISITES)
+    assert f"1 failed, {len(PREREQUISITES)} passed, {others} skipped" in run.stdout
     assert "V at its limit: 1." in run.stdout and "wrong gear: gear 86" in run.stdout
     assert "waits for limits" in run.stdout and "Traceback" not in run.stdout
 
 
 def test_plugin_bad_input(tmp_path):
-    """What is no robot is an error of collection, in one line; without files beside it, nothing else is collected."""
+    """A file that holds no robot is an error of collection, in one line, and no other file is collected."""
     (tmp_path / "test_mine.py").write_text("def test_mine():\n    pass\n")
     run = pytest_in(tmp_path, "--mrctl-robot", "none.xml")
     assert run.returncode == 4 and "none.xml" in run.stderr and "passed" not in run.stdout
 
 
 def test_plugin_sleeps(tmp_path):
-    """Without the option nobody pays: neither mrctl nor MuJoCo is imported, and no MJCF file collected."""
-    code = "import sys\ndef test_light():\n    assert not {'mrctl', 'mujoco', 'numba', 'torch'} & sys.modules.keys()\n"
+    """Without the option the plugin imports nothing heavy, and collects no MJCF file."""
+    heavy = {"numpy", "mujoco", "numba", "torch", "pydantic", "mrctl.physics", "mrctl.checks.catalogue"}
+    code = f"import sys\ndef test_light():\n    assert not {heavy} & sys.modules.keys()\n"
+    code += "    assert 'mrctl.checks.pytest_plugin' in sys.modules\n"
     (tmp_path / "test_light.py").write_text(code)
     (tmp_path / "test_robot.xml").write_text("<mujoco/>")
-    run = pytest_in(tmp_path)
+    # Plugins of other packages may import NumPy: only that of the entry point `mrctl` is loaded.
+    run = pytest_in(tmp_path, "-p", "mrctl", PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")
     assert run.returncode == 0 and "1 passed" in run.stdout, run.stdout
-    assert "mrctl" in run.stdout  # among the plugins
+    assert "plugins: mrctl" in run.stdout
+    assert "mrctl" in pytest_in(tmp_path, "--co").stdout.partition("plugins: ")[2].partition("\n")[0]  # by default
 
 
 def test_all_checks():
-    """Only those of the shipped worlds are left out."""
+    """An examination has all checks but those of the shipped worlds."""
     assert {check.name for check in CHECKS} - {check.name for check in Examination.checks} == {
         "slope", "tilted_gravity", "patch", "rough",
     }  # fmt: skip

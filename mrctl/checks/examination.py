@@ -1,0 +1,168 @@
+"""Runs the checks on a robot, and finds the cause of a failure by experiment.
+
+Inspection lists what may be wrong with the model (see `mrctl.checks.inspections`). Where a check fails, these suspects
+are repaired in a copy and the check runs again. A suspect is named as a cause only if the check passes with all of them
+repaired and fails with this one left as it was, so a model may be odd in many ways and only those that matter for what
+was measured are named. Where no repair helps, a shorter time step is tried; any other failure stays unexplained.
+
+The parameters that a check expects are read from the same model, so three kinds of mistakes show: parts of a model
+that contradict each other (left and right, geom and axle), physics that departs from equations (1) and (3), and numbers
+that are consistent but belong to no robot (no rotor inertia behind a gear, limits that no voltage reaches).
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from mrctl.checks.catalogue import CHECKS, Check
+from mrctl.checks.comparison import Comparison, Report
+from mrctl.checks.inspections import Suspect, suspects
+from mrctl.physics.parameters import read_robot
+from mrctl.record import InputError
+from mrctl.theory.robot import Steering
+
+Load = Callable[[Steering | None], mujoco.MjModel]  # None: the robot's own arrangement
+
+# Checks that have to be explained before others run, because a robot that fails them fails others for the same cause.
+PREREQUISITES = {"stance": (), "inertias": (), "motors": (), "limits": ("stance",), "turning_limits": ("stance",)}
+PREREQUISITES_OF_OTHERS = ("stance", "limits", "inertias")
+STEP_DIVISOR = 8  # by which the time step is divided where no repair explains a failure
+
+
+class Explanation(NamedTuple):
+    """A cause of a failed check.
+
+    Attributes:
+        cause: Name of the fault.
+        text: What is odd in the model, and what to do about it.
+        evidence: The worst value of the check, with all faults repaired.
+    """
+
+    cause: str
+    text: str
+    evidence: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The outcome of one check.
+
+    Attributes:
+        check: The check.
+        report: Its values, empty if it is skipped.
+        causes: Why it fails, as far as that is explained.
+        reason: Why it is skipped, empty if it is not.
+    """
+
+    check: Check
+    report: Report
+    causes: tuple[Explanation, ...] = ()
+    reason: str = ""
+
+    @property
+    def status(self) -> str:
+        """`passed`, `failed` or `skipped`."""
+        if self.reason:
+            return "skipped"
+        return "passed" if _passes(self.report) else "failed"
+
+
+class Examination:
+    """The checks of one robot.
+
+    Attributes:
+        checks: All checks for a level floor.
+        suspects: Possible faults of the robot's model.
+    """
+
+    checks = tuple(check for check in CHECKS if check.world == "flat")
+
+    def __init__(self, load: Load) -> None:
+        """Takes a function that compiles the robot in a steering arrangement.
+
+        Raises:
+            InputError: The robot cannot be loaded.
+        """
+        self._load = load
+        self.suspects = suspects(load(None))
+        self._findings: dict[str, Finding] = {}
+
+    def examine(self, check: Check) -> Finding:
+        """Runs a check, and explains it if it fails; it is skipped while the cause of an earlier failure remains."""
+        if check.name not in self._findings:
+            self._findings[check.name] = self._examine(check)
+        return self._findings[check.name]
+
+    def _examine(self, check: Check) -> Finding:
+        earlier = PREREQUISITES.get(check.name, PREREQUISITES_OF_OTHERS)
+        for prerequisite in (c for c in self.checks if c.name in earlier):
+            if self.examine(prerequisite).causes:
+                return Finding(check, [], reason=f"waits for {prerequisite.name}")
+        model = self._load(check.steering)
+        if reason := check.unsuited(model):
+            return Finding(check, [], reason=reason)
+        report = check.measure(model, read_robot(model))
+        return Finding(check, report, () if _passes(report) else self._explain(check, report))
+
+    def _explain(self, check: Check, report: Report) -> tuple[Explanation, ...]:
+        """Names the suspects without whose repair the check still fails when all others are repaired."""
+        worst = max((c for c in report if not c.passed), key=excess)
+        suspected = self.suspects
+        repaired = self._repaired(check, suspected) if suspected else []
+        if not _passes(repaired):
+            halved, finer = (_long_step(self._load(None), divisor) for divisor in (2, STEP_DIVISOR))
+            suspected = [*self.suspects, finer]
+            repaired = self._repaired(check, suspected)
+            improved = _excess_of(worst, self._repaired(check, [*self.suspects, halved])) < excess(worst)
+            if not (_passes(repaired) and improved):
+                return ()
+        causes = [s for s in suspected if not _passes(self._repaired(check, [o for o in suspected if o is not s]))]
+        if not causes:  # each of several repairs is enough
+            causes = [s for s in suspected if _passes(self._repaired(check, [s]))]
+        evidence = next((c for c in repaired if c.quantity == worst.quantity), repaired[0])
+        return tuple(Explanation(suspect.cause, suspect.text, str(evidence)) for suspect in causes)
+
+    def _repaired(self, check: Check, repairs: list[Suspect]) -> Report:
+        """Values of a check after some repairs; empty if the repaired model is no robot."""
+        model = self._load(check.steering)
+        for suspect in repairs:
+            suspect.repair(model)
+        try:
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+            return check.measure(model, read_robot(model))
+        except (InputError, mujoco.FatalError):
+            return []
+
+
+def excess(comparison: Comparison) -> float:
+    """Departure from the expected value in tolerances."""
+    excess = abs(comparison.measured - comparison.expected) / max(comparison.tolerance, 1e-12)
+    return excess if np.isfinite(excess) else np.inf
+
+
+def _excess_of(comparison: Comparison, report: Report) -> float:
+    """Excess of the same quantity in another report."""
+    return next((excess(c) for c in report if c.quantity == comparison.quantity), np.inf)
+
+
+def _passes(report: Report) -> bool:
+    return bool(report) and all(c.passed for c in report)
+
+
+def _long_step(model: mujoco.MjModel, divisor: float) -> Suspect:
+    """Suspects the time step, which no inspection can see to be too long."""
+    h = 1e3 * model.opt.timestep
+
+    def repair(faulty: mujoco.MjModel) -> None:
+        faulty.opt.timestep /= divisor
+
+    text = f"the result changes with the time step and is right at {h / divisor:g} ms instead of {h:g} ms; shorten it"
+    return Suspect("time step too long", text, repair)

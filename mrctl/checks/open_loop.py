@@ -1,0 +1,233 @@
+"""The test bench of the checks: a robot in MuJoCo that is driven open loop, with voltages and without a controller.
+
+`Car` drives and records. Functions of a `Robot` give the times, voltages and forces by which a check scales its
+experiment; functions of a model return variants of it in which one law shows alone.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mrctl.physics.elements import MOTORS, REAR, fronts, has, rolling_fronts
+from mrctl.physics.mjcf import clone
+from mrctl.physics.perturb import perturb
+from mrctl.physics.plant import addresses, inputs, read
+from mrctl.physics.stand import stand
+from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.robot import Robot
+
+Array = NDArray[np.float64]
+Control = Callable[[float], ArrayLike]  # time in s to left V, right V, steering rad, steering rate rad/s
+
+OFF = (0.0, 0.0, 0.0, 0.0)  # no voltage, which shorts the motors, and wheels straight on
+HOLD = 0.02  # s for which a control is held
+DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+
+
+class Unstable(Exception):
+    """The simulation has diverged."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """A drive, sampled at the start and after every hold of the control.
+
+    Attributes:
+        time: Time in s, `(T,)`.
+        qpos: MuJoCo's positions, `(T, nq)`.
+        qvel: MuJoCo's velocities, `(T, nv)`.
+        reading: Columns of `mrctl.physics.plant`, `(T, 11)`.
+    """
+
+    time: Array
+    qpos: Array
+    qvel: Array
+    reading: Array
+
+    def __getitem__(self, column: int) -> Array:
+        """A column of the readings, `(T,)`."""
+        return self.reading[:, column]
+
+
+class Car:
+    """A compiled robot on its wheels, driven open loop.
+
+    Attributes:
+        model: The model.
+        data: Its state.
+    """
+
+    def __init__(self, model: mujoco.MjModel, pose: ArrayLike = (0, 0, 0), twist: ArrayLike = (0, 0)) -> None:
+        """Stands the robot at a posture `(3,)` in m, m, rad, rolling with a twist `(2,)` in m/s, rad/s."""
+        self.model, self.data = model, mujoco.MjData(model)
+        self.data.qpos[:], self.data.qvel[:] = stand(model, np.asarray(pose, float), np.asarray(twist, float))
+        self._inputs = inputs(model)
+        self._address = addresses(model)
+        mujoco.mj_forward(model, self.data)
+
+    def control(self, control: ArrayLike) -> None:
+        """Sets voltages left and right in V, steering angle in rad and rate in rad/s, `(4,)`."""
+        self.data.ctrl[self._inputs] = np.asarray(control)[: len(self._inputs)]
+
+    def drive(self, seconds: float, control: ArrayLike | Control, hold: float = HOLD) -> Log:
+        """Drives with a constant control, or with a function of the time since the call that is held for `hold` s.
+
+        Raises:
+            Unstable: The simulation has diverged.
+        """
+        law = control if callable(control) else lambda _: control
+        substeps = max(1, round(hold / self.model.opt.timestep))
+        hold = substeps * self.model.opt.timestep  # in whole steps
+        ticks = max(1, round(seconds / hold))
+        qpos, qvel = np.empty((ticks + 1, self.model.nq)), np.empty((ticks + 1, self.model.nv))
+        qpos[0], qvel[0] = self.data.qpos, self.data.qvel
+        for k in range(ticks):
+            self.control(law(k * hold))
+            mujoco.mj_step(self.model, self.data, substeps)
+            qpos[k + 1], qvel[k + 1] = self.data.qpos, self.data.qvel
+        reading = np.zeros((ticks + 1, 11))
+        read(qpos, qvel, self._address, reading)
+        self.assert_stable()
+        return Log(hold * np.arange(ticks + 1.0), qpos, qvel, reading)
+
+    def assert_stable(self) -> None:
+        """Refuses a state that is not finite, and one that MuJoCo has silently reset after it diverged.
+
+        Raises:
+            Unstable: The simulation has diverged.
+        """
+        if any(self.data.warning[w].number for w in DIVERGED) or not np.isfinite(self.data.qvel).all():
+            raise Unstable
+
+    def tyre_forces(self) -> Array:
+        """Forces of the ground on left wheel, right wheel and front in the world frame, `(3, 3)` in N."""
+        mujoco.mj_forward(self.model, self.data)
+        forces, force = np.zeros((3, 3)), np.zeros(6)
+        row = {self.model.geom(name).id: k for k, name in enumerate(REAR)}
+        row |= {self.model.geom(name).id: 2 for name in fronts(self.model)}
+        for i in range(self.data.ncon):
+            contact = self.data.contact[i]
+            mujoco.mj_contactForce(self.model, self.data, i, force)
+            for side, sign in ((0, -1), (1, 1)):  # the frame's first axis points from geom 0 to geom 1
+                if (geom := int(contact.geom[side])) in row:
+                    forces[row[geom]] += sign * contact.frame.reshape(3, 3).T @ force[:3]
+        return forces
+
+
+def cruise(model: mujoco.MjModel, robot: Robot, volts: float) -> tuple[Car, Log]:
+    """Drives straight on with the same voltage on both motors until V has settled, starting near that speed."""
+    car = Car(model, twist=(robot.velocity_gain * max(0.0, volts - loss_voltage(robot)), 0))
+    return car, car.drive(settling_time(robot), (volts, volts, 0, 0))
+
+
+def fitted_time_constant(log: Log, column: int, tau: float) -> float:
+    """Time constant in s of an exponential that settles within the log, from its values near τ/2 and 2 τ.
+
+    The start is left out: the tyres, springs with a time constant of 10 ms, first have to take up their load.
+    """
+    first, last = (int(np.searchsorted(log.time, time)) for time in (tau / 2, 2 * tau))
+    remaining = (log[column][-1] - log[column][last]) / (log[column][-1] - log[column][first])
+    return -(log.time[last] - log.time[first]) / np.log(remaining) if remaining > 0 else np.nan
+
+
+# Times, voltages and forces that follow from a robot's parameters
+
+
+def settling_time(robot: Robot) -> float:
+    """Time after which e^−12 of a transient of equation (3) remains, in s."""
+    return 12 * max(robot.velocity_time_constant, robot.rotation_time_constant)
+
+
+def loss_voltage(robot: Robot) -> float:
+    """Voltage that overcomes all Coulomb losses while driving straight on, in V."""
+    return (robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2) / robot.motor_gain
+
+
+def holding_force(robot: Robot) -> float:
+    """All Coulomb losses as a force on the robot, 2 τ_loss/r + F_roll, in N."""
+    return 2 * robot.drive_loss / robot.wheel_radius + robot.rolling_force
+
+
+def braking(robot: Robot) -> float:
+    """Force per speed with which the back-EMF of both motors brakes, 2 N² k²/(R_a r²), in N·s/m."""
+    return 2 * robot.motor_gain * robot.back_emf / robot.wheel_radius**2
+
+
+def on_skid_robot(robot: Robot) -> Robot:
+    """Parameters of the robot `on_skid`: the rear wheels' rolling loss counts as gear loss, the front has none."""
+    rear = robot.rolling_force * (1 - robot.front_load) / 2 * robot.wheel_radius
+    return robot.model_copy(
+        update={"gear_loss": robot.gear_loss + rear, "rolling_coefficient": 0.0, "front_wheel_inertia": 0.0}
+    )
+
+
+# Names of wheels, and variants of a model
+
+
+def is_steered(model: mujoco.MjModel) -> bool:
+    """Whether the robot has a steered wheel."""
+    return has(model, "joint", "steering")
+
+
+def rolling_wheels(model: mujoco.MjModel) -> list[str]:
+    """Names of all wheels that turn on a joint: the two driven ones, and those in front that do not merely slide."""
+    return [*REAR, *rolling_fronts(model)]
+
+
+def open_circuit(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy with disconnected motors: without current there is neither torque nor braking; rotors and losses stay."""
+    model = clone(model)
+    model.actuator_gainprm[[model.actuator(name).id for name in MOTORS], 1] = 1e-9
+    return model
+
+
+def on_skid(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy whose front tyre has no friction: it follows wherever equation (3) sends it, and brakes nothing."""
+    model = clone(model)
+    for wheel in (model.geom(name).id for name in fronts(model)):
+        model.pair_friction[(model.pair_geom1 == wheel) | (model.pair_geom2 == wheel)] = 1e-5
+    return model
+
+
+def crisp(model: mujoco.MjModel, robot: Robot, tau: float) -> mujoco.MjModel:
+    """A copy whose contacts and time step are as short against τ and the wheel radius as the default robot's.
+
+    Slip grows with a contact's time constant and the sinking of a tyre with its square: in such a copy they weigh no
+    more than in the default robot, for which the tolerances are stated.
+    """
+    factor = min(1.0, tau / 0.18, np.sqrt(robot.wheel_radius / 0.098))
+    model = clone(model)
+    model.opt.timestep *= factor
+    model.pair_solref[:, 0] *= factor
+    model.pair_solreffriction[:, 0] *= factor
+    return model
+
+
+def with_finer_step(model: mujoco.MjModel, halvings: int) -> mujoco.MjModel:
+    """A copy whose time step is halved a number of times."""
+    model = clone(model)
+    model.opt.timestep /= 2**halvings
+    return model
+
+
+def towing(model: mujoco.MjModel, damping: float) -> mujoco.MjModel:
+    """A copy that tows a load of `damping` N·s/m at P, on a rail that keeps it from turning and moving sideways."""
+    model = clone(model)
+    dof = model.joint("chassis").dofadr[0]
+    model.dof_damping[[dof, dof + 1, dof + 5]] = damping, 1e6, 1e6
+    return model
+
+
+def perturbed(model: mujoco.MjModel, perturbation: Perturbation) -> mujoco.MjModel:
+    """A copy to which a perturbation is applied."""
+    copy = clone(model)
+    perturb(model, copy, perturbation)
+    return copy

@@ -1,0 +1,107 @@
+"""Could such a robot exist? It stands level, its motors and inertias are possible, and it reaches its declared limits.
+
+The parameters that the other checks expect are read from the robot's own file, so a wrong number that is used
+consistently breaks no law. These checks find the numbers that belong to no robot.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from mrctl.checks.comparison import Report, between, compare
+from mrctl.checks.open_loop import HOLD, OFF, Car, Log, on_skid, rolling_wheels
+from mrctl.physics.elements import MOTORS, REAR
+from mrctl.physics.plant import OMEGA, V
+from mrctl.theory.dynamics import inverse_dynamics
+from mrctl.theory.robot import Robot
+
+
+def stance(model: mujoco.MjModel, robot: Robot) -> Report:
+    """On level ground the robot stands level: the radii of its wheels fit the heights of its axles.
+
+    The tolerance of 0.5° is more than sinking tyres can cause, and less than a wrong radius causes.
+    """
+    car = Car(model)
+    car.drive(1.0, OFF)
+    frame = car.data.body("chassis").xmat.reshape(3, 3)
+    nose, side = np.degrees(np.arcsin(frame[2, :2]))
+    return [
+        compare("nose up", nose, 0.0, "°", absolute=0.5),
+        compare("left side up", side, 0.0, "°", absolute=0.5),
+    ]
+
+
+def _to_its_limit(
+    model: mujoco.MjModel, robot: Robot, direction: tuple[float, float], limit: float, rate: float
+) -> Log:
+    """Drives from rest to a limit at the limit on its rate, with the voltages of equation (3) within the supply.
+
+    Args:
+        model: The robot.
+        robot: Its parameters.
+        direction: Unit vector of the twist, (1, 0) for V or (0, 1) for θ̇.
+        limit: Final value of V or θ̇ in m/s or rad/s.
+        rate: Its rate in m/s² or rad/s².
+    """
+    hold = min(HOLD, limit / rate / 50)
+    unit = np.array(direction)
+
+    def law(t: float) -> tuple[float, ...]:
+        volts = inverse_dynamics(unit * rate * (t + hold / 2), unit * rate, robot)
+        left, right = np.clip(volts, -robot.supply, robot.supply)
+        return left, right, 0.0, 0.0
+
+    return Car(model).drive(limit / rate, law, hold)
+
+
+def limits(model: mujoco.MjModel, robot: Robot) -> Report:
+    """Motors, gear, supply and grip reach the declared limits on V and V̇, and the fork has room to steer.
+
+    The tolerance is 10 %: the voltages are those of equation (3), and nothing corrects slip.
+    """
+    log = _to_its_limit(model, robot, (1, 0), robot.max_speed, robot.max_acceleration)
+    return [
+        compare("V at its limit", log[V][-1], robot.max_speed, "m/s", relative=0.1),
+        between("largest steering angle", robot.steering_limit, 0.1, np.pi / 2, "rad"),
+    ]
+
+
+def turning_limits(model: mujoco.MjModel, robot: Robot) -> Report:
+    """The same for the limits on θ̇ and θ̈, turning on the spot with a front tyre without friction."""
+    log = _to_its_limit(on_skid(model), robot, (0, 1), robot.max_rotation, robot.max_rotation_acceleration)
+    return [compare("θ̇ at its limit", log[OMEGA][-1], robot.max_rotation, "rad/s", relative=0.1)]
+
+
+def motors(model: mujoco.MjModel, robot: Robot) -> Report:
+    """The no-load speed U/k_E and time constant J_m R_a/k² of each motor, at its own shaft, are those of real motors.
+
+    Hub motors turn at some 100 rpm, model racing motors at 50,000. Coreless motors take 0.5 ms, cheap ones up to 200.
+    The rotor's inertia may also be written at the wheel's joint; without a gear it may be part of the wheel's.
+    """
+    report = []
+    for motor, wheel in zip(MOTORS, REAR, strict=True):
+        actuator = model.actuator(motor)
+        gear, (resistance, constant) = actuator.gear[0], actuator.gainprm[:2]
+        inertia = model.actuator_armature[actuator.id] + model.joint(wheel).armature[0] / gear**2
+        volts = model.actuator_ctrlrange[model.actuator_ctrladr[actuator.id], 1]
+        report += [
+            between(f"no-load speed of {motor}", volts / constant * 30 / np.pi, 100, 60e3, "rpm"),
+            between(f"time constant of {motor}", inertia * resistance / constant**2, 0.5e-3 * (gear > 3), 0.2, "s"),
+        ]
+    return report
+
+
+def inertias(model: mujoco.MjModel, robot: Robot) -> Report:
+    """The inertia of a wheel is at most that of a hoop, and the yaw inertia fits the size of the robot."""
+    report = []
+    for name in rolling_wheels(model):
+        body, radius = model.body(name), model.geom(name).size[0]
+        spin = body.inertia.max()  # a disc's own axis
+        report.append(between(f"inertia of {name} over m r²", spin / (body.mass[0] * radius**2), 0.01, 1))
+    gyration = np.sqrt(robot.yaw_inertia / robot.mass)
+    size = np.hypot(robot.wheelbase, robot.half_track)
+    return report + [between("radius of gyration over the size", gyration / size, 0.05, 1.0)]

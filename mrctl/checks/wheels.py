@@ -1,0 +1,204 @@
+"""Wheels on the ground: their loads, rolling without slip by equation (1), and their grip."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from mrctl.checks.comparison import Report, compare
+from mrctl.checks.open_loop import HOLD, OFF, Car, crisp, loss_voltage, perturbed, settling_time
+from mrctl.physics.elements import fronts
+from mrctl.physics.plant import OMEGA, RATE_LEFT, RATE_RIGHT, STEERING, THETA, V_LATERAL, V, X, Y
+from mrctl.theory.kinematics import scrub_free_angle, twist_from_front_wheel, wheel_rates
+from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.robot import GRAVITY, Robot
+
+
+def rest(model: mujoco.MjModel, robot: Robot) -> Report:
+    """At rest the wheels bear the weight, split by the lever rule about the rear axle, and nothing moves.
+
+    The front load is m g c/(L − t), as the contact trails the fork's axis. The tolerance is 0.1 % of the weight: the
+    tyres sink in by some 50 µm, which tilts the robot by 1e-4 rad. That of the speed is 1e-6 m/s: a contact is a
+    critically damped spring of 10 ms and nothing pushes, so only the end of the settling and the solver's tolerance
+    remain.
+    """
+    car = Car(model)
+    car.drive(2.0, OFF)
+    log = car.drive(3.0, OFF)
+    loads = car.tyre_forces()[:, 2]
+    weight = robot.mass * GRAVITY
+    rear = (1 - robot.front_load) / 2 * weight
+    moved = np.abs(log.qpos[-1, :7] - log.qpos[0, :7]).max() / 3.0
+    return [
+        compare("sum of the wheel loads", loads.sum(), weight, "N", absolute=1e-3 * weight),
+        compare("front load", loads[2], robot.front_load * weight, "N", absolute=1e-3 * weight),
+        compare("left load", loads[0], rear, "N", absolute=1e-3 * weight),
+        compare("right load", loads[1], rear, "N", absolute=1e-3 * weight),
+        compare("drift at rest", moved, 0.0, "m/s", absolute=1e-6),
+    ]
+
+
+def _curvature(robot: Robot, angle: float) -> float:
+    """Curvature of the circle on which a front wheel at an angle rolls without scrub, sin φ/(L cos φ − t), in 1/m."""
+    return np.sin(angle) / (robot.wheelbase * np.cos(angle) - robot.trail)
+
+
+def _electronic_differential(robot: Robot, volts: float, angle: float, rate: float = 0.0) -> tuple[float, ...]:
+    """Control of a rigidly steered robot whose rear wheels turn as fast as the circle of its front wheel demands."""
+    v = robot.velocity_gain * (volts - loss_voltage(robot))
+    omega = v * _curvature(robot, angle)
+    differential = robot.back_emf * robot.half_track * omega / robot.wheel_radius
+    return volts - differential, volts + differential, angle, rate
+
+
+def circle(model: mujoco.MjModel, robot: Robot) -> Report:
+    """With a rigidly steered wheel P drives a circle of radius L/tan φ, with trail (L cos φ − t)/sin φ.
+
+    The robot uses a tenth of the tyres' grip. The tolerance is 0.5 %: the tyres drift outwards (see `scrub_free`),
+    which turns the robot on the circle but hardly changes the radius, and the servo gives; measured 0.03 %.
+    """
+    angle = 0.5 * robot.steering_limit
+    radius = 1 / _curvature(robot, angle)
+    v = np.sqrt(0.1 * robot.tyre_friction * GRAVITY * radius)
+    volts = v / robot.velocity_gain + loss_voltage(robot)
+    report = []
+    for side, sign in (("left", 1), ("right", -1)):
+        car = Car(model)
+        car.drive(settling_time(robot), _electronic_differential(robot, volts, sign * angle))
+        log = car.drive(2 * np.pi * radius / v, _electronic_differential(robot, volts, sign * angle))
+        x, y = log[X], log[Y]
+        # (x − a)² + (y − b)² = R², linear in a, b and R² − a² − b².
+        a, b, rest = np.linalg.lstsq(np.stack([2 * x, 2 * y, np.ones_like(x)], 1), x**2 + y**2, rcond=None)[0]
+        report.append(compare(f"radius {side}", np.sqrt(rest + a**2 + b**2), radius, "m", relative=5e-3))
+        report.append(compare(f"sense {side}", np.sign(log[OMEGA]).mean(), sign, absolute=0))
+    return report
+
+
+def rolling(model: mujoco.MjModel, robot: Robot) -> Report:
+    """By equation (1) the front wheel's rate and φ give V, θ̇ and both rear wheel rates, without sideways slip.
+
+    The robot, rigidly steered and without trail, winds left and right. The tolerances are 1 % of the mean speed (of V/L
+    for θ̇); most of it is taken by the sideways drift that `scrub_free` explains.
+    """
+    volts, w = robot.supply / 4, 2 * np.pi / 2.0
+
+    def law(t: float) -> tuple[float, ...]:
+        middle = t + HOLD / 2
+        return _electronic_differential(robot, volts, 0.35 * np.sin(w * middle), 0.35 * w * np.cos(w * middle))
+
+    car = Car(model)
+    car.drive(settling_time(robot), _electronic_differential(robot, volts, 0.0))
+    log = car.drive(6.0, law)
+    front = np.mean([log.qvel[:, model.joint(f).dofadr[0]] for f in fronts(model)], axis=0) * robot.front_wheel_radius
+    twist = twist_from_front_wheel(front, log[STEERING], robot)
+    rates = wheel_rates(twist, robot)
+    rows = (
+        ("V", log[V], twist[:, 0], 1.0, "m/s"),
+        ("θ̇", log[OMEGA], twist[:, 1], robot.wheelbase, "rad/s"),
+        ("left wheel rate", log[RATE_LEFT], rates[:, 0], robot.wheel_radius, "rad/s"),
+        ("right wheel rate", log[RATE_RIGHT], rates[:, 1], robot.wheel_radius, "rad/s"),
+        ("sideways speed", log[V_LATERAL], 0.0, 1.0, "m/s"),
+    )
+    speed = robot.velocity_gain * (volts - loss_voltage(robot))
+    return [
+        compare(
+            f"{name}: departure from equation (1)",
+            np.abs(measured - ideal).max(),
+            0.0,
+            unit,
+            absolute=0.01 * speed / arm,
+        )
+        for name, measured, ideal, arm, unit in rows
+    ]
+
+
+def spinning_wheels(model: mujoco.MjModel, robot: Robot, friction: float, x: float = 0.0) -> Report:
+    """Applies full voltage at rest at x in m, where the wheels spin on a floor of the friction coefficient μ.
+
+    The acceleration a solves N_f (L − t) = m g c − m a h and (m + J_f/r_f²) a = μ (m g − N_f) − front rolling loss.
+    `traction` explains the tolerance.
+    """
+    front = robot.front_load
+    inert = robot.mass + robot.front_wheel_inertia / robot.front_wheel_radius**2
+    inert -= friction * robot.mass * robot.com_height / (robot.wheelbase - robot.trail)
+    expected = (friction * robot.mass * GRAVITY * (1 - front) - front * robot.rolling_force) / inert
+    seconds = min(0.8, 0.5 * robot.velocity_gain * robot.supply / expected)  # faster, the wheels would catch up
+    car = Car(crisp(model, robot, robot.velocity_time_constant), pose=(x, 0, 0))
+    log = car.drive(seconds, (robot.supply, robot.supply, 0, 0), min(HOLD, seconds / 40))
+    steady = log.time > seconds / 4  # the wheels have reached their speed
+    acceleration = np.polyfit(log.time[steady], log[V][steady], 1)[0]
+    slip = ((log[RATE_LEFT] + log[RATE_RIGHT]) / 2 * robot.wheel_radius - log[V])[steady].min()
+    return [
+        compare("acceleration while wheels spin", acceleration, expected, "m/s²", relative=2e-2),
+        compare("the wheels spin (1: yes)", float(slip > 0.1 * robot.max_speed), 1.0),
+    ]
+
+
+def traction(model: mujoco.MjModel, robot: Robot) -> Report:
+    """On a slippery floor full voltage spins the rear wheels, and only μ times their load accelerates the robot.
+
+    Their load includes the transfer m a h/(L − t), which is 6 % of the acceleration. The tolerance is 2 %: MuJoCo's
+    soft friction cone lifts a tyre that slides at 1 m/s by some 0.2 mm, where it hops, so the acceleration is averaged.
+    """
+    slippery = perturbed(model, Perturbation(tyre_friction_factor=0.2))
+    return spinning_wheels(slippery, robot, 0.2 * robot.tyre_friction)
+
+
+def cornering(model: mujoco.MjModel, robot: Robot) -> Report:
+    """All tyres together bend the path with μ g at most: a robot keeps to its circle at half of that, and not at twice.
+
+    The robot, rigidly steered on a slippery floor, starts on the circle. The tolerance of the radius is 0.5 %, as in
+    `circle`. That of the limit is 3 %: sliding tyres hop, so the acceleration, and its peak with it, is averaged over
+    0.1 s; measured 1.1 % below the limit, over 0.04 s 0.3 %.
+    """
+    angle = 0.3
+    limit = 0.2 * robot.tyre_friction * GRAVITY
+    slippery = perturbed(model, Perturbation(tyre_friction_factor=0.2))
+    radius = 1 / _curvature(robot, angle)
+    logs = []
+    for ratio in (0.5, 2.0):
+        v = np.sqrt(ratio * limit * radius)
+        volts = v / robot.velocity_gain + loss_voltage(robot)
+        car = Car(slippery, twist=(v, v / radius))
+        logs.append(car.drive(1.5, _electronic_differential(robot, volts, angle)))
+    slow, fast = logs
+    ahead = np.stack([np.cos(fast[THETA]), np.sin(fast[THETA])], axis=1)
+    centre = fast.reading[:, [X, Y]] + robot.com_offset * ahead
+    k = round(0.1 / fast.time[1])  # second difference over 0.1 s: no vibration
+    bend = np.hypot(*(centre[2 * k :] - 2 * centre[k:-k] + centre[: -2 * k]).T) / fast.time[k] ** 2
+    return [
+        compare("radius below the limit", slow[V][-1] / slow[OMEGA][-1], radius, "m", relative=5e-3),
+        compare("largest acceleration above it", bend.max(), limit, "m/s²", relative=3e-2),
+        compare("it slides (1: yes)", float(np.abs(fast[V_LATERAL]).max() > 0.1 * fast[V][0]), 1.0),
+    ]
+
+
+def scrub_free(model: mujoco.MjModel, robot: Robot) -> Report:
+    """A fork without stiffness takes the angle at which its wheel rolls without scrub.
+
+    In a steady turn φ = atan(L θ̇/V) − asin(t θ̇/√(V² + L² θ̇²)), in a changing one
+    sin(direction − φ) = t (θ̇ + φ̇)/speed, with direction and speed of the fork's axis. The tolerance of the steady
+    angle is 5 mrad; measured 0.03, as P and the fork drift alike. That of the changing one is a sideslip of 7 ms · θ̇:
+    MuJoCo's contacts (time constant T, impedance d) damp the slip velocity in a frame that turns, which they do not
+    take into account, so a tyre drifts outwards with V θ̇ d T/2 whatever its friction; here d T/2 = 4.75 ms.
+    """
+    common, differential = robot.supply / 3, robot.supply / 12
+    car = Car(model)
+    log = car.drive(settling_time(robot) + 2.0, (common - differential, common + differential, 0, 0))
+    steady = float(scrub_free_angle(log.reading[-1, [V, OMEGA]], robot))
+    report = [compare("angle in a steady turn", log[STEERING][-1], steady, "rad", absolute=5e-3)]
+
+    def law(t: float) -> tuple[float, ...]:
+        swing = differential * np.cos(2.0 * t)
+        return common - swing, common + swing, 0.0, 0.0
+
+    log = car.drive(8.0, law)
+    rate = log.qvel[:, model.joint("steering").dofadr[0]]
+    side = robot.wheelbase * log[OMEGA] + log[V_LATERAL]
+    scrub = np.sin(np.arctan2(side, log[V]) - log[STEERING])
+    ideal = robot.trail * (log[OMEGA] + rate) / np.hypot(log[V], side)
+    drift = 7e-3 * np.abs(log[OMEGA]).max()
+    return report + [compare("scrub in a changing turn", np.abs(scrub - ideal).max(), 0.0, "rad", absolute=drift)]
