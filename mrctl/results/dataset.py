@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from mrctl import __version__
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
@@ -60,7 +61,25 @@ SIGNALS: dict[str, tuple[str, str]] = {
 
 def versions() -> dict[str, str]:
     """Versions of everything that can change a number."""
-    return {name: metadata.version(name) for name in ("mrctl", "mujoco", "dm-control", "numpy", "numba", "torch")}
+    others = ("mujoco", "dm-control", "numpy", "numba", "torch")
+    return {"mrctl": __version__} | {name: metadata.version(name) for name in others}
+
+
+def written_by(result: xr.Dataset) -> str:
+    """The version of mrctl that made a result, such as `0.2.0`; "" for a dataset that does not say."""
+    return json.loads(result.attrs.get("versions", "{}")).get("mrctl", "")
+
+
+def require(result: xr.Dataset, names: Iterable[str]) -> None:
+    """Checks that a result has the variables that are about to be read.
+
+    Raises:
+        InputError: One is missing, as it may be in a result of an older mrctl, which the message then names.
+    """
+    for name in names:
+        if name not in result.variables:
+            writer = f", which mrctl {version} wrote" if (version := written_by(result)) else ""
+            raise InputError(f"{name}: not a variable of this result{writer}")
 
 
 def dataset(
@@ -119,9 +138,14 @@ def combine(groups: Sequence[tuple[Sequence[int], xr.Dataset]], scenarios: Seque
 
 
 def scenarios_of(result: xr.Dataset) -> list[Scenario]:
-    """The resolved scenarios of the runs in a result, or in a selection of them, to run again."""
+    """The resolved scenarios of the runs in a result, or in a selection of them, to run again.
+
+    Raises:
+        InputError: Another version of mrctl, which the message names, wrote a scenario that this one does not know.
+    """
     every = json.loads(result.attrs["scenarios"])
-    return [Scenario.from_dict(every[run], "scenario") for run in np.atleast_1d(result["run"])]
+    source = f"scenario of a result of mrctl {written_by(result)}"
+    return [Scenario.from_dict(every[run], source) for run in np.atleast_1d(result["run"])]
 
 
 def save(result: xr.Dataset, path: str | Path) -> None:
@@ -144,7 +168,9 @@ def save(result: xr.Dataset, path: str | Path) -> None:
 
 
 def open_result(path: str | Path) -> xr.Dataset:
-    """Opens a saved result.
+    """Opens a saved result, whichever version of mrctl wrote it: a result names its variables, with their units.
+
+    What needs a variable or a field of a scenario that the result lacks says so, and names the version that wrote it.
 
     Raises:
         InputError: There is no result at this path.

@@ -20,6 +20,7 @@ from mrctl.control.feedforward import features
 from mrctl.control.guard import ACTIONS, LIMIT, NONE, REASONS
 from mrctl.record import InputError
 from mrctl.results.comparison import Interval, bootstrap_interval
+from mrctl.results.dataset import require
 
 Array = NDArray[np.float64]
 
@@ -140,9 +141,7 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
     Raises:
         InputError: The result lacks a variable, or a lap is shorter than the control period.
     """
-    for name in ("time", *SAMPLED):
-        if name not in result.variables:
-            raise InputError(f"{name}: the result has no such variable")
+    require(result, ("time", *SAMPLED))
     runs = as_runs(result)
     size = runs.sizes["run"]
     period = control_period(runs)
@@ -251,7 +250,11 @@ def guard_events(result: xr.Dataset) -> pd.DataFrame:
     Returns:
         A row an event: run, time in s, action (limit, freeze, fallback, or resume after the last two), and the reason
         in words.
+
+    Raises:
+        InputError: The result has no record of the guard.
     """
+    require(result, ("guard", "guard_reason"))
     runs = as_runs(result)
     rows = []
     for row, number in enumerate(runs["run"].values):

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from mrctl import __version__
 from mrctl.control.stages import METHODS, Stages
 from mrctl.loop import controller
 from mrctl.loop.simulation import Simulation, simulate
@@ -150,6 +151,7 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
         "samples": sweep.samples,
         "stride": sweep.stride,
         "control_period": sweep.base.control_period,
+        "signals": list(SIGNALS),
     }
 
 
@@ -185,13 +187,16 @@ def _agreed(manifest: str) -> Sweep:
     """The sweep of a store.
 
     Raises:
-        InputError: This worker has other versions or other worlds than who began the store.
+        InputError: This worker has other versions or other worlds than the process that began the store.
     """
     agreed = json.loads(manifest)
+    worker = f"worker {os.getpid()} on {os.uname().nodename}"
+    for name, version in versions().items():
+        if version != (begun := agreed["versions"].get(name)):
+            raise InputError(f"{worker}: has {name} {version}, but the store was begun with {name} {begun}")
     sweep = Sweep.from_dict(agreed["sweep"], "sweep")
-    for what, here in (("versions", versions()), ("models", _models(sweep))):
-        if unlike := sorted(name for name in here if here[name] != agreed[what].get(name)):
-            raise InputError(f"worker {os.getpid()} on {os.uname().nodename}: {unlike[0]} is not the store's")
+    if unlike := [name for name, digest in _models(sweep).items() if digest != agreed["models"].get(name)]:
+        raise InputError(f"{worker}: {unlike[0]} is not the store's")
     return sweep
 
 
@@ -254,7 +259,7 @@ class Repeat(NamedTuple):
     """A run of a sweep, computed again."""
 
     verdict: str
-    """`bit-identical`, `within tolerance`, or `departs`, and where."""
+    """`bit-identical`, `within tolerance`, or `departs`, and where; then the versions of mrctl, where they differ."""
     same: bool
     """Whether it does not depart."""
 
@@ -263,19 +268,25 @@ def scenario_of(out: str | Path, run: int) -> Scenario:
     """The scenario of one run of a stored sweep.
 
     Raises:
-        InputError: No store, no such run, or what was drawn for it is out of range.
+        InputError: No store, no such run, what was drawn for it is out of range, or the sweep of another version of
+            mrctl, which the message names, has a field that this one does not know.
     """
-    return Sweep.from_dict(Store(out).manifest["sweep"], str(out)).scenario(run)
+    return _sweep(Store(out)).scenario(run)
+
+
+def _sweep(store: Store) -> Sweep:
+    """The sweep of a store that any version of mrctl may have written."""
+    return Sweep.from_dict(store.manifest["sweep"], f"{store.path} (written by mrctl {store.writer})")
 
 
 def repeat(out: str | Path, run: int) -> Repeat:
     """Runs one run of a sweep alone and compares it with what the store has.
 
     Raises:
-        InputError: No store, no such run, or it is not done yet.
+        InputError: As `scenario_of`, or the run is not done yet.
     """
     store = Store(out)
-    sweep = Sweep.from_dict(store.manifest["sweep"], str(out))
+    sweep = _sweep(store)
     sweep.values(run)  # there is such a run
     if (stored := store.row(run)) is None:
         raise InputError(f"run: {run} is not done yet")
@@ -283,13 +294,18 @@ def repeat(out: str | Path, run: int) -> Repeat:
         raise InputError(f"run: {run} was {stored['failure']}; there is nothing to compare with")
     (row,), signals = _compute(sweep, [run], store.samples)
     reasons = [one["failure"] or "it finished" for one in (row, stored)]
+    writers = "" if store.writer == __version__ else f" (of mrctl {store.writer}; this is mrctl {__version__})"
     if reasons[0] != reasons[1]:
-        return Repeat(f"departs: {reasons[0]}, in the store {reasons[1]}", False)
+        return Repeat(f"departs: {reasons[0]}, in the store {reasons[1]}{writers}", False)
     names = [*metrics.METRICS, "failure_time", *(name for name in row if name.endswith("_per_lap"))]
+    names = [name for name in names if name in stored]  # an older version computed fewer
     pairs = {name: (np.array(row[name], float, ndmin=1), np.array(stored[name], float, ndmin=1)) for name in names}
     if signals is not None:
         kept = store.signals(run)
-        pairs |= {f"signal {name}": (signals[0, :, k], kept[:, k]) for k, name in enumerate(SIGNALS)}
+        recorded = dict(zip(store.signal_names, kept.T, strict=True))
+        pairs |= {
+            f"signal {name}": (signals[0, :, k], recorded[name]) for k, name in enumerate(SIGNALS) if name in recorded
+        }
     if all(new.tobytes() == old.tobytes() for new, old in pairs.values()):
         return Repeat("bit-identical", True)
     scale = {name: TOLERANCE * np.abs(old).max(initial=0, where=np.isfinite(old)) for name, (_, old) in pairs.items()}
@@ -300,4 +316,4 @@ def repeat(out: str | Path, run: int) -> Repeat:
     place = int(off[name].argmax())
     when = f" at t = {store.times[place]:g} s" if name.startswith("signal") else ""
     new, old = (float(one[place]) for one in pairs[name])
-    return Repeat(f"departs: {name} is {new!r}{when}, in the store {old!r}", False)
+    return Repeat(f"departs: {name} is {new!r}{when}, in the store {old!r}{writers}", False)

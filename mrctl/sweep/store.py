@@ -6,6 +6,9 @@
     STORE/signals.zarr      (run, time, signal), NaN where nothing was recorded; shard 12 is the record of job 12
     STORE/lock              held, through the operating system, by the one process that runs the sweep
 
+`mrctl.open` reads a store that another version of mrctl wrote, in this format or an older one: a metric that was not
+computed then is NaN. Only the version that began a sweep goes on with it. Format 1 did not list its signals.
+
 One job owns one shard and one part. Each file is written under another name, synchronised and renamed, the part last:
 a part that is there says that its job is done. A job that is computed twice writes the same bytes twice.
 """
@@ -33,11 +36,12 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec
 
+from mrctl import __version__
 from mrctl.record import InputError
 from mrctl.results.dataset import SIGNALS, open_result
 from mrctl.results.metrics import METRICS
 
-KIND, FORMAT = "mrctl sweep", 1
+KIND, FORMAT = "mrctl sweep", 2
 ROW_GROUP = 16384  # rows of the table that are in memory at once
 INNER = 16  # runs that are compressed together, signal by signal
 COMPLETE = b"complete"  # in the table's metadata: whether every job is in it
@@ -48,24 +52,28 @@ class Store:
 
     Attributes:
         path: The folder.
+        writer: The version of mrctl that began it.
         manifest: What `sweep.json` holds: `sweep`, `versions`, `models`, `size`, `chunk`, `samples`,
-            `stride` (control periods between samples), `control_period`.
+            `stride` (control periods between samples), `control_period`, `signals` (names of those kept).
     """
 
     def __init__(self, path: str | Path) -> None:
         """Opens a store that exists.
 
         Raises:
-            InputError: There is none, or it was written by a version with another layout.
+            InputError: There is none, or its format is newer than this version of mrctl.
         """
         self.path = Path(path).absolute()
         try:
             self.manifest: dict[str, Any] = json.loads((self.path / "sweep.json").read_bytes())
-            found = self.manifest[KIND]
+            found, self.writer = self.manifest[KIND], str(self.manifest["versions"]["mrctl"])
         except (OSError, ValueError, KeyError, TypeError):
             raise InputError(f"{path}: not a sweep's store") from None
-        if found != FORMAT:
-            raise InputError(f"{path}: a sweep's store of format {found}, this version reads format {FORMAT}")
+        if found not in range(1, FORMAT + 1):
+            raise InputError(
+                f"{path}: mrctl {self.writer} wrote this store in format {found}; "
+                f"mrctl {__version__} reads formats up to {FORMAT}"
+            )
 
     @staticmethod
     def prepare(path: Path) -> None:
@@ -90,13 +98,18 @@ class Store:
         """Starts or continues a sweep in a folder whose lock is held.
 
         Raises:
-            InputError: The folder belongs to another sweep or to other versions.
+            InputError: The folder belongs to another sweep, or other versions began it.
         """
         manifest = json.loads(json.dumps({KIND: FORMAT, **manifest}))
         if not (path / "sweep.json").exists():
             with _whole(path / "sweep.json") as file:
                 file.write(json.dumps(manifest, indent=1).encode())
         store = cls(path)
+        if store.writer != __version__:
+            raise InputError(
+                f"{path}: mrctl {store.writer} began this sweep and this is mrctl {__version__}, whose results may "
+                f"differ; finish it with mrctl {store.writer} or choose another folder"
+            )
         if difference := _difference(store.manifest, manifest):
             raise InputError(f"{path}: begun with another {difference}; finish it as it was or choose another folder")
         for left in [*path.glob(".*.tmp"), *path.glob("parts/.*.tmp"), *path.glob("signals.zarr/**/*.partial")]:
@@ -136,6 +149,20 @@ class Store:
     def samples(self) -> int:
         """Samples of each signal a run."""
         return self.manifest["samples"]
+
+    @property
+    def signal_names(self) -> list[str]:
+        """Names of the signals, in the order of the record.
+
+        Raises:
+            InputError: An older version of mrctl kept other signals and did not say their names.
+        """
+        if "signals" not in self.manifest and (count := self._signals.shape[2]) != len(SIGNALS):
+            raise InputError(
+                f"{self.path}: mrctl {self.writer} kept {count} signals without their names and mrctl {__version__} "
+                f"has {len(SIGNALS)}; open the store with mrctl {self.writer}"
+            )
+        return self.manifest.get("signals", list(SIGNALS))
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -222,8 +249,8 @@ class Store:
         chunk = self.manifest["chunk"]
         zarr.open_group(self.path / "signals.zarr", mode="a").create_array(
             "signals",
-            shape=(self.size, self.samples, len(SIGNALS)),
-            shards=(chunk, self.samples, len(SIGNALS)),
+            shape=(self.size, self.samples, len(self.signal_names)),
+            shards=(chunk, self.samples, len(self.signal_names)),
             chunks=(math.gcd(chunk, INNER), self.samples, 1),
             dtype="float64",
             fill_value=np.nan,
@@ -244,8 +271,13 @@ class Store:
         return pa.concat_tables(self.rows(job) for job in jobs).to_pandas()
 
     def dataset(self) -> xr.Dataset:
-        """The runs that are done as one dataset, labelled as `mrctl.simulate` does; signals are read when used."""
+        """The runs that are done as one dataset, labelled as `mrctl.simulate` does; signals are read when used.
+
+        Raises:
+            InputError: No run is done, or an older version kept signals of which the store does not say the names.
+        """
         frame = self.frame()
+        frame[[name for name in METRICS if name not in frame]] = np.nan
         units = {"lap_time": "s", "failure_time": "s"} | {name: unit for name, (unit, _) in METRICS.items()}
 
         def columns(names: Iterable[str]) -> dict[str, Any]:
@@ -264,7 +296,8 @@ class Store:
             found = {}
             for name in METRICS:
                 values = np.full((len(frame), len(number)), np.nan)
-                for row, laps in enumerate(frame[f"{name}_per_lap"]):
+                column = f"{name}_per_lap"
+                for row, laps in enumerate(frame[column] if column in frame else ()):
                     values[row, : len(laps)] = laps
                 found[name] = (("run", "lap"), values, {"units": units[name]})
             coords.pop("laps", None)  # where it is an axis too
@@ -272,9 +305,11 @@ class Store:
         if not self.samples:
             return xr.Dataset(outcome | columns(METRICS), coords, attrs)
         whole = xr.open_zarr(self.path / "signals.zarr", chunks=None, consolidated=False)["signals"]
-        signals = whole.isel(run=frame["run"].to_numpy()).assign_coords(signal=list(SIGNALS)).to_dataset("signal")
+        whole = whole.assign_coords(signal=self.signal_names)
+        signals = whole.isel(run=frame["run"].to_numpy()).to_dataset("signal")
         for name, (unit, meaning) in SIGNALS.items():
-            signals[name].attrs = {"units": unit, "long_name": meaning}
+            if name in signals:
+                signals[name].attrs = {"units": unit, "long_name": meaning}
         coords["time"] = ("time", self.times, {"units": "s"})
         return signals.assign(outcome).assign_coords(coords).assign_attrs(attrs)
 
