@@ -15,11 +15,11 @@ from typing import Any, NamedTuple, ParamSpec
 import matplotlib as mpl
 import numpy as np
 import xarray as xr
-from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Polygon
+from matplotlib.rcsetup import cycler
 
 from mrctl.record import InputError
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap
