@@ -18,14 +18,10 @@ and signals, and in quadrature 1.5 % for what equation (3) leaves out and no rep
 in, the engine's time step.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (mujoco is compiled and ships no stubs)
-
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
@@ -34,7 +30,7 @@ from mrctl.checks.catalogue import on_skid
 from mrctl.experiments.tables import json_text, markdown
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.plant import OMEGA, V, build
+from mrctl.physics.plant import OMEGA, Plant, V, build
 from mrctl.record import InputError
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, Robot, RobotFile
@@ -127,13 +123,15 @@ def identify(
         InputError: The robot fails on the way.
     """
     own = mjcf.arrangement(robot)
-    model = mjcf.load(world, "rigid" if own == "compliant" else own, robot=robot)
-    nominal = read_robot(model)
+    steering = "rigid" if own == "compliant" else own
+    nominal = read_robot(mjcf.load(world, steering, robot=robot))
     tau = min(nominal.velocity_time_constant, nominal.rotation_time_constant)
-    model.opt.timestep = TICK / max(5, int(np.ceil(FINE * TICK / tau)))
+    substeps = max(5, int(np.ceil(FINE * TICK / tau)))
+    model = mjcf.load(world, steering, TICK / substeps, robot)
+    plants = [build(one, REPEATS, substeps, threads=1) for one in (model, on_skid(model))]
     random = np.random.default_rng([seed, 3])
-    ahead, true = excite(model, nominal, perturbation, random, turns=False)
-    turning, _ = excite(on_skid(model), nominal, perturbation, random, turns=True)
+    ahead, true = excite(plants[0], nominal, perturbation, random, turns=False)
+    turning, _ = excite(plants[1], nominal, perturbation, random, turns=True)
     highest = round(2 * _bandwidth(nominal) * PERIOD)
     rows = []
     for straight, turn in zip(ahead, turning, strict=True):
@@ -198,12 +196,11 @@ def signals(robot: Robot, random: np.random.Generator, turns: bool) -> Array:
 
 
 def excite(
-    model: mujoco.MjModel, robot: Robot, perturbation: Perturbation, random: np.random.Generator, turns: bool
+    plant: Plant, robot: Robot, perturbation: Perturbation, random: np.random.Generator, turns: bool
 ) -> tuple[list[Drive], Robot]:
-    """Drives robots open loop; returns what was measured of each, and the robot as it truly is."""
+    """Drives `REPEATS` robots open loop; returns what was measured of each, and the robot as it truly is."""
     period = np.stack([signals(robot, random, turns) for _ in range(REPEATS)], axis=1)  # (N, B, 2)
     samples = len(period)
-    plant = build(model, REPEATS, round(TICK / model.opt.timestep), threads=1)
     for row in range(REPEATS):
         plant.perturb(row, perturbation, round(perturbation.control_delay / TICK))
     plant.reset(np.zeros((REPEATS, 3)), np.tile([robot.max_speed / 2, 0.0], (REPEATS, 1)))
