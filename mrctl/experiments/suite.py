@@ -25,6 +25,7 @@ from mrctl.sweep.plan import Sweep
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
 TITLES = {"none": "PID"}  # of feedforwards in the tables
 YARDSTICKS = ("none", "model")  # whom the tables compare everyone with
+UNCHANGED = ("steady", "steering")  # parts whose runs are as they began from the first lap to the last
 CHUNK = 32  # runs in a job: enough for a batch, and few that a worker waits for at the end
 
 
@@ -110,7 +111,8 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
     """What the tables show: a row a case and feedforward, in the order of `PARTS`.
 
     Of the last lap: mean with 95 % bootstrap interval, the worst 5 % (infinite where a run failed), ratio to PID and to
-    `model`, and probability of beating each of the others, in the same run. Of a step: see `_step`.
+    `model`, and probability of beating each of the others, in the same run. Where nothing changes on the way, the laps
+    until the error stays within `BAND` times its final value. Of a step: see `_step`.
     """
     rows = []
     for case in sorted(chosen, key=lambda case: [*PARTS].index(case.part)):
@@ -131,6 +133,9 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
                     row[metric][f"beats_{title}"] = superiority(samples, theirs)._asdict()
                     if rival in YARDSTICKS:
                         row[metric][f"to_{title}"] = paired_ratio(samples, theirs)._asdict()
+                if case.part in UNCHANGED:
+                    laps = metrics.laps_to_converge(found[case.name][name], metric, BAND).values
+                    row[metric]["laps_to_converge"] = bootstrap_interval(laps)._asdict()
                 if case.back:
                     row[metric] |= _step(found[case.name][name], metric, case)
             rows.append(row)
@@ -172,16 +177,18 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
     header += ["beats PID in V / θ̇ / position", "beats model", *(["guard acted"] if guarded else [])]
     for part, title in PARTS.items():
         own = [row for row in rows if row["part"] == part]
+        unchanged = part in UNCHANGED
         cells = [
             [
                 row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", *(_mean(row[m]) for m in COLUMNS),
                 *(_wins(row, TITLES.get(one, one)) for one in YARDSTICKS),
-                *([number(row["guard_events"])] if guarded else []),
+                *([number(row["guard_events"])] if guarded else []), *([_converged(row)] if unchanged else []),
             ]
             for row in own
         ]  # fmt: skip
         if own:
-            tables[title] = markdown(header, cells)
+            laps = [f"laps to {BAND:g}× the final V / θ̇ / position"] if unchanged else []
+            tables[title] = markdown([*header, *laps], cells)
     if any(row["feedforward"] != "oracle" for row in rows):
         tables["Best in each case, and who is level with it"] = markdown(["case", *COLUMNS.values()], leaders(rows))
     header = ["case", "feedforward", "failed", "first lap", "one lap later; worst 5 %", "recovered in V / θ̇ / position"]
@@ -225,6 +232,11 @@ def leaders(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
 def _mean(error: dict[str, Any]) -> str:
     value, low, high, worst = (number(1e3 * error[key]) for key in ("value", "low", "high", "worst"))
     return f"{value} [{low}, {high}]; {worst}" if error["samples"] else "–"
+
+
+def _converged(row: dict[str, Any]) -> str:
+    laps = [row[metric]["laps_to_converge"] for metric in COLUMNS]
+    return " / ".join(f"{one['value']:.1f}" if one["samples"] else "–" for one in laps)
 
 
 def _wins(row: dict[str, Any], rival: str) -> str:

@@ -32,10 +32,10 @@ from scipy.integrate import cumulative_trapezoid
 
 from mrctl.record import InputError
 from mrctl.results.dataset import SIGNALS
+from mrctl.theory.robot import GRAVITY
 
 Format = Literal["mcap", "csv", "parquet", "npz"]
 Columns = dict[str, NDArray]
-GRAVITY = 9.81  # m/s², as in the worlds
 
 # The definitions of ROS 2, without their comments.
 TIME = "int32 sec\nuint32 nanosec"

@@ -8,7 +8,6 @@ period.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 from mrctl.control.feedforward import features
 from mrctl.control.guard import ACTIONS, LIMIT, NONE, REASONS
 from mrctl.record import InputError
-from mrctl.results.comparison import Interval, bootstrap_interval
 from mrctl.results.dataset import require
 
 Array = NDArray[np.float64]
@@ -288,59 +286,11 @@ def laps_to_converge(laps: xr.Dataset, metric: str, factor: float = 1.2) -> xr.D
     number = np.full(laps.sizes["run"], np.nan)
     for row, count in enumerate(laps["laps"].values):
         value = laps[metric].values[row, :count]
-        if np.isfinite(value[-1]):
+        if count and np.isfinite(value[-1]):
             outside = np.flatnonzero(~(value <= factor * value[-1]))
             number[row] = 1 if not len(outside) else outside[-1] + 2
     attrs = {"units": "1", "long_name": f"laps to {factor:g}× the final {METRICS[metric][1]}"}
     return xr.DataArray(number, {"run": laps["run"].values}, ("run",), "laps_to_converge", attrs)
-
-
-def recovery_time(
-    result: xr.Dataset,
-    event_time: float,
-    error: str = "lateral_error",
-    window: float | None = None,
-    factor: float = 1.2,
-    until: float | None = None,
-) -> xr.DataArray:
-    """Time after a step change until the moving RMS error is back, to stay, within `factor` of its value before.
-
-    Args:
-        result: What `simulate` returns.
-        event_time: When the change came, s.
-        error: An error variable of the result, or "v" or "omega" for the error of that velocity.
-        window: Length of the trailing window, s; one lap of the run if not given.
-        factor: How close counts as recovered.
-        until: Look no further than this, s (the next change); the end of the run if not given.
-
-    Returns:
-        Seconds (run,): 0 if the error never left the band, infinite if it is outside at the end, NaN if the run failed.
-
-    Raises:
-        InputError: The event is outside the run, or the error unknown.
-    """
-    runs, period = as_runs(result), control_period(result)
-    stop = len(runs["time"]) if until is None else _sample(runs, until, "until")
-    event = _sample(runs, event_time, "event_time")
-    if not 0 < event < stop:
-        raise InputError(f"event_time: {event_time:g} s leaves no samples on both of its sides")
-    narrow = runs[[name for name in ("x", "failed") if name in runs]]
-    squares = np.square(_error(runs, error))
-    seconds = np.full(len(squares), np.nan)
-    for row, length in enumerate(_windows(runs, window)):
-        end = min(stop, _end(narrow.isel(run=row)))
-        square = squares[row, :end]
-        if end <= event or not np.isfinite(square).all():
-            continue
-        total = np.concatenate([[0.0], np.cumsum(square)])
-        last = np.arange(event, end + 1)  # the first value is the one before the event
-        first = np.maximum(last - length, 0)
-        moving = np.sqrt(np.maximum(total[last] - total[first], 0) / (last - first))
-        outside = np.flatnonzero(moving > factor * moving[0] + 1e-12)
-        back = outside[-1] + 1 if len(outside) else 0
-        seconds[row] = back * period if back < len(moving) else np.inf
-    attrs = {"units": "s", "long_name": f"time until the RMS of {error} is back within {factor:g}×"}
-    return xr.DataArray(seconds, {"run": runs["run"].values}, ("run",), "recovery_time", attrs)
 
 
 def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor: float = 1.2) -> xr.DataArray:
@@ -371,71 +321,6 @@ def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor
     return xr.DataArray(number, {"run": laps["run"].values}, ("run",), "recovery_laps", attrs)
 
 
-def error_on_return(
-    result: xr.Dataset,
-    event_time: float,
-    return_time: float,
-    error: str = "lateral_error",
-    window: float | None = None,
-) -> xr.DataArray:
-    """Forgetting: RMS error just after the old conditions return, over that just before they changed.
-
-    Args:
-        result: What `simulate` returns.
-        event_time: When the conditions changed, s.
-        return_time: When they changed back, s.
-        error: As in `recovery_time`.
-        window: Seconds before and after; one lap of the run if not given.
-
-    Returns:
-        The ratio (run,); 1 is a learner that forgot nothing, NaN a run that failed.
-
-    Raises:
-        InputError: The times are out of order or outside the run, or the error is unknown.
-    """
-    runs = as_runs(result)
-    event, back = _sample(runs, event_time, "event_time"), _sample(runs, return_time, "return_time")
-    if not 0 < event < back < len(runs["time"]):
-        raise InputError(f"return_time: {return_time:g} s must follow event_time {event_time:g} s, within the run")
-    signal = _error(runs, error)
-    ratio = [
-        float(np.divide(_rms(signal[row, back : back + length]), _rms(signal[row, max(event - length, 0) : event])))
-        for row, length in enumerate(_windows(runs, window))
-    ]
-    attrs = {"units": "1", "long_name": f"RMS of {error} on return over that before"}
-    return xr.DataArray(ratio, {"run": runs["run"].values}, ("run",), "error_on_return", attrs)
-
-
-def _sample(runs: xr.Dataset, time: float, field: str) -> int:
-    """Index of the first sample at or after a time."""
-    if not np.isfinite(time):
-        raise InputError(f"{field}: {time} is not a time")
-    return int(np.searchsorted(runs["time"].values, time - 1e-6 * control_period(runs)))
-
-
-def _windows(runs: xr.Dataset, window: float | None) -> list[int]:
-    """Window length of each run in samples."""
-    period = control_period(runs)
-    if window is None and "lap_time" not in runs.coords:
-        raise InputError("window: must be given, the result has no lap_time")
-    seconds = runs["lap_time"].values if window is None else np.full(runs.sizes["run"], window)
-    if not (seconds >= period).all():
-        raise InputError(f"window: shorter than the control period of {period:g} s")
-    return [int(min(np.rint(one / period), len(runs["time"]))) for one in seconds]
-
-
-def _error(runs: xr.Dataset, name: str) -> Array:
-    """An error signal (run, time): a variable, or a velocity minus its reference."""
-    if name in ("v", "omega"):
-        signal = runs[name] - runs[f"{name}_ref"]
-    elif name.endswith("_error") and name in runs:
-        signal = runs[name]
-    else:
-        names = ", ".join(["v", "omega", *(str(key) for key in runs.data_vars if str(key).endswith("_error"))])
-        raise InputError(f"error: {name!r} is not one of {names}")
-    return signal.transpose("run", "time").values.astype(float)
-
-
 def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
     """A row per run: what it was, whether it failed, and its metrics in one lap.
 
@@ -444,7 +329,8 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
         lap: Number of the lap from 1, or from the run's end from −1. NaN where a run has no such lap.
 
     Returns:
-        Columns label, feedforward, steering, seed (those there are), laps, failed, failure_time and `METRICS`;
+        Columns label, feedforward, steering, seed (those there are), laps, failed, failure_time, `METRICS` in that lap,
+        and laps_to_converge, the first lap from which on the position error stays within 1.2 times its final value;
         `attrs["failed"]` is the number of failed runs, `attrs["units"]` the units by column.
 
     Raises:
@@ -460,39 +346,11 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
     columns = {name: laps[name].values for name in PER_RUN[:-1] if name in laps.coords}
     columns |= {name: laps[name].values for name in ("laps", "failed", "failure_time")}
     columns |= {name: np.where(there, laps[name].values[rows, np.where(there, index, 0)], np.nan) for name in METRICS}
+    columns["laps_to_converge"] = laps_to_converge(laps, "position_rmse").values
     table = pd.DataFrame(columns, index=pd.Index(laps["run"].values, name="run"))
-    table.attrs = {"failed": int(laps["failed"].sum()), "units": {name: unit for name, (unit, _) in METRICS.items()}}
+    units = {name: unit for name, (unit, _) in METRICS.items()} | {"laps_to_converge": "1"}
+    table.attrs = {"failed": int(laps["failed"].sum()), "units": units}
     return table
-
-
-def statistics(
-    table: pd.DataFrame, metrics: Iterable[str] | None = None, by: str = "label", level: float = 0.95, seed: int = 0
-) -> pd.DataFrame:
-    """Means over the runs that share a label, with bootstrap intervals and the number of failures.
-
-    Args:
-        table: What `summary` returns.
-        metrics: Some of `METRICS`, or all.
-        by: The column that names the groups.
-        level: Confidence level.
-        seed: Of the bootstrap.
-
-    Returns:
-        Columns of `Interval`, indexed by (group, metric), groups in order of appearance.
-
-    Raises:
-        InputError: An unknown metric or column.
-    """
-    if by not in table:
-        raise InputError(f"by: the table has no column {by!r}")
-    names = [known(name) for name in (METRICS if metrics is None else metrics)]
-    rows = {
-        (group, name): bootstrap_interval(rows[name].to_numpy(), level, seed=seed)
-        for group, rows in table.groupby(by, sort=False)
-        for name in names
-    }
-    index = pd.MultiIndex.from_tuples(rows, names=[by, "metric"])
-    return pd.DataFrame(list(rows.values()), index=index, columns=pd.Index(Interval._fields))
 
 
 def known(metric: str) -> str:

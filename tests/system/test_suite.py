@@ -122,6 +122,10 @@ def test_table(whole: Path) -> None:
         assert row["value"] == pytest.approx(own.mean(), rel=1e-12) and row["worst"] == pytest.approx(own.max())
         assert row["to_PID"]["value"] == pytest.approx(np.exp(np.log(own / bare).mean()), rel=1e-12)
         assert row["beats_PID"]["wins"] == (own < bare).sum() and found[case, "rls"]["failed"] == 0
+        assert ("laps_to_converge" in row) == (case != "random")
+        if case != "random":
+            laps = alone["rls"]["laps_to_converge"].mean()
+            assert found[case, "rls"]["position_rmse"]["laps_to_converge"]["value"] == pytest.approx(laps)
     assert (whole / "table.md").read_text().count("| rls ") == 7  # six cases, and the recovery
 
 
