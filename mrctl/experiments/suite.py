@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from mrctl.experiments import report
@@ -67,10 +68,11 @@ def suite(
     runs = runs_of(chosen, laps)
     rows = compare(chosen, runs)
     found = Outcome(quick, chosen, laps, runs, rows, aside)
-    tables = as_markdown(rows)
-    (out / "table.md").write_text("\n\n".join(f"## {title}\n\n{text}" for title, text in tables.items()) + "\n")
+    shown = tables(rows)
+    texts = [f"## {title}\n\n{markdown(list(one), one.to_numpy().tolist())}\n" for title, one in shown.items()]
+    (out / "table.md").write_text("\n".join(texts))
     write_json(out / "table.json", {"versions": versions(), "rows": rows, "runs": each_run(runs)})
-    report.write(found, who, tables, out)
+    report.write(found, who, shown, out)
     return found
 
 
@@ -169,9 +171,9 @@ def each_run(found: Mapping[str, Laps]) -> list[dict[str, Any]]:
     return rows
 
 
-def as_markdown(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
-    """The tables by title: each part's last lap, then the steps' recovery."""
-    tables = {}
+def tables(rows: Sequence[dict[str, Any]]) -> dict[str, pd.DataFrame]:
+    """Tables of text by title: the last lap of each part, who is best, then the recovery after the steps."""
+    found = {}
     guarded = any("guard_events" in row for row in rows)
     header = ["case", "feedforward", "failed", *(f"{title}; worst 5 %" for title in COLUMNS.values())]
     header += ["beats PID in V / θ̇ / position", "beats model", *(["guard acted"] if guarded else [])]
@@ -188,9 +190,10 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
         ]  # fmt: skip
         if own:
             laps = [f"laps to {BAND:g}× the final V / θ̇ / position"] if unchanged else []
-            tables[title] = markdown([*header, *laps], cells)
+            found[title] = pd.DataFrame(cells, columns=[*header, *laps])
     if any(row["feedforward"] != "oracle" for row in rows):
-        tables["Best in each case, and who is level with it"] = markdown(["case", *COLUMNS.values()], leaders(rows))
+        best = pd.DataFrame(leaders(rows), columns=["case", *COLUMNS.values()])
+        found["Best in each case, and who is level with it"] = best
     header = ["case", "feedforward", "failed", "first lap", "one lap later; worst 5 %", "recovered in V / θ̇ / position"]
     header += ["one lap later over settled", "return: first lap", "one lap later; worst 5 %"]
     cells = []
@@ -206,8 +209,9 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
             cells.append([row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", first, later, within])
             cells[-1] += [f"{number(error['after_one_lap_to_settled']['value'])}×", back, settled]
     if cells:
-        tables["Recovery and forgetting: position error over that before the step"] = markdown(header, cells)
-    return tables
+        title = "Recovery and forgetting: position error over that before the step"
+        found[title] = pd.DataFrame(cells, columns=header)
+    return found
 
 
 def leaders(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
