@@ -18,14 +18,9 @@ from unittest import mock
 
 import numpy as np
 import torch
-from numba import njit
 
 from mrctl.control import fel
-from mrctl.control.chain import one
 from mrctl.control.feedforward import feature_scale
-from mrctl.control.kanayama import kanayama
-from mrctl.control.limiter import limit
-from mrctl.control.pid import pid
 from mrctl.experiments.tables import markdown, number
 from mrctl.loop import hierarchy
 from mrctl.loop.simulation import Simulation
@@ -38,7 +33,6 @@ from mrctl.results.dataset import SIGNALS, versions
 from mrctl.scenario import Scenario
 from mrctl.theory.kinematics import steering_angle
 
-kanayama_law, limit_law, pid_law = one(kanayama), one(limit), one(pid)
 loop = import_module("mrctl.loop.simulation")  # `mrctl.simulate` itself is the function of that name
 
 SIZES = (1, 16, 64, 256, 1024)
@@ -74,8 +68,7 @@ def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int
 
     Returns:
         `machine`; `robots`, a row a size on one thread; `threads`, rows on one and on two; `parts`, µs a control
-        period by component for the smallest and the largest size (the last rows are parts of one before); `today`, the
-        dm_control and autograd loop.
+        period by component for the smallest and the largest size; `today`, the dm_control and autograd loop.
     """
     threads = [1, 2] if (os.cpu_count() or 1) > 1 else [1]
     middle = sizes[len(sizes) // 2]
@@ -228,49 +221,7 @@ def _parts(size: int, chunk: int) -> dict[str, float]:
             whole.append(time.perf_counter() - start)
     medians = {name: 1e6 * statistics.median(spent) for name, spent in seconds.items()}
     rest = 1e6 * statistics.median(whole) - sum(medians.values())
-    return medians | {"the rest": rest} | _laws(simulation.hierarchy, max(2, 20 * chunk // size))
-
-
-def _laws(controllers: hierarchy.Hierarchy, times: int) -> dict[str, float]:
-    """µs a control period by law, of those that one compiled loop runs in turn."""
-    size, period = len(controllers.state), Scenario().control_period
-    error, reference, limits = np.full((size, 3), 0.01), np.zeros((size, 7)), np.array([1.5, 3.0, 1.5, 6.0])
-
-    @njit
-    def motion(times, state, error, reference, limits):  # noqa: ANN001, ANN202
-        for _ in range(times):
-            for i in range(len(state)):
-                s = state[i]
-                kanayama_law(error[i], reference[i, :3], reference[i, 3:5], s.kanayama, s.error, s.request)
-
-    @njit
-    def limiter(times, state, error, reference, limits):  # noqa: ANN001, ANN202
-        for _ in range(times):
-            for i in range(len(state)):
-                s = state[i]
-                limit_law(
-                    s.request, reference[i, 3:5], reference[i, 5:], limits, s.prefilter, period, s.limiter, s.command,
-                    s.derivative,
-                )  # fmt: skip
-
-    @njit
-    def feedback(times, state, error, reference, limits):  # noqa: ANN001, ANN202
-        for _ in range(times):
-            for i in range(len(state)):
-                s = state[i]
-                pid_law(s.command, s.request, s.pid_gains, period, s.excess, s.pid, s.feedback)
-
-    costs = {}
-    for name, law in (("motion controller", motion), ("limiter", limiter), ("PID", feedback)):
-        state = controllers.state.copy()
-        law(1, state, error, reference, limits)
-        spent = []
-        for _ in range(5):
-            start = time.perf_counter()
-            law(times, state, error, reference, limits)
-            spent.append(time.perf_counter() - start)
-        costs[f"· {name} alone"] = 1e6 * statistics.median(spent) / times
-    return costs
+    return medians | {"the rest": rest}
 
 
 @contextmanager
