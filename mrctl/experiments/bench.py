@@ -1,4 +1,4 @@
-"""How fast is the closed loop? Beside the engine alone, and beside what people write today."""
+"""`mrctl bench`: the speed of the closed loop, beside the engine alone and beside a loop as people write it today."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The suite's figures, and its report: one HTML page with everything in it, read without a server."""
+"""The figures of the suite and its report, an HTML page that holds its figures and needs no server."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mrctl.control.feedforward import InverseDynamics
 from mrctl.control.pid import PIDS
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
-from mrctl.experiments.cases import BAND, Outcome
+from mrctl.experiments.cases import BAND, Choices, Outcome
 from mrctl.experiments.tables import number
 from mrctl.loop import controller
 from mrctl.loop.simulation import Simulation
@@ -28,33 +28,33 @@ from mrctl.results.dataset import SIGNALS, versions
 from mrctl.results.plots import InverseMap
 from mrctl.scenario import Scenario
 
-KNOWING = ("none", "model", "oracle")  # feedforwards that do not learn
-GRID = 41  # points a side of a heat map
+STATIC = ("none", "model", "oracle")  # feedforwards that do not learn
+GRID = 41  # points along each side of a heat map
 TEMPLATE = Path(__file__).with_name("report.html")
 
 
-def write(outcome: Outcome, who: Mapping[str, dict[str, Any]], tables: Mapping[str, pd.DataFrame], out: Path) -> None:
+def write(outcome: Outcome, choices: Choices, tables: Mapping[str, pd.DataFrame], out: Path) -> None:
     """Writes the figures, as PNG and PDF, and `report.html`.
 
     Args:
-        outcome: What the suite found.
-        who: The feedforwards, by name.
+        outcome: Results of the suite.
+        choices: The feedforwards, by name.
         tables: The tables of all numbers, by title.
-        out: Folder.
+        out: Folder to write to.
 
     Raises:
         InputError: The folder cannot be written.
     """
-    drawn = figures(outcome, who)
+    drawn = figures(outcome, choices)
     images = {}
     for name, (figure, caption) in drawn.items():
         png, _ = plots.save(figure, out / "figures", name)
         images[name] = (base64.b64encode(png.read_bytes()).decode(), caption)
-    (out / "report.html").write_text(page(outcome, who, tables, images))
+    (out / "report.html").write_text(page(outcome, choices, tables, images))
 
 
-def figures(outcome: Outcome, who: Mapping[str, dict[str, Any]]) -> dict[str, tuple[Any, str]]:
-    """The figures with their captions, by file name."""
+def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
+    """The figures and their captions, by file name."""
     runs = {case.name: case for case in outcome.cases}
     found = outcome.runs
     drawn: dict[str, tuple[Any, str]] = {}
@@ -87,28 +87,28 @@ def figures(outcome: Outcome, who: Mapping[str, dict[str, Any]]) -> dict[str, tu
         ratios = {name: end / ends["none"] for name, end in ends.items()}
         drawn["random"] = (
             plots.distributions(ratios, "position error over that of PID, same run"),
-            "Random scenarios: the share of runs in which the error is below so many times that of PID alone. What "
-            "does not reach 1 has failed.",
+            "Random scenarios: the share of runs whose error is below a multiple of that of PID alone. A curve that "
+            "does not reach 1 belongs to a feedforward with failed runs.",
         )
-    learners = [name for name in who if name not in KNOWING]
+    learners = [name for name in choices if name not in STATIC]
     if learners:
         drawn["inverse_dynamics"] = (
-            plots.inverse_dynamics({name: learned(who[name], runs["all"].scenarios[0]) for name in learners}),
-            "What was learned with everything wrong at once, against the true inverse dynamics, in steady motion: the "
-            "voltage that the motors share and the one in which they differ, over V and θ̇. The line is where the robot "
-            "drove.",
+            plots.inverse_dynamics({name: learned(choices[name], runs["all"].scenarios[0]) for name in learners}),
+            "What each feedforward learned with everything wrong at once, beside the true inverse dynamics, in steady "
+            "motion: the voltage that the motors share and the one in which they differ, over V and θ̇. The line shows "
+            "where the robot drove.",
         )
     return drawn
 
 
 def _labelled(runs: Mapping[str, xr.Dataset]) -> xr.Dataset:
-    """The runs of one case with their feedforwards as labels."""
+    """The runs of one case in one dataset, labelled with their feedforwards."""
     own = [one.assign_coords(label=("run", [name] * one.sizes["run"])) for name, one in runs.items()]
     return xr.concat([one.drop_vars("scenario", errors="ignore") for one in own], "run")
 
 
 def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
-    """Drives a scenario once more and asks the feedforward what it makes of steady motion."""
+    """Drives a scenario again and evaluates the feedforward in steady motion, beside the true inverse dynamics."""
     stages: Stages = controller.load(choice["controller"]) if "controller" in choice else {}
     scenario = scenario.model_copy(update={"feedforward": choice.get("feedforward", "none")})
     simulation = Simulation([scenario], **stages)
@@ -128,15 +128,15 @@ def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
 
 def page(
     outcome: Outcome,
-    who: Mapping[str, dict[str, Any]],
+    choices: Choices,
     tables: Mapping[str, pd.DataFrame],
     images: Mapping[str, tuple[str, str]],
 ) -> str:
     """The report as HTML.
 
     Args:
-        outcome: What the suite found.
-        who: The feedforwards, by name.
+        outcome: Results of the suite.
+        choices: The feedforwards, by name.
         tables: The tables of all numbers, by title.
         images: Each figure as base64 of a PNG, and its caption, by file name.
     """
@@ -144,11 +144,11 @@ def page(
     random = sum(len(case.scenarios) for case in outcome.cases if case.part == "random")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(TEMPLATE.read_text()).render(
-        runs=sum(len(case.scenarios) for case in outcome.cases) * len(who),
+        runs=sum(len(case.scenarios) for case in outcome.cases) * len(choices),
         cases=len(fixed),
         seeds=len(fixed[0].scenarios),
         random=random,
-        feedforwards=list(who),
+        feedforwards=list(choices),
         aside=outcome.aside,
         band=f"{BAND:g}",
         scorecard=scorecard(outcome),
@@ -156,17 +156,17 @@ def page(
         duels=duels(outcome) if random else "",
         figures=[{"data": data, "caption": caption} for data, caption in images.values()],
         tables={title: _plain(table) for title, table in tables.items()},
-        command=command(outcome, who),
+        command=command(outcome, choices),
         versions=versions(),
         pids=[tuning.statement(tuning.design("flat", pid, (0.0,))) for pid in PIDS.values()],
     )
 
 
-def command(outcome: Outcome, who: Mapping[str, dict[str, Any]]) -> str:
-    """The command that does all of it again."""
+def command(outcome: Outcome, choices: Choices) -> str:
+    """The command that repeats the suite."""
     words = ["mrctl", "suite", *(["--quick"] if outcome.quick else [])]
-    words += ["--feedforward", *(name for name, one in who.items() if "feedforward" in one)]
-    own = [one["controller"] for one in who.values() if "controller" in one]
+    words += ["--feedforward", *(name for name, one in choices.items() if "feedforward" in one)]
+    own = [one["controller"] for one in choices.values() if "controller" in one]
     words += ["--controller", *own] if own else []
     words += ["--seeds", str(len(outcome.cases[0].scenarios))]
     words += ["--random", str(sum(len(case.scenarios) for case in outcome.cases if case.part == "random"))]
@@ -189,7 +189,7 @@ def scorecard(outcome: Outcome) -> str:
 
 
 def recoveries(outcome: Outcome) -> str:
-    """Position error at the end of a step, one lap after it and after the return over the error before."""
+    """Position error at the end of a step, and one lap after change and return over that before the change."""
     cells: dict[str, dict[str, Cell]] = {}
     for case, rows in _by_case(outcome, steps=True).items():
         for row in rows:
@@ -204,7 +204,7 @@ def recoveries(outcome: Outcome) -> str:
 
 
 def duels(outcome: Outcome) -> str:
-    """Who beats whom in the random scenarios."""
+    """Probabilities that one feedforward beats another in the random scenarios."""
     errors = {n: metrics.summary(own)["position_rmse"].to_numpy() for n, own in outcome.runs["random"].items()}
     rows = {row["feedforward"]: row for row in outcome.rows if row["part"] == "random"}
     cells: dict[str, dict[str, Cell]] = {}
@@ -224,7 +224,7 @@ class Cell(NamedTuple):
 
     text: str
     ratio: float = 1.0
-    """Green below one, red above."""
+    """Colour of the cell: green below one, red above."""
     bold: bool = False
 
     @property
@@ -265,7 +265,7 @@ def _mean(row: Mapping[str, Any]) -> float:
 
 
 def _shade(ratio: float) -> str:
-    """Green below one, red above, full at a factor of 30 and 3."""
+    """The colour of a ratio in CSS: green below one, deepest at 1/30; red above one, deepest at 3."""
     if not np.isfinite(ratio) or ratio <= 0:
         return "#fff"
     depth = np.log(ratio) / np.log(3 if ratio > 1 else 30)

@@ -1,4 +1,4 @@
-"""Labelled results: what a run recorded, with units, saved and opened."""
+"""Labelled results: the signals of runs with their units; saving and opening them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
 # Name: (unit, meaning), in the order in which the loop records. A sample at time t holds the state at t, the commands
-# computed from it, and the currents and power at the end of the control period that these commands were held for.
+# computed from it, and the currents and power at the end of the control period during which these commands are held.
 SIGNALS: dict[str, tuple[str, str]] = {
     "x": ("m", "position of P along the world's x axis"),
     "y": ("m", "position of P along the world's y axis"),
@@ -60,7 +60,7 @@ SIGNALS: dict[str, tuple[str, str]] = {
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that can change a number."""
+    """Versions of all packages that can change a result."""
     others = ("mujoco", "dm-control", "numpy", "numba", "torch")
     return {"mrctl": __version__} | {name: metadata.version(name) for name in others}
 
@@ -91,16 +91,20 @@ def dataset(
     failure_time: NDArray[np.float64],
     weights: NDArray[np.float64] | None,
 ) -> xr.Dataset:
-    """Labels what a uniform group of runs recorded.
+    """Labels the record of a batch of runs.
 
     Args:
-        scenarios: A scenario a run.
-        labels: What to call a run that has no name.
-        feedforwards: Name of the feedforward a run.
-        log: `(B, ticks, signals)`.
-        failure: Why a run stopped early, or "".
-        failure_time: When, s, or NaN.
-        weights: Final weights of the network a run, `(B, n)`, or None.
+        scenarios: The scenario of each run.
+        labels: Label of each run that has no name.
+        feedforwards: Name of the feedforward of each run.
+        log: Record of the runs, `(B, ticks, signals)`, with the signals of `SIGNALS` in their units.
+        failure: For each run why it stopped early, or "".
+        failure_time: For each run when it stopped in s, or NaN, `(B,)`.
+        weights: Final weights of the network of each run, `(B, n)`, or None.
+
+    Returns:
+        Variables (run, time) by signal, `failed`, `failure`, `failure_time` and `weights`; coordinates label,
+        feedforward, steering, seed and lap_time.
     """
     period = scenarios[0].control_period
     variables: dict[str, tuple] = {
@@ -126,7 +130,7 @@ def dataset(
 
 
 def combine(groups: Sequence[tuple[Sequence[int], xr.Dataset]], scenarios: Sequence[Scenario]) -> xr.Dataset:
-    """Puts groups back into the order the scenarios were given in; shorter runs end in NaN."""
+    """Combines batches into one result, runs in the order of the scenarios; shorter runs are padded with NaN."""
     parts = [part.assign_coords(run=list(rows)) for rows, part in groups]
     whole = xr.concat(parts, "run", join="outer", data_vars="minimal", coords="minimal").sortby("run")
     whole.attrs = {

@@ -1,9 +1,8 @@
-"""What a result is worth: errors per lap, learning, recovery, and their means over seeds.
+"""Metrics of a result: errors lap by lap, learning, and recovery after a change.
 
-Pure functions of the dataset that `simulate` returns. Errors are against the ORIGINAL reference. A run that failed is
-counted, never dropped: its metrics are NaN from the lap in which it failed on, and every statistic says how many it
-lost. Laps are numbered from 1. A sample is held for one control period, so an integral over time is a sum times that
-period.
+They are pure functions of the dataset that `simulate` returns. Errors are against the ORIGINAL reference. A run that
+failed is never dropped: its metrics are NaN from the lap in which it failed on. Laps are numbered from 1. A sample is
+held for one control period, so an integral over time is a sum times that period.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ METRICS: dict[str, tuple[str, str]] = {
     "omega_rmse": ("rad/s", "RMS error of the rotation velocity"),
     "v_iae": ("m", "integral of the absolute error of the linear velocity"),
     "omega_iae": ("rad", "integral of the absolute error of the rotation velocity"),
-    "v_itae": ("m s", "the same, weighted by the time since the lap began"),
-    "omega_itae": ("rad s", "the same, weighted by the time since the lap began"),
+    "v_itae": ("m s", "integral of the absolute error of the linear velocity times the time since the lap began"),
+    "omega_itae": ("rad s", "integral of the absolute rotation velocity error times the time since the lap began"),
     "feedback_share": ("1", "RMS feedback voltage over RMS voltage"),
     "voltage_variation": ("V", "total variation of the voltage, both wheels"),
     "saturation_time": ("s", "time in saturation"),
@@ -46,7 +45,7 @@ METRICS: dict[str, tuple[str, str]] = {
 }
 """Name of a metric -> (unit, description)."""
 
-ROUNDING = 1e-10  # singular values of the features below this share of the largest come of rounding alone
+ROUNDING = 1e-10  # singular values of the features below this share of the largest are due to rounding
 PER_RUN = ("label", "feedforward", "steering", "seed", "lap_time")
 SAMPLED = (
     "x", "y", "x_ref", "y_ref", "v", "omega", "v_ref", "omega_ref", "longitudinal_error", "lateral_error",
@@ -56,12 +55,12 @@ SAMPLED = (
 
 
 class Laps(NamedTuple):
-    """How one run divides into laps."""
+    """The laps of one run."""
 
     edges: NDArray[np.intp]
     """First sample of each lap, and the end of the last one (laps + 1,)."""
     failed: int | None
-    """Index of the lap in which the run failed, if it did."""
+    """Index of the lap in which the run failed, or None."""
 
 
 def as_runs(result: xr.Dataset) -> xr.Dataset:
@@ -77,7 +76,7 @@ def as_runs(result: xr.Dataset) -> xr.Dataset:
 
 
 def control_period(result: xr.Dataset) -> float:
-    """Seconds between the samples of a result.
+    """Time between the samples of a result in s.
 
     Raises:
         InputError: The result has neither two samples nor the attribute `control_period`.
@@ -91,9 +90,9 @@ def control_period(result: xr.Dataset) -> float:
 
 
 def laps_of(run: xr.Dataset) -> Laps:
-    """Divides one run (no `run` dimension) into whole laps; one that ends before its first lap does counts as one lap.
+    """Divides one run (no `run` dimension) into whole laps; a run that is shorter than a lap counts as one lap.
 
-    What follows the last whole lap is left out, but a failure in it is charged to that lap.
+    Samples after the last whole lap are left out, but a failure among them counts as one in that lap.
 
     Raises:
         InputError: `lap_time` is shorter than the control period.
@@ -121,7 +120,7 @@ def _failed(run: xr.Dataset) -> bool:
 
 
 def _end(run: xr.Dataset) -> int:
-    """Samples of one run: shorter runs are padded with NaN where results are put together, failed ones are not cut."""
+    """Number of samples of one run: the NaN that pad a shorter run are not counted, those after a failure are."""
     alive = np.flatnonzero(np.isfinite(run["x"].values))
     return len(run["time"]) if _failed(run) or not len(alive) else int(alive[-1]) + 1
 
@@ -133,8 +132,8 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
         result: What `simulate` returns, variables (run, time), or one run of it.
 
     Returns:
-        `METRICS` with dims (run, lap), units in attrs; `laps`, how many each run has (NaN beyond them); `failed` and
-        `failure_time` as in the result. Coordinate `lap` counts from 1.
+        `METRICS` with dims (run, lap), NaN beyond the laps of a run, and units in attrs; `laps`, the number of laps of
+        each run; `failed` and `failure_time` as in the result. Coordinate `lap` counts from 1.
 
     Raises:
         InputError: The result lacks a variable, or a lap is shorter than the control period.
@@ -197,7 +196,7 @@ def _lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float)
     feedback = np.hypot(_rms(data["feedback_left"]), _rms(data["feedback_right"]))
     voltage = np.hypot(_rms(data["voltage_left"]), _rms(data["voltage_right"]))
     with np.errstate(divide="ignore", invalid="ignore"):
-        found["feedback_share"] = np.where(feedback == 0, 0.0, feedback / voltage)  # at rest nobody works
+        found["feedback_share"] = np.where(feedback == 0, 0.0, feedback / voltage)  # 0 at rest, where both are 0
     variations = [np.abs(np.diff(steps[name])).sum(-1) for name in ("voltage_left", "voltage_right")]
     found["voltage_variation"] = variations[0] + variations[1]
     found["saturation_time"] = data["saturated"].sum(-1) * period
@@ -208,25 +207,25 @@ def _lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float)
 
 
 def excitation(command: Array, period: float, half_track: Array, scale: Array) -> Array:
-    """Smallest eigenvalue of the Gram matrix XᵀX/n of the 8 physical features X `(n, 8)` over some stretch of motion.
+    """Smallest eigenvalue of the Gram matrix XᵀX/n of the 8 physical features X `(n, 8)` over n samples of motion.
 
-    How well the least excited combination of coefficients can be told from what was driven: at zero a learner may hold
-    anything there (persistency of excitation; Ioannou and Sun 1996, section 4.3).
+    It says how well the motion determines the least excited combination of coefficients: where it is zero, the motion
+    says nothing about that combination (persistency of excitation; Ioannou and Sun 1996, section 4.3).
 
     Args:
         command: Commanded twist in m/s, rad/s, `(…, n, 2)`; its derivative is taken by central differences.
         period: Seconds between the samples.
-        half_track: Of the nominal robot in m, `(…,)`.
-        scale: What the features are divided by, as from `feature_scale`, `(…, 8)`.
+        half_track: Half track of the nominal robot in m, `(…,)`.
+        scale: Scales that the features are divided by, as from `feature_scale`, `(…, 8)`.
 
     Returns:
-        `(…,)`; NaN where the motion is not finite.
+        The eigenvalue, `(…,)`; NaN where the motion is not finite.
     """
     n = command.shape[-2]
     x = np.empty((*command.shape[:-1], scale.shape[-1]))
     features(command, np.gradient(command, period, axis=-2), half_track[..., None], scale[..., None, :], x)
     finite = np.asarray(np.isfinite(x).all(axis=(-2, -1)))
-    # Squared singular values resolve what eigenvalues of the product, rounded to 1e-16 of the largest, do not.
+    # Eigenvalues of XᵀX are rounded to 1e-16 of the largest; squared singular values of X resolve smaller ones.
     triangle = np.linalg.qr(np.where(finite[..., None, None], x, 0.0), mode="r")
     sizes = np.linalg.svd(triangle, compute_uv=False)
     least, largest = sizes[..., -1], sizes[..., 0]
@@ -240,14 +239,14 @@ def _rms(signal: Array) -> Array:
 
 
 def guard_events(result: xr.Dataset) -> pd.DataFrame:
-    """What the guard on the learner did, in order of time, run by run.
+    """The actions of the guard on the learner, run by run in order of time.
 
     Args:
         result: What `simulate` returns, or one run of it.
 
     Returns:
-        A row an event: run, time in s, action (limit, freeze, fallback, or resume after the last two), and the reason
-        in words.
+        A row for each action: run, time in s, action (limit, freeze, fallback, or resume after the last two), and the
+        reason in words.
 
     Raises:
         InputError: The result has no record of the guard.
@@ -272,13 +271,13 @@ def laps_to_converge(laps: xr.Dataset, metric: str, factor: float = 1.2) -> xr.D
     Args:
         laps: What `per_lap` returns.
         metric: One of `METRICS`.
-        factor: How close counts as converged, at least 1.
+        factor: Largest ratio to the final value that counts as converged, at least 1.
 
     Returns:
         The lap's number (run,), from 1; NaN for a run that failed.
 
     Raises:
-        InputError: No such metric, or a factor below 1.
+        InputError: There is no such metric, or the factor is below 1.
     """
     known(metric)
     if not factor >= 1:
@@ -299,15 +298,15 @@ def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor
     Args:
         laps: What `per_lap` returns.
         metric: One of `METRICS`.
-        change: The number of the lap in whose beginning the change came, from 2.
-        until: Number of the last lap to look at, before the next change.
-        factor: How close counts as recovered.
+        change: Number of the lap, from 2, at whose beginning the change came.
+        until: Number of the last lap before the next change.
+        factor: Largest ratio to the lap before the change that counts as recovered.
 
     Returns:
         Laps (run,): 0 if the lap of the change itself is within, infinite if the last one is not, NaN if it failed.
 
     Raises:
-        InputError: No such metric, or laps that are not there.
+        InputError: There is no such metric, or no such lap.
     """
     known(metric)
     if not 2 <= change <= until <= laps.sizes["lap"]:
@@ -322,11 +321,12 @@ def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor
 
 
 def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
-    """A row per run: what it was, whether it failed, and its metrics in one lap.
+    """A row for each run: its description, whether it failed, and its metrics in one lap.
 
     Args:
         result: What `simulate` or `per_lap` returns.
-        lap: Number of the lap from 1, or from the run's end from −1. NaN where a run has no such lap.
+        lap: Number of the lap, counted from 1, or from −1 backwards from the end of the run. A run without such a lap
+            has NaN.
 
     Returns:
         Columns label, feedforward, steering, seed (those there are), laps, failed, failure_time, `METRICS` in that lap,
@@ -354,10 +354,10 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
 
 
 def known(metric: str) -> str:
-    """The name itself, if it is one of `METRICS`.
+    """Returns the name if it is one of `METRICS`.
 
     Raises:
-        InputError: It is not; the message lists those that are.
+        InputError: It is not; the message lists all metrics.
     """
     if metric not in METRICS:
         raise InputError(f"metric: {metric!r} is not one of {', '.join(METRICS)}")

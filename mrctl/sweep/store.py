@@ -1,7 +1,7 @@
 """Where a sweep is kept: a folder that survives being killed at any moment.
 
     STORE/sweep.json        the sweep, versions, digests of the compiled worlds; written first, whole or not at all
-    STORE/runs.parquet      the table, a row a run in order; written when no job is left
+    STORE/runs.parquet      the table of runs, one row each, in order; written when no job is left
     STORE/parts/000012.parquet   rows of job 12; folded into the table, and removed once every job is in it
     STORE/signals.zarr      (run, time, signal), NaN where nothing was recorded; shard 12 is the record of job 12
     STORE/lock              held, through the operating system, by the one process that runs the sweep
@@ -10,7 +10,7 @@
 computed then is NaN. Only the version that began a sweep goes on with it. Format 1 did not list its signals.
 
 One job owns one shard and one part. Each file is written under another name, synchronised and renamed, the part last:
-a part that is there says that its job is done. A job that is computed twice writes the same bytes twice.
+the existence of a part says that its job is done. A job that is computed twice writes the same bytes twice.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from mrctl.results.metrics import METRICS
 KIND, FORMAT = "mrctl sweep", 2
 ROW_GROUP = 16384  # rows of the table that are in memory at once
 INNER = 16  # runs that are compressed together, signal by signal
-COMPLETE = b"complete"  # in the table's metadata: whether every job is in it
+COMPLETE = b"complete"  # key in the metadata of the table: whether it holds every job
 
 
 class Store:
@@ -77,17 +77,17 @@ class Store:
 
     @staticmethod
     def prepare(path: Path) -> None:
-        """Makes the folder, if need be.
+        """Makes the folder of a store unless it exists.
 
         Raises:
-            InputError: What is there is not a sweep's store; nothing was touched.
+            InputError: There is something else at this path, which is left as it was.
         """
         if not path.exists():
             path.mkdir(parents=True)
         elif not path.is_dir():
             raise InputError(f"{path}: a file, not a sweep's store")
         elif not (path / "sweep.json").is_file():
-            # Of a sweep that was killed before it could say what it is there is no more than this.
+            # A sweep that was killed before it wrote sweep.json has left nothing but these files.
             if foreign := sorted(e.name for e in path.iterdir() if e.name != "lock" and not _temporary(e)):
                 raise InputError(f"{path}: holds {foreign[0]} and is not a sweep's store; nothing was touched")
         else:
@@ -121,10 +121,10 @@ class Store:
     @staticmethod
     @contextlib.contextmanager
     def locked(path: Path) -> Iterator[None]:
-        """Holds the folder; the system lets go of it when this process ends, however it ends.
+        """Locks the folder; the system unlocks it when this process ends, however it ends.
 
         Raises:
-            InputError: Another process holds it.
+            InputError: Another process has locked it.
         """
         import fcntl  # not on Windows
 
@@ -142,12 +142,12 @@ class Store:
 
     @property
     def size(self) -> int:
-        """How many runs."""
+        """Number of runs."""
         return self.manifest["size"]
 
     @property
     def samples(self) -> int:
-        """Samples of each signal a run."""
+        """Number of samples of each signal in a run."""
         return self.manifest["samples"]
 
     @property
@@ -171,7 +171,7 @@ class Store:
 
     @property
     def jobs(self) -> int:
-        """How many jobs."""
+        """Number of jobs."""
         return math.ceil(self.size / self.manifest["chunk"])
 
     def runs(self, job: int) -> range:
@@ -181,7 +181,7 @@ class Store:
 
     @property
     def table(self) -> Path:
-        """The file with a row a run."""
+        """Path of the table of runs."""
         return self.path / "runs.parquet"
 
     @property
@@ -190,7 +190,7 @@ class Store:
         return self.table.exists() and pq.read_schema(self.table).metadata.get(COMPLETE) == b"1"
 
     def done(self) -> set[int]:
-        """Jobs that are done."""
+        """Numbers of the jobs that are done."""
         if self.complete:
             return set(range(self.jobs))
         return {int(part.stem) for part in (self.path / "parts").glob("[0-9]*.parquet")}
@@ -199,10 +199,10 @@ class Store:
         return self.path / "parts" / f"{job:06d}.parquet"
 
     def write(self, job: int, rows: pa.Table, signals: NDArray[np.float64] | None) -> None:
-        """Keeps what a job found: the signals `(runs, samples, signals)`, then the rows, which say that it is done."""
+        """Writes the results of a job: signals `(runs, samples, signals)`, then rows, which show that it is done."""
         if signals is not None:
             runs = self.runs(job)
-            self._signals[runs.start : runs.stop] = signals  # zarr renames a whole shard into its place
+            self._signals[runs.start : runs.stop] = signals  # zarr renames a whole shard
             if (shard := self.path / "signals.zarr" / "signals" / "c" / str(job) / "0" / "0").exists():
                 _synchronise(shard)  # zarr keeps no shard that is all NaN
         self._part(job).parent.mkdir(exist_ok=True)
@@ -212,27 +212,27 @@ class Store:
             file.write(buffer.getvalue())
 
     def rows(self, job: int) -> pa.Table:
-        """What a job that is done has found."""
+        """Rows of a job that is done."""
         return pq.read_table(self._part(job))
 
     def row(self, run: int) -> dict[str, Any] | None:
-        """What one run has found, if it is done."""
+        """Row of one run, or None if it is not done."""
         job = run // self.manifest["chunk"]
         source = self._part(job) if self._part(job).exists() else self.table
         found = pq.read_table(source, filters=[("run", "=", run)]).to_pylist() if source.exists() else []
         return found[0] if found else None
 
     def signals(self, run: int) -> NDArray[np.float64]:
-        """The record of one run `(samples, signals)`, where one is kept."""
+        """Signals of one run `(samples, signals)`, if the store keeps them."""
         return np.asarray(self._signals[run])
 
     def finish(self, schema: pa.Schema, rows: Iterable[pa.Table], complete: bool) -> None:
-        """Folds the parts into the table, a bounded number of rows in memory.
+        """Writes the rows of all jobs to the table; only a bounded number of rows is in memory.
 
         Args:
-            schema: Of the rows.
-            rows: Those of every job in turn.
-            complete: Whether all jobs were done.
+            schema: Columns of the table.
+            rows: Rows of each job in turn.
+            complete: Whether all jobs are done, so that their parts can be removed.
         """
         schema = schema.with_metadata({COMPLETE: b"1" if complete else b"0"})
         with _whole(self.table) as file, pq.ParquetWriter(file, schema) as writer:
@@ -259,10 +259,10 @@ class Store:
         )
 
     def frame(self) -> pd.DataFrame:
-        """The table, of the runs that are done.
+        """The table of the runs that are done.
 
         Raises:
-            InputError: None is.
+            InputError: No run is done.
         """
         if self.table.exists():
             return pd.read_parquet(self.table)
@@ -300,7 +300,7 @@ class Store:
                 for row, laps in enumerate(frame[column] if column in frame else ()):
                     values[row, : len(laps)] = laps
                 found[name] = (("run", "lap"), values, {"units": units[name]})
-            coords.pop("laps", None)  # where it is an axis too
+            coords.pop("laps", None)  # `laps` may be an axis too
             return xr.Dataset(outcome | columns(["laps"]) | found, coords | {"lap": number}, attrs)
         if not self.samples:
             return xr.Dataset(outcome | columns(METRICS), coords, attrs)
@@ -315,14 +315,15 @@ class Store:
 
 
 def open(path: str | Path) -> xr.Dataset:
-    """Opens what `mrctl sweep`, `mrctl run --out` or `mrctl.save` wrote.
+    """Opens a result or a store that `mrctl sweep`, `mrctl run --out` or `mrctl.save` wrote.
 
-    A sweep opens as one dataset of the runs that are done, axes as coordinates on `run`: with its signals (run, time)
-    where they were recorded, as what `per_lap` returns (run, lap) where laps were, and else with the metrics of the
-    last lap (run,). The table is `runs.parquet` in it.
+    A sweep opens as one dataset of the runs that are done, with its axes as coordinates of `run`. The dataset holds
+    the signals (run, time) if they were recorded, what `per_lap` returns (run, lap) if laps were, and otherwise the
+    metrics of the last lap (run,). The table of runs is `runs.parquet` in the folder.
 
     Raises:
-        InputError: There is neither at this path.
+        InputError: There is neither at this path, or another version of mrctl, which the message names, wrote a store
+            that this one cannot read.
     """
     path = Path(path)
     if (path / "sweep.json").is_file():
@@ -331,14 +332,14 @@ def open(path: str | Path) -> xr.Dataset:
 
 
 def _plain(frame: pd.DataFrame, name: str) -> NDArray:
-    """A column as NumPy has it, text as objects."""
+    """A column as a NumPy array, in which text is objects."""
     column = frame[name].to_numpy()
     return column if column.dtype.kind in "bif" else column.astype(object)
 
 
 @contextlib.contextmanager
 def _whole(path: Path) -> Iterator[BinaryIO]:
-    """A file that appears whole, on the disk, or not at all."""
+    """Opens a file that appears on the disk whole or not at all."""
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         with partial.open("xb") as file:
@@ -365,7 +366,7 @@ def _temporary(path: Path) -> bool:
 
 
 def _regroup(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
-    """The same rows in tables of `ROW_GROUP`."""
+    """The same rows in tables of `ROW_GROUP` rows."""
     held: list[pa.Table] = []
     for table in tables:
         held.append(table)
@@ -378,7 +379,7 @@ def _regroup(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
 
 
 def _difference(old: object, new: object, where: str = "") -> str:
-    """Where two trees of plain data first differ, or ""."""
+    """The first place where two trees of plain data differ, with both values, or ""."""
     if isinstance(old, dict) and isinstance(new, dict):
         pairs = [(str(key), old.get(key), new.get(key)) for key in {**old, **new}]
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
