@@ -33,3 +33,5 @@ from .theory.references import Waypoints as Waypoints
 from .theory.robot import Robot as Robot
 from .theory.robot import RobotFile as RobotFile
 from .viewer.embed import replay as replay
+
+__version__: str

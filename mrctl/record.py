@@ -9,6 +9,10 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from mrctl import __version__
+
+WRITTEN_BY = "# written by mrctl "  # first line of a TOML file that `to_toml` made
+
 
 class InputError(ValueError):
     """Input from outside is invalid; the message is one line that names the field or the file."""
@@ -43,7 +47,8 @@ class Record(BaseModel):
         """Reads and validates a TOML file.
 
         Raises:
-            InputError: The file cannot be read, is not TOML, or has an invalid field.
+            InputError: The file cannot be read, is not TOML, or names a bad field; the message names the version of
+                mrctl that wrote the file, if another one did.
         """
         try:
             text = Path(path).read_bytes().decode()
@@ -53,14 +58,16 @@ class Record(BaseModel):
             values = tomllib.loads(text)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not TOML: {error}") from None
-        return cls.from_dict(values, str(path))
+        first = text.partition("\n")[0]
+        another = first.startswith(WRITTEN_BY) and first != WRITTEN_BY + __version__
+        return cls.from_dict(values, f"{path} ({first.removeprefix('# ')})" if another else str(path))
 
     def to_toml(self) -> str:
         """Returns all fields as TOML that `from_toml` reads back, with one line for each field.
 
-        A list of records has one line for each of its elements.
+        The first line is a comment with the version of mrctl. A list of records has one line for each of its elements.
         """
-        return "".join(
+        return f"{WRITTEN_BY}{__version__}\n" + "".join(
             f"{name} = {_toml(value, nested=False)}\n"
             for name, value in self.model_dump(mode="json", exclude_none=True).items()
         )

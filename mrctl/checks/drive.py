@@ -27,7 +27,6 @@ from mrctl.checks.open_loop import (
     towing,
 )
 from mrctl.physics.elements import REAR
-from mrctl.physics.plant import OMEGA, V_LATERAL, V
 from mrctl.theory.dynamics import accelerations
 from mrctl.theory.kinematics import wheel_rates
 from mrctl.theory.perturbation import Perturbation
@@ -45,7 +44,7 @@ def hold_on_slope(model: mujoco.MjModel, robot: Robot) -> Report:
     force, weight = holding_force(robot), robot.mass * GRAVITY
     steepest = _steepest(robot)
     slopes = [Perturbation(slope=-float(np.arcsin(ratio * force / weight))) for ratio in (0.5, steepest)]
-    standing, rolling = (Car(perturbed(model, slope)).drive(settling_time(robot), OFF)[V][-1] for slope in slopes)
+    standing, rolling = (Car(perturbed(model, slope)).drive(settling_time(robot), OFF)["v"][-1] for slope in slopes)
     terminal = (steepest - 1) * force / braking(robot)
     tolerance = 2.5e-3 * steepest * force / braking(robot)
     return [
@@ -72,7 +71,7 @@ def top_speed(model: mujoco.MjModel, robot: Robot) -> Report:
     sink in by 0.05 % of the radius; that of the loss is 1 %, as it is a small difference of large numbers.
     """
     high, low = robot.supply, robot.supply / 2
-    fast, slow = (cruise(model, robot, u)[1][V][-1] for u in (high, low))
+    fast, slow = (cruise(model, robot, u)[1]["v"][-1] for u in (high, low))
     gain = (fast - slow) / (high - low)
     loss = high - fast / gain
     return [
@@ -126,10 +125,10 @@ def velocity_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
     tau = robot.velocity_time_constant
     car, _ = cruise(crisp(model, robot, tau), robot, volts)
     log = car.drive(settling_time(robot), (volts + step, volts + step, 0, 0), min(HOLD, tau / 10))
-    gain = (log[V][-1] - log[V][0]) / step
+    gain = (log["v"][-1] - log["v"][0]) / step
     return [
         compare("gain of V", gain, robot.velocity_gain, "m/s/V", relative=5e-3),
-        compare("time constant of V", fitted_time_constant(log, V, tau), tau, "s", relative=5e-3),
+        compare("time constant of V", fitted_time_constant(log, "v", tau), tau, "s", relative=5e-3),
     ]
 
 
@@ -149,10 +148,10 @@ def rotation_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
     tau = skid.effective_inertia / damping
     car, _ = cruise(on_skid(crisp(model, robot, tau)), robot, common)
     log = car.drive(settling_time(robot), (common - step, common + step, 0, 0), min(HOLD, tau / 10))
-    gain = (log[OMEGA][-1] - log[OMEGA][0]) / step
+    gain = (log["omega"][-1] - log["omega"][0]) / step
     return [
         compare("gain of θ̇", gain, 2 * arm * robot.motor_gain / damping, "rad/s/V", relative=1e-2),
-        compare("time constant of θ̇", fitted_time_constant(log, OMEGA, tau), tau, "s", relative=1e-2),
+        compare("time constant of θ̇", fitted_time_constant(log, "omega", tau), tau, "s", relative=1e-2),
     ]
 
 
@@ -165,8 +164,8 @@ def coast_down(model: mujoco.MjModel, robot: Robot) -> Report:
     speed = robot.max_speed
     log = Car(open_circuit(model), twist=(speed, 0)).drive(0.8 * speed / deceleration, OFF)
     moving = log.time > 0.1  # the tyres take up their load
-    slope, start = np.polyfit(log.time[moving], log[V][moving], 1)
-    bend = np.abs(log[V] - start - slope * log.time)[moving].max()
+    slope, start = np.polyfit(log.time[moving], log["v"][moving], 1)
+    bend = np.abs(log["v"] - start - slope * log.time)[moving].max()
     return [
         compare("deceleration", -slope, deceleration, "m/s²", relative=3e-3),
         compare("departure from a straight line", bend, 0.0, "m/s", absolute=1e-3 * speed),
@@ -197,7 +196,7 @@ def centre_of_mass(model: mujoco.MjModel, robot: Robot) -> Report:
         crispy = crisp(on_skid(car), true, min(true.velocity_time_constant, true.rotation_time_constant))
         start = Car(crispy, twist=(robot.velocity_gain * (volts.mean() - loss), 0))
         log = start.drive(2 * settling_time(true), (*volts, 0, 0))
-        v, omega, sideways = log.reading[-1, [V, OMEGA, V_LATERAL]]
+        v, omega, sideways = log["v"][-1], log["omega"][-1], log["v_lateral"][-1]
         torques = true.motor_gain * (volts - true.back_emf * wheel_rates((v, omega), true))
         loss = 2 * on_skid_robot(true).drive_loss
         push = (loss - torques.sum()) / true.wheel_radius - true.mass * sideways * omega
@@ -235,7 +234,7 @@ def prediction(model: mujoco.MjModel, robot: Robot) -> Report:
         k3 = accelerations(s + h / 2 * k2, volts, robot)
         k4 = accelerations(s + h * k3, volts, robot)
         twist[k + 1] = s + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    error = np.sqrt(np.mean((twist - log.reading[:, [V, OMEGA]]) ** 2, axis=0) / np.mean(twist**2, axis=0))
+    error = np.sqrt(np.mean((twist - log.reading["twist"]) ** 2, axis=0) / np.mean(twist**2, axis=0))
     return [
         compare("error of V", error[0], 0.0, absolute=1e-2),
         compare("error of θ̇", error[1], 0.0, absolute=6e-2),

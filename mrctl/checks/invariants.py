@@ -13,7 +13,6 @@ import numpy as np
 from mrctl.checks.comparison import Report, compare
 from mrctl.checks.open_loop import HOLD, Car, is_steered, loss_voltage, rolling_wheels, with_finer_step
 from mrctl.physics.mjcf import clone
-from mrctl.physics.plant import THETA, V, X, Y
 from mrctl.theory.robot import GRAVITY, Robot
 
 
@@ -108,7 +107,7 @@ def mirror(model: mujoco.MjModel, robot: Robot) -> Report:
     law = winding(robot)
     other = Car(model).drive(4.0, lambda t: np.array(law(t))[[1, 0, 2, 3]] * (1, 1, -1, -1))
     log = Car(model).drive(4.0, law)
-    gap = log.reading[:, [X, Y, THETA]] - other.reading[:, [X, Y, THETA]] * (1, -1, -1)
+    gap = log.reading["pose"] - other.reading["pose"] * (1, -1, -1)
     return [compare("departure from the mirrored path", np.abs(gap).max(), 0.0, "m, rad", absolute=1e-9)]
 
 
@@ -121,8 +120,8 @@ def invariance(model: mujoco.MjModel, robot: Robot) -> Report:
     log = Car(model).drive(4.0, law)
     other = Car(model, pose=(x, y, theta)).drive(4.0, law)
     c, s = np.cos(theta), np.sin(theta)
-    moved = log.reading[:, [X, Y]] @ np.array([[c, s], [-s, c]]) + (x, y)
-    gap = np.abs(moved - other.reading[:, [X, Y]]).max()
+    moved = log.reading["pose"][:, :2] @ np.array([[c, s], [-s, c]]) + (x, y)
+    gap = np.abs(moved - other.reading["pose"][:, :2]).max()
     return [compare("departure from the moved path", gap, 0.0, "m", absolute=1e-9)]
 
 
@@ -140,8 +139,8 @@ def convergence(model: mujoco.MjModel, robot: Robot) -> Report:
     for halvings in range(4):
         fine = with_finer_step(model, halvings)
         log = Car(fine, twist=(speed, 0)).drive(4.0, law)
-        ends.append(log.reading[-1, [X, Y]])
-        path = np.abs(log[V]).mean() * log.time[-1]
+        ends.append(log.reading["pose"][-1, :2])
+        path = np.abs(log["v"]).mean() * log.time[-1]
     changes = np.hypot(*np.diff(ends, axis=0).T)
     return [
         compare("second change of the end point over the first", changes[1] / changes[0], 0.5, absolute=0.15),

@@ -14,19 +14,24 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from mrctl.kernel import Array, Rows
 from mrctl.physics.elements import MOTORS, REAR, fronts, has, rolling_fronts
 from mrctl.physics.mjcf import clone
 from mrctl.physics.perturb import perturb
-from mrctl.physics.plant import addresses, inputs, read
+from mrctl.physics.readout import READING, addresses, inputs, read_all
 from mrctl.physics.stand import stand
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import Robot
 
-Array = NDArray[np.float64]
 Control = Callable[[float], ArrayLike]  # time in s to left V, right V, steering rad, steering rate rad/s
 
+COMPONENTS = {
+    "x": ("pose", 0), "y": ("pose", 1), "theta": ("pose", 2), "v": ("twist", 0), "omega": ("twist", 1),
+    "wheel_rate_left": ("wheel_rates", 0), "wheel_rate_right": ("wheel_rates", 1),
+}  # fmt: skip
+"""Signals that are components of a field of `READING`."""
 OFF = (0.0, 0.0, 0.0, 0.0)  # no voltage, which shorts the motors, and wheels straight on
 HOLD = 0.02  # s for which a control is held
 DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -44,17 +49,20 @@ class Log:
         time: Time in s, `(T,)`.
         qpos: MuJoCo's positions, `(T, nq)`.
         qvel: MuJoCo's velocities, `(T, nv)`.
-        reading: Columns of `mrctl.physics.plant`, `(T, 11)`.
+        reading: One record of `READING` a sample, `(T,)`.
     """
 
     time: Array
     qpos: Array
     qvel: Array
-    reading: Array
+    reading: Rows
 
-    def __getitem__(self, column: int) -> Array:
-        """A column of the readings, `(T,)`."""
-        return self.reading[:, column]
+    def __getitem__(self, signal: str) -> Array:
+        """A signal by the name that it has in results, or `upright`, `(T,)`."""
+        if signal in COMPONENTS:
+            field, k = COMPONENTS[signal]
+            return self.reading[field][:, k]
+        return self.reading[signal]
 
 
 class Car:
@@ -93,8 +101,8 @@ class Car:
             self.control(law(k * hold))
             mujoco.mj_step(self.model, self.data, substeps)
             qpos[k + 1], qvel[k + 1] = self.data.qpos, self.data.qvel
-        reading = np.zeros((ticks + 1, 11))
-        read(qpos, qvel, self._address, reading)
+        reading = np.zeros(ticks + 1, READING)
+        read_all(qpos, qvel, self._address, reading)
         self.assert_stable()
         return Log(hold * np.arange(ticks + 1.0), qpos, qvel, reading)
 
@@ -128,13 +136,13 @@ def cruise(model: mujoco.MjModel, robot: Robot, volts: float) -> tuple[Car, Log]
     return car, car.drive(settling_time(robot), (volts, volts, 0, 0))
 
 
-def fitted_time_constant(log: Log, column: int, tau: float) -> float:
+def fitted_time_constant(log: Log, signal: str, tau: float) -> float:
     """Time constant in s of an exponential that settles within the log, from its values near τ/2 and 2 τ.
 
     The start is left out: the tyres, springs with a time constant of 10 ms, first have to take up their load.
     """
     first, last = (int(np.searchsorted(log.time, time)) for time in (tau / 2, 2 * tau))
-    remaining = (log[column][-1] - log[column][last]) / (log[column][-1] - log[column][first])
+    remaining = (log[signal][-1] - log[signal][last]) / (log[signal][-1] - log[signal][first])
     return -(log.time[last] - log.time[first]) / np.log(remaining) if remaining > 0 else np.nan
 
 

@@ -15,7 +15,6 @@ import numpy as np
 from mrctl.checks.comparison import Report, between, compare
 from mrctl.checks.open_loop import HOLD, OFF, Car, Log, on_skid, rolling_wheels
 from mrctl.physics.elements import MOTORS, REAR
-from mrctl.physics.plant import OMEGA, V
 from mrctl.theory.dynamics import inverse_dynamics
 from mrctl.theory.robot import Robot
 
@@ -65,7 +64,7 @@ def limits(model: mujoco.MjModel, robot: Robot) -> Report:
     """
     log = _to_its_limit(model, robot, (1, 0), robot.max_speed, robot.max_acceleration)
     return [
-        compare("V at its limit", log[V][-1], robot.max_speed, "m/s", relative=0.1),
+        compare("V at its limit", log["v"][-1], robot.max_speed, "m/s", relative=0.1),
         between("largest steering angle", robot.steering_limit, 0.1, np.pi / 2, "rad"),
     ]
 
@@ -73,7 +72,7 @@ def limits(model: mujoco.MjModel, robot: Robot) -> Report:
 def turning_limits(model: mujoco.MjModel, robot: Robot) -> Report:
     """The same for the limits on θ̇ and θ̈, turning on the spot with a front tyre without friction."""
     log = _to_its_limit(on_skid(model), robot, (0, 1), robot.max_rotation, robot.max_rotation_acceleration)
-    return [compare("θ̇ at its limit", log[OMEGA][-1], robot.max_rotation, "rad/s", relative=0.1)]
+    return [compare("θ̇ at its limit", log["omega"][-1], robot.max_rotation, "rad/s", relative=0.1)]
 
 
 def motors(model: mujoco.MjModel, robot: Robot) -> Report:

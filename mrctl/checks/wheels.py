@@ -11,7 +11,6 @@ import numpy as np
 from mrctl.checks.comparison import Report, compare
 from mrctl.checks.open_loop import HOLD, OFF, Car, crisp, loss_voltage, perturbed, settling_time
 from mrctl.physics.elements import fronts
-from mrctl.physics.plant import OMEGA, RATE_LEFT, RATE_RIGHT, STEERING, THETA, V_LATERAL, V, X, Y
 from mrctl.theory.kinematics import scrub_free_angle, twist_from_front_wheel, wheel_rates
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import GRAVITY, Robot
@@ -69,11 +68,11 @@ def circle(model: mujoco.MjModel, robot: Robot) -> Report:
         car = Car(model)
         car.drive(settling_time(robot), _electronic_differential(robot, volts, sign * angle))
         log = car.drive(2 * np.pi * radius / v, _electronic_differential(robot, volts, sign * angle))
-        x, y = log[X], log[Y]
+        x, y = log["x"], log["y"]
         # (x − a)² + (y − b)² = R², linear in a, b and R² − a² − b².
         a, b, rest = np.linalg.lstsq(np.stack([2 * x, 2 * y, np.ones_like(x)], 1), x**2 + y**2, rcond=None)[0]
         report.append(compare(f"radius {side}", np.sqrt(rest + a**2 + b**2), radius, "m", relative=5e-3))
-        report.append(compare(f"sense {side}", np.sign(log[OMEGA]).mean(), sign, absolute=0))
+        report.append(compare(f"sense {side}", np.sign(log["omega"]).mean(), sign, absolute=0))
     return report
 
 
@@ -93,14 +92,14 @@ def rolling(model: mujoco.MjModel, robot: Robot) -> Report:
     car.drive(settling_time(robot), _electronic_differential(robot, volts, 0.0))
     log = car.drive(6.0, law)
     front = np.mean([log.qvel[:, model.joint(f).dofadr[0]] for f in fronts(model)], axis=0) * robot.front_wheel_radius
-    twist = twist_from_front_wheel(front, log[STEERING], robot)
+    twist = twist_from_front_wheel(front, log["steering_angle"], robot)
     rates = wheel_rates(twist, robot)
     rows = (
-        ("V", log[V], twist[:, 0], 1.0, "m/s"),
-        ("θ̇", log[OMEGA], twist[:, 1], robot.wheelbase, "rad/s"),
-        ("left wheel rate", log[RATE_LEFT], rates[:, 0], robot.wheel_radius, "rad/s"),
-        ("right wheel rate", log[RATE_RIGHT], rates[:, 1], robot.wheel_radius, "rad/s"),
-        ("sideways speed", log[V_LATERAL], 0.0, 1.0, "m/s"),
+        ("V", log["v"], twist[:, 0], 1.0, "m/s"),
+        ("θ̇", log["omega"], twist[:, 1], robot.wheelbase, "rad/s"),
+        ("left wheel rate", log["wheel_rate_left"], rates[:, 0], robot.wheel_radius, "rad/s"),
+        ("right wheel rate", log["wheel_rate_right"], rates[:, 1], robot.wheel_radius, "rad/s"),
+        ("sideways speed", log["v_lateral"], 0.0, 1.0, "m/s"),
     )
     speed = robot.velocity_gain * (volts - loss_voltage(robot))
     return [
@@ -129,8 +128,8 @@ def spinning_wheels(model: mujoco.MjModel, robot: Robot, friction: float, x: flo
     car = Car(crisp(model, robot, robot.velocity_time_constant), pose=(x, 0, 0))
     log = car.drive(seconds, (robot.supply, robot.supply, 0, 0), min(HOLD, seconds / 40))
     steady = log.time > seconds / 4  # the wheels have reached their speed
-    acceleration = np.polyfit(log.time[steady], log[V][steady], 1)[0]
-    slip = ((log[RATE_LEFT] + log[RATE_RIGHT]) / 2 * robot.wheel_radius - log[V])[steady].min()
+    acceleration = np.polyfit(log.time[steady], log["v"][steady], 1)[0]
+    slip = ((log["wheel_rate_left"] + log["wheel_rate_right"]) / 2 * robot.wheel_radius - log["v"])[steady].min()
     return [
         compare("acceleration while wheels spin", acceleration, expected, "m/s²", relative=2e-2),
         compare("the wheels spin (1: yes)", float(slip > 0.1 * robot.max_speed), 1.0),
@@ -165,14 +164,14 @@ def cornering(model: mujoco.MjModel, robot: Robot) -> Report:
         car = Car(slippery, twist=(v, v / radius))
         logs.append(car.drive(1.5, _electronic_differential(robot, volts, angle)))
     slow, fast = logs
-    ahead = np.stack([np.cos(fast[THETA]), np.sin(fast[THETA])], axis=1)
-    centre = fast.reading[:, [X, Y]] + robot.com_offset * ahead
+    ahead = np.stack([np.cos(fast["theta"]), np.sin(fast["theta"])], axis=1)
+    centre = fast.reading["pose"][:, :2] + robot.com_offset * ahead
     k = round(0.1 / fast.time[1])  # second difference over 0.1 s: no vibration
     bend = np.hypot(*(centre[2 * k :] - 2 * centre[k:-k] + centre[: -2 * k]).T) / fast.time[k] ** 2
     return [
-        compare("radius below the limit", slow[V][-1] / slow[OMEGA][-1], radius, "m", relative=5e-3),
+        compare("radius below the limit", slow["v"][-1] / slow["omega"][-1], radius, "m", relative=5e-3),
         compare("largest acceleration above it", bend.max(), limit, "m/s²", relative=3e-2),
-        compare("it slides (1: yes)", float(np.abs(fast[V_LATERAL]).max() > 0.1 * fast[V][0]), 1.0),
+        compare("it slides (1: yes)", float(np.abs(fast["v_lateral"]).max() > 0.1 * fast["v"][0]), 1.0),
     ]
 
 
@@ -188,8 +187,8 @@ def scrub_free(model: mujoco.MjModel, robot: Robot) -> Report:
     common, differential = robot.supply / 3, robot.supply / 12
     car = Car(model)
     log = car.drive(settling_time(robot) + 2.0, (common - differential, common + differential, 0, 0))
-    steady = float(scrub_free_angle(log.reading[-1, [V, OMEGA]], robot))
-    report = [compare("angle in a steady turn", log[STEERING][-1], steady, "rad", absolute=5e-3)]
+    steady = float(scrub_free_angle(log.reading["twist"][-1], robot))
+    report = [compare("angle in a steady turn", log["steering_angle"][-1], steady, "rad", absolute=5e-3)]
 
     def law(t: float) -> tuple[float, ...]:
         swing = differential * np.cos(2.0 * t)
@@ -197,8 +196,8 @@ def scrub_free(model: mujoco.MjModel, robot: Robot) -> Report:
 
     log = car.drive(8.0, law)
     rate = log.qvel[:, model.joint("steering").dofadr[0]]
-    side = robot.wheelbase * log[OMEGA] + log[V_LATERAL]
-    scrub = np.sin(np.arctan2(side, log[V]) - log[STEERING])
-    ideal = robot.trail * (log[OMEGA] + rate) / np.hypot(log[V], side)
-    drift = 7e-3 * np.abs(log[OMEGA]).max()
+    side = robot.wheelbase * log["omega"] + log["v_lateral"]
+    scrub = np.sin(np.arctan2(side, log["v"]) - log["steering_angle"])
+    ideal = robot.trail * (log["omega"] + rate) / np.hypot(log["v"], side)
+    drift = 7e-3 * np.abs(log["omega"]).max()
     return report + [compare("scrub in a changing turn", np.abs(scrub - ideal).max(), 0.0, "rad", absolute=drift)]

@@ -13,7 +13,6 @@ from mrctl.checks.invariants import winding
 from mrctl.checks.open_loop import OFF, Car, holding_force, loss_voltage, open_circuit, perturbed
 from mrctl.checks.wheels import spinning_wheels
 from mrctl.physics.mjcf import clone
-from mrctl.physics.plant import UPRIGHT, V
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import GRAVITY, Robot
 
@@ -26,7 +25,7 @@ def slope(model: mujoco.MjModel, robot: Robot) -> Report:
     expected = (robot.mass * GRAVITY * np.sin(np.radians(10)) - holding_force(robot)) / robot.effective_mass
     log = Car(open_circuit(model)).drive(1.0, OFF)
     moving = log.time > 0.2
-    measured = -np.polyfit(log.time[moving], log[V][moving], 1)[0]
+    measured = -np.polyfit(log.time[moving], log["v"][moving], 1)[0]
     return [compare("acceleration downhill", measured, expected, "m/s²", relative=3e-3)]
 
 
@@ -64,11 +63,11 @@ def rough(model: mujoco.MjModel, robot: Robot) -> Report:
     bump = 0.03
     volts = robot.supply / 3
     log = Car(model, pose=(-4, 0, 0)).drive(8.0, (volts, volts, 0, 0))
-    tilt = np.arccos(log[UPRIGHT].min())
+    tilt = np.arccos(log["upright"].min())
     bound = np.arctan(np.hypot(bump / (robot.wheelbase - robot.trail), bump / (2 * robot.half_track)))
     moving = log.time > 1.0
     v = robot.velocity_gain * (volts - loss_voltage(robot))
     return [
         compare("largest tilt", tilt, bound / 2, "rad", absolute=bound / 2),
-        compare("mean speed", log[V][moving].mean(), v, "m/s", relative=5e-2),
+        compare("mean speed", log["v"][moving].mean(), v, "m/s", relative=5e-2),
     ]

@@ -1,4 +1,4 @@
-"""What the commands of mrctl measure: the paper, the suite, tuning, identification, training, the benchmark.
+"""Experiments behind the commands: the paper, the suite, tuning, identification, training and the benchmark.
 
-Imports the loop, the results and the sweep.
+They import the loop, the results and the sweep, but not MuJoCo.
 """

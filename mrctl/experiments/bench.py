@@ -1,4 +1,4 @@
-"""How fast is the closed loop? Beside the engine alone, and beside what people write today."""
+"""`mrctl bench`: the speed of the closed loop, beside the engine alone and beside a loop as people write it today."""
 
 from __future__ import annotations
 
@@ -60,8 +60,7 @@ def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int
 
     Returns:
         `machine`; `robots`, a row a size on one thread; `threads`, rows on one and on two; `parts`, µs a control
-        period by component for the smallest and the largest size (the last rows are parts of one before); `today`, the
-        dm_control and autograd loop.
+        period by component for the smallest and the largest size; `today`, the dm_control and autograd loop.
     """
     threads = [1, 2] if (os.cpu_count() or 1) > 1 else [1]
     middle = sizes[len(sizes) // 2]

@@ -1,4 +1,4 @@
-"""What the suite drives: named cases, each a list of scenarios that every feedforward runs; and what comes of them."""
+"""The cases of the suite: each is a named list of scenarios that every feedforward drives."""
 
 from __future__ import annotations
 
@@ -17,51 +17,53 @@ from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Lemniscate, Waypoints
 from mrctl.theory.robot import GRAVITY, STEERINGS, Robot
 
-LADDER = ("nominal", "mass +50 %", "supply -20 %", "all")  # of every steering arrangement
+LADDER = ("nominal", "mass +50 %", "supply -20 %", "all")  # plants of every steering arrangement
 STEPS = (
     "mass +50 %", "payload ahead", "payload aside", "left wheel +5 %", "drive friction x3", "resistance +30 %",
     "motor constant -15 %", "supply -20 %", "delay 20 ms", "tyre friction 0.2", "left tyre on ice", "slope 10°", "all",
 )  # fmt: skip
-SHORT, LONG = 12.0, 18.0  # s a lap: the benchmark's, and a slower one to learn on
-LAP_TIMES = (12.0, 16.0, 20.0, 24.0, 30.0)  # s, of random splines: few, so that many run in one batch
+SHORT, LONG = 12.0, 18.0  # s, lap times of the benchmark, and of slower laps to learn on
+LAP_TIMES = (12.0, 16.0, 20.0, 24.0, 30.0)  # s, of random splines; they are few, so that many runs share a batch
 RANDOM_LAPS = 4
-MARGIN = 0.8  # of its limits that a random spline may ask of the robot
-GRIP = 0.3  # tyre friction that it relies on
-
-
-BAND = 1.2  # times the error before a step, within which a robot has recovered
+MARGIN = 0.8  # share of the robot's limits that a random spline may ask for
+GRIP = 0.3  # tyre friction that a random spline relies on
+BAND = 1.2  # ratio to the error before a step, or to the final error, that counts as recovered or converged
 
 
 class Case(NamedTuple):
-    """Runs that belong together."""
+    """Runs that differ in their seeds alone, or the random scenarios."""
 
     name: str
     part: str
     """One of `PARTS`."""
     scenarios: tuple[Scenario, ...]
-    """Without feedforward."""
+    """The runs; the suite sets their feedforward."""
     change: int = 0
-    """The lap in whose beginning something changes, from 1; 0 if nothing does."""
+    """Number, from 1, of the lap at whose beginning something changes; 0 if nothing does."""
     back: int = 0
-    """The lap in whose beginning it changes back."""
+    """Number of the lap at whose beginning it changes back; 0 if it does not."""
 
+
+Choices = Mapping[str, dict[str, Any]]
+"""By name what each run is driven with: a `feedforward` of mrctl or a `controller` of the user."""
 
 Laps = Mapping[str, xr.Dataset]
 """Metrics lap by lap of all runs, `(run, lap)`, by feedforward."""
 
 
 class Outcome(NamedTuple):
-    """What a suite found."""
+    """The results of a suite."""
 
     quick: bool
+    """Whether it was the selection with fewer laps."""
     cases: Sequence[Case]
     laps: Laps
     runs: Mapping[str, Laps]
     """The laps of each case."""
     rows: Sequence[dict[str, Any]]
-    """A case and feedforward each; see `suite.compare`."""
+    """Statistics of each case and feedforward; see `suite.compare`."""
     aside: str
-    """Runs that could not be done, and why, or ""."""
+    """A sentence on the runs that could not be done, or ""."""
 
 
 PARTS = {
@@ -77,9 +79,9 @@ def cases(seeds: int, random: int, quick: bool) -> list[Case]:
     """The cases of the suite, the longest runs first.
 
     Args:
-        seeds: Runs of each case, the same seeds in all.
-        random: Random scenarios.
-        quick: A selection with fewer laps.
+        seeds: Number of runs of each case; all cases have the same seeds.
+        random: Number of random scenarios.
+        quick: Whether to take a selection of the cases with fewer laps.
     """
     laps, third = (4, 2) if quick else (8, 4)
     base = Scenario(laps=laps)
@@ -121,7 +123,7 @@ def cases(seeds: int, random: int, quick: bool) -> list[Case]:
 
 
 def random_scenarios(count: int) -> list[Scenario]:
-    """The first of an endless list of random scenarios, each a pure function of its place."""
+    """The first `count` random scenarios, the shortest runs first; each is a pure function of its seed."""
     robot = read_robot(mjcf.load())
     return sorted((random_scenario(seed, robot) for seed in range(count)), key=lambda s: s.ticks)
 
@@ -130,8 +132,8 @@ def random_scenario(seed: int, robot: Robot) -> Scenario:
     """A random robot on a random closed spline with a random perturbation, from the start or as a step.
 
     Args:
-        seed: Of everything, the scenario's own seed too.
-        robot: The nominal one, for its limits.
+        seed: Seed of every draw; the scenario has it too.
+        robot: The nominal robot, whose limits the spline keeps.
     """
     random = np.random.default_rng([seed, 3])
     body = {
@@ -149,7 +151,7 @@ def random_scenario(seed: int, robot: Robot) -> Scenario:
     )  # fmt: skip
 
 
-# A payload of 6 kg at these places tips no robot of half the mass.
+# A payload of 6 kg at these places does not tip a robot of half the mass.
 _KINDS = {
     "payload": lambda r: {
         "payload": r.uniform(0, 6), "payload_x": r.uniform(-0.1, 0.3), "payload_y": r.uniform(-0.12, 0.12)
@@ -165,18 +167,18 @@ _KINDS = {
 
 
 def _spline(random: np.random.Generator, robot: Robot) -> Waypoints:
-    """A closed loop around the origin, driven as fast as leaves a margin to the robot's limits, or a step slower."""
+    """A closed spline around the origin, driven at the shortest lap time that keeps the margins, or at the next."""
     while True:
         count = int(random.integers(4, 9))
         angles = 2 * np.pi * (np.arange(count) + random.uniform(-0.25, 0.25, count)) / count
         radii = random.uniform(0.9, 2.0, count)
         points = [*zip(*(np.round(radii * f(angles), 3).tolist() for f in (np.cos, np.sin)), strict=True)]
         slower = int(random.integers(2))
-        if random.random() < 0.5:  # the other way round
+        if random.random() < 0.5:  # clockwise
             points.reverse()
         try:
             loop = Waypoints.from_dict({"points": points})
-        except InputError:  # it turns on the spot
+        except InputError:  # the spline turns on the spot
             continue
         length = loop.period * loop.speed
         times = [time for time in LAP_TIMES if length / time <= _fastest(loop, robot)]
@@ -185,7 +187,7 @@ def _spline(random: np.random.Generator, robot: Robot) -> Waypoints:
 
 
 def _fastest(loop: Waypoints, robot: Robot) -> float:
-    """The highest speed in m/s that leaves a margin; θ̇ and the lateral acceleration grow with it and its square."""
+    """The highest speed along a spline that keeps the margins, m/s: θ̇ grows with it, θ̈ and the grip with its square."""
     _, twist, acceleration = loop.sample(np.linspace(0, loop.period, 2001))
     curvature = float(np.abs(twist[:, 1]).max()) / loop.speed
     sharpness = float(np.abs(acceleration[:, 1]).max()) / loop.speed**2

@@ -1,32 +1,28 @@
 """`mrctl identify`: the constants of equation (3) from two drives, from voltages, currents and the measured twist.
 
-Robots drive open loop under periodic multisines, always forwards, so that Coulomb friction is constant: first straight
-on, then in turns with the front wheel held straight and without grip, as on a sheet of ice, because a front wheel that
-steers or trails carries a part of what equation (3) gives to the motors. Least squares follow, on signals averaged over
-periods and low-pass filtered by keeping their lowest harmonics:
+Robots drive open loop under periodic multisines, always forwards, so that Coulomb friction is constant. They drive
+straight on first, then in turns with the front wheel held straight and without grip, as on a sheet of ice, because a
+front wheel that steers or trails makes a part of the torque that equation (3) attributes to the motors. The constants
+are fitted by least squares to signals averaged over periods and low-pass filtered to their lowest harmonics:
 
     motors, straight on      ω = U/(N k) − i R_a/(N k),    ω = V/r
     straight on              V̇ = [ (N k/r) (i_d + i_s) − F_c ] / M_e
     turning                  θ̈ = [ (N k D/r) (i_d − i_s) − m c V θ̇ ] / J_e + constant
 
-with F_c = 2 τ_loss/r + F_roll. The currents give torques, so masses come out in kg; without current sensors only
-ratios such as M_e/(N k) would. V̇ is the difference of two samples over a tick, thus its mean in between, as is the
-current beside it. What is noisy stands alone on the left, where noise does not bias.
+with F_c = 2 τ_loss/r + F_roll. The currents give torques, so masses are identified in kg; without current sensors only
+ratios such as M_e/(N k) are. V̇ is the difference of two samples over a tick and thus its mean in between, as is the
+current beside it. The noisy signal stands alone on the left, where noise does not bias the estimate.
 
 Each robot drives its own signal and gives one estimate. The interval around their mean is that of Student's t for noise
-and signals, and in quadrature 1.5 % for what equation (3) leaves out and no repetition shows: tyres that creep and sink
-in, the engine's time step.
+and signals, and in quadrature 1.5 % for effects that equation (3) leaves out and repetition does not show: creep and
+sinkage of the tyres, and the engine's time step.
 """
-
-# pyright: reportAttributeAccessIssue=false
-# (mujoco is compiled and ships no stubs)
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
@@ -35,7 +31,7 @@ from mrctl.checks.open_loop import on_skid
 from mrctl.experiments.tables import json_text, machine, markdown
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.plant import build
+from mrctl.physics.plant import Plant, build
 from mrctl.record import InputError
 from mrctl.results.dataset import versions
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -44,18 +40,19 @@ from mrctl.theory.robot import CAR, Robot, RobotFile
 Array = NDArray[np.float64]
 
 PERIOD = 10.0  # s of the excitation
-PERIODS = 2  # that are averaged, after one to settle
-REPEATS = 8  # robots, each under its own signal
-TICK = 0.005  # s
-FINE = 100  # physics steps in a time constant: the engine, of first order, adds half a step of braking to the mass
-MODEL = 0.015  # share of a constant that what equation (3) leaves out may cost
+PERIODS = 2  # periods that are averaged, after one in which the robot settles
+REPEATS = 8  # number of robots, each under its own signal
+TICK = 0.005  # s, for which a voltage is held
+FINE = 100  # physics steps in a time constant; the first-order engine adds the damping over half a step to the mass
+MODEL = 0.015  # relative error that effects outside equation (3) may cause
 NOISE = PERTURBATIONS["sensor noise"]
-APART = """c takes m from a scale. Not identifiable from such drives: m, J_w and J_m (only in M_e and J_e); I_0, gear
-and rolling loss (only in F_c); N and k_M (only N k; k_E is taken to be k_M, as it is in SI)."""
+NOT_IDENTIFIABLE = """\
+For c, the mass m is taken from a scale. These drives do not identify m, J_w and J_m, which enter only M_e and J_e;
+I_0, gear loss and rolling loss, which enter only F_c; N and k_M, which enter only N k (k_E equals k_M in SI units)."""
 
 
 class Constant(NamedTuple):
-    """An identified constant: estimate, 95 % interval, and what the plant's model says."""
+    """An identified constant: its estimate, 95 % interval and true value."""
 
     name: str
     unit: str
@@ -71,32 +68,32 @@ class Constant(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """One period of one robot, averaged over periods: in the mean of each tick or at its end, `(N, 2)`.
+    """Measured signals of one robot over one period, averaged over periods; each is `(N, 2)`, a row for each tick.
 
-    Left comes before right, V before θ̇.
+    The columns are left and right, or V and θ̇. A signal is the mean over a tick or the value at its end.
     """
 
     twist: Array
-    """V in m/s and θ̇ in rad/s in the mean."""
+    """Mean V in m/s and θ̇ in rad/s."""
     rate: Array
-    """Their derivatives in the mean, in m/s² and rad/s²."""
+    """Mean V̇ in m/s² and θ̈ in rad/s²."""
     end: Array
-    """V and θ̇ at the end."""
+    """V in m/s and θ̇ in rad/s at the end of the tick."""
     voltage: Array
-    """At the terminals in V, constant in a tick."""
+    """Voltage at the terminals in V, constant within a tick."""
     current: Array
-    """At the end, in A."""
+    """Current at the end of the tick in A."""
 
 
 def run(world: str, robot: RobotFile, perturbation: Perturbation, seed: int, json: bool) -> str:
     """The command: drives, identifies, and prints a table or JSON.
 
     Args:
-        world: Where to drive; level ground.
-        robot: Whose constants.
-        perturbation: How it differs from its model, and the noise of its sensors.
-        seed: Of signals and noise.
-        json: JSON instead of a table.
+        world: World to drive in; its ground must be level.
+        robot: Robot whose constants are identified.
+        perturbation: How the plant differs from its model, and the noise of its sensors.
+        seed: Seed of signals and noise.
+        json: Whether to return JSON instead of a table.
 
     Raises:
         InputError: The robot cannot drive there.
@@ -117,31 +114,33 @@ def text(constants: Sequence[Constant]) -> str:
         [c.name, c.unit, estimate, f"{low} to {high}", true, f"{100 * c.error:+.2f} %"]
         for c, (estimate, low, high, true) in zip(constants, numbers, strict=True)
     ]
-    return f"{markdown(header, cells)}\n\n{APART}"
+    return f"{markdown(header, cells)}\n\n{NOT_IDENTIFIABLE}"
 
 
 def identify(
     world: str = "flat", robot: RobotFile = CAR, perturbation: Perturbation = NOISE, seed: int = 0
 ) -> list[Constant]:
-    """Identifies the constants of equation (3) that show.
+    """Identifies those constants of equation (3) that the drives show.
 
     Args:
-        world: World to drive in; level ground.
-        robot: Whose constants.
+        world: World to drive in; its ground must be level.
+        robot: Robot whose constants are identified.
         perturbation: How the plant differs from its model, and the noise of its sensors.
-        seed: Of signals and noise.
+        seed: Seed of signals and noise.
 
     Raises:
-        InputError: The robot fails on the way.
+        InputError: The robot fails during a drive.
     """
     own = mjcf.arrangement(robot)
-    model = mjcf.load(world, "rigid" if own == "compliant" else own, robot=robot)
-    nominal = read_robot(model)
+    steering = "rigid" if own == "compliant" else own
+    nominal = read_robot(mjcf.load(world, steering, robot=robot))
     tau = min(nominal.velocity_time_constant, nominal.rotation_time_constant)
-    model.opt.timestep = TICK / max(5, int(np.ceil(FINE * TICK / tau)))
+    substeps = max(5, int(np.ceil(FINE * TICK / tau)))
+    model = mjcf.load(world, steering, TICK / substeps, robot)
+    plants = [build(one, nominal, REPEATS, substeps, threads=1) for one in (model, on_skid(model))]
     random = np.random.default_rng([seed, 3])
-    ahead, true = excite(model, nominal, perturbation, random, turns=False)
-    turning, _ = excite(on_skid(model), nominal, perturbation, random, turns=True)
+    ahead, true = excite(plants[0], nominal, perturbation, random, turns=False)
+    turning, _ = excite(plants[1], nominal, perturbation, random, turns=True)
     highest = round(2 * _bandwidth(nominal) * PERIOD)
     rows = []
     for straight, turn in zip(ahead, turning, strict=True):
@@ -179,7 +178,7 @@ def _bandwidth(robot: Robot) -> float:
 
 
 def signals(robot: Robot, random: np.random.Generator, turns: bool) -> Array:
-    """One period of U_Σ and U_Δ in V, `(N, 2)`: random phases, amplitudes that the robot's limits allow.
+    """One period of U_Σ and U_Δ in V, `(N, 2)`, with random phases and the largest amplitudes that the limits allow.
 
     The common channel has the even harmonics, the differential one the odd ones. Predicted from the nominal robot, V
     stays within half of its mean, which is half of the limit, and θ̇ within half of its limit and of what keeps both
@@ -206,12 +205,11 @@ def signals(robot: Robot, random: np.random.Generator, turns: bool) -> Array:
 
 
 def excite(
-    model: mujoco.MjModel, robot: Robot, perturbation: Perturbation, random: np.random.Generator, turns: bool
+    plant: Plant, robot: Robot, perturbation: Perturbation, random: np.random.Generator, turns: bool
 ) -> tuple[list[Drive], Robot]:
-    """Drives robots open loop; returns what was measured of each, and the robot as it truly is."""
+    """Drives `REPEATS` robots open loop; returns the measured signals of each, and the true parameters."""
     period = np.stack([signals(robot, random, turns) for _ in range(REPEATS)], axis=1)  # (N, B, 2)
     samples = len(period)
-    plant = build(model, robot, REPEATS, round(TICK / model.opt.timestep), threads=1)
     for row in range(REPEATS):
         plant.perturb(row, perturbation, round(perturbation.control_delay / TICK))
     plant.reset(np.zeros((REPEATS, 3)), np.tile([robot.max_speed / 2, 0.0], (REPEATS, 1)))
@@ -226,7 +224,7 @@ def excite(
         voltage[k], current[k] = plant.applied, plant.current()
     twist[ticks] = plant.reading["twist"]
     if plant.failed.any():
-        raise InputError(f"identify: {next(filter(None, plant.failure))} on the way")
+        raise InputError(f"identify: a robot failed during the drive: {next(filter(None, plant.failure))}")
     twist += random.standard_normal(twist.shape) * [perturbation.velocity_noise, perturbation.rotation_noise]
 
     def mean(values: Array) -> Array:
@@ -241,9 +239,9 @@ def drive_constants(drive: Drive, wheel_radius: float, highest: int) -> dict[str
     """R_a, N k, M_e and F_c from a drive straight on.
 
     Args:
-        drive: What was measured.
-        wheel_radius: Of the driven wheels in m.
-        highest: Harmonics above it are filtered out.
+        drive: Measured signals.
+        wheel_radius: Radius of the driven wheels in m.
+        highest: Highest harmonic that the low-pass filter keeps.
     """
     rate = np.repeat(drive.end[:, :1] / wheel_radius, 2, axis=1)  # of both wheels: their motors are alike
     speed_per_volt, fall = _fit(highest, rate.T, drive.voltage.T, -drive.current.T)
@@ -258,11 +256,11 @@ def turn_constants(drive: Drive, resistance: float, constant: float, robot: Robo
     """J_e and m c from a drive in turns.
 
     Args:
-        drive: What was measured.
+        drive: Measured signals.
         resistance: R_a in Ω.
         constant: N k in N·m/A.
-        robot: Of it wheel radius and half track are used, which a ruler measures.
-        highest: Harmonics above it are filtered out.
+        robot: Robot whose wheel radius and half track are used, which a ruler measures.
+        highest: Highest harmonic that the low-pass filter keeps.
     """
     current = _mean_current(drive, resistance)
     torque = constant * robot.half_track / robot.wheel_radius * (current[:, 1] - current[:, 0])
@@ -272,13 +270,13 @@ def turn_constants(drive: Drive, resistance: float, constant: float, robot: Robo
 
 
 def _mean_current(drive: Drive, resistance: float) -> Array:
-    """Mean currents of the ticks: at its beginning the current jumps with the voltage, then it bends to its end."""
+    """Mean current of each tick: at its beginning the current jumps with the voltage, then it runs on to its end."""
     jump = (drive.voltage - np.roll(drive.voltage, 1, axis=0)) / resistance
     return (np.roll(drive.current, 1, axis=0) + jump + drive.current) / 2
 
 
 def _fit(highest: int, left: Array, *right: Array) -> Array:
-    """Coefficients of least squares, of signals over whole periods `(…, N)` of which the lowest harmonics are kept."""
+    """Least-squares coefficients of signals `(…, N)` over whole periods, low-pass filtered to the lowest harmonics."""
 
     def low(signal: Array) -> Array:
         spectrum = np.fft.rfft(signal)

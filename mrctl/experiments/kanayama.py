@@ -1,4 +1,4 @@
-"""Kanayama's table: his motion controller on the kinematic plant, held against targets.
+"""Kanayama's table: his motion controller on the kinematic plant, compared with target values.
 
 The plant is equation (2) with ideal velocity tracking, integrated at 0.1 ms with a second-order step. The reference
 runs along the x axis at v_r = 0.30 m/s, the robot starts beside it with v(0) = v_r. Gains and limits are those of
@@ -89,14 +89,14 @@ def control(
 
 
 def paths(cases: list[Case], period: float = STEP) -> NDArray[np.float64]:
-    """Postures along every case.
+    """Postures over time in every case.
 
     Args:
-        cases: The cases, B of them.
+        cases: The B cases.
         period: Control period in s, a multiple of `STEP`.
 
     Returns:
-        `(steps, B, 3)` in m, m, rad, a row each `STEP`.
+        Postures `(steps, B, 3)` in m, m, rad, `STEP` apart in time.
     """
     size, hold = len(cases), round(period / STEP)
     pose = np.array([[0.0, case.offset, case.turn] for case in cases])
@@ -120,7 +120,7 @@ def paths(cases: list[Case], period: float = STEP) -> NDArray[np.float64]:
 
 
 def measure(case: Case, path: NDArray[np.float64]) -> float:
-    """The number of one case, in its unit, from its path `(steps, 3)`."""
+    """The value of one case in its unit, from its postures `(steps, 3)` in m, m, rad."""
     x, y = path[:, 0], path[:, 1]
     if case.measure == "residual":
         k = int(np.argmax(x >= DISTANCE))

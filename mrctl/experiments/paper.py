@@ -19,15 +19,14 @@ from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.theory.perturbation import PERTURBATIONS
 from mrctl.theory.references import Lemniscate
 
-# What the figures show: PID alone, and PID with the network, on a robot that nobody modelled.
-CASE = "all"
+CASE = "all"  # the plant of the figures, which differs from the model in everything
 FAST, SLOW = 12.0, 20.0  # s a lap
-LONG = 60  # laps, for stability of learning
+LONG = 60  # laps that show whether learning stays stable
 METRICS = ("v_rmse", "omega_rmse", "position_rmse")
 
 
 def scenario(feedforward: FeedforwardName, case: str, period: float = FAST, **changes: Any) -> Scenario:  # noqa: ANN401
-    """The benchmark: the lemniscate at a lap time, on the plant of a named case."""
+    """A run of the benchmark: the lemniscate at a lap time, on the plant of a named perturbation."""
     name = f"{feedforward}, {case}, {period:g} s"
     return Scenario(
         name=name,
@@ -39,7 +38,7 @@ def scenario(feedforward: FeedforwardName, case: str, period: float = FAST, **ch
 
 
 def benchmark() -> list[Scenario]:
-    """The runs of eight laps: the whole ladder, fast and slow, and the other steering arrangements."""
+    """The runs of eight laps: every feedforward, fast and slow, and under the other steering arrangements."""
     compliant = [
         scenario(f, case, period) for period in (FAST, SLOW) for case in ("nominal", CASE) for f in FEEDFORWARDS
     ]
@@ -59,7 +58,7 @@ def reproduce(out: Path) -> str:
         out: Folder to write to.
 
     Returns:
-        What was found, as Markdown.
+        The results as Markdown.
 
     Raises:
         InputError: The folder cannot be written.
@@ -114,7 +113,7 @@ def figures(result: xr.Dataset, scenarios: Sequence[Scenario], out: Path) -> Non
 
 
 def compare(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
-    """Last-lap RMSE of every run, with its ratio to PID alone on the same plant, reference and seed."""
+    """RMSE in the last lap of every run, and its ratio to PID alone on the same plant, reference and seed."""
     table = metrics.summary(result)
     rows = []
     for k, one in enumerate(scenarios):
@@ -139,7 +138,7 @@ def _bare(one: Scenario) -> str:
 
 
 def endure(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
-    """RMSE of lap 8 and of the last lap: does learning stay stable?"""
+    """RMSE in lap 8 and in the last lap of the long runs, which agree if learning stays stable."""
     laps = metrics.per_lap(result)
     rows = []
     for k, one in enumerate(scenarios):
@@ -152,7 +151,7 @@ def endure(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str, 
 
 
 def endurance_text(rows: Sequence[dict[str, Any]]) -> str:
-    """The endurance runs as Markdown."""
+    """The long runs as Markdown."""
     header = ["run", *(f"{name}, lap 8 → {LONG}" for name in ("V, mm/s", "θ̇, mrad/s", "position, mm"))]
     cells = [
         [r["run"], *(" → ".join(number(1e3 * r[m][lap]) for lap in ("lap_8", "last")) for m in METRICS)] for r in rows

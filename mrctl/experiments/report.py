@@ -1,22 +1,24 @@
-"""The suite's figures, and its report: one HTML page with everything in it, read without a server."""
+"""The figures of the suite and its report, an HTML page that holds its figures and needs no server."""
 
 from __future__ import annotations
 
 import base64
-import html
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import xarray as xr
+from jinja2 import Environment, StrictUndefined
+from pandas.io.formats.style import Styler
 
 from mrctl.control.feedforward import InverseDynamics
 from mrctl.control.pid import PIDS
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
-from mrctl.experiments.cases import BAND, Outcome
+from mrctl.experiments.cases import BAND, Choices, Outcome
 from mrctl.experiments.tables import number
 from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation
@@ -26,46 +28,33 @@ from mrctl.results.dataset import versions
 from mrctl.results.plots import InverseMap
 from mrctl.scenario import Scenario
 
-KNOWING = ("none", "model", "oracle")  # feedforwards that do not learn
-GRID = 41  # points a side of a heat map
-STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #222; background: #fff; max-width: 1250px; margin: 2em auto;
-  padding: 0 1.5em; }
-h1 { font-size: 1.7em; margin-bottom: 0; } h2 { font-size: 1.2em; margin-top: 2em; }
-p { max-width: 75ch; } figure { margin: 1em 0 2em; } figure img { max-width: 100%; } figcaption { color: #555; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; }
-th, td { padding: 3px 9px; text-align: right; white-space: nowrap; border-bottom: 1px solid #e4e4e4; }
-th { text-align: right; position: sticky; top: 0; background: #fff; border-bottom: 1px solid #999; }
-th:first-child, td:first-child { text-align: left; } .text td:nth-child(2), .text th:nth-child(2) { text-align: left; }
-tr.new td { border-top: 1px solid #999; } td.best { font-weight: 700; }
-summary { cursor: pointer; font-weight: 600; margin: 1em 0; } 
-pre { background: #f5f5f5; padding: 1em; overflow-x: auto; }
-"""
+STATIC = ("none", "model", "oracle")  # feedforwards that do not learn
+GRID = 41  # points along each side of a heat map
+TEMPLATE = Path(__file__).with_name("report.html")
 
 
-def write(outcome: Outcome, who: Mapping[str, dict[str, Any]], tables: Mapping[str, str], out: Path) -> None:
+def write(outcome: Outcome, choices: Choices, tables: Mapping[str, pd.DataFrame], out: Path) -> None:
     """Writes the figures, as PNG and PDF, and `report.html`.
 
     Args:
-        outcome: What the suite found.
-        who: The feedforwards, by name.
-        tables: Markdown, by title.
-        out: Folder.
+        outcome: Results of the suite.
+        choices: The feedforwards, by name.
+        tables: The tables of all numbers, by title.
+        out: Folder to write to.
 
     Raises:
         InputError: The folder cannot be written.
     """
-    drawn = figures(outcome, who)
+    drawn = figures(outcome, choices)
     images = {}
     for name, (figure, caption) in drawn.items():
         png, _ = plots.save(figure, out / "figures", name)
         images[name] = (base64.b64encode(png.read_bytes()).decode(), caption)
-    (out / "report.html").write_text(page(outcome, who, tables, images))
+    (out / "report.html").write_text(page(outcome, choices, tables, images))
 
 
-def figures(outcome: Outcome, who: Mapping[str, dict[str, Any]]) -> dict[str, tuple[Any, str]]:
-    """The figures with their captions, by file name."""
+def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
+    """The figures and their captions, by file name."""
     runs = {case.name: case for case in outcome.cases}
     found = outcome.runs
     drawn: dict[str, tuple[Any, str]] = {}
@@ -98,28 +87,28 @@ def figures(outcome: Outcome, who: Mapping[str, dict[str, Any]]) -> dict[str, tu
         ratios = {name: end / ends["none"] for name, end in ends.items()}
         drawn["random"] = (
             plots.distributions(ratios, "position error over that of PID, same run"),
-            "Random scenarios: the share of runs in which the error is below so many times that of PID alone. What "
-            "does not reach 1 has failed.",
+            "Random scenarios: the share of runs whose error is below a multiple of that of PID alone. A curve that "
+            "does not reach 1 belongs to a feedforward with failed runs.",
         )
-    learners = [name for name in who if name not in KNOWING]
+    learners = [name for name in choices if name not in STATIC]
     if learners:
         drawn["inverse_dynamics"] = (
-            plots.inverse_dynamics({name: learned(who[name], runs["all"].scenarios[0]) for name in learners}),
-            "What was learned with everything wrong at once, against the true inverse dynamics, in steady motion: the "
-            "voltage that the motors share and the one in which they differ, over V and θ̇. The line is where the robot "
-            "drove.",
+            plots.inverse_dynamics({name: learned(choices[name], runs["all"].scenarios[0]) for name in learners}),
+            "What each feedforward learned with everything wrong at once, beside the true inverse dynamics, in steady "
+            "motion: the voltage that the motors share and the one in which they differ, over V and θ̇. The line shows "
+            "where the robot drove.",
         )
     return drawn
 
 
 def _labelled(runs: Mapping[str, xr.Dataset]) -> xr.Dataset:
-    """The runs of one case with their feedforwards as labels."""
+    """The runs of one case in one dataset, labelled with their feedforwards."""
     own = [one.assign_coords(label=("run", [name] * one.sizes["run"])) for name, one in runs.items()]
     return xr.concat([one.drop_vars("scenario", errors="ignore") for one in own], "run")
 
 
 def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
-    """Drives a scenario once more and asks the feedforward what it makes of steady motion."""
+    """Drives a scenario again and evaluates the feedforward in steady motion, beside the true inverse dynamics."""
     stages: Stages = user_files.load(choice["controller"]) if "controller" in choice else {}
     scenario = scenario.model_copy(update={"feedforward": choice.get("feedforward", "none")})
     simulation = Simulation([scenario], **stages)
@@ -138,78 +127,45 @@ def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
 
 def page(
     outcome: Outcome,
-    who: Mapping[str, dict[str, Any]],
-    tables: Mapping[str, str],
+    choices: Choices,
+    tables: Mapping[str, pd.DataFrame],
     images: Mapping[str, tuple[str, str]],
 ) -> str:
-    """The report."""
-    count = sum(len(case.scenarios) for case in outcome.cases)
-    names = ", ".join(who)
+    """The report as HTML.
+
+    Args:
+        outcome: Results of the suite.
+        choices: The feedforwards, by name.
+        tables: The tables of all numbers, by title.
+        images: Each figure as base64 of a PNG, and its caption, by file name.
+    """
     fixed = [case for case in outcome.cases if case.part != "random"]
     random = sum(len(case.scenarios) for case in outcome.cases if case.part == "random")
-    body = [
-        "<h1>Uncertainty suite</h1>",
-        f"<p>{count * len(who):,} runs of a car-like robot in MuJoCo: {len(fixed)} cases with "
-        f"{len(fixed[0].scenarios)} seeds each and {random} random scenarios, under each of {len(who)} feedforwards "
-        f"({html.escape(names)}). The PID beside them is the same for all of them. Every feedforward drives the same "
-        "runs, with the same seeds, so that each is compared with the others run by run.</p>",
-        f"<p><strong>{html.escape(outcome.aside)}</strong></p>" if outcome.aside else "",
-        "<h2>Position error of the last lap, mm</h2>",
-        "<p>Mean over the seeds of a case; bold is the best but <code>oracle</code>, which knows the plant. Colour: "
-        "green is less than PID alone, red is more. “3 failed” counts runs that diverged; the mean is of the "
-        "others.</p>",
-        f"<div class=wide>{scorecard(outcome)}</div>",
-    ]
-    body += [
-        "<h2>A step, and the return</h2>",
-        "<p>Mean position error in the last lap before the return, mm; geometric mean of the error one lap after "
-        f"the change over that before it; the same after the return. Bold: every run was back within {BAND:g} times "
-        "its error before, to stay, one lap after the change. The better the error before, the harder that is.</p>",
-        f"<div class=wide>{recoveries(outcome)}</div>",
-    ]
-    for data, caption in images.values():
-        image = f'<img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
-        body.append(f"<figure>{image}<figcaption>{html.escape(caption)}</figcaption></figure>")
-    if any(case.part == "random" for case in outcome.cases):
-        body += [
-            "<h2>Who beats whom in the random scenarios</h2>",
-            "<p>Probability that the row has the smaller position error in the same run, with its 95 % interval; ties "
-            "count half, and a run that fails loses. Last columns: the random runs that failed, and those of them in "
-            "which PID alone did not.</p>",
-            f"<div class=wide>{duels(outcome)}</div>",
-        ]
-    body += [
-        "<h2>All numbers</h2>",
-        "<p>RMSE of the last lap against the original reference: mean [95 % bootstrap interval] over the runs that "
-        "finished; after the semicolon the mean of the worst 5 % of all runs (CVaR; the worst one where there are no "
-        "more than 20), which is infinite where one failed. “beats”: probability of the smaller error in the same run, "
-        "with the 95 % interval of the last one. Recovery: geometric mean of the error of a lap over that of the lap "
-        "before the change, run by run; recovered is back to stay within 1.2 times, from the second lap on at the "
-        "latest, in V / θ̇ / position; settled is the last lap before the return.</p>",
-    ]
-    for title, text in tables.items():
-        body.append(f"<details><summary>{html.escape(title)}</summary><div class=wide>{_table(text)}</div></details>")
-    what = "\n".join(f"{name} {version}" for name, version in versions().items())
-    pids = [tuning.statement(tuning.design("flat", pid, (0.0,))) for pid in PIDS.values()]
-    body += [
-        "<h2>How it was made</h2>",
-        f"<pre>{html.escape(command(outcome, who))}</pre>",
-        f"<pre>{html.escape(what)}</pre>",
-        f"<p>{html.escape(pids[0])}.</p><p>The one twice as fast: {html.escape(pids[1])}.</p>",
-        "<p>Each run is stored under <code>runs/</code>; <code>mrctl run runs/NAME --run K</code> drives it again and "
-        "compares it bit for bit. <code>table.json</code> holds every number, lap by lap.</p>",
-    ]
-    return (
-        f"<!doctype html>\n<html lang=en><head><meta charset=utf-8><title>mrctl suite</title>\n<style>{STYLE}</style>"
-        f"</head>\n<body>\n{chr(10).join(filter(None, body))}\n</body></html>\n"
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return environment.from_string(TEMPLATE.read_text()).render(
+        runs=sum(len(case.scenarios) for case in outcome.cases) * len(choices),
+        cases=len(fixed),
+        seeds=len(fixed[0].scenarios),
+        random=random,
+        feedforwards=list(choices),
+        aside=outcome.aside,
+        band=f"{BAND:g}",
+        scorecard=scorecard(outcome),
+        recoveries=recoveries(outcome),
+        duels=duels(outcome) if random else "",
+        figures=[{"data": data, "caption": caption} for data, caption in images.values()],
+        tables={title: _plain(table) for title, table in tables.items()},
+        command=command(outcome, choices),
+        versions=versions(),
+        pids=[tuning.statement(tuning.design("flat", pid, (0.0,))) for pid in PIDS.values()],
     )
 
 
-def command(outcome: Outcome, who: Mapping[str, dict[str, Any]]) -> str:
-    """The command that does all of it again."""
+def command(outcome: Outcome, choices: Choices) -> str:
+    """The command that repeats the suite."""
     words = ["mrctl", "suite", *(["--quick"] if outcome.quick else [])]
-    words += ["--feedforward", *(name for name, one in who.items() if "feedforward" in one)]
-    own = [one["controller"] for one in who.values() if "controller" in one]
+    words += ["--feedforward", *(name for name, one in choices.items() if "feedforward" in one)]
+    own = [one["controller"] for one in choices.values() if "controller" in one]
     words += ["--controller", *own] if own else []
     words += ["--seeds", str(len(outcome.cases[0].scenarios))]
     words += ["--random", str(sum(len(case.scenarios) for case in outcome.cases if case.part == "random"))]
@@ -218,35 +174,79 @@ def command(outcome: Outcome, who: Mapping[str, dict[str, Any]]) -> str:
 
 def scorecard(outcome: Outcome) -> str:
     """The position error of every case under every feedforward, coloured by its ratio to that of PID alone."""
-    table: dict[str, dict[str, str]] = {}
+    cells: dict[str, dict[str, Cell]] = {}
     for case, rows in _by_case(outcome, steps=False).items():
         best = min((_mean(row) for row in rows if row["feedforward"] != "oracle"), default=np.inf)
         for row in rows:
             error = row["position_rmse"]
             text = number(1e3 * error["value"]) if error["samples"] else ""
             lost = f"{row['failed']} failed" if row["failed"] else ""
-            look = " class=best" if _mean(row) <= best < np.inf and row["feedforward"] != "oracle" else ""
-            hint = f"{row['runs']} runs; worst 5 %: {number(1e3 * error['worst'])} mm"
-            shade = _shade(error.get("to_PID", {"value": 1.0})["value"])
-            cell = f'<td{look} style="background:{shade}" title="{hint}">{", ".join(filter(None, (text, lost)))}</td>'
-            table.setdefault(case, {})[row["feedforward"]] = cell
-    return _grid(table, outcome.laps)
+            bold = _mean(row) <= best < np.inf and row["feedforward"] != "oracle"
+            ratio = error.get("to_PID", {"value": 1.0})["value"]
+            cells.setdefault(case, {})[row["feedforward"]] = Cell(", ".join(filter(None, (text, lost))), ratio, bold)
+    return _coloured("scorecard", cells)
 
 
 def recoveries(outcome: Outcome) -> str:
-    """Position error at the end of a step, one lap after it and after the return over the error before."""
-    table: dict[str, dict[str, str]] = {}
+    """Position error at the end of a step, and one lap after change and return over that before the change."""
+    cells: dict[str, dict[str, Cell]] = {}
     for case, rows in _by_case(outcome, steps=True).items():
         for row in rows:
             error = row["position_rmse"]
             after, back = (error[name]["value"] for name in ("after_one_lap", "return_after_one_lap"))
             mean = f"{number(1e3 * error['during']['value'])}: " if error["during"]["samples"] else ""
             lost = f", {row['failed']} failed" if row["failed"] else ""
-            look = " class=best" if error["recovered_within_one_lap"] == 1 else ""
-            cell = f"{mean}{number(after)}×, {number(back)}×{lost}"
-            cell = f'<td{look} style="background:{_shade(after / BAND)}">{cell}</td>'
-            table.setdefault(case, {})[row["feedforward"]] = cell
-    return _grid(table, outcome.laps)
+            text = f"{mean}{number(after)}×, {number(back)}×{lost}"
+            bold = error["recovered_within_one_lap"] == 1
+            cells.setdefault(case, {})[row["feedforward"]] = Cell(text, after / BAND, bold)
+    return _coloured("recoveries", cells)
+
+
+def duels(outcome: Outcome) -> str:
+    """Probabilities that one feedforward beats another in the random scenarios."""
+    errors = {n: metrics.summary(own)["position_rmse"].to_numpy() for n, own in outcome.runs["random"].items()}
+    rows = {row["feedforward"]: row for row in outcome.rows if row["part"] == "random"}
+    cells: dict[str, dict[str, Cell]] = {}
+    for name, own in errors.items():
+        cells[name] = {}
+        for other, theirs in errors.items():
+            won = superiority(own, theirs)
+            text = f"{won.value:.2f} [{won.low:.2f}, {won.high:.2f}]"
+            cells[name][other] = Cell("–") if other == name else Cell(text, np.exp(3 * (1 - 2 * won.value)))
+        cells[name]["failed"] = Cell(f"{rows[name]['failed']}/{rows[name]['runs']}")
+        cells[name]["where PID did not"] = Cell(str(rows[name].get("failed_where_pid_did_not", "")))
+    return _coloured("duels", cells, corner="")
+
+
+class Cell(NamedTuple):
+    """A cell of a coloured table."""
+
+    text: str
+    ratio: float = 1.0
+    """Colour of the cell: green below one, red above."""
+    bold: bool = False
+
+    @property
+    def style(self) -> str:
+        """The look of the cell in CSS."""
+        return f"background-color: {_shade(self.ratio)}; font-weight: {700 if self.bold else 400}"
+
+
+def _coloured(name: str, cells: dict[str, dict[str, Cell]], corner: str = "case") -> str:
+    """An HTML table of cells by row and column, whose `name` no other table of the page has."""
+    frame = pd.DataFrame.from_dict(cells, orient="index").rename_axis(columns=corner)
+    styler = Styler(frame.map(lambda cell: cell.text), uuid=name)
+    styler.format(escape="html")
+    styler.format_index(escape="html", axis="index")
+    styler.format_index(escape="html", axis="columns")
+    styler.apply(lambda _: frame.map(lambda cell: cell.style), axis=None)
+    return styler.to_html()
+
+
+def _plain(table: pd.DataFrame) -> str:
+    """An HTML table of text."""
+    with pd.option_context("display.max_colwidth", None):  # pandas cuts longer text
+        return table.to_html(index=False, border=0, classes="text")
 
 
 def _by_case(outcome: Outcome, steps: bool) -> dict[str, list[dict[str, Any]]]:
@@ -263,54 +263,11 @@ def _mean(row: Mapping[str, Any]) -> float:
     return np.inf if row["failed"] else row["position_rmse"]["value"]
 
 
-def _grid(table: Mapping[str, Mapping[str, str]], names: Iterable[str]) -> str:
-    """A table of finished cells."""
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
-    lines = [f"<tr><td>{html.escape(case)}</td>{''.join(cells.values())}</tr>" for case, cells in table.items()]
-    return f"<table><thead><tr><th>case</th>{head}</tr></thead><tbody>{chr(10).join(lines)}</tbody></table>"
-
-
 def _shade(ratio: float) -> str:
-    """Green below one, red above, full at a factor of 30 and 3."""
+    """The colour of a ratio in CSS: green below one, deepest at 1/30; red above one, deepest at 3."""
     if not np.isfinite(ratio) or ratio <= 0:
         return "#fff"
     depth = np.log(ratio) / np.log(3 if ratio > 1 else 30)
     depth = float(np.clip(depth, -1, 1))
     other = round(255 - 90 * abs(depth))
     return f"rgb({other},250,{other})" if depth < 0 else f"rgb(255,{other},{other})"
-
-
-def duels(outcome: Outcome) -> str:
-    """Who beats whom in the random scenarios."""
-    errors = {n: metrics.summary(own)["position_rmse"].to_numpy() for n, own in outcome.runs["random"].items()}
-    rows = {row["feedforward"]: row for row in outcome.rows if row["part"] == "random"}
-    lines = []
-    for name, own in errors.items():
-        cells = [f"<td>{html.escape(name)}</td>"]
-        for other, theirs in errors.items():
-            if other == name:
-                cells.append("<td>–</td>")
-                continue
-            won = superiority(own, theirs)
-            shade = _shade(np.exp(3 * (1 - 2 * won.value)))
-            interval = f"{won.value:.2f} [{won.low:.2f}, {won.high:.2f}]"
-            cells.append(f'<td style="background:{shade}">{interval}</td>')
-        lost = f"{rows[name]['failed']}/{rows[name]['runs']}"
-        cells += [f"<td>{lost}</td>", f"<td>{rows[name].get('failed_where_pid_did_not', '')}</td>"]
-        lines.append(f"<tr>{''.join(cells)}</tr>")
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in (*errors, "failed", "where PID did not"))
-    return f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
-
-
-def _table(text: str) -> str:
-    """A Markdown table as HTML."""
-    lines = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in text.splitlines()]
-    lines = [[cell.strip(" |") for cell in line] for line in lines]
-    head, _, *rows = lines
-    cells = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
-    body, last = [], None
-    for row in rows:
-        new = " class=new" if last not in (None, row[0]) else ""
-        last = row[0]
-        body.append(f"<tr{new}>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>")
-    return f"<table class=text><thead><tr>{cells}</tr></thead><tbody>{''.join(body)}</tbody></table>"

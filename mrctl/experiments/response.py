@@ -1,8 +1,9 @@
 """The complementary sensitivity of a velocity loop, measured on the physics, and where learning is safe in it.
 
-Feedback-error learning lowers U_fb by adding to U_ff, so what counts is how the one answers the other: ∂U_fb/∂U_ff = −T
-with T = L/(1 + L) of the loop broken at the voltage. Learning converges at frequencies where Re T(jω) > 0, whatever the
-regressor (Gomi and Kawato 1993). A feedforward that learns nothing and shakes measures T in the loop as it is.
+Feedback-error learning lowers U_fb by adding to U_ff, so it depends on the response of one to the other:
+∂U_fb/∂U_ff = −T with T = L/(1 + L) of the loop broken at the voltage. Learning converges at frequencies where
+Re T(jω) > 0, whatever the regressor (Gomi and Kawato 1993). T is measured in the complete loop by a feedforward that
+does not learn and adds a multisine to the voltage.
 """
 
 from __future__ import annotations
@@ -25,19 +26,23 @@ Array = NDArray[np.float64]
 Response = NDArray[np.complex128]
 
 SAMPLES = 1000  # control periods in a period of the excitation
-AMPLITUDE = 0.03  # V a line, a tenth of that in rad/s on a steering channel: no tyre slides, no wheel turns back
+AMPLITUDE = 0.03  # V at each frequency, or a tenth of it in rad/s for steering: no tyre slides, no wheel reverses
 
 
 def lines(samples: int) -> NDArray[np.intp]:
-    """The odd harmonics below Nyquist: a quadratic nonlinearity answers at the even ones, where it does no harm."""
+    """The odd harmonics below the Nyquist frequency; a quadratic nonlinearity responds at the even ones alone."""
     return np.arange(1, samples // 2, 2)
 
 
 def multisine(samples: int, harmonics: NDArray[np.intp]) -> Array:
-    """One period of the sum of these harmonics with amplitude 1 and the phases of Schroeder (1970), which keep it low.
+    """One period of a sum of harmonics of amplitude 1 with Schroeder's phases (1970), which keep its peak low.
+
+    Args:
+        samples: Number of samples in the period.
+        harmonics: The harmonics, `(F,)`.
 
     Returns:
-        `(samples,)`.
+        The signal, `(samples,)`.
     """
     k = np.arange(len(harmonics))
     angle = 2 * np.pi * np.outer(np.arange(samples), harmonics) / samples - np.pi * k * (k + 1) / len(harmonics)
@@ -48,21 +53,21 @@ def estimate(excitation: Array, answer: Array, harmonics: NDArray[np.intp]) -> R
     """Frequency response of a system in its periodic steady state, exact if it is linear.
 
     Args:
-        excitation: One period of what went in, `(N,)`.
-        answer: The same period of what came out, `(N, …)`.
-        harmonics: Those that went in, `(F,)`.
+        excitation: One period of the input, `(N,)`.
+        answer: The same period of the output, `(N, …)`.
+        harmonics: Harmonics of the input, `(F,)`.
 
     Returns:
-        `(…, F)`.
+        The complex response at the harmonics, `(…, F)`.
     """
     return np.moveaxis(np.fft.rfft(answer, axis=0)[harmonics], 0, -1) / np.fft.rfft(excitation)[harmonics]
 
 
 class Shaker:
-    """A feedforward that repeats a signal and remembers the feedback.
+    """A feedforward stage that repeats a signal and records the feedback.
 
     Attributes:
-        feedback: `(ticks, B, 2)`.
+        feedback: Feedback in each tick, `(ticks, B, 2)`, in the units of the channels.
     """
 
     def __init__(self, signal: Array, ticks: int, size: int) -> None:
@@ -72,29 +77,30 @@ class Shaker:
         self.feedback = np.zeros((ticks, size, 2))
 
     def output(self, command: Array, derivative: Array) -> Array:
-        """The signal now."""
+        """The signal at this tick, `(B, 2)`."""
         return self._signal[self._tick % len(self._signal)]
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> None:
-        """Notes the feedback."""
+        """Records the feedback."""
         self.feedback[self._tick] = feedback
         self._tick += 1
 
 
 def measure(scenarios: Sequence[Scenario], channel: int) -> tuple[Array, Response]:
-    """Measures T of one channel on robots that drive straight on, with all that is in the loop: hold, delay, tyres.
+    """Measures T of one channel on robots that drive straight on, in the complete loop with hold, delay and tyres.
 
-    With the motion controller's gains at zero this is the velocity loop; with its own, the loop that learning works in.
+    With the gains of the motion controller at zero this is the velocity loop; with its own gains it is the loop that
+    learning works in.
 
     Args:
-        scenarios: A uniform group; their references, feedforwards and events are replaced.
-        channel: 0 for the common channel, 1 for the differential or the steering one.
+        scenarios: Runs that fit one batch; their references, feedforwards and events are replaced.
+        channel: 0 for the common channel, 1 for the differential or the steering channel.
 
     Returns:
         ω in rad/s `(F,)` and T `(B, F)`.
 
     Raises:
-        InputError: A robot failed on the way.
+        InputError: A robot failed.
     """
     first = scenarios[0]
     harmonics = lines(SAMPLES)
@@ -116,24 +122,24 @@ def measure(scenarios: Sequence[Scenario], channel: int) -> tuple[Array, Respons
 
 
 def refine(frequency: Array, response: Response) -> tuple[Array, Response]:
-    """A response between the lines, by cubic splines, on a grid fine and even on a logarithmic scale."""
+    """A response interpolated by cubic splines on a fine grid, which is even on a logarithmic scale."""
     fine = np.geomspace(frequency[0], frequency[-1], 4000)
     real, imaginary = CubicSpline(frequency, np.stack([response.real, response.imag]), axis=1)(fine)
     return fine, real + 1j * imaginary
 
 
 class Safety(NamedTuple):
-    """Where learning is safe in a loop.
+    """Frequencies and steps at which learning is safe in a loop.
 
     With a constant regressor a learner of normalised step μ is an integrator, U_ff(k + 1) = U_ff(k) + μ U_fb(k), in a
-    loop with T. If it hands a share of what it adds over from the PID's integral, as `Hierarchy` has it, T is replaced
-    by a + (1 − a) T: the condition is then Re T > −a/(1 − a).
+    loop with T. If a share a of what it adds is taken from the PID's integral, as `Hierarchy` does, T is replaced by
+    a + (1 − a) T; the condition is then Re T > −a/(1 − a).
 
     Attributes:
-        positive_to: Frequency in rad/s up to which Re T(jω) > 0; infinite if everywhere.
+        positive_to: Frequency in rad/s up to which Re T(jω) > 0; infinite if it is positive everywhere.
         lowest: Least Re T.
-        step: Largest μ at which the integrator is stable without hand-over.
-        step_handed_over: The same with it.
+        step: Largest μ at which the integrator is stable without this hand-over.
+        step_handed_over: Largest μ at which it is stable with the hand-over.
     """
 
     positive_to: float
@@ -143,7 +149,7 @@ class Safety(NamedTuple):
 
 
 def safety(frequency: Array, response: Response, period: float) -> Safety:
-    """Where learning is safe, from T on a fine grid.
+    """Frequencies and steps at which learning is safe, from T on a fine grid.
 
     Args:
         frequency: ω in rad/s, `(F,)`.
@@ -161,7 +167,7 @@ def safety(frequency: Array, response: Response, period: float) -> Safety:
 
 
 def _largest_step(frequency: Array, response: Response, period: float) -> float:
-    """Gain margin of T/(z − 1)."""
+    """The largest stable step: the gain margin of T/(z − 1)."""
     loop = response / (np.exp(1j * frequency * period) - 1)
     crossing = (loop.imag[:-1] * loop.imag[1:] < 0) & (loop.real[:-1] < 0)
     return float((1 / np.abs(loop[:-1][crossing])).min(initial=np.inf))

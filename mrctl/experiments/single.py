@@ -1,4 +1,4 @@
-"""`mrctl run`: one scenario, its metrics, and what is kept of it."""
+"""`mrctl run`: runs one scenario, prints its metrics and saves its result."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     """Runs a scenario.
 
     Args:
-        scenario: What to run.
-        out: Folder for `result.zarr`, figures and learned weights, or None.
-        as_json: JSON instead of a table.
-        own: Stages of your own; see `mrctl.loop.user_files`.
+        scenario: The run.
+        out: Folder for `result.zarr`, figures and learned weights; None saves nothing.
+        as_json: Whether to return JSON instead of a table.
+        own: Stages of the user; see `mrctl.loop.user_files`.
 
     Returns:
-        The metrics, a row a lap.
+        The metrics, a row for each lap.
 
     Raises:
-        InputError: A bad scenario or controller, or a folder that cannot be written or holds a result already.
+        InputError: The scenario or a stage is bad, or the folder cannot be written or holds a result already.
     """
     if out is not None and (output_folder(out) / "result.zarr").exists():
         raise InputError(f"out: {out} holds a result already; nothing was overwritten")

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from mrctl.experiments import report
-from mrctl.experiments.cases import BAND, PARTS, Case, Laps, Outcome, cases
+from mrctl.experiments.cases import BAND, PARTS, Case, Choices, Laps, Outcome, cases
 from mrctl.experiments.tables import machine, markdown, number, output_folder, write_json
 from mrctl.loop import user_files
 from mrctl.record import InputError
@@ -23,9 +24,10 @@ from mrctl.sweep import jobs, store
 from mrctl.sweep.plan import Sweep
 
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
-TITLES = {"none": "PID"}  # of feedforwards in the tables
-YARDSTICKS = ("none", "model")  # whom the tables compare everyone with
-CHUNK = 32  # runs in a job: enough for a batch, and few that a worker waits for at the end
+TITLES = {"none": "PID"}  # names of feedforwards in the tables, where they differ
+YARDSTICKS = ("none", "model")  # feedforwards that the tables compare all others with
+UNCHANGED = ("steady", "steering")  # parts in whose runs nothing changes from the first lap to the last
+CHUNK = 32  # runs in a job: enough for a fast batch, and few enough that no worker idles for long at the end
 
 
 def suite(
@@ -37,55 +39,60 @@ def suite(
     workers: int | None,
     out: Path,
 ) -> Outcome:
-    """Runs what is left of the suite and writes `table.md`, `table.json`, figures and `report.html`.
+    """Runs those runs of the suite that are not done yet; writes `table.md`, `table.json`, figures and `report.html`.
 
     Args:
-        feedforwards: Which to compare.
-        controllers: Controllers of your own, as `my_file.py:MyController`; see `mrctl.loop.user_files`.
-        seeds: Runs of each case, seeds 0 to `seeds` − 1 for everyone.
-        random: How many random scenarios.
-        quick: A selection with fewer laps.
-        workers: Processes, by default one a core.
-        out: Folder; the runs of each feedforward are a store of their own in it, under `runs`.
-
-    Raises:
-        InputError: No feedforward, no seed, a bad controller, or a folder that cannot be written or holds other runs.
-    """
-    if seeds < 1 or random < 0 or not (feedforwards or controllers):
-        raise InputError("seeds: at least one run of at least one feedforward")
-    who: dict[str, dict[str, Any]] = {name: {"feedforward": name} for name in feedforwards}
-    for one in controllers:
-        name = "+".join(part.attribute for part in user_files.parts(one))
-        if name in who:
-            raise InputError(f"controller: the name {name} is taken")
-        who[name] = {"controller": user_files.absolute(one)}
-        user_files.trial(who[name]["controller"], Scenario(laps=1))
-    output_folder(out)
-    chosen = cases(seeds, random, quick)
-    laps, aside = run(chosen, who, workers, out / "runs")
-    runs = runs_of(chosen, laps)
-    rows = compare(chosen, runs)
-    found = Outcome(quick, chosen, laps, runs, rows, aside)
-    tables = as_markdown(rows)
-    (out / "table.md").write_text("\n\n".join(f"## {title}\n\n{text}" for title, text in tables.items()) + "\n")
-    write_json(out / "table.json", {"versions": versions(), "machine": machine(), "rows": rows, "runs": each_run(runs)})
-    report.write(found, who, tables, out)
-    return found
-
-
-def run(chosen: Sequence[Case], who: Mapping[str, dict[str, Any]], workers: int | None, out: Path) -> tuple[Laps, str]:
-    """Runs every case under every feedforward, or what is left of it; each feedforward is a sweep with its own store.
+        feedforwards: Names of the feedforwards to compare.
+        controllers: Feedforwards of the user, each as `my_file.py:MyController`; see `mrctl.loop.user_files`.
+        seeds: Number of runs of each case; every feedforward drives the seeds 0 to `seeds` − 1.
+        random: Number of random scenarios.
+        quick: Whether to run a selection of the cases with fewer laps.
+        workers: Number of processes; by default one for each core.
+        out: Folder for the results; the runs of each feedforward are a store under `runs` in it.
 
     Returns:
-        The laps, and what could not be done.
+        What was run and measured.
+
+    Raises:
+        InputError: There is no feedforward or no seed, a controller is bad, or the folder cannot be written or holds
+            other runs.
+    """
+    if seeds < 1 or random < 0 or not (feedforwards or controllers):
+        raise InputError("seeds: the suite needs at least one run of at least one feedforward")
+    choices: dict[str, dict[str, Any]] = {name: {"feedforward": name} for name in feedforwards}
+    for stages in controllers:
+        name = "+".join(part.attribute for part in user_files.parts(stages))
+        if name in choices:
+            raise InputError(f"controller: the name {name} is taken")
+        choices[name] = {"controller": user_files.absolute(stages)}
+        user_files.trial(choices[name]["controller"], Scenario(laps=1))
+    output_folder(out)
+    chosen = cases(seeds, random, quick)
+    laps, aside = run(chosen, choices, workers, out / "runs")
+    runs = runs_of(chosen, laps)
+    rows = compare(chosen, runs)
+    outcome = Outcome(quick, chosen, laps, runs, rows, aside)
+    shown = tables(rows)
+    texts = [f"## {title}\n\n{markdown(list(table), table.to_numpy().tolist())}\n" for title, table in shown.items()]
+    (out / "table.md").write_text("\n".join(texts))
+    write_json(out / "table.json", {"versions": versions(), "machine": machine(), "rows": rows, "runs": each_run(runs)})
+    report.write(outcome, choices, shown, out)
+    return outcome
+
+
+def run(chosen: Sequence[Case], choices: Choices, workers: int | None, out: Path) -> tuple[Laps, str]:
+    """Runs every case under every feedforward, as far as it is not done yet; each feedforward has a store of its own.
+
+    Returns:
+        Metrics lap by lap, by feedforward; and a sentence on the runs that could not be done, or "".
     """
     laps, aside = {}, []
-    for place, (name, choice) in enumerate(who.items(), 1):
+    for place, (name, choice) in enumerate(choices.items(), 1):
         feedforward = {"feedforward": choice.get("feedforward", "none")}
         scenarios = [s.model_copy(update=feedforward) for case in chosen for s in case.scenarios]
         chunk = min(CHUNK, -(-len(scenarios) // 4))
         sweep = Sweep.of(scenarios, record="laps", chunk=chunk, controller=choice.get("controller"))
-        print(f"{name} ({place} of {len(who)})", file=sys.stderr)
+        print(f"{name} ({place} of {len(choices)})", file=sys.stderr)
         ended = jobs.run(sweep, out / name, workers, progress=True)
         laps[name] = store.open(out / name)
         if ended.aside:
@@ -95,7 +102,7 @@ def run(chosen: Sequence[Case], who: Mapping[str, dict[str, Any]], workers: int 
 
 
 def runs_of(chosen: Sequence[Case], laps: Laps) -> dict[str, Laps]:
-    """The runs of each case, by feedforward; a run that could not be done has its laps too, all NaN."""
+    """The runs of each case, by feedforward; the laps of a run that could not be done are NaN."""
     found: dict[str, Laps] = {}
     end = 0
     for case in chosen:
@@ -107,10 +114,12 @@ def runs_of(chosen: Sequence[Case], laps: Laps) -> dict[str, Laps]:
 
 
 def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str, Any]]:
-    """What the tables show: a row a case and feedforward, in the order of `PARTS`.
+    """Statistics that the tables show: a row for each case and feedforward, in the order of `PARTS`.
 
-    Of the last lap: mean with 95 % bootstrap interval, the worst 5 % (infinite where a run failed), ratio to PID and to
-    `model`, and probability of beating each of the others, in the same run. Of a step: see `_step`.
+    A row holds for the last lap the mean with its 95 % bootstrap interval, the mean of the worst 5 % (infinite where a
+    run failed), the ratio to PID and to `model`, and the probability of beating each of the others in the same run.
+    Where nothing changes on the way, it holds the laps until the error stays within `BAND` times its final value; for a
+    step it holds what `_step` returns.
     """
     rows = []
     for case in sorted(chosen, key=lambda case: [*PARTS].index(case.part)):
@@ -131,6 +140,9 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
                     row[metric][f"beats_{title}"] = superiority(samples, theirs)._asdict()
                     if rival in YARDSTICKS:
                         row[metric][f"to_{title}"] = paired_ratio(samples, theirs)._asdict()
+                if case.part in UNCHANGED:
+                    laps = metrics.laps_to_converge(found[case.name][name], metric, BAND).values
+                    row[metric]["laps_to_converge"] = bootstrap_interval(laps)._asdict()
                 if case.back:
                     row[metric] |= _step(found[case.name][name], metric, case)
             rows.append(row)
@@ -138,7 +150,7 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
 
 
 def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:
-    """Recovery and forgetting, run by run against the error in the lap before the change, and where that settles."""
+    """Recovery and forgetting: errors run by run over that in the lap before the change, and the error that settles."""
     error = laps[metric].values
     before, settled = error[:, case.change - 2], error[:, case.back - 2]
     after = {"in_first_lap": case.change, "after_one_lap": case.change + 1}
@@ -152,7 +164,7 @@ def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:
 
 
 def each_run(found: Mapping[str, Laps]) -> list[dict[str, Any]]:
-    """What became of every run, for statistics of your own."""
+    """How each run ended, and its errors lap by lap: a row for each run, for statistics of the user."""
     rows = []
     for case, runs in found.items():
         for name, own in runs.items():
@@ -164,26 +176,29 @@ def each_run(found: Mapping[str, Laps]) -> list[dict[str, Any]]:
     return rows
 
 
-def as_markdown(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
-    """The tables by title: each part's last lap, then the steps' recovery."""
-    tables = {}
+def tables(rows: Sequence[dict[str, Any]]) -> dict[str, pd.DataFrame]:
+    """Tables of text by title: the last lap of each part, who is best, then the recovery after the steps."""
+    found = {}
     guarded = any("guard_events" in row for row in rows)
     header = ["case", "feedforward", "failed", *(f"{title}; worst 5 %" for title in COLUMNS.values())]
     header += ["beats PID in V / θ̇ / position", "beats model", *(["guard acted"] if guarded else [])]
     for part, title in PARTS.items():
         own = [row for row in rows if row["part"] == part]
+        unchanged = part in UNCHANGED
         cells = [
             [
                 row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", *(_mean(row[m]) for m in COLUMNS),
                 *(_wins(row, TITLES.get(one, one)) for one in YARDSTICKS),
-                *([number(row["guard_events"])] if guarded else []),
+                *([number(row["guard_events"])] if guarded else []), *([_converged(row)] if unchanged else []),
             ]
             for row in own
         ]  # fmt: skip
         if own:
-            tables[title] = markdown(header, cells)
+            laps = [f"laps to {BAND:g}× the final V / θ̇ / position"] if unchanged else []
+            found[title] = pd.DataFrame(cells, columns=[*header, *laps])
     if any(row["feedforward"] != "oracle" for row in rows):
-        tables["Best in each case, and who is level with it"] = markdown(["case", *COLUMNS.values()], leaders(rows))
+        best = pd.DataFrame(leaders(rows), columns=["case", *COLUMNS.values()])
+        found["Best in each case, and who is level with it"] = best
     header = ["case", "feedforward", "failed", "first lap", "one lap later; worst 5 %", "recovered in V / θ̇ / position"]
     header += ["one lap later over settled", "return: first lap", "one lap later; worst 5 %"]
     cells = []
@@ -199,14 +214,16 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
             cells.append([row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", first, later, within])
             cells[-1] += [f"{number(error['after_one_lap_to_settled']['value'])}×", back, settled]
     if cells:
-        tables["Recovery and forgetting: position error over that before the step"] = markdown(header, cells)
-    return tables
+        title = "Recovery and forgetting: position error over that before the step"
+        found[title] = pd.DataFrame(cells, columns=header)
+    return found
 
 
 def leaders(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """Case by case and metric by metric: the least mean but that of the oracle, who knows the plant, and who is level.
+    """For each case and metric the feedforward with the least mean error, and those that are level with it.
 
-    Level is whom the best does not beat with 95 % confidence in the same runs; a failed run excludes.
+    A feedforward is level if the best does not beat it with 95 % confidence in the same runs. One with a failed run is
+    left out, and so is the oracle, which knows the plant.
     """
     lines = []
     for case in dict.fromkeys(row["case"] for row in rows):
@@ -225,6 +242,11 @@ def leaders(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
 def _mean(error: dict[str, Any]) -> str:
     value, low, high, worst = (number(1e3 * error[key]) for key in ("value", "low", "high", "worst"))
     return f"{value} [{low}, {high}]; {worst}" if error["samples"] else "–"
+
+
+def _converged(row: dict[str, Any]) -> str:
+    laps = [row[metric]["laps_to_converge"] for metric in COLUMNS]
+    return " / ".join(f"{one['value']:.1f}" if one["samples"] else "–" for one in laps)
 
 
 def _wins(row: dict[str, Any], rival: str) -> str:

@@ -21,15 +21,15 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def number(value: float) -> str:
-    """Three significant digits."""
+    """A number as text with three significant digits."""
     return f"{value:#.3g}".rstrip(".")
 
 
 def output_folder(path: Path) -> Path:
-    """Makes sure that a folder can be written, before anything is computed for it.
+    """Makes a folder and checks that it can be written to, before anything is computed for it.
 
     Raises:
-        InputError: It cannot.
+        InputError: The folder cannot be made or written to.
     """
     probe = path / ".writable"
     try:

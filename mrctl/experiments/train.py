@@ -1,11 +1,10 @@
-"""`mrctl train`: what `composite` knows before it drives, learned off-line on randomised plants.
+"""`mrctl train`: learns the features and the prior of `composite` off-line on randomised plants.
 
 As in Neural-Fly (O'Connell et al. 2022), a network φ is trained so that its last layer, solved anew for each plant,
-says what the model leaves unexplained. A plant's weights are the maximum a posteriori of a linear regression on what
-was seen, and the loss is the residual on what was not: on the rest of the same drive, and on a drive along another
-reference. The prior P₀ of the weights is no ridge that somebody chose but how they scatter over the plants, by
-expectation maximisation (empirical Bayes; Dempster, Laird and Rubin 1977), and goes into the file with φ: the Kalman
-filter starts from it.
+predicts the residual of the model. The weights of a plant are the maximum a posteriori of a linear regression on a part
+of its data; the loss is the residual on the rest of the same drive and on a drive along another reference. The prior P₀
+of the weights is not a ridge chosen by hand but their covariance over the plants, estimated by expectation maximisation
+(empirical Bayes; Dempster, Laird and Rubin 1977). It is saved together with φ, and the Kalman filter starts from it.
 """
 
 from __future__ import annotations
@@ -39,10 +38,10 @@ from mrctl.theory.robot import STEERINGS, Robot
 
 DRIVE = 24.0  # s along each reference, in one to three laps
 EVERY = 20  # control periods between samples of the regression
-CORRELATED = 10.0  # samples that count as one: what the features miss changes slowly
+CORRELATED = 10.0  # samples that count as one, because the error of the features changes slowly
 EPOCHS, EVERY_PRIOR, RATE = 150, 50, 0.02
-PSEUDO_PLANTS, SCATTER = 10.0, 0.3  # the prior of P₀: so many plants whose weights scatter by so much, V
-# Name, channel, steering arrangements, and what counts there as one volt.
+PSEUDO_PLANTS, SCATTER = 10.0, 0.3  # prior of P₀: number of plants, and standard deviation of their weights in V
+# Name, channel, steering arrangements, and the unit of its residual in V or rad/s.
 GROUPS = (
     ("common", 0, STEERINGS, 1.0),
     ("differential", 1, ("compliant", "caster"), 1.0),
@@ -51,12 +50,12 @@ GROUPS = (
 
 
 class Drives(NamedTuple):
-    """What two drives with each of P plants have shown, after the filters of `composite`.
+    """Two drives with each of P plants, after the filters of `composite`.
 
     Attributes:
-        steering: Arrangement a plant, `(P,)`.
+        steering: Steering arrangement of each plant, `(P,)`.
         physical: Scaled physical features, `(P, 2, M, 10)`.
-        residual: Filtered voltage less the model's, `(P, 2, M, 2)`.
+        residual: Filtered voltage minus that of the model in V, `(P, 2, M, 2)`; rad/s for rigid steering.
     """
 
     steering: Array
@@ -76,15 +75,15 @@ def train(out: Path, plants: int, seed: int) -> str:
     """Trains on `plants` randomised plants and writes the file.
 
     Args:
-        out: File for the weights, safetensors.
-        plants: How many; a third as many more are held out for the table.
-        seed: Of plants, references and initial network.
+        out: File for the weights, in the safetensors format.
+        plants: Number of plants to train on; a third as many more are held out for the table.
+        seed: Seed of plants, references and initial network.
 
     Returns:
-        A table of the residual on plants that training has not seen.
+        A table of the residual on the plants that were held out.
 
     Raises:
-        InputError: Too few plants, or a file that cannot be written.
+        InputError: There are too few or too many plants, or the file cannot be written.
     """
     if not 12 <= plants <= 100_000:
         raise InputError("plants: must be between 12 and 100,000")
@@ -117,7 +116,7 @@ def train(out: Path, plants: int, seed: int) -> str:
 
 
 def draw(robot: Robot, plants: int, seed: Sequence[int]) -> list[Scenario]:
-    """Random plants in turn under each steering arrangement, two drives along random references each."""
+    """Two drives along random references with each of some random plants, in turn under each steering arrangement."""
     rng = np.random.default_rng([*seed, 3])
     scenarios = []
     for plant in range(plants):
@@ -145,12 +144,12 @@ def _perturbation(rng: np.random.Generator) -> Perturbation:
         drive_friction_factor=factor(0.4, 4), resistance_factor=factor(0.75, 1.4),
         motor_constant_factor=factor(0.85, 1.15), supply_factor=factor(0.75, 1.1),
         tyre_friction_factor=factor(0.25, 1.3), slope=float(rng.choice([0.0, rng.uniform(-0.17, 0.17)])),
-control_delay=0.01 * max(0, int(rng.integers(-3, 4))),
+        control_delay=0.01 * max(0, int(rng.integers(-3, 4))),
     )  # fmt: skip
 
 
 def _reference(rng: np.random.Generator, robot: Robot) -> tuple[Reference, int]:
-    """A reference that the robot can follow, and how often it is driven in `DRIVE` seconds."""
+    """A random reference that the robot can follow, and its number of laps in `DRIVE` seconds."""
     while True:
         laps = int(rng.integers(1, 4))
         period = DRIVE / laps
@@ -175,14 +174,14 @@ def _reference(rng: np.random.Generator, robot: Robot) -> tuple[Reference, int]:
 
 
 def _timed(reference: RoundedSquare | Waypoints, period: float) -> RoundedSquare | Waypoints:
-    """The same path in another lap time."""
+    """The same path, driven in another lap time in s."""
     return type(reference).model_validate(
         reference.model_dump() | {"speed": reference.speed * reference.period / period}
     )
 
 
 def drive(scenarios: Sequence[Scenario], robot: Robot) -> Drives:
-    """Drives with the model as feedforward, filtered as `composite` does; plants that failed are left out."""
+    """Drives with the model as feedforward and filters as `composite` does; plants that failed are left out."""
     result = simulate(scenarios, progress=True)
     kept = np.logical_not(np.asarray(result["failed"]).reshape(-1, 2).any(axis=1))
     period, time_constant = scenarios[0].control_period, Composite().filter
@@ -194,10 +193,10 @@ def drive(scenarios: Sequence[Scenario], robot: Robot) -> Drives:
     rigid = (steering == "rigid")[:, None, None]
     v, omega, left, right = (column(n) for n in ("v_measured", "omega_measured", "voltage_left", "voltage_right"))
     angle = column("steering_command") - column("steering_rate_command") * period / 2
-    asked = column("v_command") * np.tan(angle) / robot.wheelbase  # what `rigid` steering is asked for
+    asked = column("v_command") * np.tan(angle) / robot.wheelbase  # yaw rate that the commanded steering angle gives
     sent = np.stack([(left + right) / 2, np.where(rigid, asked, (right - left) / 2)])
-    sent = np.concatenate([sent[..., :1], sent[..., :-1]], -1)  # acts on the motion of the next sample
-    # Nobody knows the direction of a slope: each plant sees another one.
+    sent = np.concatenate([sent[..., :1], sent[..., :-1]], -1)  # a command acts on the motion of the next sample
+    # The direction of a slope is unknown, so each plant gets another heading.
     heading = column("theta") + 2 * np.pi * np.arange(len(steering))[:, None, None] * 0.618
     share = period / (period + time_constant)
     signals = np.stack([*sent, v, omega, np.cos(heading), np.sin(heading)])
@@ -219,12 +218,12 @@ def drive(scenarios: Sequence[Scenario], robot: Robot) -> Drives:
 
 
 def _basis(physical: Tensor, units: Tensor) -> Tensor:
-    """φ as `composite.basis`."""
+    """The features φ, as `composite.basis` computes them."""
     return torch.cat([physical, torch.tanh(physical[..., :INPUTS] @ units[:, :INPUTS].T + units[:, INPUTS])], -1)
 
 
 def _moments(drives: Drives, units: Tensor) -> dict[str, Moments]:
-    """Moments of each group, by plant, drive and half of the drive, `(P, 2, 2, …)`."""
+    """Moments of each group, for each plant, drive and half of the drive, `(P, 2, 2, …)`."""
     found = {}
     for name, channel, where, _ in GROUPS:
         rows = np.isin(drives.steering, where)
@@ -243,7 +242,7 @@ def _mean(m: Moments, *dimensions: int) -> Moments:
 
 
 def _solve(m: Moments, samples: float, precision: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights of largest posterior and their covariance, for moments over so many independent samples."""
+    """Maximum a posteriori weights and their covariance, for moments over a number of independent samples."""
     covariance = torch.linalg.inv(m.gram * samples / noise + precision)
     return (covariance @ m.cross[..., None] * samples / noise)[..., 0], covariance
 
@@ -258,7 +257,7 @@ def _residual(m: Moments, weights: Tensor) -> Tensor:
 def _scatter(m: Moments, samples: float, unit: float, iterations: int = 30) -> tuple[Tensor, Tensor]:
     """Expectation maximisation of P₀ and of the noise's variance: weights a ~ N(0, P₀) a plant, y = φ a + noise.
 
-    The noise is the geometric mean over plants: a few that slip should not blur what the others show.
+    The noise is the geometric mean over plants, on which a few plants that slip have little influence.
     """
     plants, n = m.cross.shape
     start = (SCATTER * unit) ** 2 * torch.eye(n, dtype=torch.float64)
@@ -273,7 +272,7 @@ def _scatter(m: Moments, samples: float, unit: float, iterations: int = 30) -> t
 
 
 def _samples(drives: Drives) -> float:
-    """Independent samples in half a drive."""
+    """Number of independent samples in half a drive."""
     return drives.physical.shape[2] / 2 / CORRELATED
 
 
@@ -291,7 +290,7 @@ def priors(drives: Drives, units: Array) -> Array:
 def _queries(
     drives: Drives, units: Tensor, scatters: dict[str, tuple[Tensor, Tensor]]
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Mean square residual a drive: of its second half by its first, and of all by the other drive, each `(P, 2)`."""
+    """Mean square residual of each drive: of its second half by its first, and of all by the other drive, `(P, 2)`."""
     samples = _samples(drives)
     found = {}
     for name, m in _moments(drives, units).items():
@@ -304,7 +303,7 @@ def _queries(
 
 
 def fit(drives: Drives, seed: int) -> Array:
-    """Trains the units, `(16, 9)`; the priors follow them now and then."""
+    """Trains the units, `(16, 9)`; the priors are estimated anew every `EVERY_PRIOR` epochs."""
     torch.set_num_threads(1)  # the matrices are small, and one thread adds up in one order
     rng = np.random.default_rng([seed, 4])
     units = torch.tensor(0.7 * rng.normal(size=(UNITS, INPUTS + 1)), requires_grad=True)
@@ -327,7 +326,7 @@ def fit(drives: Drives, seed: int) -> Array:
 
 
 def held_out(seen: Drives, unseen: Drives, units: Array) -> dict[str, dict[str, float]]:
-    """Geometric mean of the RMS residual on other plants, with the prior of the first, by channel and kind of query."""
+    """Geometric mean of the RMS residual on unseen plants, with the prior of those seen, by channel and prediction."""
     network = torch.tensor(units)
     queries = _queries(unseen, network, _scatters(seen, network))
     return {

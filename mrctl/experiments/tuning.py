@@ -1,4 +1,4 @@
-"""`mrctl tune`: the velocity PID of a robot, its margins, and where learning is safe; designed and measured."""
+"""`mrctl tune`: designs the velocity PID of a robot; computes and measures its margins and where learning is safe."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mrctl.scenario import Scenario
 
 CHANNELS = (("common", "V/(m/s)", "V/m"), ("differential", "V/(rad/s)", "V/rad"))
 LOOPS = (("compliant", 0), ("compliant", 1), ("caster", 1), ("rigid", 1))
-"""Steering arrangement and channel; the common channel is the same for all three."""
+"""Steering arrangement and channel of each loop; the common channel is the same under all three arrangements."""
 RESPONSES = {"design": "equation (3)", "measured": "measured", "hierarchy": "measured with motion controller"}
 STYLES: dict[str, dict[str, Any]] = {
     "design": {"lw": 0.8},
@@ -41,21 +41,21 @@ MARGINS = {
 SAFETY = {"positive_to": "Re T > 0 to, rad/s", "lowest": "least Re T", "step": "largest step"}
 ADVICE = f"""\
 Learning by feedback error is safe at frequencies where Re T > 0; with the hand-over of the built-in learners, where
-Re T > {-TAKE_OVER / (1 - TAKE_OVER):g}. Both hold for commands that do not depend on what the robot does: a fast motion
-controller behind a delay takes from them. Above the largest step a learner of one constant oscillates without
-hand-over: stay below half of it."""
+Re T > {-TAKE_OVER / (1 - TAKE_OVER):g}. Both hold for commands that do not depend on the motion of the robot; a fast
+motion controller behind a delay narrows them. Above the largest step a learner of one constant oscillates without
+hand-over: choose at most half of it."""
 
 
 def tune(world: str, time_constant: float, delays: Sequence[float], out: Path | None, json: bool) -> str:
-    """The command: designs, measures, and writes `table.json` and `sensitivity` as a figure where asked to.
+    """The command: designs and measures; writes `table.json` and the figure `sensitivity` to `out` unless it is None.
 
     Raises:
-        InputError: As `design`; or a folder that cannot be written.
+        InputError: As `design`, or the folder cannot be written.
     """
     if out is not None:
         output_folder(out)
     asked = Pid.from_dict({"time_constant": time_constant})
-    # `faster`, because the steering's gains go with the time constant.
+    # `faster` also scales the gains of the steering, which go with the time constant.
     table = design(world, Pid().faster(Pid().time_constant / asked.time_constant), delays)
     if out is not None:
         (out / "table.json").write_text(json_text(table) + "\n")
@@ -64,23 +64,23 @@ def tune(world: str, time_constant: float, delays: Sequence[float], out: Path | 
 
 
 def design(world: str, pid: Pid, delays: Sequence[float]) -> dict[str, Any]:
-    """The loops that come of a PID design, on paper and on the physics.
+    """Margins and safety of the loops of a PID design, by equation (3) and measured on the physics.
 
     Args:
         world: World or MJCF file.
-        pid: The design; on paper without its derivative part.
-        delays: Loop delays in s, whole control periods, beside the hold.
+        pid: The design; equation (3) is evaluated without its derivative part.
+        delays: Loop delays in s, in whole control periods, in addition to the hold.
 
     Returns:
-        Per channel static gain, time constant, PI gains and the ratio of the learning condition; `loops`, a row for
-        every one of `LOOPS` and every delay, with `Margins` and `Safety` for each of `RESPONSES`; `frequency` and
-        `responses`, T of the same rows as they were measured.
+        For each channel static gain, time constant, PI gains and the ratio of the learning condition; `loops`, a row
+        for each of `LOOPS` and each delay, with `Margins` and `Safety` for each of `RESPONSES`; `frequency` in rad/s
+        and `responses`, T of the same rows.
 
     Raises:
-        InputError: A bad world or delay, or one that the robot does not survive.
+        InputError: The world or a delay is bad, or the robot fails with that delay.
     """
     if not delays:
-        raise InputError("delay: none given")
+        raise InputError("delay: at least one delay is needed")
     scenarios = [
         Scenario.from_dict(
             {
@@ -107,7 +107,7 @@ def design(world: str, pid: Pid, delays: Sequence[float]) -> dict[str, Any]:
     for steering, channel in LOOPS:
         frequency, measured = measure([s.model_copy(update={"steering": steering}) for s in scenarios], channel)
         rigid = steering == "rigid"
-        plant = (1.0, 0.0) if rigid else plants[channel]  # the steering is taken to do what it is asked to
+        plant = (1.0, 0.0) if rigid else plants[channel]  # the steering is taken as ideal
         gains = pid.channels(robot, rigid)[channel]
         for k, delay in enumerate(delays):
             loop = sampled_loop(frequency, *plant, gains, period, delay)
@@ -129,7 +129,7 @@ def _judge(frequency: Array, response: Response, period: float) -> dict[str, flo
 
 
 def text(table: dict[str, Any]) -> str:
-    """The design in words and numbers."""
+    """The design as text."""
     lines = [f"closed-loop time constant {table['time_constant']:g} s"]
     for name, unit_p, unit_i in CHANNELS:
         c = table[name]
@@ -153,7 +153,7 @@ def text(table: dict[str, Any]) -> str:
 
 
 def statement(table: dict[str, Any]) -> str:
-    """Bandwidth and margins as measured without delay, in a line, to stand beside a comparison."""
+    """Measured bandwidth and margins without delay, in one line for the report of a comparison."""
     loops = [
         f"{_name(row)} {' / '.join(_cell(row['measured'][name]) for name in ('bandwidth', 'phase', 'gain'))}"
         for row in table["loops"]
@@ -175,7 +175,7 @@ def _cell(value: float) -> str:
 
 @plots.styled
 def figure(table: dict[str, Any]) -> Figure:
-    """Re T(jω) on paper, measured, and in the whole hierarchy; below zero, learning by feedback error is not safe."""
+    """Re T(jω) by equation (3), measured, and in the whole hierarchy; below zero, learning is not safe."""
     drawn = Figure(figsize=(plots.PAGE, 0.7 * plots.PAGE), layout="constrained")
     panels = list(drawn.subplots(2, 2, sharex=True, sharey=True).flat)
     frequency = table["frequency"]

@@ -1,4 +1,4 @@
-"""What a run recorded: labelled datasets, metrics, comparisons, figures and exports.
+"""Results of runs: labelled datasets, metrics, comparisons, figures and exports.
 
-Imports theory, control (for names and features) and `mrctl.scenario`; it knows neither physics nor the loop.
+They import theory, control (for names and features) and `mrctl.scenario`, but neither physics nor the loop.
 """

@@ -1,6 +1,7 @@
 """Statistics over runs: means with bootstrap intervals, paired comparisons, the worst runs.
 
-A sample is an error, smaller is better; NaN or infinite stands for a run that failed. Failures are counted, and lose.
+A sample is an error, of which smaller is better; NaN or infinite stands for a run that failed. Failed runs are counted,
+and lose every comparison.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class Interval(NamedTuple):
     high: float
     samples: int
     failed: int
-    """Samples that are NaN or infinite: runs that failed, or never recovered."""
+    """Number of samples that are NaN or infinite: runs that failed, or never recovered."""
 
 
 class Ratio(NamedTuple):
@@ -57,11 +58,11 @@ def bootstrap_interval(samples: ArrayLike, level: float = 0.95, n: int = 10_000,
     Args:
         samples: One number a run (n,); NaN or infinite where it failed.
         level: Confidence level, between 0 and 1.
-        n: Resamples.
-        seed: Of the resampling.
+        n: Number of resamples.
+        seed: Seed of the resampling.
 
     Returns:
-        The interval; its ends are NaN where fewer than two samples are finite: one run says nothing of the spread.
+        The interval; its ends are NaN where fewer than two samples are finite, for one run does not show the spread.
     """
     values = np.asarray(samples, float).ravel()
     finite = values[np.isfinite(values)]
@@ -73,14 +74,14 @@ def bootstrap_interval(samples: ArrayLike, level: float = 0.95, n: int = 10_000,
 def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0) -> Ratio:
     """Geometric mean of a / b over pairs (same seed, same perturbation), with its bootstrap interval.
 
-    Every pair weighs the same, however large its errors, and the ratio of b to a is one over that of a to b.
+    Every pair has the same weight, however large its errors, and the ratio of b to a is the inverse of that of a to b.
 
     Args:
         a: One number a run (n,); NaN or infinite where it failed.
         b: The same runs under the other controller (n,).
         level: Confidence level, between 0 and 1.
-        n: Resamples.
-        seed: Of the resampling.
+        n: Number of resamples.
+        seed: Seed of the resampling.
 
     Raises:
         InputError: `a` and `b` differ in length.
@@ -123,17 +124,17 @@ def cvar(samples: ArrayLike, share: float = 0.05) -> float:
     """Conditional value at risk: the mean of the worst share of the runs; infinite where one of them failed.
 
     Rockafellar and Uryasev (2002): of n samples the worst `share` · n count, the last of them in part. With fewer than
-    1 / `share` samples it is the worst.
+    1 / `share` samples it is the worst sample.
 
     Args:
         samples: One number a run (n,); NaN or infinite where it failed.
-        share: Above 0, at most 1.
+        share: Share of the samples that count, above 0 and at most 1.
 
     Returns:
         The mean; NaN without samples.
 
     Raises:
-        InputError: A share out of range.
+        InputError: `share` is out of range.
     """
     if not 0 < share <= 1:
         raise InputError(f"share: {share} is not above 0 and at most 1")
@@ -146,10 +147,10 @@ def cvar(samples: ArrayLike, share: float = 0.05) -> float:
 
 
 def _pairs(a: ArrayLike, b: ArrayLike) -> tuple[Array, Array]:
-    """Both as vectors of one length.
+    """Both sequences of samples as vectors of the same length.
 
     Raises:
-        InputError: They are not.
+        InputError: They differ in length.
     """
     first, second = np.asarray(a, float).ravel(), np.asarray(b, float).ravel()
     if len(first) != len(second):
@@ -161,7 +162,7 @@ def _interval(
     data: tuple[Array, ...], statistic: Callable[..., ArrayLike], level: float, n: int, seed: int
 ) -> tuple[float, float]:
     """BCa bootstrap interval of a paired statistic; percentiles where the data are too alike for BCa."""
-    from scipy.stats import bootstrap  # 0.4 s to import, which only a comparison pays for
+    from scipy.stats import bootstrap  # the import takes 0.4 s
 
     if not 0 < level < 1:
         raise InputError(f"level: {level} is not between 0 and 1")

@@ -1,10 +1,10 @@
-"""Labelled results: what a run recorded, with units, saved and opened."""
+"""Labelled results: the signals of runs with their units; saving and opening them."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -12,11 +12,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from mrctl import __version__
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
-# Name: (unit, meaning). A sample at time t holds the state at t, the commands computed from it, and the currents and
-# power at the end of the control period that these commands were held for.
+# Name: (unit, meaning). A sample at time t holds the state at t, the commands
+# computed from it, and the currents and power at the end of the control period during which these commands are held.
 SIGNALS: dict[str, tuple[str, str]] = {
     "x": ("m", "position of P along the world's x axis"),
     "y": ("m", "position of P along the world's y axis"),
@@ -66,8 +67,26 @@ def blank(*shape: int) -> NDArray[np.void]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that can change a number."""
-    return {name: metadata.version(name) for name in ("mrctl", "mujoco", "dm-control", "numpy", "numba", "torch")}
+    """Versions of all packages that can change a result."""
+    others = ("mujoco", "dm-control", "numpy", "numba", "torch")
+    return {"mrctl": __version__} | {name: metadata.version(name) for name in others}
+
+
+def written_by(result: xr.Dataset) -> str:
+    """The version of mrctl that made a result, such as `0.2.0`; "" for a dataset that does not say."""
+    return json.loads(result.attrs.get("versions", "{}")).get("mrctl", "")
+
+
+def require(result: xr.Dataset, names: Iterable[str]) -> None:
+    """Checks that a result has the variables that are about to be read.
+
+    Raises:
+        InputError: One is missing, as it may be in a result of an older mrctl, which the message then names.
+    """
+    for name in names:
+        if name not in result.variables:
+            writer = f", which mrctl {version} wrote" if (version := written_by(result)) else ""
+            raise InputError(f"{name}: not a variable of this result{writer}")
 
 
 def dataset(
@@ -79,16 +98,20 @@ def dataset(
     failure_time: NDArray[np.float64],
     weights: NDArray[np.float64] | None,
 ) -> xr.Dataset:
-    """Labels what a uniform group of runs recorded.
+    """Labels the record of a batch of runs.
 
     Args:
-        scenarios: A scenario a run.
-        labels: What to call a run that has no name.
-        feedforwards: Name of the feedforward a run.
-        log: One record of `TICK` a tick and robot, `(ticks, B)`.
-        failure: Why a run stopped early, or "".
-        failure_time: When, s, or NaN.
-        weights: Final weights of the network a run, `(B, n)`, or None.
+        scenarios: The scenario of each run.
+        labels: Label of each run that has no name.
+        feedforwards: Name of the feedforward of each run.
+        log: One record of `TICK` for each tick and run, `(ticks, B)`.
+        failure: For each run why it stopped early, or "".
+        failure_time: For each run when it stopped in s, or NaN, `(B,)`.
+        weights: Final weights of the network of each run, `(B, n)`, or None.
+
+    Returns:
+        Variables (run, time) by signal, `failed`, `failure`, `failure_time` and `weights`; coordinates label,
+        feedforward, steering, seed and lap_time.
     """
     period = scenarios[0].control_period
     variables: dict[str, tuple] = {
@@ -114,7 +137,7 @@ def dataset(
 
 
 def combine(groups: Sequence[tuple[Sequence[int], xr.Dataset]], scenarios: Sequence[Scenario]) -> xr.Dataset:
-    """Puts groups back into the order the scenarios were given in; shorter runs end in NaN."""
+    """Combines batches into one result, runs in the order of the scenarios; shorter runs are padded with NaN."""
     parts = [part.assign_coords(run=list(rows)) for rows, part in groups]
     whole = xr.concat(parts, "run", join="outer", data_vars="minimal", coords="minimal").sortby("run")
     whole.attrs = {
@@ -126,9 +149,14 @@ def combine(groups: Sequence[tuple[Sequence[int], xr.Dataset]], scenarios: Seque
 
 
 def scenarios_of(result: xr.Dataset) -> list[Scenario]:
-    """The resolved scenarios of the runs in a result, or in a selection of them, to run again."""
+    """The resolved scenarios of the runs in a result, or in a selection of them, to run again.
+
+    Raises:
+        InputError: Another version of mrctl, which the message names, wrote a scenario that this one does not know.
+    """
     every = json.loads(result.attrs["scenarios"])
-    return [Scenario.from_dict(every[run], "scenario") for run in np.atleast_1d(result["run"])]
+    source = f"scenario of a result of mrctl {written_by(result)}"
+    return [Scenario.from_dict(every[run], source) for run in np.atleast_1d(result["run"])]
 
 
 def save(result: xr.Dataset, path: str | Path) -> None:
@@ -151,7 +179,9 @@ def save(result: xr.Dataset, path: str | Path) -> None:
 
 
 def open_result(path: str | Path) -> xr.Dataset:
-    """Opens a saved result.
+    """Opens a saved result, whichever version of mrctl wrote it: a result names its variables, with their units.
+
+    What needs a variable or a field of a scenario that the result lacks says so, and names the version that wrote it.
 
     Raises:
         InputError: There is no result at this path.

@@ -3,10 +3,10 @@
 Tables hold every signal of `results.dataset.SIGNALS`; where a run has failed, they end. With several runs there is a
 column `run`, or in MCAP a name `/runK` before each topic.
 
-| topic           | message                     | what                                                              |
+| topic           | message                     | content                                                           |
 | --------------- | --------------------------- | ----------------------------------------------------------------- |
 | `odom`          | nav_msgs/Odometry           | true posture and twist, V, lateral velocity and θ̇ in `base_link`  |
-| `reference`     | nav_msgs/Odometry           | what it shall follow                                              |
+| `reference`     | nav_msgs/Odometry           | reference posture and twist                                       |
 | `cmd_vel`       | geometry_msgs/TwistStamped  | commanded twist                                                   |
 | `measured`      | geometry_msgs/TwistStamped  | measured twist                                                    |
 | `joint_states`  | sensor_msgs/JointState      | wheels and fork; wheel angles integrated, the fork's rate derived |
@@ -32,10 +32,10 @@ from scipy.integrate import cumulative_trapezoid
 
 from mrctl.record import InputError
 from mrctl.results.dataset import SIGNALS
+from mrctl.theory.robot import GRAVITY
 
 Format = Literal["mcap", "csv", "parquet", "npz"]
 Columns = dict[str, NDArray]
-GRAVITY = 9.81  # m/s², as in the worlds
 
 # The definitions of ROS 2, without their comments.
 TIME = "int32 sec\nuint32 nanosec"
@@ -79,16 +79,16 @@ def export(result: xr.Dataset, to: Format, out: str | Path, run: int | None = No
 
     Args:
         result: What `mrctl.simulate` or `mrctl.open` returned.
-        to: The format.
+        to: Format of the file.
         out: The file to write.
-        run: The number of one run; by default all of them.
+        run: Number of the run to write; by default all runs.
 
     Returns:
-        How many runs were written.
+        The number of runs that were written.
 
     Raises:
-        InputError: There is no such run, the result has no signals, the file exists or cannot be written, or the
-            library for the format is missing.
+        InputError: There is no such format or run, the result has no signals, the file exists or cannot be written, or
+            the library for the format is missing.
     """
     if to not in get_args(Format):
         raise InputError(f"to: {to!r} is not {', '.join(get_args(Format))}")
@@ -119,7 +119,7 @@ def export(result: xr.Dataset, to: Format, out: str | Path, run: int | None = No
 
 
 def _runs(whole: xr.Dataset) -> Iterator[tuple[int, Columns]]:
-    """Each run's number and signals with their times, as long as it drove; one run in memory at a time."""
+    """Number and signals of each run, with their times, until it ended; one run is in memory at a time."""
     for k, number in enumerate(whole["run"].values):
         one = whole.isel(run=k).load()
         drove = np.isfinite(one["x"].values)
@@ -131,7 +131,7 @@ def _unit(name: str) -> str:
 
 
 def _table(whole: xr.Dataset) -> Iterator[pa.Table]:
-    """A table a run, units and meanings in the fields' metadata, scenarios and versions in the schema's."""
+    """A table for each run, with units and meanings in its fields' metadata, scenarios and versions in its schema's."""
     numbered = whole.sizes["run"] > 1
     about = {name: str(value) for name, value in whole.attrs.items()}
     for number, columns in _runs(whole):
@@ -154,7 +154,7 @@ def _parquet(whole: xr.Dataset, path: Path) -> None:
 
 
 def _csv(whole: xr.Dataset, path: Path) -> None:
-    """Names and units in the first line, as `v [m/s]`; numbers in full."""
+    """Writes names and units in the first line, as `v [m/s]`, and numbers in full precision."""
     for k, table in enumerate(_table(whole)):
         names = {field.name: f"{field.name} [{field.metadata[b'units'].decode()}]" for field in table.schema}
         names = {name: name if text.endswith("[1]") else text for name, text in names.items()}
@@ -162,7 +162,7 @@ def _csv(whole: xr.Dataset, path: Path) -> None:
 
 
 def _npz(whole: xr.Dataset, path: Path) -> None:
-    """`time` (T,), `run` (R,) and each signal (R, T), NaN where a run has failed; units and scenarios as JSON."""
+    """Writes `time` (T,), `run` (R,) and each signal (R, T), NaN after a failure; units and scenarios are JSON."""
     whole = whole.load()
     names = [name for name in SIGNALS if name in whole]
     arrays: Columns = {name: whole[name].transpose("run", "time").values for name in names}
@@ -175,7 +175,7 @@ def _npz(whole: xr.Dataset, path: Path) -> None:
 
 
 def _definition(name: str) -> str:
-    """A message's definition followed by those of all that it holds, as MCAP wants them."""
+    """The definition of a message followed by those of its parts, as MCAP requires."""
     own, parts = MESSAGES[name]
     parts = parts | {"std_msgs/Header": HEADER, "builtin_interfaces/Time": TIME}
     return own + "".join(f"\n{'=' * 80}\nMSG: {part}\n{text}" for part, text in parts.items())

@@ -1,14 +1,12 @@
-"""What a result is worth: errors per lap, learning, recovery, and their means over seeds.
+"""Metrics of a result: errors lap by lap, learning, and recovery after a change.
 
-Pure functions of the dataset that `simulate` returns. Errors are against the ORIGINAL reference. A run that failed is
-counted, never dropped: its metrics are NaN from the lap in which it failed on, and every statistic says how many it
-lost. Laps are numbered from 1. A sample is held for one control period, so an integral over time is a sum times that
-period.
+They are pure functions of the dataset that `simulate` returns. Errors are against the ORIGINAL reference. A run that
+failed is never dropped: its metrics are NaN from the lap in which it failed on. Laps are numbered from 1. A sample is
+held for one control period, so an integral over time is a sum times that period.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +17,7 @@ from numpy.typing import NDArray
 from mrctl.control.features import feature_matrix
 from mrctl.control.guard import GUARD_ACTIONS, LIMIT, NONE, REASONS
 from mrctl.record import InputError
-from mrctl.results.comparison import Interval, bootstrap_interval
+from mrctl.results.dataset import require
 
 Array = NDArray[np.float64]
 
@@ -35,8 +33,8 @@ METRICS: dict[str, tuple[str, str]] = {
     "omega_rmse": ("rad/s", "RMS error of the rotation velocity"),
     "v_iae": ("m", "integral of the absolute error of the linear velocity"),
     "omega_iae": ("rad", "integral of the absolute error of the rotation velocity"),
-    "v_itae": ("m s", "the same, weighted by the time since the lap began"),
-    "omega_itae": ("rad s", "the same, weighted by the time since the lap began"),
+    "v_itae": ("m s", "integral of the absolute error of the linear velocity times the time since the lap began"),
+    "omega_itae": ("rad s", "integral of the absolute rotation velocity error times the time since the lap began"),
     "feedback_share": ("1", "RMS feedback voltage over RMS voltage"),
     "voltage_variation": ("V", "total variation of the voltage, both wheels"),
     "saturation_time": ("s", "time in saturation"),
@@ -47,7 +45,7 @@ METRICS: dict[str, tuple[str, str]] = {
 }
 """Name of a metric -> (unit, description)."""
 
-ROUNDING = 1e-10  # singular values of the features below this share of the largest come of rounding alone
+ROUNDING = 1e-10  # singular values of the features below this share of the largest are due to rounding
 PER_RUN = ("label", "feedforward", "steering", "seed", "lap_time")
 SAMPLED = (
     "x", "y", "x_ref", "y_ref", "v", "omega", "v_ref", "omega_ref", "longitudinal_error", "lateral_error",
@@ -57,12 +55,12 @@ SAMPLED = (
 
 
 class Laps(NamedTuple):
-    """How one run divides into laps."""
+    """The laps of one run."""
 
     edges: NDArray[np.intp]
     """First sample of each lap, and the end of the last one (laps + 1,)."""
     failed: int | None
-    """Index of the lap in which the run failed, if it did."""
+    """Index of the lap in which the run failed, or None."""
 
 
 def as_runs(result: xr.Dataset) -> xr.Dataset:
@@ -78,7 +76,7 @@ def as_runs(result: xr.Dataset) -> xr.Dataset:
 
 
 def control_period(result: xr.Dataset) -> float:
-    """Seconds between the samples of a result.
+    """Time between the samples of a result in s.
 
     Raises:
         InputError: The result has neither two samples nor the attribute `control_period`.
@@ -92,9 +90,9 @@ def control_period(result: xr.Dataset) -> float:
 
 
 def laps_of(run: xr.Dataset) -> Laps:
-    """Divides one run (no `run` dimension) into whole laps; one that ends before its first lap does counts as one lap.
+    """Divides one run (no `run` dimension) into whole laps; a run that is shorter than a lap counts as one lap.
 
-    What follows the last whole lap is left out, but a failure in it is charged to that lap.
+    Samples after the last whole lap are left out, but a failure among them counts as one in that lap.
 
     Raises:
         InputError: `lap_time` is shorter than the control period.
@@ -122,7 +120,7 @@ def _failed(run: xr.Dataset) -> bool:
 
 
 def _end(run: xr.Dataset) -> int:
-    """Samples of one run: shorter runs are padded with NaN where results are put together, failed ones are not cut."""
+    """Number of samples of one run: the NaN that pad a shorter run are not counted, those after a failure are."""
     alive = np.flatnonzero(np.isfinite(run["x"].values))
     return len(run["time"]) if _failed(run) or not len(alive) else int(alive[-1]) + 1
 
@@ -134,15 +132,13 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
         result: What `simulate` returns, variables (run, time), or one run of it.
 
     Returns:
-        `METRICS` with dims (run, lap), units in attrs; `laps`, how many each run has (NaN beyond them); `failed` and
-        `failure_time` as in the result. Coordinate `lap` counts from 1.
+        `METRICS` with dims (run, lap), NaN beyond the laps of a run, and units in attrs; `laps`, the number of laps of
+        each run; `failed` and `failure_time` as in the result. Coordinate `lap` counts from 1.
 
     Raises:
         InputError: The result lacks a variable, or a lap is shorter than the control period.
     """
-    for name in ("time", *SAMPLED):
-        if name not in result.variables:
-            raise InputError(f"{name}: the result has no such variable")
+    require(result, ("time", *SAMPLED))
     runs = as_runs(result)
     size = runs.sizes["run"]
     period = control_period(runs)
@@ -200,7 +196,7 @@ def _lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float)
     feedback = np.hypot(_rms(data["feedback_left"]), _rms(data["feedback_right"]))
     voltage = np.hypot(_rms(data["voltage_left"]), _rms(data["voltage_right"]))
     with np.errstate(divide="ignore", invalid="ignore"):
-        found["feedback_share"] = np.where(feedback == 0, 0.0, feedback / voltage)  # at rest nobody works
+        found["feedback_share"] = np.where(feedback == 0, 0.0, feedback / voltage)  # 0 at rest, where both are 0
     variations = [np.abs(np.diff(steps[name])).sum(-1) for name in ("voltage_left", "voltage_right")]
     found["voltage_variation"] = variations[0] + variations[1]
     found["saturation_time"] = data["saturated"].sum(-1) * period
@@ -211,24 +207,24 @@ def _lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float)
 
 
 def excitation(command: Array, period: float, half_track: Array, scale: Array) -> Array:
-    """Smallest eigenvalue of the Gram matrix XᵀX/n of the 8 physical features X `(n, 8)` over some stretch of motion.
+    """Smallest eigenvalue of the Gram matrix XᵀX/n of the 8 physical features X `(n, 8)` over n samples of motion.
 
-    How well the least excited combination of coefficients can be told from what was driven: at zero a learner may hold
-    anything there (persistency of excitation; Ioannou and Sun 1996, section 4.3).
+    It says how well the motion determines the least excited combination of coefficients: where it is zero, the motion
+    says nothing about that combination (persistency of excitation; Ioannou and Sun 1996, section 4.3).
 
     Args:
         command: Commanded twist in m/s, rad/s, `(…, n, 2)`; its derivative is taken by central differences.
         period: Seconds between the samples.
-        half_track: Of the nominal robot in m, `(…,)`.
-        scale: What the features are divided by, as from `feature_scale`, `(…, 8)`.
+        half_track: Half track of the nominal robot in m, `(…,)`.
+        scale: Scales that the features are divided by, as from `feature_scale`, `(…, 8)`.
 
     Returns:
-        `(…,)`; NaN where the motion is not finite.
+        The eigenvalue, `(…,)`; NaN where the motion is not finite.
     """
     n = command.shape[-2]
     x = feature_matrix(command, np.gradient(command, period, axis=-2), half_track[..., None], scale[..., None, :])
     finite = np.asarray(np.isfinite(x).all(axis=(-2, -1)))
-    # Squared singular values resolve what eigenvalues of the product, rounded to 1e-16 of the largest, do not.
+    # Eigenvalues of XᵀX are rounded to 1e-16 of the largest; squared singular values of X resolve smaller ones.
     triangle = np.linalg.qr(np.where(finite[..., None, None], x, 0.0), mode="r")
     sizes = np.linalg.svd(triangle, compute_uv=False)
     least, largest = sizes[..., -1], sizes[..., 0]
@@ -242,15 +238,19 @@ def _rms(signal: Array) -> Array:
 
 
 def guard_events(result: xr.Dataset) -> pd.DataFrame:
-    """What the guard on the learner did, in order of time, run by run.
+    """The actions of the guard on the learner, run by run in order of time.
 
     Args:
         result: What `simulate` returns, or one run of it.
 
     Returns:
-        A row an event: run, time in s, action (limit, freeze, fallback, or resume after the last two), and the reason
-        in words.
+        A row for each action: run, time in s, action (limit, freeze, fallback, or resume after the last two), and the
+        reason in words.
+
+    Raises:
+        InputError: The result has no record of the guard.
     """
+    require(result, ("guard", "guard_reason"))
     runs = as_runs(result)
     rows = []
     for row, number in enumerate(runs["run"].values):
@@ -270,13 +270,13 @@ def laps_to_converge(laps: xr.Dataset, metric: str, factor: float = 1.2) -> xr.D
     Args:
         laps: What `per_lap` returns.
         metric: One of `METRICS`.
-        factor: How close counts as converged, at least 1.
+        factor: Largest ratio to the final value that counts as converged, at least 1.
 
     Returns:
         The lap's number (run,), from 1; NaN for a run that failed.
 
     Raises:
-        InputError: No such metric, or a factor below 1.
+        InputError: There is no such metric, or the factor is below 1.
     """
     known(metric)
     if not factor >= 1:
@@ -284,59 +284,11 @@ def laps_to_converge(laps: xr.Dataset, metric: str, factor: float = 1.2) -> xr.D
     number = np.full(laps.sizes["run"], np.nan)
     for row, count in enumerate(laps["laps"].values):
         value = laps[metric].values[row, :count]
-        if np.isfinite(value[-1]):
+        if count and np.isfinite(value[-1]):
             outside = np.flatnonzero(~(value <= factor * value[-1]))
             number[row] = 1 if not len(outside) else outside[-1] + 2
     attrs = {"units": "1", "long_name": f"laps to {factor:g}× the final {METRICS[metric][1]}"}
     return xr.DataArray(number, {"run": laps["run"].values}, ("run",), "laps_to_converge", attrs)
-
-
-def recovery_time(
-    result: xr.Dataset,
-    event_time: float,
-    error: str = "lateral_error",
-    window: float | None = None,
-    factor: float = 1.2,
-    until: float | None = None,
-) -> xr.DataArray:
-    """Time after a step change until the moving RMS error is back, to stay, within `factor` of its value before.
-
-    Args:
-        result: What `simulate` returns.
-        event_time: When the change came, s.
-        error: An error variable of the result, or "v" or "omega" for the error of that velocity.
-        window: Length of the trailing window, s; one lap of the run if not given.
-        factor: How close counts as recovered.
-        until: Look no further than this, s (the next change); the end of the run if not given.
-
-    Returns:
-        Seconds (run,): 0 if the error never left the band, infinite if it is outside at the end, NaN if the run failed.
-
-    Raises:
-        InputError: The event is outside the run, or the error unknown.
-    """
-    runs, period = as_runs(result), control_period(result)
-    stop = len(runs["time"]) if until is None else _sample(runs, until, "until")
-    event = _sample(runs, event_time, "event_time")
-    if not 0 < event < stop:
-        raise InputError(f"event_time: {event_time:g} s leaves no samples on both of its sides")
-    narrow = runs[[name for name in ("x", "failed") if name in runs]]
-    squares = np.square(_error(runs, error))
-    seconds = np.full(len(squares), np.nan)
-    for row, length in enumerate(_windows(runs, window)):
-        end = min(stop, _end(narrow.isel(run=row)))
-        square = squares[row, :end]
-        if end <= event or not np.isfinite(square).all():
-            continue
-        total = np.concatenate([[0.0], np.cumsum(square)])
-        last = np.arange(event, end + 1)  # the first value is the one before the event
-        first = np.maximum(last - length, 0)
-        moving = np.sqrt(np.maximum(total[last] - total[first], 0) / (last - first))
-        outside = np.flatnonzero(moving > factor * moving[0] + 1e-12)
-        back = outside[-1] + 1 if len(outside) else 0
-        seconds[row] = back * period if back < len(moving) else np.inf
-    attrs = {"units": "s", "long_name": f"time until the RMS of {error} is back within {factor:g}×"}
-    return xr.DataArray(seconds, {"run": runs["run"].values}, ("run",), "recovery_time", attrs)
 
 
 def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor: float = 1.2) -> xr.DataArray:
@@ -345,15 +297,15 @@ def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor
     Args:
         laps: What `per_lap` returns.
         metric: One of `METRICS`.
-        change: The number of the lap in whose beginning the change came, from 2.
-        until: Number of the last lap to look at, before the next change.
-        factor: How close counts as recovered.
+        change: Number of the lap, from 2, at whose beginning the change came.
+        until: Number of the last lap before the next change.
+        factor: Largest ratio to the lap before the change that counts as recovered.
 
     Returns:
         Laps (run,): 0 if the lap of the change itself is within, infinite if the last one is not, NaN if it failed.
 
     Raises:
-        InputError: No such metric, or laps that are not there.
+        InputError: There is no such metric, or no such lap.
     """
     known(metric)
     if not 2 <= change <= until <= laps.sizes["lap"]:
@@ -367,80 +319,17 @@ def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor
     return xr.DataArray(number, {"run": laps["run"].values}, ("run",), "recovery_laps", attrs)
 
 
-def error_on_return(
-    result: xr.Dataset,
-    event_time: float,
-    return_time: float,
-    error: str = "lateral_error",
-    window: float | None = None,
-) -> xr.DataArray:
-    """Forgetting: RMS error just after the old conditions return, over that just before they changed.
-
-    Args:
-        result: What `simulate` returns.
-        event_time: When the conditions changed, s.
-        return_time: When they changed back, s.
-        error: As in `recovery_time`.
-        window: Seconds before and after; one lap of the run if not given.
-
-    Returns:
-        The ratio (run,); 1 is a learner that forgot nothing, NaN a run that failed.
-
-    Raises:
-        InputError: The times are out of order or outside the run, or the error is unknown.
-    """
-    runs = as_runs(result)
-    event, back = _sample(runs, event_time, "event_time"), _sample(runs, return_time, "return_time")
-    if not 0 < event < back < len(runs["time"]):
-        raise InputError(f"return_time: {return_time:g} s must follow event_time {event_time:g} s, within the run")
-    signal = _error(runs, error)
-    ratio = [
-        float(np.divide(_rms(signal[row, back : back + length]), _rms(signal[row, max(event - length, 0) : event])))
-        for row, length in enumerate(_windows(runs, window))
-    ]
-    attrs = {"units": "1", "long_name": f"RMS of {error} on return over that before"}
-    return xr.DataArray(ratio, {"run": runs["run"].values}, ("run",), "error_on_return", attrs)
-
-
-def _sample(runs: xr.Dataset, time: float, field: str) -> int:
-    """Index of the first sample at or after a time."""
-    if not np.isfinite(time):
-        raise InputError(f"{field}: {time} is not a time")
-    return int(np.searchsorted(runs["time"].values, time - 1e-6 * control_period(runs)))
-
-
-def _windows(runs: xr.Dataset, window: float | None) -> list[int]:
-    """Window length of each run in samples."""
-    period = control_period(runs)
-    if window is None and "lap_time" not in runs.coords:
-        raise InputError("window: must be given, the result has no lap_time")
-    seconds = runs["lap_time"].values if window is None else np.full(runs.sizes["run"], window)
-    if not (seconds >= period).all():
-        raise InputError(f"window: shorter than the control period of {period:g} s")
-    return [int(min(np.rint(one / period), len(runs["time"]))) for one in seconds]
-
-
-def _error(runs: xr.Dataset, name: str) -> Array:
-    """An error signal (run, time): a variable, or a velocity minus its reference."""
-    if name in ("v", "omega"):
-        signal = runs[name] - runs[f"{name}_ref"]
-    elif name.endswith("_error") and name in runs:
-        signal = runs[name]
-    else:
-        names = ", ".join(["v", "omega", *(str(key) for key in runs.data_vars if str(key).endswith("_error"))])
-        raise InputError(f"error: {name!r} is not one of {names}")
-    return signal.transpose("run", "time").values.astype(float)
-
-
 def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
-    """A row per run: what it was, whether it failed, and its metrics in one lap.
+    """A row for each run: its description, whether it failed, and its metrics in one lap.
 
     Args:
         result: What `simulate` or `per_lap` returns.
-        lap: Number of the lap from 1, or from the run's end from −1. NaN where a run has no such lap.
+        lap: Number of the lap, counted from 1, or from −1 backwards from the end of the run. A run without such a lap
+            has NaN.
 
     Returns:
-        Columns label, feedforward, steering, seed (those there are), laps, failed, failure_time and `METRICS`;
+        Columns label, feedforward, steering, seed (those there are), laps, failed, failure_time, `METRICS` in that lap,
+        and laps_to_converge, the first lap from which on the position error stays within 1.2 times its final value;
         `attrs["failed"]` is the number of failed runs, `attrs["units"]` the units by column.
 
     Raises:
@@ -456,46 +345,18 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
     columns = {name: laps[name].values for name in PER_RUN[:-1] if name in laps.coords}
     columns |= {name: laps[name].values for name in ("laps", "failed", "failure_time")}
     columns |= {name: np.where(there, laps[name].values[rows, np.where(there, index, 0)], np.nan) for name in METRICS}
+    columns["laps_to_converge"] = laps_to_converge(laps, "position_rmse").values
     table = pd.DataFrame(columns, index=pd.Index(laps["run"].values, name="run"))
-    table.attrs = {"failed": int(laps["failed"].sum()), "units": {name: unit for name, (unit, _) in METRICS.items()}}
+    units = {name: unit for name, (unit, _) in METRICS.items()} | {"laps_to_converge": "1"}
+    table.attrs = {"failed": int(laps["failed"].sum()), "units": units}
     return table
 
 
-def statistics(
-    table: pd.DataFrame, metrics: Iterable[str] | None = None, by: str = "label", level: float = 0.95, seed: int = 0
-) -> pd.DataFrame:
-    """Means over the runs that share a label, with bootstrap intervals and the number of failures.
-
-    Args:
-        table: What `summary` returns.
-        metrics: Some of `METRICS`, or all.
-        by: The column that names the groups.
-        level: Confidence level.
-        seed: Of the bootstrap.
-
-    Returns:
-        Columns of `Interval`, indexed by (group, metric), groups in order of appearance.
-
-    Raises:
-        InputError: An unknown metric or column.
-    """
-    if by not in table:
-        raise InputError(f"by: the table has no column {by!r}")
-    names = [known(name) for name in (METRICS if metrics is None else metrics)]
-    rows = {
-        (group, name): bootstrap_interval(rows[name].to_numpy(), level, seed=seed)
-        for group, rows in table.groupby(by, sort=False)
-        for name in names
-    }
-    index = pd.MultiIndex.from_tuples(rows, names=[by, "metric"])
-    return pd.DataFrame(list(rows.values()), index=index, columns=pd.Index(Interval._fields))
-
-
 def known(metric: str) -> str:
-    """The name itself, if it is one of `METRICS`.
+    """Returns the name if it is one of `METRICS`.
 
     Raises:
-        InputError: It is not; the message lists those that are.
+        InputError: It is not; the message lists all metrics.
     """
     if metric not in METRICS:
         raise InputError(f"metric: {metric!r} is not one of {', '.join(METRICS)}")

@@ -1,8 +1,9 @@
-"""Figures of a result, fit to print: 88 mm or 180 mm wide, Okabe and Ito's colours, units on every axis.
+"""Figures of a result for print: they are 88 mm or 180 mm wide, with Okabe and Ito's colours and units on every axis.
 
 Each function returns a matplotlib `Figure` and shows nothing. Results may hold several runs or one that was squeezed;
 runs with the same `label` share a colour and one entry in the legend, which counts those that failed. A cross marks
-where a run failed. `window` is a pair of times in s, `lap` a lap's number from 1, or from the run's end from −1.
+where a run failed. `window` is a pair of times in s; `lap` is the number of a lap, counted from 1, or from −1 backwards
+from the end of the run.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from typing import Any, NamedTuple, ParamSpec
 import matplotlib as mpl
 import numpy as np
 import xarray as xr
-from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Polygon
+from matplotlib.rcsetup import cycler
 
 from mrctl.record import InputError
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap
@@ -67,7 +68,7 @@ Point = Sequence[float] | np.ndarray
 
 
 class Curve(NamedTuple):
-    """One run, cut to what is to be seen, and how to draw it."""
+    """One run, cut to the part that is shown, with its label and style."""
 
     data: xr.Dataset
     label: str
@@ -75,7 +76,7 @@ class Curve(NamedTuple):
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Draws in the style of this module and leaves the user's settings alone."""
+    """Makes a function draw in the style of this module without changing the user's settings."""
 
     @wraps(draw)
     def inner(*args: P.args, **kwargs: P.kwargs) -> Figure:
@@ -90,11 +91,11 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
 
     Args:
         figure: Any figure.
-        folder: Where to; created if need be.
+        folder: Folder to write to; it is created if it does not exist.
         name: File name without suffix.
 
     Returns:
-        The paths written.
+        The paths of both files.
 
     Raises:
         InputError: The folder cannot be created or written to.
@@ -104,7 +105,7 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
         Path(folder).mkdir(parents=True, exist_ok=True)
         with mpl.rc_context({"pdf.fonttype": STYLE["pdf.fonttype"]}):
             figure.savefig(paths[0], dpi=STYLE["savefig.dpi"])
-            figure.savefig(paths[1], metadata={"CreationDate": None})  # the same figure, the same file
+            figure.savefig(paths[1], metadata={"CreationDate": None})  # the same figure gives the same file
     except OSError as error:
         raise InputError(f"{folder}: cannot write figures there: {error.strerror or error}") from None
     return paths
@@ -112,7 +113,7 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
 
 @styled
 def path(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
-    """The way P went, over the reference; a dot marks the start."""
+    """The path of P over that of the reference; a dot marks the start."""
     figure, (axes,) = _figure(COLUMN, COLUMN * 0.95)
     curves = _curves(result, window, lap)
     _references(axes, curves, "x_ref", "y_ref")
@@ -162,11 +163,11 @@ def compare_errors(
     """Tracking errors of two controllers in the same axes, with their RMS values (the paper's figure 5).
 
     Args:
-        result_pid: Runs of the one, conventional PID in the paper.
-        result_nn: Runs of the other, with neural feedforward in the paper.
-        labels: What to call them.
-        window: Times to show, s.
-        lap: Or the lap to show.
+        result_pid: Runs of the first controller, in the paper conventional PID.
+        result_nn: Runs of the second controller, in the paper PID with neural feedforward.
+        labels: Names of the two controllers in the legend.
+        window: Times to show in s.
+        lap: Lap to show instead of a window.
     """
     curves = []
     for result, label, colour in zip((result_pid, result_nn), labels, COLOURS, strict=False):
@@ -185,7 +186,7 @@ def compare_errors(
 
 @styled
 def voltages(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
-    """Feedback, feedforward and total voltage of each wheel over time; a column per run."""
+    """Feedback, feedforward and total voltage of each wheel over time, in a column for each run."""
     curves = _curves(result, window, lap)
     count = len(curves)
     width = COLUMN if count == 1 else max(PAGE, 60 / 25.4 * count)
@@ -214,7 +215,7 @@ def voltages(result: xr.Dataset, window: tuple[float, float] | None = None, lap:
 def feedforward_outputs(
     result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None
 ) -> Figure:
-    """What the feedforward asks of the left and the right motor, over time (the paper's figure 6)."""
+    """Feedforward voltage of the left and the right motor over time (the paper's figure 6)."""
     figure, axes = _figure(COLUMN, 0.9 * COLUMN, rows=2, sharey=True)
     curves = _curves(result, window, lap)
     for one, wheel in zip(axes, ("left", "right"), strict=True):
@@ -225,17 +226,17 @@ def feedforward_outputs(
 
 @styled
 def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omega_rmse")) -> Figure:
-    """Metrics lap by lap on a log axis: a thin line per run, a thick one for the mean of the runs that share a label.
+    """Metrics lap by lap on a log axis, with a thin line for each run and a thick one for the mean of each label.
 
     Args:
         result: What `simulate` or `metrics.per_lap` returns.
-        metrics: Some of `METRICS`, a panel each.
+        metrics: Names in `METRICS`; each has a panel.
 
     Raises:
-        InputError: An unknown metric, or none.
+        InputError: A metric is unknown, or none is given.
     """
     if not metrics:
-        raise InputError("metrics: none given")
+        raise InputError("metrics: at least one is needed")
     names = [known(name) for name in metrics]
     laps = as_runs(result if "lap" in result.dims else per_lap(result))
     columns = min(2, len(names))
@@ -268,19 +269,19 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
 
 @styled
 def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence[int] = ()) -> Figure:
-    """A metric lap by lap on a log axis, a panel a case: the mean of the runs that share a label, and their range.
+    """A metric lap by lap on a log axis, in a panel for each case: mean and range of the runs that share a label.
 
     Args:
-        cases: What `metrics.per_lap` returns, by title.
+        cases: Datasets as `metrics.per_lap` returns them, by title.
         metric: One of `METRICS`.
-        changes: Laps in whose beginning something changes: dotted lines.
+        changes: Numbers of laps at whose beginning something changes; dotted lines mark them.
 
     Raises:
-        InputError: An unknown metric, or no case.
+        InputError: The metric is unknown, or there is no case.
     """
     unit, text = METRICS[known(metric)]
     if not cases:
-        raise InputError("cases: none given")
+        raise InputError("cases: at least one is needed")
     columns = 2 if len(cases) in (2, 4) else min(3, len(cases))
     rows = -(-len(cases) // columns)
     figure, axes = _figure(PAGE, (0.12 + 0.55 * rows) * COLUMN, rows=rows, columns=columns, sharey=True)
@@ -314,11 +315,11 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
 
 @styled
 def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
-    """The share of runs below each value, on a log axis; runs that are not finite never count as below.
+    """The share of runs below each value, on a log axis; a run that failed, which is not finite, is below none.
 
     Args:
-        samples: Positive numbers, one a run, by name.
-        label: What they are, with its unit.
+        samples: A positive number for each run, by name.
+        label: Quantity and unit for the axis.
     """
     figure, (axes,) = _figure(COLUMN, 0.8 * COLUMN)
     for order, values in enumerate(samples.values()):
@@ -332,7 +333,7 @@ def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
 
 
 class InverseMap(NamedTuple):
-    """A feedforward in steady motion, beside the truth."""
+    """The output of a feedforward in steady motion, beside the true inverse dynamics."""
 
     v: np.ndarray
     """Speeds in m/s (n,)."""
@@ -348,15 +349,15 @@ class InverseMap(NamedTuple):
 
 @styled
 def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
-    """Learned against true inverse dynamics as heat maps over the twist: a row a learner; true, learned, error in V.
+    """Heat maps of the inverse dynamics over the twist, in a row for each learner: true, learned, and the error, in V.
 
-    The white line is where the robot drove while learning.
+    The white line shows where the robot drove while it learned.
 
     Raises:
-        InputError: No map.
+        InputError: There is no map.
     """
     if not maps:
-        raise InputError("maps: none given")
+        raise InputError("maps: at least one is needed")
     figure, axes = _figure(PAGE, (0.1 + 0.36 * len(maps)) * PAGE, rows=len(maps), columns=6, sharey=True)
     true = np.stack([one.true for one in maps.values()])
     for row, (name, one) in enumerate(maps.items()):
@@ -384,13 +385,13 @@ def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
 
 
 def _line(order: int) -> dict[str, Any]:
-    """Colour and dashes of the label in that place; colours come again with other dashes."""
+    """Colour and dashes of the label in a place of the legend; colours repeat with other dashes."""
     again, colour = divmod(order, len(COLOURS))
     return {"color": COLOURS[colour], "ls": ("-", "--", ":")[again % 3]}
 
 
 def _figure(width: float, height: float, rows: int = 1, columns: int = 1, sharey: bool = False) -> tuple[Figure, list]:
-    """A figure and its axes, row by row. No pyplot: nothing to close, and no figure shown twice in a notebook."""
+    """A figure and its axes, row by row; made without pyplot, it need not be closed and a notebook shows it once."""
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots(rows, columns, sharex=rows > 1, sharey=sharey, squeeze=False)
     return figure, list(axes.flat)
@@ -433,7 +434,7 @@ def _cut(run: xr.Dataset, window: tuple[float, float] | None, lap: int | None) -
 
 
 def _signals(axes: Axes, curves: Iterable[Curve], name: str, label: str) -> None:
-    """One variable of every run over time."""
+    """Draws one variable of every run over time."""
     for data, _, style in curves:
         time, signal = data["time"].values, data[name].values
         axes.plot(time, signal, **style)
@@ -445,7 +446,7 @@ def _signals(axes: Axes, curves: Iterable[Curve], name: str, label: str) -> None
 
 
 def _references(axes: Axes, curves: Iterable[Curve], x: str, y: str) -> None:
-    """The references, each once where runs share one."""
+    """Draws the references; one that runs share is drawn once."""
     seen = set()
     for data, _, _ in curves:
         points = np.column_stack([data[x].values, data[y].values])
@@ -470,7 +471,7 @@ def _counted(label: str, failed: int, count: int) -> str:
 
 
 def _legend(figure: Figure, curves: Sequence[Curve], reference: bool = False) -> None:
-    """An entry per label, above the axes, with the number of failures."""
+    """Draws an entry for each label above the axes, with the number of failures."""
     entries: dict[str, list[Curve]] = {}
     for curve in curves:
         entries.setdefault(curve.label, []).append(curve)
@@ -485,7 +486,7 @@ def _legend(figure: Figure, curves: Sequence[Curve], reference: bool = False) ->
 
 
 def _errors(curves: Sequence[Curve]) -> Figure:
-    """Three panels of errors."""
+    """Draws the three errors, each in a panel."""
     figure, axes = _figure(COLUMN, 1.15 * COLUMN, rows=3)
     for one, (name, label) in zip(axes, ERRORS.items(), strict=True):
         one.axhline(0, color="0.6", lw=0.6)
@@ -498,7 +499,7 @@ def _errors(curves: Sequence[Curve]) -> Figure:
 def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> None:
     """Names each line at its end, spread so that no two names overlap."""
     low, high = np.log10(axes.get_ylim())
-    gap = 0.075  # of the axis: a line of 8 pt in a panel of 50 mm
+    gap = 0.075  # share of the axis that a line of 8 pt takes in a panel of 50 mm
     shown = sorted((e for e in ends if np.isfinite(e[1]) and e[1] > 0), key=lambda end: end[1])
     heights = np.array([(np.log10(y) - low) / (high - low) for _, y, _, _ in shown])
     places = heights.copy()

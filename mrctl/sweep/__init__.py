@@ -1,4 +1,4 @@
-"""Thousands of runs: the sweep file, the jobs it is cut into, the processes that compute them, and the store.
+"""Sweeps of thousands of runs: the sweep file, its jobs, the workers that compute them, and the store.
 
-Imports the loop and the results.
+They import the loop and the results.
 """

@@ -1,4 +1,4 @@
-"""Runs a sweep, job by job, and single runs of it again."""
+"""Runs a sweep job by job, and repeats single runs of it."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from mrctl import __version__
 from mrctl.control.stages import METHODS, Stages
 from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation, simulate
@@ -29,7 +30,7 @@ from mrctl.sweep.pool import Cluster, Outcome, Pool, Processes, Work
 from mrctl.sweep.store import Store
 from mrctl.theory.robot import CAR
 
-TOLERANCE = 1e-9  # of a run that is computed again, relative
+TOLERANCE = 1e-9  # relative difference within which a repeated run agrees
 ASIDE = "set aside: "
 
 
@@ -38,9 +39,9 @@ class Report(NamedTuple):
 
     runs: int
     failed: int
-    """Runs that failed, those set aside included."""
+    """Number of runs that failed, including those of jobs that were set aside."""
     aside: dict[range, str]
-    """The runs of jobs that could not be done, and why."""
+    """Why a job could not be done, by the runs of the job."""
 
 
 def run(
@@ -51,21 +52,22 @@ def run(
     progress: bool = False,
     work: Work | None = None,
 ) -> Report:
-    """Runs a sweep, or what is left of it.
+    """Runs a sweep, or those jobs of it that are not done yet.
 
-    The store holds the same values for any number of workers and any interruptions. In a script, call this under
-    `if __name__ == "__main__":`, for the workers import the script.
+    The store holds the same values for any number of workers and any interruptions. In a script, call this function
+    under `if __name__ == "__main__":`, because the workers import the script.
 
     Args:
-        sweep: What to run.
+        sweep: The sweep to run.
         out: Folder of the store.
-        workers: Processes on this machine, one core each; by default as many as there are cores.
+        workers: Number of processes on this machine, one core each; by default the number of cores.
         scheduler: Address of a Dask scheduler to use instead.
-        progress: Shows a progress bar.
-        work: What a worker does with a job; by default `compute`.
+        progress: Whether to show a progress bar.
+        work: Function that a worker calls for a job; by default `compute`.
 
     Raises:
-        InputError: A bad sweep; a folder that is not this sweep's, is in use or cannot be written; no scheduler.
+        InputError: The sweep is bad; the folder belongs to another sweep or version of mrctl, is in use or cannot be
+            written; or no scheduler answers.
     """
     if workers is not None and (scheduler or workers < 1):
         raise InputError("workers: not together with a scheduler" if scheduler else f"workers: {workers} is below 1")
@@ -94,7 +96,7 @@ def run(
 
 
 def _drive(store: Store, pending: Sequence[int], pool: Pool, progress: bool) -> dict[int, str]:
-    """Has jobs done; those that kill their worker or raise are tried again alone, after the others, then set aside."""
+    """Has jobs computed. One that kills its worker or raises is tried again after the others, alone, then set aside."""
     fresh, again = deque(pending), deque[int]()
     tries, aside, flying = Counter[int](), dict[int, str](), 0
     kept = store.size - sum(len(store.runs(job)) for job in pending)
@@ -122,19 +124,23 @@ def _drive(store: Store, pending: Sequence[int], pool: Pool, progress: bool) -> 
                     bar.set_postfix(failed=failed, refresh=False)
                     bar.update(size)
         except KeyboardInterrupt:
-            pool.close()  # or a worker would finish another job behind the count
+            pool.close()  # otherwise a worker would finish another job while the jobs are counted
             done = sum(len(store.runs(job)) for job in store.done())
             raise KeyboardInterrupt(f"{done} of {store.size} runs are done; the same command goes on") from None
     return aside
 
 
 def _failed(tables: Iterable[Path]) -> int:
-    """How many runs failed."""
+    """Number of runs that failed."""
     return sum(pq.read_table(table, columns=["failed"])["failed"].to_numpy().sum() for table in tables)
 
 
 def _manifest(sweep: Sweep) -> dict[str, Any]:
-    """What a store must agree on. Fails for a sweep whose worlds do not compile or whose robot cannot follow."""
+    """The description that a store and a sweep must agree on.
+
+    Raises:
+        InputError: A world does not compile, or the robot cannot follow the reference.
+    """
     models = _models(sweep)
     if scenario := sweep.valid(0):
         if sweep.controller:
@@ -150,11 +156,12 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
         "samples": sweep.samples,
         "stride": sweep.stride,
         "control_period": sweep.base.control_period,
+        "signals": list(SIGNALS),
     }
 
 
 def _models(sweep: Sweep) -> dict[str, str]:
-    """Digests of the compiled worlds with the robot, and of the files of a controller."""
+    """Digests of the compiled worlds with their robots, and of the files of the user's stages."""
     worlds = {
         f"{world}, {steering}" + (f", {robot.path}" if robot != CAR else ""): mjcf.digest(
             mjcf.load(world, steering, robot=robot)
@@ -165,7 +172,7 @@ def _models(sweep: Sweep) -> dict[str, str]:
 
 
 def compute(path: str, job: int) -> Outcome:
-    """What a worker does: computes the runs of a job and keeps them in the store."""
+    """Computes the runs of a job in a worker and writes them to the store."""
     try:
         store = Store(path)
         sweep = _agreed(json.dumps(store.manifest))
@@ -176,7 +183,7 @@ def compute(path: str, job: int) -> Outcome:
         return Outcome(job, error=str(error), fatal=True)
     except OSError as error:
         return Outcome(job, error=f"{path}: {error.strerror or error}", fatal=True)
-    except Exception as error:  # noqa: BLE001 (whatever it is, the other jobs go on)
+    except Exception as error:  # noqa: BLE001 (whatever the error is, the other jobs go on)
         return Outcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))
 
 
@@ -185,18 +192,21 @@ def _agreed(manifest: str) -> Sweep:
     """The sweep of a store.
 
     Raises:
-        InputError: This worker has other versions or other worlds than who began the store.
+        InputError: This worker has other versions or other worlds than the process that began the store.
     """
     agreed = json.loads(manifest)
+    worker = f"worker {os.getpid()} on {os.uname().nodename}"
+    for name, version in versions().items():
+        if version != (begun := agreed["versions"].get(name)):
+            raise InputError(f"{worker}: has {name} {version}, but the store was begun with {name} {begun}")
     sweep = Sweep.from_dict(agreed["sweep"], "sweep")
-    for what, here in (("versions", versions()), ("models", _models(sweep))):
-        if unlike := sorted(name for name in here if here[name] != agreed[what].get(name)):
-            raise InputError(f"worker {os.getpid()} on {os.uname().nodename}: {unlike[0]} is not the store's")
+    if unlike := [name for name, digest in _models(sweep).items() if digest != agreed["models"].get(name)]:
+        raise InputError(f"{worker}: {unlike[0]} is not the store's")
     return sweep
 
 
 def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict[str, Any]], NDArray | None]:
-    """Rows of the table, and signals `(runs, samples, signals)` if any are kept."""
+    """Rows of the table, and signals `(runs, samples, signals)` if the store keeps them."""
     rows: dict[int, dict[str, Any]] = {}
     signals = np.full((len(runs), samples, len(SIGNALS)), np.nan) if samples else None
     batches: dict[float, dict[int, Scenario]] = {}
@@ -204,7 +214,7 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
         try:
             scenario = sweep.scenario(run)
             batches.setdefault(scenario.control_period, {})[run] = scenario
-        except InputError as error:  # drawn out of range
+        except InputError as error:  # a value that was drawn is out of range
             rows[run] = _row(sweep, run, str(error).removeprefix(f"run {run}: "))
     stages: Stages = user_files.load(sweep.controller) if sweep.controller else {}
     queue = list(batches.values())
@@ -214,11 +224,11 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
         except InputError as error:
             if len(batch) == 1:
                 rows |= {run: _row(sweep, run, str(error)) for run in batch}
-            else:  # one that cannot be run shall not cost the others
+            else:  # a run that is impossible must not prevent the others
                 queue.extend({run: scenario} for run, scenario in batch.items())
             continue
         if stages and len(batch) > 1 and any(str(why).startswith((*METHODS,)) for why in result["failure"].values):
-            # A stage that raises ends its whole group; alone, each run is what it is in any company.
+            # A stage that raises ends its whole batch; computed alone, a run does not depend on the others.
             queue.extend({run: scenario} for run, scenario in batch.items())
             continue
         laps = metrics.per_lap(result)
@@ -235,7 +245,7 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
 
 
 def _row(sweep: Sweep, run: int, failure: str = "", **found: object) -> dict[str, Any]:
-    """A row of the table: what the run was and what was found, NaN where nothing was."""
+    """A row of the table: the description of the run and its metrics, which are NaN unless they are `found`."""
     values, valid = sweep.values(run), sweep.valid(run)
     scenario = valid or sweep.base
     row: dict[str, Any] = {name: np.nan for name in (*metrics.METRICS, "lap_time")}
@@ -251,45 +261,56 @@ def _table(sweep: Sweep, rows: Sequence[dict[str, Any]]) -> pa.Table:
 
 
 class Repeat(NamedTuple):
-    """A run of a sweep, computed again."""
+    """The comparison of a run that was computed again with the store."""
 
     verdict: str
-    """`bit-identical`, `within tolerance`, or `departs`, and where."""
+    """`bit-identical`, `within tolerance`, or `departs`, and where; then the versions of mrctl, where they differ."""
     same: bool
-    """Whether it does not depart."""
+    """Whether the run agrees with the store."""
 
 
 def scenario_of(out: str | Path, run: int) -> Scenario:
     """The scenario of one run of a stored sweep.
 
     Raises:
-        InputError: No store, no such run, or what was drawn for it is out of range.
+        InputError: There is no store or no such run, a value that was drawn for it is out of range, or another version
+            of mrctl, which the message names, wrote a field that this one does not know.
     """
-    return Sweep.from_dict(Store(out).manifest["sweep"], str(out)).scenario(run)
+    return _sweep(Store(out)).scenario(run)
+
+
+def _sweep(store: Store) -> Sweep:
+    """The sweep of a store that any version of mrctl may have written."""
+    return Sweep.from_dict(store.manifest["sweep"], f"{store.path} (written by mrctl {store.writer})")
 
 
 def repeat(out: str | Path, run: int) -> Repeat:
     """Runs one run of a sweep alone and compares it with what the store has.
 
     Raises:
-        InputError: No store, no such run, or it is not done yet.
+        InputError: As `scenario_of`, or the run is not done yet.
     """
     store = Store(out)
-    sweep = Sweep.from_dict(store.manifest["sweep"], str(out))
-    sweep.values(run)  # there is such a run
+    sweep = _sweep(store)
+    sweep.values(run)  # raises an error if there is no such run
     if (stored := store.row(run)) is None:
         raise InputError(f"run: {run} is not done yet")
     if stored["failure"].startswith(ASIDE):
         raise InputError(f"run: {run} was {stored['failure']}; there is nothing to compare with")
     (row,), signals = _compute(sweep, [run], store.samples)
     reasons = [one["failure"] or "it finished" for one in (row, stored)]
+    writers = "" if store.writer == __version__ else f" (of mrctl {store.writer}; this is mrctl {__version__})"
     if reasons[0] != reasons[1]:
-        return Repeat(f"departs: {reasons[0]}, in the store {reasons[1]}", False)
+        return Repeat(f"departs: {reasons[0]}, in the store {reasons[1]}{writers}", False)
     names = [*metrics.METRICS, "failure_time", *(name for name in row if name.endswith("_per_lap"))]
+    names = [name for name in names if name in stored]  # an older version computed fewer
     pairs = {name: (np.array(row[name], float, ndmin=1), np.array(stored[name], float, ndmin=1)) for name in names}
     if signals is not None:
         kept = store.signals(run)
-        pairs |= {f"signal {name}": (signals[0, :, k], kept[:, k]) for k, name in enumerate(SIGNALS)}
+        recorded = dict(zip(store.signal_names, kept.T, strict=True))
+        pairs |= {
+            f"signal {name}": (signals[0, :, k], recorded[name]) for k, name in enumerate(SIGNALS) if name in recorded
+        }
     if all(new.tobytes() == old.tobytes() for new, old in pairs.values()):
         return Repeat("bit-identical", True)
     scale = {name: TOLERANCE * np.abs(old).max(initial=0, where=np.isfinite(old)) for name, (_, old) in pairs.items()}
@@ -300,4 +321,4 @@ def repeat(out: str | Path, run: int) -> Repeat:
     place = int(off[name].argmax())
     when = f" at t = {store.times[place]:g} s" if name.startswith("signal") else ""
     new, old = (float(one[place]) for one in pairs[name])
-    return Repeat(f"departs: {name} is {new!r}{when}, in the store {old!r}", False)
+    return Repeat(f"departs: {name} is {new!r}{when}, in the store {old!r}{writers}", False)

@@ -1,10 +1,10 @@
-"""Thousands of runs as data: a sweep file in, one scenario a run out. `sweep.jobs` runs them, `sweep.store` keeps them.
+"""Sweeps as data: turns a sweep file into the scenarios of its runs. `sweep.jobs` runs them, `sweep.store` keeps them.
 
 Run i is a pure function of the sweep and i. The runs are the product of the axes that list their values, in the order
-of the file, the first one slowest; each combination is drawn `runs` times, and that number changes fastest. Draw d of
-a combination sets the scenario's seed and the value of every distribution from a stream of its own, so neither the
-order nor the company in which a run is computed can change it. Combinations that differ in `paired` axes alone share
-their draws.
+of the file, with the first axis slowest; each combination is drawn `runs` times, and the number of the draw changes
+fastest. A draw takes the seed of the scenario and the value of every distribution from a random stream of its own, so
+neither the order in which runs are computed nor the other runs of a batch change it. Combinations that differ only in
+`paired` axes share their draws.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from mrctl.results.metrics import METRICS
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import RobotFile
 
-CHUNK_BYTES = 2**27  # what the signals of a job may take in memory
-TRIED = 20  # runs of which at least one must make sense
+CHUNK_BYTES = 2**27  # largest size of the signals of a job in memory
+TRIED = 20  # first runs, of which at least one must have a valid scenario
 WHOLE = "scenario"  # the field of an axis whose values are tables of changes to the scenario
 
 
 class Grid(Record):
-    """Evenly spaced numbers, both ends included."""
+    """Evenly spaced numbers from `start` to `stop`, both included."""
 
     start: float
     stop: float
@@ -40,25 +40,25 @@ class Grid(Record):
 
 
 class Axis(Record):
-    """One field of the scenario and what it takes: values, a grid, or a distribution."""
+    """One field of the scenario and its values: a list, a grid, or a distribution."""
 
     field: Annotated[str, Field(min_length=1)]
     """Dotted path into the scenario, such as `perturbation.mass_factor` or `events.0.time`; or `scenario`, whose values
-    are tables of what changes in it, such as `{ laps = 4, perturbation = { payload = 5.0 } }`."""
+    are tables of changes to the scenario, such as `{ laps = 4, perturbation = { payload = 5.0 } }`."""
     values: Annotated[tuple[Any, ...], Field(min_length=1)] | None = None
-    """A list; a value may be a whole table, such as a perturbation."""
+    """List of values; a value may be a whole table, such as a perturbation."""
     grid: Grid | None = None
-    """`{ start, stop, count }`."""
+    """Evenly spaced numbers, `{ start, stop, count }`."""
     uniform: tuple[float, float] | None = None
-    """Lowest and highest."""
+    """Lowest and highest value of a uniform distribution."""
     normal: tuple[float, Annotated[float, Field(gt=0)]] | None = None
-    """Mean and standard deviation."""
+    """Mean and standard deviation of a normal distribution."""
     loguniform: tuple[Annotated[float, Field(gt=0)], float] | None = None
-    """Lowest and highest; uniform in the logarithm."""
+    """Lowest and highest value of a distribution that is uniform in the logarithm."""
     paired: bool = False
-    """A comparison: every value sees the same seeds and the same draws."""
+    """Whether every value gets the same seeds and the same draws, for a paired comparison."""
     zip: str = ""
-    """Axes with the same word here move together, value by value."""
+    """Name of a group of axes that change together, value by value; "" for an axis on its own."""
 
     @model_validator(mode="after")
     def _one_kind(self) -> Axis:
@@ -74,7 +74,7 @@ class Axis(Record):
 
     @cached_property
     def listed(self) -> tuple[Any, ...]:
-        """The values of a list or grid; none of a distribution."""
+        """The values of a list or grid; a distribution has none."""
         if self.grid is not None:
             return tuple(np.linspace(self.grid.start, self.grid.stop, self.grid.count).tolist())
         return self.values or ()
@@ -98,7 +98,7 @@ class Axis(Record):
 
     @cached_property
     def type(self) -> pa.DataType:
-        """How a table holds the values; tables and mixtures as JSON."""
+        """Type of the axis's column in the table of runs; tables and values of mixed types are JSON text."""
         kinds = {type(value) for value in self.listed}
         for kind, found in ((pa.bool_(), {bool}), (pa.int64(), {int}), (pa.float64(), {int, float})):
             if kinds <= found and kinds:
@@ -106,38 +106,38 @@ class Axis(Record):
         return pa.string() if kinds else pa.float64()
 
     def cell(self, value: object) -> object:
-        """The value as a table holds it."""
+        """The value as it stands in the table of runs."""
         return json.dumps(value) if self.type == pa.string() and not isinstance(value, str) else value
 
 
 class Sweep(Record):
-    """Many runs: a base scenario and what varies."""
+    """Many runs: a base scenario, and the axes along which it varies."""
 
     base: Scenario = Scenario()
-    """What the runs have in common; its seed is replaced unless `seed` is an axis."""
+    """Scenario that the runs have in common; each run has a seed of its own unless `seed` is an axis."""
     axes: tuple[Axis, ...] = ()
-    """What varies. Put first what makes batches differ (feedforward, steering, world): batches of equals are fast."""
+    """Axes that vary. Put first those that split batches (feedforward, steering, world), for large batches are fast."""
     runs: Annotated[int, Field(ge=1, le=100_000_000)] = 1
-    """Draws of seed and distributions for each combination of the listed values."""
+    """Number of draws of seed and distributions for each combination of the listed values."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    """Of all draws."""
+    """Seed of all draws."""
     record: Literal["metrics", "laps", "decimated", "full"] = "metrics"
-    """What to keep: metrics of the last lap; those and the metrics of every lap, as lists in the table; or those of the
-    last lap and every so many samples of the signals, or all of them."""
+    """Record to keep. `metrics`: metrics of the last lap. `laps`: the same, and metrics of every lap as lists in the
+    table. `decimated`: metrics of the last lap and every `every`-th sample of the signals. `full`: all samples."""
     every: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
-    """Control periods from one kept sample to the next, where the record is decimated; by default 10."""
+    """Control periods between samples of a decimated record; by default 10."""
     chunk: Annotated[int, Field(ge=1, le=65536)] | None = None
-    """Runs in a job; by default 64, or fewer where the runs are long."""
+    """Number of runs in a job; by default 64, or fewer where the runs are long."""
     controller: str | None = None
-    """A feedforward of your own instead of the named one, as `my_file.py:MyController`, or other stages, as
+    """Feedforward of the user instead of the named one, as `my_file.py:MyController`, or other stages, as
     `motion=my_file.py:PurePursuit`; see `mrctl.loop.user_files`."""
 
     @classmethod
     def of(cls, scenarios: Sequence[Scenario], **settings: Any) -> Self:  # noqa: ANN401
-        """A sweep whose run i is `scenarios[i]`; settings are the fields of a sweep but `base` and `axes`."""
-        usual = Scenario().model_dump(mode="json")
+        """A sweep whose run i is `scenarios[i]`; `settings` are fields of the sweep other than `base` and `axes`."""
+        default = Scenario().model_dump(mode="json")
         every = [s.model_dump(mode="json") for s in scenarios]
-        changes = [{k: v for k, v in one.items() if k == "seed" or v != usual[k]} for one in every]
+        changes = [{k: v for k, v in one.items() if k == "seed" or v != default[k]} for one in every]
         return cls.from_dict({**settings, "axes": [{"field": WHOLE, "values": changes}]}, "sweep")
 
     @model_validator(mode="after")
@@ -158,7 +158,7 @@ class Sweep(Record):
         return self
 
     def _check_values(self) -> None:
-        """Each listed value and each end of a range must make a scenario with the other axes in the middle."""
+        """Checks that each listed value and each end of a range gives a valid scenario (other axes in the middle)."""
         middle = {"seed": 0} | {axis.field: axis.listed[0] if axis.listed else axis.middle for axis in self.axes}
         trials = [{}]
         for group in self._dimensions:
@@ -169,11 +169,11 @@ class Sweep(Record):
             raise ValueError("control_period: signals share their time axis; keep it, or record metrics")
         first = range(min(self.size, TRIED))
         if not any(self.valid(run) for run in first):
-            self.scenario(0)  # says why not
+            self.scenario(0)  # raises the error of the first run
 
     @cached_property
     def _dimensions(self) -> list[list[int]]:
-        """Axes that move together, in the order of the file."""
+        """Groups of axes that change together, in the order of the file."""
         groups: dict[str, list[int]] = {}
         for number, axis in enumerate(self.axes):
             if axis.listed:
@@ -182,7 +182,7 @@ class Sweep(Record):
 
     @cached_property
     def _shape(self) -> tuple[int, ...]:
-        """Values of each dimension, then draws."""
+        """Number of values in each dimension, then of draws."""
         return (*map(self._length, self._dimensions), self.runs)
 
     def _length(self, group: list[int]) -> int:
@@ -190,22 +190,22 @@ class Sweep(Record):
 
     @property
     def size(self) -> int:
-        """How many runs."""
+        """Number of runs."""
         return int(np.prod(self._shape, dtype=object))
 
     @cached_property
     def chunk_size(self) -> int:
-        """Runs in a job, a function of the file alone."""
+        """Number of runs in a job, which depends on the file alone."""
         return self.chunk or int(np.clip(CHUNK_BYTES // (8 * len(SIGNALS) * self.base.ticks), 1, 64))
 
     @property
     def stride(self) -> int:
-        """Control periods from one kept sample to the next."""
+        """Control periods between samples that are kept."""
         return self.every or 10 if self.record == "decimated" else 1
 
     @cached_property
     def samples(self) -> int:
-        """Samples of the longest run that the store keeps; 0 where it keeps metrics only."""
+        """Number of samples that the store keeps of the longest run; 0 where it keeps metrics only."""
         if self.record in ("metrics", "laps"):
             return 0
         ticks = self.base.ticks
@@ -214,7 +214,7 @@ class Sweep(Record):
         return -(-ticks // self.stride)
 
     def values(self, run: int) -> dict[str, Any]:
-        """What each axis is in one run, and the seed.
+        """The value of each axis in one run, by field, and the seed.
 
         Raises:
             InputError: There is no such run.
@@ -239,12 +239,12 @@ class Sweep(Record):
         """The scenario of one run.
 
         Raises:
-            InputError: There is no such run, or what was drawn for it is out of range.
+            InputError: There is no such run, or a value that was drawn for it is out of range.
         """
         return self._assemble(self.values(run), f"run {run}")
 
     def valid(self, run: int) -> Scenario | None:
-        """The scenario of one run, or None where what was drawn for it is out of range."""
+        """The scenario of one run, or None where a value that was drawn for it is out of range."""
         try:
             return self.scenario(run)
         except InputError:
@@ -257,7 +257,7 @@ class Sweep(Record):
                 data |= value
             else:
                 _put(data, field, value)
-            if isinstance(value, dict):  # a table, completed so that later axes find its fields
+            if isinstance(value, dict):  # a table is completed, so that later axes find its fields
                 data = Scenario.from_dict(data, source).model_dump(mode="json")
         return Scenario.from_dict(data, source)
 
@@ -280,7 +280,7 @@ class Sweep(Record):
 
     @cached_property
     def columns(self) -> pa.Schema:
-        """Columns of the table: the run, its axes, what became of it, and its metrics, lap by lap too."""
+        """Columns of the table of runs: number, axes, description, failure, metrics, and metrics of every lap."""
         columns: dict[str, tuple[pa.DataType, str]] = {"run": (pa.int64(), "1")}
         columns |= {axis.field: (axis.type, "") for axis in self.axes}
         for name, kind, unit in (

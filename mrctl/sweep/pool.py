@@ -1,4 +1,4 @@
-"""Where jobs are computed: processes on this machine, or a Dask cluster. A pool outlives the death of its workers."""
+"""Pools of workers that compute jobs: processes on this machine, or a Dask cluster. A pool survives its workers."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from typing import Any, NamedTuple, Protocol
 
 from mrctl.record import InputError
 
-PATIENCE = 30.0  # s, for a scheduler and its first worker
+PATIENCE = 30.0  # s to wait for a scheduler and its first worker
 
 
 class Outcome(NamedTuple):
-    """What became of a job."""
+    """How a job ended."""
 
     job: int
     failed: int = 0
-    """Runs that failed."""
+    """Number of runs that failed."""
     error: str = ""
-    """Why there is no result, or ""."""
+    """Why the job has no result, or ""."""
     fatal: bool = False
-    """Whether nothing else would fare better: a full disk, other versions."""
+    """Whether every other job would end the same way, as with a full disk or other versions."""
 
 
 Work = Callable[[str, int], Outcome]
-"""Computes a job of the store at a path, in a worker."""
+"""Function that computes a job of the store at a path, in a worker."""
 
 
 class Pool(Protocol):
     """Computes jobs, a few at a time.
 
     Attributes:
-        tries: How often a job whose worker dies is given to it.
+        tries: Number of times that a job whose worker dies is computed.
     """
 
     tries: int
 
     def room(self) -> int:
-        """How many jobs make all workers busy."""
+        """Number of jobs that keep all workers busy."""
         ...
 
     def submit(self, job: int) -> None:
@@ -54,7 +54,7 @@ class Pool(Protocol):
         ...
 
     def wait(self) -> list[Outcome]:
-        """Waits until a job has ended, and says how."""
+        """Waits until at least one job has ended; returns how."""
         ...
 
     def close(self) -> None:
@@ -63,14 +63,14 @@ class Pool(Protocol):
 
 
 class Processes:
-    """Workers on this machine, each a process with one job at a time, so that its death is that job's alone."""
+    """Workers on this machine: processes with one job at a time, so that the death of one affects that job alone."""
 
     tries = 3
 
     def __init__(self, work: Work, path: str, workers: int) -> None:
-        """Takes what to do, for which store, and how many processes."""
+        """Makes a pool of `workers` processes that do `work` for the store at `path`."""
         self._work, self._path, self._workers = work, path, workers
-        # Workers are forked from a process that has the imports behind it and no threads.
+        # Workers are forked from a process that has done the imports and has no threads.
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(["mrctl.sweep.jobs"])
         self._idle: list[tuple[BaseProcess, Connection]] = []
@@ -84,7 +84,7 @@ class Processes:
         """Gives a job to an idle process, or to a new one."""
         process, pipe = self._idle.pop() if self._idle else self._start()
         self._busy[pipe] = process, job
-        with contextlib.suppress(OSError):  # died idle: `wait` will see it
+        with contextlib.suppress(OSError):  # a worker that died while idle is noticed in `wait`
             pipe.send(job)
 
     def _start(self) -> tuple[BaseProcess, Connection]:
@@ -96,7 +96,7 @@ class Processes:
         return process, ours
 
     def wait(self) -> list[Outcome]:
-        """Waits for an answer, or for a pipe that breaks with its process."""
+        """Waits for outcomes, or for pipes that break because their process died."""
         outcomes = []
         for pipe in wait(list(self._busy)):
             assert isinstance(pipe, Connection)
@@ -113,7 +113,7 @@ class Processes:
         return outcomes
 
     def close(self) -> None:
-        """Kills the processes."""
+        """Kills all processes."""
         for process, pipe in [*self._idle, *((process, pipe) for pipe, (process, _) in self._busy.items())]:
             process.kill()
             process.join()
@@ -123,9 +123,9 @@ class Processes:
 
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Puts Ctrl-C off, which would leave half a process behind, and keeps it from the children, who inherit the mask.
+    """Defers Ctrl-C, which would leave half a process behind, and keeps it from children, which inherit the mask.
 
-    To block it is not enough: the system may hand it to a thread that does not, and Python then raises it here.
+    Blocking the signal is not enough: the system may deliver it to another thread, and Python then raises it here.
     """
     pressed: list[int] = []
     main = threading.current_thread() is threading.main_thread()
@@ -142,9 +142,9 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def _serve(work: Work, path: str, pipe: Connection) -> None:
-    """A worker: jobs in, outcomes out, until the other side is gone."""
+    """The loop of a worker: receives jobs and sends their outcomes until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    multiprocessing.set_start_method("fork", force=True)  # libraries make locks; of this kind none outlives a kill
+    multiprocessing.set_start_method("fork", force=True)  # locks of this method do not outlive a kill
     if parent := multiprocessing.parent_process():
         threading.Thread(target=_follow, args=(parent.sentinel,), daemon=True).start()
     with contextlib.suppress(EOFError, OSError):
@@ -153,27 +153,27 @@ def _serve(work: Work, path: str, pipe: Connection) -> None:
 
 
 def _follow(sentinel: int) -> None:
-    """Ends this process with its parent, also in the middle of a job."""
+    """Ends this process when its parent ends, even during a job."""
     wait([sentinel])
     os._exit(1)
 
 
 class Cluster:
-    """A Dask cluster that somebody else has started; every machine sees the store at the same path."""
+    """A Dask cluster that is running already; every machine must see the store at the same path."""
 
-    tries = 2  # the scheduler itself lets a job kill four workers each time
+    tries = 2  # in each try the scheduler itself lets a job kill four workers
 
     def __init__(self, work: Work, path: str, address: str) -> None:
         """Connects to a scheduler and waits for its first worker.
 
         Raises:
-            InputError: Dask is not installed, or there is no scheduler or no worker.
+            InputError: Dask is not installed, or no scheduler or no worker answers.
         """
         try:
             import distributed
         except ImportError:
             raise InputError("scheduler: needs Dask: pip install 'mrctl[dask]'") from None
-        for name in [*logging.root.manager.loggerDict]:  # what matters of it arrives as an exception
+        for name in [*logging.root.manager.loggerDict]:  # errors that matter arrive as exceptions
             if name.startswith(("distributed", "tornado", "asyncio")):
                 logging.getLogger(name).setLevel(logging.CRITICAL)
         self._distributed, self._work, self._path, self._address = distributed, work, path, address
@@ -191,7 +191,7 @@ class Cluster:
             raise InputError(f"scheduler: {address}: has no workers") from None
 
     def _call(self, function: Callable[..., Any], *args: object) -> Any:  # noqa: ANN401
-        """Asks the cluster from another thread, for Dask takes an interruption of its own waiting badly.
+        """Calls the cluster from another thread, because Dask does not survive an interruption while it waits.
 
         Raises:
             InputError: The scheduler is gone.
@@ -202,22 +202,22 @@ class Cluster:
             raise InputError(f"scheduler: {self._address}: the connection is lost; what was done is kept") from None
 
     def room(self) -> int:
-        """The threads of all workers there are now."""
+        """Number of threads of all workers at present."""
         return max(1, sum(self._call(self._client.nthreads).values()))
 
     def submit(self, job: int) -> None:
-        """Hands a job to the scheduler, which gives it to another worker when one dies."""
+        """Gives a job to the scheduler, which gives it to another worker if the first one dies."""
         future = self._client.submit(self._work, self._path, job, pure=False)
         self._jobs[future] = job
         future.add_done_callback(self._ended.put)
 
     def wait(self) -> list[Outcome]:
-        """Waits for a future."""
+        """Waits until a job has ended; returns how."""
         while True:
             with contextlib.suppress(Empty):
                 future = self._ended.get(timeout=5)
                 return [self._call(self._outcome, future, self._jobs.pop(future))]
-            self.room()  # there is still somebody
+            self.room()  # raises an error if the scheduler is gone
 
     def _outcome(self, future: Any, job: int) -> Outcome:  # noqa: ANN401
         if future.status == "cancelled":
@@ -230,7 +230,7 @@ class Cluster:
         return Outcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))
 
     def close(self) -> None:
-        """Gives up what is under way and disconnects; the cluster lives on."""
+        """Cancels jobs that are running and disconnects; the cluster keeps running."""
         jobs, self._jobs = list(self._jobs), {}
         with contextlib.suppress(Exception):
             self._client.cancel(jobs, force=True)

@@ -1,13 +1,16 @@
 """Where a sweep is kept: a folder that survives being killed at any moment.
 
     STORE/sweep.json        the sweep, versions, digests of the compiled worlds; written first, whole or not at all
-    STORE/runs.parquet      the table, a row a run in order; written when no job is left
+    STORE/runs.parquet      the table of runs, one row each, in order; written when no job is left
     STORE/parts/000012.parquet   rows of job 12; folded into the table, and removed once every job is in it
     STORE/signals.zarr      (run, time, signal), NaN where nothing was recorded; shard 12 is the record of job 12
     STORE/lock              held, through the operating system, by the one process that runs the sweep
 
+`mrctl.open` reads a store that another version of mrctl wrote, in this format or an older one: a metric that was not
+computed then is NaN. Only the version that began a sweep goes on with it. Format 1 did not list its signals.
+
 One job owns one shard and one part. Each file is written under another name, synchronised and renamed, the part last:
-a part that is there says that its job is done. A job that is computed twice writes the same bytes twice.
+the existence of a part says that its job is done. A job that is computed twice writes the same bytes twice.
 """
 
 from __future__ import annotations
@@ -33,14 +36,15 @@ import zarr
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec
 
+from mrctl import __version__
 from mrctl.record import InputError
 from mrctl.results.dataset import SIGNALS, open_result
 from mrctl.results.metrics import METRICS
 
-KIND, FORMAT = "mrctl sweep", 1
+KIND, FORMAT = "mrctl sweep", 2
 ROW_GROUP = 16384  # rows of the table that are in memory at once
 INNER = 16  # runs that are compressed together, signal by signal
-COMPLETE = b"complete"  # in the table's metadata: whether every job is in it
+COMPLETE = b"complete"  # key in the metadata of the table: whether it holds every job
 
 
 class Store:
@@ -48,38 +52,42 @@ class Store:
 
     Attributes:
         path: The folder.
+        writer: The version of mrctl that began it.
         manifest: What `sweep.json` holds: `sweep`, `versions`, `models`, `size`, `chunk`, `samples`,
-            `stride` (control periods between samples), `control_period`.
+            `stride` (control periods between samples), `control_period`, `signals` (names of those kept).
     """
 
     def __init__(self, path: str | Path) -> None:
         """Opens a store that exists.
 
         Raises:
-            InputError: There is none, or it was written by a version with another layout.
+            InputError: There is none, or its format is newer than this version of mrctl.
         """
         self.path = Path(path).absolute()
         try:
             self.manifest: dict[str, Any] = json.loads((self.path / "sweep.json").read_bytes())
-            found = self.manifest[KIND]
+            found, self.writer = self.manifest[KIND], str(self.manifest["versions"]["mrctl"])
         except (OSError, ValueError, KeyError, TypeError):
             raise InputError(f"{path}: not a sweep's store") from None
-        if found != FORMAT:
-            raise InputError(f"{path}: a sweep's store of format {found}, this version reads format {FORMAT}")
+        if found not in range(1, FORMAT + 1):
+            raise InputError(
+                f"{path}: mrctl {self.writer} wrote this store in format {found}; "
+                f"mrctl {__version__} reads formats up to {FORMAT}"
+            )
 
     @staticmethod
     def prepare(path: Path) -> None:
-        """Makes the folder, if need be.
+        """Makes the folder of a store unless it exists.
 
         Raises:
-            InputError: What is there is not a sweep's store; nothing was touched.
+            InputError: There is something else at this path, which is left as it was.
         """
         if not path.exists():
             path.mkdir(parents=True)
         elif not path.is_dir():
             raise InputError(f"{path}: a file, not a sweep's store")
         elif not (path / "sweep.json").is_file():
-            # Of a sweep that was killed before it could say what it is there is no more than this.
+            # A sweep that was killed before it wrote sweep.json has left nothing but these files.
             if foreign := sorted(e.name for e in path.iterdir() if e.name != "lock" and not _temporary(e)):
                 raise InputError(f"{path}: holds {foreign[0]} and is not a sweep's store; nothing was touched")
         else:
@@ -90,13 +98,18 @@ class Store:
         """Starts or continues a sweep in a folder whose lock is held.
 
         Raises:
-            InputError: The folder belongs to another sweep or to other versions.
+            InputError: The folder belongs to another sweep, or other versions began it.
         """
         manifest = json.loads(json.dumps({KIND: FORMAT, **manifest}))
         if not (path / "sweep.json").exists():
             with _whole(path / "sweep.json") as file:
                 file.write(json.dumps(manifest, indent=1).encode())
         store = cls(path)
+        if store.writer != __version__:
+            raise InputError(
+                f"{path}: mrctl {store.writer} began this sweep and this is mrctl {__version__}, whose results may "
+                f"differ; finish it with mrctl {store.writer} or choose another folder"
+            )
         if difference := _difference(store.manifest, manifest):
             raise InputError(f"{path}: begun with another {difference}; finish it as it was or choose another folder")
         for left in [*path.glob(".*.tmp"), *path.glob("parts/.*.tmp"), *path.glob("signals.zarr/**/*.partial")]:
@@ -108,10 +121,10 @@ class Store:
     @staticmethod
     @contextlib.contextmanager
     def locked(path: Path) -> Iterator[None]:
-        """Holds the folder; the system lets go of it when this process ends, however it ends.
+        """Locks the folder; the system unlocks it when this process ends, however it ends.
 
         Raises:
-            InputError: Another process holds it.
+            InputError: Another process has locked it.
         """
         import fcntl  # not on Windows
 
@@ -129,13 +142,27 @@ class Store:
 
     @property
     def size(self) -> int:
-        """How many runs."""
+        """Number of runs."""
         return self.manifest["size"]
 
     @property
     def samples(self) -> int:
-        """Samples of each signal a run."""
+        """Number of samples of each signal in a run."""
         return self.manifest["samples"]
+
+    @property
+    def signal_names(self) -> list[str]:
+        """Names of the signals, in the order of the record.
+
+        Raises:
+            InputError: An older version of mrctl kept other signals and did not say their names.
+        """
+        if "signals" not in self.manifest and (count := self._signals.shape[2]) != len(SIGNALS):
+            raise InputError(
+                f"{self.path}: mrctl {self.writer} kept {count} signals without their names and mrctl {__version__} "
+                f"has {len(SIGNALS)}; open the store with mrctl {self.writer}"
+            )
+        return self.manifest.get("signals", list(SIGNALS))
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -144,7 +171,7 @@ class Store:
 
     @property
     def jobs(self) -> int:
-        """How many jobs."""
+        """Number of jobs."""
         return math.ceil(self.size / self.manifest["chunk"])
 
     def runs(self, job: int) -> range:
@@ -154,7 +181,7 @@ class Store:
 
     @property
     def table(self) -> Path:
-        """The file with a row a run."""
+        """Path of the table of runs."""
         return self.path / "runs.parquet"
 
     @property
@@ -163,7 +190,7 @@ class Store:
         return self.table.exists() and pq.read_schema(self.table).metadata.get(COMPLETE) == b"1"
 
     def done(self) -> set[int]:
-        """Jobs that are done."""
+        """Numbers of the jobs that are done."""
         if self.complete:
             return set(range(self.jobs))
         return {int(part.stem) for part in (self.path / "parts").glob("[0-9]*.parquet")}
@@ -172,10 +199,10 @@ class Store:
         return self.path / "parts" / f"{job:06d}.parquet"
 
     def write(self, job: int, rows: pa.Table, signals: NDArray[np.float64] | None) -> None:
-        """Keeps what a job found: the signals `(runs, samples, signals)`, then the rows, which say that it is done."""
+        """Writes the results of a job: signals `(runs, samples, signals)`, then rows, which show that it is done."""
         if signals is not None:
             runs = self.runs(job)
-            self._signals[runs.start : runs.stop] = signals  # zarr renames a whole shard into its place
+            self._signals[runs.start : runs.stop] = signals  # zarr renames a whole shard
             if (shard := self.path / "signals.zarr" / "signals" / "c" / str(job) / "0" / "0").exists():
                 _synchronise(shard)  # zarr keeps no shard that is all NaN
         self._part(job).parent.mkdir(exist_ok=True)
@@ -185,27 +212,27 @@ class Store:
             file.write(buffer.getvalue())
 
     def rows(self, job: int) -> pa.Table:
-        """What a job that is done has found."""
+        """Rows of a job that is done."""
         return pq.read_table(self._part(job))
 
     def row(self, run: int) -> dict[str, Any] | None:
-        """What one run has found, if it is done."""
+        """Row of one run, or None if it is not done."""
         job = run // self.manifest["chunk"]
         source = self._part(job) if self._part(job).exists() else self.table
         found = pq.read_table(source, filters=[("run", "=", run)]).to_pylist() if source.exists() else []
         return found[0] if found else None
 
     def signals(self, run: int) -> NDArray[np.float64]:
-        """The record of one run `(samples, signals)`, where one is kept."""
+        """Signals of one run `(samples, signals)`, if the store keeps them."""
         return np.asarray(self._signals[run])
 
     def finish(self, schema: pa.Schema, rows: Iterable[pa.Table], complete: bool) -> None:
-        """Folds the parts into the table, a bounded number of rows in memory.
+        """Writes the rows of all jobs to the table; only a bounded number of rows is in memory.
 
         Args:
-            schema: Of the rows.
-            rows: Those of every job in turn.
-            complete: Whether all jobs were done.
+            schema: Columns of the table.
+            rows: Rows of each job in turn.
+            complete: Whether all jobs are done, so that their parts can be removed.
         """
         schema = schema.with_metadata({COMPLETE: b"1" if complete else b"0"})
         with _whole(self.table) as file, pq.ParquetWriter(file, schema) as writer:
@@ -222,8 +249,8 @@ class Store:
         chunk = self.manifest["chunk"]
         zarr.open_group(self.path / "signals.zarr", mode="a").create_array(
             "signals",
-            shape=(self.size, self.samples, len(SIGNALS)),
-            shards=(chunk, self.samples, len(SIGNALS)),
+            shape=(self.size, self.samples, len(self.signal_names)),
+            shards=(chunk, self.samples, len(self.signal_names)),
             chunks=(math.gcd(chunk, INNER), self.samples, 1),
             dtype="float64",
             fill_value=np.nan,
@@ -232,10 +259,10 @@ class Store:
         )
 
     def frame(self) -> pd.DataFrame:
-        """The table, of the runs that are done.
+        """The table of the runs that are done.
 
         Raises:
-            InputError: None is.
+            InputError: No run is done.
         """
         if self.table.exists():
             return pd.read_parquet(self.table)
@@ -244,8 +271,13 @@ class Store:
         return pa.concat_tables(self.rows(job) for job in jobs).to_pandas()
 
     def dataset(self) -> xr.Dataset:
-        """The runs that are done as one dataset, labelled as `mrctl.simulate` does; signals are read when used."""
+        """The runs that are done as one dataset, labelled as `mrctl.simulate` does; signals are read when used.
+
+        Raises:
+            InputError: No run is done, or an older version kept signals of which the store does not say the names.
+        """
         frame = self.frame()
+        frame[[name for name in METRICS if name not in frame]] = np.nan
         units = {"lap_time": "s", "failure_time": "s"} | {name: unit for name, (unit, _) in METRICS.items()}
 
         def columns(names: Iterable[str]) -> dict[str, Any]:
@@ -264,30 +296,34 @@ class Store:
             found = {}
             for name in METRICS:
                 values = np.full((len(frame), len(number)), np.nan)
-                for row, laps in enumerate(frame[f"{name}_per_lap"]):
+                column = f"{name}_per_lap"
+                for row, laps in enumerate(frame[column] if column in frame else ()):
                     values[row, : len(laps)] = laps
                 found[name] = (("run", "lap"), values, {"units": units[name]})
-            coords.pop("laps", None)  # where it is an axis too
+            coords.pop("laps", None)  # `laps` may be an axis too
             return xr.Dataset(outcome | columns(["laps"]) | found, coords | {"lap": number}, attrs)
         if not self.samples:
             return xr.Dataset(outcome | columns(METRICS), coords, attrs)
         whole = xr.open_zarr(self.path / "signals.zarr", chunks=None, consolidated=False)["signals"]
-        signals = whole.isel(run=frame["run"].to_numpy()).assign_coords(signal=list(SIGNALS)).to_dataset("signal")
+        whole = whole.assign_coords(signal=self.signal_names)
+        signals = whole.isel(run=frame["run"].to_numpy()).to_dataset("signal")
         for name, (unit, meaning) in SIGNALS.items():
-            signals[name].attrs = {"units": unit, "long_name": meaning}
+            if name in signals:
+                signals[name].attrs = {"units": unit, "long_name": meaning}
         coords["time"] = ("time", self.times, {"units": "s"})
         return signals.assign(outcome).assign_coords(coords).assign_attrs(attrs)
 
 
 def open(path: str | Path) -> xr.Dataset:
-    """Opens what `mrctl sweep`, `mrctl run --out` or `mrctl.save` wrote.
+    """Opens a result or a store that `mrctl sweep`, `mrctl run --out` or `mrctl.save` wrote.
 
-    A sweep opens as one dataset of the runs that are done, axes as coordinates on `run`: with its signals (run, time)
-    where they were recorded, as what `per_lap` returns (run, lap) where laps were, and else with the metrics of the
-    last lap (run,). The table is `runs.parquet` in it.
+    A sweep opens as one dataset of the runs that are done, with its axes as coordinates of `run`. The dataset holds
+    the signals (run, time) if they were recorded, what `per_lap` returns (run, lap) if laps were, and otherwise the
+    metrics of the last lap (run,). The table of runs is `runs.parquet` in the folder.
 
     Raises:
-        InputError: There is neither at this path.
+        InputError: There is neither at this path, or another version of mrctl, which the message names, wrote a store
+            that this one cannot read.
     """
     path = Path(path)
     if (path / "sweep.json").is_file():
@@ -296,14 +332,14 @@ def open(path: str | Path) -> xr.Dataset:
 
 
 def _plain(frame: pd.DataFrame, name: str) -> NDArray:
-    """A column as NumPy has it, text as objects."""
+    """A column as a NumPy array, in which text is objects."""
     column = frame[name].to_numpy()
     return column if column.dtype.kind in "bif" else column.astype(object)
 
 
 @contextlib.contextmanager
 def _whole(path: Path) -> Iterator[BinaryIO]:
-    """A file that appears whole, on the disk, or not at all."""
+    """Opens a file that appears on the disk whole or not at all."""
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         with partial.open("xb") as file:
@@ -330,7 +366,7 @@ def _temporary(path: Path) -> bool:
 
 
 def _regroup(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
-    """The same rows in tables of `ROW_GROUP`."""
+    """The same rows in tables of `ROW_GROUP` rows."""
     held: list[pa.Table] = []
     for table in tables:
         held.append(table)
@@ -343,7 +379,7 @@ def _regroup(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
 
 
 def _difference(old: object, new: object, where: str = "") -> str:
-    """Where two trees of plain data first differ, or ""."""
+    """The first place where two trees of plain data differ, with both values, or ""."""
     if isinstance(old, dict) and isinstance(new, dict):
         pairs = [(str(key), old.get(key), new.get(key)) for key in {**old, **new}]
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):

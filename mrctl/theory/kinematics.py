@@ -105,20 +105,6 @@ def wheel_rates(twist: ArrayLike, robot: Robot) -> NDArray[np.float64]:
     return stack(v - across, v + across) / robot.wheel_radius
 
 
-def twist_from_wheel_rates(rates: ArrayLike, robot: Robot) -> NDArray[np.float64]:
-    """Odometry: the twist of rolling rear wheels, the inverse of `wheel_rates`.
-
-    Args:
-        rates: (left, right), rad/s, shape (…, 2).
-        robot: The robot.
-
-    Returns:
-        (V, θ̇), m/s and rad/s, shape (…, 2).
-    """
-    left, right = split(rates) * robot.wheel_radius
-    return stack((left + right) / 2, (right - left) / (2 * robot.half_track))
-
-
 def steering_angle(twist: ArrayLike, robot: Robot) -> NDArray[np.float64]:
     """The textbook steering angle atan(L θ̇ / V), for either sign of V, without trail.
 

@@ -75,8 +75,7 @@ def test_figures(figures):
 def test_parts(figures):
     """All components were measured; the physics is the largest."""
     for parts in figures["parts"].values():
-        laws = {f"· {law} alone" for law in ("motion controller", "limiter", "PID")}
-        assert set(parts) == {*bench.PARTS, "the rest", *laws}
+        assert set(parts) == {*bench.PARTS, "the rest"}
         assert all(value > 0 for value in parts.values())
         assert max(parts, key=parts.__getitem__) == "physics"
 

@@ -15,12 +15,12 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from mrctl import PERTURBATIONS, Circle, Event, InputError, Line, Perturbation, Scenario
 from mrctl.envs.dm_env import SUITE, Environment, Tracking, register
-from mrctl.envs.episodes import ACTIONS, OBSERVATIONS, Episodes
+from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Episodes
 from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
 
-IDS = [f"mrctl/{action.capitalize()}Tracking-v0" for action in ACTIONS]
+IDS = [f"mrctl/{action.capitalize()}Tracking-v0" for action in ACTION_KINDS]
 SHORT = Scenario(reference=Circle(period=2.2, radius=0.3), laps=1)
 # All that a robot remembers: weights, delays, filters, odometry, noise, a perturbation and a push under way.
 BUSY = Scenario(
@@ -110,7 +110,7 @@ def test_vector_bits(feedforward):
             assert np.array_equal(found, expected(scenarios[row], seed)[: len(found)]), (row, seed)
 
 
-@pytest.mark.parametrize("action", ACTIONS)
+@pytest.mark.parametrize("action", ACTION_KINDS)
 def test_vector_is_single(action):
     """Under any actions the vector environment is Gymnasium's own vector of single ones, autoreset and all."""
     line = Scenario(reference=Line(speed=0.5, length=1.1), laps=1)
@@ -209,7 +209,7 @@ def test_suite():
     )
     step = env.reset()
     assert step.step_type == StepType.FIRST and step.observation["observations"].shape == (14,)
-    assert sorted(SUITE) == sorted(ACTIONS) == sorted(SUITE.tagged("tracking"))
+    assert sorted(SUITE) == sorted(ACTION_KINDS) == sorted(SUITE.tagged("tracking"))
     limited = SUITE["voltage"](SHORT, environment_kwargs={"time_limit": 0.05})
     limited.reset()
     assert [limited.step(np.zeros(2)).last() for _ in range(5)] == [False] * 4 + [True]

@@ -51,7 +51,7 @@ def tiny(seeds: int, random: int, quick: bool) -> list[Case]:
     off, on = mrctl.Event(time=0, learning=False), mrctl.Event(time=LAP, learning=True)
     found = [
         ("payload", "step", {"laps": 6, "events": (payload, back)}, 3, 5),
-        ("switch", "learning", {"events": (off, on)}, 2, 0),
+        ("switch <on>", "learning", {"events": (off, on)}, 2, 0),
         ("nominal", "steady", {}, 0, 0),
         ("all", "steady", {"perturbation": mrctl.PERTURBATIONS["all"]}, 0, 0),
         ("caster", "steering", {"steering": "caster"}, 0, 0),
@@ -122,6 +122,10 @@ def test_table(whole: Path) -> None:
         assert row["value"] == pytest.approx(own.mean(), rel=1e-12) and row["worst"] == pytest.approx(own.max())
         assert row["to_PID"]["value"] == pytest.approx(np.exp(np.log(own / bare).mean()), rel=1e-12)
         assert row["beats_PID"]["wins"] == (own < bare).sum() and found[case, "rls"]["failed"] == 0
+        assert ("laps_to_converge" in row) == (case != "random")
+        if case != "random":
+            laps = alone["rls"]["laps_to_converge"].mean()
+            assert found[case, "rls"]["position_rmse"]["laps_to_converge"]["value"] == pytest.approx(laps)
     assert (whole / "table.md").read_text().count("| rls ") == 7  # six cases, and the recovery
 
 
@@ -220,8 +224,9 @@ def test_page_stands_alone(whole: Path) -> None:
         image = Image.open(io.BytesIO(base64.b64decode(source.split(",")[1], validate=True)))
         image.load()
         assert image.width > 150
-    for word in ("39 runs", "payload", f"mujoco {mrctl.results.dataset.versions()['mujoco']}", "phase margin"):
-        assert word in page.words
+    mujoco = mrctl.results.dataset.versions()["mujoco"]
+    for text in ("39 runs", "payload", "switch <on>", "laps to 1.2× the final", f"mujoco {mujoco}", "phase margin"):
+        assert text in page.words
     again = next(line for line in page.words.splitlines() if line.startswith("mrctl suite --"))
     assert again == "mrctl suite --feedforward none model rls --seeds 2 --random 3"
 

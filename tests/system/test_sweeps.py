@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import json
 import os
 import random
 import resource
@@ -17,6 +18,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import xarray as xr
 
 import mrctl
 from mrctl import InputError, Sweep, cli
@@ -25,7 +27,7 @@ from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
 from mrctl.sweep.jobs import compute
 from mrctl.sweep.pool import Outcome
-from mrctl.sweep.store import Store
+from mrctl.sweep.store import KIND, Store
 
 KILLS = int(os.environ.get("MRCTL_KILLS", "2"))  # random moments for each victim; 20 in a release
 FILE = """
@@ -205,9 +207,87 @@ def test_changed_sweep(file, sweep, tmp_path, capsys, whole):
     assert cli.main(["sweep", str(file), "--out", str(store)]) == 0
     with mock.patch("mrctl.sweep.jobs.versions", lambda: {**mrctl.results.dataset.versions(), "mujoco": "9"}):
         assert 'versions.mujoco ("3.17.0", now "9")' in refused(capsys, "sweep", file, "--out", store)
+    with mock.patch("mrctl.sweep.store.__version__", "9.1"):
+        line = refused(capsys, "sweep", file, "--out", store)
+    assert f"mrctl {mrctl.__version__} began this sweep and this is mrctl 9.1" in line
     with mock.patch("mrctl.physics.mjcf.digest", lambda model: "another"):
         assert "models.flat, compliant" in refused(capsys, "sweep", file, "--out", store)
     assert content(store) == whole
+
+
+def aged(store, version="0.1.0", drop=(), **manifest):
+    """The store as another version of mrctl might have left it."""
+    description = json.loads((store / "sweep.json").read_text())
+    description["versions"]["mrctl"] = version
+    description = {name: value for name, value in (description | manifest).items() if value is not None}
+    (store / "sweep.json").write_text(json.dumps(description))
+    table = pq.read_table(store / "runs.parquet")
+    pq.write_table(table.drop_columns(list(drop)), store / "runs.parquet")
+
+
+OLD = {KIND: 1, "signals": None}  # format 1 did not say which signals it kept
+
+
+@pytest.mark.parametrize("record", ["metrics", "laps", "decimated"])
+def test_store_of_an_older_version(file, tmp_path, capsys, record):
+    """It opens, with NaN for a metric that was not computed then; its runs repeat; it is not gone on with."""
+    text, store = FILE.replace("decimated", record).replace("runs = 12", "runs = 2"), tmp_path / "store"
+    file.write_text(text)
+    jobs.run(Sweep.from_toml(file), store, 1)
+    before = mrctl.open(store).load()
+    aged(store, drop=["excitation", *(["excitation_per_lap"] if record == "laps" else [])], **OLD)
+    opened = mrctl.open(store)
+    if record == "decimated":
+        xr.testing.assert_identical(opened.drop_attrs(), before.drop_attrs())
+    else:
+        assert np.isnan(opened["excitation"]).all() and np.isfinite(before["excitation"]).any()
+        names = [name for name in before if name != "excitation"]
+        xr.testing.assert_identical(opened[names].drop_attrs(), before[names].drop_attrs())
+    assert json.loads(opened.attrs["versions"])["mrctl"] == "0.1.0"
+    if record == "laps":
+        assert np.isnan(mrctl.summary(opened)["excitation"]).all()
+    run = next(run for run in range(4) if run not in failures(Sweep.from_toml(file)))
+    assert cli.main(["run", str(store), "--run", str(run)]) == 0
+    assert "bit-identical" in capsys.readouterr().out
+    line = refused(capsys, "sweep", file, "--out", store)
+    assert f"mrctl 0.1.0 began this sweep and this is mrctl {mrctl.__version__}" in line
+
+
+def test_store_that_cannot_be_read(sweep, tmp_path, capsys, whole):
+    """A newer format, signals without names, an unknown field: one line that names the version that wrote it."""
+    store = tmp_path / "store"
+    jobs.run(sweep, store, 1)
+    aged(store, "9.1", **{KIND: 99})
+    with pytest.raises(InputError, match=f"mrctl 9.1 wrote this store in format 99; mrctl {mrctl.__version__} reads"):
+        mrctl.open(store)
+    aged(store, "0.0.9", **OLD)
+    with mock.patch.dict("mrctl.sweep.store.SIGNALS", {"new": ("1", "a signal that came later")}):
+        with pytest.raises(InputError, match="mrctl 0.0.9 kept 37 signals without their names and mrctl .* has 38"):
+            mrctl.open(store)
+    base = {"base": {"former": 1}, "axes": [], "record": "decimated"}
+    aged(store, "0.0.9", **OLD, sweep=base)
+    line = refused(capsys, "run", store, "--run", 0)
+    assert "(written by mrctl 0.0.9): base.former: Extra inputs" in line
+
+
+def test_signals_keep_their_names(sweep, tmp_path):
+    """A store says which signals it holds: one that a later version adds or moves changes no name of the others."""
+    store = tmp_path / "store"
+    jobs.run(sweep, store, 1)
+    before = mrctl.open(store).load()
+    later = {"new": ("1", "a signal that came later"), **dict(reversed(SIGNALS.items()))}
+    with mock.patch("mrctl.sweep.store.SIGNALS", later):
+        xr.testing.assert_identical(mrctl.open(store).load(), before)
+
+
+def test_repeat_names_another_version(sweep, tmp_path, capsys):
+    """Where a run departs from a store that another version began, the line names both versions."""
+    store = tmp_path / "store"
+    jobs.run(sweep, store, 1)
+    Store(store)._signals[14, 7, 3] = 3.0
+    aged(store)
+    line = refused(capsys, "run", store, "--run", 14, status=1)
+    assert line.endswith(f"in the store 3.0 (of mrctl 0.1.0; this is mrctl {mrctl.__version__})")
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "sweep.json", "signals.zarr"])

@@ -22,7 +22,7 @@ FLOORS = (
     {"experiments", "viewer"},
     {"cli"},
 )
-ENGINE = {"physics", "checks", "viewer", "envs", "experiments"}  # who may import MuJoCo and dm_control
+ENGINE = {"physics", "checks", "viewer", "envs"}  # who may import MuJoCo and dm_control
 
 
 def module_of(path: Path) -> str:

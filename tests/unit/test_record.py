@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import mrctl
 from mrctl.record import InputError, Record
 from mrctl.scenario import Event, Scenario
 from mrctl.theory.perturbation import Perturbation
@@ -90,6 +91,19 @@ def test_toml_matches_dict(tmp_path):
     text = "name = 'a'\n[inner]\nrate = 2.5\n"
     assert Outer.from_toml(write(tmp_path, text)) == Outer.from_dict(tomllib.loads(text))
     assert Outer.from_toml(str(write(tmp_path, text))).inner.rate == 2.5
+
+
+def test_file_of_another_version(tmp_path):
+    """A file that mrctl wrote names its version, and so does the message where another version does not read it."""
+    text = Outer().to_toml()
+    assert text.startswith(f"# written by mrctl {mrctl.__version__}\n")
+    for version, source in (("0.0.9", " (written by mrctl 0.0.9)"), (mrctl.__version__, "")):
+        path = write(tmp_path, text.replace(mrctl.__version__, version))
+        assert Outer.from_toml(path) == Outer()
+        path.write_text(path.read_text() + "former = 1\n")
+        with pytest.raises(InputError, match="former") as error:
+            Outer.from_toml(path)
+        assert str(error.value).startswith(f"{path}{source}: former")
 
 
 def test_frozen():

@@ -2,6 +2,8 @@
 
 import json
 import os
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -90,6 +92,31 @@ def test_selection(result):
     assert scenarios_of(result.isel(run=[2, 0])) == [SCENARIOS[2], SCENARIOS[0]]
     assert scenarios_of(result.isel(run=1)) == [SCENARIOS[1]]
     assert scenarios_of(simulate(SCENARIOS[1])) == [SCENARIOS[1]]
+
+
+def test_result_of_an_older_version(result, tmp_path):
+    """It opens; what it lacks is named together with the version that wrote it, in one line."""
+    scenarios = json.loads(result.attrs["scenarios"])
+    scenarios[0] |= {"former": 1}
+    old = result.drop_vars(["energy", "guard"], errors="ignore").assign_attrs(
+        versions=json.dumps({**versions(), "mrctl": "0.0.9"}), scenarios=json.dumps(scenarios)
+    )
+    save(old, tmp_path / "a")
+    opened = mrctl.open(tmp_path / "a")
+    assert opened.identical(old)
+    refused("guard: not a variable of this result, which mrctl 0.0.9 wrote", mrctl.summary, opened)
+    refused("guard: not a variable of this result, which mrctl 0.0.9 wrote", mrctl.guard_events, opened)
+    refused("scenario of a result of mrctl 0.0.9: former: Extra inputs", scenarios_of, opened)
+    assert scenarios_of(opened.isel(run=[1])) == [SCENARIOS[1]]
+
+
+def test_version():
+    """Results carry the version of the code that runs, not that of some earlier installation."""
+    assert versions()["mrctl"] == mrctl.__version__
+    with open(Path(mrctl.__file__).parent.parent / "pyproject.toml", "rb") as file:
+        project = tomllib.load(file)
+    assert project["project"]["dynamic"] == ["version"]
+    assert project["tool"]["hatch"]["version"] == {"path": "mrctl/__init__.py"}
 
 
 def refused(message: str, call, *arguments) -> None:
