@@ -10,7 +10,9 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import Any
 from unittest import mock
 
@@ -19,16 +21,18 @@ import torch
 
 from mrctl.control.features import feature_scale
 from mrctl.experiments.tables import machine, markdown, number
-from mrctl.loop import hierarchy, log
-from mrctl.loop.simulation import Simulation
-from mrctl.physics import plant
+from mrctl.loop.hierarchy import Hierarchy
+from mrctl.loop.log import Log
+from mrctl.loop.simulation import Simulation, split
+from mrctl.loop.simulation import run as run_all
+from mrctl.physics.car import CarPhysics
 from mrctl.physics.mjcf import load
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.plant import BatchPlant, CarPhysics
+from mrctl.physics.plant import BatchPlant, Plant
 from mrctl.physics.stand import stand
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
-from mrctl.sensing import sensors
+from mrctl.sensing.sensors import Sensors
 from mrctl.theory.kinematics import steering_angle
 
 SIZES = (1, 16, 64, 256, 1024)
@@ -38,11 +42,11 @@ WARM = 20  # control periods before the clock starts
 CONTROLS = ["voltage_left", "voltage_right", "steering_command", "steering_rate_command"]
 PARTS: dict[str, tuple[Any, str]] = {
     "physics": (BatchPlant, "_advance"),
-    "measurement": (sensors, "measure"),
-    "control and learning": (hierarchy.Hierarchy, "update"),
-    "actuation (delay, supply)": (plant, "drive"),
-    "readout, currents": (plant, "look"),
-    "record": (log, "record"),
+    "measurement": (Sensors, "measure"),
+    "control and learning": (Hierarchy, "update"),
+    "actuation (delay, supply)": (Plant, "send"),
+    "readout, currents": (Plant, "look"),
+    "record": (Log, "record"),
 }
 
 
@@ -111,92 +115,100 @@ def text(figures: dict[str, Any]) -> str:
     )
 
 
-def build(size: int, ticks: int, threads: int = 1) -> Simulation:
-    """A closed loop with `fel` in every robot on the batch engine, also for one robot, past its first moments.
+def build(size: int, ticks: int, threads: int = 1) -> list[Simulation]:
+    """Closed loops with `fel` in every robot on the batch engine, also for one robot, past their first moments.
 
     Args:
         size: Number of robots, which differ in their seeds.
-        ticks: Control periods that will be asked of it.
-        threads: Threads of the batch engine.
+        ticks: Control periods that will be asked of them.
+        threads: Number of threads, each of which gets a simulation with its share of the robots, as in `simulate`.
     """
     laps = math.ceil((WARM + ticks) / Scenario(laps=1).ticks)
+    scenarios = [Scenario(seed=seed, laps=laps) for seed in range(size)]
     with mock.patch("mrctl.loop.simulation.build", BatchPlant):
-        simulation = Simulation([Scenario(seed=seed, laps=laps) for seed in range(size)], threads=threads)
-    for _ in range(WARM):
-        simulation.step()
-    return simulation
+        simulations = [simulation for _, simulation in split(scenarios, list(range(size)), threads)]
+    run_all(simulations, ticks=WARM)
+    return simulations
 
 
-def turn(simulation: Simulation, ticks: int) -> tuple[float, float, bool]:
-    """Drives on in closed loop, then replays the same stretch open loop.
+def turn(simulations: Sequence[Simulation], ticks: int) -> tuple[float, float, bool]:
+    """Drives on in closed loop, then replays the same stretch open loop, each simulation in a thread of its own.
 
     Args:
-        simulation: On a `BatchPlant`, with nominal robots.
+        simulations: Simulations on a `BatchPlant`, with nominal robots.
         ticks: Control periods.
 
     Returns:
         Seconds in closed loop, seconds of the rollout, and whether it came to the same bits of `qpos`.
     """
-    physics = simulation.plant
-    assert isinstance(physics, BatchPlant)
-    batch, first = physics.batch, simulation.tick
-    before = batch.state.copy()
+    plants = [simulation.plant for simulation in simulations if isinstance(simulation.plant, BatchPlant)]
+    first = simulations[0].tick
+    before = [plant.batch.state.copy() for plant in plants]
     start = time.perf_counter()
-    for _ in range(ticks):
-        simulation.step()
+    run_all(simulations, ticks=ticks)
     closed = time.perf_counter() - start
-    after, qpos = batch.state.copy(), physics.qpos.copy()
-    recorded = simulation.log.ticks[first : first + ticks]
-    controls = np.stack([recorded[name].T for name in CONTROLS], axis=-1)
-    held = np.repeat(controls, physics.substeps, axis=1)
-    batch.state[:] = before
+    after, qpos = [plant.batch.state.copy() for plant in plants], [plant.qpos.copy() for plant in plants]
+    held = []
+    for simulation in simulations:
+        recorded = simulation.log.ticks[first : first + ticks]
+        controls = np.stack([recorded[name].T for name in CONTROLS], axis=-1)
+        held.append(np.repeat(controls, simulation.plant.substeps, axis=1))
+    for plant, state in zip(plants, before, strict=True):
+        plant.batch.state[:] = state
+    rollouts = [partial(p.batch.rollout, h.shape[1], h, record=()) for p, h in zip(plants, held, strict=True)]
     start = time.perf_counter()
-    batch.rollout(held.shape[1], held, record=())
+    if len(rollouts) == 1:
+        rollouts[0]()
+    else:
+        with ThreadPoolExecutor(len(rollouts)) as pool:
+            list(pool.map(lambda rollout: rollout(), rollouts))
     limit = time.perf_counter() - start
-    same = np.array_equal(physics.qpos, qpos)
-    batch.state[:] = after
+    same = all(np.array_equal(plant.qpos, q) for plant, q in zip(plants, qpos, strict=True))
+    for plant, state in zip(plants, after, strict=True):
+        plant.batch.state[:] = state
     return closed, limit, same
 
 
 def _compare(size: int, threads: int, repetitions: int, chunk: int) -> dict[str, Any]:
     gc.collect()
     memory = _resident()
-    ticks = max(2, chunk // size)
-    simulation = build(size, ticks * repetitions, threads)
+    ticks = max(2, threads * chunk // size)
+    simulations = build(size, ticks * repetitions, threads)
     turns = []
     for _ in range(repetitions):
         gc.collect()
-        turns.append(turn(simulation, ticks))
+        turns.append(turn(simulations, ticks))
     closed, limit = (statistics.median(column) / ticks for column in list(zip(*turns, strict=True))[:2])
-    steps = size * simulation.plant.substeps
+    first = simulations[0]
+    steps = size * first.plant.substeps
     return {
         "robots": size,
         "threads": threads,
         "steps_per_second": steps / closed,
         "limit_steps_per_second": steps / limit,
-        "real_time_factor": size * simulation.scenarios[0].control_period / closed,
+        "real_time_factor": size * first.period / closed,
         "ratio": statistics.median(limit / closed for closed, limit, _ in turns),
         "overhead_us_per_tick": 1e6 * statistics.median(c - limit for c, limit, _ in turns) / ticks,
         "replayed_exactly": all(same for _, _, same in turns),
         "memory_mib": (_resident() - memory) / 2**20,
-        "ticks": simulation.tick,
+        "ticks": first.tick,
     }
 
 
 def _today(repetitions: int, chunk: int) -> dict[str, float]:
     """The closed loop with one robot and the autograd loop, taking turns."""
     ticks = max(chunk // 15, 20)
-    simulation = build(1, ticks * repetitions)
+    simulations = build(1, ticks * repetitions)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # faster for a network this small
     turns = []
     try:
         for seconds, rmse in autograd_loop(ticks, repetitions):
-            turns.append((seconds, turn(simulation, ticks)[0], rmse))
+            turns.append((seconds, turn(simulations, ticks)[0], rmse))
     finally:
         torch.set_num_threads(threads)
     return {
-        "steps_per_second": simulation.plant.substeps * ticks / statistics.median(theirs for theirs, _, _ in turns),
+        "steps_per_second": simulations[0].plant.substeps * ticks / statistics.median(theirs for theirs, _, _ in turns),
         "closed_loop_is_faster_by": statistics.median(theirs / ours for theirs, ours, _ in turns),
         "position_rmse": turns[-1][2],
     }
@@ -205,7 +217,7 @@ def _today(repetitions: int, chunk: int) -> dict[str, float]:
 def _parts(size: int, chunk: int) -> dict[str, float]:
     """µs a control period by component, as they run in the loop."""
     ticks = max(2, chunk // size)
-    simulation = build(size, ticks)
+    (simulation,) = build(size, ticks)
     whole = []
     with _stopwatches() as seconds:
         for _ in range(ticks):

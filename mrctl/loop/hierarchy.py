@@ -225,6 +225,8 @@ class Hierarchy:
         self.command, self.derivative = state["limiter"]["command"], state["limiter"]["derivative"]
         self.feedback, self.weight_norm = state["feedback"], state["weight_norm"]
         self.output, self.saturated = state["allocation"]["command"], state["allocation"]["saturated"]
+        built_in = isinstance(self.feedforward, CompiledFeedforward)
+        self._update = update_with(type(self.feedforward)) if built_in else update
         self.finite = True
 
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
@@ -291,7 +293,7 @@ class Hierarchy:
         assert isinstance(stage, CompiledFeedforward)
         moves = self._tick % self._every == 0
         self._tick += 1
-        self.finite, forget = update_with(type(stage)).compiled(
+        self.finite, forget = self._update.compiled(
             moves, seen, goal, self._record, *self._inverse, self._period, stage.arrays, self.state
         )
         if forget:

@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.control.kanayama import posture_error
-from mrctl.kernel import Rows, kernel
+from mrctl.kernel import Array, Rows, kernel
 from mrctl.results.dataset import SIGNALS, TICK
 
 DIVERGED = 1.0  # m of lateral error
 
 
 @kernel
-def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, ticks: Rows) -> bool:
+def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, error: Array, ticks: Rows) -> bool:
     """Writes the signals of one control tick of all robots; returns whether all are near their references.
 
     A sample at time t holds the state at t, the commands computed from it, and the currents and power at the end of the
@@ -24,10 +24,10 @@ def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, ticks: Rows) -> b
         seen: One record of `SEEN` a robot.
         goal: One record of `GOAL` a robot.
         control: One record of `CONTROL` a robot.
+        error: Scratch, `(3,)`.
         ticks: Out: one record of `TICK` a robot.
     """
     near = True
-    error = np.empty(3)
     for i in range(len(ticks)):
         t, p, s, g, c = ticks[i], plant[i], seen[i], goal[i], control[i]
         state = p.before
@@ -65,6 +65,7 @@ class Log:
         """Takes the number of ticks that are kept and the number of robots."""
         # A tick's records lie side by side: the loop writes one block of memory a tick, however many robots there are.
         self.ticks = np.empty((length, size), TICK)
+        self._error = np.zeros(3)
 
     def at(self, tick: int) -> Rows:
         """The records of one tick, `(B,)`."""
@@ -76,4 +77,4 @@ class Log:
 
     def record(self, tick: int, plant: Rows, seen: Rows, goal: Rows, control: Rows) -> bool:
         """Records a tick; see the kernel for the arguments and the result."""
-        return record(plant, seen, goal, control, self.at(tick))
+        return record.compiled(plant, seen, goal, control, self._error, self.at(tick))

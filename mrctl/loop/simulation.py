@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from collections import defaultdict
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Unpack
 
 import numpy as np
@@ -27,6 +30,8 @@ from mrctl.scenario import Event, Scenario
 from mrctl.sensing.sensors import Sensors
 from mrctl.theory.references import check
 
+LEAST = 8  # robots in a thread, for fewer do not pay for it
+
 
 def simulate(
     scenarios: Scenario | Sequence[Scenario], *, progress: bool = False, threads: int = 0, **stages: Unpack[Stages]
@@ -36,21 +41,21 @@ def simulate(
     One scenario runs through dm_control, several run together on MuJoCo's batch engine, with the same bits.
 
     Args:
-        scenarios: One, or several; those that differ in world, laws, steering, length or rates run in turn.
-        progress: Shows a progress bar.
-        threads: Of the batch engine, which change no bit; 0 for all cores.
-        stages: Stages of your own, `motion`, `feedback`, `feedforward` or `steering`, instead of the scenario's: a
+        scenarios: One scenario, or several; those that differ in world, laws, steering, length or rates run in turn.
+        progress: Whether to show a progress bar.
+        threads: Number of threads that control and physics run on, which changes no bit; 0 for all cores.
+        stages: The user's stages `motion`, `feedback`, `feedforward` or `steering` in place of the scenario's: a
             factory, called with the nominal robot and the number of robots, which returns an object with the two
-            methods of that stage in `mrctl.control.stages`. One that raises, or returns what does not fit, fails its
-            whole group of runs; one that returns NaN for a robot fails that run.
+            methods of that stage in `mrctl.control.stages`. One that raises, or returns an array of the wrong shape,
+            fails all runs that are computed together; one that returns NaN for a robot fails that run.
 
     Returns:
         The signals of `results.dataset.SIGNALS` with dimensions run and time (time alone for one scenario), with units;
-        `failed`, `failure` and `failure_time` a run; `weights` where a network learned.
+        `failed`, `failure` and `failure_time` of each run; `weights` where a network learned.
 
     Raises:
-        InputError: A scenario asks for what is not there or what the robot cannot do; the message names the field. Or
-            a stage of yours cannot be made.
+        InputError: A scenario asks for something that does not exist or that the robot cannot do, and the message names
+            the field; or a stage of the user cannot be made.
     """
     several = [scenarios] if isinstance(scenarios, Scenario) else list(scenarios)
     if not several:
@@ -58,30 +63,76 @@ def simulate(
     if len({s.control_period for s in several}) > 1:
         raise InputError("control_period: runs of one result share their time axis, so also their control period")
     # Built first, so that bad input is refused before anything is computed.
-    simulations = batches(several, threads=threads, **stages)
-    total = sum(simulation.ticks * len(rows) for rows, simulation in simulations)
-    parts = []
+    groups = [split(several, rows, threads, **stages) for rows in uniform(several)]
+    parts = [part for group in groups for part in group]
+    total = sum(simulation.ticks * len(rows) for rows, simulation in parts)
     with tqdm(total=total, unit="tick", unit_scale=True, disable=not progress) as bar:
-        for rows, simulation in simulations:
-            with np.errstate(
-                invalid="ignore", over="ignore"
-            ):  # a robot that blew up is computed on in NaN, to no effect
-                while simulation.running:
-                    simulation.step()
-                    bar.update(len(rows))
-            parts.append((rows, simulation.result()))
-    whole = dataset.combine(parts, several)
+        for group in groups:
+            run([simulation for _, simulation in group], bar.update if progress else None)
+    whole = dataset.combine([(rows, simulation.result()) for rows, simulation in parts], several)
     return whole.isel(run=0) if isinstance(scenarios, Scenario) else whole
 
 
-def batches(
-    scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]
-) -> list[tuple[list[int], Simulation]]:
-    """Uniform groups of scenarios: which they are, and their simulation. Arguments and errors as in `simulate`."""
+def uniform(scenarios: Sequence[Scenario]) -> list[list[int]]:
+    """The scenarios that can run in one simulation, by their indices."""
     groups: dict[Hashable, list[int]] = defaultdict(list)
     for row, s in enumerate(scenarios):
         groups[group_of(s)].append(row)
-    return [(rows, Simulation([scenarios[r] for r in rows], threads=threads, **stages)) for rows in groups.values()]
+    return list(groups.values())
+
+
+def split(
+    scenarios: Sequence[Scenario], rows: list[int], threads: int, **stages: Unpack[Stages]
+) -> list[tuple[list[int], Simulation]]:
+    """Splits a uniform group into simulations that run at the same time, a thread each.
+
+    With stages of the user the group stays whole: these see all robots at once, and the engine alone has threads.
+
+    Args:
+        scenarios: All scenarios.
+        rows: Those of the group.
+        threads: Number of threads; 0 for all cores.
+        stages: As in `simulate`.
+
+    Raises:
+        InputError: As `simulate`.
+    """
+    if any(stages.values()):
+        return [(rows, Simulation([scenarios[row] for row in rows], threads=threads, **stages))]
+    count = min(threads or len(os.sched_getaffinity(0)), max(1, len(rows) // LEAST))
+    parts = [part.tolist() for part in np.array_split(rows, count)]
+    return [(part, Simulation([scenarios[row] for row in part], threads=1)) for part in parts]
+
+
+def run(
+    simulations: Sequence[Simulation], progress: Callable[[int], object] | None = None, ticks: int | None = None
+) -> None:
+    """Runs simulations at the same time, each in a thread of its own; control and physics release the global lock.
+
+    Args:
+        simulations: The simulations.
+        progress: Is called after every tick of a simulation with the number of its robots.
+        ticks: Number of control periods; by default to the end of the runs.
+    """
+    stop = threading.Event()
+
+    def drive(simulation: Simulation) -> None:
+        last = simulation.ticks if ticks is None else simulation.tick + ticks
+        with np.errstate(invalid="ignore", over="ignore"):  # a robot that blew up is computed on in NaN, to no effect
+            while simulation.running and simulation.tick < last and not stop.is_set():
+                simulation.step()
+                if progress:
+                    progress(simulation.plant.size)
+
+    if len(simulations) == 1:
+        return drive(simulations[0])
+    with ThreadPoolExecutor(len(simulations)) as pool:
+        try:
+            for future in [pool.submit(drive, simulation) for simulation in simulations]:
+                future.result()
+        except BaseException:
+            stop.set()
+            raise
 
 
 def group_of(s: Scenario) -> Hashable:
@@ -111,8 +162,8 @@ class Simulation:
         """Compiles the world, stands the robots on their references, rolling.
 
         Args:
-            scenarios: Scenarios that `simulate` would run together.
-            threads: As in `simulate`.
+            scenarios: Scenarios of one group, see `group_of`.
+            threads: Number of threads of the batch engine; 0 for all cores. Control runs on one.
             stages: As in `simulate`.
 
         Raises:

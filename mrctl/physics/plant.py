@@ -234,7 +234,7 @@ class Plant(ABC):
         if command.shape != (self.size, 4):
             raise ValueError(f"command: shape {command.shape}, expected {(self.size, 4)}")
         # The engine would silently take zero volts instead of what is no number.
-        if not drive(command, self._tick, self._queue, self._inputs, self.state, self.ctrl):
+        if not drive.compiled(command, self._tick, self._queue, self._inputs, self.state, self.ctrl):
             sent = self._queue[(self._tick - self.state["delay"]) % len(self._queue), np.arange(self.size)]
             for robot in np.flatnonzero(~np.isfinite(sent).all(axis=1)):
                 self.fail(int(robot), "non-finite command")
@@ -268,7 +268,7 @@ class Plant(ABC):
         return self.state["current"]
 
     def _look(self) -> bool:
-        return look(self.qpos, self.qvel, self.act, self._address, self._acts, self.state)
+        return look.compiled(self.qpos, self.qvel, self.act, self._address, self._acts, self.state)
 
 
 class PhysicsPlant(Plant):

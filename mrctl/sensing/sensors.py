@@ -117,5 +117,5 @@ class Sensors:
         """
         for row in self._noisy:
             self.seen["noise"][row] = self.seen["noise_scale"][row] * self._random[row].standard_normal(5)
-        measure(plant, *self._constants, self.seen)
+        measure.compiled(plant, *self._constants, self.seen)
         return self.seen

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.kernel import Rows
-from mrctl.loop.simulation import batches
+from mrctl.loop.simulation import Simulation, uniform
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank
 from mrctl.scenario import Event, Scenario
@@ -47,7 +47,7 @@ class Session:
         self.start = list(scenarios)
         self.period = scenarios[0].control_period
         long = [s.model_copy(update={"laps": max(1, floor(HOUR / s.reference.period))}) for s in scenarios]
-        self.simulations = batches(long, threads=1)
+        self.simulations = [(rows, Simulation([long[row] for row in rows], threads=1)) for rows in uniform(long)]
         self._place = {row: (sim, k) for rows, sim in self.simulations for k, row in enumerate(rows)}
         self.tick = 0
 
