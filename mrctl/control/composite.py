@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import feature_scale, features
-from mrctl.control.feedforward import STEERING_SHARE, CompiledFeedforward
+from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, CompiledFeedforward
 from mrctl.control.weights import FEATURES, INPUTS, PHYSICAL, SHIPPED, load_training
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
@@ -46,7 +46,6 @@ from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
 CHANNELS = 2
-STEERING_SCALE = 0.1  # rad/s that count on a steering channel as one volt does on the others
 STEERING_DISTURBANCE = 0.03  # rad/s of disturbance per volt: less, since the geometry holds without a motor
 OUTLIER = 3.0  # standard deviations beyond which a sample pulls no harder: a tyre slips, a wheel lost its load
 SLOW = 0.1  # m/s of the faster wheel; below it stiction, not the motion, decides about the voltage

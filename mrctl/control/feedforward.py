@@ -16,6 +16,7 @@ from mrctl.kernel import Array, Kernel, Row, Rows, kernel
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
+STEERING_SCALE = 0.1  # rad/s on a steering channel that count as one volt does on the others
 STEERING_SHARE = 0.1  # how much slower a steering channel learns: its geometry is nearly right from the start
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import feature_scale, features
-from mrctl.control.feedforward import STEERING_SHARE, CompiledFeedforward
+from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, CompiledFeedforward
 from mrctl.control.weights import INPUTS, OUTPUTS, initial_weights, load_weights
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
@@ -25,7 +25,6 @@ from mrctl.theory.robot import Robot
 # to learn what changes during a lap, quick to oscillate.
 HIDDEN_GAIN, BIAS_GAIN = 0.15, 0.1
 REGULARISATION = 1e-3  # ε: keeps the normalised step finite at rest, where the regressor vanishes
-STEERING_SCALE = 0.1  # rad/s that a steering channel corrects, per volt of the other arrangements
 
 
 class Fel(Record):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mrctl import __version__
 from mrctl.kernel import Array
 from mrctl.record import InputError
 
@@ -118,7 +119,8 @@ def load_training(path: str | Path = SHIPPED) -> Training:
 def _write(path: str | Path, arrays: Mapping[str, Array], metadata: dict[str, str] | None = None) -> None:
     from safetensors.numpy import save
 
-    data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, metadata=metadata)
+    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    data = save(contiguous, metadata={"mrctl": __version__} | (metadata or {}))
     try:
         Path(path).write_bytes(data)
     except OSError as error:
@@ -126,14 +128,17 @@ def _write(path: str | Path, arrays: Mapping[str, Array], metadata: dict[str, st
 
 
 def _read(path: str | Path, field: str, expected: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
-    """Arrays of these names and shapes, as float64; errors name the field that gave the path."""
+    """Arrays of these names and shapes, as float64; errors name the field, the path and the version that wrote it."""
     if not Path(path).is_file():
         raise InputError(f"{field}: no file {path}")
+    writer = ""
     try:
         if Path(path).suffix == ".safetensors":
-            from safetensors.numpy import load_file
+            from safetensors import safe_open
 
-            arrays = load_file(path)
+            with safe_open(path, "numpy") as file:
+                arrays = {name: file.get_tensor(name) for name in file.keys()}
+                writer = (file.metadata() or {}).get("mrctl", "")
         else:
             import torch
 
@@ -144,7 +149,8 @@ def _read(path: str | Path, field: str, expected: Mapping[str, tuple[int, ...]])
     for name, shape in expected.items():
         if name not in arrays or arrays[name].shape != shape:
             found = arrays[name].shape if name in arrays else "missing"
-            raise InputError(f"{field}: {path}: {name} is {found}, it must have shape {shape}")
+            by = f" (written by mrctl {writer})" if writer and writer != __version__ else ""
+            raise InputError(f"{field}: {path}{by}: {name} is {found}, it must have shape {shape}")
     if unknown := set(arrays) - set(expected):
         raise InputError(f"{field}: {path}: unknown entry {min(unknown)!r}")
     if not all(np.isfinite(array).all() for array in arrays.values()):

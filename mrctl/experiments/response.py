@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from mrctl.control.fel import STEERING_SCALE
+from mrctl.control.feedforward import STEERING_SCALE
 from mrctl.loop.hierarchy import TAKE_OVER
 from mrctl.loop.simulation import Simulation
 from mrctl.record import InputError
