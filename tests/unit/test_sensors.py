@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mrctl.kernel import over_rows
-from mrctl.sensing.sensors import SEEN, observe
+from mrctl.physics.plant import PLANT
+from mrctl.sensing.sensors import SEEN, Sensors, observe
 from mrctl.sensing.slip import SLIP_FILTER, slip_ratio
 
 
@@ -15,7 +16,7 @@ def numbers(*shape, bound=5.0):
     return arrays(float, shape, elements=st.floats(-bound, bound))
 
 
-def sensors(size, **fields):
+def records(size, **fields):
     """Returns `size` records of `SEEN` with these fields; `speed` in m/s is what the encoders show of V, `(B,)`."""
     seen = np.zeros(size, SEEN)
     if "speed" in fields:
@@ -35,7 +36,7 @@ def dead_reckoning(start, v, omega, duration, period, noise=(0, 0, 0, 0, 0), sho
     """Returns odometry's last pose at a constant twist for which the encoders show the speed `shown`."""
     shown = v if shown is None else shown
     twist = shown + noise[3], omega + noise[4]
-    s = sensors(1, pose=start, twist=twist, odometry=True, noise=noise, speed=shown, elapsed=period)[0]
+    s = records(1, pose=start, twist=twist, odometry=True, noise=noise, speed=shown, elapsed=period)[0]
     lost = np.full(3, np.nan)  # odometry never looks at the true pose
     for _ in range(round(duration / period)):
         observe(lost, np.array([v, omega]), s)
@@ -45,7 +46,7 @@ def dead_reckoning(start, v, omega, duration, period, noise=(0, 0, 0, 0, 0), sho
 @given(numbers(4, 3), numbers(4, 2), numbers(4, 3))
 def test_truth(true_pose, true_twist, before):
     """Without noise the truth passes to the bit, whatever was measured before and whatever the encoders show."""
-    seen = sensors(4, pose=before, twist=1.0, speed=99.0, elapsed=0.01)
+    seen = records(4, pose=before, twist=1.0, speed=99.0, elapsed=0.01)
     over_rows(observe, true_pose, true_twist, seen)
     np.testing.assert_array_equal(seen["pose"], true_pose)
     np.testing.assert_array_equal(seen["twist"], true_twist)
@@ -54,7 +55,7 @@ def test_truth(true_pose, true_twist, before):
 @given(numbers(4, 3), numbers(4, 2), numbers(4, 5, bound=0.1))
 def test_noise(true_pose, true_twist, noise):
     """Each sample of the noise is added to its own signal."""
-    seen = sensors(4, noise=noise, elapsed=0.01)
+    seen = records(4, noise=noise, elapsed=0.01)
     over_rows(observe, true_pose, true_twist, seen)
     measured = np.hstack([seen["pose"], seen["twist"]])
     np.testing.assert_array_equal(measured, np.hstack([true_pose, true_twist]) + noise)
@@ -75,7 +76,7 @@ def test_odometry_of_a_varying_twist():
     """Odometry takes a changing twist at the middle of the period, so it is of second order there too."""
 
     def end(h):
-        s = sensors(1, twist=(0.5, 0.0), odometry=True, elapsed=h)[0]
+        s = records(1, twist=(0.5, 0.0), odometry=True, elapsed=h)[0]
         for t in h * np.arange(1, round(2 / h) + 1):
             v, omega = 0.5 + 0.4 * np.sin(2 * t), np.sin(3 * t)
             s["wheel_speeds"] = v
@@ -113,7 +114,7 @@ def test_rows(true_pose, true_twist, noise, odometry, speed, pose, twist):
     def answer(rows, lost=()):
         fields = {"noise": noise, "odometry": odometry, "speed": speed, "pose": pose, "twist": twist}
         chosen = {name: values[rows] for name, values in fields.items()}
-        seen = sensors(len(chosen["pose"]), elapsed=0.01, **chosen)
+        seen = records(len(chosen["pose"]), elapsed=0.01, **chosen)
         true = true_twist[rows].copy()
         true[list(lost)] = np.nan
         over_rows(observe, true_pose[rows], true, seen)
@@ -122,6 +123,23 @@ def test_rows(true_pose, true_twist, noise, odometry, speed, pose, twist):
     together = answer(slice(None), lost=[1])
     for i in (0, 2, 3):
         assert together[i].tobytes() == answer(slice(i, i + 1))[0].tobytes()
+
+
+def test_start(robot):
+    """The first measurement is the true posture for odometry too, which integrates from the second one on."""
+    start, v, omega, period = np.array([0.3, -0.2, 0.5]), 0.8, 1.3, 0.01
+    plant = np.zeros(2, PLANT)
+    reading = plant["reading"]
+    reading["pose"], reading["twist"] = start, (v, omega)
+    reading["wheel_rates"] = (v + np.array([-1, 1]) * robot.half_track * omega) / robot.wheel_radius
+    sensors = Sensors([True, False], [0, 1], robot, period)
+    sensors.start(reading)
+    assert np.array_equal(sensors.measure(plant)["pose"], [start, start])
+    seen = sensors.measure(plant)
+    np.testing.assert_allclose(seen["pose"], [circle(start, v, omega, period), start], atol=1e-6)
+    np.testing.assert_allclose(seen["twist"], [(v, omega)] * 2, atol=1e-12)
+    sensors.restart(0, 0, reading)
+    assert np.array_equal(sensors.measure(plant)["pose"], [start, start])
 
 
 def slip_of(wheels, twist, ticks=400):
