@@ -266,4 +266,4 @@ def test_sweep(browser, tmp_path):
         page.mouse.click(*at)
         until(lambda: replay.runs == [4], "the run to open")
     again = simulate(jobs.scenario_of(tmp_path / "store", 4))
-    assert replay._log[:, 0, 0].tobytes() == again.x.values.tobytes()
+    assert replay._log["x"][:, 0].tobytes() == again.x.values.tobytes()
