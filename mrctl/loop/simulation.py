@@ -1,4 +1,4 @@
-"""THE closed loop: scenarios in, result out."""
+"""The closed loop: scenarios in, result out."""
 
 from __future__ import annotations
 
@@ -36,36 +36,34 @@ def simulate(
     One scenario runs through dm_control, several run together on MuJoCo's batch engine, with the same bits.
 
     Args:
-        scenarios: One, or several; those that differ in world, laws, steering, length or rates run in turn.
-        progress: Shows a progress bar.
-        threads: Of the batch engine, which change no bit; 0 for all cores.
-        stages: Stages of your own, `motion`, `feedback`, `feedforward` or `steering`, instead of the scenario's: a
-            factory, called with the nominal robot and the number of robots, which returns an object with the two
-            methods of that stage in `mrctl.control.stages`. One that raises, or returns what does not fit, fails its
-            whole group of runs; one that returns NaN for a robot fails that run.
+        scenarios: One or several; those that differ in world, laws, steering, length or rates run in turn.
+        progress: Whether to show a progress bar.
+        threads: Number of threads of the batch engine, which changes no bit; 0 for all cores.
+        stages: Your own stages, `motion`, `feedback`, `feedforward` or `steering`, in place of the scenario's: for
+            each, a factory that is called with the nominal robot and the number of robots, and returns an object with
+            the two methods of that stage in `mrctl.control.stages`. A stage that raises, or returns an array of another
+            shape, fails all runs of its group; one that returns NaN for a robot fails that run.
 
     Returns:
-        The signals of `results.dataset.SIGNALS` with dimensions run and time (time alone for one scenario), with units;
-        `failed`, `failure` and `failure_time` a run; `weights` where a network learned.
+        The signals of `results.dataset.SIGNALS` with their units and the dimensions run and time (time alone for one
+        scenario); `failed`, `failure` and `failure_time` of each run; `weights` if a network learned.
 
     Raises:
-        InputError: A scenario asks for what is not there or what the robot cannot do; the message names the field. Or
-            a stage of yours cannot be made.
+        InputError: A scenario names something that does not exist, or a motion that the robot cannot do; the message
+            names the field. Or one of your stages cannot be made.
     """
     several = [scenarios] if isinstance(scenarios, Scenario) else list(scenarios)
     if not several:
         raise InputError("scenarios: none given")
     if len({s.control_period for s in several}) > 1:
         raise InputError("control_period: runs of one result share their time axis, so also their control period")
-    # Built first, so that bad input is refused before anything is computed.
+    # All simulations are built first, so that bad input is refused before anything is computed.
     simulations = batches(several, threads=threads, **stages)
     total = sum(simulation.ticks * len(rows) for rows, simulation in simulations)
     parts = []
     with tqdm(total=total, unit="tick", unit_scale=True, disable=not progress) as bar:
         for rows, simulation in simulations:
-            with np.errstate(
-                invalid="ignore", over="ignore"
-            ):  # a robot that blew up is computed on in NaN, to no effect
+            with np.errstate(invalid="ignore", over="ignore"):  # a failed robot is computed on in NaN, without effect
                 while simulation.running:
                     simulation.step()
                     bar.update(len(rows))
@@ -77,7 +75,7 @@ def simulate(
 def batches(
     scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]
 ) -> list[tuple[list[int], Simulation]]:
-    """Uniform groups of scenarios: which they are, and their simulation. Arguments and errors as in `simulate`."""
+    """Returns the indices and the simulation of each uniform group; arguments and errors are those of `simulate`."""
     groups: dict[Hashable, list[int]] = defaultdict(list)
     for row, s in enumerate(scenarios):
         groups[group_of(s)].append(row)
@@ -85,7 +83,7 @@ def batches(
 
 
 def group_of(s: Scenario) -> Hashable:
-    """What runs in one simulation must share."""
+    """Returns what the runs of one simulation must share."""
     net = s.fel.hidden, s.composite.weights
     rates = s.ticks, s.physics_step, s.control_period, s.motion_period
     return s.world, s.robot, s.steering, s.feedforward, *rates, *net
@@ -95,28 +93,28 @@ class Simulation:
     """A uniform group of runs, one control period at a time.
 
     Attributes:
-        scenarios: What is run, with the events that were added.
+        scenarios: Scenario of each run, with the events that were added.
         model: The compiled world with the nominal robot.
-        courses: What the robots shall follow.
-        sensors: What the controllers are shown.
+        courses: The references that the robots follow.
+        sensors: The measurements that the controllers receive.
         hierarchy: The controllers.
         plant: The physics.
-        events: What happens to the robots.
-        log: What was recorded; nothing yet from `tick` on.
-        tick: Control periods done.
-        ticks: Control periods in the whole run.
+        events: The perturbations, pushes and other changes during the run.
+        log: The recorded signals; the records from `tick` on are not written yet.
+        tick: Number of control periods done.
+        ticks: Number of control periods in the whole run.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]) -> None:
-        """Compiles the world, stands the robots on their references, rolling.
+        """Compiles the world, and sets the robots on their references with the twist of the reference.
 
         Args:
             scenarios: Scenarios that `simulate` would run together.
-            threads: As in `simulate`.
-            stages: As in `simulate`.
+            threads: Number of threads, as in `simulate`.
+            stages: Your own stages, as in `simulate`.
 
         Raises:
-            InputError: As `simulate`.
+            InputError: A scenario or a stage is refused, as in `simulate`.
         """
         first, size = scenarios[0], len(scenarios)
         self.scenarios = list(scenarios)
@@ -150,17 +148,17 @@ class Simulation:
 
     @property
     def running(self) -> bool:
-        """Whether there is anything left to do."""
+        """Whether the run goes on: ticks are left, and a robot has not failed."""
         return self.tick < self.ticks and self.plant.running > 0
 
     def add(self, event: Event) -> None:
-        """Adds an event to every run under way: `scenarios` then hold it, and run again give the same bits.
+        """Adds an event to every run; `scenarios` then contain it, and a new run of them gives the same bits.
 
         Args:
-            event: What happens, not before the coming tick.
+            event: The event, not before the coming tick.
 
         Raises:
-            InputError: It comes too late, or a scenario with it is refused; then nothing was added.
+            InputError: The event is in the past, or a scenario with it is refused; then nothing is added.
         """
         if event.tick(self.period) < self.tick:
             raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self.period:g} s")
@@ -179,10 +177,10 @@ class Simulation:
         self.settle()
 
     def sense(self) -> tuple[Rows, Rows]:
-        """Lets this tick's events happen and measures, once a tick.
+        """Applies the events of this tick and measures; further calls in the same tick only return the result.
 
         Returns:
-            What is measured, one record of `SEEN` a robot, and the references, one of `GOAL`.
+            Measurement of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each.
         """
         if self._sensed != self.tick:
             self._sensed = self.tick
@@ -192,7 +190,7 @@ class Simulation:
         return self.sensors.seen, self._goal
 
     def decide(self) -> Array:
-        """What comes before the physics: events, measurement, control.
+        """Does what comes before the physics: events, measurement and control.
 
         Returns:
             Commanded voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
@@ -200,23 +198,23 @@ class Simulation:
         hierarchy = self.hierarchy
         try:
             command = hierarchy.update(*self.sense())
-        except StageError as error:  # of the whole group: what was recorded until now is kept
+        except StageError as error:  # it concerns the whole group; the records until now are kept
             self._fail(dict.fromkeys(range(self.plant.size), str(error)))
             return hierarchy.output
         if isinstance(hierarchy, UserHierarchy):
             self._fail(hierarchy.faults)
-        if not hierarchy.finite:  # the limit would turn NaN into the full voltage
+        if not hierarchy.finite:  # the voltage limit would turn NaN into the full voltage
             for row in hierarchy.non_finite():
                 self.plant.fail(row, "non-finite voltage")
         return command
 
     def _fail(self, faults: dict[int, str]) -> None:
-        """Stops the robots whose user's stages failed."""
+        """Fails robots, for the reason that a user's stage gave for each."""
         for row, fault in faults.items():
             self.plant.fail(row, f"{fault}, tick {self.tick}")
 
     def settle(self) -> None:
-        """What comes after the physics: record and failures."""
+        """Does what comes after the physics: the record and the failures."""
         plant, tick = self.plant, self.tick
         near = self.log.record(tick, plant.state, self.sensors.seen, self._goal, self.hierarchy.state)
         if not near:
@@ -229,7 +227,7 @@ class Simulation:
             self.log.blank(tick, plant.failed)
 
     def result(self) -> xr.Dataset:
-        """What was recorded so far; the whole length, ending in NaN, once every robot has failed."""
+        """Returns the signals so far; if every robot has failed, of the whole run, with NaN at the end."""
         stage = self.hierarchy.feedforward
         weights = stage.weights.copy() if isinstance(stage, FeedbackErrorLearning) else None
         size, robot = len(self.scenarios), self.plant.robot
@@ -239,7 +237,7 @@ class Simulation:
         names = [self._label] * size, [self._feedforward] * size
         log, failure = self.log.ticks[:length], self.plant.failure
         found = dataset.dataset(self.scenarios, *names, log, failure, self._failure_time, weights)
-        return found.assign(  # what turns the commanded motion into features
+        return found.assign(  # the constants that turn the commanded motion into features
             half_track=("run", np.full(size, robot.half_track), {"units": "m"}),
             feature_scale=(("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         )
