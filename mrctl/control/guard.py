@@ -87,7 +87,7 @@ GUARD = np.dtype(
         ("retries", "f8"),
         ("fade", "f8"),  # s
         ("model", "?"),  # whether the fallback is the nominal model, not PID alone
-        ("range", "f8", 2),  # what a channel can command: the supply in V, or the largest θ̇ in rad/s
+        ("range", "f8", 2),  # largest command of a channel: the supply in V, or the largest θ̇ in rad/s
         # Oscillation of four signals, feedforward and feedback of the two channels, as shares of `range`
         ("low_pass", "f8", 4),  # the signal without noise
         ("slow_mean", "f8", 4),  # its slow mean
@@ -154,7 +154,7 @@ def guard(
     - fallback: the nominal inverse dynamics replaces the learner, after trouble that freezing does not end. The
       integral starts from the mean error of the model, so that the step in voltage is small; what is left of it fades.
       The learner is reset to its initial weights.
-    - resume: the learner is back after the hold, once nothing is wrong, each time with less gain and after a longer
+    - resume: the learner returns after the hold, once nothing is wrong, each time with less gain and after a longer
       hold. After a fallback its share of the output, the authority, grows from 0 to 1 as slowly as it learns; the rest
       is the fallback's. After `retries` the fallback stays.
 

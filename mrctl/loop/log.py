@@ -63,7 +63,7 @@ class Log:
 
     def __init__(self, length: int, size: int) -> None:
         """Takes the number of ticks that are kept and the number of robots."""
-        # A tick's records lie side by side: the loop writes one block of memory a tick, however many robots there are.
+        # The records of a tick lie side by side, so that the loop writes one block of memory for any number of robots.
         self.ticks = np.empty((length, size), TICK)
 
     def at(self, tick: int) -> Rows:
