@@ -50,13 +50,18 @@ class Kernel(Generic[P, T]):
         _known_to_numba()
         law: Any = self.law
         # Numba looks a function up on disk by its code and by what its closure holds.
-        version = (kernel_files_digest(), *sorted((name, law.__module__) for name, law in self._laws.items()))
+        version = repr((kernel_files_digest(), self._names()))
         code = law.__code__.replace(co_freevars=("version",))
         versioned = FunctionType(
             code, law.__globals__ | self._laws, law.__name__, law.__defaults__, (CellType(version),)
         )
         update_wrapper(versioned, law)
         return njit(cache=True, nogil=True)(versioned)
+
+    def _names(self) -> tuple[Any, ...]:
+        """Names of the function, and of the kernels that it calls in place of others."""
+        called = sorted((name, law._names()) for name, law in self._laws.items())
+        return self.law.__module__, self.law.__qualname__, called
 
     def __call__(self, *arguments: P.args, **options: P.kwargs) -> T:
         """Calls the compiled function."""

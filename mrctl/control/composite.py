@@ -39,9 +39,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import feature_scale, features
+from mrctl.control.features import FEATURES, INPUTS, PHYSICAL, feature_scale, features
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, CompiledFeedforward
-from mrctl.control.weights import FEATURES, INPUTS, PHYSICAL, SHIPPED, load_training
+from mrctl.control.weights import SHIPPED, load_training
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients

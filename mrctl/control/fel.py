@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import feature_scale, features
+from mrctl.control.features import INPUTS, OUTPUTS, feature_scale, features
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, CompiledFeedforward
-from mrctl.control.weights import INPUTS, OUTPUTS, initial_weights, load_weights
+from mrctl.control.weights import initial_weights, load_weights
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot

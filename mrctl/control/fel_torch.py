@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.func import functional_call, stack_module_state, vjp, vmap
 
-from mrctl.control.features import feature_matrix, feature_scale
+from mrctl.control.features import INPUTS, OUTPUTS, feature_matrix, feature_scale
 from mrctl.control.fel import BIAS_GAIN, HIDDEN_GAIN, REGULARISATION, Fel, fresh
-from mrctl.control.weights import INPUTS, OUTPUTS
 from mrctl.kernel import Array
 from mrctl.theory.robot import Robot
 

@@ -9,13 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from mrctl import __version__
+from mrctl.control.features import FEATURES, INPUTS, OUTPUTS, UNITS
 from mrctl.kernel import Array
 from mrctl.record import InputError
 
-INPUTS, OUTPUTS = 8, 2  # inputs and outputs of the network of `fel`: physical features, and channels
-UNITS = 16  # tanh units of `composite`
-PHYSICAL = INPUTS + 2  # physical features of `composite`: the eight, and gravity on a slope
-FEATURES = PHYSICAL + UNITS
 SHIPPED = Path(__file__).with_name("composite.safetensors")
 
 

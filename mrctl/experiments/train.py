@@ -21,8 +21,8 @@ from scipy.signal import lfilter
 from torch import Tensor
 
 from mrctl.control.composite import Composite
-from mrctl.control.features import feature_matrix, feature_scale
-from mrctl.control.weights import INPUTS, PHYSICAL, UNITS, Training, save_training
+from mrctl.control.features import INPUTS, PHYSICAL, UNITS, feature_matrix, feature_scale
+from mrctl.control.weights import Training, save_training
 from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.kernel import Array
 from mrctl.loop.simulation import simulate

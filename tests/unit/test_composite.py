@@ -8,32 +8,36 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mrctl.control.composite import (
-    FEATURES,
-    INPUTS,
-    PHYSICAL,
+    COMPOSITE,
     SCATTER,
     STEERING_DISTURBANCE,
-    STEERING_SCALE,
-    UNITS,
     Composite,
     CompositeAdaptation,
-    Training,
-    adapt,
     basis,
-    load_training,
-    save_training,
-)  # fmt: skip
-from mrctl.control.feedforward import InverseDynamics, feature_scale
+    predict,
+    track,
+)
+from mrctl.control.features import FEATURES, INPUTS, PHYSICAL, UNITS, feature_scale
+from mrctl.control.feedforward import STEERING_SCALE, InverseDynamics
+from mrctl.control.weights import Training, load_training, save_training
 from mrctl.record import InputError
 from mrctl.theory.dynamics import accelerations, inverse_coefficients, left_right
 
 RNG = np.random.default_rng(8)
 PERIOD = 0.01
-N = 4  # features in the tests of the law alone
+N = FEATURES
 
 
 def numbers(*shape, bound=3.0):
     return arrays(float, shape, elements=st.floats(-bound, bound))
+
+
+def many(*shape, bound=3.0):
+    """More numbers than Hypothesis draws one by one: from a seed, in a range that it chooses."""
+    return st.builds(
+        lambda seed, size: size * np.random.default_rng(seed).uniform(-1, 1, shape),
+        st.integers(0, 2**32 - 1), st.floats(0, bound),
+    )  # fmt: skip
 
 
 def spd(root):
@@ -42,16 +46,37 @@ def spd(root):
     return (found + found.T) / 2
 
 
+def with_disturbance(prior):
+    """Stationary covariance of weights and disturbance, whose standard deviation is 0.5 V."""
+    return np.block([[prior, np.zeros((N, 1))], [np.zeros((1, N)), np.array([[0.25]])]])
+
+
+def channel(prior, forgetting, noise, step=0.0, dead_zone=0.0, brief=0.0, lasting=0.0):
+    """A record, and the prior as the law takes it: weights of covariance P₀ and a disturbance of 0.5 V."""
+    s = np.zeros(1, COMPOSITE)[0]
+    s["f"], s["f"][:, N], s["drift"] = forgetting, 0.9, (1 - 0.9**2) * 0.25
+    s["noise"], s["step"], s["dead_zone"], s["brief"], s["lasting"] = noise, step, dead_zone, brief, lasting
+    s["power"] = 1.0
+    s["P"] = with_disturbance(prior)
+    return s, with_disturbance(prior) - np.diag([*np.zeros(N), 0.25])
+
+
+def adapt(k, x, residual, command, feedback, prior, s):
+    """One composite step of one channel at these features of measured and commanded motion."""
+    s["phi"], s["phi_c"], s["residual"][k] = np.append(x, 1), np.append(command, 1), residual
+    predict(k, prior, s)
+    track(k, feedback, s)
+
+
 @given(
-    numbers(N), numbers(N), numbers(N + 1), numbers(N + 1, N + 1, bound=1), numbers(N, N, bound=1),
-    st.floats(-20, 20), st.floats(-3, 3), st.floats(0.1, 2), st.floats(0, 1),
+    many(N), many(N), many(N + 1), many(N + 1, N + 1, bound=1), many(N, N, bound=1),
+    st.floats(-20, 20), st.floats(-3, 3), st.floats(0.1, 2), st.floats(0, 1), st.integers(0, 1),
 )  # fmt: skip
-def test_one_step(x, command, weights, root, prior_root, residual, feedback, noise, step):
+def test_one_step(x, command, weights, root, prior_root, residual, feedback, noise, step, k):
     """Correction, prediction to the stationary prior, tracking: each as in the books, in matrices."""
-    settings = np.array([0.99, 0.9, 0.5, step, 0.1, 0.0, 0.0])
     covariance, prior = spd(root), spd(prior_root)
     h, f = np.append(x, 1), np.append(np.full(N, 0.99), 0.9)
-    stationary = np.block([[prior, np.zeros((N, 1))], [np.zeros((1, N)), np.array([[0.25]])]])
+    stationary = with_disturbance(prior)
     total = h @ covariance @ h + noise**2
     innovation = np.clip(residual - h @ weights, -3 * np.sqrt(total), 3 * np.sqrt(total))
     gain = covariance @ h / total
@@ -62,21 +87,22 @@ def test_one_step(x, command, weights, root, prior_root, residual, feedback, noi
     direction = predicted[:N, :N] @ command
     if abs(feedback) > 0.1 and command @ direction > 1e-9:
         expected[:N] += step * feedback * direction / (command @ direction)
-    found, spread = weights.copy(), covariance.copy()
-    adapt(x, residual, command, feedback, noise**2, settings, prior, np.ones(2), found, spread)
-    np.testing.assert_allclose(spread, predicted, atol=1e-9)
-    np.testing.assert_allclose(found, expected, atol=1e-7, rtol=1e-7)
+    s, bordered = channel(prior, 0.99, noise, step, dead_zone=0.1)
+    s["a"][k], s["P"][k] = weights, covariance
+    adapt(k, x, residual, command, feedback, bordered, s)
+    np.testing.assert_allclose(s["P"][k], predicted, atol=1e-9)
+    np.testing.assert_allclose(s["a"][k], expected, atol=1e-7, rtol=1e-7)
 
 
-@given(numbers(40, N), numbers(N, N, bound=1), st.floats(0.5, 0.9999))
+@given(many(40, N), many(N, N, bound=1), st.floats(0.5, 0.9999))
 def test_covariance(inputs, root, forgetting):
     """From the prior on, it stays symmetric, positive and below the prior: nothing that is not excited blows up."""
     prior = spd(root)
-    stationary = np.block([[prior, np.zeros((N, 1))], [np.zeros((1, N)), np.array([[0.25]])]])
-    covariance, weights, usual = stationary.copy(), np.zeros(N + 1), np.ones(2)
-    settings = np.array([forgetting, 0.9, 0.5, 0.02, 0, 0.1, 0.01])
+    stationary = with_disturbance(prior)
+    s, bordered = channel(prior, forgetting, noise=0.5, step=0.02, brief=0.1, lasting=0.01)
     for x in inputs:
-        adapt(x, 1.0, x, 1.0, 0.25, settings, prior, usual, weights, covariance)
+        adapt(0, x, 1.0, x, 1.0, bordered, s)
+        covariance = s["P"][0]
         np.testing.assert_array_equal(covariance, covariance.T)
         assert np.linalg.eigvalsh(covariance).min() > 0
         assert np.linalg.eigvalsh(stationary - covariance).min() > -1e-9
@@ -86,22 +112,22 @@ def test_outlier():
     """A sample a thousand times too large moves the weights as far as one of three standard deviations."""
     moved = []
     for residual in (3 * np.sqrt(1.25 + N), 1e4):
-        weights, covariance = np.zeros(N + 1), np.diag([*np.ones(N), 0.25])
-        settings = np.array([1, 1, 0.5, 0, 0, 0.1, 0.1])
-        adapt(np.ones(N), residual, np.zeros(N), 0.0, 1.0, settings, np.eye(N), np.ones(2), weights, covariance)
-        moved.append(weights)
+        s, prior = channel(np.eye(N), 1.0, noise=1.0, brief=0.1, lasting=0.1)
+        adapt(0, np.ones(N), residual, np.zeros(N), 0.0, prior, s)
+        moved.append(s["a"][0])
     np.testing.assert_allclose(moved[0], moved[1], rtol=1e-12)
+    assert moved[0].any()
 
 
 @given(numbers(PHYSICAL), numbers(UNITS, INPUTS + 1))
 def test_basis(x, units):
-    """φ is the physical features and a torch layer of the first eight."""
+    """φ is the physical features and a torch layer of the first eight, with a one for the disturbance."""
     layer = torch.nn.Linear(INPUTS, UNITS, dtype=torch.float64)
     layer.load_state_dict({"weight": torch.tensor(units[:, :INPUTS]), "bias": torch.tensor(units[:, INPUTS])})
     hidden = torch.tanh(layer(torch.tensor(x[:INPUTS]))).detach().numpy()
-    phi = np.empty(FEATURES)
+    phi = np.empty(FEATURES + 1)
     basis(x, units, phi)
-    np.testing.assert_allclose(phi, np.concatenate([x, hidden]), atol=1e-14)
+    np.testing.assert_allclose(phi, np.concatenate([x, hidden, [1]]), atol=1e-14)
 
 
 def stage(robot, size=1, rigid=False, **settings):
@@ -149,7 +175,7 @@ def drive(pupil, plant, seconds, disturbance=0.0, watch=None):
 
 def openness(pupil):
     """How much of what plants differ in is still open in the two channels, `(2,)`."""
-    return np.trace(pupil.state["covariance"][0], axis1=1, axis2=2)
+    return np.trace(pupil.rows["P"][0], axis1=1, axis2=2)
 
 
 @pytest.mark.parametrize("changed", [{}, {"resistance": 3.0}, {"com_offset": 0.2}])
@@ -162,7 +188,7 @@ def test_change_of_the_plant(robot, changed):
 
     def watch(_):
         spread.append(openness(pupil))
-        learned.append((pupil.state["weights"][0, :, :FEATURES] ** 2).sum(1))
+        learned.append((pupil.rows["a"][0, :, :FEATURES] ** 2).sum(1))
 
     assert (settled < 0.5 * openness(stage(robot))).all()
     drive(pupil, plant.model_copy(update=changed), 3, watch=watch)
@@ -187,7 +213,7 @@ def test_former_plant(robot, back):
     }
     pupil, known = stage(robot), {}
     for name in ("nominal", "heavy"):
-        known[name] = drive(pupil, plants[name], 30), pupil.state["weights"][0, :, :FEATURES].copy(), openness(pupil)
+        known[name] = drive(pupil, plants[name], 30), pupil.rows["a"][0, :, :FEATURES].copy(), openness(pupil)
     drive(pupil, plants["aside" if back == "heavy" else back], 0.5)  # the way back to `heavy` is short
     spread = []
     drive(pupil, plants[back], 6, watch=lambda _: spread.append(openness(pupil)))
@@ -196,7 +222,7 @@ def test_former_plant(robot, back):
     if back in known:
         feedback, weights, certain = known[back]
         assert (openness(pupil) < 1.2 * certain).all()
-        found, other = pupil.state["weights"][0, :, :FEATURES], known["heavy" if back == "nominal" else "nominal"][1]
+        found, other = pupil.rows["a"][0, :, :FEATURES], known["heavy" if back == "nominal" else "nominal"][1]
         assert np.linalg.norm(found - weights) < 0.2 * np.linalg.norm(found - other)
         again = drive(pupil, plants[back], 20)
         assert (again.std(0) < 1.1 * feedback[-2000:].std(0)).all()
@@ -216,12 +242,12 @@ def test_push(robot):
     """What looks like another plant for a moment, and is none, takes nothing of what was known."""
     pupil, plant = stage(robot), robot.model_copy(update={"mass": 30.0, "supply": 1e3})
     drive(pupil, plant, 30)
-    weights, certain = pupil.state["weights"][0, :, :FEATURES].copy(), openness(pupil)
+    weights, certain = pupil.rows["a"][0, :, :FEATURES].copy(), openness(pupil)
     drive(pupil, plant, 0.3, disturbance=0.3)
     assert (openness(pupil) > 5 * certain).all()
     drive(pupil, plant, 5)
     assert (openness(pupil) < 1.1 * certain).all()
-    assert np.linalg.norm(pupil.state["weights"][0, :, :FEATURES] - weights) < 0.2 * np.linalg.norm(weights)
+    assert np.linalg.norm(pupil.rows["a"][0, :, :FEATURES] - weights) < 0.2 * np.linalg.norm(weights)
 
 
 @pytest.mark.parametrize("rigid", [False, True])
@@ -239,18 +265,18 @@ def test_noise_counts(robot, channel, rigid):
     voltage = pupil.output(start, np.zeros((1, 2))).copy()
     for _ in range(3000):
         pupil.learn(np.zeros((1, 2)), np.ones(1), start + sigma * random.standard_normal(2), voltage)
-    assert np.sqrt(pupil.measured_noise[0, channel]) == pytest.approx(sigma[channel], rel=0.2)
-    assert pupil.measured_noise[0, 1 - channel] == 0
+    assert np.sqrt(pupil.rows["variance"][0, channel]) == pytest.approx(sigma[channel], rel=0.2)
+    assert pupil.rows["variance"][0, 1 - channel] == 0
     settings = Composite()
     scale = np.array([1.0, STEERING_SCALE if rigid else 1.0])
     per_speed = scale * SCATTER * [1.0, robot.half_track]
-    noise = (scale * settings.noise) ** 2 + per_speed**2 * pupil.measured_noise[0]
-    pupil.state["covariance"][:] = 0.0
-    pupil.state["covariance"][0, :, FEATURES, FEATURES] = before = 0.01
+    noise = (scale * settings.noise) ** 2 + per_speed**2 * pupil.rows["variance"][0]
+    pupil.rows["P"][:] = 0.0
+    pupil.rows["P"][0, :, FEATURES, FEATURES] = before = 0.01
     pupil.learn(np.zeros((1, 2)), np.zeros(1), start, voltage)
     fading = np.exp(-2 * PERIOD / settings.disturbance_memory)
     deviation = settings.disturbance * np.array([1.0, STEERING_DISTURBANCE if rigid else 1.0])
-    found = (pupil.state["covariance"][0, :, FEATURES, FEATURES] - (1 - fading) * deviation**2) / fading
+    found = (pupil.rows["P"][0, :, FEATURES, FEATURES] - (1 - fading) * deviation**2) / fading
     variance = found * before / (before - found)
     np.testing.assert_allclose(variance, noise, rtol=0.05)
 
@@ -268,7 +294,7 @@ def test_finds_the_plant(robot, tmp_path):
     feedback, untaught = drive(pupil, plant, 40), drive(InverseDynamics([robot], False), plant, 40)
     assert np.sqrt((feedback[-1000:] ** 2).mean()) < 0.06 * np.sqrt((untaught[-1000:] ** 2).mean())
     missing = ((inverse_coefficients(plant) - inverse_coefficients(robot)) * feature_scale(robot)[:, None]).T
-    found = pupil.state["weights"][0]
+    found = pupil.rows["a"][0]
     # The signs hardly move at these speeds and share a constant with V; half a period of hold is taken for inertia.
     for channel, feature in ((0, 2), (1, 3), (1, 4), (0, 5)):
         assert found[channel, feature] == pytest.approx(missing[channel, feature], rel=0.12, abs=0.02)
@@ -291,15 +317,15 @@ def test_gates(robot):
     for twist, idle in ((np.zeros((1, 2)), 0.0), (np.ones((1, 2)), 1.0)):
         for _ in range(100):  # until the filters are at rest too
             pupil.learn(np.ones((1, 2)), np.full(1, idle), twist, np.ones((1, 2)))
-        kept = pupil.state["weights"].copy()
+        kept = pupil.rows["a"].copy()
         assert kept[..., :FEATURES].any()
         kept[..., FEATURES] = 0.2
-        pupil.state["weights"][:] = kept
+        pupil.rows["a"][:] = kept
         for _ in range(50):
             assert not pupil.learn(np.ones((1, 2)), np.full(1, idle), twist, np.ones((1, 2))).any()
-        np.testing.assert_array_equal(pupil.state["weights"][..., :FEATURES], kept[..., :FEATURES])
+        np.testing.assert_array_equal(pupil.rows["a"][..., :FEATURES], kept[..., :FEATURES])
         faded = 0.2 * np.exp(-50 * PERIOD / Composite().disturbance_memory)
-        np.testing.assert_allclose(pupil.state["weights"][..., FEATURES], faded, rtol=1e-9)
+        np.testing.assert_allclose(pupil.rows["a"][..., FEATURES], faded, rtol=1e-9)
 
 
 def test_what_it_added(robot):
@@ -309,7 +335,7 @@ def test_what_it_added(robot):
     command, derivative = np.array([[0.9, 0.4]]), np.array([[0.3, -0.5]])
 
     def learned():
-        return pupil.output(command, derivative) - pupil.state["weights"][..., FEATURES]
+        return pupil.output(command, derivative) - pupil.rows["a"][..., FEATURES]
 
     before = learned().copy()
     added = pupil.learn(np.array([[0.5, -0.2]]), np.zeros(1), command, np.array([[9.0, 1.0]])).copy()
@@ -330,7 +356,7 @@ def test_rows(robot, rigid):
             twist[list(lost)] = np.nan
             log.append(pupil.output(command, derivative).copy())
             log.append(pupil.learn(feedback, np.zeros(len(command)), twist, voltage).copy())
-        return np.array(log), pupil.state["covariance"]
+        return np.array(log), pupil.rows["P"]
 
     together, covariance = answer(slice(None), lost=[2])
     for i in (0, 1, 3):
@@ -348,7 +374,8 @@ def test_files(robot, tmp_path):
     save_training(tmp_path / "b.safetensors", Training(training.units[:4], training.priors), {})
     save_training(tmp_path / "c.safetensors", Training(training.units * np.nan, training.priors), {})
     (tmp_path / "d.safetensors").write_text("nothing of the kind")
-    for name, message in (("b", "needs units"), ("c", "non-finite"), ("d", "not a weights file"), ("e", "no file")):
+    wrong_shape = r"units is \(4, 9\), it must have shape \(16, 9\)"
+    for name, message in (("b", wrong_shape), ("c", "non-finite"), ("d", "not a weights file"), ("e", "no file")):
         with pytest.raises(InputError, match=rf"^composite\.weights: .*{message}"):
             stage(robot, weights=str(tmp_path / f"{name}.safetensors"))
     with pytest.raises(InputError, match="cannot write"):

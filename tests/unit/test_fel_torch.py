@@ -5,15 +5,21 @@ import pytest
 import torch
 from torch import nn
 
-from mrctl.control.fel import FeedbackErrorLearning, Fel, flatten, initial_weights, unflatten
+from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.fel_torch import ModuleLearning, Network
+from mrctl.control.weights import flatten, initial_weights, unflatten
 
-HIDDEN, SIZE = 5, 3
+HIDDEN, SIZE, PERIOD = 5, 3, 0.01
 GELU = nn.Sequential(nn.Linear(8, 12), nn.GELU(), nn.Linear(12, 12), nn.GELU(), nn.Linear(12, 2))
 
 
 def draw(rng, size):
     return rng.uniform([-1.5, -3], [1.5, 3], (size, 2)), rng.uniform([-1.5, -6], [1.5, 6], (size, 2))
+
+
+def teach(stage, feedback, frozen):
+    """One learning step; where and how the robots move does not matter to these stages."""
+    return stage.learn(feedback, frozen, *np.zeros((2, len(feedback), 2)))
 
 
 def rows(state):
@@ -39,7 +45,7 @@ def test_twins(robot, settings, rigid, ticks):
     rng = np.random.default_rng(2)
     module = Network(HIDDEN)
     module.load_state_dict({k: torch.tensor(v) for k, v in unflatten(initial_weights(HIDDEN, 4)).items()})
-    compiled = FeedbackErrorLearning(robot, [settings] * SIZE, [4] * SIZE, rigid)
+    compiled = FeedbackErrorLearning(robot, [settings] * SIZE, [4] * SIZE, rigid, PERIOD)
     general = ModuleLearning(module, robot, SIZE, settings, rigid)
     largest = 0.0
     for _ in range(ticks):
@@ -48,9 +54,9 @@ def test_twins(robot, settings, rigid, ticks):
         np.testing.assert_allclose(found, expected, atol=1e-12)
         feedback = rng.normal(size=(SIZE, 2)) * [1.5, 0.15 if rigid else 1.5] - expected / 3
         saturated = (rng.random(SIZE) < 0.2).astype(float)
-        added = [stage.learn(feedback, saturated, None, None) for stage in (general, compiled)]
+        added = [teach(stage, feedback, saturated) for stage in (general, compiled)]
         np.testing.assert_allclose(*added, atol=1e-12)
-        np.testing.assert_allclose(rows(general.state), compiled.state["weights"], atol=1e-12)
+        np.testing.assert_allclose(rows(general.state), compiled.weights, atol=1e-12)
         np.testing.assert_allclose(general.weight_norm, compiled.weight_norm, atol=1e-12)
         largest = max(largest, compiled.weight_norm.max())
     still = settings.frozen or settings.step == 0
@@ -88,7 +94,7 @@ def test_any_module(robot):
             np.testing.assert_array_equal(given, np.zeros((8, 2)))
         target = np.stack([5 * command[:, 0] + derivative[:, 0], 2 * command[:, 1] - 0.3 * derivative[:, 1]], -1)
         missing.append(np.sqrt(((target - given) ** 2).mean()))
-        stage.learn(target - given, np.zeros(8), None, None)
+        teach(stage, target - given, np.zeros(8))
     assert np.mean(missing[-50:]) < 0.2 * np.mean(missing[:5])
     for name, value in module.state_dict().items():
         assert value.dtype == torch.float32
@@ -108,8 +114,8 @@ def test_copies(robot):
         for row, stage in enumerate(alone):
             cut = slice(row, row + 1)
             np.testing.assert_allclose(stage.output(command[cut], derivative[cut]), given[cut], atol=1e-9)
-            stage.learn(feedback[cut], saturated[cut], None, None)
-        together.learn(feedback, saturated, None, None)
+            teach(stage, feedback[cut], saturated[cut])
+        teach(together, feedback, saturated)
     for name, value in together.state.items():
         single = torch.cat([stage.state[name] for stage in alone])
         torch.testing.assert_close(value, single, atol=1e-9, rtol=0)

@@ -10,7 +10,8 @@ from mrctl import InputError
 from mrctl.control import guard as module
 from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.fel_torch import ModuleLearning
-from mrctl.control.guard import ACTIONS, REASONS, Guard, guard, watches
+from mrctl.control.guard import GUARD_ACTIONS, REASONS, Guard, fresh, guard
+from mrctl.control.nominal import NOMINAL
 from mrctl.control.rls import RecursiveLeastSquares, Rls
 
 PERIOD = 0.01
@@ -21,20 +22,22 @@ class Bench:
     """One robot's guard and what it is connected to, by default in peace."""
 
     def __init__(self, rigid=False, volts=1.0, **settings):
-        self.g = watches([Guard(**settings)], SUPPLY, ROTATION, np.array([volts]), rigid)[0]
-        self.integral, self.feedback = np.zeros(7), np.zeros(2)
+        robot = np.zeros(1, NOMINAL)
+        robot["supply"], robot["max_twist"], robot["rigid"] = SUPPLY, (1.5, ROTATION), rigid
+        self.g = fresh([Guard(**settings)], robot, np.array([volts]))[0]
+        self.rigid, self.integral, self.feedback = rigid, np.zeros(2), np.zeros(2)
         self.ticks = 0
 
-    def tick(self, feedforward=(0, 0), nominal=(0, 0), feedback=(0, 0), error=0.0, norm=0.0, saturated=0.0, sent=None):
+    def tick(self, feedforward=(0, 0), nominal=(0, 0), feedback=(0, 0), error=0.0, norm=0.0, saturated=False, sent=None):
         self.feedback[:] = feedback
         nominal = np.array(nominal, float)
         voltage = nominal if sent is None else np.array(sent, float)
         guard(
-            self.g, np.array(feedforward, float), nominal, np.array([error, 0.0, 0.0]), float(norm), float(saturated),
-            voltage, PERIOD, self.integral, self.feedback,
+            self.g, np.array(feedforward, float), nominal, np.array([error, 0.0, 0.0]), float(norm), saturated,
+            voltage, PERIOD, self.rigid, self.integral, self.feedback,
         )  # fmt: skip
         self.ticks += 1
-        return ACTIONS[int(self.g["action"])]
+        return GUARD_ACTIONS[int(self.g["action"])]
 
     def until(self, action, longest=100.0, **inputs):
         """Ticks until the guard does this."""
@@ -81,14 +84,14 @@ def test_silent(inputs):
         calm = np.array([a, b]) / 5, np.array([c, d]) / 5  # below the amplitude that counts
         assert bench.tick(feedforward=calm[0], feedback=calm[1]) == "none"
         assert np.array_equal(bench.g["output"], calm[0]) and np.array_equal(bench.g["teaching"], calm[1])
-        assert np.array_equal(bench.feedback, calm[1]) and not bench.integral.any() and bench.g["idle"] == 0
+        assert np.array_equal(bench.feedback, calm[1]) and not bench.integral.any() and not bench.g["frozen"]
 
 
 def test_off():
     """Switched off it passes on everything."""
     bench = Bench(on=False)
     for values in ((100.0, -200.0), (np.nan, np.inf)):
-        assert bench.tick(feedforward=values, feedback=(50, 60), error=9.0, norm=1e9, saturated=1) == "none"
+        assert bench.tick(feedforward=values, feedback=(50, 60), error=9.0, norm=1e9, saturated=True) == "none"
         np.testing.assert_array_equal(bench.g["output"], values)
         np.testing.assert_array_equal(bench.g["teaching"], (50, 60))
 
@@ -102,9 +105,9 @@ def test_limit(rigid, share, output):
     bench = Bench(rigid=rigid, share=share)
     assert bench.tick(feedforward=(32, -16)) == "limit" and "share of the supply" in bench.reason
     np.testing.assert_allclose(bench.g["output"], output)
-    assert bench.g["idle"] == 1
+    assert bench.g["frozen"]
     assert bench.tick(feedforward=np.array(output) * 0.999) == "limit"  # for a second, so that it is one event
-    assert bench.g["idle"] == 0
+    assert not bench.g["frozen"]
     np.testing.assert_array_equal(bench.g["output"], np.array(output) * 0.999)
     assert bench.until("none") == pytest.approx(module.BUSY / PERIOD, abs=2)
 
@@ -184,10 +187,10 @@ def test_freeze_and_resume():
     frozen(bench)
     for k in range(1, 200):
         assert bench.tick(feedforward=(1, 2), feedback=(3, 4)) == "freeze", k
-        assert bench.g["idle"] == 1
+        assert bench.g["frozen"]
         np.testing.assert_array_equal(bench.g["output"], (1, 2))
     assert bench.tick(feedforward=(1, 2), feedback=(3, 6)) == "none"
-    assert bench.g["idle"] == 0
+    assert not bench.g["frozen"]
     np.testing.assert_allclose(bench.g["teaching"], (1, 2))
     np.testing.assert_array_equal(bench.feedback, (3, 6))
 
@@ -199,7 +202,7 @@ def test_freezing_was_not_enough():
     for value in 1.5 * wave[bench.ticks :]:
         if bench.tick(feedforward=(value, 0)) == "fallback":
             break
-    assert bench.g["strikes"] == 1 and bench.g["restore"] == 1
+    assert bench.g["strikes"] == 1 and bench.g["forget"]
 
 
 @pytest.mark.parametrize("fallback", ["model", "none"])
@@ -211,21 +214,21 @@ def test_fallback(fallback):
     bench = Bench(fallback=fallback, fade=0.1)
     for _ in range(1000):
         bench.tick(feedforward=(7, 1), nominal=(5, 1), sent=(7, 1))
-    bench.integral[:2] = 0.5, -0.5
+    bench.integral[:] = 0.5, -0.5
     feedback = np.array([0.6, -0.4])  # of which the integral is all but 0.1 V
     assert bench.tick(feedforward=(9, 4), nominal=(5, 1), feedback=feedback, sent=(7, 1), norm=1e9) == "fallback"
-    assert "weights" in bench.reason and bench.g["restore"] == 1
+    assert "weights" in bench.reason and bench.g["forget"]
     np.testing.assert_allclose(bench.g["output"] + bench.feedback, (9.6, 3.6))  # 9 + 0.6, 4 − 0.4: no jump
     given = np.array([5.0, 1.0]) if fallback == "model" else np.zeros(2)
-    np.testing.assert_allclose(bench.integral[:2], np.array([7.0, 1.0]) - given, atol=1e-3)
-    np.testing.assert_allclose(bench.feedback, bench.integral[:2] + 0.1)
+    np.testing.assert_allclose(bench.integral, np.array([7.0, 1.0]) - given, atol=1e-3)
+    np.testing.assert_allclose(bench.feedback, bench.integral + 0.1)
     bump = bench.g["output"] - given
     for k in range(1, 30):
         integral = bench.integral.copy()
         bench.tick(feedforward=(-9, -9), nominal=(5, 1), feedback=(1, 1))
         np.testing.assert_allclose(bench.g["output"], given + bump * (0.1 / 0.11) ** k)
         np.testing.assert_array_equal(bench.integral, integral)
-        assert bench.g["restore"] == 0 and bench.g["idle"] == 1
+        assert not bench.g["forget"] and bench.g["frozen"]
 
 
 def test_return():
@@ -235,7 +238,7 @@ def test_return():
     assert bench.until("none", nominal=(4, 2)) == pytest.approx(50, abs=1)
     for k in range(0, 1500, 100):
         np.testing.assert_allclose(bench.g["output"], (4 + k / 1500 * 2, 2 - k / 1500 * 2), atol=0.01)
-        assert bench.g["idle"] == 0
+        assert not bench.g["frozen"]
         for _ in range(100):
             bench.tick(feedforward=(6, 0), nominal=(4, 2))
     bench.tick(feedforward=(6, 0.7), nominal=(4, 2))
@@ -298,8 +301,8 @@ def test_far():
 def test_saturation():
     """Saturated for 2 ln 2 s, it freezes until that is over; the setting of the learner is not to blame."""
     bench = Bench()
-    assert bench.until("freeze", saturated=1) == pytest.approx(np.log(2) * module.STUCK / PERIOD, abs=2)
-    assert bench.tick(saturated=1) == "freeze"
+    assert bench.until("freeze", saturated=True) == pytest.approx(np.log(2) * module.STUCK / PERIOD, abs=2)
+    assert bench.tick(saturated=True) == "freeze"
     bench.until("none")
     bench.tick(feedback=(3, 1))
     np.testing.assert_array_equal(bench.g["teaching"], (3, 1))
@@ -316,8 +319,8 @@ def stages(robot):
     """The stages that can forget."""
     torch.manual_seed(0)
     return {
-        "fel": FeedbackErrorLearning(robot, [Fel()] * 2, [3, 4], False),
-        "rls": RecursiveLeastSquares(robot, [Rls()] * 2, False),
+        "fel": FeedbackErrorLearning(robot, [Fel()] * 2, [3, 4], False, PERIOD),
+        "rls": RecursiveLeastSquares(robot, [Rls()] * 2, False, PERIOD),
         "torch": ModuleLearning(torch.nn.Linear(8, 2), robot, 2),
     }
 

@@ -1,0 +1,217 @@
+"""Kernels: an edited law reaches all that call it, nothing is compiled at import, and laws can be put in place."""
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mrctl
+from mrctl.kernel import kernel, over_rows
+from mrctl.physics.files import models_folder
+
+PACKAGE = Path(mrctl.__file__).parent
+FEEDFORWARDS = ("model", "observer", "composite", "rls", "fel")
+LAP = """
+import gc
+import sys
+
+import numpy as np
+
+from mrctl import Line, Scenario, simulate
+from mrctl.kernel import Kernel
+
+file, *names = sys.argv[1:]
+result = simulate([Scenario(reference=Line(length=0.8), laps=1, feedforward=name) for name in names])
+voltages = np.stack([result.voltage_left, result.voltage_right], axis=-1)
+np.savez(file, **dict(zip(names, voltages, strict=True)))
+kernels = [k for k in gc.get_objects() if type(k) is Kernel and "compiled" in vars(k)]
+hits, misses = (
+    sum(sum(getattr(k.compiled.stats, name).values()) for k in kernels) for name in ("cache_hits", "cache_misses")
+)
+print(sys.modules["mrctl"].__file__, hits, misses)
+"""
+
+
+class Copy:
+    """A copy of the package and its models, without caches."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        shutil.copytree(PACKAGE, folder / "mrctl", ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(models_folder(), folder / "models")
+
+    def edit_features(self):
+        """Makes the first feature half as large again."""
+        file = self.folder / "mrctl" / "control" / "features.py"
+        text = file.read_text()
+        assert text.count("x[0] = v / scale[0]") == 1
+        file.write_text(text.replace("x[0] = v / scale[0]", "x[0] = 1.5 * v / scale[0]"))
+
+    def start_lap(self):
+        """Starts a fresh interpreter that drives one second with each feedforward."""
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+        environment |= {"PYTHONPATH": str(self.folder), "NUMBA_NUM_THREADS": "1"}
+        command = [sys.executable, "-c", LAP, "voltages.npz", *FEEDFORWARDS]
+        return subprocess.Popen(command, cwd=self.folder, env=environment, stdout=subprocess.PIPE, text=True)
+
+    def read_lap(self, process):
+        """Voltages by feedforward as bytes, and how often machine code was found on disk and was not."""
+        printed, _ = process.communicate()
+        assert process.returncode == 0
+        file, hits, misses = printed.split()[-3:]
+        assert file == str(self.folder / "mrctl" / "__init__.py")
+        with np.load(self.folder / "voltages.npz") as voltages:
+            return {name: voltages[name].tobytes() for name in FEEDFORWARDS}, int(hits), int(misses)
+
+    def lap(self):
+        """Drives and reads."""
+        return self.read_lap(self.start_lap())
+
+
+def test_edited_law(tmp_path):
+    """With `features` edited, every feedforward, all in other files, drives as if nothing had been compiled before."""
+    used, fresh = Copy(tmp_path / "used"), Copy(tmp_path / "fresh")
+    fresh.edit_features()
+    processes = used.start_lap(), fresh.start_lap()  # at the same time: most of a lap is compilation
+    (before, hits, misses), (expected, _, _) = used.read_lap(processes[0]), fresh.read_lap(processes[1])
+    assert hits == 0 < misses
+    again, hits, misses = used.lap()
+    assert again == before
+    assert misses == 0 < hits
+    used.edit_features()
+    after, hits, _ = used.lap()
+    assert hits == 0
+    for name in FEEDFORWARDS:
+        assert after[name] != before[name], name
+        assert after[name] == expected[name], name
+
+
+def kernel_files():
+    """Modules of the package that hold a kernel."""
+    return [path for path in sorted(PACKAGE.rglob("*.py")) if re.search(r"^@kernel$", path.read_text(), re.MULTILINE)]
+
+
+def test_nothing_compiled_at_import():
+    """All files with kernels can be imported without Numba."""
+    names = [".".join(("mrctl", *path.relative_to(PACKAGE).with_suffix("").parts)) for path in kernel_files()]
+    assert {"mrctl.control.fel", "mrctl.loop.hierarchy", "mrctl.physics.plant"} <= set(names)
+    code = f"import sys, {', '.join(names)}; sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@kernel
+def double(x):
+    """Twice x."""
+    return 2 * x
+
+
+@kernel
+def triple(x):
+    """Three times x."""
+    return 3 * x
+
+
+@kernel
+def through(x):
+    """What `inner` makes of x."""
+    return inner(x)  # noqa: F821
+
+
+@kernel
+def total(x):
+    """What `law` makes of the sum of x."""
+    return law(x.sum())
+
+
+law = inner = double
+
+
+def test_calling():
+    """Other kernels take the place of a global name, also within one that is put in place; the template stays."""
+    x = np.array([1.0, 2.0, 4.0])
+    laws = {"double": double, "triple": triple}
+    templates = [total, total.calling(law=triple), total.calling(law=double)]
+    templates += [total.calling(law=through.calling(inner=law)) for law in laws.values()]
+    assert [template(x) for template in templates] == [14, 21, 14, 14, 21]
+    assert total.calling(law=triple).__name__ == "total"
+
+
+@kernel
+def scaled(x, factor, s, out):
+    """A law with a vector, a number, a record, and a result."""
+    s.calls += 1
+    for k in range(len(x)):
+        out[k] = factor * x[k] + s.offset
+
+
+@pytest.mark.parametrize("factor", [2.0, np.array([1.0, 2.0, -3.0])])
+def test_over_rows(factor):
+    """Arrays are passed row by row, numbers as they are, and records are written in place."""
+    x, out = np.arange(6.0).reshape(3, 2), np.zeros((3, 2))
+    records = np.zeros(3, [("offset", "f8"), ("calls", "i8")])
+    records["offset"] = 10, 20, 30
+    over_rows(scaled, x, factor, records, out)
+    np.testing.assert_array_equal(out, np.reshape(factor, (-1, 1)) * x + records["offset"][:, None])
+    assert records["calls"].tolist() == [1, 1, 1]
+
+
+class Module:
+    """Constants of one file of the package, by name."""
+
+    def __init__(self, path):
+        self.path, tree = path, ast.parse(path.read_text())
+        self.imports, self.constants, self.kernels = {}, {}, []
+        for node in tree.body:
+            if isinstance(node, ast.ImportFrom):
+                self.imports |= {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
+            elif isinstance(node, (ast.Assign, ast.AnnAssign)):
+                self.constants |= {n.id: node.value for n in ast.walk(node) if stored(n)}
+            elif isinstance(node, ast.FunctionDef) and any(ast.unparse(d) == "kernel" for d in node.decorator_list):
+                self.kernels.append(node)
+
+    def sources(self, name):
+        """Where a constant is written, and all that it is computed from."""
+        if name in self.constants:
+            used = [n.id for n in ast.walk(self.constants[name]) if isinstance(n, ast.Name) and n.id.isupper()]
+            return {self.path}.union(*(self.sources(other) for other in used))
+        module, original = self.imports[name]
+        path = PACKAGE.joinpath(*module.split(".")[1:]).with_suffix(".py")
+        return Module(path).sources(original)
+
+
+def stored(node):
+    """Whether a node is a name that gets a value."""
+    return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+
+
+def constants_in(function):
+    """Upper-case names of a kernel that are not its own, of which none may be that of another module's attribute."""
+    body = [node for statement in function.body for node in ast.walk(statement)]
+    own = {argument.arg for argument in function.args.args} | {node.id for node in body if stored(node)}
+    used = {node.id for node in body if isinstance(node, ast.Name)} - own
+    for node in body:
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.attr.isupper():
+            assert node.value.id in own, f"{function.name}: {ast.unparse(node)}"
+    return {name for name in used if name.isupper()}
+
+
+def test_constants_of_kernels():
+    """Every constant that a kernel is compiled with is in a file whose edits are noticed: one that holds a kernel."""
+    files = kernel_files()
+    found = {}
+    for path in files:
+        module = Module(path)
+        assert module.kernels
+        for function in module.kernels:
+            for name in constants_in(function):
+                found[path.stem, function.name, name] = module.sources(name)
+    assert {("fel", "network", "HIDDEN_GAIN"), ("fel", "network", "INPUTS")} <= found.keys()
+    assert found["steering", "allocate", "SIGN_SPEED"] == {PACKAGE / "control" / "features.py"}
+    for place, sources in found.items():
+        assert sources <= set(files), place
