@@ -28,7 +28,9 @@ class Bench:
         self.rigid, self.integral, self.feedback = rigid, np.zeros(2), np.zeros(2)
         self.ticks = 0
 
-    def tick(self, feedforward=(0, 0), nominal=(0, 0), feedback=(0, 0), error=0.0, norm=0.0, saturated=False, sent=None):
+    def tick(
+        self, feedforward=(0, 0), nominal=(0, 0), feedback=(0, 0), error=0.0, norm=0.0, saturated=False, sent=None
+    ):
         self.feedback[:] = feedback
         nominal = np.array(nominal, float)
         voltage = nominal if sent is None else np.array(sent, float)
