@@ -19,7 +19,6 @@ from mrctl import (
     per_lap,
     simulate,
 )
-from mrctl.control.feedforward import NoFeedforward
 from mrctl.experiments import single
 from mrctl.results.dataset import SIGNALS
 
@@ -86,7 +85,7 @@ def test_batch():
     assert same(together.isel(run=0), simulate(calm)) and same(together.isel(run=0), together.isel(run=2))
 
 
-class Shakes(NoFeedforward):
+class Shakes:
     """A user's stage that begins to shake after a second, and cannot forget; in row 1 it breaks instead."""
 
     def __init__(self, robot, size):
@@ -99,6 +98,9 @@ class Shakes(NoFeedforward):
         if t > 0:
             self.out[1:2] = np.nan
         return self.out
+
+    def learn(self, feedback, saturated, twist, voltage):
+        pass
 
 
 def test_own_stage():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Scenario, per_lap, save_weights
-from mrctl.control.fel import initial_weights, unflatten
+from mrctl.control.weights import initial_weights, unflatten
 from mrctl.loop.simulation import simulate
 
 pytestmark = pytest.mark.xdist_group("learning")  # what its tests share is made once
@@ -96,7 +96,7 @@ def test_torch_weights(runs, tmp_path):
 def test_wrong_weights(tmp_path):
     """A file for another size is refused by name."""
     save_weights(tmp_path / "small.safetensors", initial_weights(4, 0))
-    with pytest.raises(InputError, match=r"^fel\.weights: .*24 hidden units need"):
+    with pytest.raises(InputError, match=r"^fel\.weights: .*hidden\.weight is \(4, 8\), it must have shape \(24, 8\)"):
         simulate(variant(fel=Fel(weights=str(tmp_path / "small.safetensors"))))
 
 

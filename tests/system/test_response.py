@@ -6,7 +6,8 @@ from scipy import signal
 
 import mrctl
 from mrctl.control.kanayama import Kanayama
-from mrctl.control.pid import PIDS, Gains, sampled_loop
+from mrctl.control.margins import sampled_loop
+from mrctl.control.pid import PIDS
 from mrctl.experiments.response import SAMPLES, Shaker, estimate, lines, measure, multisine, refine, safety
 from mrctl.experiments.tuning import design, statement
 from mrctl.loop.hierarchy import TAKE_OVER
@@ -32,7 +33,7 @@ def on_paper(frequency, channel, delay, pid="normal"):
         (robot.velocity_gain, robot.velocity_time_constant),
         (robot.rotation_gain, robot.rotation_time_constant),
     )[channel]
-    loop = sampled_loop(frequency, gain, tau, Gains(*PIDS[pid].gains(robot, rigid=False)[channel, :2]), H, delay)
+    loop = sampled_loop(frequency, gain, tau, PIDS[pid].channels(robot, rigid=False)[channel], H, delay)
     return loop / (1 + loop)
 
 

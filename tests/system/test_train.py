@@ -7,7 +7,8 @@ import pytest
 from safetensors import safe_open
 
 from mrctl import cli
-from mrctl.control.composite import SHIPPED, Composite, load_training
+from mrctl.control.composite import Composite
+from mrctl.control.weights import SHIPPED, load_training
 from mrctl.experiments import train
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot

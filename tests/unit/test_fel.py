@@ -9,8 +9,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
+import mrctl
 from mrctl.control.features import feature_matrix, feature_scale
 from mrctl.control.fel import (
     BIAS_GAIN,
@@ -62,8 +64,9 @@ def one_step(x, feedback, weights, rigid=False, prior=None, **settings):
 
 def teach(stage, feedback, frozen=0.0):
     """One learning step of every robot; where and how they move does not matter to this stage."""
-    size = len(feedback)
-    return stage.learn(np.array(feedback, float), np.broadcast_to(frozen, size), *np.zeros((2, size, 2)))
+    return stage.learn(
+        np.array(feedback, float), np.broadcast_to(frozen, len(feedback)), *np.zeros((2, len(feedback), 2))
+    )
 
 
 def taught(robot, settings=None, rigid=False, size=1):
@@ -316,6 +319,17 @@ def test_bad_files(tmp_path, suffix):
     assert "no file" in refused(tmp_path / f"absent{suffix}")
     (tmp_path / f"folder{suffix}").mkdir()
     assert "no file" in refused(tmp_path / f"folder{suffix}")
+
+
+def test_writer(tmp_path):
+    """A file says which version wrote it; if it has another shape, so does its error, unless that is this version."""
+    path = tmp_path / "weights.safetensors"
+    save_weights(path, trained())
+    with safe_open(path, "numpy") as file:
+        assert file.metadata()["mrctl"] == mrctl.__version__
+    assert "written by" not in refused(path, 7)
+    save_file({name: layer.copy() for name, layer in unflatten(trained()).items()}, path, {"mrctl": "0.0.9"})
+    assert "(written by mrctl 0.0.9): hidden.weight is (6, 8)" in refused(path, 7)
 
 
 @pytest.mark.parametrize("content", [torch.ones(3), [1, 2], {"hidden.weight": "text"}, {"hidden.weight": [1.0]}, None])

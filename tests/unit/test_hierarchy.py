@@ -6,12 +6,16 @@ import pytest
 from mrctl.control.composite import CompositeAdaptation
 from mrctl.control.feedforward import InverseDynamics, NoFeedforward
 from mrctl.control.fel import FeedbackErrorLearning, Fel
-from mrctl.control.kanayama import Kanayama, kanayama
+from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import Pid
 from mrctl.control.rls import RecursiveLeastSquares
-from mrctl.loop.hierarchy import TAKE_OVER, Hierarchy, feedforward_of
+from mrctl.kernel import over_rows
+from mrctl.loop.courses import GOAL
+from mrctl.loop.hierarchy import TAKE_OVER, Hierarchy
+from mrctl.loop.user_stages import UserHierarchy, UserStage
 from mrctl.scenario import FEEDFORWARDS, Scenario
+from mrctl.sensing.sensors import SEEN
 from mrctl.theory.dynamics import inverse_dynamics
 from mrctl.theory.robot import STEERINGS, Robot
 
@@ -19,7 +23,7 @@ from mrctl.theory.robot import STEERINGS, Robot
 def build(robot: Robot, size=1, **settings):
     """A hierarchy for B robots that differ in their seeds."""
     scenarios = [Scenario(seed=seed, **settings) for seed in range(size)]
-    return Hierarchy(scenarios, robot, feedforward_of(scenarios, robot))
+    return Hierarchy(scenarios, robot)
 
 
 def signals(size, ticks, seed=0):
@@ -36,15 +40,30 @@ def signals(size, ticks, seed=0):
     return pose, twist + 0.1 * rng.normal(size=twist.shape), motion, np.zeros((ticks, size))
 
 
+def tick(hierarchy, pose, twist, motion, slip=0.0):
+    """One control tick with these measurements and references, `(B, …)`; its output."""
+    seen, goal = np.zeros(len(pose), SEEN), np.zeros(len(pose), GOAL)
+    seen["pose"], seen["twist"], seen["slip"] = pose, twist, slip
+    goal["pose"], goal["twist"], goal["acceleration"] = np.split(motion, [3, 5], axis=-1)
+    return hierarchy.update(seen, goal)
+
+
 def drive(hierarchy, inputs):
     """Outputs, errors, commands and flags of every tick, side by side."""
     log = []
     for arguments in zip(*inputs, strict=True):
-        hierarchy.update(*arguments)
-        log.append(
-            np.hstack([hierarchy.output, hierarchy.error, hierarchy.command, hierarchy.derivative, hierarchy.feedback])
-        )
+        output = tick(hierarchy, *arguments)
+        error = hierarchy.state["error"]
+        log.append(np.hstack([output, error, hierarchy.command, hierarchy.derivative, hierarchy.feedback]))
     return np.array(log)
+
+
+def weights(hierarchy):
+    """What a learner knows of its robots, `(B, …)`; a disturbance, which fades while nothing is learned, is no part."""
+    stage = hierarchy.feedforward
+    if isinstance(stage, CompositeAdaptation):
+        return stage.rows["a"][..., :26]
+    return stage.rows["theta"] if isinstance(stage, RecursiveLeastSquares) else stage.weights
 
 
 @pytest.mark.parametrize(
@@ -81,8 +100,11 @@ def test_slow_motion_controller(robot):
     inputs = pose, _, motion, _ = signals(2, 43)
     reference, twist = motion[..., :3], motion[..., 3:5]
     log = drive(hierarchy, inputs)
-    gains = np.array([3.0, 25.0, 10.0])
-    errors, requests = kanayama(pose[::5], reference[::5], twist[::5], gains)
+    errors, requests = np.zeros((9, 2, 3)), np.zeros((9, 2, 2))
+    gains = np.array([(3.0, 25.0, 10.0)] * 2, GAINS)
+    for k in range(9):
+        over_rows(posture_error, pose[5 * k], reference[5 * k], errors[k])
+        over_rows(kanayama, errors[k], twist[5 * k], gains, requests[k])
     np.testing.assert_array_equal(log[:, :, 4:7], np.repeat(errors, 5, axis=0)[:43])
     # Held for the five ticks, the prefilter (here one period) passes it wherever no limit acts.
     correction = np.repeat(requests - twist[::5], 5, axis=0)[:43]
@@ -115,7 +137,7 @@ def test_rows(robot, name, steering):
 
     def answer(rows):
         chosen = scenarios[rows]
-        hierarchy = Hierarchy(chosen, body, feedforward_of(chosen, body))
+        hierarchy = Hierarchy(chosen, body)
         log = drive(hierarchy, [signal[:, rows] for signal in inputs])
         return log, hierarchy
 
@@ -123,9 +145,10 @@ def test_rows(robot, name, steering):
     for i in range(3):
         alone, _ = answer(slice(i, i + 1))
         assert together[:, i].tobytes() == alone[:, 0].tobytes()
-    for array in (hierarchy.state, *getattr(hierarchy.feedforward, "state", {}).values()):
+    stage = hierarchy.feedforward
+    for array in (hierarchy.state, *(getattr(stage, name) for name in ("rows", "weights") if hasattr(stage, name))):
         assert array.shape[0] == 3  # what is remembered has a leading B
-    for array in (hierarchy.output, hierarchy.parts, hierarchy.weight_norm, hierarchy.saturated):
+    for array in (hierarchy.output, hierarchy.weight_norm, hierarchy.saturated):
         assert array.shape[0] == 3
     assert (hierarchy.weight_norm > 0).all() == (name in ("fel", "rls", "composite"))
 
@@ -134,36 +157,32 @@ def test_rows(robot, name, steering):
 def test_learning_switch(robot, name):
     """Switched off, a robot keeps its weights while its neighbour learns; switched on again, it goes on."""
     hierarchy = build(robot, 2, feedforward=name)
-    key = "coefficients" if name == "rls" else "weights"
-    kept = slice(26) if name == "composite" else slice(None)  # a disturbance fades, the weights stay
     inputs = signals(2, 360)
     early, middle, late = ([signal[part] for signal in inputs] for part in np.split(np.arange(360), 3))
     drive(hierarchy, early)
-    learned = hierarchy.feedforward.state[key].copy()
+    learned = weights(hierarchy).copy()
     norm = hierarchy.weight_norm.copy()
     hierarchy.set_learning(0, False)
     drive(hierarchy, middle)
-    np.testing.assert_array_equal(hierarchy.feedforward.state[key][0, ..., kept], learned[0, ..., kept])
-    assert (hierarchy.feedforward.state[key][1] != learned[1]).any()
+    np.testing.assert_array_equal(weights(hierarchy)[0], learned[0])
+    assert (weights(hierarchy)[1] != learned[1]).any()
     assert hierarchy.weight_norm[0] == norm[0] != hierarchy.weight_norm[1]
     hierarchy.set_learning(0, True)
     drive(hierarchy, late)
-    assert (hierarchy.feedforward.state[key][0] != learned[0]).any()
+    assert (weights(hierarchy)[0] != learned[0]).any()
 
 
 @pytest.mark.parametrize("name", ["fel", "rls", "composite"])
 def test_slip_freezes(robot, name):
     """The voltage of a wheel that slips says nothing about the motion: nobody learns from it, the neighbour goes on."""
     hierarchy = build(robot, 2, feedforward=name)
-    key = "coefficients" if name == "rls" else "weights"
-    kept = slice(26) if name == "composite" else slice(None)  # a disturbance fades, the weights stay
     early, late = ([signal[part] for signal in signals(2, 240)] for part in np.split(np.arange(240), 2))
     drive(hierarchy, early)
-    learned = hierarchy.feedforward.state[key].copy()
+    learned = weights(hierarchy).copy()
     late[-1][:] = [0.11, 0.09]
     drive(hierarchy, late)
-    np.testing.assert_array_equal(hierarchy.feedforward.state[key][0, ..., kept], learned[0, ..., kept])
-    assert (hierarchy.feedforward.state[key][1] != learned[1]).any()
+    np.testing.assert_array_equal(weights(hierarchy)[0], learned[0])
+    assert (weights(hierarchy)[1] != learned[1]).any()
 
 
 def test_saturation_freezes(robot):
@@ -172,15 +191,15 @@ def test_saturation_freezes(robot):
     hierarchy = build(weak, 1, feedforward="fel")
     still, pose, ahead, wanted = np.zeros((1, 2)), np.zeros((1, 3)), np.array([[0.5, 0, 0]]), np.array([[0.5, 0]])
     for _ in range(10):  # until the command has risen beyond reach
-        hierarchy.update(pose, still, np.hstack([ahead, wanted, still]), np.zeros(1))
-    before = hierarchy.feedforward.state["weights"].copy()
+        tick(hierarchy, pose, still, np.hstack([ahead, wanted, still]))
+    before = weights(hierarchy).copy()
     for _ in range(400):
-        output = hierarchy.update(pose, still, np.hstack([ahead, wanted, still]), np.zeros(1))
-        assert hierarchy.saturated[0] == 1
+        output = tick(hierarchy, pose, still, np.hstack([ahead, wanted, still]))
+        assert hierarchy.saturated[0]
     np.testing.assert_array_equal(output[0, :2], 0.5)
-    np.testing.assert_array_equal(hierarchy.feedforward.state["weights"], before)
+    np.testing.assert_array_equal(weights(hierarchy), before)
     # Unwinding stops where it balances the error, K_p e beyond the limit: the integral is the limit itself.
-    assert hierarchy.state["pid"][0, 0] == pytest.approx(0.5, abs=0.02)
+    assert hierarchy.state["pid"]["integral"][0, 0] == pytest.approx(0.5, abs=0.02)
 
 
 def test_switching_one_robot(robot):
@@ -207,7 +226,7 @@ def test_rolling_start(robot, name):
     hierarchy = build(robot, feedforward=name)
     hierarchy.reset(twist, acceleration, np.array([0.2]))
     pose = np.array([[1.0, 2.0, 0.5]])
-    output = hierarchy.update(pose, twist, np.hstack([pose, twist, acceleration]), np.zeros(1))
+    output = tick(hierarchy, pose, twist, np.hstack([pose, twist, acceleration]))
     np.testing.assert_allclose(hierarchy.command, twist, atol=1e-12)
     np.testing.assert_allclose(hierarchy.derivative, acceleration, atol=1e-12)
     steady = inverse_dynamics(twist, acceleration, robot, sign_speed=0.05)
@@ -217,18 +236,25 @@ def test_rolling_start(robot, name):
 def test_take_over(robot):
     """What learning adds to the feedforward, the integral gives up in part; a stage that does not say is left alone."""
 
-    class Learner(NoFeedforward):
-        taken = np.array([[0.6, -0.2]])
+    taken = np.array([[0.6, -0.2]])
+
+    class Learner:
+        def __init__(self, added):
+            self.added = added
+
+        def output(self, command, derivative):
+            return np.zeros((1, 2))
 
         def learn(self, feedback, saturated, twist, voltage):
-            return self.taken
+            return self.added
 
     integrals = []
-    for stage in (Learner(1), NoFeedforward(1)):
-        hierarchy = Hierarchy([Scenario(feedforward="none")], robot, stage)
-        hierarchy.update(np.zeros((1, 3)), np.zeros((1, 2)), np.array([[0, 0, 0, 1.0, 1.0, 0, 0]]), np.zeros(1))
-        integrals.append(hierarchy.state["pid"][:, :2].copy())
-    np.testing.assert_allclose(integrals[1] - integrals[0], TAKE_OVER * Learner.taken, atol=1e-14)
+    for added in (taken, None):
+        stage = UserStage("feedforward", lambda robot, size, added=added: Learner(added), robot, 1)
+        hierarchy = UserHierarchy([Scenario(feedforward="none")], robot, {"feedforward": stage})
+        tick(hierarchy, np.zeros((1, 3)), np.zeros((1, 2)), np.array([[0, 0, 0, 1.0, 1.0, 0, 0]]))
+        integrals.append(hierarchy.state["pid"]["integral"].copy())
+    np.testing.assert_allclose(integrals[1] - integrals[0], TAKE_OVER * taken, atol=1e-14)
 
 
 def test_lag_of_the_fork(robot):
@@ -236,10 +262,10 @@ def test_lag_of_the_fork(robot):
     hierarchy = build(robot, feedforward="none")
     twist, still, pose = np.array([[0.8, 0.5]]), np.zeros((1, 2)), np.zeros((1, 3))
     hierarchy.reset(twist, still, np.array([0.4]))
-    first = hierarchy.update(pose, twist, np.hstack([pose, twist, still]), np.zeros(1))[0, 2]
+    first = tick(hierarchy, pose, twist, np.hstack([pose, twist, still]))[0, 2]
     settled = first
     for _ in range(200):
-        settled = hierarchy.update(pose, twist, np.hstack([pose, twist, still]), np.zeros(1))[0, 2]
+        settled = tick(hierarchy, pose, twist, np.hstack([pose, twist, still]))[0, 2]
     assert settled < first < 0.4
     assert first > settled + 0.5 * (0.4 - settled)
 
@@ -247,7 +273,7 @@ def test_lag_of_the_fork(robot):
 def test_other_settings(robot):
     """Every robot has settings of its own."""
     scenarios = [Scenario(fel=Fel(step=step), prefilter=lag) for step, lag in ((0.0, 0.05), (0.05, 0.2))]
-    hierarchy = Hierarchy(scenarios, robot, feedforward_of(scenarios, robot))
+    hierarchy = Hierarchy(scenarios, robot)
     inputs = [np.repeat(signal, 2, axis=1) for signal in signals(1, 40)]
     log = drive(hierarchy, inputs)
     assert hierarchy.weight_norm[0] == 0 < hierarchy.weight_norm[1]
