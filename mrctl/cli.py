@@ -14,13 +14,13 @@ import textwrap
 import typing
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
-from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pydantic
 import tyro
 
+from mrctl import __version__
 from mrctl.record import InputError, Record
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -37,12 +37,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The command line without the program's name; `sys.argv` by default.
 
     Returns:
-        The exit status: 0 on success, 1 where jobs of a sweep were set aside, a repeated run differs from its store or
-        a robot fails a check, 2 on bad input, and 130 after Ctrl-C. Except on success, one line on stderr says why.
+        The exit status: 0 on success; 1 where a single run fails, jobs of a sweep were set aside, a repeated run
+        differs from its store or a robot fails a check; 2 on bad input; 130 after Ctrl-C. Except on success, one line
+        on stderr says why.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if arguments == ["--version"]:
-        print(f"mrctl {metadata.version('mrctl')}")
+        print(f"mrctl {__version__}")
         return 0
     try:
         _parse(arguments)()
@@ -173,6 +174,8 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
     ) -> None:
         """Runs one scenario and prints its metrics lap by lap.
 
+        The exit status is 1 if the run fails.
+
         Args:
             file: Scenario file, whose values flags override; or with --run the store of a sweep.
             scenario: The scenario.
@@ -187,7 +190,10 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             raise InputError(f"run: {file} is a store; give the number of one of its runs with --run")
         from mrctl.experiments import single
 
-        print(single.run(scenario, out, json, controller))
+        text, failure = single.run(scenario, out, json, controller)
+        print(text)
+        if failure:
+            raise _Incomplete(f"the run failed: {failure}")
 
     if _is_short_help(arguments):
         short = _short(default)
@@ -205,7 +211,7 @@ def _repeat(store: Path | None, number: int, out: Path | None, json: bool) -> No
     if store is None:
         raise InputError("run: --run needs the store of a sweep, as in mrctl run STORE --run 3")
     if out is not None or json:
-        print(single.run(jobs.scenario_of(store, number), out, json, Store(store).manifest["sweep"]["controller"]))
+        print(single.run(jobs.scenario_of(store, number), out, json, Store(store).manifest["sweep"]["controller"])[0])
     repeated = jobs.repeat(store, number)
     verdict = f"run {number}: {repeated.verdict}"
     if not repeated.same:

@@ -22,3 +22,10 @@ def robot() -> Robot:
         no_load_current=0.037, gear_loss=0.1, rolling_coefficient=0.015, wheel_inertia=3.4e-3, front_wheel_inertia=1e-3,
         supply=24, tyre_friction=0.9, max_speed=1.5, max_rotation=3, max_acceleration=1.5, max_rotation_acceleration=6,
     )  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks what runs the whole system, so that `pytest -m "not system"` is a quick loop for developers."""
+    for item in items:
+        if "system" in item.path.parts:
+            item.add_marker("system")

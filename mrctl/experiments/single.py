@@ -29,7 +29,7 @@ COLUMNS = {
 }
 
 
-def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = None) -> str:
+def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = None) -> tuple[str, str]:
     """Runs a scenario.
 
     Args:
@@ -39,7 +39,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         own: Stages of the user; see `mrctl.loop.user_files`.
 
     Returns:
-        The metrics, a row for each lap.
+        The metrics, a row for each lap; and why the run failed, or "".
 
     Raises:
         InputError: The scenario or a stage is bad, or the folder cannot be written or holds a result already.
@@ -76,7 +76,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
             "laps": [{name: _number(row[name].values[k]) for name in metrics.METRICS} for k in range(row.sizes["lap"])],
             "guard": events.to_dict("records"),
         }
-        return json.dumps(values, indent=1)
+        return json.dumps(values, indent=1), failure
     header = ["lap", *(title for title, _ in COLUMNS.values())]
     rows = [
         [str(k + 1), *(number(scale * float(row[name].values[k])) for name, (_, scale) in COLUMNS.items())]
@@ -87,7 +87,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     if failure:
         lines.append(f"failed after {float(row['failure_time']):.2f} s: {failure}")
     acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]
-    return "\n".join([*lines, markdown(header, rows), *(text.removesuffix(", ") for text in acted)])
+    return "\n".join([*lines, markdown(header, rows), *(text.removesuffix(", ") for text in acted)]), failure
 
 
 def _number(value: float) -> float | None:

@@ -122,8 +122,8 @@ def test_own_stage():
 def test_told():
     """A run says how often and why."""
     fast = of(DELAYED, "fel", Guard(), steering="rigid", laps=1, **FAST)
-    text = single.run(fast, None, False)
+    text, _ = single.run(fast, None, False)
     assert "guard acted" in text and re.search(r"guard at \d\.\d\d s: fallback, growing oscillation", text)
-    listed = json.loads(single.run(fast, None, True))
+    listed = json.loads(single.run(fast, None, True)[0])
     assert {"time", "action", "reason"} == set(listed["guard"][0])
     assert listed["laps"][0]["guard_actions"] == sum(event["action"] != "resume" for event in listed["guard"])

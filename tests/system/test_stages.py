@@ -305,12 +305,12 @@ def test_command_line(tmp_path, capsys):
     scenario.write_text(SHORT.to_toml())
     run = ["run", str(scenario)]
 
-    def table(*more):
-        assert main([*run, *more]) == 0
+    def table(*more, status=0):
+        assert main([*run, *more]) == status
         return capsys.readouterr().out.splitlines()
 
     plain, mine, stops = (
-        table(), table("--controller", f"motion={file}:Mine"), table("--controller", f"motion={file}:Stops")
+        table(), table("--controller", f"motion={file}:Mine"), table("--controller", f"motion={file}:Stops", status=1)
     )  # fmt: skip
     assert mine[1:] == plain[1:] and f"motion={file}:Mine" in mine[0]
     assert stops[1] == (
