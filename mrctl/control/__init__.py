@@ -1,5 +1,5 @@
-"""The laws, one a file: motion controller, limiter, PID, feedforwards, guard, steering.
+"""The laws, one in each file: motion controller, limiter, PID, feedforwards, guard, steering.
 
-Each law is one function for one robot on named records, compiled by `mrctl.kernel`. Laws know the theory and nothing of
-physics, sensors or scenarios; `mrctl.loop.hierarchy` wires them.
+Each law is one function for one robot on named records, compiled by `mrctl.kernel`. A law may import the theory, but
+neither physics nor sensors nor scenarios; `mrctl.loop.hierarchy` wires the laws.
 """

@@ -1,32 +1,34 @@
-"""Composite adaptation: the model, and features whose weights follow prediction and tracking errors at once.
+"""Composite adaptation: the model plus features whose weights follow prediction errors and tracking errors.
 
-Slotine and Li (1989) combine the two errors; Neural-Fly (O'Connell et al. 2022) and MAGIC-VFM (Lupu et al. 2024) adapt
-with them the last layer alone of a network that was trained off-line on many plants. Here
+    U = model(x) + φ(x)ᵀ a + d,      φ = 8 physical features, gravity on a slope, 16 tanh units,      a(0) = 0, d(0) = 0
 
-    U = model(x) + φ(x) a + d,      φ = 8 physical features, gravity on a slope, 16 tanh units,      a(0) = 0, d(0) = 0
+A Kalman filter (`predict`) estimates the weights a and the disturbance d from the voltage that acted and the motion
+that followed, both low-passed; the tracking term (`track`) moves a by a share of the feedback voltage e:
 
-and a and the disturbance d are what a Kalman filter makes of the voltage that acted, at the motion that came of it:
+    U_f = model(x_f) + φ(x_f)ᵀ a + d + noise,      x_f = (V_f, V̇_f)
+    a ← a + P φ(x_c) · step · e / (φ(x_c)ᵀ P φ(x_c)),      x_c = commanded motion
 
-    U_f − model(x_f) = φ(x_f) a + d + noise,      x_f = (V_f, V̇_f)
+Slotine and Li (1989) combine the two errors; Neural-Fly (O'Connell et al. 2022) and MAGIC-VFM (Lupu et al. 2024) use
+them to adapt only the last layer of a network that was trained off-line on many plants.
 
-Voltage and motion pass the same two first-order filters, and V̇_f is the difference of what enters and leaves the second
-over its time constant: nothing is differentiated. With one filter V̇_f would carry the noise of V unfiltered, and noise
-on a regressor biases its weight toward zero.
+Voltage and motion pass the same two first-order filters. V̇_f is the input of the second filter less its output, over
+its time constant, so that nothing is differentiated. With only one filter, V̇_f would contain the noise of V unfiltered,
+and noise on a regressor biases its weight toward zero.
 
-The weights are taken to wander as an Ornstein-Uhlenbeck process whose stationary covariance P₀ is how they scatter over
-the plants of the training: it tells the filter what plants differ in, and P returns to P₀, no further, where nothing is
-excited. d does the same, fast: what is no function of the motion, such as a push, goes there. How noisily the motion is
-measured shows in its second differences, which mass keeps small; the noisier, the less a sample counts. The heading
-that slope features need is dead reckoning; from where it counts does not matter. The tracking term moves a along P φ(x)
-by a share of the feedback voltage, like `rls`.
+The weights are modelled as an Ornstein-Uhlenbeck process whose stationary covariance P₀ is the scatter of the weights
+over the plants of the training. P₀ tells the filter in what plants differ, and without excitation P returns to P₀ and
+does not grow further. d is modelled in the same way with a short memory; it takes up what is no function of the motion,
+such as a push. The noise of the measured motion is estimated from its second differences, which inertia keeps small;
+the larger the noise, the less a sample counts. The heading in the slope features is dead reckoning; its origin does not
+matter.
 
-When the innovations of one channel grow suddenly, the plant has changed. What was learned of it is stored, and P of
-both channels is reset. Two former plants are stored, and each goes on predicting (multiple models, Narendra and
-Balakrishnan, 1997): when one of them predicts well again within seconds, its weights and covariance are restored. With
-a noisy measurement no former plant can be told from the noise, and the plant is learned anew.
+When the innovations of one channel grow suddenly, the plant has changed. The weights of the former plant are stored,
+and P of both channels is reset. Two former plants are stored and go on predicting (multiple models, Narendra and
+Balakrishnan, 1997): when one of them predicts well again within seconds, its weights and covariance are restored. If
+the measurement is noisy, a former plant cannot be told from the noise, and the plant is learned anew.
 
-Under `rigid` steering the second channel is treated alike: what is asked of the steering stands for the voltage, its
-nominal inverse is the rotation itself, and U is what has to be added to the command.
+Under `rigid` steering the second channel works in the same way: the rotation that is commanded to the steering takes
+the place of the voltage, its nominal inverse is the rotation itself, and U is the correction of the command.
 """
 
 from __future__ import annotations
@@ -46,67 +48,67 @@ from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
 CHANNELS = 2
-STEERING_DISTURBANCE = 0.03  # rad/s of disturbance per volt: less, since the geometry holds without a motor
-OUTLIER = 3.0  # standard deviations beyond which a sample pulls no harder: a tyre slips, a wheel lost its load
-SLOW = 0.1  # m/s of the faster wheel; below it stiction, not the motion, decides about the voltage
+STEERING_DISTURBANCE = 0.03  # rad/s of disturbance per volt; it is smaller, since the geometry needs no motor
+OUTLIER = 3.0  # standard deviations at which an innovation is clipped: a tyre slips, or a wheel lost its load
+SLOW = 0.1  # m/s of the faster wheel; below it the voltage depends on stiction, not on the motion
 BRIEF, LASTING = 0.25, 4.0  # s over which squared innovations are averaged, to detect a change of the plant
-CHANGE = 5.0  # times the lasting mean square of the innovations that the brief one of a changed plant exceeds
-NOTHING = 1e-9  # V² or (rad/s)²: features that vary less explain no feedback
-# V of noise that a sample is taken to have per m/s by which the measured wheel speed scatters; tuned with sensor noise
-# of 10 mm/s and 20 mrad/s behind filters of 0.03 s, at 10 ms.
+CHANGE = 5.0  # ratio of the brief to the lasting mean square of the innovations that shows a changed plant
+NOTHING = 1e-9  # V² or (rad/s)²; features whose φᵀ P φ is smaller explain no feedback
+# V of noise in a sample for each m/s of noise in the measured wheel speed; tuned with sensor noise of 10 mm/s and
+# 20 mrad/s behind filters of 0.03 s, at a control period of 10 ms.
 SCATTER = 300.0
-SETTLED = 6.0  # time constants until two filters have forgotten how they began
-LEARNED = 12.0  # s of learning after which a plant is worth storing, and for which a former one is looked for
-LOOK = 2.0  # s over which the misprediction of former plants is averaged, and for which they predict at least
-BACK = 0.2  # variances of a sample, of both channels together, below whose mean square a former plant is back
-FORMER = 2  # plants that are stored
-SIGNALS = 6  # pass the filters: the voltage of the two channels, the twist, cosine and sine of the heading
+SETTLED = 6.0  # time constants until the two filters have forgotten their initial state
+LEARNED = 12.0  # s of learning after which a plant is stored, and during which a former one is sought
+LOOK = 2.0  # s over which the prediction error of former plants is averaged, and the least time of averaging
+BACK = 0.2  # mean square prediction error, in variances of a sample, below which a former plant is back
+FORMER = 2  # number of former plants that are stored
+SIGNALS = 6  # filtered signals: voltage of the two channels, twist, cosine and sine of the heading
 
 
 class Composite(Record):
     """Settings of the `composite` feedforward; one setting serves every robot, steering and perturbation."""
 
     noise: Annotated[float, Field(gt=0, le=100)] = 0.2
-    """Standard deviation of one sample of the regression, V (a tenth of it in rad/s on a steering channel), where the
-    motion is measured without noise; what noise the measured motion shows is added."""
+    """Standard deviation of one sample of the regression in V, if the motion is measured without noise; the noise that
+    the measured motion shows is added. On a steering channel it is a tenth of this number in rad/s."""
     memory: Annotated[float, Field(ge=1, le=1e6)] = 1000.0
-    """Time in which the weights are taken to wander by as much as plants differ, s."""
+    """Correlation time of the weights in s, in which they wander by as much as plants differ."""
     disturbance: Annotated[float, Field(ge=0, le=100)] = 0.15
-    """Standard deviation of the disturbance, V (as for `noise`)."""
+    """Standard deviation of the disturbance in V; on a steering channel it is 3 % of this number in rad/s."""
     disturbance_memory: Annotated[float, Field(ge=0.01, le=1e6)] = 0.15
-    """Time in which the disturbance wanders by that, s."""
+    """Correlation time of the disturbance in s, in which it wanders by its standard deviation."""
     filter: Annotated[float, Field(ge=0.01, le=2)] = 0.03
-    """Time constant of each of the two filters on voltage and motion, s."""
+    """Time constant in s of each of the two filters on voltage and motion."""
     step: Annotated[float, Field(ge=0, le=1)] = 0.025
-    """Share of the feedback that the tracking term moves into the feedforward each control period, as for `rls`."""
+    """Share of the feedback that the tracking term moves into the feedforward in each control period."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
-    """Feedback below this moves nothing, V (as for `noise`)."""
+    """Feedback in V below which the tracking term is zero; on a steering channel, a tenth of this number in rad/s."""
     weights: str | None = None
-    """File of `mrctl train`; by default the one that ships with the package."""
+    """File that `mrctl train` wrote; by default the one that comes with the package."""
 
 
 COMPOSITE = np.dtype(
     [
         # Settings, for the two channels; the second is in rad/s where it is steering.
-        ("f", "f8", (CHANNELS, FEATURES + 1)),  # F: factor by which a and, last, d decay in a period
+        ("f", "f8", (CHANNELS, FEATURES + 1)),  # diagonal of F: decay of a and, last, of d in a period
         ("drift", "f8", CHANNELS),  # variance that d gains in a period, V²
         ("disturbance", "f8", CHANNELS),  # standard deviation of d, V
         ("step", "f8", CHANNELS),  # share of the feedback that the tracking term moves into the feedforward
-        ("dead_zone", "f8", CHANNELS),  # feedback below this moves nothing, V
+        ("dead_zone", "f8", CHANNELS),  # feedback below which the tracking term is zero, V
         ("noise", "f8", CHANNELS),  # standard deviation of a sample, V
-        ("scatter", "f8", CHANNELS),  # and per m/s or rad/s by which the measured twist scatters, V
+        ("scatter", "f8", CHANNELS),  # further noise of a sample for each m/s or rad/s of noise in the twist, V
         ("brief", "f8"),  # weight of a new sample in the brief mean square of the innovations
-        ("lasting", "f8"),  # and in the lasting one
+        ("lasting", "f8"),  # weight of a new sample in the lasting mean square
         ("filter", "f8"),  # weight of a new sample in the two filters
         # Motion
         ("age", "f8"),  # time since the start in time constants of the filters
         ("heading", "f8"),  # by dead reckoning, rad
-        ("signals", "f8", SIGNALS),  # what enters the filters
-        ("once", "f8", SIGNALS),  # behind the first filter
-        ("twice", "f8", SIGNALS),  # behind the second
+        ("signals", "f8", SIGNALS),  # input of the first filter
+        ("once", "f8", SIGNALS),  # output of the first filter
+        ("twice", "f8", SIGNALS),  # output of the second filter
         ("last", "f8", (2, CHANNELS)),  # the last two measured twists, m/s and rad/s
-        ("variance", "f8", CHANNELS),  # of the noise of the measured twist, (m/s)² and (rad/s)²
-        ("rate", "f8", CHANNELS),  # acceleration at the filtered motion, m/s² and rad/s²
+        ("variance", "f8", CHANNELS),  # variance of the noise of the measured twist, (m/s)² and (rad/s)²
+        ("rate", "f8", CHANNELS),  # filtered acceleration, m/s² and rad/s²
         ("x", "f8", PHYSICAL),  # physical features at the filtered motion, or at the command
         ("phi", "f8", FEATURES + 1),  # (φ, 1) at the filtered motion
         ("phi_c", "f8", FEATURES + 1),  # (φ, 1) at the command
@@ -120,11 +122,11 @@ COMPOSITE = np.dtype(
         # Former plants
         ("learned", "f8"),  # how long the present plant has been learned, s
         ("place", "i8"),  # where it will be stored
-        ("restored", "?"),  # whether it is a former one
+        ("restored", "?"),  # whether the present plant is a former one
         ("stored", "i8", FORMER),  # 1 where a place holds a plant
-        ("former_a", "f8", (FORMER, CHANNELS, FEATURES + 1)),
-        ("former_P", "f8", (FORMER, CHANNELS, FEATURES + 1, FEATURES + 1)),
-        ("misfit", "f8", FORMER),  # mean square of what a former plant mispredicts, in variances of a sample
+        ("former_a", "f8", (FORMER, CHANNELS, FEATURES + 1)),  # a and d of the stored plants, V
+        ("former_P", "f8", (FORMER, CHANNELS, FEATURES + 1, FEATURES + 1)),  # their covariance, V²
+        ("misfit", "f8", FORMER),  # mean square prediction error of a stored plant, in variances of a sample
     ],
     align=True,
 )
@@ -132,12 +134,12 @@ COMPOSITE = np.dtype(
 
 @kernel
 def basis(x: Array, units: Array, phi: Array) -> None:
-    """φ: the physical features, and tanh(W x + b) of the first 8.
+    """The features φ = (x, tanh(W x₁…₈ + b)), followed by a one for the disturbance.
 
     Args:
-        x: Scaled features and the cosine and sine of the heading, `(10,)`.
+        x: The 8 scaled features, and cosine and sine of the heading, `(10,)`.
         units: W and b side by side, `(16, 9)`.
-        phi: Out, φ and 1, `(27,)`.
+        phi: Out: φ and 1, `(27,)`.
     """
     for i in range(PHYSICAL):
         phi[i] = x[i]
@@ -153,7 +155,7 @@ def basis(x: Array, units: Array, phi: Array) -> None:
 
 @kernel
 def times(P: Array, phi: Array, out: Array) -> None:
-    """P φ, row by row: P is symmetric, and sums side by side are vector instructions."""
+    """P φ; P is symmetric, so it is read by rows, in sums that compile to vector instructions."""
     n = phi.shape[0]
     for i in range(n):
         out[i] = 0.0
@@ -164,17 +166,17 @@ def times(P: Array, phi: Array, out: Array) -> None:
 
 @kernel
 def predict(k: int, prior: Array, s: Row) -> None:
-    """One Kalman step of channel k for residual = φᵀ a + d + noise, with (a, d) and (φ, 1) as one vector each.
+    """One Kalman step of channel k for residual = φᵀ a + d + noise; below, a stands for (a, d) and φ for (φ, 1).
 
         S = φᵀ P φ + r,    e = residual − φᵀ a,    K = P φ / S
         a ← F (a + K e),    P ← F (P − K S Kᵀ) F + Q,    Q = P₀ − F P₀ F
 
-    so that, unexcited, a wanders with covariance P₀ (Ornstein-Uhlenbeck). An innovation e beyond 3 √S counts as 3 √S
-    (Huber). r grows with the scatter of the measured twist.
+    With this Q, the covariance returns to P₀ without excitation (Ornstein-Uhlenbeck process). An innovation beyond 3 √S
+    is clipped to 3 √S (Huber). The variance r of a sample grows with the noise of the measured twist.
 
     Args:
         k: Channel.
-        prior: P₀ of a with a row and a column of zeros for d, `(27, 27)`; Q of d is `s.drift`.
+        prior: P₀ of a, with a row and a column of zeros for d, whose Q is `s.drift`, `(27, 27)`.
         s: In and out: a record of `COMPOSITE`.
     """
     a, P, f, Pphi = s.a[k], s.P[k], s.f[k], s.Pphi
@@ -199,7 +201,12 @@ def predict(k: int, prior: Array, s: Row) -> None:
 def track(k: int, feedback: float, s: Row) -> None:
     """The tracking term of channel k moves φ_cᵀ a by `step` times the feedback voltage e, along P φ_c.
 
-    a ← a + P φ_c · step · e / (φ_cᵀ P φ_c),    φ_c at the commanded motion, without d
+        a ← a + P φ_c · step · e / (φ_cᵀ P φ_c),    φ_c = φ at the commanded motion; d is left out
+
+    Args:
+        k: Channel.
+        feedback: e in V (rad/s on a steering channel).
+        s: In and out: a record of `COMPOSITE`.
     """
     if not abs(feedback) > s.dead_zone[k]:
         return
@@ -221,8 +228,8 @@ def track(k: int, feedback: float, s: Row) -> None:
 def reset_covariance(k: int, prior: Array, s: Row) -> None:
     """P ← P₀ + a aᵀ after a change of the plant; the weights stay.
 
-    Covariance resetting (Goodwin and Sin, 1984). The second term is what the weights would move if the plant changed
-    back.
+    This is covariance resetting (Goodwin and Sin, 1984). The second term is the step of the weights back to zero, in
+    case the plant returns to the nominal one.
     """
     a, P = s.a[k], s.P[k]
     for i in range(FEATURES):
@@ -234,7 +241,7 @@ def reset_covariance(k: int, prior: Array, s: Row) -> None:
 
 @kernel
 def learned_voltage(a: Array, phi: Array) -> float:
-    """φᵀ a, without the disturbance."""
+    """Returns φᵀ a, without the disturbance."""
     total = 0.0
     for i in range(FEATURES):
         total += a[i] * phi[i]
@@ -255,7 +262,7 @@ def detect_change(period: float, priors: Array, s: Row) -> None:
         if s.learned > LEARNED or s.restored:
             s.place = 1 - s.place
         s.learned, s.restored = 0.0, False
-    if changed or before < settled <= s.learned:  # once more when the filters hold nothing of the plant before
+    if changed or before < settled <= s.learned:  # once more, when the filters have forgotten the former plant
         for k in range(CHANNELS):
             reset_covariance(k, priors[k], s)
         for j in range(FORMER):
@@ -266,7 +273,7 @@ def detect_change(period: float, priors: Array, s: Row) -> None:
 
 @kernel
 def seek_former(period: float, settled: float, s: Row) -> None:
-    """Lets the former plants predict, and restores the one that predicts as well as a sample's noise allows."""
+    """Predicts with the former plants, and restores one whose prediction error is within the noise of a sample."""
     for j in range(FORMER):
         misfit = 0.0
         for k in range(CHANNELS):
@@ -286,10 +293,11 @@ def seek_former(period: float, settled: float, s: Row) -> None:
 
 @kernel
 def filter_motion(command: Array, twist: Array, voltage: Array, period: float, robot: Row, s: Row) -> None:
-    """Passes voltage, twist and heading through the two filters, and measures the noise of the twist.
+    """Passes voltage, twist and heading through the two filters, and estimates the noise of the twist.
 
-    The acceleration at the filtered motion is what enters the second filter less what leaves it, over its time
-    constant. The second difference of independent noise has six times its variance.
+        V̇_f = (once − twice)/T,    var V = mean (V_n − 2 V_n−1 + V_n−2)²/6
+
+    The second difference of independent noise has six times the variance of that noise.
     """
     s.heading += period * twist[1]
     s.signals[2], s.signals[3] = twist[0], twist[1]
@@ -306,15 +314,15 @@ def filter_motion(command: Array, twist: Array, voltage: Array, period: float, r
         s.variance[k] += s.lasting * (difference * difference / 6 - s.variance[k])
         s.last[1, k], s.last[0, k] = s.last[0, k], twist[k]
         s.rate[k] = (s.once[2 + k] - s.twice[2 + k]) * s.filter / (1 - s.filter) / period
-        s.signals[k] = voltage[k]  # which acts from now on
+        s.signals[k] = voltage[k]  # it acts in the coming period
     if robot.rigid:
-        s.signals[1] += command[1]  # a steering channel corrects what is asked of the geometry
+        s.signals[1] += command[1]  # a steering channel adds a correction to the commanded rotation
     s.age += s.filter
 
 
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
-    """U = model(x_c) + φ(x_c)ᵀ a + d at the commanded motion; under `rigid` steering less the command itself."""
+    """U = model(x_c) + φ(x_c)ᵀ a + d at the commanded motion x_c; under `rigid` steering, less the command itself."""
     rows, scale, model, units, _ = arrays
     s = rows[i]
     features(command, derivative, robot.half_track, scale, s.x)
@@ -333,9 +341,9 @@ def learn(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
     arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
-    """One composite step: prediction and tracking; where the robot must not learn, the disturbance fades.
+    """One step of prediction and tracking; while the robot must not learn, the disturbance decays.
 
-    `added` leaves the disturbance out: the PID's integral may keep what it holds, as beside `observer`.
+    `added` leaves the disturbance out, so that the PID's integral keeps its part of it, as with `observer`.
     """
     rows, scale, model, units, priors = arrays
     s = rows[i]
@@ -364,22 +372,24 @@ def learn(
 
 
 class CompositeAdaptation(CompiledFeedforward):
-    """`composite` for B robots.
+    """The feedforward `composite` for B robots.
 
     Attributes:
         rows: One record of `COMPOSITE` a robot.
         weight_norm: Euclidean norm of a, `(B,)`.
-        weight_volts: The weights are in volts.
+        weight_volts: Unit of the weights: 1 V.
     """
 
     respond, learn_one = respond, learn
     weight_volts = 1.0
 
     def __init__(self, robot: Robot, settings: list[Composite], rigid: bool, period: float) -> None:
-        """Takes the nominal robot, settings a row, whether channel two is steering, and the control period in s.
+        """Takes the nominal robot, the settings of each robot, whether channel two is steering, and the period in s.
+
+        All robots use the weights file of the first.
 
         Raises:
-            InputError: The weights file of the first row, which is that of all, is missing, broken or of another shape.
+            InputError: The weights file is missing, broken or of another shape.
         """
         super().__init__(robot, len(settings), rigid, period)
         training = load_training(settings[0].weights or SHIPPED)
@@ -387,7 +397,7 @@ class CompositeAdaptation(CompiledFeedforward):
         self._priors[:, :FEATURES, :FEATURES] = training.priors[[0, 2 if rigid else 1]]
         scale = feature_scale(robot)
         model = np.ascontiguousarray((inverse_coefficients(robot) * scale[:, None]).T)
-        if rigid:  # the nominal steering makes the rotation that is asked of it
+        if rigid:  # the nominal steering makes the rotation that is commanded
             model[1] = 0.0
             model[1, 1] = scale[1]
         self.rows = rows = np.zeros(len(settings), COMPOSITE)
@@ -407,7 +417,7 @@ class CompositeAdaptation(CompiledFeedforward):
         self.restore(np.arange(len(settings)))
 
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Takes robots back to what they knew at the start."""
+        """Resets robots to their initial weights and covariance, without former plants."""
         self.weight_norm[rows] = 0.0
         for i in rows:
             s = self.rows[i]

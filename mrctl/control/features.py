@@ -1,4 +1,4 @@
-"""The 8 physical features, in which the inverse of equation (3) is linear, and their scales."""
+"""The 8 physical features in which the inverse of equation (3) is linear, and their scales."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ INPUTS, OUTPUTS = 8, 2  # of the network of `fel`: the physical features, and ch
 UNITS = 16  # tanh units of `composite`
 PHYSICAL = INPUTS + 2  # its physical features: the eight, and gravity on a slope
 FEATURES = PHYSICAL + UNITS
-SIGN_SPEED = 0.05  # m/s over which the smooth sign of the losses turns
+SIGN_SPEED = 0.05  # m/s over which the smooth sign function of the friction turns
 
 
 @kernel
 def features(command: Array, derivative: Array, half_track: float, scale: Array, x: Array) -> None:
-    """The 8 features of the inverse dynamics (physics of equation (3)), divided by their scales.
+    """The 8 features of the inverse dynamics, the inverse of equation (3), divided by their scales.
 
         x = (V, ω, V̇, ω̇, V ω, ω², tanh(V_l/0.05), tanh(V_r/0.05)) / scale,    V_l,r = V ∓ D ω
 
@@ -27,8 +27,8 @@ def features(command: Array, derivative: Array, half_track: float, scale: Array,
         command: V in m/s and ω in rad/s, `(2,)`.
         derivative: V̇ in m/s² and ω̇ in rad/s², `(2,)`.
         half_track: D in m.
-        scale: As from `feature_scale`, `(8,)`.
-        x: Out, `(8,)`.
+        scale: Scales, as from `feature_scale`, or ones, `(8,)`.
+        x: Out: the features, `(8,)`.
     """
     v, omega = command[0], command[1]
     x[0] = v / scale[0]
@@ -63,7 +63,7 @@ def feature_matrix(command: Array, derivative: Array, half_track: ArrayLike, sca
 
 @kernel
 def linear(x: Array, coefficients: Array, voltage: Array) -> None:
-    """Features `(n,)` times coefficients `(n, 2)`: volts of the two channels, `(2,)`; sums run in a fixed order."""
+    """Writes coefficientsᵀ x to the two channels: `(n,)` and `(n, 2)` in, `(2,)` out; sums run in a fixed order."""
     for k in range(2):
         total = 0.0
         for i in range(x.shape[0]):
@@ -72,10 +72,10 @@ def linear(x: Array, coefficients: Array, voltage: Array) -> None:
 
 
 def feature_scale(robot: Robot) -> Array:
-    """Scales of the 8 features, `(8,)`, chosen so that each moves by about one on an ordinary lap.
+    """Scales of the 8 features, `(8,)`, chosen so that each feature varies by about one on an ordinary lap.
 
-    Speeds are divided by the robot's limits; accelerations and products by a third of theirs, where a robot spends its
-    time; the signs, which hardly move, by three.
+    Speeds are divided by the robot's limits, accelerations and products by a third of theirs, which is where a robot
+    spends its time, and the signs, which hardly vary, by three.
     """
     v, omega = robot.max_speed, robot.max_rotation
     products = np.array([robot.max_acceleration, robot.max_rotation_acceleration, v * omega, omega**2]) / 3

@@ -1,4 +1,4 @@
-"""What every feedforward has in common, and the ones that do not learn: `none`, `model`, `oracle`."""
+"""The interface of every feedforward, and the feedforwards that do not learn: `none`, `model`, `oracle`."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from mrctl.kernel import Array, Kernel, Row, Rows, kernel
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
-STEERING_SCALE = 0.1  # rad/s on a steering channel that count as one volt does on the others
-STEERING_SHARE = 0.1  # how much slower a steering channel learns: its geometry is nearly right from the start
+STEERING_SCALE = 0.1  # rad/s on a steering channel that correspond to one volt on the others
+STEERING_SHARE = 0.1  # factor on the step of a steering channel, whose geometry is nearly right from the start
 
 
 class Feedforward(Protocol):
-    """The stage that turns the commanded motion into voltages. Any object with these two methods is one.
+    """The stage that turns the commanded motion into voltages: any object with these two methods.
 
-    A stage serves B robots; what it remembers belongs in arrays with a leading B, so that rows cannot mix. What it may
-    have besides helps the guard (`mrctl.control.guard`): `weight_norm`, a float64 array `(B,)`; `weight_volts`, what
-    weights of norm one make of features of one, in V, a number or `(B,)`; and `restore(rows)`, which takes the robots
-    with these indices back to what they began with.
+    A stage serves B robots; its memory belongs in arrays with a leading axis B, so that robots cannot mix. It may have
+    three further members for the guard (`mrctl.control.guard`): `weight_norm`, a float64 array `(B,)`; `weight_volts`,
+    the voltage in V that weights of norm one give for features of size one, a number or `(B,)`; and `restore(rows)`,
+    which resets the robots with these indices to their initial weights.
     """
 
     def output(self, command: Array, derivative: Array) -> Array:
-        """Feedforward of the two channels; asked once before the first tick, too, for a start without a bump.
+        """Returns the feedforward of the two channels; the first call, before the first tick, serves a bumpless start.
 
         Args:
             command: Commanded V in m/s and θ̇ in rad/s, `(B, 2)`.
@@ -42,16 +42,16 @@ class Feedforward(Protocol):
         ...
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array | None:
-        """Learns from what the feedback still had to do after the last `output`, and from how the robot moves.
+        """Learns from the feedback that was added to the last `output`, and from the motion of the robot.
 
         Args:
-            feedback: Feedback of the two channels `(B, 2)`, units as `output`.
-            saturated: 1 where a limit acted, a driven wheel slips, or this robot must not learn, `(B,)`.
+            feedback: Feedback in the channels and units of `output`, `(B, 2)`.
+            saturated: 1 where a limit acted, a driven wheel slips, or this robot must not learn, else 0, `(B,)`.
             twist: Measured V in m/s and θ̇ in rad/s, on which `voltage` has not acted yet, `(B, 2)`.
-            voltage: What is sent from now on, after the limits, in the channels and units of `output`, `(B, 2)`.
+            voltage: Voltage of the coming period, after the limits, in the channels and units of `output`, `(B, 2)`.
 
         Returns:
-            How much this added to the output for the same command, `(B, 2)`, so that the PID can hand it over; or None.
+            Change of the output for the same command, `(B, 2)`, of which the PID's integral gives up a part; or None.
         """
         ...
 
@@ -64,11 +64,11 @@ class CompiledFeedforward(ABC):
     Attributes:
         respond: `(i, command, derivative, robot, arrays, voltage)` writes the output of robot i to `voltage`, `(2,)`.
         learn_one: `(i, command, feedback, frozen, twist, voltage, period, robot, arrays, added)` learns, writes what
-            that added to the output of robot i to `added`, `(2,)`, and returns the norm of what it has learned.
-        arrays: What the kernels keep and share, a plain tuple of arrays.
-        guarded: Whether the guard has anything to watch.
-        weight_norm: Norm of what was learned, `(B,)`.
-        weight_volts: What weights of norm one make of features of one, in V; 0 where there are no weights.
+            that added to the output of robot i to `added`, `(2,)`, and returns the norm of the weights.
+        arrays: Memory and constants of the kernels, a tuple of arrays.
+        guarded: Whether the guard watches it.
+        weight_norm: Norm of the weights, `(B,)`.
+        weight_volts: Voltage in V that weights of norm one give for features of size one; 0 if there are no weights.
     """
 
     respond: ClassVar[Kernel]
@@ -85,10 +85,10 @@ class CompiledFeedforward(ABC):
 
     @abstractmethod
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Takes the robots with these indices back to what they knew at the start."""
+        """Resets the robots with these indices to their initial memory."""
 
     def take(self, row: int, other: CompiledFeedforward) -> None:
-        """Copies what the same stage for one robot keeps into a row of this one."""
+        """Copies the memory of the same stage for one robot into a row of this stage."""
         size = len(self.weight_norm)
         self.weight_norm[row] = other.weight_norm[0]
         for mine, theirs in zip(_flat(self.arrays), _flat(other.arrays), strict=True):
@@ -96,13 +96,13 @@ class CompiledFeedforward(ABC):
                 mine[row] = theirs[0]
 
     def output(self, command: Array, derivative: Array) -> Array:
-        """See `Feedforward.output`."""
+        """Returns the feedforward of all robots; see `Feedforward.output`."""
         self._command[:] = command
         _respond_all(type(self))(self._command, _own(derivative), self.robot, self.arrays, self._voltage)
         return self._voltage
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
-        """See `Feedforward.learn`."""
+        """Lets all robots learn; see `Feedforward.learn`."""
         _learn_all(type(self))(
             self._command, _own(feedback), _own(saturated), _own(twist), _own(voltage), self.period, self.robot,
             self.arrays, self._added, self.weight_norm,
@@ -111,12 +111,12 @@ class CompiledFeedforward(ABC):
 
 
 def _flat(arrays: tuple[Any, ...]) -> list[NDArray[Any]]:
-    """The arrays in a tuple of arrays and such tuples."""
+    """Returns the arrays of a nested tuple of arrays."""
     return [a for entry in arrays for a in (_flat(entry) if isinstance(entry, tuple) else [entry])]
 
 
 def _own(values: Array) -> Array:
-    """Contiguous float64, so that the loops below are compiled once."""
+    """Returns the values as contiguous float64, so that the loops below are compiled once."""
     return np.ascontiguousarray(values, float)
 
 
@@ -132,7 +132,7 @@ def _learn_all(stage: type[CompiledFeedforward]) -> Kernel:
 
 @kernel
 def nothing(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
-    """Zero volts."""
+    """Writes zero volts."""
     voltage[0] = voltage[1] = 0.0
 
 
@@ -141,17 +141,17 @@ def learn_nothing(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
     arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
-    """Adds nothing."""
+    """Learns nothing."""
     added[0] = added[1] = 0.0
     return 0.0
 
 
-respond, learn_one = nothing, learn_nothing  # what the loops below call, until `Kernel.calling` says otherwise
+respond, learn_one = nothing, learn_nothing  # the kernels that the loops below call; `Kernel.calling` replaces them
 
 
 @kernel
 def respond_all(command: Array, derivative: Array, robot: Rows, arrays: tuple[Any, ...], voltage: Array) -> None:
-    """The output of all robots."""
+    """Writes the outputs of all robots."""
     for i in range(len(voltage)):
         respond(i, command[i], derivative[i], robot[0], arrays, voltage[i])
 
@@ -161,7 +161,7 @@ def learn_all(
     command: Array, feedback: Array, frozen: Array, twist: Array, voltage: Array, period: float, robot: Rows,
     arrays: tuple[Any, ...], added: Array, norm: Array,
 ) -> None:  # fmt: skip
-    """One learning step of all robots."""
+    """Does one learning step of all robots."""
     for i in range(len(added)):
         norm[i] = learn_one(
             i, command[i], feedback[i], frozen[i], twist[i], voltage[i], period, robot[0], arrays, added[i]
@@ -169,36 +169,36 @@ def learn_all(
 
 
 class NoFeedforward(CompiledFeedforward):
-    """`none`: PID alone, the paper's baseline."""
+    """The feedforward `none`: PID alone, the paper's baseline."""
 
     respond, learn_one, guarded = nothing, learn_nothing, False
     arrays = ()
 
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Has nothing to forget."""
+        """Does nothing, since nothing is learned."""
 
 
 @kernel
 def inverse_dynamics(
     i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array
 ) -> None:
-    """Equation (3) inverted, on features without scale."""
+    """U = cᵀ x: the inverse of equation (3), with the unscaled features x and the robot's coefficients c."""
     half_track, coefficients, ones, x = arrays
     features(command, derivative, half_track[i], ones, x)
     linear(x, coefficients[i], voltage)
 
 
 class InverseDynamics(CompiledFeedforward):
-    """The corrected equation (3) inverted: `model` with nominal parameters, `oracle` with the plant's own.
+    """The inverse of the corrected equation (3): `model` has the nominal parameters, `oracle` the plant's own.
 
     Attributes:
-        coefficients: Of the features in the two channels, `(B, 8, 2)`.
+        coefficients: Coefficients of the unscaled features in the two channels, `(B, 8, 2)`.
     """
 
     respond, learn_one, guarded = inverse_dynamics, learn_nothing, False
 
     def __init__(self, robots: Sequence[Robot], rigid: bool) -> None:
-        """Takes a robot a row, and whether the second channel is steering."""
+        """Takes the robots, and whether the second channel is steering."""
         super().__init__(robots[0], len(robots), rigid, 0.0)
         self._half_track, self.coefficients = np.zeros(len(robots)), np.zeros((len(robots), 8, 2))
         self.arrays = self._half_track, self.coefficients, np.ones(8), np.zeros(8)
@@ -206,11 +206,11 @@ class InverseDynamics(CompiledFeedforward):
             self.set_robot(row, robot)
 
     def set_robot(self, row: int, robot: Robot) -> None:
-        """Replaces the parameters of one row."""
+        """Replaces the parameters of one robot."""
         self._half_track[row] = robot.half_track
         self.coefficients[row] = inverse_coefficients(robot)
-        if self.robot["rigid"][0]:  # the steering makes θ̇; its inverse is φ_c itself
+        if self.robot["rigid"][0]:  # the steering angle φ_c makes θ̇, without a correction from this channel
             self.coefficients[row, :, 1] = 0.0
 
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Has nothing to forget."""
+        """Does nothing, since nothing is learned."""

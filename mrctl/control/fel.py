@@ -1,8 +1,10 @@
 """Feedback-error learning of the inverse dynamics with a small network: the paper's feedforward.
 
-Kawato, Furukawa and Suzuki (1987), Gomi and Kawato (1993): Ẇ = γ (∂U_ff/∂W)ᵀ U_fb. The feedback voltage is the teaching
-signal, so the network takes over exactly the work that the feedback still does. `fel_torch` is the general form for
-any stateless torch module.
+    U_ff = scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x),      Ẇ = γ (∂U_ff/∂W)ᵀ U_fb
+
+The feedback voltage U_fb is the teaching signal, so the network takes over the work that the feedback still does
+(Kawato, Furukawa and Suzuki 1987, Gomi and Kawato 1993). `update` is the normalised discrete step; `fel_torch` has the
+same law for any stateless torch module.
 """
 
 from __future__ import annotations
@@ -20,9 +22,9 @@ from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot
 
-# Gains of hidden units and bias beside the direct links. A normalised step is shared out by squared regressor, so these
-# give most of it to the eight features. With gains of one, two dozen nearly constant units act as an integrator: slow
-# to learn what changes during a lap, quick to oscillate.
+# Gains of hidden units and bias, relative to the direct links W₃. A normalised step is divided among the weights in
+# proportion to their squared regressors, so these gains give most of it to the eight features. With gains of one, two
+# dozen nearly constant units act as an integrator, which learns slowly what changes during a lap, and soon oscillates.
 HIDDEN_GAIN, BIAS_GAIN = 0.15, 0.1
 REGULARISATION = 1e-3  # ε: keeps the normalised step finite at rest, where the regressor vanishes
 
@@ -31,42 +33,42 @@ class Fel(Record):
     """Settings of the `fel` feedforward; one setting serves every robot, steering arrangement and perturbation."""
 
     hidden: Annotated[int, Field(ge=1, le=256)] = 24
-    """Hidden tanh units."""
+    """Number of hidden tanh units."""
     step: Annotated[float, Field(ge=0, le=1)] = 0.1
-    """Normalised step μ: the share of the feedback voltage that one control period moves into the feedforward."""
+    """Normalised step μ: share of the feedback voltage that one control period moves into the feedforward."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.03
-    """Feedback below this teaches nothing, V (a tenth of it in rad/s on a steering channel)."""
+    """Feedback in V below which nothing is learned; on a steering channel, a tenth of this number in rad/s."""
     leak: Annotated[float, Field(ge=0, le=0.1)] = 1e-6
-    """Share of the distance to the prior weights that is given back each control period."""
+    """Share of the distance to the initial weights that the weights go back in each control period."""
     weight_bound: Annotated[float, Field(gt=0, le=1e4)] = 30.0
-    """Largest Euclidean distance of the weights from the prior; beyond it they are projected back."""
+    """Largest Euclidean distance of the weights from the initial ones, dimensionless; it is kept by projection."""
     output_scale: Annotated[float, Field(gt=0, le=100)] = 6.0
-    """Volts for a network output of one (a tenth of it in rad/s on a steering channel)."""
+    """Feedforward in V for a network output of one; on a steering channel, a tenth of this number in rad/s."""
     weights: str | None = None
-    """File to start from, `.safetensors` or a torch state dict; by default random hidden and zero output layers."""
+    """File of initial weights, `.safetensors` or a torch state dict; by default only the hidden layer is not zero."""
     frozen: bool = False
-    """Use the weights, do not change them."""
+    """Whether the weights stay as they are, so that nothing is learned."""
 
 
 FEL = np.dtype(
     [
-        ("scale", "f8", OUTPUTS),  # output for a network output of one, V (rad/s on a steering channel)
-        ("dead_zone", "f8", OUTPUTS),  # feedback below this teaches nothing, V (rad/s)
-        ("share", "f8", OUTPUTS),  # of the step in the two channels
+        ("scale", "f8", OUTPUTS),  # feedforward for a network output of one, V (rad/s on a steering channel)
+        ("dead_zone", "f8", OUTPUTS),  # feedback below which nothing is learned, V (rad/s)
+        ("share", "f8", OUTPUTS),  # factor on the step in the two channels; a steering channel learns more slowly
         ("step", "f8"),  # μ; 0 keeps the weights as they are
-        ("leak", "f8"),  # share of the distance to the prior that is given back each period
-        ("bound", "f8"),  # largest distance from the prior
+        ("leak", "f8"),  # share of W − W₀ that is subtracted each period
+        ("bound", "f8"),  # largest ‖W − W₀‖
         ("x", "f8", INPUTS),  # scaled features of the commanded motion
         ("output", "f8", OUTPUTS),  # feedforward at x, V (rad/s)
         ("error", "f8", OUTPUTS),  # e: feedback in units of the network's output
-        ("norm", "f8"),  # distance of the weights from the prior
+        ("norm", "f8"),  # ‖W − W₀‖
     ],
     align=True,
 )
 
 
 def fresh(settings: list[Fel], rigid: bool) -> Rows:
-    """Records of `FEL` at the start of a run, a robot each; `rigid` says whether channel two is steering."""
+    """Returns a record of `FEL` for each robot; `rigid` says whether channel two is steering."""
     rows = np.zeros(len(settings), FEL)
     second = STEERING_SCALE if rigid else 1.0
     rows["scale"] = [(s.output_scale, s.output_scale * second) for s in settings]
@@ -92,11 +94,11 @@ def network(x: Array, w: Array, hidden: Array, scale: Array, output: Array) -> N
     """The network: output = scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x).
 
     Args:
-        x: Scaled features `(8,)`.
+        x: Scaled features, `(8,)`.
         w: Flat weights, in the order of `layers`.
         hidden: Out: tanh(W₁ x + b₁), `(units,)`.
-        scale: `(2,)`.
-        output: Out: feedforward of the two channels, `(2,)`.
+        scale: Output for a network output of one, V (rad/s on a steering channel), `(2,)`.
+        output: Out: feedforward of the two channels in the same units, `(2,)`.
     """
     units = hidden.shape[0]
     W1, b1, W2, b2, W3 = layers(w, units)
@@ -118,14 +120,14 @@ def network(x: Array, w: Array, hidden: Array, scale: Array, output: Array) -> N
 
 @kernel
 def backpropagate(x: Array, w: Array, hidden: Array, error: Array, gradient: Array) -> None:
-    """Jᵀe: the gradient of the network's output times e with respect to the weights, in their order.
+    """Writes Jᵀe, with J = ∂(output/scale)/∂W of the network, in the order of the weights.
 
     Args:
-        x: Scaled features `(8,)`.
-        w: Flat weights.
-        hidden: As from `network`, `(units,)`.
+        x: Scaled features, `(8,)`.
+        w: Flat weights, `(n,)`.
+        hidden: Activations at x, as from `network`, `(units,)`.
         error: e, `(2,)`.
-        gradient: Out, as long as the weights.
+        gradient: Out: Jᵀe, `(n,)`.
     """
     units = hidden.shape[0]
     _, _, W2, _, _ = layers(w, units)
@@ -147,7 +149,7 @@ def backpropagate(x: Array, w: Array, hidden: Array, error: Array, gradient: Arr
 
 @kernel
 def squared_norm(vector: Array) -> float:
-    """‖v‖²; four sums side by side, since each addition waits for the one before."""
+    """Returns ‖v‖², from four sums side by side, since in one sum each addition waits for the one before."""
     a = b = c = d = 0.0
     whole = vector.shape[0] // 4 * 4
     for w in range(0, whole, 4):
@@ -162,20 +164,20 @@ def squared_norm(vector: Array) -> float:
 
 @kernel
 def update(feedback: Array, s: Row, w: Array, prior: Array, hidden: Array, gradient: Array) -> None:
-    """One normalised step of feedback-error learning, with its safeguards.
+    """One normalised step of feedback-error learning, with leak, dead zone and projection.
 
         ΔW = μ Jᵀe / (‖Jᵀe‖²/‖e‖² + ε) − leak (W − W₀),    ‖W − W₀‖ ≤ bound
 
-    e is the scaled feedback and J = ∂f/∂W: with one output this is normalised LMS, and the feedforward at this input
-    moves by about μ times the feedback whatever the size of the regressor.
+    e is the scaled feedback, 0 in the dead zone, and J = ∂(output/scale)/∂W. With one output this is normalised LMS:
+    the feedforward at this input moves by about μ times the feedback, whatever the size of the regressor.
 
     Args:
         feedback: Feedback of the two channels in V (rad/s on a steering channel), `(2,)`.
         s: In and out: a record of `FEL`, whose `x` and `output` are those of the last output.
-        w: In and out: flat weights W.
-        prior: W₀, as long.
+        w: In and out: flat weights W, `(n,)`.
+        prior: Initial weights W₀, `(n,)`.
         hidden: In and out: activations at `x`, `(units,)`.
-        gradient: Scratch, as long as the weights.
+        gradient: Scratch, `(n,)`.
     """
     power = 0.0
     for k in range(OUTPUTS):
@@ -199,7 +201,7 @@ def update(feedback: Array, s: Row, w: Array, prior: Array, hidden: Array, gradi
 
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
-    """The network at the commanded motion; never at the measured one."""
+    """U_ff of the network at the commanded motion, not at the measured one."""
     rows, scale, weights, _, hidden, _ = arrays
     s = rows[i]
     features(command, derivative, robot.half_track, scale, s.x)
@@ -212,9 +214,10 @@ def learn(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
     arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
-    """One step on the features of the last output, unless the robot must not learn.
+    """One step of `update` on the features of the last output, unless the robot must not learn.
 
-    At the bound of the weights it adds nothing that the PID may hand over: what is gained here is lost elsewhere.
+    At the bound of the weights `added` is zero: the projection takes away elsewhere what the step adds here, so the
+    PID's integral must not give up its share.
     """
     rows, _, weights, prior, hidden, gradient = arrays
     s = rows[i]
@@ -228,13 +231,13 @@ def learn(
 
 
 class FeedbackErrorLearning(CompiledFeedforward):
-    """`fel` for B robots.
+    """The feedforward `fel` for B robots.
 
     Attributes:
-        weights: `(B, n)`, flat.
-        prior: What leak and projection refer to, `(B, n)`.
-        weight_norm: Euclidean distance between the two, `(B,)`.
-        weight_volts: Output scale, `(B,)`.
+        weights: Flat weights W, `(B, n)`.
+        prior: Initial weights W₀, to which leak and projection refer, `(B, n)`.
+        weight_norm: ‖W − W₀‖, `(B,)`.
+        weight_volts: Output scale in V, `(B,)`.
     """
 
     respond, learn_one = respond, learn
@@ -243,7 +246,7 @@ class FeedbackErrorLearning(CompiledFeedforward):
         """Builds the networks.
 
         Args:
-            robot: Nominal robot, for the scales alone.
+            robot: The nominal robot, which sets the scales of the features.
             settings: Settings of each robot; `hidden` must be the same for all.
             seeds: Seed of the initial weights of each robot.
             rigid: Whether channel two is steering.
@@ -266,6 +269,6 @@ class FeedbackErrorLearning(CompiledFeedforward):
         self.arrays = self.rows, feature_scale(robot), self.weights, self.prior, hidden, np.zeros(self.prior.shape[1])
 
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Takes robots back to their prior weights."""
+        """Resets robots to their initial weights."""
         self.weights[rows] = self.prior[rows]
         self.rows["norm"][rows] = self.weight_norm[rows] = 0.0

@@ -1,4 +1,4 @@
-"""Feedback-error learning with any stateless torch module: the general form of `fel`, per-robot copies by autograd."""
+"""Feedback-error learning with any stateless torch module, copied for each robot: the general form of `fel`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mrctl.theory.robot import Robot
 
 
 class Network(nn.Module):
-    """The torch twin of the compiled network: 8 features in, 2 scaled channels out; weights move between the two."""
+    """The network of `fel` in torch, with the same weights: 8 scaled features in, 2 channels without scale out."""
 
     def __init__(self, hidden: int = 24) -> None:
         """Takes the number of hidden units; the layers behind them start at zero."""
@@ -29,7 +29,7 @@ class Network(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """`(…, 8)` to `(…, 2)`."""
+        """Maps features `(…, 8)` to channels `(…, 2)`."""
         hidden = HIDDEN_GAIN * torch.tanh(self.hidden(x))
         return hidden @ self.output.weight.T + BIAS_GAIN * self.output.bias + self.direct(x)
 
@@ -37,12 +37,12 @@ class Network(nn.Module):
 class ModuleLearning:
     """Feedback-error learning of B copies of a torch module, with the update and safeguards of `fel`.
 
-    The output is scale · (f_W(x) − f_W₀(x)), so learning begins as pure PID whatever the module. Pass it to `simulate`
+    The output is scale · (f_W(x) − f_W₀(x)), so that learning begins as pure PID with any module. `simulate` takes it
     as `feedforward=lambda robot, size: ModuleLearning(module, robot, size)`.
 
     Attributes:
-        state: Parameters by name, each with a leading B.
-        weight_norm: Euclidean distance of the parameters from their start, `(B,)`.
+        state: Parameters W by name, each with a leading axis B.
+        weight_norm: ‖W − W₀‖, `(B,)`.
     """
 
     def __init__(
@@ -51,10 +51,10 @@ class ModuleLearning:
         """Copies a module for B robots.
 
         Args:
-            module: Maps `(8,)` scaled features to `(2,)` channels; no buffers, so no running statistics.
-            robot: Nominal robot, for the scales.
-            size: B.
-            settings: As for `fel`; `hidden` and `weights` are the module's own business.
+            module: Maps scaled features `(8,)` to channels `(2,)`; it must have no buffers (running statistics).
+            robot: The nominal robot, which sets the scales of the features.
+            size: Number of robots B.
+            settings: Settings of `fel`; `hidden` and `weights` have no effect.
             rigid: Whether the second channel is steering.
 
         Raises:
@@ -84,7 +84,7 @@ class ModuleLearning:
         self.weight_norm = np.zeros(size)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Takes robots back to the module's own parameters."""
+        """Resets robots to the parameters of the module."""
         for name, value in self.state.items():
             value[rows] = self.prior[name][rows]
         self.weight_norm[rows] = 0.0
@@ -94,13 +94,13 @@ class ModuleLearning:
         return vmap(lambda p, row: functional_call(self._module, p, (row,)))(parameters, x)
 
     def output(self, command: Array, derivative: Array) -> Array:
-        """The modules at the commanded motion."""
+        """Returns the outputs of the modules at the commanded motion."""
         self._features = feature_matrix(command, derivative, self._half_track, self._scale)
         with torch.no_grad():
             return (self._output_scale * (self._forward(self.state) - self._forward(self.prior))).numpy()
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
-        """One normalised step, by a vector-Jacobian product; see `fel.update`."""
+        """Does the step of `fel.update` for all robots, with Jᵀe by automatic differentiation."""
         fb = torch.from_numpy(np.array(feedback))
         error = torch.where(fb.abs() > self._dead_zone, self._share * fb / self._output_scale, 0.0)
         power = (error**2).sum(1)
@@ -126,10 +126,10 @@ class ModuleLearning:
 
 
 def _square(layers: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Squared Euclidean norm of everything that belongs to one robot, `(B,)`."""
+    """Squared Euclidean norm of all parameters of each robot, `(B,)`."""
     return torch.stack([(layer**2).reshape(len(layer), -1).sum(1) for layer in layers.values()]).sum(0)
 
 
 def _like(row: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
-    """`(B,)` shaped to broadcast against `(B, …)`."""
+    """Reshapes `(B,)` so that it broadcasts against `(B, …)`."""
     return row.reshape(-1, *[1] * (value.ndim - 1))

@@ -1,4 +1,4 @@
-"""The motion controller of Kanayama, Kimura, Miyazaki and Noguchi (1990)."""
+"""The motion controller of Kanayama, Kimura, Miyazaki and Noguchi (1990): posture error to requested twist."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from mrctl.record import Record
 
 
 class Kanayama(Record):
-    """Gains of the motion controller."""
+    """Gains of Kanayama's motion controller."""
 
     k_x: Annotated[float, Field(ge=0, le=100)] = 3.0
     """Longitudinal gain K_x in 1/s."""
     k_y: Annotated[float, Field(ge=0, le=1000)] = 25.0
     """Lateral gain K_y in 1/m²."""
     k_theta: Annotated[float, Field(ge=0, le=100)] = 10.0
-    """Heading gain K_θ in 1/m; 2√K_y is critical damping."""
+    """Heading gain K_θ in 1/m; 2√K_y makes the lateral error critically damped."""
 
 
 GAINS = np.dtype([("k_x", "f8"), ("k_y", "f8"), ("k_theta", "f8")])  # 1/s, 1/m², 1/m
@@ -49,7 +49,7 @@ def kanayama(error: Array, twist: Array, k: Row, request: Array) -> None:
 
         v = v_r cos θ_e + K_x x_e,    ω = ω_r + v_r K_y y_e + |v_r| K_θ sin θ_e
 
-    The paper has v_r before K_θ; in reverse that would amplify the heading error.
+    The paper has v_r in place of |v_r|; in reverse that would amplify the heading error.
 
     Args:
         error: Posture error x_e, y_e, θ_e in m, m, rad, `(3,)`.

@@ -1,4 +1,4 @@
-"""Velocity and acceleration limits on the command, and the prefilter that yields its derivative."""
+"""Velocity and acceleration limits on the requested twist, and the prefilter that gives the command a derivative."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from mrctl.kernel import Array, Row, kernel
 
 LIMITER = np.dtype(
     [
-        ("time_constant", "f8"),  # of the filter on the correction, at least the control period, s
-        ("correction", "f8", 2),  # filtered part of the request beyond the reference twist, m/s and rad/s
+        ("time_constant", "f8"),  # T of the filter on the correction, at least the control period, s
+        ("correction", "f8", 2),  # c: filtered part of the request beyond the reference twist, m/s and rad/s
         ("command", "f8", 2),  # commanded V and θ̇, m/s and rad/s
         ("derivative", "f8", 2),  # their derivatives, m/s² and rad/s²
     ],
@@ -21,26 +21,30 @@ LIMITER = np.dtype(
 def limit(
     request: Array, twist: Array, acceleration: Array, max_twist: Array, max_acceleration: Array, period: float, s: Row
 ) -> None:
-    """Limits a requested twist as Kanayama et al. (1990), each of v, ω, v̇, ω̇ by itself.
+    """Filters and limits a requested twist; v and ω are treated separately, as by Kanayama et al. (1990).
 
-    Only what the request adds to the reference is low-pass filtered: the reference brings its own derivative, so it
-    passes without lag. With a zero reference and `time_constant` = `period` this is his limiter alone.
+        ċ = (u − u_r − c)/T,    u_c = u_r + c,    u̇_c = u̇_r + ċ,    |u_c| ≤ u_max,    |u̇_c| ≤ a_max
+
+    with the request u, the reference u_r and the command u_c. The filter acts only on the correction c, which the
+    request adds to the reference: the derivative of the reference is known, so the reference passes without lag. Where
+    a limit acts, c becomes u_c − u_r, and u̇_c the difference quotient of the command. With a zero reference and T equal
+    to the control period, this is Kanayama's limiter alone.
 
     Args:
-        request: Requested v, ω, `(2,)` in m/s, rad/s.
-        twist: Reference twist `(2,)`.
-        acceleration: Its derivative `(2,)`.
-        max_twist: Largest |v| and |ω|, `(2,)`.
-        max_acceleration: Largest |v̇| and |ω̇|, `(2,)`.
-        period: Control period, s.
+        request: Requested v in m/s and ω in rad/s, `(2,)`.
+        twist: Reference twist in m/s and rad/s, `(2,)`.
+        acceleration: Its derivative in m/s² and rad/s², `(2,)`.
+        max_twist: Largest |v| in m/s and |ω| in rad/s, `(2,)`.
+        max_acceleration: Largest |v̇| in m/s² and |ω̇| in rad/s², `(2,)`.
+        period: Control period in s.
         s: In and out: a record of `LIMITER`, whose `command` and `derivative` are the result.
     """
     for k in range(2):
         rate = (request[k] - twist[k] - s.correction[k]) / s.time_constant
-        wish = twist[k] + s.correction[k] + period * rate
-        reach = max_acceleration[k] * period
-        bounded = max(-max_twist[k], min(max_twist[k], max(s.command[k] - reach, min(s.command[k] + reach, wish))))
-        if bounded == wish:
+        wanted = twist[k] + s.correction[k] + period * rate
+        step = max_acceleration[k] * period
+        bounded = max(-max_twist[k], min(max_twist[k], max(s.command[k] - step, min(s.command[k] + step, wanted))))
+        if bounded == wanted:
             s.derivative[k] = max(-max_acceleration[k], min(max_acceleration[k], acceleration[k] + rate))
         else:
             s.derivative[k] = (bounded - s.command[k]) / period

@@ -1,4 +1,4 @@
-"""How fast and how robust a velocity loop is, and whether feedback-error learning converges in it."""
+"""Bandwidth and stability margins of a velocity loop, and the convergence condition of feedback-error learning."""
 
 from __future__ import annotations
 
@@ -13,15 +13,22 @@ from mrctl.control.pid import Gains
 def sampled_loop(
     frequency: NDArray[np.float64], gain: float, time_constant: float, gains: Gains, period: float, delay: float
 ) -> NDArray[np.complex128]:
-    """The open velocity loop L(e^(jωh)) of PI control, as `pid` computes it, of a held K/(τs + 1) behind a delay.
+    """Frequency response of the open velocity loop: PI control, zero-order hold, plant K/(τs + 1) and delay.
+
+        L = (K_p + K_i h z/(z − 1)) · K (1 − a)/(z − a) · e^(−jωT_d),    z = e^(jωh),    a = e^(−h/τ)
+
+    The first factor is the integration of `pid`, the second the plant behind the hold.
 
     Args:
         frequency: ω in rad/s, below π/h, `(F,)`.
-        gain: K.
+        gain: K of the plant, in output units per V.
         time_constant: τ in s; 0 for a plant that follows within a period.
-        gains: PI gains.
+        gains: PI gains K_p and K_i.
         period: Control period h in s.
-        delay: Loop delay in s beside the hold.
+        delay: Loop delay T_d in s, without that of the hold.
+
+    Returns:
+        L(e^(jωh)), dimensionless, `(F,)`.
     """
     z = np.exp(1j * frequency * period)
     decay = np.exp(-period / time_constant) if time_constant > 0 else 0.0
@@ -31,14 +38,14 @@ def sampled_loop(
 
 
 class Margins(NamedTuple):
-    """How fast and how robust one loop is; NaN where its size is below one from the lowest frequency on.
+    """Bandwidth and margins of one loop; NaN where the loop gain is below one from the lowest frequency on.
 
     Attributes:
         crossover: Gain crossover in rad/s.
         phase: Phase margin in degrees.
-        gain: Gain margin as a factor.
+        gain: Gain margin as a factor; infinite if the phase never reaches −180°.
         delay: Delay margin in s.
-        bandwidth: Frequency in rad/s from which on the closed loop passes less than 1/√2.
+        bandwidth: Frequency in rad/s above which the closed loop passes less than 1/√2.
     """
 
     crossover: float
@@ -53,7 +60,7 @@ def margins(frequency: NDArray[np.float64], loop: NDArray[np.complex128]) -> Mar
 
     Args:
         frequency: ω in rad/s, ascending, `(F,)`.
-        loop: L(jω), `(F,)`.
+        loop: Frequency response of the open loop at these frequencies, `(F,)`.
     """
     magnitude, phase = np.abs(loop), np.unwrap(np.angle(loop))
     phase -= 2 * np.pi * np.round((phase[0] + np.pi / 2) / (2 * np.pi))  # PI control starts between 0 and −180°
@@ -75,8 +82,14 @@ def margins(frequency: NDArray[np.float64], loop: NDArray[np.complex128]) -> Mar
 
 
 def learning_ratio(gain: float, time_constant: float, gains: Gains) -> float:
-    """K_p (B + b K_p) / (M K_i) of PI control of K/(τs + 1); above 1, feedback-error learning converges without delay.
+    """Ratio K_p (1 + K K_p)/(τ K_i); above 1, feedback-error learning converges with PI control of K/(τs + 1).
 
-    Gomi and Kawato (1993) for M V̇ + B V = b U; here M = τ, B = 1, b = K.
+    The condition K_p (B + b K_p) > M K_i of Gomi and Kawato (1993) holds for M V̇ + B V = b U without delay; here
+    M = τ, B = 1 and b = K.
+
+    Args:
+        gain: K of the plant, in output units per V.
+        time_constant: τ in s.
+        gains: PI gains K_p and K_i.
     """
     return gains.k_p * (1 + gain * gains.k_p) / (time_constant * gains.k_i)

@@ -1,4 +1,4 @@
-"""The nominal robot as the laws read it: one record of the numbers that equations (1) to (3) give them."""
+"""The nominal robot as the laws read it: one record of the parameters of equations (1) to (3)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NOMINAL = np.dtype(
         ("steering_limit", "f8"),  # φ_max, rad
         ("supply", "f8"),  # U_max, V
         ("emf", "f8"),  # back-EMF per ground speed k_E N / r, V/(m/s)
-        ("loss", "f8"),  # voltage that overcomes the loss of one drive, τ_loss R_a / (N k_M), V
+        ("loss", "f8"),  # voltage that overcomes the friction of one drive, τ_loss R_a / (N k_M), V
         ("max_twist", "f8", 2),  # largest |V| and |θ̇|, m/s and rad/s
         ("max_acceleration", "f8", 2),  # largest |V̇| and |θ̈|, m/s² and rad/s²
         ("rigid", "?"),  # whether the second channel is steering
@@ -25,7 +25,7 @@ NOMINAL = np.dtype(
 
 
 def nominal(robot: Robot, rigid: bool) -> Rows:
-    """The record of a robot, as an array of one element `(1,)`.
+    """Returns the record of `NOMINAL` of a robot, as an array of one element, `(1,)`.
 
     Args:
         robot: The nominal robot.

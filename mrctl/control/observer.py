@@ -1,7 +1,7 @@
-"""Nominal model with a disturbance observer on the voltage: the classical answer, which does not learn.
+"""Nominal model with a disturbance observer on the voltage: the classical method, which does not learn.
 
-Ohnishi (1987), Umeno and Hori (1991): what was sent beyond what the nominal inverse dynamics takes for the motion that
-came of it is a disturbance, and its low-pass is added to what is sent next:
+Ohnishi (1987), Umeno and Hori (1991): the voltage that was sent, less the voltage that the nominal inverse dynamics
+needs for the measured motion, is the disturbance. The next voltage contains its low-pass:
 
     U = model(command) + d̂,    d̂ = Q (U − model(motion)),    Q = 1/(T s + 1)
 
@@ -11,8 +11,9 @@ With the IMC rule's PI, C P = 1/(λ s) for the nominal plant P, the loop opened 
 
     (C P + Q)/(1 − Q) e^(−Ls) = (1/(λ s) + 1/(T s) + 1/(λ T s²)) e^(−Ls)
 
-which has two integrators on purpose, and a zero that pays for them. The PID's integral keeps what it holds: handing
-half of d̂ over would turn 1 − Q into 1 − Q/2, which does not vanish at s = 0, and take away what the observer is for.
+which has two integrators on purpose, and a zero that restores the phase. The observer takes nothing out of the PID's
+integral: if half of d̂ were handed over, 1 − Q would become 1 − Q/2, which does not vanish at s = 0, and a constant
+disturbance would no longer be rejected by the observer.
 """
 
 from __future__ import annotations
@@ -35,20 +36,21 @@ class Observer(Record):
     """Settings of the `observer` feedforward."""
 
     time_constant: Annotated[float, Field(ge=0.02, le=10)] = 0.055
-    """Time constant T of Q, s: the shortest, to 5 ms, that keeps the sensitivity below 2 with a delay of 20 ms, a hold
-    of half a period and λ = 0.15 s. With that hold the phase margin is 43° there, 72° without delay, 14° with 40 ms."""
+    """Time constant T of the filter Q in s. The default is the shortest, to 5 ms, that keeps the sensitivity below 2
+    with a delay of 20 ms, a hold of half a period and λ = 0.15 s; the phase margin is then 43°, without delay 72°, and
+    with a delay of 40 ms 14°."""
 
 
 OBSERVER = np.dtype(
     [
         ("time_constant", "f8"),  # T of Q, s
         ("twist", "f8", 2),  # Q of the measured V and θ̇, m/s and rad/s
-        ("voltage", "f8", 2),  # Q of the voltage less the model at no acceleration, V
-        ("sent", "f8", 2),  # voltage of the period that has passed, V
+        ("voltage", "f8", 2),  # Q of the voltage less the model's at zero acceleration, V
+        ("sent", "f8", 2),  # voltage that was applied in the last period, V
         ("disturbance", "f8", 2),  # d̂ of the two channels, V
-        ("started", "?"),  # whether a period has passed
+        ("started", "?"),  # whether there was a last period
         ("x", "f8", 8),  # features of the measured motion
-        ("rate", "f8", 2),  # its acceleration, m/s² and rad/s²
+        ("rate", "f8", 2),  # Q of its acceleration, m/s² and rad/s²
     ],
     align=True,
 )
@@ -58,15 +60,15 @@ OBSERVER = np.dtype(
 def observe(twist: Array, sent: Array, c: Array, ones: Array, half_track: float, period: float, s: Row) -> None:
     """One step of the observer, for the model c · x = c_V V + c_ω ω + c_V̇ V̇ + c_ω̇ ω̇ + ….
 
-        d̂ = Q (U − c · x at no acceleration) − c_V̇ (V − Q V)/T − c_ω̇ (ω − Q ω)/T
+        d̂ = Q (U − c · x|V̇=ω̇=0) − c_V̇ (V − Q V)/T − c_ω̇ (ω − Q ω)/T
 
-    Q is 1/(T s + 1) by implicit Euler, so that Q of the twist's difference quotient is (V − Q V)/T.
+    Q = 1/(T s + 1) is discretised by implicit Euler, for which Q of the difference quotient of V is (V − Q V)/T.
 
     Args:
-        twist: Measured V and θ̇ `(2,)`, on which `sent` has not acted yet.
-        sent: Voltage from now on, after the limits, in the two channels `(2,)`.
-        c: Coefficients of the nominal inverse on features without scale, `(8, 2)`.
-        ones: The scale of such features, `(8,)`.
+        twist: Measured V in m/s and θ̇ in rad/s, on which `sent` has not acted yet, `(2,)`.
+        sent: Voltage of the coming period in the two channels, after the limits, in V, `(2,)`.
+        c: Coefficients of the nominal inverse dynamics on unscaled features, `(8, 2)`.
+        ones: Scale of unscaled features: ones, `(8,)`.
         half_track: D in m.
         period: Control period in s.
         s: In and out: a record of `OBSERVER`, whose `disturbance` is the result.
@@ -92,7 +94,7 @@ def observe(twist: Array, sent: Array, c: Array, ones: Array, half_track: float,
 
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
-    """U = model(command) + d̂, with d̂ as last observed."""
+    """U = model(command) + d̂, with the latest d̂."""
     model, rows, _, _ = arrays
     inverse_dynamics(i, command, derivative, robot, model, voltage)
     for k in range(2):
@@ -104,18 +106,18 @@ def learn(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
     arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
-    """One step of the observer, whether or not the robot may learn: it has nothing to forget."""
+    """One step of the observer, which also runs while the robot must not learn; it hands nothing over to the PID."""
     model, rows, coefficients, sent = arrays
     sent[0], sent[1] = voltage[0], voltage[1]
     if robot.rigid:
-        sent[1] += command[1]  # a steering channel corrects what is asked of the geometry
+        sent[1] += command[1]  # a steering channel adds a correction to the commanded rotation
     observe(twist, sent, coefficients, model[2], robot.half_track, period, rows[i])
     added[0] = added[1] = 0.0
     return 0.0
 
 
 class DisturbanceObserver(CompiledFeedforward):
-    """`observer` for B robots.
+    """The feedforward `observer` for B robots.
 
     Attributes:
         rows: One record of `OBSERVER` a robot.
@@ -124,10 +126,10 @@ class DisturbanceObserver(CompiledFeedforward):
     respond, learn_one = respond, learn
 
     def __init__(self, robot: Robot, settings: list[Observer], rigid: bool, period: float) -> None:
-        """Takes the nominal robot, settings a row, whether channel two is steering, and the control period in s."""
+        """Takes the nominal robot, the settings of each robot, whether channel two is steering, and the period in s."""
         super().__init__(robot, len(settings), rigid, period)
         coefficients = inverse_coefficients(robot)
-        if rigid:  # the nominal steering makes the rotation that is asked of it
+        if rigid:  # the nominal steering makes the rotation that is commanded
             coefficients[:, 1] = 0.0
             coefficients[1, 1] = 1.0
         self.rows = np.zeros(len(settings), OBSERVER)
@@ -136,6 +138,6 @@ class DisturbanceObserver(CompiledFeedforward):
         self.arrays = model.arrays, self.rows, np.ascontiguousarray(coefficients), np.zeros(2)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Takes robots back to no disturbance."""
+        """Resets the observers of the robots with these indices."""
         for name in ("twist", "voltage", "sent", "disturbance", "started"):
             self.rows[name][rows] = 0

@@ -1,4 +1,4 @@
-"""PID on linear and rotation velocity, and its design from equation (3)."""
+"""The velocity controller: PID on linear and rotation velocity, and its design from equation (3)."""
 
 from __future__ import annotations
 
@@ -11,60 +11,13 @@ from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot
 
-
-class Pid(Record):
-    """Design of the velocity controller; the gains follow from the robot's nominal equation (3)."""
-
-    time_constant: Annotated[float, Field(ge=0.03, le=2)] = 0.15
-    """Closed-loop time constant λ of both channels in s (IMC rule: K_p = τ/(K λ), K_i = 1/(K λ))."""
-    derivative_time: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """K_d / K_p in s; the rule for a first-order plant asks for none."""
-    derivative_filter: Annotated[float, Field(ge=0.005, le=1)] = 0.03
-    """Time constant of the derivative's filter in s."""
-    steering_kp: Annotated[float, Field(ge=0, le=10)] = 0.3
-    """Proportional gain of the second channel under `rigid` steering, rad/s per rad/s."""
-    steering_ki: Annotated[float, Field(ge=0, le=50)] = 5.0
-    """Its integral gain in 1/s."""
-
-    def gains(self, robot: Robot, rigid: bool) -> dict[str, tuple[float, float]]:
-        """Settings of the record `PID` by name, for the two channels.
-
-        The common channel is in volts per m/s; the second in volts per rad/s, or in rad/s per rad/s if `rigid`.
-        """
-        common, second = self.channels(robot, rigid)
-        return {
-            "k_p": (common.k_p, second.k_p),
-            "k_i": (common.k_i, second.k_i),
-            "k_d": (common.k_p * self.derivative_time, second.k_p * self.derivative_time),
-            "filter": (self.derivative_filter, self.derivative_filter),
-        }
-
-    def channels(self, robot: Robot, rigid: bool) -> tuple[Gains, Gains]:
-        """Proportional and integral gains of the two channels; units as in `gains`."""
-        common, differential = imc(robot, self.time_constant)
-        return common, Gains(self.steering_kp, self.steering_ki) if rigid else differential
-
-    def faster(self, factor: float) -> Pid:
-        """The same rule with the closed-loop time constant divided: every gain is multiplied by `factor`.
-
-        Raises:
-            InputError: This leaves the range of a field.
-        """
-        changed = {
-            "time_constant": self.time_constant / factor,
-            "steering_kp": self.steering_kp * factor,
-            "steering_ki": self.steering_ki * factor,
-        }
-        return Pid.from_dict(self.model_dump() | changed)
-
-
 PID = np.dtype(
     [
         ("k_p", "f8", 2),  # gains of the two channels: V/(m/s) and V/(rad/s) (rad/s per rad/s on a steering channel)
         ("k_i", "f8", 2),  # the same per second
         ("k_d", "f8", 2),  # the same times seconds
         ("filter", "f8", 2),  # time constant of the derivative's filter, s
-        ("integral", "f8", 2),  # V (rad/s on a steering channel)
+        ("integral", "f8", 2),  # integral part of the output, V (rad/s on a steering channel)
         ("slope", "f8", 2),  # filtered derivative of the error, m/s² and rad/s²
         ("error", "f8", 2),  # last error, m/s and rad/s
         ("started", "?"),  # whether there is a last error
@@ -79,14 +32,14 @@ def pid(command: Array, twist: Array, excess: Array, period: float, s: Row, feed
 
         U = K_p e + ∫ (K_i e + K_i/K_p · excess) dt + K_d ė,    e = command − twist
 
-    Åström and Hägglund (Advanced PID Control, 2006, chapter 3): what saturation takes unwinds the integral over
-    K_p/K_i, or over a control period where K_p is smaller than K_i times that.
+    The excess is the output after saturation less that before it. It unwinds the integral with the time constant
+    K_p/K_i, or within a control period if K_p/K_i is shorter (Åström and Hägglund, Advanced PID Control, 2006, ch. 3).
 
     Args:
-        command: Commanded V and θ̇ `(2,)` in m/s, rad/s.
-        twist: Measured V and θ̇ `(2,)`.
-        excess: What saturation took from the last output, `(2,)`, in its units.
-        period: Control period, s.
+        command: Commanded V in m/s and θ̇ in rad/s, `(2,)`.
+        twist: Measured V in m/s and θ̇ in rad/s, `(2,)`.
+        excess: Excess of the last period, in the units of `feedback`, `(2,)`.
+        period: Control period in s.
         s: In and out: a record of `PID`.
         feedback: Out: U of the two channels in V (rad/s on a steering channel), `(2,)`.
     """
@@ -101,8 +54,54 @@ def pid(command: Array, twist: Array, excess: Array, period: float, s: Row, feed
     s.started = True
 
 
+class Pid(Record):
+    """Design of the velocity controller; the gains follow from the robot's nominal equation (3)."""
+
+    time_constant: Annotated[float, Field(ge=0.03, le=2)] = 0.15
+    """Closed-loop time constant λ of both channels in s; the IMC rule sets K_p = τ/(K λ) and K_i = 1/(K λ)."""
+    derivative_time: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """Derivative time K_d/K_p in s; the rule for a first-order plant needs no derivative action."""
+    derivative_filter: Annotated[float, Field(ge=0.005, le=1)] = 0.03
+    """Time constant of the filter on the derivative in s."""
+    steering_kp: Annotated[float, Field(ge=0, le=10)] = 0.3
+    """Proportional gain of the second channel under `rigid` steering; it is dimensionless, in rad/s per rad/s."""
+    steering_ki: Annotated[float, Field(ge=0, le=50)] = 5.0
+    """Integral gain of the second channel under `rigid` steering in 1/s."""
+
+    def gains(self, robot: Robot, rigid: bool) -> dict[str, tuple[float, float]]:
+        """Returns the settings of the record `PID` by name, each for the common and the second channel.
+
+        The common channel is in V per m/s; the second in V per rad/s, or in rad/s per rad/s if `rigid`.
+        """
+        common, second = self.channels(robot, rigid)
+        return {
+            "k_p": (common.k_p, second.k_p),
+            "k_i": (common.k_i, second.k_i),
+            "k_d": (common.k_p * self.derivative_time, second.k_p * self.derivative_time),
+            "filter": (self.derivative_filter, self.derivative_filter),
+        }
+
+    def channels(self, robot: Robot, rigid: bool) -> tuple[Gains, Gains]:
+        """Returns proportional and integral gains of the two channels, in the units of `gains`."""
+        common, differential = imc(robot, self.time_constant)
+        return common, Gains(self.steering_kp, self.steering_ki) if rigid else differential
+
+    def faster(self, factor: float) -> Pid:
+        """Returns the design whose gains are all multiplied by `factor`, the closed-loop time constant divided by it.
+
+        Raises:
+            InputError: A field is then out of its range.
+        """
+        changed = {
+            "time_constant": self.time_constant / factor,
+            "steering_kp": self.steering_kp * factor,
+            "steering_ki": self.steering_ki * factor,
+        }
+        return Pid.from_dict(self.model_dump() | changed)
+
+
 PIDS: dict[str, Pid] = {"normal": Pid(), "fast": Pid().faster(2)}
-"""The feedback of every comparison: everyone's, and one twice as fast, which leaves less for a feedforward to gain."""
+"""PIDs of the comparisons: the default, and one twice as fast, which leaves less for a feedforward to gain."""
 
 
 class Gains(NamedTuple):
@@ -113,13 +112,15 @@ class Gains(NamedTuple):
 
 
 def imc(robot: Robot, time_constant: float) -> tuple[Gains, Gains]:
-    """IMC design for the common (V/(m/s), V/m) and the differential channel (V/(rad/s), V/rad).
+    """IMC design of PI control of the first-order plant K/(τs + 1), for the common and the differential channel.
 
-    Rivera, Morari and Skogestad (1986) for a first-order plant K/(τs + 1): K_p = τ/(K λ), K_i = 1/(K λ).
+        K_p = τ/(K λ),    K_i = 1/(K λ)        (Rivera, Morari and Skogestad 1986)
+
+    The gains are in V/(m/s) and V/m, and in V/(rad/s) and V/rad.
 
     Args:
-        robot: Nominal parameters.
-        time_constant: λ in s.
+        robot: The nominal robot.
+        time_constant: Closed-loop time constant λ in s.
     """
     plants = (
         (robot.velocity_gain, robot.velocity_time_constant),

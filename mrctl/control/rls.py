@@ -14,30 +14,13 @@ from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot
 
-
-class Rls(Record):
-    """Settings of the `rls` feedforward."""
-
-    step: Annotated[float, Field(gt=0, le=1)] = 0.02
-    """Largest share of the feedback that one control period moves into the feedforward, as for `fel`: beyond it the
-    adaptation is a second integral action fast enough to shake the loop."""
-    initial_covariance: Annotated[float, Field(gt=0, le=1e3)] = 0.2
-    """Diagonal of the initial covariance of the coefficients, relative to the variance of the feedback."""
-    drift: Annotated[float, Field(ge=0, le=1)] = 3e-5
-    """Variance that every coefficient gains each control period: how fast the truth may wander."""
-    covariance_bound: Annotated[float, Field(gt=0, le=1e3)] = 0.2
-    """A diagonal element above this gains no more; without excitation it would grow for ever."""
-    dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
-    """Feedback below this teaches nothing, V (rad/s on a steering channel)."""
-
-
 RLS = np.dtype(
     [
         ("step", "f8"),  # largest share of the feedback that one period moves into the feedforward
         ("drift", "f8"),  # variance that a coefficient gains each period
-        ("bound", "f8"),  # element of the covariance above which it gains no more
-        ("dead_zone", "f8"),  # V (rad/s on a steering channel)
-        ("share", "f8", 2),  # of the step in the two channels
+        ("bound", "f8"),  # diagonal element of P above which it gains no more
+        ("dead_zone", "f8"),  # feedback below which nothing is learned, V (rad/s on a steering channel)
+        ("share", "f8", 2),  # factor on the gain in the two channels; a steering channel learns more slowly
         ("x", "f8", 8),  # scaled features of the commanded motion
         ("theta", "f8", (8, 2)),  # θ: coefficients of the features in the two channels, V
         ("P", "f8", (8, 8)),  # covariance of θ over the variance of the feedback
@@ -50,13 +33,13 @@ RLS = np.dtype(
 
 @kernel
 def update(x: Array, feedback: Array, s: Row) -> None:
-    """One recursive step whose innovation is the feedback voltage e.
+    """One step of recursive least squares whose innovation is the feedback voltage e.
 
         K = P x / max(1 + xᵀ P x, xᵀ P x / step),    θ ← θ + K eᵀ,    P ← P − K (P x)ᵀ + drift · 1
 
-    Recursive least squares for drifting coefficients (Ljung 1999, section 11.2): the Kalman filter of a random walk.
-    Exponential forgetting would inflate the directions that a lap never excites and starve the others at the bound.
-    The second denominator takes the measurement to be as noisy as the largest step asks.
+    This is recursive least squares for drifting coefficients (Ljung 1999, section 11.2), the Kalman filter of a random
+    walk. Exponential forgetting would inflate P in the directions that a lap never excites and starve the others at the
+    bound. The second denominator limits xᵀ K, the share of e that moves into the output at x, to `step`.
 
     Args:
         x: Scaled features `(8,)`.
@@ -83,6 +66,24 @@ def update(x: Array, feedback: Array, s: Row) -> None:
     s.norm = np.sqrt((s.theta**2).sum())
 
 
+class Rls(Record):
+    """Settings of the `rls` feedforward."""
+
+    step: Annotated[float, Field(gt=0, le=1)] = 0.02
+    """Largest share of the feedback that one control period moves into the feedforward. With a larger one, the
+    adaptation is a second integral action that is fast enough to make the loop oscillate."""
+    initial_covariance: Annotated[float, Field(gt=0, le=1e3)] = 0.2
+    """Diagonal of the initial covariance of the coefficients, as a ratio to the variance of the feedback."""
+    drift: Annotated[float, Field(ge=0, le=1)] = 3e-5
+    """Variance that every coefficient gains in each control period, as a ratio to the variance of the feedback; it
+    states how fast the true coefficients wander."""
+    covariance_bound: Annotated[float, Field(gt=0, le=1e3)] = 0.2
+    """Ratio of a diagonal element of the covariance to the variance of the feedback, above which that element gains no
+    more; without excitation it would grow for ever."""
+    dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
+    """Feedback in V (rad/s on a steering channel) below which nothing is learned."""
+
+
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
     """U = θᵀ x at the commanded motion."""
@@ -96,7 +97,7 @@ def learn(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
     arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
-    """One recursive step on the features of the last output, unless the robot must not learn."""
+    """One step of `update` on the features of the last output, unless the robot must not learn."""
     s = arrays[0][i]
     linear(s.x, s.theta, added)
     before, before_second = added[0], added[1]
@@ -109,18 +110,18 @@ def learn(
 
 
 class RecursiveLeastSquares(CompiledFeedforward):
-    """`rls` for B robots: U_ff = θᵀ x, θ from zero.
+    """The feedforward `rls` for B robots: U_ff = θᵀ x, with θ = 0 at the start.
 
     Attributes:
         rows: One record of `RLS` a robot.
-        weight_volts: The coefficients are in volts.
+        weight_volts: Unit of the coefficients: 1 V.
     """
 
     respond, learn_one = respond, learn
     weight_volts = 1.0
 
     def __init__(self, robot: Robot, settings: list[Rls], rigid: bool, period: float) -> None:
-        """Takes the nominal robot, settings a row, whether channel two is steering, and the period in s."""
+        """Takes the nominal robot, the settings of each robot, whether channel two is steering, and the period in s."""
         super().__init__(robot, len(settings), rigid, period)
         self.rows = rows = np.zeros(len(settings), RLS)
         rows["step"], rows["drift"] = [s.step for s in settings], [s.drift for s in settings]
@@ -131,6 +132,6 @@ class RecursiveLeastSquares(CompiledFeedforward):
         self.arrays = rows, feature_scale(robot)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Takes robots back to no coefficients and the initial covariance."""
+        """Resets robots to zero coefficients and the initial covariance."""
         self.rows["theta"][rows], self.rows["norm"][rows], self.weight_norm[rows] = 0.0, 0.0, 0.0
         self.rows["P"][rows] = self._covariance[rows]

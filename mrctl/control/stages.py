@@ -1,17 +1,17 @@
-"""The stages of figure 3, and what an object of your own must have to be one.
+"""The four stages of figure 3 that a user can replace, and the methods that each needs.
 
-A stage serves B robots: arrays have a leading B, so that rows cannot mix. It is made by a factory, which is called with
-the nominal robot and the number of robots, and has two methods. What goes in are copies, NumPy arrays of float64; what
-comes out may be NumPy or torch. Any of these is replaced by `mrctl.simulate(…, motion=, feedback=, feedforward=,
-steering=)`; the limits and the prefilter of the command, the limits of voltage and steering angle, and the guard on the
-feedforward stay what they are.
+A stage serves B robots: arrays have a leading axis B, so that robots cannot mix. A factory makes it, which is called
+with the nominal robot and the number of robots. Its two methods receive copies, NumPy arrays of float64, and may return
+NumPy arrays or torch tensors. `mrctl.simulate(…, motion=, feedback=, feedforward=, steering=)` takes the factories. The
+limits and the prefilter of the command, the limits of voltage and steering angle, and the guard on the feedforward
+still act.
 
-| stage         | asked for                                    | other method                                        |
-| ------------- | -------------------------------------------- | --------------------------------------------------- |
-| `Motion`      | requested twist from posture and reference   | `reset` before the first tick                       |
-| `Feedback`    | volts from commanded and measured twist      | `reset`, to what holds the motion at the start      |
-| `Feedforward` | volts from commanded twist and its rate      | `learn` from what the feedback still had to do      |
-| `Steering`    | angle and rate of the fork from the same     | `reset`, to the angle at the start                  |
+| stage         | `output` returns                                    | other method                                 |
+| ------------- | --------------------------------------------------- | -------------------------------------------- |
+| `Motion`      | requested twist from posture and reference          | `reset` before the first tick                |
+| `Feedback`    | voltages from commanded and measured twist          | `reset` to the voltages of the initial motion |
+| `Feedforward` | voltages from commanded twist and its derivative    | `learn` from the feedback and the motion     |
+| `Steering`    | angle and rate of the fork from commanded twist     | `reset` to the initial angle                 |
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from mrctl.theory.robot import Robot
 
 
 class Motion(Protocol):
-    """The motion controller: how to move so that the reference is reached. Asked once a motion period."""
+    """The motion controller: it requests the twist that brings the robot to its reference, once in a motion period."""
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
-        """Begins.
+        """Starts a run.
 
         Args:
             pose: Posture in m, m, rad, `(B, 3)`.
-            reference: As for `output`, `(B, 7)`.
-            period: From one `output` to the next in s.
+            reference: Reference as for `output`, `(B, 7)`.
+            period: Motion period, from one `output` to the next, in s.
         """
         ...
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
-        """The twist to ask for.
+        """Returns the requested twist.
 
         Args:
             pose: Measured x, y in m and θ in rad, `(B, 3)`.
             twist: Measured V in m/s and θ̇ in rad/s, `(B, 2)`.
-            reference: x_r, y_r, θ_r, V_r, θ̇_r and the derivatives of the last two, side by side, `(B, 7)`.
+            reference: x_r and y_r in m, θ_r in rad, V_r in m/s, θ̇_r in rad/s, V̇_r in m/s², θ̈_r in rad/s², `(B, 7)`.
 
         Returns:
             Requested V in m/s and θ̇ in rad/s, `(B, 2)`.
@@ -52,28 +52,29 @@ class Motion(Protocol):
 
 
 class Feedback(Protocol):
-    """The velocity controller without its feedforward. Asked once a control period.
+    """The velocity controller without its feedforward, which is called once in a control period.
 
-    It may have `integral`, a float64 array `(B, 2)`: what a learner takes over, and what the guard hands back, is then
-    moved out of it and into it.
+    It may have a member `integral`, a float64 array `(B, 2)`. The hierarchy then subtracts from it what a learner takes
+    over, and the guard sets it at the beginning of a fallback.
     """
 
     def reset(self, steady: Array, period: float) -> None:
-        """Begins.
+        """Starts a run.
 
         Args:
-            steady: What the feedback has to hold for a start without a bump, in the units of `output`, `(B, 2)`.
-            period: From one `output` to the next in s.
+            steady: Output that holds the initial motion, for a bumpless start, in the units of `output`, `(B, 2)`.
+            period: Control period, from one `output` to the next, in s.
         """
         ...
 
     def output(self, command: Array, twist: Array, excess: Array) -> Array:
-        """What is added to the feedforward.
+        """Returns the voltages that are added to the feedforward.
 
         Args:
             command: Commanded V in m/s and θ̇ in rad/s, after limits and prefilter, `(B, 2)`.
-            twist: Measured V and θ̇, `(B, 2)`.
-            excess: What the limits took from the last output, in its units, for anti-windup, `(B, 2)`.
+            twist: Measured V in m/s and θ̇ in rad/s, `(B, 2)`.
+            excess: Last command after the limits less that before them, for anti-windup, in the units of the output,
+                `(B, 2)`.
 
         Returns:
             U_Σ and U_Δ in V, `(B, 2)`; under `rigid` steering the second channel is a correction of θ̇ in rad/s.
@@ -82,27 +83,27 @@ class Feedback(Protocol):
 
 
 class Steering(Protocol):
-    """The law of the fork. Asked once a control period."""
+    """The law of the steered fork, which is called once in a control period."""
 
     def reset(self, angle: Array, period: float) -> None:
-        """Begins.
+        """Starts a run.
 
         Args:
             angle: Angles of the forks in rad, `(B,)`.
-            period: From one `output` to the next in s.
+            period: Control period, from one `output` to the next, in s.
         """
         ...
 
     def output(self, command: Array, derivative: Array) -> Array:
-        """Where the fork goes.
+        """Returns the steering command.
 
         Args:
-            command: Commanded V in m/s and θ̇ in rad/s, `(B, 2)`; under `rigid` steering with what the second channel
-                adds to θ̇.
-            derivative: Derivatives of the commanded V and θ̇ in m/s², rad/s², `(B, 2)`.
+            command: Commanded V in m/s and θ̇ in rad/s, `(B, 2)`; under `rigid` steering, θ̇ contains the correction of
+                the second channel.
+            derivative: Derivatives of the commanded V in m/s² and θ̇ in rad/s², `(B, 2)`.
 
         Returns:
-            Angle in rad, positive to the left, and its rate in rad/s, `(B, 2)`.
+            Steering angle in rad, positive to the left, and its rate in rad/s, `(B, 2)`.
         """
         ...
 
@@ -112,7 +113,7 @@ Factory = Callable[[Robot, int], Stage]
 
 
 class Stages(TypedDict, total=False):
-    """Factories of stages of your own, by the stage that they replace."""
+    """Factories of a user's own stages, by the name of the stage that they replace."""
 
     motion: Factory[Motion] | None
     feedback: Factory[Feedback] | None

@@ -1,4 +1,4 @@
-"""Allocation: how the two channels of the velocity controller reach motors and fork, for each steering arrangement."""
+"""Allocation: from the two channels of the velocity controller to motor voltages and steering angle."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ ALLOCATION = np.dtype(
     [
         ("angle", "f8"),  # steering angle φ_c of the fork at the end of the last period, rad
         ("rate", "f8"),  # its rate, rad/s
-        ("feedback", "f8", 2),  # share of the feedback in the voltages left and right, V
-        ("feedforward", "f8", 2),  # share of the feedforward, V; it includes the differential of `rigid` steering
+        ("feedback", "f8", 2),  # part of the voltages left and right that comes from feedback, V
+        ("feedforward", "f8", 2),  # part from feedforward, V; it includes the differential of `rigid` steering
         ("command", "f8", 4),  # voltages left and right in V, steering angle in rad, steering rate in rad/s
-        ("excess", "f8", 2),  # what the limits took from the two channels, V (rad/s on a steering channel)
+        ("excess", "f8", 2),  # the two channels after the limits less before them, V (rad/s on a steering channel)
         ("saturated", "?"),  # whether a limit acted
     ],
     align=True,
@@ -25,12 +25,13 @@ ALLOCATION = np.dtype(
 
 @kernel
 def scrub_free(v: float, omega: float, v_dot: float, omega_dot: float, period: float, robot: Row, s: Row) -> None:
-    """Angle at which a trailing front wheel rolls without scrub, and its rate, with the fork's own motion in it.
+    """Angle φ at which a trailing front wheel rolls without scrub, and its rate; the fork's own motion is included.
 
         speed · sin(direction − φ) = t (θ̇ + φ̇),    speed² = V² + (L θ̇)²,    tan direction = L θ̇ / V
 
-    so φ is the quasi-static φ_c = atan(L θ̇/V) − asin(t θ̇/speed) behind a lag of t/speed: the front contact trails the
-    axis by t and swings with the fork. At rest the angle is held. In reverse V and L θ̇ change their signs.
+    The contact of the front wheel trails the steering axis by t and swings with the fork. Therefore φ follows the
+    quasi-static angle φ_c = atan(L θ̇/V) − asin(t θ̇/speed) with a lag of t/speed. At rest the angle is held. In reverse
+    V and L θ̇ change their signs.
 
     Args:
         v: V in m/s.
@@ -62,20 +63,22 @@ def scrub_free(v: float, omega: float, v_dot: float, omega_dot: float, period: f
 def allocate(
     twist: Array, acceleration: Array, feedback: Array, feedforward: Array, period: float, robot: Row, s: Row
 ) -> None:
-    """Voltages and steering from feedback plus feedforward.
+    """Voltages and steering from feedback plus feedforward, and the excess of the limits.
 
-    - `compliant` and `caster`: U_r,l = U_Σ ± U_Δ, and the fork goes where its wheel rolls without scrub.
-    - `rigid`: the second channel corrects θ̇ inside the steering angle, and U_Δ is the electronic differential
-      k_E N D θ̇/r plus half the difference of the loss terms.
+        U_r,l = U_Σ ± U_Δ,    φ from `scrub_free` at the commanded V and θ̇
+
+    - `compliant` and `caster`: U_Δ is the second channel.
+    - `rigid`: the second channel is added to the θ̇ that determines φ, and U_Δ is the electronic differential
+      k_E N D θ̇/r plus half the difference of the friction terms of the two drives.
 
     Args:
         twist: Commanded V in m/s and θ̇ in rad/s, `(2,)`.
-        acceleration: Their derivatives `(2,)`.
-        feedback: U_Σ and U_Δ of the feedback in V (the second in rad/s if rigid), `(2,)`.
-        feedforward: Those of the feedforward, `(2,)`.
+        acceleration: Their derivatives in m/s² and rad/s², `(2,)`.
+        feedback: Channels of the feedback, U_Σ in V, and U_Δ in V or, if rigid, a correction of θ̇ in rad/s, `(2,)`.
+        feedforward: Channels of the feedforward in the same units, `(2,)`.
         period: Control period in s.
         robot: The nominal robot, a record of `NOMINAL`.
-        s: In and out: a record of `ALLOCATION`.
+        s: In and out: a record of `ALLOCATION`, all of whose fields are the result.
     """
     v, omega = twist[0], twist[1]
     s.excess[1], s.saturated = 0.0, False
@@ -97,7 +100,7 @@ def allocate(
         if robot.rigid:
             s.excess[1] = v * np.tan(s.angle) / robot.wheelbase - omega
             s.saturated = True
-    middle = s.angle + s.rate * period / 2  # the set-point is held for a period
+    middle = s.angle + s.rate * period / 2  # the middle of the period for which the set-point is held
     s.command[2], s.command[3] = max(-robot.steering_limit, min(robot.steering_limit, middle)), s.rate
 
     left, right = s.feedback[0] + s.feedforward[0], s.feedback[1] + s.feedforward[1]

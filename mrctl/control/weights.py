@@ -1,4 +1,4 @@
-"""What learners start from, as files: the weights of `fel`, and what `mrctl train` found for `composite`."""
+"""Files that learners start from: the weights of `fel`, and the training of `composite` by `mrctl train`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SHIPPED = Path(__file__).with_name("composite.safetensors")
 
 
 def shapes(hidden: int) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the weights, in the order of the flat vector; they are those of `fel_torch.Network`."""
+    """Returns names and shapes of the weights, in the order of the flat vector; `fel_torch.Network` has the same."""
     return {
         "hidden.weight": (hidden, INPUTS),
         "hidden.bias": (hidden,),
@@ -28,7 +28,7 @@ def shapes(hidden: int) -> dict[str, tuple[int, ...]]:
 
 
 def initial_weights(hidden: int, seed: int) -> Array:
-    """Random hidden layer, everything behind it zero: learning begins as pure PID.
+    """Returns weights with a random hidden layer and zeros elsewhere, so that learning begins as pure PID.
 
     Returns:
         Flat weights, `(11 hidden + 18,)`.
@@ -41,13 +41,13 @@ def initial_weights(hidden: int, seed: int) -> Array:
 
 
 def flatten(layers: dict[str, Array]) -> Array:
-    """Named weights to the flat vector of the compiled network."""
+    """Returns named weights as the flat vector of the compiled network."""
     hidden = len(layers["hidden.bias"])
     return np.concatenate([np.ravel(layers[name]) for name in shapes(hidden)])
 
 
 def unflatten(weights: Array) -> dict[str, Array]:
-    """The flat vector to named weights."""
+    """Returns the flat vector as named weights."""
     hidden = (len(weights) - OUTPUTS * (INPUTS + 1)) // (INPUTS + 1 + OUTPUTS)
     layers, start = {}, 0
     for name, shape in shapes(hidden).items():
@@ -69,8 +69,8 @@ def load_weights(path: str | Path, hidden: int) -> Array:
     """Reads weights of `fel` from a safetensors file or a torch state dict.
 
     Args:
-        path: `.safetensors`, else a file of `torch.save(module.state_dict())`, read with `weights_only`.
-        hidden: Hidden units that the file must hold.
+        path: A `.safetensors` file, or a file of `torch.save(module.state_dict())`, which is read with `weights_only`.
+        hidden: Number of hidden units that the file must have.
 
     Returns:
         Flat weights, `(11 hidden + 18,)`.
@@ -82,10 +82,10 @@ def load_weights(path: str | Path, hidden: int) -> Array:
 
 
 class Training(NamedTuple):
-    """What `mrctl train` found.
+    """The result of `mrctl train`.
 
     Attributes:
-        units: Weights and, last, bias of the tanh units on the scaled features, `(16, 9)`.
+        units: Weights of the tanh units for the scaled features, and their bias in the last column, `(16, 9)`.
         priors: Covariance P₀ of the weights of φ, in V² for the common and the differential channel and in (rad/s)² for
             a steering channel, `(3, 26, 26)`.
     """
@@ -104,7 +104,7 @@ def save_training(path: str | Path, training: Training, recipe: dict[str, str]) 
 
 
 def load_training(path: str | Path = SHIPPED) -> Training:
-    """Reads a file of `mrctl train`.
+    """Reads a file that `mrctl train` wrote.
 
     Raises:
         InputError: The file is missing, broken, of another shape, or holds non-finite numbers.
@@ -140,7 +140,7 @@ def _read(path: str | Path, field: str, expected: Mapping[str, tuple[int, ...]])
             import torch
 
             arrays = {k: v.double().numpy() for k, v in torch.load(path, map_location="cpu", weights_only=True).items()}
-    except Exception as error:  # each format has its own errors; none of them is ours to tell apart
+    except Exception as error:  # each format raises its own errors
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise InputError(f"{field}: {path}: not a weights file: {reason}") from None
     for name, shape in expected.items():

@@ -1,4 +1,4 @@
-"""Figure 3, closed: the hierarchy of controllers, a user's own stages, and the simulation that everybody runs.
+"""The closed loop of figure 3: the hierarchy of controllers, a user's own stages, and the simulation.
 
 Imports everything below it: theory, control, sensing, physics, `mrctl.scenario` and results.
 """

@@ -1,4 +1,4 @@
-"""What the robots shall follow: the references of a group of scenarios, sampled tick by tick."""
+"""The references that the robots follow: those of a group of scenarios, sampled at each control tick."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
 BLOCK = 10_000  # control ticks whose references are sampled at once
-FAR = 0.8  # m between robot and reference at the start
+FAR = 0.8  # m, largest distance between robot and reference at the start
 
 GOAL = np.dtype(
     [
@@ -24,7 +24,7 @@ GOAL = np.dtype(
 
 
 def course(scenario: Scenario, ticks: range) -> Rows:
-    """The reference of a scenario through all events that change it, one record of `GOAL` a tick."""
+    """Returns the reference of a scenario, including the events that change it, one record of `GOAL` for each tick."""
     period = scenario.control_period
     samples = np.hstack(scenario.reference.sample(period * np.array(ticks, float)))
     for event in sorted(scenario.events, key=lambda e: e.time):
@@ -36,26 +36,26 @@ def course(scenario: Scenario, ticks: range) -> Rows:
 
 
 def distinct_courses(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], NDArray[np.intp]]:
-    """Scenarios with different references or changes of it, and which of them each robot follows, `(B,)`."""
-    names = [(s.reference, *((e.time, e.reference) for e in s.events if e.reference)) for s in scenarios]
-    distinct = dict(zip(names, scenarios, strict=True))
+    """Returns one scenario for each different course, and the index of the one that each robot follows, `(B,)`."""
+    keys = [(s.reference, *((e.time, e.reference) for e in s.events if e.reference)) for s in scenarios]
+    distinct = dict(zip(keys, scenarios, strict=True))
     order = list(distinct)
-    return list(distinct.values()), np.array([order.index(name) for name in names])
+    return list(distinct.values()), np.array([order.index(key) for key in keys])
 
 
 class Courses:
-    """The references of a uniform group of scenarios; robots on the same one share its samples."""
+    """The references of a uniform group of scenarios; robots with the same reference share its samples."""
 
     def __init__(self, scenarios: Sequence[Scenario]) -> None:
-        """Takes a scenario a robot."""
+        """Takes the scenario of each robot."""
         self._ticks = scenarios[0].ticks
         self._courses, self._place = distinct_courses(scenarios)
-        self._own = len(self._courses) == len(scenarios)  # whether no two robots share one
+        self._own = len(self._courses) == len(scenarios)  # whether no two robots share a course
         self._block = range(0)
 
     def at(self, tick: int) -> Rows:
-        """The references at a control tick, one record of `GOAL` a robot, `(B,)`."""
-        if tick not in self._block:  # a long run does not hold all samples: (ticks of a block, courses)
+        """Returns the references at a control tick, one record of `GOAL` for each robot, `(B,)`."""
+        if tick not in self._block:  # only one block of samples is held, (ticks of a block, courses)
             first = tick // BLOCK * BLOCK
             self._block = range(first, min(first + BLOCK, self._ticks))
             self._samples = np.stack([course(s, self._block) for s in self._courses], axis=1)
@@ -64,14 +64,14 @@ class Courses:
 
 
 def start_pose(scenario: Scenario, reference: Array) -> Array:
-    """Posture at the start `(3,)`: the given one or the reference's, plus the seeded offset.
+    """Returns the initial pose in m, m, rad, `(3,)`: the scenario's or the reference's, plus the random offset.
 
     Args:
         scenario: The scenario.
-        reference: Posture of the reference at the start, `(3,)`.
+        reference: Pose of the reference at the start in m, m, rad, `(3,)`.
 
     Raises:
-        InputError: It is far from the reference.
+        InputError: The initial pose is more than 0.8 m from the reference.
     """
     base = reference if scenario.initial_pose is None else np.array(scenario.initial_pose)
     offset = np.random.default_rng([scenario.seed, 0]).standard_normal(3) * scenario.initial_spread

@@ -1,4 +1,4 @@
-"""What happens to the robots during a run: perturbations, pushes, new gains, learning switched on or off."""
+"""The events of a run: perturbations, pushes, new gains, and learning switched on or off."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mrctl.theory.perturbation import Perturbation
 
 
 class Events:
-    """The events of a group of runs, in the order of their ticks. New references are `Courses`' business."""
+    """The events of a group of runs, by control tick; changes of the reference are in `Courses` instead."""
 
     def __init__(
         self, scenarios: Sequence[Scenario], plant: Plant, hierarchy: Hierarchy, sensors: Sensors, period: float
@@ -23,10 +23,10 @@ class Events:
         """Perturbs the robots as their scenarios say, and schedules their events.
 
         Args:
-            scenarios: A scenario a robot.
-            plant: Where perturbations and pushes act.
-            hierarchy: Whose gains change.
-            sensors: Whose noise changes with a perturbation.
+            scenarios: Scenario of each robot.
+            plant: The physics, on which perturbations and pushes act.
+            hierarchy: The controllers, whose gains change.
+            sensors: The sensors, whose noise changes with a perturbation.
             period: Control period in s.
         """
         self._plant, self._hierarchy, self._sensors, self._period = plant, hierarchy, sensors, period
@@ -40,12 +40,12 @@ class Events:
             self._schedule[tick + event.tick(self._period)].append((row, event))
 
     def add(self, event: Event) -> None:
-        """Lets an event happen to every robot."""
+        """Schedules an event for every robot."""
         self._schedule[event.tick(self._period)] += enumerate([event] * self._plant.size)
 
     def restart(self, row: int, scenario: Scenario, tick: int) -> None:
-        """Starts the events of one robot again, from this tick on."""
-        coming = {t: [e for e in some if e[0] != row] for t, some in self._schedule.items() if t >= tick}
+        """Schedules the events of a new scenario for one robot, whose time begins at this tick."""
+        coming = {t: [e for e in entries if e[0] != row] for t, entries in self._schedule.items() if t >= tick}
         self._schedule = defaultdict(list, coming)
         self._enter(row, scenario, tick)
         if any(event.perturbation for event in scenario.events):
@@ -54,7 +54,7 @@ class Events:
             self._hierarchy.set_truth(row, self._plant.truth[row])
 
     def apply(self, tick: int) -> None:
-        """Lets the events of a control tick happen."""
+        """Applies the events of a control tick."""
         for row, event in self._schedule.get(tick, ()):
             if event.perturbation is not None:
                 self.perturb(row, event.perturbation)
@@ -68,7 +68,7 @@ class Events:
                 self._hierarchy.set_learning(row, event.learning)
 
     def perturb(self, row: int, perturbation: Perturbation) -> None:
-        """Replaces the perturbation of one robot, from now on."""
+        """Replaces the perturbation of one robot from this tick on."""
         self._plant.perturb(row, perturbation, round(perturbation.control_delay / self._period))
         self._sensors.set_noise(row, perturbation)
         self._hierarchy.set_truth(row, self._plant.truth[row])

@@ -38,10 +38,10 @@ from mrctl.kernel import Array, Kernel, Row, Rows, kernel
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import Robot
 
-SLIPS = 0.1  # slip ratio beyond which a wheel's voltage says nothing about the motion
-# Share of what learning adds to the feedforward that the PID's integral gives up at once. With none, both hold the same
-# voltage until the error has unwound the integral: the first lap overshoots, and the loop has one fast integrator too
-# many. With all of it, learning has no integral action of its own, and tracks the position less well.
+SLIPS = 0.1  # slip ratio beyond which the voltage of a wheel does not explain the motion
+# Share of the change of the feedforward by learning that the PID's integral gives up at once. With 0, both contain the
+# same voltage until the error has unwound the integral: the first lap overshoots, and the loop has one fast integrator
+# too many. With 1, learning has no integral action of its own, and the position is tracked less well.
 TAKE_OVER = 0.5
 
 CONTROL = np.dtype(
@@ -49,20 +49,20 @@ CONTROL = np.dtype(
         ("kanayama", GAINS),
         ("error", "f8", 3),  # posture error in the robot's frame, as of the motion controller's last tick, m, m, rad
         ("request", "f8", 2),  # twist that the motion controller requests, m/s and rad/s
-        ("correction", "f8", 2),  # what it requests beyond the reference twist
+        ("correction", "f8", 2),  # requested twist less the reference twist, m/s and rad/s
         ("limiter", LIMITER),
         ("pid", PID),
         ("feedback", "f8", 2),  # output of the PID, V (rad/s on a steering channel)
-        ("feedforward", "f8", 2),  # output of the feedforward stage
-        ("nominal", "f8", 2),  # output of the nominal inverse dynamics, where a guard needs it
+        ("feedforward", "f8", 2),  # output of the feedforward stage, V (rad/s on a steering channel)
+        ("nominal", "f8", 2),  # output of the nominal inverse dynamics, if the guard is on, V (rad/s)
         ("guard", GUARD),
         ("allocation", ALLOCATION),
-        ("voltage", "f8", 2),  # what is sent, after the limits, in the two channels
+        ("voltage", "f8", 2),  # voltage of the two channels after the limits, V (rad/s)
         ("learning_off", "?"),  # whether an event has switched learning off
         ("slips", "?"),  # whether a driven wheel slips
         ("frozen", "f8"),  # 1 where nothing may be learned from this tick, else 0
-        ("added", "f8", 2),  # what learning added to the feedforward
-        ("weight_norm", "f8"),  # size of what was learned
+        ("added", "f8", 2),  # change of the feedforward by learning in this tick, V (rad/s)
+        ("weight_norm", "f8"),  # norm of the learner's weights
     ],
     align=True,
 )
@@ -72,7 +72,7 @@ respond, learn_one = nothing, learn_nothing  # the feedforward of `update`, whic
 
 @kernel
 def request_motion(seen: Row, goal: Row, s: Row) -> None:
-    """The motion controller: posture error to requested twist."""
+    """The motion controller: from posture error to requested twist."""
     posture_error(seen.pose, goal.pose, s.error)
     kanayama(s.error, goal.twist, s.kanayama, s.request)
     for k in range(2):
@@ -81,7 +81,7 @@ def request_motion(seen: Row, goal: Row, s: Row) -> None:
 
 @kernel
 def command_motion(goal: Row, robot: Row, period: float, s: Row) -> None:
-    """Limiter and prefilter: requested to commanded twist. Between two motion periods the correction is held."""
+    """Limiter and prefilter: from requested to commanded twist; the correction is held between two motion periods."""
     for k in range(2):
         s.request[k] = goal.twist[k] + s.correction[k]
     limit(s.request, goal.twist, goal.acceleration, robot.max_twist, robot.max_acceleration, period, s.limiter)
@@ -89,7 +89,7 @@ def command_motion(goal: Row, robot: Row, period: float, s: Row) -> None:
 
 @kernel
 def apply_voltages(slip: float, inverse: Array, ones: Array, x: Array, robot: Row, period: float, s: Row) -> bool:
-    """Guard and allocation: feedback and feedforward to voltages and steering; returns whether these are finite."""
+    """Guard and allocation: from feedback and feedforward to voltages and steering; returns whether they are finite."""
     command, derivative, a = s.limiter.command, s.limiter.derivative, s.allocation
     if s.guard.on:
         features(command, derivative, robot.half_track, ones, x)
@@ -99,7 +99,7 @@ def apply_voltages(slip: float, inverse: Array, ones: Array, x: Array, robot: Ro
         s.pid.integral, s.feedback,
     )  # fmt: skip
     allocate(command, derivative, s.feedback, s.guard.output, period, robot, a)
-    s.slips = not slip <= SLIPS  # NaN is no rolling
+    s.slips = not slip <= SLIPS  # NaN counts as slip
     s.frozen = 1.0 if a.saturated or s.learning_off or s.guard.frozen or s.slips else 0.0
     finite = True
     for k in range(2):
@@ -110,7 +110,7 @@ def apply_voltages(slip: float, inverse: Array, ones: Array, x: Array, robot: Ro
 
 @kernel
 def hand_over(s: Row) -> None:
-    """Takes a share of what learning added to the feedforward out of the PID's integral."""
+    """The PID's integral gives up a share of what learning added: ∫ ← ∫ − `TAKE_OVER` · authority · added."""
     for k in range(2):
         s.pid.integral[k] -= TAKE_OVER * s.guard.authority * s.added[k]
 
@@ -124,18 +124,18 @@ def update(
 
     Args:
         moves: Whether the motion controller acts in this tick.
-        seen: One record of `SEEN` a robot.
-        goal: One record of `GOAL` a robot.
+        seen: Record of `SEEN` of each robot.
+        goal: Record of `GOAL` of each robot.
         robot: The nominal robot, one record of `NOMINAL`.
-        inverse: Coefficients of its inverse dynamics on features without scale, `(8, 2)`.
-        ones: The scale of such features, `(8,)`.
-        x: Scratch for them, `(8,)`.
+        inverse: Coefficients of its inverse dynamics on unscaled features, `(8, 2)`.
+        ones: Scale of unscaled features: ones, `(8,)`.
+        x: Scratch for the features, `(8,)`.
         period: Control period in s.
-        arrays: What the feedforward keeps.
-        control: In and out: one record of `CONTROL` a robot.
+        arrays: Memory and constants of the feedforward.
+        control: In and out: record of `CONTROL` of each robot.
 
     Returns:
-        Whether all voltages are finite, and whether a guard wants a learner to forget.
+        Whether all voltages are finite, and whether a guard wants a learner to be reset.
     """
     finite, forget = True, False
     for i in range(len(control)):
@@ -157,12 +157,12 @@ def update(
 
 @cache
 def update_with(stage: type[CompiledFeedforward]) -> Kernel:
-    """`update` with the two laws of a feedforward."""
+    """Returns the kernel `update` with the two laws of a feedforward."""
     return update.calling(respond=stage.respond, learn_one=stage.learn_one)
 
 
 def feedforward_of(scenarios: Sequence[Scenario], robot: Robot) -> CompiledFeedforward:
-    """The named feedforward of a uniform group of scenarios."""
+    """Returns the feedforward that a uniform group of scenarios names."""
     first = scenarios[0]
     rigid, period = first.steering == "rigid", first.control_period
     if first.feedforward == "none":
@@ -183,25 +183,23 @@ class Hierarchy:
 
     Attributes:
         feedforward: The feedforward stage.
-        state: Everything else that is kept, one record of `CONTROL` a robot; what follows are views of it.
-        command: Prefiltered twist command `(B, 2)` in m/s, rad/s.
-        derivative: Its derivative `(B, 2)`.
-        feedback: Output of the PID for the two channels `(B, 2)`.
+        state: Record of `CONTROL` of each robot, `(B,)`; the following arrays are views of it.
+        command: Commanded V in m/s and θ̇ in rad/s, after prefilter and limits, `(B, 2)`.
+        derivative: Its derivative in m/s² and rad/s², `(B, 2)`.
+        feedback: Output of the PID for the two channels in V (rad/s on a steering channel), `(B, 2)`.
         output: Voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
         saturated: Whether a limit acted, `(B,)`.
-        weight_norm: Size of what the feedforward has learned, `(B,)`.
+        weight_norm: Norm of the learner's weights, `(B,)`.
         finite: Whether all voltages of the last tick were finite numbers.
     """
 
-    def __init__(
-        self, scenarios: Sequence[Scenario], robot: Robot, feedforward: Feedforward | None = None
-    ) -> None:
+    def __init__(self, scenarios: Sequence[Scenario], robot: Robot, feedforward: Feedforward | None = None) -> None:
         """Wires the stages.
 
         Args:
-            scenarios: A uniform group.
+            scenarios: A uniform group of scenarios.
             robot: The nominal robot.
-            feedforward: Instead of the named one.
+            feedforward: Feedforward stage in place of the one that the scenarios name.
         """
         first, size = scenarios[0], len(scenarios)
         self.feedforward: Feedforward = feedforward_of(scenarios, robot) if feedforward is None else feedforward
@@ -239,20 +237,20 @@ class Hierarchy:
             self.state["pid"][name][row] = value
 
     def set_learning(self, row: int, on: bool) -> None:
-        """Lets the feedforward of one robot learn, or not."""
+        """Switches learning of one robot on or off."""
         self.state["learning_off"][row] = not on
 
     def set_truth(self, row: int, robot: Robot) -> None:
-        """Tells an oracle the true parameters of one robot; nobody else listens."""
+        """Tells the feedforward `oracle` the true parameters of one robot; other feedforwards ignore them."""
         if self._oracle and isinstance(self.feedforward, InverseDynamics):
             self.feedforward.set_robot(row, robot)
 
     def renew(self, row: int, scenario: Scenario) -> None:
-        """Gives one robot the settings and the memory of a new one, before `reset`.
+        """Gives one robot the settings and the initial memory of a scenario, before `reset`.
 
         Args:
-            row: Which robot.
-            scenario: One that fits the group.
+            row: Index of the robot.
+            scenario: A scenario that fits the group.
         """
         renewed = Hierarchy([scenario], self._robot)
         self.state[row] = renewed.state[0]
@@ -261,30 +259,30 @@ class Hierarchy:
         mine.take(row, other)
 
     def restart_clock(self) -> None:
-        """Counts the motion controller's periods from here on."""
+        """Starts a motion period at the coming tick."""
         self._tick = 0
 
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
-        """Starts without a bump, as if the nominal robot had been driven here steadily.
+        """Starts without a bump: the integral holds the voltage that the nominal robot needs for its initial motion.
 
         Args:
-            twist: What the robots already do, `(B, 2)`.
-            acceleration: Its derivative along the reference, `(B, 2)`.
+            twist: Initial twist of the robots in m/s and rad/s, `(B, 2)`.
+            acceleration: Its derivative along the reference in m/s² and rad/s², `(B, 2)`.
             steering_angle: Angles of the forks in rad, `(B,)`.
-            rows: Which of them start.
+            rows: Indices of the robots that start.
         """
         self.command[rows] = twist[rows]
         self.state["allocation"]["angle"][rows] = steering_angle[rows]
-        # The integral holds what the nominal robot takes here, less what the feedforward brings by itself.
+        # The feedforward already gives a part of the voltage that the nominal robot needs.
         integral = self._nominal.output(twist, acceleration) - self.feedforward.output(twist, acceleration)
         self.state["pid"]["integral"][rows] = integral[rows]
 
     def update(self, seen: Rows, goal: Rows) -> Array:
-        """One control tick.
+        """Computes the commands of one control tick.
 
         Args:
-            seen: What is measured, one record of `SEEN` a robot.
-            goal: The references, one record of `GOAL` a robot.
+            seen: Measurement of each robot, a record of `SEEN`, `(B,)`.
+            goal: Reference of each robot, a record of `GOAL`, `(B,)`.
 
         Returns:
             `output`, `(B, 4)`.
@@ -301,19 +299,19 @@ class Hierarchy:
         return self.output
 
     def non_finite(self) -> list[int]:
-        """The robots whose voltages of the last tick are no finite numbers."""
+        """Returns the indices of the robots whose voltages of the last tick are not finite."""
         a = self.state["allocation"]
         finite = np.isfinite(a["feedback"]).all(axis=1) & np.isfinite(a["feedforward"]).all(axis=1)
         return np.flatnonzero(~finite).tolist()
 
     def _forget(self) -> None:
-        """Takes learners that failed back to what they began with; one that cannot has to go on more slowly."""
+        """Resets learners that failed to their initial weights; one that cannot be reset learns more slowly instead."""
         rows = np.flatnonzero(self.state["guard"]["forget"])
         if not self._restore(rows):
             self.state["guard"]["gain"][rows] *= UNSURE
 
     def _restore(self, rows: NDArray[np.intp]) -> bool:
-        """Takes the learners of these robots back; returns whether the feedforward can."""
+        """Resets the learners of these robots; returns whether the feedforward can be reset."""
         assert isinstance(self.feedforward, CompiledFeedforward)
         self.feedforward.restore(rows)
         self.weight_norm[rows] = 0.0

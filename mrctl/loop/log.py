@@ -1,4 +1,4 @@
-"""The record of a run: one `TICK` of signals a robot and control tick."""
+"""The log of a run: one record of `TICK` for each robot and control tick."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from mrctl.control.kanayama import posture_error
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.results.dataset import SIGNALS, TICK
 
-DIVERGED = 1.0  # m of lateral error
+DIVERGED = 1.0  # m of lateral error, beyond which a run has failed
 
 
 @kernel
 def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, error: Array, ticks: Rows) -> bool:
     """Writes the signals of one control tick of all robots; returns whether all are near their references.
 
-    A sample at time t holds the state at t, the commands computed from it, and the currents and power at the end of the
-    control period that these commands were held for.
+    A sample at time t has the state at t, the commands computed from it, and the currents and the power at the end of
+    the control period in which these commands were held.
 
     Args:
-        plant: One record of `PLANT` a robot, after the control period.
-        seen: One record of `SEEN` a robot.
-        goal: One record of `GOAL` a robot.
-        control: One record of `CONTROL` a robot.
+        plant: Record of `PLANT` of each robot, after the control period.
+        seen: Record of `SEEN` of each robot.
+        goal: Record of `GOAL` of each robot.
+        control: Record of `CONTROL` of each robot.
         error: Scratch, `(3,)`.
-        ticks: Out: one record of `TICK` a robot.
+        ticks: Out: record of `TICK` of each robot.
     """
     near = True
     for i in range(len(ticks)):
@@ -55,20 +55,20 @@ def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, error: Array, tic
 
 
 class Log:
-    """What was recorded of B robots.
+    """The log of B robots.
 
     Attributes:
-        ticks: One record of `TICK` a tick and robot, `(length, B)`; beyond `length` ticks the oldest are overwritten.
+        ticks: Record of `TICK` of each tick and robot, `(length, B)`; after `length` ticks the oldest are overwritten.
     """
 
     def __init__(self, length: int, size: int) -> None:
         """Takes the number of ticks that are kept and the number of robots."""
-        # A tick's records lie side by side: the loop writes one block of memory a tick, however many robots there are.
+        # The records of a tick lie side by side, so that the loop writes one block of memory for any number of robots.
         self.ticks = np.empty((length, size), TICK)
         self._error = np.zeros(3)
 
     def at(self, tick: int) -> Rows:
-        """The records of one tick, `(B,)`."""
+        """Returns the records of one tick, `(B,)`."""
         return self.ticks[tick % len(self.ticks)]
 
     def blank(self, tick: int, rows: NDArray[np.bool] | slice) -> None:
@@ -76,5 +76,5 @@ class Log:
         self.at(tick).view(float).reshape(-1, len(SIGNALS))[rows] = np.nan
 
     def record(self, tick: int, plant: Rows, seen: Rows, goal: Rows, control: Rows) -> bool:
-        """Records a tick; see the kernel for the arguments and the result."""
+        """Records a tick; the arguments and the result are those of the kernel `record`."""
         return record.compiled(plant, seen, goal, control, self._error, self.at(tick))

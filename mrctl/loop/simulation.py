@@ -1,4 +1,4 @@
-"""THE closed loop: scenarios in, result out."""
+"""The closed loop: scenarios in, result out."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def run(
 
 
 def group_of(s: Scenario) -> Hashable:
-    """What runs in one simulation must share."""
+    """Returns what the runs of one simulation must share."""
     net = s.fel.hidden, s.composite.weights
     rates = s.ticks, s.physics_step, s.control_period, s.motion_period
     return s.world, s.robot, s.steering, s.feedforward, *rates, *net
@@ -146,20 +146,20 @@ class Simulation:
     """A uniform group of runs, one control period at a time.
 
     Attributes:
-        scenarios: What is run, with the events that were added.
+        scenarios: Scenario of each run, with the events that were added.
         model: The compiled world with the nominal robot.
-        courses: What the robots shall follow.
-        sensors: What the controllers are shown.
+        courses: The references that the robots follow.
+        sensors: The measurements that the controllers receive.
         hierarchy: The controllers.
         plant: The physics.
-        events: What happens to the robots.
-        log: What was recorded; nothing yet from `tick` on.
-        tick: Control periods done.
-        ticks: Control periods in the whole run.
+        events: The perturbations, pushes and other changes during the run.
+        log: The recorded signals; the records from `tick` on are not written yet.
+        tick: Number of control periods done.
+        ticks: Number of control periods in the whole run.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]) -> None:
-        """Compiles the world, stands the robots on their references, rolling.
+        """Compiles the world, and sets the robots on their references with the twist of the reference.
 
         Args:
             scenarios: Scenarios of one group, see `group_of`.
@@ -167,7 +167,7 @@ class Simulation:
             stages: As in `simulate`.
 
         Raises:
-            InputError: As `simulate`.
+            InputError: A scenario or a stage is refused, as in `simulate`.
         """
         first, size = scenarios[0], len(scenarios)
         self.scenarios = list(scenarios)
@@ -201,17 +201,17 @@ class Simulation:
 
     @property
     def running(self) -> bool:
-        """Whether there is anything left to do."""
+        """Whether the run goes on: ticks are left, and a robot has not failed."""
         return self.tick < self.ticks and self.plant.running > 0
 
     def add(self, event: Event) -> None:
-        """Adds an event to every run under way: `scenarios` then hold it, and run again give the same bits.
+        """Adds an event to every run; `scenarios` then contain it, and a new run of them gives the same bits.
 
         Args:
-            event: What happens, not before the coming tick.
+            event: The event, not before the coming tick.
 
         Raises:
-            InputError: It comes too late, or a scenario with it is refused; then nothing was added.
+            InputError: The event is in the past, or a scenario with it is refused; then nothing is added.
         """
         if event.tick(self.period) < self.tick:
             raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self.period:g} s")
@@ -230,10 +230,10 @@ class Simulation:
         self.settle()
 
     def sense(self) -> tuple[Rows, Rows]:
-        """Lets this tick's events happen and measures, once a tick.
+        """Applies the events of this tick and measures; further calls in the same tick only return the result.
 
         Returns:
-            What is measured, one record of `SEEN` a robot, and the references, one of `GOAL`.
+            Measurement of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each.
         """
         if self._sensed != self.tick:
             self._sensed = self.tick
@@ -243,7 +243,7 @@ class Simulation:
         return self.sensors.seen, self._goal
 
     def decide(self) -> Array:
-        """What comes before the physics: events, measurement, control.
+        """Does what comes before the physics: events, measurement and control.
 
         Returns:
             Commanded voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
@@ -251,23 +251,23 @@ class Simulation:
         hierarchy = self.hierarchy
         try:
             command = hierarchy.update(*self.sense())
-        except StageError as error:  # of the whole group: what was recorded until now is kept
+        except StageError as error:  # it concerns the whole group; the records until now are kept
             self._fail(dict.fromkeys(range(self.plant.size), str(error)))
             return hierarchy.output
         if isinstance(hierarchy, UserHierarchy):
             self._fail(hierarchy.faults)
-        if not hierarchy.finite:  # the limit would turn NaN into the full voltage
+        if not hierarchy.finite:  # the voltage limit would turn NaN into the full voltage
             for row in hierarchy.non_finite():
                 self.plant.fail(row, "non-finite voltage")
         return command
 
     def _fail(self, faults: dict[int, str]) -> None:
-        """Stops the robots whose user's stages failed."""
+        """Fails robots, for the reason that a user's stage gave for each."""
         for row, fault in faults.items():
             self.plant.fail(row, f"{fault}, tick {self.tick}")
 
     def settle(self) -> None:
-        """What comes after the physics: record and failures."""
+        """Does what comes after the physics: the record and the failures."""
         plant, tick = self.plant, self.tick
         near = self.log.record(tick, plant.state, self.sensors.seen, self._goal, self.hierarchy.state)
         if not near:
@@ -280,7 +280,7 @@ class Simulation:
             self.log.blank(tick, plant.failed)
 
     def result(self) -> xr.Dataset:
-        """What was recorded so far; the whole length, ending in NaN, once every robot has failed."""
+        """Returns the signals so far; if every robot has failed, of the whole run, with NaN at the end."""
         stage = self.hierarchy.feedforward
         weights = stage.weights.copy() if isinstance(stage, FeedbackErrorLearning) else None
         size, robot = len(self.scenarios), self.plant.robot
@@ -290,7 +290,7 @@ class Simulation:
         names = [self._label] * size, [self._feedforward] * size
         log, failure = self.log.ticks[:length], self.plant.failure
         found = dataset.dataset(self.scenarios, *names, log, failure, self._failure_time, weights)
-        return found.assign(  # what turns the commanded motion into features
+        return found.assign(  # the constants that turn the commanded motion into features
             half_track=("run", np.full(size, robot.half_track), {"units": "m"}),
             feature_scale=(("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         )

@@ -1,7 +1,7 @@
-"""Stages of your own, named by their files: `my_file.py:MyController`, `motion=my_file.py:PurePursuit`.
+"""A user's own stages, named by their files: `my_file.py:MyController`, `motion=my_file.py:PurePursuit`.
 
-A name stands for a factory as `simulate` takes it; without a stage in front it is the feedforward's. Several are joined
-by commas. Loading runs the files.
+A name stands for a factory as `simulate` takes it; a name without a stage in front is a feedforward. Several names are
+joined by commas. Loading runs the files.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ class Part(NamedTuple):
 
 
 def parts(name: str) -> list[Part]:
-    """What a name consists of.
+    """Splits a name into its parts.
 
     Raises:
-        InputError: It is not of the form above, names no stage or one twice, or there is no such file.
+        InputError: The name is not of the form above, names an unknown stage or one twice, or a file is missing.
     """
     found: list[Part] = []
     for part in name.split(","):
@@ -42,7 +42,7 @@ def parts(name: str) -> list[Part]:
             raise InputError(f"controller: {part!r} is not of the form my_file.py:MyController")
         if stage not in METHODS:
             raise InputError(f"controller: {stage!r} is no stage; there are {', '.join(METHODS)}")
-        if stage in {one.stage for one in found}:
+        if stage in {known.stage for known in found}:
             raise InputError(f"controller: {stage} is there twice")
         if not Path(file).is_file():
             raise InputError(f"controller: no file {file}")
@@ -51,15 +51,15 @@ def parts(name: str) -> list[Part]:
 
 
 def absolute(name: str) -> str:
-    """The same with whole paths, in the same words for the same controller."""
+    """Returns the name with absolute paths; it is the same for every spelling of the same controller."""
     return ",".join(f"{part.stage}={part.path}:{part.attribute}" for part in parts(name)).removeprefix("feedforward=")
 
 
 def digest(name: str) -> str:
-    """Tells whether two controllers have the same files.
+    """Returns a digest of the contents of the files, which is the same for the same controller.
 
     Raises:
-        InputError: As `parts`.
+        InputError: The name is refused, as by `parts`.
     """
     return hashlib.sha256(b"".join(part.path.read_bytes() for part in parts(name))).hexdigest()
 
@@ -69,7 +69,7 @@ def load(name: str) -> Stages:
     """Runs the files and returns the factories by stage, as keywords for `simulate`.
 
     Raises:
-        InputError: As `parts`; a file fails; it has no such name, or one that cannot be called.
+        InputError: The name is refused, as by `parts`; a file raises; or it has no such name that can be called.
     """
     factories: Any = {part.stage: _factory(part) for part in parts(name)}
     return factories
@@ -80,8 +80,8 @@ def _factory(part: Part) -> Any:  # noqa: ANN401
     module_name = f"mrctl_controller_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     assert spec and spec.loader
-    module = sys.modules[module_name] = importlib.util.module_from_spec(spec)  # dataclasses look there
-    sys.path.insert(0, str(path.parent))  # as for a script: what lies beside it can be imported
+    module = sys.modules[module_name] = importlib.util.module_from_spec(spec)  # where dataclasses look the module up
+    sys.path.insert(0, str(path.parent))  # as for a script, so that the file can import its neighbours
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
@@ -94,13 +94,13 @@ def _factory(part: Part) -> Any:  # noqa: ANN401
 
 
 def trial(name: str, scenario: Scenario) -> None:
-    """Tries factories and stages on two robots for a few ticks, before much is computed.
+    """Tries factories and stages on two robots for three ticks, before anything long is computed.
 
     Raises:
-        InputError: As `load`; the scenario is bad; or whatever went wrong in the controller.
+        InputError: The name is refused, as by `load`; the scenario is refused; or the controller fails.
     """
     stages = load(name)
-    Simulation([scenario])  # what is wrong with the scenario is no fault of the controller
+    Simulation([scenario])  # an error of the scenario is not blamed on the controller
     try:
         simulation = Simulation([scenario, scenario], **stages)
     except InputError as error:

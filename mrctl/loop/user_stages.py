@@ -1,4 +1,4 @@
-"""A user's own stages in the hierarchy: objects that are called in Python, with care, around the compiled laws."""
+"""A user's own stages in the hierarchy: Python objects that are called, and checked, between the compiled laws."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from mrctl.theory.robot import Robot
 
 
 class StageError(InputError):
-    """A user's stage raised, or did not return what it should; one line that names it."""
+    """A user's stage raised or returned something wrong; the message is one line that names the stage."""
 
 
 class UserStage:
-    """One stage of a user's, called with copies; what it returns is checked.
+    """One of a user's stages; it receives copies, and what it returns is checked.
 
     Attributes:
-        stage: The object.
-        title: Its stage and name, for messages.
+        stage: The user's object.
+        title: Names of the stage and of its factory, for messages.
     """
 
     def __init__(self, name: str, factory: Factory[Any], robot: Robot, size: int) -> None:
         """Makes the stage.
 
         Args:
-            name: Which stage it is.
-            factory: As the user gave it.
+            name: Name of the stage, such as `feedforward`.
+            factory: Factory from the user, which makes the object.
             robot: The nominal robot.
             size: Number of robots B.
 
         Raises:
-            StageError: There is no such stage, the factory raised, or what it made lacks a method.
+            StageError: There is no such stage, the factory raised, or its object lacks a method.
         """
         if name not in METHODS:
             raise StageError(f"{name}: no such stage; there are {', '.join(METHODS)}")
@@ -50,17 +50,17 @@ class UserStage:
         self._size = size
         try:
             self.stage: Any = factory(robot, size)
-        except Exception as error:  # noqa: BLE001 (it is the user's code, here and below)
+        except Exception as error:  # noqa: BLE001 (this is the user's code, here and below)
             raise self._raised(error) from error
         for method in METHODS[name]:
             if not callable(getattr(self.stage, method, None)):
                 raise StageError(f"{self.title}: has no method {method}")
 
     def call(self, method: str, *values: Any) -> Any:  # noqa: ANN401
-        """Calls a method with copies of arrays, in which the rows of robots that have blown up are zero.
+        """Calls a method with copies of the arrays, in which numbers that are not finite are zero.
 
         Raises:
-            StageError: It raised.
+            StageError: The method raised.
         """
         floats = [isinstance(v, np.ndarray) and v.dtype.kind == "f" for v in values]
         copies = [np.where(np.isfinite(v), v, 0.0) if real else v for v, real in zip(values, floats, strict=True)]
@@ -71,18 +71,18 @@ class UserStage:
             raise self._raised(error) from error
 
     def output(self, *values: Array) -> Array:
-        """Calls the method `output`, which must answer with two numbers a robot, `(B, 2)`.
+        """Calls the method `output`, which must return two numbers for each robot, `(B, 2)`.
 
         Raises:
-            StageError: It raised, or the answer has another shape.
+            StageError: The method raised, or returned another shape.
         """
         return self.checked(self.call("output", *values), (self._size, 2), "output")
 
     def checked(self, answer: object, shape: tuple[int, ...], what: str) -> Array:
-        """An answer as an array of float64.
+        """Returns an answer of the user's stage as an array of float64.
 
         Raises:
-            StageError: It has another shape, or is no array of numbers.
+            StageError: The answer has another shape, or is not an array of numbers.
         """
         try:
             array = np.asarray(answer, float)
@@ -101,14 +101,14 @@ class UserStage:
 
 @kernel
 def request_all(seen: Rows, goal: Rows, control: Rows) -> None:
-    """`request_motion` for all robots."""
+    """Calls `request_motion` for all robots."""
     for i in range(len(control)):
         request_motion(seen[i], goal[i], control[i])
 
 
 @kernel
 def command_all(seen: Rows, goal: Rows, robot: Rows, period: float, control: Rows) -> None:
-    """Limiter, prefilter and PID for all robots."""
+    """Calls limiter, prefilter and PID for all robots."""
     for i in range(len(control)):
         s = control[i]
         command_motion(goal[i], robot[0], period, s)
@@ -119,7 +119,7 @@ def command_all(seen: Rows, goal: Rows, robot: Rows, period: float, control: Row
 def apply_all(
     seen: Rows, inverse: Array, ones: Array, x: Array, robot: Rows, period: float, control: Rows
 ) -> tuple[bool, bool]:
-    """`apply_voltages` for all robots; whether all are finite, and whether a guard wants a learner to forget."""
+    """Calls `apply_voltages` for all robots; returns whether all are finite, and whether a learner is to be reset."""
     finite, forget = True, False
     for i in range(len(control)):
         finite &= apply_voltages(seen[i].slip, inverse, ones, x, robot[0], period, control[i])
@@ -129,20 +129,20 @@ def apply_all(
 
 @kernel
 def hand_over_all(control: Rows) -> None:
-    """`hand_over` for all robots."""
+    """Calls `hand_over` for all robots."""
     for i in range(len(control)):
         hand_over(control[i])
 
 
 class UserHierarchy(Hierarchy):
-    """The hierarchy with some stages of a user's; a tick calls them between compiled loops over the built-in laws.
+    """The hierarchy with some of a user's stages; a tick calls them between compiled loops over the built-in laws.
 
     Attributes:
-        faults: The robots for which a stage gave no finite number in the last tick, and what to say of it.
+        faults: Robots for which a stage returned a number that is not finite in the last tick, with the message.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], robot: Robot, stages: dict[str, UserStage]) -> None:
-        """Wires the stages, the user's by name and the scenarios' for the rest."""
+        """Wires the user's stages, by name, and the scenarios' stages for the rest."""
         self._stages = stages
         self._feedforward_stage = stages.get("feedforward")
         super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
@@ -160,7 +160,7 @@ class UserHierarchy(Hierarchy):
             stage.call("reset", steering_angle, self._period)
 
     def update(self, seen: Rows, goal: Rows) -> Array:
-        """One control tick; see `Hierarchy.update`."""
+        """Computes the commands of one control tick; see `Hierarchy.update`."""
         self.faults.clear()
         state, constants = self.state, (self._record, self._period)
         if self._tick % self._every == 0:
@@ -189,7 +189,7 @@ class UserHierarchy(Hierarchy):
         return self.output
 
     def _request(self, stage: UserStage, seen: Rows, goal: Rows) -> None:
-        """Asks the user's motion controller."""
+        """Calls the user's motion controller."""
         state = self.state
         reference = goal.view(float).reshape(len(goal), -1)
         if self._tick == 0:
@@ -199,7 +199,7 @@ class UserHierarchy(Hierarchy):
         state["correction"] = request - goal["twist"]
 
     def _feed_back(self, stage: UserStage, twist: Array) -> None:
-        """Asks the user's feedback, and shows its integral to guard and hand-over."""
+        """Calls the user's feedback, and copies its integral for guard and hand-over."""
         state = self.state
         self.feedback[:] = self._finite_rows(stage, stage.output(self.command, twist, state["allocation"]["excess"]))
         integral = getattr(stage.stage, "integral", None)
@@ -207,14 +207,14 @@ class UserHierarchy(Hierarchy):
         state["pid"]["integral"] = known
 
     def _forward(self, command: Array, derivative: Array) -> Array:
-        """The feedforward's output, the user's or a built-in one's."""
+        """Returns the output of the feedforward, the user's or a built-in one."""
         stage = self._feedforward_stage
         if not stage:
             return self.feedforward.output(command, derivative)
         return self._finite_rows(stage, stage.output(command, derivative))
 
     def _steer(self, stage: UserStage) -> None:
-        """Asks the user's steering, and limits it as `allocate` does."""
+        """Calls the user's steering, and limits it as `allocate` does."""
         state, limit = self.state, self._robot.steering_limit
         allocation, command = state["allocation"], self.command.copy()
         if self._rigid:
@@ -224,7 +224,7 @@ class UserHierarchy(Hierarchy):
         beyond = angle != answer[:, 0]
         rate = np.where(beyond, 0.0, answer[:, 1])
         self.output[:, 2], self.output[:, 3] = np.clip(angle + rate * self._period / 2, -limit, limit), rate
-        if self._rigid:  # the fork is what makes θ̇, so its limit is one of the second channel
+        if self._rigid:  # the fork makes θ̇, so its limit acts on the second channel
             clipped = (self.output[:, :2] != allocation["feedback"] + allocation["feedforward"]).any(axis=1)
             made = command[:, 0] * np.tan(angle) / self._robot.wheelbase
             allocation["excess"][:, 1] = np.where(beyond, made - command[:, 1], 0.0)
@@ -235,7 +235,7 @@ class UserHierarchy(Hierarchy):
             )
 
     def _learn(self, twist: Array) -> Array | None:
-        """Lets the feedforward learn, the user's or a built-in one; returns what that added to its output."""
+        """Lets the feedforward learn, the user's or a built-in one; returns the change of its output."""
         state, stage = self.state, self._feedforward_stage
         values = state["guard"]["teaching"], state["frozen"], twist, state["voltage"]
         if not stage:
@@ -246,7 +246,7 @@ class UserHierarchy(Hierarchy):
         return self._finite_rows(stage, stage.checked(added, self.feedback.shape, "what `learn` returns"))
 
     def _read_weight_norm(self) -> None:
-        """Reads the size of what the feedforward has learned, where it says so."""
+        """Reads the norm of the learner's weights, if the feedforward has it."""
         norm = getattr(self.feedforward, "weight_norm", None)
         if norm is None:
             return
@@ -263,7 +263,7 @@ class UserHierarchy(Hierarchy):
         return True
 
     def _finite_rows(self, stage: UserStage, answer: Array) -> Array:
-        """An answer whose rows that are not finite are zero; these robots are noted in `faults`."""
+        """Returns an answer with zeros in the rows that are not finite, and notes these robots in `faults`."""
         broken = np.any(~np.isfinite(answer), axis=1)
         for row in np.flatnonzero(broken):
             self.faults.setdefault(int(row), f"{stage.title}: not finite")

@@ -145,7 +145,7 @@ class Plant(ABC):
         Raises:
             InputError: The perturbed robot could not stand.
         """
-        if self._nominal_robots[robot] and perturbation == Perturbation():
+        if self._nominal_robots[robot] and perturbation == Perturbation() and delay == 0:
             return
         self._nominal_robots[robot] = False
         perturb(self._nominal, self._scratch, perturbation, self.robot)

@@ -1,4 +1,4 @@
-"""What the controller is shown: the measured posture and twist, and whether a wheel slips.
+"""The measurements that the controller receives: posture, twist, and the slip of the driven wheels.
 
 Imports `mrctl.kernel` and `mrctl.theory`.
 """

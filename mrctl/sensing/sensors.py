@@ -1,4 +1,4 @@
-"""What the controller is shown of the robot: the truth, or odometry from encoders and gyro, with noise; and slip."""
+"""The measurement that the controller receives: true motion or odometry from encoders and gyro, noise, and slip."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ SEEN = np.dtype(
         ("slip", "f8"),  # slip ratio of the driven wheel that slips more
         ("odometry", "?"),  # whether posture and twist come from encoders and gyro
         ("noise_scale", "f8", 5),  # standard deviations of the noise of x, y, θ, V, θ̇
-        ("noise", "f8", 5),  # its samples in this period
-        ("wheel_speeds", "f8", 2),  # left and right, by the encoders and the nominal wheel radius, m/s
-        ("elapsed", "f8"),  # since the last measurement, s; 0 at the start
+        ("noise", "f8", 5),  # samples of that noise in this period
+        ("wheel_speeds", "f8", 2),  # wheel speeds left and right, from encoders and nominal wheel radius, m/s
+        ("elapsed", "f8"),  # time since the last measurement, s; 0 at the start
     ],
     align=True,
 )
@@ -28,10 +28,12 @@ SEEN = np.dtype(
 
 @kernel
 def observe(true_pose: Array, true_twist: Array, s: Row) -> None:
-    """Measured posture and twist of one robot.
+    """Measured posture and twist of one robot: the truth plus noise, or odometry.
 
-    Odometry takes V from the encoders and θ̇ from the gyro and integrates them, the heading at its midpoint
-    (second-order Runge-Kutta); it starts from the true posture.
+        V = (v_l + v_r)/2,  θ̇ from the gyro;    ẋ = V cos θ,  ẏ = V sin θ
+
+    Odometry takes V from the encoders, adds noise to V and θ̇, and integrates them from the true initial posture, with
+    mean velocities and the heading at the middle of the period (second-order Runge-Kutta).
 
     Args:
         true_pose: x and y in m, θ in rad, `(3,)`.
@@ -55,7 +57,7 @@ def observe(true_pose: Array, true_twist: Array, s: Row) -> None:
 
 @kernel
 def measure(plant: Rows, wheel_radius: float, half_track: float, period: float, seen: Rows) -> None:
-    """Measures all robots; `plant` and `seen` hold a record of `PLANT` and of `SEEN` each."""
+    """Measures all robots: from a record of `PLANT` to one of `SEEN` for each."""
     for i in range(len(seen)):
         true, s = plant[i].reading, seen[i]
         for k in range(2):
@@ -69,14 +71,14 @@ class Sensors:
     """The sensors of B robots.
 
     Attributes:
-        seen: One record of `SEEN` a robot, as of the last measurement.
+        seen: Last measurement of each robot, a record of `SEEN`, `(B,)`.
     """
 
     def __init__(self, odometry: Sequence[bool], seeds: Sequence[int], robot: Robot, period: float) -> None:
         """Builds the sensors.
 
         Args:
-            odometry: Whether posture and twist of a robot come from its encoders and gyro.
+            odometry: For each robot, whether posture and twist come from encoders and gyro.
             seeds: Seed of the noise of each robot.
             robot: The nominal robot.
             period: Control period in s.
@@ -95,7 +97,7 @@ class Sensors:
         self._noisy = np.flatnonzero(self.seen["noise_scale"].any(axis=1)).tolist()
 
     def start(self, reading: Rows, rows: int | slice = slice(None)) -> None:
-        """Lets odometry start from the true posture and twist of robots, `READING` each."""
+        """Starts odometry of robots from their true posture and twist, a record of `READING` for each."""
         for name in ("pose", "twist"):
             self.seen[name][rows] = reading[name][rows]
         self.seen["elapsed"][rows] = self.seen["slip"][rows] = 0.0
@@ -110,10 +112,10 @@ class Sensors:
         """Measures all robots.
 
         Args:
-            plant: One record of `PLANT` a robot.
+            plant: Record of `PLANT` of each robot, `(B,)`.
 
         Returns:
-            `seen`.
+            `seen`, `(B,)`.
         """
         for row in self._noisy:
             self.seen["noise"][row] = self.seen["noise_scale"][row] * self._random[row].standard_normal(5)

@@ -1,11 +1,11 @@
-"""Slip of the driven wheels, as encoders and the measured motion show it."""
+"""Slip of the driven wheels, from encoders and the measured motion."""
 
 from __future__ import annotations
 
 from mrctl.kernel import Array, kernel
 
-SLIP_FILTER = 0.1  # s
-SLIP_SPEED = 0.3  # m/s that a slip is held against at least: noise is no slip of a wheel that stands
+SLIP_FILTER = 0.1  # s, time constant of the low-pass
+SLIP_SPEED = 0.3  # m/s, least speed to which a slip is related, so that noise is no slip of a wheel at rest
 
 
 @kernel
@@ -14,17 +14,21 @@ def slip_ratio(wheel_speeds: Array, twist: Array, half_track: float, period: flo
 
         |v_i − u_i| / max(|v_i|, |u_i|, 0.3 m/s),    u_l,r = V ∓ D θ̇
 
-    where v_i is the speed of a wheel by its encoder and u_i how fast the measured motion carries it over the floor. The
-    low-pass keeps a jolt from passing for slip, and lets a slip last until what a learner's filters hold of it is gone.
-    Odometry, whose V is the mean of the encoders, shows about half of what one wheel slips. A radius that is wrong by
-    some percent is a slip of as much, and noise one of 0.8 of its standard deviation over the speed.
+    where v_i is the speed of a wheel from its encoder, and u_i the speed at which the measured motion carries it over
+    the floor. The low-pass prevents a jolt from counting as slip, and prolongs a slip until the filters of a learner
+    have forgotten it. Odometry, whose V is the mean of the encoders, shows about half of the slip of one wheel. An
+    error of the wheel radius of some percent appears as a slip of as much, and noise as one of 0.8 of its standard
+    deviation over the speed.
 
     Args:
-        wheel_speeds: v left and right, by the encoders and the nominal wheel radius in m/s, `(2,)`.
-        twist: Measured V in m/s and θ̇ in rad/s `(2,)`.
+        wheel_speeds: v left and right, from encoders and nominal wheel radius, in m/s, `(2,)`.
+        twist: Measured V in m/s and θ̇ in rad/s, `(2,)`.
         half_track: D in m.
         period: Control period in s.
-        slip: The slip ratio of one period before.
+        slip: Slip ratio of the last period.
+
+    Returns:
+        Slip ratio of this period, dimensionless.
     """
     worst = 0.0
     for k in range(2):

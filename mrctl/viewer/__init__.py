@@ -1,4 +1,4 @@
-"""The viewer in the browser: live sessions, replays, and files that play by themselves.
+"""The viewer in the browser: live sessions, replays, and files that play without a server.
 
-It composes the simulation and owns no physics. Imports the loop, the results and the sweep.
+It drives the simulation of `mrctl.loop` and has no physics of its own. Imports the loop, the results and the sweep.
 """

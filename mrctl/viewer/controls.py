@@ -1,4 +1,4 @@
-"""Inputs of a page, made from the fields of a record and their limits."""
+"""Inputs of a page, made from the fields of a record of settings and their limits."""
 
 from __future__ import annotations
 
@@ -13,30 +13,31 @@ from pydantic.fields import FieldInfo
 
 from mrctl.record import Record
 
-Changed = Callable[[tuple[str, ...], Any], None]
+OnChange = Callable[[tuple[str, ...], Any], None]
 WORLDS = ("flat", "slope", "rough", "patch")
 
 
 class Controls:
-    """An input for every field of a record that is a number, a choice or a switch; records in it become folders.
+    """One input for every number, choice or switch of a record; records inside it become folders.
 
-    Of a record that comes in several kinds, every kind has its folder and the present one is seen. None is ever taken
-    away: a browser that is behind applies what it was sent in one go, removals first, and complains about the rest.
+    A record that comes in several kinds has a folder for each kind, of which only that of the present kind is visible.
+    No folder is ever removed: a slow browser applies several messages at once, removals first, and then reports errors
+    for messages to what it has removed.
     """
 
-    def __init__(self, gui: viser.GuiApi, changed: Changed) -> None:
-        """Takes the page's GUI and what is told of a change: the path of the field, and its new value."""
-        self._gui, self._changed = gui, changed
+    def __init__(self, gui: viser.GuiApi, on_change: OnChange) -> None:
+        """Takes the GUI of the page, and a function that receives the path and the new value of a changed field."""
+        self._gui, self._on_change = gui, on_change
         self._inputs: dict[tuple[str, ...], Any] = {}
         self._folders: dict[tuple[str, ...], viser.GuiFolderHandle] = {}
 
     def add(self, record: Record, path: tuple[str, ...] = (), only: Sequence[str] | None = None) -> None:
-        """Adds inputs where the GUI's context is.
+        """Adds inputs in the present context of the GUI.
 
         Args:
-            record: The present values.
-            path: Where it is in the whole.
-            only: Which of its fields; by default all.
+            record: Present values.
+            path: Names of the fields that lead to the record.
+            only: Names of the fields that get an input; by default all.
         """
         for name, field in type(record).model_fields.items():
             if only is None or name in only:
@@ -63,8 +64,8 @@ class Controls:
             handle = self._gui.add_checkbox(label, value, hint=hint)
         elif isinstance(value, int | float) and (limits := _limits(field, value)):
             low, high, step = limits
-            # Floats even for whole numbers: viser passes on what any page sends for an int, however large, and then
-            # cannot pack it for any other.
+            # Whole numbers are floats too: viser accepts an int of any size from a page, and then fails to pack it for
+            # the other pages.
             if high - low > 1e4 * step:
                 handle = self._gui.add_number(label, float(value), min=low, max=high, step=step, hint=hint)
             else:
@@ -75,15 +76,15 @@ class Controls:
 
     def _listen(self, path: tuple[str, ...], handle: Any) -> None:  # noqa: ANN401
         self._inputs[path] = handle
-        field = path[:-2] + path[-1:] if path[:-1] in self._folders else path  # the kind is no part of a field's path
+        field = path[:-2] + path[-1:] if path[:-1] in self._folders else path  # a field's path is without the kind
 
         @handle.on_update
         async def _(event: viser.GuiEvent) -> None:
             if event.client is not None:
-                self._changed(field, handle.value)
+                self._on_change(field, handle.value)
 
     def show(self, record: Record, path: tuple[str, ...] = ()) -> None:
-        """Sets the inputs below a path to the values of a record."""
+        """Sets the inputs of a record, whose path is given, to its values."""
         for name, field in type(record).model_fields.items():
             value, where = getattr(record, name), (*path, name)
             if isinstance(value, Record):
@@ -103,12 +104,12 @@ class Controls:
 
 
 def _kinds(field: FieldInfo) -> dict[str, type[Record]]:
-    """The alternatives of a record that comes in several kinds, by kind."""
+    """Returns the alternatives of a record that comes in several kinds, by kind; empty for other fields."""
     return {k.model_fields["kind"].default: k for k in typing.get_args(field.annotation) if field.discriminator}
 
 
 def _limits(field: FieldInfo, value: float) -> tuple[float, float, float] | None:
-    """Least and greatest value and a step that suits range and value, or None where a side is open."""
+    """Returns lower limit, upper limit and a suitable step of an input, or None for a field without both limits."""
     bounds = {type(m): getattr(m, type(m).__name__.lower()) for m in field.metadata if isinstance(m, Ge | Gt | Le | Lt)}
     low, high = bounds.get(Ge, bounds.get(Gt)), bounds.get(Le, bounds.get(Lt))
     if low is None or high is None:

@@ -11,42 +11,42 @@ from mrctl.record import InputError
 from mrctl.results.metrics import as_runs
 
 HEIGHT = 480  # pixels
-LONGEST = 60.0  # s; the page of a minute of two robots takes a few megabytes
+LONGEST = 60.0  # s, longest replay; the page of a minute of two robots takes a few megabytes
 
 
 class Replay:
-    """Runs in three dimensions with their curves, as one page; a notebook that ends a cell with it shows it.
+    """Runs in three dimensions with their curves, as one page; a notebook shows it when a cell ends with it.
 
-    It needs no server and no network, and what `jupyter nbconvert --to html` writes still has it.
+    The page needs neither a server nor a network, and remains in the file that `jupyter nbconvert --to html` writes.
 
     Attributes:
-        page: The page, HTML.
+        page: The page in HTML.
     """
 
     def __init__(self, page: str) -> None:
-        """Takes the page."""
+        """Takes the page in HTML."""
         self.page = page
 
     def _repr_html_(self) -> str:
         style = f"width: 100%; height: {HEIGHT}px; border: 1px solid #e5e7eb"
-        start = '<iframe class="mrctl-replay" title="replay" loading="lazy"'  # begins when a reader gets there
+        start = '<iframe class="mrctl-replay" title="replay" loading="lazy"'  # loads when a reader scrolls to it
         return f'{start} style="{style}" srcdoc="{html.escape(self.page)}"></iframe>'
 
 
 def replay(*results: xr.Dataset) -> Replay:
-    """Shows runs in three dimensions: the first one solid, the others as ghosts.
+    """Shows runs in three dimensions, the first one solid and the others as ghosts.
 
     Args:
-        results: What `simulate` returns, or some of it: `result.isel(run=[0, 2])` are two runs of it,
-            `result.sel(time=slice(84, 96))` is a stretch of time.
+        results: Results of `simulate`, or parts of them: `result.isel(run=[0, 2])` are two of the runs,
+            `result.sel(time=slice(84, 96))` is an interval of time.
 
     Raises:
-        InputError: No run, more than a minute of one, or runs of different worlds or control periods.
+        InputError: There is no run, a run is longer than a minute, or runs differ in world or control period.
     """
     from mrctl.viewer.export import page
-    from mrctl.viewer.recording import Recording, names
+    from mrctl.viewer.recording import Recording, labels_of
 
-    runs = [one.isel(run=k) for one in map(as_runs, results) for k in range(one.sizes["run"])]
+    runs = [result.isel(run=k) for result in map(as_runs, results) for k in range(result.sizes["run"])]
     if not runs:
         raise InputError("results: no run to show")
     recordings = [Recording(run) for run in runs]
@@ -57,4 +57,4 @@ def replay(*results: xr.Dataset) -> Replay:
             raise InputError(
                 f"results: {recording.duration:g} s are too long for a page; select some with .sel(time=…)"
             )
-    return Replay(page(recordings, names(recordings, range(len(recordings)))))
+    return Replay(page(recordings, labels_of(recordings, range(len(recordings)))))

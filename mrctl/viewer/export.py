@@ -14,25 +14,25 @@ from numpy.typing import NDArray
 
 from mrctl.record import InputError
 from mrctl.viewer.plots import charts, legend
-from mrctl.viewer.recording import Recording, together
+from mrctl.viewer.recording import Recording, joint_log
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.server import Server
 
-PICTURES = 25  # a second
-SAMPLES = 1200  # in a curve
+PICTURE_RATE = 25  # pictures for each second of the replay
+SAMPLES = 1200  # about the largest number of samples in a curve
 PLAYER = Path(__file__).parent / "player.html"
 
 
 def export(recordings: Sequence[Recording], labels: Sequence[str], path: Path) -> None:
-    """Writes recordings as a page of their own.
+    """Writes recordings as one HTML file.
 
     Args:
-        recordings: As for `page`.
-        labels: As for `page`.
-        path: The file.
+        recordings: Runs in one world; the first one is solid, the others are ghosts.
+        labels: Label of each run.
+        path: File to write.
 
     Raises:
-        InputError: It exists or cannot be written.
+        InputError: The file exists or cannot be written.
     """
     if path.exists():
         raise InputError(f"export: {path} exists already; nothing was overwritten")
@@ -43,42 +43,42 @@ def export(recordings: Sequence[Recording], labels: Sequence[str], path: Path) -
 
 
 def page(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
-    """Recordings as a page with the 3-D scene and the curves, and one scrubber for both.
+    """Returns a page in HTML with the 3-D scene and the curves of recordings, and one scrubber for both.
 
     Args:
-        recordings: Runs in one world, the first one solid.
-        labels: A name a run.
+        recordings: Runs in one world; the first one is solid, the others are ghosts.
+        labels: Label of each run.
     """
     parts = {
         "legend": legend(labels),
         "scene": html.escape(_scene(recordings, labels)),
         "data": _curves(recordings, labels),
     }
-    return re.sub(r"{{(\w+)}}", lambda found: parts[found[1]], PLAYER.read_text())
+    return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], PLAYER.read_text())
 
 
 def _scene(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
-    """The scene with its player, as a page of its own."""
+    """Returns the scene with its player, as a complete page in HTML."""
     server = Server(port=0)
     try:
         scene = Scene(server, recordings[0].model, labels)
         scene.show_recordings(recordings)
         duration = max(r.duration for r in recordings)
         serializer = server.get_scene_serializer()
-        for time in np.arange(0, duration, 1 / PICTURES):
+        for time in np.arange(0, duration, 1 / PICTURE_RATE):
             for row, recording in enumerate(recordings):
                 scene.show(row, recording.qpos(recording.index(time)))
             scene.show_payload(recordings[0].perturbation(time))
             scene.flush(follow=False)
-            serializer.insert_sleep(1 / PICTURES)
+            serializer.insert_sleep(1 / PICTURE_RATE)
         return serializer.as_html()
     finally:
         server.stop()
 
 
 def _curves(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
-    """The curves as JSON, safe inside a script element."""
-    times, log = together(recordings)
+    """Returns the curves as JSON that is safe inside a script element."""
+    times, log = joint_log(recordings)
     step = max(1, len(log) // SAMPLES)
     drawn = []
     for chart in charts(log, labels, recordings[0].period):

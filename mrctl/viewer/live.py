@@ -1,4 +1,4 @@
-"""A live session in the browser: drive, break the robot, watch it learn."""
+"""A live session in the browser: the robot drives, visitors perturb it, and it learns."""
 
 from __future__ import annotations
 
@@ -25,19 +25,20 @@ from mrctl.viewer.scene import Scene
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import CHANGEABLE, Session, changed
 
-WINDOW = 12.0  # s that the plots show
-SAMPLES = 300  # in a curve
-TIDY = 10.0  # s at least between two times that freed memory is handed back, which may take half a second
-UNMARKED = 3  # plots for each point of the trails
-BEHIND = 0.25  # s of wall time that are caught up with; what is more is lost
-# What the buttons do to the robots: label of the group, button, change of the perturbation or a push.
+WINDOW = 12.0  # s, time span of the plots
+SAMPLES = 300  # about the largest number of samples in a curve
+TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each of which may take half a second
+PLOTS_PER_MARK = 3  # updates of the plots for each point of the trails
+MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
+# Label of each group of buttons, its buttons, and the change of the perturbation or the push that a button makes.
 BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
     "Payload": {"drop payload": {"payload": 10.0, "payload_x": 0.05, "payload_y": 0.06}, "remove": {"payload": 0.0}},
     "Supply": {"sag supply": {"supply_factor": 0.7}, "restore": {"supply_factor": 1.0}},
     "Floor": {"slippery patch": {"tyre_friction_factor": 0.15}, "dry": {"tyre_friction_factor": 1.0}},
     "Push": {"push": {"push": (0.0, 60.0, 0.0)}, "spin": {"push": (0.0, 0.0, 15.0)}},
 }
-RUN = ("world", "steering", "reference", "measurement", "seed", "prefilter")
+# Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
+NEW_RUN = ("world", "steering", "reference", "measurement", "seed", "prefilter")
 HIDDEN = (
     "name",
     "laps",
@@ -52,31 +53,31 @@ HIDDEN = (
 
 
 class Live(Page):
-    """The page of a live session: between two ticks, its loop does what visitors have asked for."""
+    """The page of a live session; its loop carries out the requests of visitors between two ticks."""
 
     def __init__(self, scenarios: Sequence[Scenario], server: Server) -> None:
-        """Builds the page and stands the robots on their references.
+        """Builds the page and sets the robots on their references.
 
         Args:
-            scenarios: A scenario a robot, the first one solid, the others ghosts.
-            server: Where the page is served.
+            scenarios: Scenario of each robot; the first one is solid, the others are ghosts.
+            server: Server of the page.
 
         Raises:
-            InputError: As `Session`.
+            InputError: A scenario is refused, as by `Session`.
         """
         super().__init__(server)
         self.session = Session(scenarios)
-        self.factor = 0.0  # simulated time over wall time, of the last second
-        self.late = self.ticks = 0  # ticks that began over a period after they were due, and all at a finite speed
-        self._owed = 0.0  # ticks that are due
-        self._wishes: dict[tuple[str, ...], Any] = {}
-        self._cast: tuple[object, ...] | None = None  # what the scene was built for
+        self.factor = 0.0  # ratio of simulated to wall time in the last second
+        self.late = self.ticks = 0  # ticks that began more than a period too late, and all ticks, at a finite speed
+        self._due = 0.0  # number of ticks that are due
+        self._changed_inputs: dict[tuple[str, ...], Any] = {}
+        self._shown_setup: tuple[object, ...] | None = None  # world, robot, steering and labels of the present scene
         self._drawn: tuple[int, bool] | None = None
         self._plotted: int | None = None
-        self._unmarked = 0
+        self._plots_since_mark = 0
         self._tidied = time.monotonic()
         self._build()
-        self._stage()
+        self._show_session()
 
     # -- the page ------------------------------------------------------------------------------------------------
 
@@ -100,7 +101,7 @@ class Live(Page):
             async def _(event: viser.GuiEvent) -> None:
                 self.ask(self._save, event.client)
 
-        self._controls = Controls(gui, partial(self.ask, self._wish))
+        self._controls = Controls(gui, partial(self.ask, self._note_input))
         first, changing = self.session.start[0], [name for name in Scenario.model_fields if name not in HIDDEN]
         with tabs.add_tab("Robot"):
             self._controls.add(first, only=["perturbation"])
@@ -113,22 +114,22 @@ class Live(Page):
                 for name, ghost in self._ghosts.items():
                     self.on(ghost, partial(self._compare, name))
             self._learning = gui.add_checkbox("learning", True)
-            self.on(self._learning, lambda on: self._happen(learning=on))
-            self._controls.add(first, only=[n for n in changing if n not in (*RUN, "perturbation", "feedforward")])
+            self.on(self._learning, lambda on: self._apply_event(learning=on))
+            self._controls.add(first, only=[n for n in changing if n not in (*NEW_RUN, "perturbation", "feedforward")])
         with tabs.add_tab("Run"):
-            self._controls.add(first, only=RUN)
+            self._controls.add(first, only=NEW_RUN)
 
-    def _stage(self) -> None:
-        """Puts the robots of the session into the scene and the plots."""
+    def _show_session(self) -> None:
+        """Shows the robots of a new session in the scene and in the plots."""
         session, first = self.session, self.session.start[0]
         labels = [s.name or s.feedforward for s in session.start]
-        cast = (first.world, first.robot, first.steering, labels)
-        if self._cast != cast:
-            if self._cast is not None:
+        setup = (first.world, first.robot, first.steering, labels)
+        if self._shown_setup != setup:
+            if self._shown_setup is not None:
                 self._scene.remove()
-            self._cast = cast
+            self._shown_setup = setup
             self._scene = Scene(self.server, session.simulations[0][1].model, labels)
-            self._plots.cast(labels, session.period)
+            self._plots.set_robots(labels, session.period)
         self._scene.show_reference(first)
         self._scene.forget_trails()
         self._controls.show(first)
@@ -138,7 +139,7 @@ class Live(Page):
         self._counted = (time.monotonic(), session.tick)
         self._describe()
 
-    # -- what visitors ask for, carried out by the loop -------------------------------------------------------------
+    # -- requests of visitors, carried out by the loop --------------------------------------------------------------
 
     def _command(self, name: str) -> None:
         if name == "reset":
@@ -150,27 +151,27 @@ class Live(Page):
             self.playing = name == "play" and self.session.running
 
     def _set_speed(self, speed: float) -> None:
-        self.speed, self._owed = speed, 0.0
+        self.speed, self._due = speed, 0.0
 
     def _press(self, choices: dict[str, dict[str, Any]], name: str) -> None:
         change = choices[name]
         if "push" in change:
-            return self._happen(**change)
+            return self._apply_event(**change)
         now: Perturbation = self.session.state()["perturbation"]
-        self._happen(perturbation=now.model_copy(update=change))
+        self._apply_event(perturbation=now.model_copy(update=change))
 
-    def _happen(self, **change: Any) -> None:  # noqa: ANN401
-        self.session.happen(**change)
+    def _apply_event(self, **change: Any) -> None:  # noqa: ANN401
+        self.session.apply(**change)
         self._describe()
 
-    def _wish(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
-        """Remembers what an input was set to; while it is dragged, the last value counts."""
-        self._wishes[path] = value
+    def _note_input(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
+        """Notes the value of an input; while a slider is dragged, only the last value counts."""
+        self._changed_inputs[path] = value
 
-    def _grant(self) -> None:
-        """Does what the inputs were set to: an event where that can be, another run where not."""
-        wishes, self._wishes = self._wishes, {}
-        for path, value in wishes.items():
+    def _apply_inputs(self) -> None:
+        """Applies the noted inputs: as an event if the field can change during a run, otherwise in a new run."""
+        inputs, self._changed_inputs = self._changed_inputs, {}
+        for path, value in inputs.items():
             try:
                 self._apply(path, value)
             except InputError as error:
@@ -184,7 +185,7 @@ class Live(Page):
         if path == ("reference",):
             value = {"kind": value}
         if name in CHANGEABLE:
-            return self._happen(**{name: changed(self.session.state()[name], rest, value)})
+            return self._apply_event(**{name: changed(self.session.state()[name], rest, value)})
         start = self.session.start
         touched = start[:1] if name == "feedforward" else start
         others = start[len(touched) :]
@@ -193,7 +194,7 @@ class Live(Page):
         self._restart(new)
 
     def _present(self, scenario: Scenario) -> Scenario:
-        """A scenario that starts as things are now."""
+        """Returns the scenario with the present values of the fields that events have changed."""
         state = self.session.state()
         return scenario.model_copy(update={name: state[name] for name in CHANGEABLE})
 
@@ -206,16 +207,16 @@ class Live(Page):
 
     def _restart(self, scenarios: Sequence[Scenario]) -> None:
         self.session = Session(scenarios)
-        if time.monotonic() > self._tidied + TIDY:
+        if time.monotonic() > self._tidied + TIDY_INTERVAL:
             self._tidied = time.monotonic()
             _tidy()
         self.message = ""
         self._learning.value = True
-        self._stage()
+        self._show_session()
 
     def _save(self, client: viser.ClientHandle) -> None:
         if client.client_id not in self.server.get_clients():
-            return  # left meanwhile
+            return  # the visitor has left in the meantime
         for scenario in self.session.saved():
             name = f"session-{scenario.name or scenario.feedforward}.toml"
             client.send_file_download(name, scenario.to_toml().encode(), save_immediately=True)
@@ -226,23 +227,23 @@ class Live(Page):
     def advance(self, elapsed: float, until: float) -> None:
         session = self.session
         if self.speed == float("inf"):
-            self._owed = 0.0
+            self._due = 0.0
             while session.running and time.monotonic() < until:
                 session.step()
         else:
             pace = self.speed / session.period
-            self._owed = min(self._owed + elapsed * pace, max(1.0, BEHIND * pace))
-            while self._owed >= 1 and session.running and time.monotonic() < until:
-                self.late += self._owed > 1 + self.speed
+            self._due = min(self._due + elapsed * pace, max(1.0, MAX_BACKLOG * pace))
+            while self._due >= 1 and session.running and time.monotonic() < until:
+                self.late += self._due > 1 + self.speed
                 session.step()
-                self._owed -= 1
+                self._due -= 1
                 self.ticks += 1
         if not session.running:
             self.playing = False
 
     @override
-    def rest(self) -> float:
-        return (1 - self._owed) * self.session.period / self.speed
+    def idle_time(self) -> float:
+        return (1 - self._due) * self.session.period / self.speed
 
     @override
     def draw(self) -> None:
@@ -257,13 +258,13 @@ class Live(Page):
 
     @override
     def refresh(self) -> None:
-        self._grant()
+        self._apply_inputs()
         session, now = self.session, time.monotonic()
         since, tick = self._counted
         if now - since >= 1:
             self.factor = (session.tick - tick) * session.period / (now - since)
             self._counted = now, session.tick
-        state = "playing" if self.playing else "paused" if session.running else "over: reset starts anew"
+        state = "playing" if self.playing else "paused" if session.running else "finished; reset starts again"
         lap = 1 + int(session.time / session.start[0].reference.period)
         factor = f" · {self.factor:.2f}× real time" if self.playing else ""
         lines = [f"<b>{session.time:.2f} s</b> · lap {lap} · {state}{factor}"]
@@ -275,9 +276,9 @@ class Live(Page):
         write(self._status, block("status", *lines))
         if session.tick != self._plotted and session.tick > 1:
             self._plotted = session.tick
-            self._unmarked += 1
-            if self.playing and self._unmarked >= UNMARKED:
-                self._unmarked = 0
+            self._plots_since_mark += 1
+            if self.playing and self._plots_since_mark >= PLOTS_PER_MARK:
+                self._plots_since_mark = 0
                 self._scene.mark_trails()
             ticks = round(WINDOW / session.period)
             step = max(1, ticks // SAMPLES)
@@ -287,14 +288,14 @@ class Live(Page):
             self._plots.show(times, log, step)
 
     def _describe(self) -> None:
-        """Writes the timeline, and sets the inputs to what holds now."""
+        """Writes the timeline, and sets the inputs to the present values."""
         scenario = max(self.session.saved(), key=lambda s: len(s.events))
         before: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE}
         lines = []
         for event in sorted(scenario.events, key=lambda e: e.time):
-            lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_what(event, before))}")
+            lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_in_words(event, before))}")
             before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
-        write(self._timeline, block("timeline", *(reversed(lines[-50:]) if lines else ["nothing has happened yet"])))
+        write(self._timeline, block("timeline", *(reversed(lines[-50:]) if lines else ["no events yet"])))
         state = self.session.state()
         self._scene.show_payload(state["perturbation"])
         for name in CHANGEABLE:
@@ -302,14 +303,14 @@ class Live(Page):
 
 
 def _tidy() -> None:
-    """Hands the memory of the session before back; glibc would keep the gaps between its models, and they add up."""
+    """Returns the memory of old sessions to the system; glibc would keep the gaps between models, which add up."""
     gc.collect()
     with contextlib.suppress(OSError, AttributeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _what(event: Event, before: dict[str, Any]) -> str:
-    """An event in words."""
+def _in_words(event: Event, before: dict[str, Any]) -> str:
+    """Returns an event in words."""
     parts = []
     for name in CHANGEABLE:
         if (new := getattr(event, name)) is not None:
@@ -319,7 +320,7 @@ def _what(event: Event, before: dict[str, Any]) -> str:
                 if getattr(new, field) != getattr(before[name], field)
             ]
     if event.reference is not None:
-        parts.append(f"now along a {event.reference.kind.replace('_', ' ')}")
+        parts.append(f"new reference: {event.reference.kind.replace('_', ' ')}")
     if event.push is not None:
         parts.append("push {:g} N, {:g} N, {:g} N·m".format(*event.push))
     if event.learning is not None:

@@ -1,4 +1,4 @@
-"""What every page has: a queue of requests, and the one loop that carries them out."""
+"""The base of every page: a queue of requests, and the loop that carries them out."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ import viser
 from mrctl.record import InputError
 from mrctl.viewer.server import Server
 
-FRAME, REFRESH = 1 / 25, 1 / 15  # s of wall time between pictures, and between plots
+FRAME, REFRESH = 1 / 25, 1 / 15  # s of wall time between two pictures, and between two updates of the plots
 SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "as fast as it goes": float("inf")}
 
 
 class Page(ABC):
     """A page and the loop behind it.
 
-    Whatever a visitor does is queued and carried out by the loop; nothing happens in a callback.
+    Each action of a visitor is queued, and the loop carries it out; a callback itself changes nothing.
 
     Attributes:
-        server: Where the page is served.
+        server: Server of the page.
         playing: Whether time goes on.
-        speed: Simulated over wall time that is asked for.
-        message: What went wrong last, or "".
-        curves: The tab for plots.
+        speed: Requested ratio of simulated to wall time.
+        message: Last error, or "".
+        curves: Tab for the plots.
     """
 
     def __init__(self, server: Server) -> None:
-        """Takes the server; whoever inherits builds the page."""
+        """Takes the server; a subclass builds the rest of the page."""
         self.server = server
         self.playing = True
         self.speed = 1.0
@@ -49,55 +49,55 @@ class Page(ABC):
         server.gui.main_panel.dock_right()
 
     def ask(self, action: Callable[..., None], *arguments: Any) -> None:  # noqa: ANN401
-        """Lets the loop do something, in the order of asking; from any thread."""
+        """Queues an action for the loop; any thread may call this."""
         self._requests.put(partial(action, *arguments))
 
     def on(self, handle: Any, action: Callable[[Any], None]) -> None:  # noqa: ANN401
-        """Asks for an action with the new value whenever a visitor uses an input; coroutines keep their order."""
+        """Queues an action with the new value whenever a visitor uses an input."""
 
-        async def called(event: viser.GuiEvent) -> None:
+        async def called(event: viser.GuiEvent) -> None:  # viser runs coroutines, unlike functions, in order
             if event.client is not None:
                 self.ask(action, event.target.value)
 
         (handle.on_click if hasattr(handle, "on_click") else handle.on_update)(called)
 
     def complain(self, reason: object) -> None:
-        """Says in page and terminal what went wrong."""
+        """Shows an error in the page and in the terminal."""
         self.message = str(reason)
         print(f"mrctl: {reason}", file=sys.stderr)
 
     def close(self) -> None:
-        """Lets `run` return after the present round."""
+        """Makes `run` return after the present iteration."""
         self._closing = True
 
     def run(self) -> None:
         """Serves the page until `close`."""
         last = next_frame = next_refresh = time.monotonic()
         while not self._closing:
-            self._obey()
+            self._run_requests()
             now = time.monotonic()
             elapsed, last = now - last, now
             if self.playing:
-                self._guarded(partial(self.advance, elapsed, now + FRAME))
+                self._report_errors(partial(self.advance, elapsed, now + FRAME))
             now = time.monotonic()
             if now >= next_frame:
                 next_frame = max(next_frame + FRAME, now)
-                self._guarded(self.draw)
+                self._report_errors(self.draw)
             if now >= next_refresh:
                 next_refresh = max(next_refresh + REFRESH, now)
-                self._guarded(self.refresh)
+                self._report_errors(self.refresh)
             wait = min(next_frame, next_refresh) - time.monotonic()
             if self.playing:
-                wait = min(wait, self.rest())
-            time.sleep(max(wait, 1e-3))  # the web server's thread needs its turns
+                wait = min(wait, self.idle_time())
+            time.sleep(max(wait, 1e-3))  # this lets the thread of the web server run
 
     @abstractmethod
     def advance(self, elapsed: float, until: float) -> None:
-        """Lets time go on by `elapsed` s of wall time, with time for it `until` then."""
+        """Advances the simulated time for `elapsed` s of wall time, but not beyond the monotonic time `until` in s."""
 
     @abstractmethod
-    def rest(self) -> float:
-        """Wall time until `advance` has something to do, s."""
+    def idle_time(self) -> float:
+        """Returns the wall time in s until `advance` has something to do."""
 
     @abstractmethod
     def draw(self) -> None:
@@ -105,10 +105,10 @@ class Page(ABC):
 
     @abstractmethod
     def refresh(self) -> None:
-        """Draws what need not be as smooth."""
+        """Updates plots and texts, which need fewer pictures per second than the robots."""
 
-    def _guarded(self, work: Callable[[], None]) -> None:
-        """Does a piece of work; what goes wrong in it is shown in page and terminal, and the loop goes on."""
+    def _report_errors(self, work: Callable[[], None]) -> None:
+        """Does a piece of work; an error in it is shown in page and terminal, and the loop goes on."""
         try:
             work()
         except InputError as error:
@@ -116,29 +116,30 @@ class Page(ABC):
         except Exception as error:
             self.playing = False
             traceback.print_exc(file=sys.stderr)
-            self.complain(f"{type(error).__name__}: {error} (details in the terminal; reset starts anew)")
+            self.complain(f"{type(error).__name__}: {error} (details in the terminal; reset starts again)")
 
-    def _obey(self) -> None:
+    def _run_requests(self) -> None:
+        """Carries out the queued requests."""
         while True:
             try:
                 request = self._requests.get_nowait()
             except queue.Empty:
                 return
             self.message = ""
-            self._guarded(request)
+            self._report_errors(request)
 
 
 def warning(text: str) -> str:
-    """Text in red."""
+    """Returns a text as red HTML."""
     return f'<span style="color:#b91c1c" class="mrctl-error">{html.escape(text)}</span>'
 
 
 def block(name: str, *lines: str) -> str:
-    """Lines of a page, which tests find by name."""
+    """Returns lines as an HTML block with the id `mrctl-NAME`."""
     return f'<div style="margin:0.4em 1em;max-height:9em;overflow:auto" id="mrctl-{name}">{"<br>".join(lines)}</div>'
 
 
 def write(handle: viser.GuiHtmlHandle, content: str) -> None:
-    """Replaces what a part of the page says."""
+    """Replaces the content of a part of the page, if it differs."""
     if handle.content != content:
         handle.content = content

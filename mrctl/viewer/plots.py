@@ -1,4 +1,4 @@
-"""Who does the work: the curves that live pages, replays and exported files show."""
+"""The curves in live pages, replays and exported files: tracking, and the shares of feedback and feedforward."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from viser import uplot
 
 from mrctl.kernel import Rows
 from mrctl.results.dataset import blank
-from mrctl.viewer.scene import REFERENCE, Colour, colour_of
+from mrctl.viewer.scene import REFERENCE_COLOUR, Colour, colour_of
 
 Array = NDArray[np.float64]
 
-SHARE_WINDOW = 1.0  # s over which the share of feedback is taken
-CURSOR: Colour = (150, 155, 160)
-MOST = 4  # robots whose curves are drawn
+SHARE_WINDOW = 1.0  # s over which the share of the feedback is averaged
+CURSOR_COLOUR: Colour = (150, 155, 160)
+MAX_ROBOTS = 4  # number of robots whose curves are drawn
 
 
 class Curve(NamedTuple):
@@ -39,14 +39,14 @@ class Chart(NamedTuple):
 
 
 def charts(log: Rows, labels: Sequence[str], period: float) -> list[Chart]:
-    """The charts of a record.
+    """Returns the charts of a log.
 
     Args:
-        log: One record of `results.dataset.TICK` a sample and robot, `(T, B)`.
-        labels: A name a robot.
+        log: Record of `results.dataset.TICK` for each sample and robot, `(T, B)`.
+        labels: Label of each robot.
         period: Time between samples in s.
     """
-    shown = range(min(len(labels), MOST))
+    shown = range(min(len(labels), MAX_ROBOTS))
 
     def signal(name: str, row: int) -> Array:
         return log[name][:, row]
@@ -55,7 +55,7 @@ def charts(log: Rows, labels: Sequence[str], period: float) -> list[Chart]:
         return [Curve(f"{labels[r]} {quantity}", colour_of(r), dashed, values[r]) for r in shown]
 
     def tracked(title: str, name: str) -> Chart:
-        reference = Curve("reference", REFERENCE, False, signal(f"{name}_ref", 0))
+        reference = Curve("reference", REFERENCE_COLOUR, False, signal(f"{name}_ref", 0))
         return Chart(title, [reference, *each(name, [signal(name, r) for r in shown])])
 
     def voltages(title: str, sign: float) -> Chart:
@@ -78,10 +78,10 @@ def charts(log: Rows, labels: Sequence[str], period: float) -> list[Chart]:
         tracked("V, m/s", "v"),
         tracked("θ̇, rad/s", "omega"),
         Chart("position error, mm", each("position error", position)),
-        Chart("share of the voltage from feedback, last second", each("share", shares)),
+        Chart("share of the voltage that is feedback, last second", each("share", shares)),
         voltages("Σ: feedback (solid), feedforward (dashed), V", 1.0),
         voltages("Δ: feedback (solid), feedforward (dashed), V", -1.0),
-        Chart("what has been learned, ‖W‖", each("weight norm", [signal("weight_norm", r) for r in shown])),
+        Chart("norm of the learned weights, ‖W‖", each("weight norm", [signal("weight_norm", r) for r in shown])),
         Chart(
             "saturated, guard (dashed)",
             each("saturated", [signal("saturated", r) for r in shown])
@@ -91,7 +91,7 @@ def charts(log: Rows, labels: Sequence[str], period: float) -> list[Chart]:
 
 
 def _moving_mean(values: Array, window: int) -> Array:
-    """Mean of the last `window` values, or of as many as there are; a NaN counts as 0."""
+    """Returns the mean of the last `window` values, or of fewer at the beginning; a NaN counts as 0."""
     total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(values))])
     end = np.arange(1, len(values) + 1)
     first = np.maximum(end - window, 0)
@@ -99,28 +99,29 @@ def _moving_mean(values: Array, window: int) -> Array:
 
 
 class Plots:
-    """uPlot charts in the page.
+    """The uPlot charts of a page.
 
-    A set of charts for each number of robots that comes, of which one is seen; as with `Controls`, nothing is removed.
+    There is a set of charts for each number of robots so far, of which one is visible; as in `Controls`, nothing is
+    removed.
     """
 
     def __init__(self, gui: viser.GuiApi, tab: viser.GuiTabHandle, cursor: bool = False) -> None:
-        """Takes the page's GUI and the tab where the charts go; with a cursor, `show` will be told where it stands."""
+        """Takes the GUI of the page and the tab for the charts; with `cursor`, `show` needs the time of a cursor."""
         self._gui, self._tab, self._cursor = gui, tab, cursor
         self._sets: dict[int, list[viser.GuiUplotHandle]] = {}
         with tab:
             self._legend = gui.add_html("")
 
-    def cast(self, labels: Sequence[str], period: float) -> None:
-        """Says whose curves come.
+    def set_robots(self, labels: Sequence[str], period: float) -> None:
+        """Sets the robots whose curves `show` will draw.
 
         Args:
-            labels: A name a robot.
+            labels: Label of each robot.
             period: Time between samples in s.
         """
         self._labels, self._period = labels, period
         self._legend.content = legend(labels)
-        size = min(len(labels), MOST)
+        size = min(len(labels), MAX_ROBOTS)
         if size not in self._sets:
             empty = charts(blank(2, size), labels[:size], period)
             with self._tab:
@@ -131,13 +132,13 @@ class Plots:
         self._handles = self._sets[size]
 
     def show(self, time: Array, log: Rows, step: int, cursor: float | None = None) -> None:
-        """Draws a record.
+        """Draws a log.
 
         Args:
-            time: Of the samples in s, `(T,)`.
-            log: One record of `TICK` a sample and robot, `(T, B)`.
-            step: Samples from one that is drawn to the next.
-            cursor: Where a vertical line stands, in s.
+            time: Times of the samples in s, `(T,)`.
+            log: Record of `TICK` for each sample and robot, `(T, B)`.
+            step: Number of samples from one drawn sample to the next.
+            cursor: Time of a vertical line in s.
         """
         for handle, chart in zip(self._handles, charts(log, self._labels, self._period), strict=True):
             curves = [np.ascontiguousarray(curve.values[::step]) for curve in chart.curves]
@@ -146,14 +147,14 @@ class Plots:
 
 
 def legend(labels: Sequence[str]) -> str:
-    """Which colour is whose, in HTML."""
+    """Returns the legend of robots and their colours in HTML."""
     keys = [f'<span style="color:rgb{colour_of(k)}">■ {html.escape(name)}</span>' for k, name in enumerate(labels)]
-    keys = [*keys[:MOST], f'<span style="color:rgb{REFERENCE}">■ reference</span>']
+    keys = [*keys[:MAX_ROBOTS], f'<span style="color:rgb{REFERENCE_COLOUR}">■ reference</span>']
     return f'<p style="margin:0.3em 1em">{" &nbsp; ".join(keys)}</p>'
 
 
 def _add(gui: viser.GuiApi, chart: Chart, cursor: bool) -> viser.GuiUplotHandle:
-    colours = [curve.colour for curve in chart.curves] + [CURSOR] * cursor
+    colours = [curve.colour for curve in chart.curves] + [CURSOR_COLOUR] * cursor
     dashes = [curve.dashed for curve in chart.curves] + [False] * cursor
     series = [
         uplot.Series(label="", stroke=f"rgb{colour}", width=1.5, dash=(5, 4) if dashed else (), points={"show": False})
@@ -172,7 +173,7 @@ def _add(gui: viser.GuiApi, chart: Chart, cursor: bool) -> viser.GuiUplotHandle:
 
 
 def _with_cursor(time: Array, curves: Sequence[Array], cursor: float) -> tuple[Array, ...]:
-    """Data for uPlot with one series more: a vertical line at a time, and a base line elsewhere."""
+    """Returns data for uPlot with one more series: a vertical line at the cursor, and a base line elsewhere."""
     at = min(int(np.searchsorted(time, cursor)), len(time) - 1)
     known = np.concatenate(curves)
     low, high = (np.nanmin(known), np.nanmax(known)) if np.isfinite(known).any() else (0.0, 0.0)

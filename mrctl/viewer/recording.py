@@ -1,4 +1,4 @@
-"""Runs that are over: their record, and where the robot was."""
+"""Finished runs: their signals, and the positions of the robot."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -30,24 +30,24 @@ from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.session import state
 
 Array = NDArray[np.float64]
-FEW = 4  # runs of a result that are all shown at once
+MAX_SHOWN = 4  # largest number of runs in a result that are all shown at the beginning
 WHEELS = {"wheel_left": "wheel_rate_left", "wheel_right": "wheel_rate_right"}
 
 
 class Recording:
-    """One run.
+    """One finished run, or an interval of it.
 
     Attributes:
-        scenario: What was run.
-        label: Its name.
+        scenario: Scenario of the run.
+        label: Name of the run.
         period: Time between samples in s.
-        start: Time of the first sample in the run, s; the times below are counted from there.
-        log: What was recorded, one record of `TICK` a sample, `(T,)`; as long as the robot drove.
-        failure: Why it stopped early, or "".
+        start: Time of the first sample since the start of the run in s; all methods count time from this sample.
+        log: Record of `TICK` for each sample until the end or the failure, `(T,)`.
+        failure: Reason of an early end, or "".
     """
 
     def __init__(self, run: xr.Dataset) -> None:
-        """Takes a single run of a result, or a stretch of one."""
+        """Takes a single run of a result, or an interval of one."""
         self.scenario: Scenario = scenarios_of(run)[0]
         self.label = str(run["label"].values)
         self.period = float(run.attrs["control_period"])
@@ -66,7 +66,7 @@ class Recording:
         return self.period * (len(self.log) - 1)
 
     def index(self, time: float) -> int:
-        """The sample at a time, or the last one."""
+        """Returns the index of the sample at a time in s, limited to the first and the last one."""
         return int(np.clip(round(time / self.period), 0, len(self.log) - 1))
 
     @cached_property
@@ -75,53 +75,53 @@ class Recording:
         return mjcf.load(self.scenario.world, self.scenario.steering, robot=self.scenario.robot)
 
     @cached_property
-    def _turned(self) -> dict[str, Array]:
-        """How far each wheel has turned at the samples, rad."""
+    def _wheel_angles(self) -> dict[str, Array]:
+        """Angle of each wheel at the samples in rad, `(T,)`."""
         log, robot = self.log, read_robot(self.model)
         rates = {wheel: log[name] for wheel, name in WHEELS.items()}
         rates |= front_rates(self.model, robot, log["v"], log["omega"], log["steering_angle"])
         return {wheel: self.period * np.cumsum(rate) for wheel, rate in rates.items()}
 
     def perturbation(self, time: float) -> Perturbation:
-        """What the plant did differently at a time."""
+        """Returns the perturbation of the plant at a time in s."""
         return state(self.scenario, self.start + time)["perturbation"]
 
-    def way(self, points: int = 600) -> Array:
-        """The way that P went, a little above the ground, `(points, 3)` in m."""
+    def path(self, points: int = 600) -> Array:
+        """Returns points of the path of P, a little above the ground, in m, `(points, 3)`."""
         rows = self.log[np.linspace(0, len(self.log) - 1, points).astype(int)]
         height = self.qpos(0)[2] - self.model.geom("wheel_left").size[0] + 0.01
         return np.column_stack([rows["x"], rows["y"], np.full(points, height)])
 
     def qpos(self, index: int) -> Array:
-        """Where the robot stood at a sample, `(nq,)`: on the ground, as recorded in the plane."""
+        """Returns the generalised position at a sample, `(nq,)`: the recorded plane motion, placed on the ground."""
         now = self.log[index]
         pose, twist = (np.array([now[name] for name in names]) for names in (("x", "y", "theta"), ("v", "omega")))
         qpos = stand(self.model, pose, twist).qpos
         steer(self.model, qpos, now["steering_angle"])
-        for wheel, angle in self._turned.items():
+        for wheel, angle in self._wheel_angles.items():
             qpos[self.model.joint(wheel).qposadr[0]] = angle[index]
         return qpos
 
 
-def together(recordings: Sequence[Recording]) -> tuple[Array, Rows]:
-    """Times `(T,)` in s and records of several runs, one of `TICK` a sample and run, `(T, B)`; NaN after its end."""
+def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows]:
+    """Returns times in s, `(T,)`, and a record of `TICK` for each sample and run, `(T, B)`; NaN after a run's end."""
     log = blank(max(len(r.log) for r in recordings), len(recordings))
     for k, r in enumerate(recordings):
         log[: len(r.log), k] = r.log
     return recordings[0].period * np.arange(len(log), dtype=float), log
 
 
-def names(recordings: Sequence[Recording], runs: Sequence[int]) -> list[str]:
-    """A label a run, with its number where they would be the same.
+def labels_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[str]:
+    """Returns a label for each run, with its number if labels would be equal.
 
     Raises:
-        InputError: Runs that do not go into one scene.
+        InputError: Runs differ in world, robot or control period, so they cannot share a scene.
     """
     first = recordings[0]
     for r in recordings:
-        for what in ("world", "robot", "control_period"):
-            if getattr(r.scenario, what) != getattr(first.scenario, what):
-                raise InputError(f"run: {r.label} drove with another {what} than {first.label}")
+        for field in ("world", "robot", "control_period"):
+            if getattr(r.scenario, field) != getattr(first.scenario, field):
+                raise InputError(f"run: {r.label} drove with another {field} than {first.label}")
     labels = [r.label for r in recordings]
     unique = len(set(labels)) == len(labels)
     return labels if unique else [f"{label} {run}" for label, run in zip(labels, runs, strict=True)]
@@ -131,28 +131,28 @@ class Library:
     """The runs of a result or of a sweep.
 
     Attributes:
-        table: A row a run: what varies, and the metrics of its last lap.
+        table: Row of each run with the values that vary and the metrics of its last lap.
     """
 
     def __init__(self, path: Path) -> None:
-        """Opens what `mrctl.save` or `mrctl sweep` wrote.
+        """Opens a folder that `mrctl.save` or `mrctl sweep` wrote.
 
         Raises:
-            InputError: There is neither, or nothing in it.
+            InputError: The folder is neither a result nor a sweep, or has no run yet.
         """
         self._path, self._result = path, None
         if (path / "sweep.json").is_file():
-            Store(path)  # refuses what is none
+            Store(path)  # raises if the folder is not a sweep
             self.table = pd.read_parquet(path / "runs.parquet").set_index("run", drop=False)
         else:
             result = store.open(path)
             self._result = result if "run" in result.dims else result.expand_dims("run")
             self.table = summary(self._result).set_index(np.arange(self._result.sizes["run"]))
         if self.table.empty:
-            raise InputError(f"{path}: holds no run yet")
+            raise InputError(f"{path}: there is no run in it yet")
 
     def recording(self, run: int) -> Recording:
-        """A run, read, or of a sweep simulated once more: the same bits without a record of every sample.
+        """Returns a run: one of a result is read, one of a sweep is simulated once more, with the same bits.
 
         Raises:
             InputError: There is no such run.

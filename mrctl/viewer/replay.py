@@ -1,4 +1,4 @@
-"""A replay in the browser: a result or a sweep, with a scrubber."""
+"""The replay of a result or a sweep in the browser, with a scrubber."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from typing_extensions import override
 from mrctl.record import InputError
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
-from mrctl.viewer.recording import FEW, Library, Recording, names, together
+from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, labels_of
 from mrctl.viewer.scene import Scene, colour_of
 from mrctl.viewer.server import Server
 
-SAMPLES = 800  # in a curve
-BOARD = np.array([4.0, 0.0, 2.2])  # m: width and height of the scatter in the scene
-CORNER = np.array([-2.0, 3.2, 0.3])  # m: where it stands
+SAMPLES = 800  # about the largest number of samples in a curve
+BOARD_SIZE = np.array([4.0, 0.0, 2.2])  # m, extent of the scatter plot in the scene along x, y and z
+BOARD_CORNER = np.array([-2.0, 3.2, 0.3])  # m, its lower left corner
 FAILED = (185, 28, 28)
 
 
 class Replay(Page):
-    """The page of runs that are over."""
+    """The page of finished runs."""
 
     def __init__(self, library: Library, runs: Sequence[int], server: Server) -> None:
         """Builds the page.
 
         Args:
-            library: Where runs come from.
-            runs: Which are shown, the first one solid.
-            server: Where the page is served.
+            library: The runs to choose from.
+            runs: Numbers of the runs to show; the first one is solid, the others are ghosts.
+            server: Server of the page.
 
         Raises:
-            InputError: A run that is not there, or runs in different worlds.
+            InputError: A run does not exist, or runs differ in world, robot or control period.
         """
         super().__init__(server)
         self.library = library
@@ -69,11 +69,10 @@ class Replay(Page):
             self.on(gui.add_button("Only this run"), lambda _: self._show(self.runs[:1]))
         numbers = [str(name) for name, values in table.select_dtypes("number").nunique().items() if values > 1]
         self._board: list[Any] = []
-        if len(table) > FEW and numbers:
+        if len(table) > MAX_SHOWN and numbers:
             with tabs.add_tab("All runs"):
-                gui.add_html(
-                    block("scatter", "Each sphere behind the track is a run; red ones have failed. Click one.")
-                )
+                text = "Each sphere behind the track is a run; red runs have failed. Click on one to show it."
+                gui.add_html(block("scatter", text))
                 last = "position_rmse" if "position_rmse" in numbers else numbers[-1]
                 self._axes = [
                     gui.add_dropdown(label, numbers, initial_value=value)
@@ -84,7 +83,7 @@ class Replay(Page):
             self._scatter()
 
     def _scatter(self) -> None:
-        """Puts all runs on a board behind the track, by two columns of the table."""
+        """Draws all runs as a scatter plot of two columns of the table, on a board behind the track."""
         scene, table = self.server.scene, self.library.table
         for node in self._board:
             node.remove()
@@ -93,10 +92,10 @@ class Replay(Page):
         known = np.isfinite(values).all(axis=1)
         if not known.any():
             self._board = []
-            raise InputError(f"{fields[0]}, {fields[1]}: no run has both")
+            raise InputError(f"{fields[0]}, {fields[1]}: no run has both numbers")
         low, high = values[known].min(axis=0), values[known].max(axis=0)
         share = (values[known] - low) / np.where(high > low, high - low, 1.0)
-        where = CORNER + share[:, [0, 0, 1]] * BOARD
+        where = BOARD_CORNER + share[:, [0, 0, 1]] * BOARD_SIZE
         failed = table["failed"].to_numpy(bool)[known]
         sphere = _sphere()
         points = scene.add_batched_meshes_simple(
@@ -111,7 +110,7 @@ class Replay(Page):
             if event.instance_index is not None:
                 self.ask(self._open, int(runs[event.instance_index]))
 
-        frame = np.array([CORNER, CORNER + BOARD * [1, 0, 0], CORNER + BOARD, CORNER + BOARD * [0, 0, 1], CORNER])
+        frame = BOARD_CORNER + BOARD_SIZE * [[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1], [0, 0, 0]]
         lines = np.stack([frame[:-1], frame[1:]], axis=1)
         labels = {
             "low": (f"{fields[0]} {low[0]:.3g}", [0, 0, -0.15]), "high": (f"{high[0]:.3g}", [1, 0, -0.15]),
@@ -121,7 +120,7 @@ class Replay(Page):
             points,
             scene.add_line_segments("/board/frame", lines, (120, 120, 120), thickness=0.01),
             *(
-                scene.add_label(f"/board/{key}", text, position=CORNER + BOARD * at)
+                scene.add_label(f"/board/{key}", text, position=BOARD_CORNER + BOARD_SIZE * at)
                 for key, (text, at) in labels.items()
             ),
         ]
@@ -131,16 +130,16 @@ class Replay(Page):
         self._chosen.value = float(run)
 
     def _show(self, runs: Sequence[int]) -> None:
-        """Puts runs into the scene and the plots."""
+        """Shows runs in the scene and in the plots."""
         recordings = [self.library.recording(run) for run in runs]
-        labels = names(recordings, runs)
+        labels = labels_of(recordings, runs)
         if self.recordings:
             self._scene.remove()
         self.runs, self.recordings = list(runs), recordings
         self._scene = Scene(self.server, recordings[0].model, labels)
         self._scene.show_recordings(recordings)
-        self._plots.cast(labels, recordings[0].period)
-        self._times, self._log = together(recordings)
+        self._plots.set_robots(labels, recordings[0].period)
+        self._times, self._log = joint_log(recordings)
         self.duration = float(self._times[-1])
         self.scrubber.max = self.duration
         self._scrub(self.time, pause=False)
@@ -162,8 +161,8 @@ class Replay(Page):
             self.playing = False
 
     @override
-    def rest(self) -> float:
-        return 1.0  # until the next picture
+    def idle_time(self) -> float:
+        return 1.0  # longer than the time to the next picture, which limits it
 
     @override
     def draw(self) -> None:
@@ -197,7 +196,7 @@ class Replay(Page):
 
 
 def _sphere() -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of an octahedron of 5 cm, a sphere for the eye at this size."""
+    """Returns vertices and faces of an octahedron of 5 cm radius, which looks like a sphere at this size."""
     corners = 0.05 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
     faces = [[a, b, c] for a in (0, 1) for b in (2, 3) for c in (4, 5)]
     faces = [f if np.linalg.det(corners[f]) > 0 else f[::-1] for f in faces]

@@ -1,4 +1,4 @@
-"""The world, its robots and their ways in three dimensions."""
+"""The world, its robots and their paths in three dimensions."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -25,50 +25,51 @@ from mrctl.viewer.recording import Recording
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
-# The first robot is solid, the others are translucent; curves of a robot have its colour.
+# The first robot is solid, the others are translucent; the curves of a robot have its colour.
 COLOURS: list[Colour] = [
     (37, 99, 235), (234, 88, 12), (22, 163, 74), (147, 51, 234), (8, 145, 178), (202, 138, 4), (219, 39, 119),
 ]  # fmt: skip
-REFERENCE: Colour = (110, 115, 122)
-TRAIL = 240  # points of the way that a robot has come
-TRAILS = 1600  # and of all together
-SEEN_FROM, SEEN_AT = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])  # in sizes of the reference
-NEAR = 1.2  # m that a view shows at least
-SEEN = 2  # the last geom group that is for the eye
+REFERENCE_COLOUR: Colour = (110, 115, 122)
+TRAIL_POINTS = 240  # number of points in the trail of a robot
+TRAIL_POINTS_OF_ALL = 1600  # largest number of points in the trails of all robots
+# Initial camera, relative to the middle of the reference and in units of its size.
+CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])
+LEAST_VIEW = 1.2  # m, least width of the view
+SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
 
 
 def colour_of(row: int) -> Colour:
-    """The colour of a robot."""
+    """Returns the colour of a robot."""
     return COLOURS[row % len(COLOURS)]
 
 
 class Scene:
-    """One world, one solid robot, any number of translucent ones.
+    """One world with one solid robot and any number of translucent ones.
 
-    Everything hangs below the node `/world`, so that following a robot moves that node instead of cameras.
+    Everything is below the node `/world`: to follow a robot, that node moves instead of the cameras.
     """
 
     def __init__(self, server: viser.ViserServer, model: mujoco.MjModel, labels: Sequence[str]) -> None:
         """Draws the world and its robots.
 
         Args:
-            server: Where to.
+            server: Server of the page.
             model: Compiled world; it is not changed.
-            labels: A name a robot.
+            labels: Label of each robot.
         """
         self.size = len(labels)
         self._scene = server.scene
         self._camera = server.initial_camera
         self._model, self._data = mjcf.clone(model), mujoco.MjData(model)
         round_ends = self._model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
-        self._model.geom_type[round_ends] = mujoco.mjtGeom.mjGEOM_CYLINDER  # which take thousands of triangles each
+        self._model.geom_type[round_ends] = mujoco.mjtGeom.mjGEOM_CYLINDER  # a capsule takes thousands of triangles
         self._radius = read_robot(model).wheel_radius
         self._root = self._scene.add_frame("/world", show_axes=False)
         chassis = model.body("chassis").id
         self._bodies = [b for b in range(model.nbody) if model.body_rootid[b] == chassis]
         self._chassis = self._bodies.index(chassis)
-        self._place = np.zeros((self.size, len(self._bodies), 3))
-        self._turn = np.tile([1.0, 0.0, 0.0, 0.0], (self.size, len(self._bodies), 1))
+        self._positions = np.zeros((self.size, len(self._bodies), 3))
+        self._quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (self.size, len(self._bodies), 1))
         self._draw_world()
         self._solid, self._ghosts = self._draw_robots()
         self._labels = [
@@ -123,7 +124,8 @@ class Scene:
             if others:
                 rough = _rough(model, geoms)
                 handle = self._scene.add_batched_meshes_simple(
-                    f"/world/ghosts/{name}", rough.vertices, rough.faces, self._turn[1:, k], self._place[1:, k],
+                    f"/world/ghosts/{name}", rough.vertices, rough.faces, self._quaternions[1:, k],
+                    self._positions[1:, k],
                     batched_colors=np.array([colour_of(row + 1) for row in range(others)], np.uint8),
                     opacity=0.4, lod="off", cast_shadow=False, receive_shadow=False,
                 )  # fmt: skip
@@ -131,28 +133,28 @@ class Scene:
         return solid, ghosts
 
     def show_reference(self, scenario: Scenario) -> None:
-        """Draws a lap of each reference of a scenario on the ground, and lets who comes see all of it."""
+        """Draws a lap of each reference of a scenario on the ground, and sets the initial camera to show them."""
         lines = []
         for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
             pose = reference.sample(np.linspace(0, reference.period, 401)).pose
             heights = [self._height(x, y) + 0.006 for x, y in pose[:, :2]]
             lines.append(np.column_stack([pose[:, :2], heights]))
-        self._lay("/world/reference", np.stack(lines), 0.025, REFERENCE)
+        self._draw_lines("/world/reference", np.stack(lines), 0.025, REFERENCE_COLOUR)
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
-        middle, size = (low + high) / 2, max(NEAR, *(high - low))
-        self._camera.position, self._camera.look_at = middle + size * SEEN_FROM, middle + size * SEEN_AT
+        middle, size = (low + high) / 2, max(LEAST_VIEW, *(high - low))
+        self._camera.position, self._camera.look_at = middle + size * CAMERA_POSITION, middle + size * CAMERA_TARGET
 
-    def _lay(self, name: str, lines: Array, width: float, colour: Colour) -> viser.MeshHandle:
-        """Lays lines `(B, n, 3)` on the ground as one mesh; of viser's thick lines each segment costs about as much."""
+    def _draw_lines(self, name: str, lines: Array, width: float, colour: Colour) -> viser.MeshHandle:
+        """Draws lines `(B, n, 3)` as one mesh; each segment of a thick line of viser's costs about as much."""
         vertices, faces = _ribbons(lines, width)
         return self._scene.add_mesh_simple(
             name, vertices, faces, color=colour, side="double", cast_shadow=False, receive_shadow=False
         )
 
     def show_recordings(self, recordings: Sequence[Recording]) -> None:
-        """Draws the reference and the ways of runs that are over."""
+        """Draws the references and the paths of finished runs."""
         self.show_reference(recordings[0].scenario)
-        self.show_trails(np.stack([recording.way() for recording in recordings]))
+        self.show_trails(np.stack([recording.path() for recording in recordings]))
 
     def _height(self, x: float, y: float) -> float:
         try:
@@ -161,33 +163,33 @@ class Scene:
             return 0.0
 
     def show(self, row: int, qpos: Array) -> None:
-        """Moves a robot; it is seen there after `flush`.
+        """Moves a robot; browsers receive the motion with `flush`.
 
         Args:
-            row: Which one.
-            qpos: Its generalised position `(nq,)`.
+            row: Index of the robot.
+            qpos: Generalised position of the robot, `(nq,)`.
         """
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
-        self._place[row], self._turn[row] = self._data.xpos[self._bodies], self._data.xquat[self._bodies]
+        self._positions[row], self._quaternions[row] = self._data.xpos[self._bodies], self._data.xquat[self._bodies]
 
     def flush(self, follow: bool) -> None:
-        """Sends what `show` has changed.
+        """Sends the positions of all robots to the browsers.
 
         Args:
-            follow: The first robot stays where it is on the screen, and the world moves.
+            follow: Whether the first robot stays in the middle of the screen, and the world moves.
         """
-        self._root.position = -self._place[0, self._chassis] * [1, 1, 0] if follow else np.zeros(3)
+        self._root.position = -self._positions[0, self._chassis] * [1, 1, 0] if follow else np.zeros(3)
         for k, frame in enumerate(self._solid):
-            frame.position, frame.wxyz = self._place[0, k], self._turn[0, k]
+            frame.position, frame.wxyz = self._positions[0, k], self._quaternions[0, k]
         for k, handle in self._ghosts:
-            handle.batched_positions = self._place[1:, k].astype(np.float32)
-            handle.batched_wxyzs = self._turn[1:, k].astype(np.float32)
+            handle.batched_positions = self._positions[1:, k].astype(np.float32)
+            handle.batched_wxyzs = self._quaternions[1:, k].astype(np.float32)
         for row, label in enumerate(self._labels):
-            label.position = self._place[row, self._chassis] + [0, 0, 0.4 + 0.12 * row]
+            label.position = self._positions[row, self._chassis] + [0, 0, 0.4 + 0.12 * row]
 
     def show_payload(self, perturbation: Perturbation) -> None:
-        """Draws a payload of its size (the density of water) where it is, or none."""
+        """Draws the payload as a cube with the density of water at its place; without a payload, it draws nothing."""
         p, box = perturbation, self._payload
         if p == self._shown:
             return
@@ -199,35 +201,37 @@ class Scene:
             box.position = (p.payload_x, p.payload_y, p.payload_z - self._radius)
 
     def mark_trails(self) -> None:
-        """Adds where the robots are to the ways that they have come."""
-        here = self._place[:, self._chassis] - [0, 0, self._radius - 0.01]
+        """Adds the present positions of the robots to their trails."""
+        here = self._positions[:, self._chassis] - [0, 0, self._radius - 0.01]
         if self._trails is None:
-            self._trails = np.repeat(here[:, None], min(TRAIL, TRAILS // self.size), axis=1)
+            self._trails = np.repeat(here[:, None], min(TRAIL_POINTS, TRAIL_POINTS_OF_ALL // self.size), axis=1)
         self._trails = np.concatenate([self._trails[:, 1:], here[:, None]], axis=1)
         self.show_trails(self._trails)
 
-    def show_trails(self, ways: Array) -> None:
-        """Draws ways, `(B, n, 3)` in m."""
-        groups = [ways[k :: len(COLOURS)] for k in range(min(self.size, len(COLOURS)))]
+    def show_trails(self, paths: Array) -> None:
+        """Draws the paths of the robots in m, `(B, n, 3)`."""
+        groups = [paths[k :: len(COLOURS)] for k in range(min(self.size, len(COLOURS)))]
         if not self._ribbons:
-            self._ribbons = [self._lay(f"/world/trail/{k}", group, 0.012, COLOURS[k]) for k, group in enumerate(groups)]
+            self._ribbons = [
+                self._draw_lines(f"/world/trail/{k}", group, 0.012, COLOURS[k]) for k, group in enumerate(groups)
+            ]
             return
         for ribbon, group in zip(self._ribbons, groups, strict=True):
             ribbon.vertices = _ribbons(group, 0.012)[0]
 
     def forget_trails(self) -> None:
-        """Begins the ways anew."""
+        """Removes the trails; new ones begin at the next mark."""
         for ribbon in self._ribbons:
             ribbon.remove()
         self._trails, self._ribbons = None, []
 
     def remove(self) -> None:
-        """Takes everything away."""
+        """Removes the world with everything in it."""
         self._root.remove()
 
 
 def _rough(model: mujoco.MjModel, geoms: Sequence[int]) -> trimesh.Trimesh:
-    """The geoms of one body without colours; what is round has few corners, since there may be many ghosts."""
+    """Returns the geoms of one body as one mesh without colours; round ones are coarse, since ghosts may be many."""
     sphere, ellipsoid = int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
     parts = []
     for geom in geoms:
@@ -246,7 +250,7 @@ def _rough(model: mujoco.MjModel, geoms: Sequence[int]) -> trimesh.Trimesh:
 
 
 def _ribbons(lines: Array, width: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Vertices `(2Bn, 3)` and triangles `(2B(n − 1), 3)` of level ribbons along lines `(B, n, 3)`."""
+    """Returns vertices `(2Bn, 3)` and triangles `(2B(n − 1), 3)` of level ribbons along lines `(B, n, 3)`."""
     along = np.gradient(lines[..., :2], axis=1)
     length = np.linalg.norm(along, axis=-1, keepdims=True)
     across = np.stack([-along[..., 1], along[..., 0]], axis=-1) / np.where(length > 0, length, 1)

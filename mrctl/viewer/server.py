@@ -26,10 +26,10 @@ ANYWHERE = ("0.0.0.0", "::")
 
 
 class Server(viser.ViserServer):
-    """Viser without what would let others in.
+    """A viser server that only this machine and pages of its own origin can reach.
 
-    Viser itself listens on all interfaces, moves to another port when one is taken, answers pages of any origin, and
-    opens a public tunnel for whoever asks.
+    Viser itself listens on all interfaces, moves to another port if one is in use, answers pages of any origin, and
+    opens a public tunnel for any client that asks.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 8080) -> None:
@@ -37,16 +37,16 @@ class Server(viser.ViserServer):
 
         Args:
             host: Address to listen on.
-            port: Port; 0 for any that is free.
+            port: Port to listen on; 0 for any free port.
 
         Raises:
-            InputError: The port is taken, or there is no such address here.
+            InputError: The port is in use, or this machine does not have the address.
         """
         with contextlib.closing(_reserve(host, port)) as taken:
             port = taken.getsockname()[1]
         with _guarded(host), _quiet():
             super().__init__(host, port, label="mrctl", verbose=False)
-        if self.get_port() != port:  # somebody was quicker
+        if self.get_port() != port:  # another program took it in the meantime
             self.stop()
             raise InputError(f"port: {port} is in use; choose another with --port")
         self.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
@@ -60,12 +60,12 @@ class Server(viser.ViserServer):
             print("mrctl: a request to share this page publicly was refused", file=sys.stderr)
 
     def stop(self) -> None:
-        """Stops to serve, quietly."""
+        """Stops serving, without viser's announcements."""
         with _quiet():
             super().stop()
 
     def announce(self) -> str:
-        """Where the page is, and what to know about reaching it."""
+        """Returns the address of the page, and how to reach it from another machine."""
         host, port = self.get_host(), self.get_port()
         if host in LOCAL:
             return (
@@ -74,15 +74,15 @@ class Server(viser.ViserServer):
             )
         return (
             f"open http://{host}:{port}  (Ctrl-C ends)\n"
-            f"warning: --host {host}: everyone who reaches this address controls the viewer; nobody is asked to log in"
+            f"warning: --host {host}: everyone who reaches this address controls the viewer, without a login"
         )
 
 
 def _reserve(host: str, port: int) -> socket.socket:
-    """A socket on the address, to know that it can be had.
+    """Returns a socket that listens on the address, which shows that the address is free.
 
     Raises:
-        InputError: It cannot.
+        InputError: The server cannot listen on the address.
     """
     if not 0 <= port <= 65535:
         raise InputError(f"port: {port} is not between 0 and 65535")
@@ -104,13 +104,13 @@ def _reserve(host: str, port: int) -> socket.socket:
 
 
 def _quiet() -> contextlib.AbstractContextManager[object]:
-    """Without viser's own announcements, which in a notebook go around stdout."""
+    """Suppresses viser's own announcements, which in a notebook bypass stdout."""
     return mock.patch.object(rich, "print")
 
 
 @contextlib.contextmanager
 def _guarded(host: str) -> Iterator[None]:
-    """Lets viser, which offers no way to say so, start its web server with a look at every request first."""
+    """Makes viser start its web server with a check of every request, for which viser has no option."""
     started = []
 
     def serve(*args: Any, process_request: Any, **kwargs: Any) -> Any:  # noqa: ANN401
@@ -127,8 +127,8 @@ def _guarded(host: str) -> Iterator[None]:
 def _admit(host: str, answer: Any, connection: ServerConnection, request: Request) -> Response | None:  # noqa: ANN401
     """Refuses requests that pages of another origin make through a visitor's browser.
 
-    The page must have been asked for by a name of this machine (a stranger's name may point here: DNS rebinding), and
-    a connection must come from that very page. Programs other than browsers send no origin, and could send any.
+    The host of the request must be a name of this machine, since a foreign name may point here (DNS rebinding), and the
+    origin must be a page of that host. Programs other than browsers send no origin, and could send any.
     """
     names, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
     known = host in ANYWHERE or all(urlsplit(f"//{name}").hostname in (*LOCAL, host) for name in names)

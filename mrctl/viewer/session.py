@@ -1,4 +1,4 @@
-"""Robots under way, and what was done to them: a session that ran live runs again headless to the bit."""
+"""A live session: robots that drive, and events that visitors add; its scenarios repeat it headless, bit for bit."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank
 from mrctl.scenario import Event, Scenario
 
-HOUR = 3600.0  # s of simulated time that a session has room for
-ALIKE = ("world", "robot", "steering", "control_period", "physics_step")
-# What can change in the middle of a run, by the name of the scenario's field; the rest needs another run.
+HOUR = 3600.0  # s of simulated time after which a session ends
+SHARED_FIELDS = ("world", "robot", "steering", "control_period", "physics_step")
+# Fields of a scenario that can change in the middle of a run; a change of another field needs a new run.
 CHANGEABLE = [name for name in ("perturbation", "kanayama", "pid") if name in Event.model_fields]
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
@@ -27,21 +27,22 @@ class Session:
     """One or more robots in one world, driven by `Simulation.step` alone.
 
     Attributes:
-        start: The scenarios as they were given.
-        simulations: Which of the robots, and their simulation.
-        tick: Control periods done.
+        start: Scenarios at the start of the session.
+        simulations: Indices of the robots in each simulation, and the simulation.
+        period: Control period in s.
+        tick: Number of control periods done.
     """
 
     def __init__(self, scenarios: Sequence[Scenario]) -> None:
-        """Stands the robots on their references.
+        """Sets the robots on their references.
 
         Args:
-            scenarios: A scenario a robot; their laps do not count, a session has room for an hour.
+            scenarios: Scenario of each robot; their laps are ignored, since a session lasts up to an hour.
 
         Raises:
-            InputError: As `mrctl.simulate`, or robots that differ in what they must share.
+            InputError: A scenario is refused, as by `mrctl.simulate`, or robots differ in a field of `SHARED_FIELDS`.
         """
-        for name in ALIKE:
+        for name in SHARED_FIELDS:
             if len({getattr(s, name) for s in scenarios}) > 1:
                 raise InputError(f"{name}: robots in one scene must share it")
         self.start = list(scenarios)
@@ -63,42 +64,42 @@ class Session:
 
     @property
     def running(self) -> bool:
-        """Whether a robot is left that drives."""
+        """Whether at least one robot still drives."""
         return any(sim.running for _, sim in self.simulations)
 
     def step(self) -> None:
-        """One control period of every robot."""
-        with np.errstate(invalid="ignore", over="ignore"):  # as `simulate`
+        """Does one control period of every robot."""
+        with np.errstate(invalid="ignore", over="ignore"):  # as in `simulate`
             for _, sim in self.simulations:
                 if sim.running:
                     sim.step()
         self.tick += 1
 
-    def happen(self, **change: Any) -> None:  # noqa: ANN401
-        """Lets something happen to every robot at the coming tick.
+    def apply(self, **change: Any) -> None:  # noqa: ANN401
+        """Applies an event to every robot at the coming tick.
 
         Args:
-            change: Fields of `Event`.
+            change: Fields of `Event`, without the time.
 
         Raises:
-            InputError: The change is refused; then nothing happened.
+            InputError: The event is refused; then nothing changes.
         """
         event = Event.from_dict({"time": self.time, **change})
         for _, sim in self.simulations:
-            if sim.tick == self.tick:  # not one that has stopped
+            if sim.tick == self.tick:  # the others have stopped
                 sim.add(event)
 
     def state(self) -> dict[str, Any]:
-        """What holds now of what can change: the fields `CHANGEABLE`, and `learning`."""
+        """Returns the present values of the fields `CHANGEABLE`, and `learning`."""
         return state(max(self.saved(), key=lambda s: len(s.events)), self.time)
 
     def saved(self) -> list[Scenario]:
-        """Scenarios that run again as the robots did, to the end of the lap that they are in."""
-        whole = [self._place[row][0].scenarios[self._place[row][1]] for row in range(self.size)]
+        """Returns scenarios that repeat the session, to the end of the present lap of each robot."""
+        whole = [sim.scenarios[k] for sim, k in (self._place[row] for row in range(self.size))]
         return [s.model_copy(update={"laps": max(1, ceil(self.time / s.reference.period - 1e-9))}) for s in whole]
 
     def log(self, first: int = 0) -> Rows:
-        """What was recorded from a tick on, one record of `TICK` a tick and robot; NaN of a robot that has stopped."""
+        """Returns the log from a tick on, a record of `TICK` for each tick and robot; NaN after a robot has stopped."""
         parts = blank(self.tick - first, self.size)
         for rows, sim in self.simulations:
             done = sim.log.ticks[first : sim.tick]
@@ -106,30 +107,30 @@ class Session:
         return parts
 
     def qpos(self, row: int) -> NDArray[np.float64]:
-        """Generalised position of a robot, `(nq,)`."""
+        """Returns the generalised position of a robot, `(nq,)`."""
         sim, k = self._place[row]
         return sim.plant.qpos[k]
 
     def failure(self, row: int) -> str:
-        """Why a robot has stopped, or ""."""
+        """Returns the reason why a robot has stopped, or ""."""
         sim, k = self._place[row]
         return sim.plant.failure[k]
 
 
 def state(scenario: Scenario, time: float) -> dict[str, Any]:
-    """What holds at a time of what can change in a run: the fields `CHANGEABLE`, and `learning`."""
-    found = {name: getattr(scenario, name) for name in CHANGEABLE} | {"learning": True}
+    """Returns the values of the fields `CHANGEABLE`, and of `learning`, at a time in s of a run."""
+    now: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE} | {"learning": True}
     for event in sorted(scenario.events, key=lambda e: e.time):
         if event.time <= time + 1e-9:
-            found |= {name: value for name in found if (value := getattr(event, name)) is not None}
-    return found
+            now |= {name: value for name in now if (value := getattr(event, name)) is not None}
+    return now
 
 
 def changed(record: AnyRecord, path: Sequence[str], value: object) -> AnyRecord:
-    """The record with one field changed, however deep.
+    """Returns a copy of the record in which the field at a path has another value.
 
     Raises:
-        InputError: The record refuses it.
+        InputError: The record refuses the value.
     """
     name, *rest = path
     if rest:

@@ -1,4 +1,4 @@
-"""The command `mrctl view`: which page shows what, and the server under it."""
+"""The command `mrctl view`: it chooses the page for a file, and serves or exports it."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ def view(
     """Shows robots in the browser: a live session, or the replay of a result or a sweep.
 
     Args:
-        file: Scenario, or folder of a result or sweep; None for the default scenario.
+        file: Scenario file, or folder of a result or a sweep; None for the default scenario.
         compare: Feedforwards of the ghosts beside a scenario.
-        run: Run of a result or sweep to begin with.
+        run: Number of the run of a result or a sweep that is shown first.
         export: File to write instead of serving a page.
         host: Address to listen on.
         port: Port to listen on.
 
     Raises:
-        InputError: What `mrctl.simulate` and `mrctl.open` refuse, an address that cannot be listened on, or options
-            that do not go together.
+        InputError: The file is refused, as by `mrctl.simulate` or `mrctl.open`; the server cannot listen on the
+            address; or options contradict each other.
     """
     from mrctl.viewer.export import export as write
     from mrctl.viewer.live import Live
-    from mrctl.viewer.recording import FEW, Library, Recording, names
+    from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, labels_of
     from mrctl.viewer.replay import Replay
 
     if file is not None and file.is_dir():
         if compare:
-            raise InputError("compare: a replay shows what was run; ghosts are chosen in the page")
+            raise InputError("compare: it needs a scenario; the ghosts of a replay are chosen in the page")
         library = Library(file)
         table = library.table
         shown = [int(table.index[0]) if run is None else run]
-        if run is None and len(table) <= FEW:
+        if run is None and len(table) <= MAX_SHOWN:
             shown = [int(k) for k in table.index]
         if export is not None:
             recordings = [library.recording(k) for k in shown]
-            return write(recordings, names(recordings, shown), export)
+            return write(recordings, labels_of(recordings, shown), export)
         return _serve(lambda server: Replay(library, shown, server), host, port)
     if run is not None:
         raise InputError("run: only a result or a sweep has several")
@@ -56,11 +56,12 @@ def view(
     if export is not None:
         result = simulate([scenario, *ghosts], progress=True)
         recordings = [Recording(result.isel(run=k)) for k in range(result.sizes["run"])]
-        return write(recordings, names(recordings, range(len(recordings))), export)
+        return write(recordings, labels_of(recordings, range(len(recordings))), export)
     return _serve(lambda server: Live([scenario, *ghosts], server), host, port)
 
 
 def _serve(page: Callable[[Server], Page], host: str, port: int) -> None:
+    """Serves a page until it is interrupted."""
     from mrctl.viewer.server import Server
 
     server = Server(host, port)

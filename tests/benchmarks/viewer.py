@@ -39,7 +39,7 @@ def resident() -> float:
 
 def recorded(live: Live) -> float:
     """What the session keeps in order to be saved and drawn, in MiB; it grows with simulated time, and goes with it."""
-    return sum(simulation.log[: simulation.tick].nbytes for _, simulation in live.session.simulations) / 2**20
+    return sum(simulation.log.ticks[: simulation.tick].nbytes for _, simulation in live.session.simulations) / 2**20
 
 
 def measure(robots: int, seconds: int) -> None:

@@ -144,8 +144,11 @@ def test_equal(scenarios, alone, chunk):
 @pytest.mark.parametrize("threads", [1, 2])
 def test_threads(scenarios, alone, threads, monkeypatch):
     """The number of threads changes nothing; a batch of one is no special case either."""
-    loop = import_module("mrctl.loop.simulation")
-    monkeypatch.setattr(loop, "build", lambda model, size, substeps, _: BatchPlant(model, size, substeps, threads))
+
+    def build(model, robot, size, substeps, _):
+        return BatchPlant(model, robot, size, substeps, threads)
+
+    monkeypatch.setattr(import_module("mrctl.loop.simulation"), "build", build)
     rows = range(0, COUNT, 3)
     whole = simulate([scenarios[row] for row in rows])
     for run, row in enumerate(rows):

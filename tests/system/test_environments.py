@@ -44,8 +44,8 @@ def expected(scenario, seed):
 
 
 def last(loop, row=0):
-    """The complete record of the tick that has just ended."""
-    return loop.log[(loop.tick - 1) % 2, row].copy()
+    """Returns every signal of the tick that has just ended, `(signals,)`."""
+    return np.array(loop.log.at(loop.tick - 1)[row].item())
 
 
 @pytest.mark.parametrize("feedforward", FEEDFORWARDS)
@@ -254,7 +254,7 @@ def test_actions():
     env.reset(seed=0)
     for _ in range(200):
         env.step(np.array([0.7, 0.3]) / env.episodes.bound)
-    np.testing.assert_allclose(env.episodes.plant.reading[0, 3:5], [0.7, 0.3], atol=0.03)
+    np.testing.assert_allclose(env.episodes.plant.reading["twist"][0], [0.7, 0.3], atol=0.03)
     volts = TrackingEnv(straight, "voltage")
     volts.reset(seed=0)
     for action, sent in (((0.5, -0.25), (12.0, -6.0)), ((1.5, -99.0), (24.0, -24.0))):

@@ -144,9 +144,10 @@ def test_gains():
     hierarchy = simulation.hierarchy
     for tick in range(4):
         simulation.step()
-        assert hierarchy.state["kanayama"][0, 0] == (9 if tick >= 2 else 3)
+        assert hierarchy.state["kanayama"]["k_x"][0] == (9 if tick >= 2 else 3)
         gains = Pid(time_constant=0.3 if tick >= 2 else 0.15).gains(simulation.plant.robot, False)
-        assert np.array_equal(hierarchy.state["pid_gains"][0], gains)
+        for name, value in gains.items():
+            assert tuple(hierarchy.state["pid"][name][0]) == value, name
 
 
 def test_reference():

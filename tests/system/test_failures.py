@@ -95,7 +95,7 @@ def test_non_finite_stage():
     bare = [scenario.model_copy(update={"guard": Guard(on=False)}) for scenario in HEALTHY]
     whole, sound = (
         simulate(bare, feedforward=BreaksAfter),
-        simulate(bare, feedforward=lambda robot, size: NoFeedforward(size)),
+        simulate(bare, feedforward=lambda robot, size: NoFeedforward(robot, size, False, PERIOD)),
     )
     tick = round(float(whole.failure_time[1]) / PERIOD) - 1
     check_record(whole.isel(run=1), f"feedforward BreaksAfter: not finite, tick {tick}")

@@ -98,7 +98,7 @@ def test_kept_with_the_result(tmp_path):
     again = mrctl.simulate(recording.scenario)
     np.testing.assert_array_equal(run["x"].values, again["x"].values)
     # A replay turns the wheels: the outer front wheel farthest, and all by the way over the radius.
-    turned = {w: a[-1] for w, a in recording._turned.items()}
+    turned = {w: a[-1] for w, a in recording._wheel_angles.items()}
     assert turned["front_right"] > turned["front_left"] > turned["wheel_left"]
     radius = float(mrctl.physics.parameters.read_robot(recording.model).wheel_radius)
     way = 2 * np.pi * 1.5

@@ -1,7 +1,5 @@
 """A session under way: what is done to it is kept, and the saved session runs again headless to the bit."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -34,14 +32,14 @@ def test_saved_session(reference, tmp_path):
     ]
     session = Session(scenarios)
     drive(session, 37)
-    session.happen(perturbation=Perturbation(payload=6, payload_x=0.05, velocity_noise=0.01))
-    session.happen(push=(0.0, 30.0, 0.0))
+    session.apply(perturbation=Perturbation(payload=6, payload_x=0.05, velocity_noise=0.01))
+    session.apply(push=(0.0, 30.0, 0.0))
     drive(session, 101)
-    session.happen(learning=False)
-    session.happen(kanayama=changed(session.state()["kanayama"], ["k_y"], 10.0))
+    session.apply(learning=False)
+    session.apply(kanayama=changed(session.state()["kanayama"], ["k_y"], 10.0))
     drive(session, 1)
-    session.happen(perturbation=changed(session.state()["perturbation"], ["control_delay"], 0.02))
-    session.happen(pid=changed(session.state()["pid"], ["time_constant"], 0.25))
+    session.apply(perturbation=changed(session.state()["perturbation"], ["control_delay"], 0.02))
+    session.apply(pid=changed(session.state()["pid"], ["time_constant"], 0.25))
     drive(session, 363)
     again = []
     for k, scenario in enumerate(session.saved()):
@@ -54,7 +52,7 @@ def test_saved_session(reference, tmp_path):
     same(session, [results.isel(run=k) for k in range(3)])
     alone = Session(scenarios[:1])
     drive(alone, 20)
-    alone.happen(push=(20.0, 0.0, 0.0))
+    alone.apply(push=(20.0, 0.0, 0.0))
     drive(alone, 60)
     same(alone, [simulate(alone.saved()[0])])
 
@@ -64,9 +62,9 @@ def test_refused_change():
     session = Session([BASE])
     drive(session, 5)
     with pytest.raises(InputError, match="tip over"):
-        session.happen(perturbation=Perturbation(payload=150, payload_x=-1))
+        session.apply(perturbation=Perturbation(payload=150, payload_x=-1))
     with pytest.raises(InputError, match="control_delay"):
-        session.happen(perturbation=Perturbation(control_delay=0.0123))
+        session.apply(perturbation=Perturbation(control_delay=0.0123))
     with pytest.raises(InputError, match="has passed"):
         session.simulations[0][1].add(_event(0.01))
     assert session.saved()[0].events == ()
@@ -83,7 +81,7 @@ def test_events_of_the_file():
     base = BASE.model_copy(update={"events": (_event(0.1), Event(time=0.2, perturbation=Perturbation(payload=3)))})
     session = Session([base])
     drive(session, 15)
-    session.happen(perturbation=Perturbation(supply_factor=0.8))
+    session.apply(perturbation=Perturbation(supply_factor=0.8))
     assert session.state()["perturbation"].payload == 0
     drive(session, 10)
     assert session.state()["perturbation"].payload == 3
@@ -96,8 +94,11 @@ def test_stopped_robot():
     session = Session([BASE, weak])
     drive(session, 1500)
     assert "lateral error" in session.failure(1) and session.failure(0) == ""
-    assert session.running and np.isnan(session.log(1400)[:, 1]).all() and np.isfinite(session.log(1400)[:, 0]).all()
-    session.happen(push=(0.0, 5.0, 0.0))
+    log = session.log(1400)
+    assert session.running
+    for name in SIGNALS:
+        assert np.isnan(log[name][:, 1]).all() and np.isfinite(log[name][:, 0]).all(), name
+    session.apply(push=(0.0, 5.0, 0.0))
     session.step()
 
 
@@ -128,7 +129,7 @@ def test_blocks(monkeypatch):
         BASE.model_copy(update={"reference": Circle(radius=0.6, period=4)}),
     ]
     whole = simulate(scenarios)
-    monkeypatch.setattr(sys.modules["mrctl.loop.simulation"], "BLOCK", 97)  # `mrctl.simulate` itself is the function
+    monkeypatch.setattr("mrctl.loop.courses.BLOCK", 97)
     parts = simulate(scenarios)
     for name in ("x_ref", "omega_ref", "x", "voltage_left"):
         assert parts[name].values.tobytes() == whole[name].values.tobytes()

@@ -1,4 +1,4 @@
-"""Somebody's own stages: any of the four can be replaced, what goes wrong in one is said, and the rest is kept."""
+"""A user's own stage replaces any of the four; an error in one is reported, and other runs are kept."""
 
 import numpy as np
 import pytest
@@ -7,10 +7,12 @@ import torch
 import mrctl
 from mrctl import Circle, InputError, Lemniscate, Scenario, Sweep
 from mrctl.cli import main
-from mrctl.control.kanayama import kanayama, posture_error
-from mrctl.control.pid import pid
+from mrctl.control.kanayama import GAINS, kanayama, posture_error
+from mrctl.control.nominal import nominal
+from mrctl.control.pid import PID, pid
 from mrctl.control.stages import METHODS
-from mrctl.control.steering import allocate, parameters
+from mrctl.control.steering import ALLOCATION, allocate
+from mrctl.kernel import over_rows
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
@@ -18,6 +20,13 @@ from mrctl.sweep import jobs
 SHORT = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
 THREE = [SHORT.model_copy(update={"seed": seed}) for seed in range(3)]
 LAP = Scenario(reference=Lemniscate(period=10), laps=1)
+
+
+def posture_errors(pose, reference):
+    """Returns the posture errors of B robots in their own frames, `(B, 3)`."""
+    error = np.empty((len(pose), 3))
+    over_rows(posture_error, pose, reference[:, :3], error)
+    return error
 
 
 class Stanley:
@@ -30,7 +39,7 @@ class Stanley:
         pass
 
     def output(self, pose, twist, reference):
-        e = posture_error(pose, reference[:, :3])
+        e = posture_errors(pose, reference)
         v = reference[:, 3] + 2.0 * e[:, 0]
         angle = (
             e[:, 2]
@@ -41,16 +50,18 @@ class Stanley:
 
 
 class Kanayama:
-    """The built-in motion controller, from outside."""
+    """The built-in motion controller as a user's stage."""
 
     def __init__(self, robot, size):
-        pass
+        self.gains = np.array((3.0, 25.0, 10.0), GAINS)[()]
 
     def reset(self, pose, reference, period):
         assert period == 0.01 and reference.shape == (len(pose), 7)
 
     def output(self, pose, twist, reference):
-        return kanayama(pose, reference[:, :3], reference[:, 3:5], np.array([3.0, 25.0, 10.0]))[1]
+        request = np.empty((len(pose), 2))
+        over_rows(kanayama, posture_errors(pose, reference), reference[:, 3:5], self.gains, request)
+        return request
 
 
 class TorchKanayama(Kanayama):
@@ -61,12 +72,13 @@ class TorchKanayama(Kanayama):
 
 
 class Feedback:
-    """The built-in PID, from outside."""
+    """The built-in PID as a user's stage."""
 
     def __init__(self, robot, size, rigid=False):
-        self.gains = mrctl.Pid().gains(robot, rigid)
-        self.state = np.zeros((size, 7))
-        self.integral = self.state[:, :2]
+        self.state = np.zeros(size, PID)
+        for name, value in mrctl.Pid().gains(robot, rigid).items():
+            self.state[name] = value
+        self.integral = self.state["integral"]
 
     def reset(self, steady, period):
         self.period = period
@@ -74,26 +86,25 @@ class Feedback:
 
     def output(self, command, twist, excess):
         volts = np.zeros_like(command)
-        pid(command, twist, self.gains, self.period, excess, self.state, volts)
+        over_rows(pid, command, twist, excess, self.period, self.state, volts)
         return volts
 
 
 class Fork:
-    """The built-in law of the fork, from outside."""
+    """The built-in law of the fork as a user's stage."""
 
     def __init__(self, robot, size):
-        self.parameters = parameters(robot, False)
-        self.state = np.zeros((size, 2))
+        self.robot = nominal(robot, False)[0]
+        self.state = np.zeros(size, ALLOCATION)
 
     def reset(self, angle, period):
         self.period = period
-        self.state[:, 0] = angle
+        self.state["angle"] = angle
 
     def output(self, command, derivative):
         zero = np.zeros_like(command)
-        sink = [np.zeros((len(command), n)) for n in (4, 4, 2, 1)]
-        allocate(command, derivative, zero, zero, self.parameters, self.period, self.state, *sink[:3], sink[3][:, 0])
-        return self.state
+        over_rows(allocate, command, derivative, zero, zero, self.period, self.robot, self.state)
+        return np.stack([self.state["angle"], self.state["rate"]], axis=1)
 
 
 def same(one, other):
@@ -110,7 +121,7 @@ def same(one, other):
     ids=["motion", "torch", "feedback", "steering", "all"],
 )
 def test_same_law(own, steering):
-    """The built-in laws brought in from outside give the built-in bits: saturation, learning and hand-over included."""
+    """The built-in laws as a user's stages give the built-in bits, with saturation, learning and hand-over."""
     hard = mrctl.Perturbation(supply_factor=0.5, mass_factor=1.5)
     base = LAP.model_copy(update={"steering": steering, "perturbation": hard})
     scenarios = [base, base.model_copy(update={"seed": 1})]
@@ -128,7 +139,7 @@ def test_same_law(own, steering):
 
 
 def test_slow_motion():
-    """A motion controller of your own is asked at the motion controller's rate."""
+    """A user's motion controller is asked at the motion controller's rate."""
     calls = []
 
     class Counted(Kanayama):
@@ -145,14 +156,14 @@ def test_slow_motion():
 
 
 def test_stanley():
-    """A known motion controller in a few lines drives the robot, and the result says whose it is."""
+    """A published motion controller in a few lines drives the robot, and the label of the result names it."""
     run = simulate(LAP, motion=Stanley)
     assert not run.failed and str(run.label.item()) == "fel + Stanley" and str(run.feedforward.item()) == "fel"
     assert float(np.hypot(run.longitudinal_error, run.lateral_error)[-200:].max()) < 0.1
 
 
 def breaking(stage, fault, after=100):
-    """A stage that does as the built-in one for a while, and then what `fault` makes of it."""
+    """Returns a stage that does as the built-in one for a while, and then answers what `fault` makes of it."""
     base = {"motion": Kanayama, "feedback": Feedback, "steering": Fork, "feedforward": Silent}[stage]
 
     class Breaks(base):
@@ -199,7 +210,7 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("stage", METHODS)
 def test_fault(stage, fault):
-    """What raises or does not fit ends its group with what it has; other groups never notice."""
+    """A stage that raises or answers in another shape ends its group, whose record is kept; other groups go on."""
     other = SHORT.model_copy(update={"steering": "caster"})
     what, message = FAULTS[fault]
     whole = simulate([*THREE, other], **breaking(stage, what))
@@ -219,7 +230,7 @@ def test_fault(stage, fault):
 
 @pytest.mark.parametrize("stage", METHODS)
 def test_not_finite(stage):
-    """A number that is none in one row stops that run, by name and tick, and no other."""
+    """A number that is not finite stops the run of its row, whose failure names stage and tick, and no other run."""
     whole, sound = simulate(THREE, **breaking(stage, spoilt)), simulate(THREE)
     tick = 99 if stage == "feedforward" else 100
     assert str(whole.failure[1].item()) == f"{stage} Breaks: not finite, tick {tick}"
@@ -229,7 +240,7 @@ def test_not_finite(stage):
 
 
 def test_blown_up_robot():
-    """A robot that blew up shows no NaN to somebody's stage, which may well raise on it."""
+    """A user's stage receives no NaN from a robot that blew up."""
 
     class Careful(Kanayama):
         def output(self, pose, twist, reference):
@@ -242,7 +253,7 @@ def test_blown_up_robot():
 
 
 def test_inputs_are_copies():
-    """A stage that writes into what it is given harms nobody."""
+    """A stage that writes into its arguments changes no result."""
 
     class Careless(Kanayama):
         def output(self, pose, twist, reference):
@@ -264,23 +275,28 @@ def test_inputs_are_copies():
     ],
 )
 def test_refused(own, message):
-    """What is no stage is refused before anything is computed."""
+    """An object that is not a stage is refused before anything is computed."""
     with pytest.raises(InputError, match="(?s)^" + message.replace("<", "[<]")):
         simulate(SHORT, **own)
 
 
 def test_command_line(tmp_path, capsys):
-    """From a file: the same numbers as from Python, faults in the table's heading, mistakes in one line."""
+    """A stage from a file gives the numbers of Python; the table's heading shows faults, and one line each mistake."""
     file = tmp_path / "mine.py"
     file.write_text(
         "import numpy as np\n"
-        "from mrctl.control.kanayama import kanayama\n"
+        "from mrctl.control.kanayama import GAINS, kanayama, posture_error\n"
+        "from mrctl.kernel import over_rows\n"
         "class Mine:\n"
-        "    def __init__(self, robot, size): self.calls = 0\n"
+        "    def __init__(self, robot, size):\n"
+        "        self.calls, self.gains = 0, np.array((3.0, 25.0, 10.0), GAINS)[()]\n"
         "    def reset(self, pose, reference, period): pass\n"
         "    def output(self, pose, twist, reference):\n"
         "        self.calls += 1\n"
-        "        return kanayama(pose, reference[:, :3], reference[:, 3:5], np.array([3.0, 25.0, 10.0]))[1]\n"
+        "        error, request = np.empty((len(pose), 3)), np.empty((len(pose), 2))\n"
+        "        over_rows(posture_error, pose, reference[:, :3], error)\n"
+        "        over_rows(kanayama, error, reference[:, 3:5], self.gains, request)\n"
+        "        return request\n"
         "class Stops(Mine):\n"
         "    def output(self, pose, twist, reference):\n"
         "        return super().output(pose, twist, reference) if self.calls < 50 else 1 / 0\n"
@@ -298,7 +314,7 @@ def test_command_line(tmp_path, capsys):
     )  # fmt: skip
     assert mine[1:] == plain[1:] and f"motion={file}:Mine" in mine[0]
     assert stops[1] == (
-        "failed after 0.51 s: motion Stops: ZeroDivisionError: division by zero (mine.py, line 11), tick 50"
+        "failed after 0.51 s: motion Stops: ZeroDivisionError: division by zero (mine.py, line 16), tick 50"
     )
     for name, message in (
         (f"{file}:Mine", "feedforward Mine: has no method learn"),
@@ -313,7 +329,7 @@ def test_command_line(tmp_path, capsys):
 
 
 def test_sweep(tmp_path):
-    """In a sweep: a stage of your own by its file, and a fault of it in the table."""
+    """A sweep takes a user's stage by its file, and its table shows a fault of the stage."""
     file = tmp_path / "mine.py"
     file.write_text(
         "import numpy as np\n"
@@ -333,7 +349,7 @@ def test_sweep(tmp_path):
 
 
 def test_company(tmp_path):
-    """In a sweep, what raises for one run costs no other run of its job."""
+    """In a sweep, a stage that raises for one run costs no other run of its job."""
     file = tmp_path / "mine.py"
     file.write_text(
         "class Picky:\n"

@@ -75,9 +75,10 @@ def content(store):
 
 
 def refused(capsys, *arguments, status=2):
-    """The one line that a command ends with."""
+    """Returns the one line that a command prints on stderr beside its progress bar, which shows run/s or s/run."""
     assert cli.main([str(a) for a in arguments]) == status
-    lines = [line for line in capsys.readouterr().err.replace("\r", "\n").splitlines() if "run/s" not in line and line]
+    printed = capsys.readouterr().err.replace("\r", "\n").splitlines()
+    lines = [line for line in printed if line and "run/s" not in line and "s/run" not in line]
     assert len(lines) == 1 and "Traceback" not in lines[0], lines
     return lines[0]
 
@@ -190,7 +191,7 @@ def test_run_again(sweep, tmp_path, capsys):
     assert "run 14: departs: signal v is" in (line := refused(capsys, "run", store, "--run", 14, status=1))
     assert line.endswith("at t = 0.7 s, in the store 3.0")
     assert "run: 24 is not in 0 to 23" in refused(capsys, "run", store, "--run", 24)
-    assert "which one" in refused(capsys, "run", store)
+    assert "give the number of one of its runs with --run" in refused(capsys, "run", store)
     assert "not a sweep's store" in refused(capsys, "run", tmp_path, "--run", 1)
 
 

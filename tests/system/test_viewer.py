@@ -164,7 +164,7 @@ def test_inputs(browser, tmp_path):
         assert live.session.start[1].perturbation.mass_factor == pytest.approx(1.03)  # goes on as things were
         until(lambda: node(page, "/world/ghosts/chassis") is not None, "the ghost in the scene")
         live.ask(live._compare, "rls", False)  # while the page is busy: it gets all of this at once
-        live.ask(live._wish, ("reference",), "rounded_square")
+        live.ask(live._note_input, ("reference",), "rounded_square")
         page.evaluate("() => { const end = performance.now() + 2000; while (performance.now() < end); }")
         until(lambda: live.session.start[0].reference.kind == "rounded_square", "another reference")
 
@@ -266,4 +266,4 @@ def test_sweep(browser, tmp_path):
         page.mouse.click(*at)
         until(lambda: replay.runs == [4], "the run to open")
     again = simulate(jobs.scenario_of(tmp_path / "store", 4))
-    assert replay._log[:, 0, 0].tobytes() == again.x.values.tobytes()
+    assert replay._log["x"][:, 0].tobytes() == again.x.values.tobytes()

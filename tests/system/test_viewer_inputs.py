@@ -46,8 +46,8 @@ def test_every_input(live):
             value = "circle"
         if kind and isinstance(value, float):  # a little, within what the robot can do
             value = handle.value - max(1, round(handle.value / 20 / handle.step)) * handle.step
-        live._wish(path, value)
-        live._grant()
+        live._note_input(path, value)
+        live._apply_inputs()
         assert live.message == "", where
         saved = live.session.saved()[0]
         changing = path[0] in CHANGEABLE
@@ -70,23 +70,23 @@ def test_every_input(live):
 def test_refusals(live):
     """What cannot be is said in the page, and the inputs show again what holds."""
     live._restart([Scenario()])
-    live._wish(("reference",), "stop_and_go")  # reverses, with a fork that cannot
-    live._grant()
+    live._note_input(("reference",), "stop_and_go")  # reverses, with a fork that cannot
+    live._apply_inputs()
     assert "reverses" in live.message and live.session.start == [Scenario()]
-    live._wish(("perturbation", "payload_x"), -1.0)
-    live._wish(("perturbation", "payload"), 200.0)
-    live._grant()
+    live._note_input(("perturbation", "payload_x"), -1.0)
+    live._note_input(("perturbation", "payload"), 200.0)
+    live._apply_inputs()
     assert "tip over" in live.message
     assert live._controls._inputs["perturbation", "payload"].value == 0.0
-    live._wish(("perturbation", "mass_factor"), "heavy")
-    live._grant()
+    live._note_input(("perturbation", "mass_factor"), "heavy")
+    live._apply_inputs()
     assert "mass_factor" in live.message and len(live.session.saved()[0].events) == 1
 
 
 def test_robot_that_stops(live):
     """The page says that a robot has stopped and why, and waits."""
     live._restart([Scenario()])
-    live._happen(push=(0.0, 5000.0, 0.0))
+    live._apply_event(push=(0.0, 5000.0, 0.0))
     live.playing = True
     for _ in range(30):
         live.advance(0.1, float("inf"))

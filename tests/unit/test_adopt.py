@@ -1,4 +1,4 @@
-"""Robots of other MJCF files: the same robot comes out whatever the file calls its parts and wherever these are."""
+"""A robot adopted from another MJCF file is the same whatever the file calls its parts and wherever it puts them."""
 
 import mujoco
 import numpy as np
@@ -11,7 +11,8 @@ from mrctl.physics.elements import fronts
 from mrctl.physics.files import models_folder
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
-from mrctl.physics.plant import OMEGA, V, build
+from mrctl.physics.plant import build
+from mrctl.physics.readout import READING
 from mrctl.physics.stand import front_rates, stand, steer
 
 MOTOR = '<dcmotor name="{0}" joint="{0}" gear="{1}" motorconst="0.02 0.02" resistance="2" ctrlrange="-12 12" {2}/>'
@@ -19,7 +20,7 @@ FLOOR = '<light pos="0 0 3"/><geom name="floor" type="plane" size="5 5 .1"/>'
 
 
 def wheel(joint, at, axis="0 1 0", extra="", loss=0.1):
-    """A wheel: a solid cylinder of radius 0.1 m, width 0.04 m and 2 kg with its joint."""
+    """Returns a wheel with its joint: a solid cylinder of radius 0.1 m, width 0.04 m and 2 kg."""
     return f"""<body pos="{at}">
       <joint name="{joint}" axis="{axis}" frictionloss="{loss}"/>
       <geom type="cylinder" size="0.1 0.02" euler="90 0 0" mass="2" friction="0.8"/>{extra}
@@ -112,13 +113,16 @@ def test_the_same_robot(file, name):
     ideal, plain = read(file(document(DIFF, MOTORS)))
     robot, model = read(file(VARIANTS[name]))
     assert robot.model_dump() == pytest.approx(ideal.model_dump(), rel=1e-6, abs=1e-9)
-    ends = [drive(m, (5.0, 6.0)) for m in (plain, model)]
-    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
-    assert ends[1][V] > 0.2 and ends[1][OMEGA] > 0.05  # ahead, and to the left
+    ends = [drive(m, r, (5.0, 6.0)) for m, r in ((plain, ideal), (model, robot))]
+    for signal in READING.names:
+        np.testing.assert_allclose(ends[0][signal], ends[1][signal], atol=1e-6, err_msg=signal)
+    v, omega = ends[1]["twist"]
+    assert v > 0.2 and omega > 0.05  # ahead, and to the left
 
 
-def drive(model, volts, steering=0.0, seconds=3.0, twist=(0.0, 0.0)):
-    plant = build(model, 1, 5)
+def drive(model, robot, volts, steering=0.0, seconds=3.0, twist=(0.0, 0.0)):
+    """Returns the readings of a robot that starts at the origin, after some seconds of constant voltages in V."""
+    plant = build(model, robot, 1, 5)
     plant.reset(np.zeros((1, 3)), np.array([twist]))
     for _ in range(round(100 * seconds)):
         plant.step(np.array([[*volts, steering, 0.0]]))
@@ -132,11 +136,11 @@ def test_caster_behind(file):
     robot, model = read(file(document(body, MOTORS)))
     assert robot.wheelbase == pytest.approx(-0.3) and robot.com_offset == pytest.approx(-10 * 0.1 / 14)
     assert robot.front_load == pytest.approx(10 * 0.1 / 14 / 0.3)
-    plant = build(model, 1, 5)
+    plant = build(model, robot, 1, 5)
     plant.reset(np.zeros((1, 3)), np.zeros((1, 2)))
     for _ in range(100):
         plant.step(np.zeros((1, 4)))
-    assert abs(plant.reading[0, V]) < 1e-5 and plant.reading[0, 10] > 0.9999  # stands level
+    assert abs(plant.reading["twist"][0, 0]) < 1e-5 and plant.reading["upright"][0] > 0.9999  # stands level
 
 
 @pytest.mark.parametrize("body", [CAR, TRICYCLE], ids=["two wheels", "one wheel"])
@@ -151,8 +155,8 @@ def test_steered(file, body):
     phi = 0.3
     omega = 0.4 * np.tan(phi) / 0.5
     apart = robot.back_emf * robot.half_track * omega / robot.wheel_radius
-    reading = drive(model, (5 - apart, 5 + apart), phi, 4.0, (0.4, omega))
-    assert reading[V] / reading[OMEGA] == pytest.approx(0.5 / np.tan(phi), rel=0.01)
+    v, omega = drive(model, robot, (5 - apart, 5 + apart), phi, 4.0, (0.4, omega))["twist"]
+    assert v / omega == pytest.approx(0.5 / np.tan(phi), rel=0.01)
     if body is CAR:
         qpos = np.zeros(model.nq)
         steer(model, qpos, phi)
@@ -226,7 +230,7 @@ def test_limits(file):
     assert found == pytest.approx((1.5, 3, 1.5, 6), rel=0.2)
 
 
-def test_slow_casters_tip_nobody(file):
+def test_perturbed(file):
     """A perturbation changes mass, motor, wheel and losses of an adopted robot."""
     _, model = read(file(document(DIFF, MOTORS)))
     changed = mjcf.clone(model)

@@ -5,20 +5,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mrctl.control.feedforward import (
-    FEATURES,
-    SIGN_SPEED,
-    InverseDynamics,
-    NoFeedforward,
-    feature_scale,
-    features,
-    linear,
-)
+from mrctl.control.features import NAMES, SIGN_SPEED, feature_matrix, feature_scale, linear
+from mrctl.control.feedforward import InverseDynamics, NoFeedforward
+from mrctl.kernel import over_rows
 from mrctl.theory import dynamics
 from mrctl.theory.references import Lemniscate
 
 RNG = np.random.default_rng(3)
 COMMANDS, DERIVATIVES = RNG.uniform([-1.5, -3], [1.5, 3], (50, 2)), RNG.uniform([-1.5, -6], [1.5, 6], (50, 2))
+
+UNUSED = np.full((50, 2), np.nan)  # measured twist and voltage, which these stages do not read
 
 
 def numbers(*shape, bound=3.0):
@@ -28,16 +24,16 @@ def numbers(*shape, bound=3.0):
 def test_features(robot):
     """The features are the regressor of the inverse dynamics over their scales."""
     scale = feature_scale(robot)
-    found = features(COMMANDS, DERIVATIVES, robot.half_track, scale) * scale
+    found = feature_matrix(COMMANDS, DERIVATIVES, robot.half_track, scale) * scale
     expected = dynamics.regressor(COMMANDS, DERIVATIVES, robot, SIGN_SPEED)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
-    assert len(FEATURES) == expected.shape[-1]
+    assert len(NAMES) == expected.shape[-1]
 
 
 def test_scales(robot):
     """On an ordinary lap every feature reaches a fair part of one, and none is far beyond."""
     _, twist, acceleration = Lemniscate().sample(np.linspace(0, 12, 600))
-    peaks = np.abs(features(twist, acceleration, robot.half_track, feature_scale(robot))).max(axis=0)
+    peaks = np.abs(feature_matrix(twist, acceleration, robot.half_track, feature_scale(robot))).max(axis=0)
     assert (peaks > 0.2).all()
     assert (peaks < 2).all()
 
@@ -67,7 +63,7 @@ def test_set_robot(robot):
     slow, derivative = 0.05 * COMMANDS[:4], DERIVATIVES[:4]  # where the half track shows in the smooth signs
     before = stage.output(slow, derivative).copy()
     stage.set_robot(2, heavy)
-    stage.learn(np.ones((4, 2)), np.zeros(4), None, None)
+    stage.learn(np.ones((4, 2)), np.zeros(4), UNUSED[:4], UNUSED[:4])
     after = stage.output(slow, derivative)
     np.testing.assert_array_equal(np.delete(after, 2, 0), np.delete(before, 2, 0))
     alone = InverseDynamics([heavy], rigid=False).output(slow[2:3], derivative[2:3])
@@ -75,10 +71,10 @@ def test_set_robot(robot):
     assert (after[2] != before[2]).all()
 
 
-def test_none():
+def test_none(robot):
     """`none` gives nothing and learns nothing."""
-    stage = NoFeedforward(50)
-    stage.learn(np.ones((50, 2)), np.zeros(50), None, None)
+    stage = NoFeedforward(robot, 50, rigid=False, period=0.01)
+    stage.learn(np.ones((50, 2)), np.zeros(50), UNUSED, UNUSED)
     np.testing.assert_array_equal(stage.output(COMMANDS, DERIVATIVES), np.zeros((50, 2)))
 
 
@@ -90,8 +86,10 @@ def test_rows(command, derivative, half_track, coefficients):
     def answer(rows, lost=()):
         wanted = command[rows].copy()
         wanted[list(lost)] = np.nan
-        x = features(wanted, derivative[rows], half_track[rows], scale)
-        return np.hstack([x, linear(x, coefficients[rows])])
+        x = feature_matrix(wanted, derivative[rows], half_track[rows], scale)
+        voltage = np.zeros((len(x), 2))
+        over_rows(linear, x, coefficients[rows], voltage)
+        return np.hstack([x, voltage])
 
     together = answer(slice(None), lost=[0])
     for i in (1, 2, 3):

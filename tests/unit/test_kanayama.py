@@ -8,15 +8,29 @@ from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from mrctl.control.kanayama import Kanayama, kanayama
+from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
+from mrctl.kernel import over_rows
 from mrctl.theory.kinematics import pose_rates
 
-GAINS = np.array([3.0, 25.0, 10.0])
+K = np.array([3.0, 25.0, 10.0])
 
 
 def rows(width, bound, size=4):
     """Arrays (size, width) of numbers up to `bound`."""
     return arrays(float, (size, width), elements=st.floats(-bound, bound))
+
+
+def follow(pose, reference, twist, gains):
+    """Posture errors `(B, 3)` and requested twists `(B, 2)`, or those of one robot if `pose` is that of one."""
+    size = len(np.atleast_2d(pose))
+    poses, references, twists, k = (
+        np.array(np.broadcast_to(values, (size, width)), float, order="C")
+        for values, width in ((pose, 3), (reference, 3), (twist, 2), (gains, 3))
+    )
+    error, request = np.zeros((size, 3)), np.zeros((size, 2))
+    over_rows(posture_error, poses, references, error)
+    over_rows(kanayama, error, twists, k.view(GAINS)[:, 0], request)
+    return (error, request) if np.ndim(pose) > 1 else (error[0], request[0])
 
 
 def body_error(pose, reference):
@@ -35,7 +49,7 @@ def move(pose, twist, time):
 @given(rows(3, 8.0), rows(3, 8.0), rows(2, 2.0))
 def test_error(pose, reference, twist):
     """The error is R(θ)ᵀ(reference − pose), its heading the short way round."""
-    error, _ = kanayama(pose, reference, twist, GAINS)
+    error, _ = follow(pose, reference, twist, K)
     expected = np.array([body_error(p, r) for p, r in zip(pose, reference, strict=True)])
     np.testing.assert_allclose(error[:, :2], expected[:, :2], atol=1e-12)
     np.testing.assert_allclose(np.exp(1j * (error[:, 2] - expected[:, 2])), 1, atol=1e-12)
@@ -45,14 +59,14 @@ def test_error(pose, reference, twist):
 @given(rows(3, 2.0, 1), rows(3, 2.0, 1), rows(2, 1.5, 1), st.integers(-5, 5))
 def test_full_turns(pose, reference, twist, turns):
     """Counting full turns of the heading changes nothing."""
-    _, request = kanayama(pose, reference, twist, GAINS)
-    _, turned = kanayama(pose, reference + [0, 0, 2 * np.pi * turns], twist, GAINS)
+    _, request = follow(pose, reference, twist, K)
+    _, turned = follow(pose, reference + [0, 0, 2 * np.pi * turns], twist, K)
     np.testing.assert_allclose(turned, request, atol=1e-11)
 
 
 def test_published_law():
     """One value by hand: a robot turned by 90° that stands 0.1 m ahead of and 0.2 m right of its reference."""
-    error, request = kanayama([1.0, 1.0, np.pi / 2], [0.8, 0.9, np.pi / 6], [0.5, 0.3], [10.0, 64.0, 16.0])
+    error, request = follow([1.0, 1.0, np.pi / 2], [0.8, 0.9, np.pi / 6], [0.5, 0.3], [10.0, 64.0, 16.0])
     np.testing.assert_allclose(error, [-0.1, 0.2, -np.pi / 3], atol=1e-12)
     np.testing.assert_allclose(request, [0.5 * 0.5 - 1.0, 0.3 + 0.5 * (64 * 0.2 - 16 * np.sqrt(3) / 2)], atol=1e-12)
 
@@ -64,7 +78,7 @@ def test_published_law():
 def test_lyapunov(offset, turn, v, omega, k_x, k_y, k_theta):
     """½(x² + y²) + (1 − cos θ_e)/K_y falls at the rate −K_x x² − |v_r| K_θ sin²θ_e/K_y along the ideal unicycle."""
     pose, reference, target = np.array([*offset[0], turn]), np.array([0.3, -0.2, 0.4]), np.array([v, omega])
-    error, request = kanayama(pose, reference, target, [k_x, k_y, k_theta])
+    error, request = follow(pose, reference, target, [k_x, k_y, k_theta])
 
     def potential(time):
         x, y, theta = body_error(move(pose, request, time), move(reference, target, time))
@@ -85,7 +99,7 @@ def test_line(speed, damping):
     frequency = abs(speed) * 8.0
 
     def rates(t, pose):
-        _, request = kanayama(pose, [speed * t, 0.0, 0.0], [speed, 0.0], gains)
+        _, request = follow(pose, [speed * t, 0.0, 0.0], [speed, 0.0], gains)
         return pose_rates(pose, request)
 
     times = np.linspace(0, 3, 13)
@@ -101,7 +115,7 @@ def test_convergence(speed):
     target = np.array([speed, 0.4])
     pose, reference = np.array([-0.3, 0.4, 1.5]), np.array([0.0, 0.0, 0.0])
     for _ in range(2000):
-        error, request = kanayama(pose, reference, target, GAINS)
+        error, request = follow(pose, reference, target, K)
         pose, reference = move(pose, request, 0.01), move(reference, target, 0.01)
     assert np.abs(error).max() < 1e-6
 
@@ -109,19 +123,19 @@ def test_convergence(speed):
 @given(rows(3, 50.0), rows(3, 50.0))
 def test_rest(pose, reference):
     """At a resting reference the request is finite, turns nothing, and vanishes on the spot."""
-    error, request = kanayama(pose, reference, np.zeros(2), GAINS)
+    error, request = follow(pose, reference, np.zeros(2), K)
     np.testing.assert_array_equal(request, np.stack([3.0 * error[:, 0], 0 * error[:, 0]], -1))
     assert np.isfinite(request).all()
-    _, there = kanayama(pose, pose, np.zeros(2), GAINS)
+    _, there = follow(pose, pose, np.zeros(2), K)
     assert not there.any()
 
 
 @given(rows(3, 10.0), rows(3, 10.0), rows(2, 2.0), arrays(float, (4, 3), elements=st.floats(0, 60)))
 def test_rows(pose, reference, twist, gains):
     """Robots do not mix: a row has the same bits alone and beside others, one of which is lost."""
-    alone = [np.hstack(kanayama(*(a[i : i + 1] for a in (pose, reference, twist, gains)))) for i in range(4)]
+    alone = [np.hstack(follow(*(a[i : i + 1] for a in (pose, reference, twist, gains)))) for i in range(4)]
     pose[2] = np.nan
-    together = np.hstack(kanayama(pose, reference, twist, gains))
+    together = np.hstack(follow(pose, reference, twist, gains))
     for i in (0, 1, 3):
         assert together[i].tobytes() == alone[i].tobytes()
 

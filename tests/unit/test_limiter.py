@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mrctl.control.limiter import limit
+from mrctl.control.limiter import LIMITER, limit
+from mrctl.kernel import over_rows
 from mrctl.theory.references import Lemniscate
 
 LIMITS = np.array([1.5, 3.0, 1.5, 6.0])
@@ -18,13 +19,13 @@ def numbers(shape, bound):
 
 def run(requests, twists, accelerations, time_constant=0.05, period=0.01, limits=LIMITS, last=None):
     """Commands and derivatives (T, 2) of one robot."""
-    state = np.concatenate([np.zeros(2), twists[0] if last is None else last])
-    command, derivative = np.zeros(2), np.zeros(2)
+    s = np.zeros(1, LIMITER)
+    s["time_constant"], s["command"] = time_constant, twists[0] if last is None else last
     commands, derivatives = [], []
     for request, twist, acceleration in zip(requests, twists, accelerations, strict=True):
-        limit(request, twist, acceleration, limits, time_constant, period, state, command, derivative)
-        commands.append(command.copy())
-        derivatives.append(derivative.copy())
+        limit(request, twist, acceleration, limits[:2], limits[2:], period, s[0])
+        commands.append(s["command"][0].copy())
+        derivatives.append(s["derivative"][0].copy())
     return np.array(commands), np.array(derivatives)
 
 
@@ -108,12 +109,13 @@ def test_rows(request, twist, acceleration, lag, state):
     """Robots do not mix: a row has the same bits alone and beside others, one of which is lost."""
 
     def answer(rows, lost=()):
-        inputs = [a[rows].copy() for a in (request, twist, acceleration, lag, state)]
-        for i in lost:
-            inputs[0][i] = np.nan
-        command, derivative = np.zeros((2, len(inputs[3]), 2))
-        limit(*inputs[:3], LIMITS, inputs[3], 0.01, inputs[4], command, derivative)
-        return np.hstack([command, derivative, inputs[4]])
+        asked, target, slope = (a[rows].copy() for a in (request, twist, acceleration))
+        asked[list(lost)] = np.nan
+        s = np.zeros(len(asked), LIMITER)
+        s["time_constant"], s["correction"], s["command"] = lag[rows], state[rows, :2], state[rows, 2:]
+        bounds = np.tile(LIMITS, (len(asked), 1))
+        over_rows(limit, asked, target, slope, bounds[:, :2], bounds[:, 2:], 0.01, s)
+        return s
 
     together = answer(slice(None), lost=[1])
     for i in (0, 2, 3):

@@ -6,7 +6,7 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mrctl.control.feedforward import feature_scale
+from mrctl.control.features import feature_scale
 from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.theory.references import Circle, Lemniscate

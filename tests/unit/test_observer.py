@@ -20,7 +20,7 @@ def drive(robot, disturbance, seconds):
     for tick in range(round(seconds / PERIOD)):
         voltage = np.array([9.0 + np.sin(3 * PERIOD * tick), 0.5])
         stage.learn(np.zeros((1, 2)), np.zeros(1), twist[None], voltage[None])
-        log.append(stage.state["disturbance"][0].copy())
+        log.append(stage.rows["disturbance"][0].copy())
         for part in range(10):
             lost = disturbance(PERIOD * (tick + part / 10))
             twist = twist + PERIOD / 10 * accelerations(twist, left_right(voltage - lost), plant, sign_speed=0.05)
@@ -74,15 +74,15 @@ def test_margin():
 
 @pytest.mark.parametrize("rigid", [False, True])
 def test_output(robot, rigid):
-    """It begins as the model and adds what it has observed; the PID's integral is left alone."""
+    """It begins as the model and adds what it has observed; it takes nothing out of the PID's integral."""
     stage, model = DisturbanceObserver(robot, [Observer()] * 2, rigid, PERIOD), InverseDynamics([robot] * 2, rigid)
     command, derivative = RNG.uniform(-1, 1, (2, 2, 2))
     np.testing.assert_array_equal(stage.output(command, derivative), model.output(command, derivative))
     for _ in range(3):
-        assert stage.learn(np.ones((2, 2)), np.zeros(2), command, np.ones((2, 2))) is None
-    expected = model.output(command, derivative) + stage.state["disturbance"]
+        assert not stage.learn(np.ones((2, 2)), np.zeros(2), command, np.ones((2, 2))).any()
+    expected = model.output(command, derivative) + stage.rows["disturbance"]
     np.testing.assert_array_equal(stage.output(command, derivative), expected)
-    assert stage.state["disturbance"].any()
+    assert stage.rows["disturbance"].any()
 
 
 def test_steering(robot):
@@ -92,7 +92,7 @@ def test_steering(robot):
     for _ in range(300):
         stage.output(command, np.zeros((1, 2)))
         stage.learn(np.zeros((1, 2)), np.zeros(1), np.array([[0.8, 0.45]]), np.array([[9.0, 0.02]]))
-    assert stage.state["disturbance"][0, 1] == pytest.approx(0.5 + 0.02 - 0.45, rel=1e-6)
+    assert stage.rows["disturbance"][0, 1] == pytest.approx(0.5 + 0.02 - 0.45, rel=1e-6)
 
 
 def test_rows(robot):

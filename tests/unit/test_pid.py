@@ -8,19 +8,34 @@ from hypothesis.extra.numpy import arrays
 from scipy import signal
 from scipy.optimize import brentq
 
-from mrctl.control.pid import PIDS, Gains, Pid, imc, learning_ratio, margins, pid, sampled_loop
+from mrctl.control.margins import learning_ratio, margins, sampled_loop
+from mrctl.control.pid import PID, PIDS, Gains, Pid, imc, pid
+from mrctl.kernel import over_rows
 from mrctl.record import InputError
 
 CLOSED = 0.15  # λ
 
 
+def controllers(gains, size=1):
+    """Records of `PID` with gains by name, as from `Pid.gains`."""
+    s = np.zeros(size, PID)
+    for name, values in gains.items():
+        s[name] = values
+    return s
+
+
+def table(gains):
+    """Gains by name as an array, a row a channel, a column a name."""
+    return np.transpose(list(gains.values()))
+
+
 def loop(gain, tau, gains, command, period, limit=np.inf, unwinding=True):
     """Twist and voltage (T, 2) of two plants K/(τs + 1) under the PID, exact between ticks."""
-    state, voltage, excess, twist = np.zeros(7), np.zeros(2), np.zeros(2), np.zeros(2)
+    s, voltage, excess, twist = controllers(gains)[0], np.zeros(2), np.zeros(2), np.zeros(2)
     decay = np.exp(-period / np.asarray(tau))
     twists, voltages = [], []
     for wanted in command:
-        pid(wanted, twist, gains, period, excess, state, voltage)
+        pid(wanted, twist, excess, period, s, voltage)
         applied = np.clip(voltage, -limit, limit)
         excess = applied - voltage if unwinding else excess
         twists.append(twist)
@@ -49,8 +64,10 @@ def test_published_gains(robot):
     integral = emf / 0.098 / CLOSED
     np.testing.assert_allclose(found, [[m_e * half, integral], [j_e / 0.188 * half, 0.188 * integral]], rtol=1e-12)
     gains = Pid(derivative_time=0.02, derivative_filter=0.04).gains(robot, rigid=False)
-    np.testing.assert_allclose(gains, np.hstack([found, 0.02 * found[:, :1], [[0.04], [0.04]]]), rtol=1e-12)
-    assert Pid().gains(robot, rigid=True)[1].tolist() == [0.3, 5.0, 0.0, 0.03]
+    assert list(gains) == ["k_p", "k_i", "k_d", "filter"]
+    expected = np.hstack([found, 0.02 * found[:, :1], [[0.04], [0.04]]])
+    np.testing.assert_allclose(table(gains), expected, rtol=1e-12)
+    assert table(Pid().gains(robot, rigid=True))[1].tolist() == [0.3, 5.0, 0.0, 0.03]
 
 
 @pytest.mark.parametrize("closed", [0.05, 0.15, 0.4])
@@ -85,18 +102,16 @@ def test_derivative_filter():
     error = np.append([0, 0], np.random.default_rng(0).normal(size=200))
     numerator, denominator, _ = signal.cont2discrete(([k_d, 0], [lag, 1]), h, method="backward_diff")
     expected = signal.lfilter(numerator.ravel(), denominator, error)
-    gains = np.array([[0, 0, k_d, lag], [2.0, 0, 0, lag]])
-    state, output = np.zeros(7), np.zeros(2)
+    s, output = controllers({"k_p": [0, 2], "k_d": [k_d, 0], "filter": lag})[0], np.zeros(2)
     for e, want in zip(error, expected, strict=True):
-        pid(np.full(2, e), np.zeros(2), gains, h, np.zeros(2), state, output)
+        pid(np.full(2, e), np.zeros(2), np.zeros(2), h, s, output)
         np.testing.assert_allclose(output, [want, 2 * e], atol=1e-12)
 
 
 def test_no_kick_at_the_start():
     """A loop that starts with an error does not take it for a rate."""
-    gains = np.array([[1.0, 0, 5.0, 0.01]] * 2)
-    output = np.zeros(2)
-    pid(np.ones(2), np.zeros(2), gains, 0.01, np.zeros(2), np.zeros(7), output)
+    s, output = controllers({"k_p": 1, "k_d": 5, "filter": 0.01})[0], np.zeros(2)
+    pid(np.ones(2), np.zeros(2), np.zeros(2), 0.01, s, output)
     np.testing.assert_array_equal(output, 1)
 
 
@@ -104,12 +119,12 @@ def test_no_kick_at_the_start():
 @pytest.mark.parametrize("k_p", [0.0, 0.01, 0.3])
 def test_antiwindup_of_any_gains(k_p, k_i):
     """At its limit the integral stays beside it, also where K_p/K_i is shorter than a period."""
-    gains = np.array([[k_p, k_i, 0, 0.03]] * 2)
-    state, output, excess = np.zeros(7), np.zeros(2), np.zeros(2)
+    s = controllers({"k_p": k_p, "k_i": k_i, "filter": 0.03})[0]
+    output, excess = np.zeros(2), np.zeros(2)
     for _ in range(1000):
-        pid(np.ones(2), np.zeros(2), gains, 0.01, excess, state, output)
+        pid(np.ones(2), np.zeros(2), excess, 0.01, s, output)
         excess = np.clip(output, -0.5, 0.5) - output
-    assert (np.abs(state[:2]) < 0.5 + 3 * max(k_p, 0.01 * k_i)).all()
+    assert (np.abs(s["integral"]) < 0.5 + 3 * max(k_p, 0.01 * k_i)).all()
 
 
 GRID = np.geomspace(1e-2, 1e3, 200_001)
@@ -175,17 +190,17 @@ def test_sampled_loop(robot, delay):
     for harmonic in (1, 7, 40, 190):
         w = 2 * np.pi * harmonic / 400 / h
         command = np.repeat(np.sin(w * h * np.arange(ticks))[:, None], 2, axis=1)
-        state, feedback, twist, decay = np.zeros(7), np.zeros(2), np.zeros(2), np.exp(-h / tau)
+        s, feedback, twist, decay = controllers(gains)[0], np.zeros(2), np.zeros(2), np.exp(-h / tau)
         answer, sent = [], [np.zeros(2)] * delay
         for wanted in command:
-            pid(wanted, twist, gains, h, np.zeros(2), state, feedback)
+            pid(wanted, twist, np.zeros(2), h, s, feedback)
             answer.append(twist)
             sent.append(feedback.copy())
             twist = decay * twist + (1 - decay) * gain * sent[len(answer) - 1]
         found = np.fft.rfft(answer[-400:], axis=0)[harmonic] / np.fft.rfft(command[-400:], axis=0)[harmonic]
         loops = [
-            sampled_loop(np.array([w]), k, t, Gains(*row[:2]), h, delay * h)[0]
-            for k, t, row in zip(gain, tau, gains, strict=True)
+            sampled_loop(np.array([w]), k, t, Gains(k_p, k_i), h, delay * h)[0]
+            for k, t, k_p, k_i in zip(gain, tau, gains["k_p"], gains["k_i"], strict=True)
         ]
         np.testing.assert_allclose(found, [loop / (1 + loop) for loop in loops], rtol=1e-9)
 
@@ -193,7 +208,7 @@ def test_sampled_loop(robot, delay):
 @pytest.mark.parametrize("rigid", [False, True])
 def test_twice_as_fast(robot, rigid):
     """Half the time constant is twice every gain, in both channels of every steering arrangement."""
-    normal, fast = (PIDS[name].gains(robot, rigid) for name in ("normal", "fast"))
+    normal, fast = (table(PIDS[name].gains(robot, rigid)) for name in ("normal", "fast"))
     assert PIDS["normal"] == Pid()
     np.testing.assert_allclose(fast[:, :3], 2 * normal[:, :3], rtol=1e-12)
     with pytest.raises(InputError, match="time_constant"):
@@ -210,12 +225,15 @@ def test_rows(command, twist, gains, excess, state):
 
     def answer(rows, lost=()):
         wanted, measured, design, cut, memory = (a[rows].copy() for a in (command, twist, gains, excess, state))
-        for i in lost:
-            measured[i] = np.nan
+        measured[list(lost)] = np.nan
+        names = "k_p", "k_i", "k_d", "filter"
+        s = controllers({name: design[..., k] for k, name in enumerate(names)}, len(wanted))
+        s["integral"], s["slope"], s["error"] = memory[:, :2], memory[:, 2:4], memory[:, 4:6]
+        s["started"] = memory[:, 6] > 0
         output = np.zeros((len(wanted), 2))
-        pid(wanted, measured, design, 0.01, cut, memory, output)
-        return np.hstack([output, memory])
+        over_rows(pid, wanted, measured, cut, 0.01, s, output)
+        return [volts.tobytes() + kept.tobytes() for volts, kept in zip(output, s, strict=True)]
 
     together = answer(slice(None), lost=[0])
     for i in (1, 2, 3):
-        assert together[i].tobytes() == answer(slice(i, i + 1))[0].tobytes()
+        assert together[i] == answer(slice(i, i + 1))[0]

@@ -10,33 +10,33 @@ import pytest
 from mrctl import Circle, Scenario
 from mrctl.loop.simulation import simulate
 from mrctl.physics import mjcf
+from mrctl.physics.car import CarPhysics
 from mrctl.physics.files import models_folder
-from mrctl.physics.parameters import read_robot
-from mrctl.physics.plant import BatchPlant, CarPhysics, PhysicsPlant, build, read
+from mrctl.physics.plant import BatchPlant, PhysicsPlant, build
+from mrctl.physics.readout import READING, addresses, read
 from mrctl.physics.stand import stand
 from mrctl.theory.perturbation import Perturbation
 
-MODEL = mjcf.load()
-ROBOT = read_robot(MODEL)
+MODEL, ROBOT = mjcf.build()
 SUBSTEPS = 5
 
 
-def plants(size=3, model=MODEL):
-    """A plant of each kind, standing at the origin, at rest."""
-    for plant in (PhysicsPlant(model, SUBSTEPS), BatchPlant(model, size, SUBSTEPS)):
+def plants(size=3, model=MODEL, robot=ROBOT):
+    """Yields a plant of each kind, at rest at the origin."""
+    for plant in (PhysicsPlant(model, robot, SUBSTEPS), BatchPlant(model, robot, size, SUBSTEPS)):
         plant.reset(np.zeros((plant.size, 3)), np.zeros((plant.size, 2)))
         yield plant
 
 
 def volts(plant, left, right=None, angle=0.0):
-    """The same command for every robot."""
+    """Returns the same command for every robot."""
     return np.tile([left, left if right is None else right, angle, 0.0], (plant.size, 1))
 
 
 def test_build():
-    """dm_control for one, the batch engine for more."""
-    assert isinstance(build(MODEL, 1, SUBSTEPS), PhysicsPlant)
-    assert isinstance(build(MODEL, 2, SUBSTEPS), BatchPlant)
+    """One robot runs on dm_control, and several on the batch engine."""
+    assert isinstance(build(MODEL, ROBOT, 1, SUBSTEPS), PhysicsPlant)
+    assert isinstance(build(MODEL, ROBOT, 2, SUBSTEPS), BatchPlant)
 
 
 @pytest.mark.parametrize("world", ["flat", "slope", "rough"])
@@ -58,7 +58,7 @@ def test_readouts(world):
         assert physics.pose()[2] == pytest.approx(math.atan2(frame[3], frame[0]), abs=1e-12)
         assert physics.upright() == pytest.approx(frame[8], abs=1e-12)
         assert physics.twist()[0] == pytest.approx(sensor["velocity"][0], abs=1e-12)
-        assert physics.reading()[5] == pytest.approx(sensor["velocity"][1], abs=1e-12)
+        assert physics.reading()["v_lateral"] == pytest.approx(sensor["velocity"][1], abs=1e-12)
         assert physics.twist()[1] == pytest.approx(sensor["gyro"][2], abs=1e-12)
         rates = [sensor["encoder_rate_left"].item(), sensor["encoder_rate_right"].item()]
         assert physics.wheel_rates() == pytest.approx(rates, abs=1e-12)
@@ -69,28 +69,29 @@ def test_readouts(world):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e11])
 def test_blown_up(value):
-    """A value that is no number, or huge, anywhere in the state, leaves no cosine of the tilt."""
+    """A value that is not finite, or huge, anywhere in the state makes the cosine of the tilt NaN."""
     physics = CarPhysics.from_world()
-    address = np.array([0, 0, 7, 6, 8, 7, 9, 8])
+    address = addresses(physics.model.ptr)
+    assert list(address) == [0, 0, 7, 6, 8, 7, 9, 8]
     for field in ("qpos", "qvel"):
         for i in range(getattr(physics.data, field).size):
             state = {"qpos": physics.data.qpos.copy(), "qvel": physics.data.qvel.copy()}
-            reading = np.zeros(11)
+            reading = np.zeros(1, READING)[0]
             read(state["qpos"], state["qvel"], address, reading)
-            assert reading[10] == 1
+            assert reading["upright"] == 1
             state[field][i] = value
             with np.errstate(invalid="ignore"):
                 read(state["qpos"], state["qvel"], address, reading)
-            assert np.isnan(reading[10])
+            assert np.isnan(reading["upright"])
 
 
 def test_views():
-    """Both plants show the engine's own memory: a step is seen without copying."""
+    """The arrays of both plants are views of the engine's own memory, which a step changes without copying."""
     for plant in plants():
         before = plant.qpos.copy()
         plant.step(volts(plant, 12.0))
         assert (plant.qpos[:, 0] > before[:, 0]).all() and (plant.ctrl[:, 0] == 12).all()
-        assert plant.reading[:, 0] == pytest.approx(plant.qpos[:, 0])
+        assert plant.reading["pose"][:, 0] == pytest.approx(plant.qpos[:, 0])
 
 
 @pytest.mark.parametrize("delay", [1, 3, 50])
@@ -99,7 +100,7 @@ def test_delay(delay):
     for plant in plants():
         plant.perturb(plant.size - 1, Perturbation(), delay)
         plant.reset(np.zeros((plant.size, 3)), np.tile([0.5, 0.4], (plant.size, 1)))
-        angle = plant.reading[0, 8]
+        angle = plant.reading["steering_angle"][0]
         commands = np.random.default_rng(1).uniform(0, 12, (delay + 20, 4)) * (1, 1, 0.02, 0)
         for tick, command in enumerate(commands):
             plant.step(np.tile(command, (plant.size, 1)))
@@ -133,7 +134,7 @@ def test_supply():
             assert plant.applied[0] == pytest.approx([24 * factor] * 2)
             load = ROBOT.resistance * ROBOT.rolling_force * ROBOT.wheel_radius / 2
             drag = (ROBOT.drive_loss / ROBOT.motor_gain) + load / ROBOT.back_emf
-            assert plant.reading[0, 3] == pytest.approx(ROBOT.velocity_gain * (24 * factor - drag), rel=0.02)
+            assert plant.reading["twist"][0, 0] == pytest.approx(ROBOT.velocity_gain * (24 * factor - drag), rel=0.02)
 
 
 def test_current():
@@ -143,40 +144,42 @@ def test_current():
         plant.perturb(row, Perturbation(resistance_factor=1.5, motor_constant_factor=0.8), 0)
         for _ in range(30):
             plant.step(volts(plant, 8.0, 6.0))
-        emf = 43 * 0.0234 * 0.8 * plant.reading[row, 6:8]
+        emf = 43 * 0.0234 * 0.8 * plant.reading["wheel_rates"][row]
         assert plant.current()[row] == pytest.approx((np.array([8.0, 6.0]) - emf) / (2.32 * 1.5))
         if plant.size > 1:
-            emf = 43 * 0.0234 * plant.reading[0, 6:8]
+            emf = 43 * 0.0234 * plant.reading["wheel_rates"][0]
             assert plant.current()[0] == pytest.approx((np.array([8.0, 6.0]) - emf) / 2.32)
 
 
 def test_push():
     """An impulse of F t on a robot that coasts: Δv = F t / M_e, and a torque turns it; afterwards nothing pushes."""
     coasting = Perturbation(drive_friction_factor=0, resistance_factor=20)  # windings nearly open: nothing brakes
-    for plant in plants(model=mjcf.load("flat", "caster")):  # whose fork does not resist turning
+    model, nominal = mjcf.build("flat", "caster")  # whose fork does not resist turning
+    for plant in plants(model=model, robot=nominal):
         row = plant.size - 1
         for robot in range(plant.size):
             plant.perturb(robot, coasting, 0)
         plant.reset(np.zeros((plant.size, 3)), np.tile([0.6, 0.0], (plant.size, 1)))
         free = ROBOT.effective_mass
         plant.push(row, np.array([50.0, 0.0, 0.0]), 10)
-        before = plant.reading[row, 3]
+        before = plant.reading["twist"][row, 0]
         for _ in range(10):
             assert plant.wrench[row].any()
             plant.step(volts(plant, 6.0))
         assert not plant.wrench.any()
-        assert plant.reading[row, 3] - before == pytest.approx((50 - ROBOT.rolling_force) * 0.1 / free, rel=0.05)
-        after = plant.reading[row, 3]
+        jump = plant.reading["twist"][row, 0] - before
+        assert jump == pytest.approx((50 - ROBOT.rolling_force) * 0.1 / free, rel=0.05)
+        after = plant.reading["twist"][row, 0]
         for _ in range(5):
             plant.step(volts(plant, 6.0))
-        assert plant.reading[row, 3] == pytest.approx(after, abs=0.02)
+        assert plant.reading["twist"][row, 0] == pytest.approx(after, abs=0.02)
         if plant.size > 1:
-            assert abs(plant.reading[0, 3] - before) < 0.05
-        turning = plant.reading[row, 4]
+            assert abs(plant.reading["twist"][0, 0] - before) < 0.05
+        turning = plant.reading["twist"][row, 1]
         plant.push(row, np.array([0.0, 0.0, 4.0]), 2)
         plant.step(volts(plant, 6.0))
         plant.step(volts(plant, 6.0))
-        assert plant.reading[row, 4] - turning == pytest.approx(4 * 0.02 / ROBOT.effective_inertia, rel=0.15)
+        assert plant.reading["twist"][row, 1] - turning == pytest.approx(4 * 0.02 / ROBOT.effective_inertia, rel=0.15)
 
 
 def test_second_push():

@@ -300,7 +300,7 @@ def test_label():
     scenario = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
 
     def mine(robot, size):
-        return NoFeedforward(size)
+        return NoFeedforward(robot, size, rigid=False, period=scenario.control_period)
 
     assert str(simulate(scenario).label.item()) == "none"
     assert (

@@ -6,7 +6,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mrctl.control.steering import REST, allocate, parameters
+from mrctl.control.nominal import nominal
+from mrctl.control.steering import ALLOCATION, REST, allocate
+from mrctl.kernel import over_rows
 from mrctl.theory import kinematics
 from mrctl.theory.dynamics import common_differential, inverse_dynamics, left_right
 from mrctl.theory.references import Lemniscate, StopAndGo
@@ -21,21 +23,25 @@ def stiff(robot):
 
 
 class Allocation:
-    """One robot's allocation with its memory and outputs."""
+    """The allocation of one robot; its attributes are the fields of the record `ALLOCATION`."""
 
     def __init__(self, robot, rigid=False, period=0.01, angle=0.0):
-        self.parameters, self.period = parameters(robot, rigid), period
-        self.state = np.array([angle, 0.0])
-        self.command, self.parts = np.zeros((2, 4))
-        self.excess, self.saturated = np.zeros(2), np.zeros(1)
+        self._robot, self._period = nominal(robot, rigid)[0], period
+        self._record = np.zeros(1, ALLOCATION)
+        self._record["angle"] = angle
+
+    def __getattr__(self, name):
+        return self._record[name][0]
 
     def __call__(self, twist, acceleration=ZERO, feedback=ZERO, feedforward=ZERO):
-        allocate(
-            np.asarray(twist, float), np.asarray(acceleration, float), np.asarray(feedback, float),
-            np.asarray(feedforward, float), self.parameters, self.period, self.state, self.command, self.parts,
-            self.excess, self.saturated,
-        )  # fmt: skip
+        motion = (np.asarray(values, float) for values in (twist, acceleration, feedback, feedforward))
+        allocate(*motion, self._period, self._robot, self._record[0])
         return self.command
+
+    @property
+    def parts(self):
+        """Shares of the feedback in the voltages left and right, then those of the feedforward, `(4,)`."""
+        return np.append(self.feedback, self.feedforward)
 
 
 def fork(robot, motion, rigid=False, period=0.01):
@@ -44,7 +50,7 @@ def fork(robot, motion, rigid=False, period=0.01):
     found = []
     for twist, acceleration in zip(motion.twist, motion.acceleration, strict=True):
         allocation(twist, acceleration)
-        found.append(allocation.state.copy())
+        found.append([allocation.angle, allocation.rate])
     return np.transpose(found)
 
 
@@ -73,7 +79,7 @@ def test_rate(robot, trail, tolerance):
     np.testing.assert_allclose(rate[1000:-1], slope[999:], atol=tolerance * np.abs(slope[999:]).max())
     allocation = Allocation(robot, period=0.01, angle=0.1)
     command = allocation([0.5, 0.4], [0.3, 0.8])
-    np.testing.assert_allclose(command[2], allocation.state[0] + 0.005 * command[3], atol=1e-15)
+    np.testing.assert_allclose(command[2], allocation.angle + 0.005 * command[3], atol=1e-15)
     assert command[3] != 0
 
 
@@ -103,7 +109,7 @@ def test_rigid(stiff, twist, acceleration):
     _, _, command, rate = allocation(twist, acceleration)
     h = 1e-6
     ahead, behind = (kinematics.steering_angle(twist + s * h * acceleration, stiff) for s in (1, -1))
-    assert allocation.state[0] == pytest.approx(angle, abs=1e-12)
+    assert allocation.angle == pytest.approx(angle, abs=1e-12)
     assert rate == pytest.approx((ahead - behind) / (2 * h), rel=1e-3, abs=1e-5)
     assert command == pytest.approx(angle + 0.005 * rate, abs=1e-12)
 
@@ -130,7 +136,7 @@ def test_steering_limit(robot, stiff, rigid, twist, acceleration, feedback):
     allocation = Allocation(stiff if rigid else robot, rigid)
     for arguments in zip(twist, acceleration, feedback, strict=True):
         allocation(*arguments)
-        assert abs(allocation.state[0]) <= robot.steering_limit
+        assert abs(allocation.angle) <= robot.steering_limit
 
 
 @given(numbers(2, 40.0), numbers(2, 40.0), numbers(2, 1.0))
@@ -142,7 +148,7 @@ def test_voltages(robot, feedback, feedforward, twist):
     np.testing.assert_allclose(voltage, np.clip(asked, -24, 24), atol=1e-12)
     np.testing.assert_allclose(allocation.parts, [*left_right(feedback), *left_right(feedforward)], atol=1e-12)
     np.testing.assert_allclose(allocation.excess, common_differential(voltage - asked), atol=1e-12)
-    assert allocation.saturated[0] == (np.abs(allocation.parts[:2] + allocation.parts[2:]) > 24).any()
+    assert allocation.saturated == (np.abs(allocation.parts[:2] + allocation.parts[2:]) > 24).any()
 
 
 @given(numbers(2, 40.0), numbers(2, 1.0), numbers(2, 40.0), numbers(2, 1.0))
@@ -159,24 +165,24 @@ def test_rigid_voltages(stiff, feedback, correction, feedforward, twist):
     asked = allocation.parts[:2] + allocation.parts[2:]
     np.testing.assert_allclose(voltage, np.clip(asked, -24, 24), atol=1e-12)
     assert allocation.excess[0] == pytest.approx((voltage - asked).mean(), abs=1e-12)
-    at_stop = abs(allocation.state[0]) == stiff.steering_limit
-    assert allocation.saturated[0] == ((np.abs(asked) > 24).any() or at_stop)
+    at_stop = abs(allocation.angle) == stiff.steering_limit
+    assert allocation.saturated == ((np.abs(asked) > 24).any() or at_stop)
 
 
 def test_rigid_correction(stiff):
     """Feedback and feedforward of the second channel act through the angle; what the stop cut of them is excess."""
     allocation = Allocation(stiff, rigid=True)
     allocation([0.5, 0.4], feedback=[0, 0.1], feedforward=[0, -0.03])
-    assert kinematics.twist_from_front_wheel(0.5 / np.cos(allocation.state[0]), allocation.state[0], stiff)[
+    assert kinematics.twist_from_front_wheel(0.5 / np.cos(allocation.angle), allocation.angle, stiff)[
         1
     ] == pytest.approx(0.47)
-    assert allocation.excess[1] == allocation.saturated[0] == 0
+    assert allocation.excess[1] == allocation.saturated == 0
     for v in (0.3, -0.3):
         allocation([v, 1.0], feedback=[0, 0.8], feedforward=[0, 0.1])
-        made = v * np.tan(allocation.state[0]) / 0.4  # θ̇ of the wheel at its stop
-        assert abs(allocation.state[0]) == stiff.steering_limit
+        made = v * np.tan(allocation.angle) / 0.4  # θ̇ of the wheel at its stop
+        assert abs(allocation.angle) == stiff.steering_limit
         assert allocation.excess[1] == pytest.approx(made - 1.9)
-        assert allocation.saturated[0] == 1
+        assert allocation.saturated == 1
 
 
 @pytest.mark.parametrize("rigid", [False, True])
@@ -190,12 +196,11 @@ def test_rows(robot, rigid, twist, acceleration, feedback, feedforward, state):
 
     def answer(rows, lost=()):
         inputs = [a[rows].copy() for a in (twist, acceleration, feedback, feedforward)]
-        memory, size = state[rows].copy(), len(inputs[0])
-        for i in lost:
-            inputs[2][i] = inputs[0][i] = np.nan
-        command, parts, excess, saturated = (np.zeros(shape) for shape in ((size, 4), (size, 4), (size, 2), size))
-        allocate(*inputs, parameters(robot, rigid), 0.01, memory, command, parts, excess, saturated)
-        return np.hstack([command, parts, excess, saturated[:, None], memory])
+        inputs[0][list(lost)] = inputs[2][list(lost)] = np.nan
+        s = np.zeros(len(inputs[0]), ALLOCATION)
+        s["angle"], s["rate"] = state[rows].T
+        over_rows(allocate, *inputs, 0.01, nominal(robot, rigid)[0], s)
+        return s
 
     together = answer(slice(None), lost=[3])
     for i in (0, 1, 2):

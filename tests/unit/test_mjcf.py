@@ -1,0 +1,162 @@
+"""Compiled worlds: robot and steering in each of them, digests, and files that are refused."""
+
+import shutil
+
+import mujoco
+import numpy as np
+import pytest
+
+from mrctl.physics import mjcf
+from mrctl.physics.files import models_folder
+from mrctl.physics.parameters import read_robot
+from mrctl.record import InputError
+
+NOMINAL = mjcf.load()
+BASE = read_robot(NOMINAL)
+
+
+@pytest.mark.parametrize("world", ["flat", "slope", "rough", "patch"])
+@pytest.mark.parametrize("steering", ["compliant", "caster", "rigid"])
+def test_worlds(world, steering):
+    """The robot is the same in every world; only trail, centre of mass and yaw inertia depend on the steering."""
+    robot = read_robot(mjcf.load(world, steering)).model_dump()
+    moved = {"trail", "com_offset", "yaw_inertia"} if steering == "rigid" else set()
+    for name, value in BASE.model_dump().items():
+        if name not in moved:
+            assert robot[name] == pytest.approx(value, rel=1e-12), name
+    assert robot["trail"] == (0 if steering == "rigid" else 0.03)
+
+
+@pytest.mark.parametrize(
+    ("steering", "stiffness", "damping"), [("compliant", 2, 0.1), ("caster", 0, 0.02), ("rigid", 40, 1)]
+)
+def test_steering(steering, stiffness, damping):
+    """The fork's servo has the stiffness and damping of its arrangement, by the engine's torque."""
+    model = mjcf.load("flat", steering)
+    fork, servo = model.joint("steering"), model.actuator("steering")
+    inputs = model.actuator_ctrladr[servo.id] + np.arange(2)
+    for position, rate, torque in ((0.1, 0, 0.1 * stiffness), (0, 0.5, 0.5 * damping)):
+        data = mujoco.MjData(model)
+        data.ctrl[inputs] = position, rate
+        mujoco.mj_forward(model, data)
+        assert data.qfrc_actuator[fork.dofadr[0]] == pytest.approx(torque)
+        data = mujoco.MjData(model)
+        data.qpos[fork.qposadr[0]], data.qvel[fork.dofadr[0]] = -position, -rate
+        mujoco.mj_forward(model, data)
+        assert data.qfrc_actuator[fork.dofadr[0]] == pytest.approx(torque)
+
+
+def test_digest(tmp_path):
+    """A digest is the same for a copy of a world elsewhere, and differs with a bump, name, scale or time step."""
+    for name in ("rough.xml", "rough.png", "car.xml", "scenery.xml"):
+        shutil.copy(models_folder() / name, tmp_path / name)
+    text, world = (tmp_path / "rough.xml").read_text(), tmp_path / "another.xml"
+    found = [mjcf.digest(mjcf.load("rough")), mjcf.digest(mjcf.load("rough", timestep=5e-4))]
+    for old, new in (
+        ("0.03 0.05", "0.031 0.05"), ('"rough"', '"bumpy"'), ("<asset>", '<statistic meaninertia="2"/><asset>'),
+    ):  # fmt: skip
+        world.write_text(text.replace(old, new))
+        found.append(mjcf.digest(mjcf.load(str(world))))
+    assert len(set(found)) == 5
+    assert mjcf.digest(mjcf.load(str(tmp_path / "rough.xml"))) == found[0]
+
+
+def test_timestep():
+    """The time step can be set."""
+    assert NOMINAL.opt.timestep == 0.002
+    assert mjcf.load("flat", timestep=0.001).opt.timestep == 0.001
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Returns a copy of the shipped models, which a test may break."""
+    return shutil.copytree(models_folder(), tmp_path / "models")
+
+
+def broken(folder, old, new, file="car.xml"):
+    """Returns the flat world with one passage of a file replaced."""
+    text = (folder / file).read_text()
+    assert old in text
+    (folder / file).write_text(text.replace(old, new))
+    return str(folder / "flat.xml")
+
+
+def refuses(world, *words, steering="compliant"):
+    """Checks that a world is refused with one line that names the file and has these words."""
+    with pytest.raises(InputError) as error:
+        mjcf.load(world, steering)
+    message = str(error.value)
+    assert "\n" not in message and "flat" in message
+    for word in words:
+        assert word in message, message
+
+
+def test_found():
+    """The shipped worlds come with the checkout."""
+    assert {"car", "flat", "slope", "rough", "patch"} <= {path.stem for path in models_folder().glob("*.xml")}
+
+
+def test_missing_file(tmp_path):
+    """An unknown name and a missing path are refused; the message lists the shipped worlds."""
+    for world in ("flatt", str(tmp_path / "flat.xml"), ""):
+        with pytest.raises(InputError, match=r"^world: no file .*shipped worlds: flat, patch, rough, slope$"):
+            mjcf.load(world)
+
+
+def test_broken_xml(folder):
+    """Files that are not XML, not MJCF, or miss an include are refused."""
+    world = folder / "flat.xml"
+    for text in (
+        "<mujoco",
+        "hello",
+        "",
+        "<robot/>",
+        '<mujoco><include file="none.xml"/></mujoco>',
+        "<mujoco><geom/></mujoco>",
+    ):
+        world.write_text(text)
+        refuses(str(world))
+    world.write_bytes(bytes(range(256)))
+    refuses(str(world))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('numeric name="limits"', 'numeric name="limitz"', ("numeric", "limits")),
+        ('data="1.5 3 1.5 6"', 'data="1.5 3"', ("limits", "4 values")),
+        ('numeric name="no_load_current"', 'numeric name="no_load"', ("numeric", "no_load_current")),
+        ('joint name="front_wheel"', 'joint name="castor"', ("joint", "front_wheel")),
+        ('motor_left"', 'motor_1"', ("actuator", "motor_left")),
+        ('body name="fork"', 'body name="head"', ("body", "fork")),
+        ('frictionloss="0.242462"', 'frictionloss="0.01"', ("frictionloss",)),
+        ('ctrlrange="-24 24"', "", ("supply",)),
+        ('pos="0.089884 0 0.025733"', 'pos="-0.2 0 0.025733"', ("com_offset",)),
+        (
+            '<pid name="steering" joint="steering" kp="2" kv="0.1"/>',
+            '<position name="steering" joint="steering"/>',
+            ("steering",),
+        ),
+        ('<dcmotor name="motor_left" class="motor"', '<motor name="motor_left"', ("motor_left", "dcmotor")),
+    ],
+)
+def test_missing_element(folder, old, new, words):
+    """A missing or wrong element is refused by its name."""
+    refuses(broken(folder, old, new), *words)
+
+
+def test_missing_steering(folder):
+    """A steering arrangement that the file does not describe is refused when it is asked for."""
+    world = broken(
+        folder, '<numeric name="steering_rigid" data="40 1 0"/>', '<numeric name="steering_caster_" data="1"/>'
+    )
+    mjcf.load(world, "compliant")
+    refuses(world, "steering_rigid", steering="rigid")
+    refuses(broken(folder, 'data="0 0.02 0.03"', 'data="0 0.02"'), "steering_caster", "3 values", steering="caster")
+
+
+def test_no_pair(folder):
+    """A world without contact pairs is refused, as the robot would fall through the floor."""
+    text = (folder / "flat.xml").read_text()
+    (folder / "flat.xml").write_text(text[: text.index("<contact>")] + "</mujoco>")
+    refuses(str(folder / "flat.xml"), "pair")

@@ -1,0 +1,99 @@
+"""The parameters of a robot as read from its compiled MJCF, against the numbers of its data sheet."""
+
+import math
+import shutil
+
+import mujoco
+import numpy as np
+import pytest
+
+from mrctl.physics import mjcf
+from mrctl.physics.files import models_folder
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.perturb import perturb
+from mrctl.theory.perturbation import Perturbation
+
+NOMINAL = mjcf.load()
+BASE = read_robot(NOMINAL)
+
+PUBLISHED = {
+    "mass": 20,
+    "yaw_inertia": 0.60,
+    "com_offset": 0.10,
+    "com_height": 0.12,
+    "wheel_radius": 0.098,
+    "front_wheel_radius": 0.075,
+    "half_track": 0.188,
+    "wheelbase": 0.40,
+    "trail": 0.03,
+    "steering_limit": math.radians(60),
+    "resistance": 2.32,
+    "inductance": 0.0,
+    "torque_constant": 0.0234,
+    "gear_ratio": 43,
+    "rotor_inertia": 1.03e-6,
+    "no_load_current": 0.037,
+    "gear_loss": 0.10,
+    "rolling_coefficient": 0.015,
+    "wheel_inertia": 3.4e-3,
+    "supply": 24,
+    "drive_gain": 1,
+    "tyre_friction": 0.9,
+    "max_speed": 1.5,
+    "max_rotation": 3,
+    "max_acceleration": 1.5,
+    "max_rotation_acceleration": 6,
+    "effective_mass": 21.1,
+    "effective_inertia": 0.84,
+    "velocity_time_constant": 0.23,
+    "rotation_time_constant": 0.26,
+    "velocity_gain": 0.0974,
+    "rotation_gain": 0.518,
+}
+
+
+@pytest.mark.parametrize(("name", "value"), PUBLISHED.items())
+def test_published(name, value):
+    """The MJCF has the documented parameters."""
+    assert getattr(BASE, name) == pytest.approx(value, rel=0.02)
+
+
+def test_exact():
+    """Parameters that the file states are read exactly, and those derived from it to six digits."""
+    for name in ("mass", "wheel_radius", "half_track", "resistance", "torque_constant", "rotor_inertia", "supply"):
+        assert getattr(BASE, name) == pytest.approx(PUBLISHED[name], rel=1e-12)
+    for name in ("yaw_inertia", "com_offset", "com_height", "gear_loss", "rolling_coefficient"):
+        assert getattr(BASE, name) == pytest.approx(PUBLISHED[name], rel=2e-5)
+
+
+def test_motor_limits():
+    """The no-load speed is 2.34 m/s and the stall torque 10.4 N·m."""
+    assert BASE.supply * BASE.velocity_gain == pytest.approx(2.34, abs=5e-3)
+    assert BASE.supply * BASE.motor_gain == pytest.approx(10.4, abs=0.05)
+
+
+def test_inertia_by_physics():
+    """Mass and J_z + m c² about P are those of the engine's own mass matrix."""
+    model, data = mjcf.clone(NOMINAL), mujoco.MjData(NOMINAL)
+    mujoco.mj_forward(model, data)
+    matrix = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, matrix)
+    yaw = np.zeros(model.nv)
+    yaw[5] = 1
+    assert matrix[0, 0] == pytest.approx(BASE.mass)
+    assert yaw @ matrix @ yaw == pytest.approx(BASE.yaw_inertia + BASE.mass * BASE.com_offset**2)
+
+
+def test_inductance(tmp_path):
+    """The inductance is read from the file, and does not change with the resistance."""
+    folder = shutil.copytree(models_folder(), tmp_path / "models")
+    text = (folder / "car.xml").read_text()
+    assert 'resistance="2.32"' in text
+    (folder / "car.xml").write_text(text.replace('resistance="2.32"', 'resistance="2.32" inductance="2.4e-4 0"'))
+    nominal = mjcf.load(str(folder / "flat.xml"))
+    model = mjcf.clone(nominal)
+    perturb(nominal, model, Perturbation(resistance_factor=1.5))
+    for candidate, resistance in ((nominal, 2.32), (model, 3.48)):
+        robot = read_robot(candidate)
+        assert robot.inductance == pytest.approx(2.4e-4)
+        assert robot.resistance == pytest.approx(resistance)
