@@ -64,9 +64,8 @@ def one_step(x, feedback, weights, rigid=False, prior=None, **settings):
 
 def teach(stage, feedback, frozen=0.0):
     """One learning step of every robot; where and how they move does not matter to this stage."""
-    return stage.learn(
-        np.array(feedback, float), np.broadcast_to(frozen, len(feedback)), *np.zeros((2, len(feedback), 2))
-    )
+    size = len(feedback)
+    return stage.learn(np.array(feedback, float), np.broadcast_to(frozen, size), *np.zeros((2, size, 2)))
 
 
 def taught(robot, settings=None, rigid=False, size=1):
