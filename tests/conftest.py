@@ -1,9 +1,23 @@
 """Fixtures for every test."""
 
+import subprocess
+import sys
+
 import pytest
 from hypothesis import settings
 
+from mrctl.kernel import kernel_files_digest
 from mrctl.theory.robot import Robot
+
+COMPILE = """
+import sys
+
+from mrctl import Line, Scenario, per_lap, simulate
+
+for name in sys.argv[1:]:
+    runs = [Scenario(reference=Line(length=0.8), laps=1, feedforward=name, seed=seed) for seed in range(2)]
+    per_lap(simulate(runs))
+"""
 
 # The same examples for everyone, no deadline (shared machines stall); `--hypothesis-profile=explore` looks further.
 settings.register_profile("mrctl", deadline=None, derandomize=True)
@@ -29,3 +43,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "system" in item.path.parts:
             item.add_marker("system")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compiles the laws once for all workers and what they start, where a law has changed since the last session."""
+    cache, digest = session.config.cache, kernel_files_digest()
+    if hasattr(session.config, "workerinput") or cache is None or cache.get("mrctl/compiled", "") == digest:
+        return
+    halves = ("fel", "none", "model"), ("composite", "rls", "observer")
+    processes = [subprocess.Popen([sys.executable, "-c", COMPILE, *names]) for names in halves]
+    if not any(process.wait() for process in processes):
+        cache.set("mrctl/compiled", digest)
