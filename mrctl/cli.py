@@ -19,9 +19,10 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 import tyro
+from pydantic import ValidationError
 
 from mrctl import __version__
-from mrctl.record import InputError, Record
+from mrctl.record import InputError, Record, describe
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, RobotFile
@@ -93,6 +94,8 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
                 "mrctl COMMAND --help explains a command, mrctl --version prints the version.",
                 args=["--help" if argument == "--help-all" else argument for argument in arguments],
             )
+    except ValidationError as error:  # of a field of the scenario itself, which tyro lets through
+        raise InputError(describe(error)) from None
     except SystemExit as stop:
         if stop.code:
             raise InputError(_one_line(complaints.getvalue())) from None

@@ -305,3 +305,8 @@ def test_installed_command_without_a_display(tmp_path: Path) -> None:
     bad = subprocess.run([script, "run", "nowhere.toml"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (bad.returncode, bad.stdout) == (2, "")
     assert bad.stderr == "mrctl: nowhere.toml: No such file or directory\n"
+
+
+def test_bad_field_of_the_scenario_is_one_line(capsys: pytest.CaptureFixture) -> None:
+    """A flag out of range that belongs to the scenario itself, not to a part of it, is named too."""
+    assert refused(capsys, "run", "--laps", "0").startswith("mrctl: laps: ")
