@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from mrctl import __version__
 
@@ -25,6 +25,15 @@ class Record(BaseModel):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+    moved: ClassVar[dict[str, str]] = {}
+    """Fields of earlier versions, each with what takes its place."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _knows_moved_fields(cls, values: Any) -> Any:  # noqa: ANN401
+        for name in cls.moved.keys() & values.keys() if isinstance(values, dict) else ():
+            raise ValueError(f"{name}: this field of an earlier version is gone; {cls.moved[name]}")
+        return values
 
     @classmethod
     def from_dict(cls, values: object, source: str = "") -> Self:

@@ -18,6 +18,7 @@ from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
 from mrctl.record import Record
+from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Lemniscate, Reference
 from mrctl.theory.robot import CAR, RobotFile, Steering
@@ -58,6 +59,8 @@ class Event(Record):
 class Scenario(Record):
     """One run of a robot along a reference; the same scenario gives the same result, bit for bit."""
 
+    moved = {"measurement": "set sensing.estimator to truth or odometry"}
+
     name: str = ""
     """Label of the run in tables and figures; by default the name of the feedforward."""
     world: str = "flat"
@@ -72,8 +75,8 @@ class Scenario(Record):
     """Number of laps."""
     feedforward: FeedforwardName = "fel"
     """Feedforward that is added to the velocity PID; `none` is PID alone."""
-    measurement: Literal["truth", "odometry"] = "truth"
-    """Measurement that the controller receives: true pose and twist, or odometry from wheel encoders and a gyro."""
+    sensing: Sensing = Sensing()
+    """Sensors, estimator, motor driver, battery and steering servo."""
     kanayama: Kanayama = Kanayama()
     """Gains of the motion controller."""
     pid: Pid = Pid()
@@ -117,6 +120,7 @@ class Scenario(Record):
             whole(perturbation.control_delay, self.control_period, f"{name}.control_delay", "control_period")
         if not 1 <= self.duration / self.control_period <= LONGEST:
             raise ValueError(f"laps: a run of {self.duration:g} s is not between 1 and {LONGEST:,} control periods")
+        self.sensing.check(self.control_period, self.duration)
         return self
 
     def with_event(self, event: Event) -> Scenario:

@@ -1,8 +1,8 @@
-"""The four stages of figure 3 that a user can replace, and the methods that each needs.
+"""The stages of figure 3 that a user can replace, with the estimator before them, and the methods that each needs.
 
 A stage serves B robots: arrays have a leading axis B, so that robots cannot mix. A factory makes it, which is called
 with the nominal robot and the number of robots. Its two methods receive copies, NumPy arrays of float64, and may return
-NumPy arrays or torch tensors. `mrctl.simulate(…, motion=, feedback=, feedforward=, steering=)` takes the factories. The
+NumPy arrays or torch tensors. `mrctl.simulate(…, motion=, feedback=, feedforward=, steering=, estimator=)` takes the factories. The
 limits and the prefilter of the command, the limits of voltage and steering angle, and the guard on the feedforward
 still act.
 
@@ -12,6 +12,7 @@ still act.
 | `Feedback`    | voltages from commanded and measured twist          | `reset` to the voltages of the initial motion |
 | `Feedforward` | voltages from commanded twist and its derivative    | `learn` from the feedback and the motion     |
 | `Steering`    | angle and rate of the fork from commanded twist     | `reset` to the initial angle                 |
+| `Estimator`   | posture and twist from the samples of the sensors   | `reset` to a first estimate                  |
 """
 
 from __future__ import annotations
@@ -108,6 +109,39 @@ class Steering(Protocol):
         ...
 
 
+class Estimator(Protocol):
+    """The estimator of posture and twist, which is called once in a control period.
+
+    Its estimate is predicted to the moment when the voltage of the period acts. A robot for which it returns a number
+    that is not finite goes on with odometry from the last estimate; the result names the tick in `estimator_fault`.
+    """
+
+    def reset(self, pose: Array, twist: Array, period: float) -> None:
+        """Starts a run.
+
+        Args:
+            pose: First estimate of x and y in m and of θ in rad, with the errors of a fix, `(B, 3)`.
+            twist: First estimate of V in m/s and θ̇ in rad/s, `(B, 2)`.
+            period: Control period, from one `output` to the next, in s.
+        """
+        ...
+
+    def output(self, encoders: Array, gyro: Array, acceleration: Array, fix: Array, age: Array) -> Array:
+        """Returns the estimate at the moment of the call.
+
+        Args:
+            encoders: Angles of the rear wheels that arrived last, left and right, in rad, `(B, 2)`.
+            gyro: Last θ̇ of the gyro in rad/s, `(B,)`.
+            acceleration: Last specific force, forward and to the left, in m/s², `(B, 2)`.
+            fix: Posture fix that arrived in this period in m, m, rad, `(B, 3)`; zeros where none did.
+            age: Age of that fix in s, `(B,)`; −1 where none arrived.
+
+        Returns:
+            x and y in m, θ in rad, V in m/s and θ̇ in rad/s, `(B, 5)`.
+        """
+        ...
+
+
 Stage = TypeVar("Stage", covariant=True)
 Factory = Callable[[Robot, int], Stage]
 
@@ -119,6 +153,7 @@ class Stages(TypedDict, total=False):
     feedback: Factory[Feedback] | None
     feedforward: Factory[Feedforward] | None
     steering: Factory[Steering] | None
+    estimator: Factory[Estimator] | None
 
 
 METHODS = {name: ("output", "learn" if name == "feedforward" else "reset") for name in Stages.__annotations__}

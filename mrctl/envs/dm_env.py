@@ -120,6 +120,7 @@ class Environment(control.Environment):
 
 def _add(action: Action) -> None:
     """Adds the task with this meaning of an action to the suite."""
+
     def task(
         scenario: Scenario | str | Path | None = None,
         random: int | np.random.RandomState | None = None,

@@ -71,17 +71,18 @@ class AgentMotion:
 class EpisodeCourses:
     """The references of robots whose clocks start at different ticks."""
 
-    def __init__(self, scenarios: Sequence[Scenario]) -> None:
-        """Samples every course once, to the end of the episode and one tick more."""
+    def __init__(self, scenarios: Sequence[Scenario], lead: int) -> None:
+        """Samples every course once, to the end of the episode and one tick and the lead more."""
         self._ticks = scenarios[0].ticks
+        self._last = self._ticks + lead
         distinct, self._place = distinct_courses(scenarios)
-        whole, end = range(self._ticks), range(self._ticks, self._ticks + 1)
+        whole, end = range(self._ticks), range(self._ticks, self._last + 1)
         self._table = np.stack([np.append(course(s, whole), course(s, end)) for s in distinct], axis=1)
         self.start = np.zeros(len(scenarios), int)
 
-    def at(self, tick: int) -> Rows:
-        """The references at a control tick of the simulation, one record of `GOAL` a robot, `(B,)`."""
-        return self._table[np.minimum(tick - self.start, self._ticks), self._place]
+    def at(self, tick: int, ahead: int = 0) -> Rows:
+        """The references `ahead` ticks after a tick of the simulation, one record of `GOAL` a robot, `(B,)`."""
+        return self._table[np.minimum(tick + ahead - self.start, self._last), self._place]
 
 
 class Episodes(Simulation):
@@ -125,7 +126,7 @@ class Episodes(Simulation):
         limits = robot.max_speed, robot.max_rotation
         share = RESIDUAL if action == "residual" else 1.0
         self.bound = np.array(limits if action == "twist" else [share * robot.supply] * 2)
-        self.courses: EpisodeCourses = EpisodeCourses(scenarios)  # type: ignore[assignment]
+        self.courses: EpisodeCourses = EpisodeCourses(scenarios, self._lead)  # type: ignore[assignment]
         self.log = Log(1, len(scenarios))
 
     def _make_agent(self, robot: Robot, size: int) -> AgentMotion:
@@ -146,7 +147,8 @@ class Episodes(Simulation):
         goal, plant = self.courses.at(self.tick), self.plant
         plant.restart(row, start_pose(scenario, goal["pose"][row]), goal["twist"][row])
         self.hierarchy.reset(goal["twist"], goal["acceleration"], plant.reading["steering_angle"], row)
-        self.sensors.restart(row, seed, plant.reading)
+        self.sensors.restart(row, seed, self.tick)
+        self.estimator.start(row, plant.reading[row], seed, self.tick)
         self._failure_time[row] = np.nan
         self._action[row] = 0.0
 

@@ -46,20 +46,21 @@ def distinct_courses(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], NDA
 class Courses:
     """The references of a uniform group of scenarios; robots with the same reference share its samples."""
 
-    def __init__(self, scenarios: Sequence[Scenario]) -> None:
-        """Takes the scenario of each robot."""
-        self._ticks = scenarios[0].ticks
+    def __init__(self, scenarios: Sequence[Scenario], lead: int = 0) -> None:
+        """Takes the scenario of each robot, and by how many control ticks references are asked for ahead of time."""
+        self._ticks, self._lead = scenarios[0].ticks, lead
         self._courses, self._place = distinct_courses(scenarios)
         self._own = len(self._courses) == len(scenarios)  # whether no two robots share a course
         self._block = range(0)
 
-    def at(self, tick: int) -> Rows:
-        """Returns the references at a control tick, one record of `GOAL` for each robot, `(B,)`."""
+    def at(self, tick: int, ahead: int = 0) -> Rows:
+        """Returns the references `ahead` ticks after a control tick, one record of `GOAL` for each robot, `(B,)`."""
         if tick not in self._block:  # only one block of samples is held, (ticks of a block, courses)
             first = tick // BLOCK * BLOCK
             self._block = range(first, min(first + BLOCK, self._ticks))
-            self._samples = np.stack([course(s, self._block) for s in self._courses], axis=1)
-        now = self._samples[tick - self._block.start]
+            whole = range(first, self._block.stop + self._lead)
+            self._samples = np.stack([course(s, whole) for s in self._courses], axis=1)
+        now = self._samples[tick + ahead - self._block.start]
         return now if self._own else now[self._place]
 
 

@@ -10,26 +10,23 @@ import numpy as np
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.physics.plant import Plant
 from mrctl.scenario import Event, Scenario
-from mrctl.sensing.sensors import Sensors
 from mrctl.theory.perturbation import Perturbation
 
 
 class Events:
     """The events of a group of runs, by control tick; changes of the reference are in `Courses` instead."""
 
-    def __init__(
-        self, scenarios: Sequence[Scenario], plant: Plant, hierarchy: Hierarchy, sensors: Sensors, period: float
-    ) -> None:
+    def __init__(self, scenarios: Sequence[Scenario], plant: Plant, hierarchy: Hierarchy, period: float) -> None:
         """Perturbs the robots as their scenarios say, and schedules their events.
 
         Args:
             scenarios: Scenario of each robot.
             plant: The physics, on which perturbations and pushes act.
             hierarchy: The controllers, whose gains change.
-            sensors: The sensors, whose noise changes with a perturbation.
             period: Control period in s.
         """
-        self._plant, self._hierarchy, self._sensors, self._period = plant, hierarchy, sensors, period
+        self._plant, self._hierarchy, self._period = plant, hierarchy, period
+        self._delays = [s.sensing.periods("delay", period) for s in scenarios]
         self._schedule: dict[int, list[tuple[int, Event]]] = defaultdict(list)
         for row, scenario in enumerate(scenarios):
             self.perturb(row, scenario.perturbation)
@@ -69,6 +66,6 @@ class Events:
 
     def perturb(self, row: int, perturbation: Perturbation) -> None:
         """Replaces the perturbation of one robot from this tick on."""
-        self._plant.perturb(row, perturbation, round(perturbation.control_delay / self._period))
-        self._sensors.set_noise(row, perturbation)
+        delay = perturbation.control_delay / self._period + self._delays[row]
+        self._plant.perturb(row, perturbation, round(delay))
         self._hierarchy.set_truth(row, self._plant.truth[row])

@@ -39,7 +39,14 @@ def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, error: Array, tic
         t.v_ref, t.omega_ref = g.twist[0], g.twist[1]
         posture_error(state.pose, g.pose, error)
         t.longitudinal_error, t.lateral_error, t.heading_error = error[0], error[1], error[2]
-        t.v_measured, t.omega_measured, t.slip = s.twist[0], s.twist[1], s.slip
+        e, var = s.estimate, s.variance
+        t.x_measured, t.y_measured, t.theta_measured, t.v_measured, t.omega_measured = e[0], e[1], e[2], e[3], e[4]
+        t.variance_x, t.covariance_xy, t.variance_y = var[0], var[1], var[2]
+        t.variance_theta, t.variance_v, t.variance_omega = var[3], var[4], var[5]
+        t.fix_x, t.fix_y, t.fix_theta = s.fix[0], s.fix[1], s.fix[2]
+        t.encoder_left, t.encoder_right, t.gyro = s.encoder[0], s.encoder[1], s.gyro
+        t.acceleration_x, t.acceleration_y = s.acceleration[0], s.acceleration[1]
+        t.slip = s.slip
         t.v_command, t.omega_command = c.limiter.command[0], c.limiter.command[1]
         a = c.allocation
         t.feedback_left, t.feedback_right = a.feedback[0], a.feedback[1]

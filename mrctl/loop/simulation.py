@@ -21,12 +21,13 @@ from mrctl.loop.courses import Courses, start_pose
 from mrctl.loop.events import Events
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.log import DIVERGED, Log
-from mrctl.loop.user_stages import StageError, UserHierarchy, UserStage
+from mrctl.loop.user_stages import StageError, UserEstimator, UserHierarchy, UserStage
 from mrctl.physics import mjcf
 from mrctl.physics.plant import Plant, build
 from mrctl.record import InputError
 from mrctl.results import dataset
 from mrctl.scenario import Event, Scenario
+from mrctl.sensing.estimators import Estimator
 from mrctl.sensing.sensors import Sensors
 from mrctl.theory.references import check
 
@@ -44,7 +45,7 @@ def simulate(
         scenarios: One scenario, or several; those that differ in world, laws, steering, length or rates run in turn.
         progress: Whether to show a progress bar.
         threads: Number of threads that control and physics run on, which changes no bit; 0 for all cores.
-        stages: The user's stages `motion`, `feedback`, `feedforward` or `steering` in place of the scenario's: a
+        stages: The user's stages `motion`, `feedback`, `feedforward`, `steering` or `estimator` in place of the scenario's: a
             factory, called with the nominal robot and the number of robots, which returns an object with the two
             methods of that stage in `mrctl.control.stages`. One that raises, or returns an array of the wrong shape,
             fails all runs that are computed together; one that returns NaN for a robot fails that run.
@@ -139,7 +140,8 @@ def group_of(s: Scenario) -> Hashable:
     """Returns what the runs of one simulation must share."""
     net = s.fel.hidden, s.composite.weights
     rates = s.ticks, s.physics_step, s.control_period, s.motion_period
-    return s.world, s.robot, s.steering, s.feedforward, *rates, *net
+    chain = s.sensing.source, s.sensing.periods("delay", s.control_period)
+    return s.world, s.robot, s.steering, s.feedforward, *rates, *net, *chain
 
 
 class Simulation:
@@ -149,7 +151,8 @@ class Simulation:
         scenarios: Scenario of each run, with the events that were added.
         model: The compiled world with the nominal robot.
         courses: The references that the robots follow.
-        sensors: The measurements that the controllers receive.
+        sensors: The sensors of the robots.
+        estimator: The posture and the twist that the controllers are told.
         hierarchy: The controllers.
         plant: The physics.
         events: The perturbations, pushes and other changes during the run.
@@ -183,12 +186,17 @@ class Simulation:
         self._feedforward = names.pop("feedforward", first.feedforward)
         self._label = " + ".join([self._feedforward, *names.values()])
 
-        self.courses = Courses(scenarios)
+        self._lead = first.sensing.periods("delay", self.period)
+        self.courses = Courses(scenarios, self._lead)
         self.plant: Plant = build(self.model, robot, size, round(self.period / first.physics_step), threads)
+        own = users.pop("estimator", None)
         self.hierarchy = UserHierarchy(scenarios, robot, users) if users else Hierarchy(scenarios, robot)
-        odometry = [s.measurement == "odometry" for s in scenarios]
-        self.sensors = Sensors(odometry, [s.seed for s in scenarios], robot, self.period)
-        self.events = Events(scenarios, self.plant, self.hierarchy, self.sensors, self.period)
+        sensing = [s.sensing for s in scenarios]
+        self.sensors = Sensors(sensing, [s.seed for s in scenarios], self.period)
+        # The engine moves positions with the velocities at the end of a step, so velocities are half a step behind.
+        parts = sensing, robot, self.sensors, self.plant.imu, first.physics_step / 2
+        self.estimator = UserEstimator(own, *parts) if own else Estimator(first.sensing.source, *parts)
+        self.events = Events(scenarios, self.plant, self.hierarchy, self.period)
         self.log = Log(self.ticks, size)
         self._failure_time = np.full(size, np.nan)
         self._sensed = -1  # the last tick that was measured
@@ -197,7 +205,8 @@ class Simulation:
         poses = np.stack([start_pose(s, goal["pose"][row]) for row, s in enumerate(scenarios)])
         self.plant.reset(poses, goal["twist"])
         self.hierarchy.reset(goal["twist"], goal["acceleration"], self.plant.reading["steering_angle"])
-        self.sensors.start(self.plant.reading)
+        for row, scenario in enumerate(scenarios):
+            self.estimator.start(row, self.plant.reading[row], scenario.seed, 0)
 
     @property
     def running(self) -> bool:
@@ -222,7 +231,7 @@ class Simulation:
         self.scenarios = [scenario.with_event(event) for scenario in self.scenarios]
         self.events.add(event)
         if event.reference is not None:
-            self.courses = Courses(self.scenarios)
+            self.courses = Courses(self.scenarios, self._lead)
 
     def step(self) -> None:
         """One control period, as in figure 3."""
@@ -233,14 +242,17 @@ class Simulation:
         """Applies the events of this tick and measures; further calls in the same tick only return the result.
 
         Returns:
-            Measurement of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each.
+            Estimate of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each; both are those
+            of the moment when the voltage of this tick acts.
         """
         if self._sensed != self.tick:
             self._sensed = self.tick
             self.events.apply(self.tick)
             self._goal = self.courses.at(self.tick)
-            self.sensors.measure(self.plant.state)
-        return self.sensors.seen, self._goal
+            self._wanted = self.courses.at(self.tick, self._lead) if self._lead else self._goal
+            self.sensors.measure(self.tick, self.plant.state)
+            self.estimator.estimate(self.tick, self.plant.state)
+        return self.estimator.seen, self._wanted
 
     def decide(self) -> Array:
         """Does what comes before the physics: events, measurement and control.
@@ -259,6 +271,7 @@ class Simulation:
         if not hierarchy.finite:  # the voltage limit would turn NaN into the full voltage
             for row in hierarchy.non_finite():
                 self.plant.fail(row, "non-finite voltage")
+        self.sensors.command(self.tick, hierarchy.derivative)
         return command
 
     def _fail(self, faults: dict[int, str]) -> None:
@@ -269,7 +282,7 @@ class Simulation:
     def settle(self) -> None:
         """Does what comes after the physics: the record and the failures."""
         plant, tick = self.plant, self.tick
-        near = self.log.record(tick, plant.state, self.sensors.seen, self._goal, self.hierarchy.state)
+        near = self.log.record(tick, plant.state, self.estimator.seen, self._goal, self.hierarchy.state)
         if not near:
             for row in np.flatnonzero(np.abs(self.log.at(tick)["lateral_error"]) > DIVERGED):
                 plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
@@ -292,5 +305,6 @@ class Simulation:
         found = dataset.dataset(self.scenarios, *names, log, failure, self._failure_time, weights)
         return found.assign(  # the constants that turn the commanded motion into features
             half_track=("run", np.full(size, robot.half_track), {"units": "m"}),
+            estimator_fault=("run", np.array(getattr(self.estimator, "faults", [""] * size), object)),
             feature_scale=(("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         )

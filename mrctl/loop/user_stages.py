@@ -17,6 +17,7 @@ from mrctl.kernel import Array, Rows, kernel, over_rows
 from mrctl.loop.hierarchy import Hierarchy, apply_voltages, command_motion, hand_over, request_motion
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
+from mrctl.sensing.estimators import Estimator
 from mrctl.theory.robot import Robot
 
 
@@ -268,3 +269,43 @@ class UserHierarchy(Hierarchy):
         for row in np.flatnonzero(broken):
             self.faults.setdefault(int(row), f"{stage.title}: not finite")
         return np.where(broken[:, None], 0.0, answer) if broken.any() else answer
+
+
+class UserEstimator(Estimator):
+    """A user's estimator, with odometry for robots of which it tells nothing.
+
+    Attributes:
+        faults: For each robot the message of the first tick at which the estimate was not finite, or "".
+    """
+
+    def __init__(self, stage: UserStage, *arguments: Any) -> None:  # noqa: ANN401
+        """Takes the user's stage, and the arguments of `Estimator` behind the name."""
+        super().__init__("user", *arguments)
+        self._stage = stage
+        self._started = False
+        self.faults = [""] * len(self.seen)
+
+    def estimate(self, tick: int, plant: Rows) -> Rows:
+        """Estimates posture and twist of all robots; see `Estimator.estimate`."""
+        memory, sensors = self.memory, self._sensors
+        if not self._started:
+            self._stage.call("reset", memory["mean"][:, :3], memory["mean"][:, 3:], sensors.period)
+            self._started = True
+        rows = np.arange(len(memory))
+
+        def arrived(name: str) -> Rows:
+            latency = sensors.sensors[f"{name}_latency"]
+            return sensors.ring[np.maximum(tick - latency, self.seen["start"]) % len(sensors.ring), rows]
+
+        latency = sensors.sensors["fix_latency"]
+        fixes = sensors.ring[(tick - latency) % len(sensors.ring), rows]
+        new = fixes["fix_arrives"] & (tick - latency >= self.seen["start"])
+        fix = np.where(new[:, None], fixes["fix"], 0.0)
+        age = np.where(new, latency * sensors.period, -1.0)
+        samples = arrived("encoder")["encoder"], arrived("gyro")["gyro"], arrived("accelerometer")["acceleration"]
+        answer = self._stage.call("output", *samples, fix, age)
+        memory["told"] = self._stage.checked(answer, (len(memory), 5), "output")
+        memory["valid"] = np.isfinite(memory["told"]).all(axis=1)
+        for row in np.flatnonzero(~memory["valid"]):
+            self.faults[row] = self.faults[row] or f"{self._stage.title}: not finite, tick {tick}"
+        return super().estimate(tick, plant)

@@ -28,9 +28,7 @@ class CarPhysics(dm_mujoco.Physics):
     """
 
     @classmethod
-    def from_world(
-        cls, world: str = "flat", steering: Steering = "compliant", robot: RobotFile = CAR
-    ) -> CarPhysics:
+    def from_world(cls, world: str = "flat", steering: Steering = "compliant", robot: RobotFile = CAR) -> CarPhysics:
         """Loads a world by name or path with a robot (see `physics.mjcf.load`)."""
         return cls.from_compiled(mjcf.load(world, steering, robot=robot))
 

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.physics import mjcf
 from mrctl.physics.car import CarPhysics
+from mrctl.physics.elements import has
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import fields, perturb, write
-from mrctl.physics.readout import READING, addresses, inputs, motor_parameters, read
+from mrctl.physics.readout import READING, addresses, imu_motion, inputs, motor_parameters, read
 from mrctl.physics.stand import stand
 from mrctl.theory.perturbation import LONGEST_DELAY, Perturbation
 from mrctl.theory.robot import Robot
@@ -39,6 +40,10 @@ PLANT = np.dtype(
         ("reading", READING),  # now
         ("applied", "f8", 2),  # voltages at the terminals, left and right, V
         ("current", "f8", 2),  # armature currents, A
+        ("wheel_angles", "f8", 2),  # of the rear wheels, left and right, since the model's zero, rad
+        ("imu_velocity", "f8", 3),  # velocity of the inertial sensor in the world, m/s
+        ("specific_force", "f8", 2),  # forward and to the left at the inertial sensor, mean over the period, m/s²
+        ("gravity", "f8", 3),  # in the world, m/s²
         ("failed", "?"),  # whether the robot has stopped
     ],
     align=True,
@@ -46,9 +51,7 @@ PLANT = np.dtype(
 
 
 @kernel
-def drive(
-    command: Array, tick: int, queue: Array, inputs: NDArray[np.int64], plant: Rows, ctrl: Array
-) -> bool:
+def drive(command: Array, tick: int, queue: Array, inputs: NDArray[np.int64], plant: Rows, ctrl: Array) -> bool:
     """Sends each robot the command of `delay` periods ago; returns whether all commands are finite."""
     finite = True
     for i in range(len(plant)):
@@ -66,13 +69,25 @@ def drive(
 
 @kernel
 def look(
-    qpos: Array, qvel: Array, act: Array, address: NDArray[np.int64], acts: NDArray[np.int64], plant: Rows
-) -> bool:
-    """Readings and armature currents after a period; returns whether all robots are upright and sane."""
-    upright = True
+    qpos: Array, qvel: Array, act: Array, address: NDArray[np.int64], acts: NDArray[np.int64], imu: Array,
+    period: float, plant: Rows,
+) -> bool:  # fmt: skip
+    """Readings and armature currents after a period; returns whether all robots are upright and sane.
+
+    The specific force is the velocity that was gained in the period less that which gravity gives, over the period.
+    """
+    upright, velocity, axes = True, np.empty(3), np.empty((2, 3))
     for i in range(len(plant)):
         p = plant[i]
         read(qpos[i], qvel[i], address, p.reading)
+        imu_motion(qpos[i], qvel[i], address, imu, velocity, axes)
+        for k in range(2):
+            p.wheel_angles[k] = qpos[i, address[2 + 2 * k]]
+            p.specific_force[k] = 0.0
+            for n in range(3):
+                p.specific_force[k] += axes[k, n] * ((velocity[n] - p.imu_velocity[n]) / period - p.gravity[n])
+        for n in range(3):
+            p.imu_velocity[n] = velocity[n]
         for k in range(2):
             if len(acts):
                 p.current[k] = act[i, acts[k]]
@@ -94,6 +109,7 @@ class Plant(ABC):
         failed: Which robots have stopped, `(B,)`.
         failure: Why, one string a robot.
         running: How many have not.
+        imu: Position of the inertial sensor in the frame of the chassis in m, `(3,)`.
     """
 
     size: int
@@ -119,9 +135,12 @@ class Plant(ABC):
         self._inputs = np.array(inputs(model), int)
         resistance, back_emf, acts = motor_parameters(model)
         self._acts = np.array(acts, int)
+        self.imu = model.site("imu").pos.copy() if has(model, "site", "imu") else np.zeros(3)
+        self._period = substeps * model.opt.timestep
         state["resistance"], state["back_emf"], state["drive_gain"] = resistance, back_emf, 1.0
-        # As long as any delay, so that a robot's past does not depend on the delays of the others.
-        self._queue = np.zeros((1 + round(LONGEST_DELAY / (substeps * model.opt.timestep)), size, 4))
+        state["gravity"] = model.opt.gravity
+        # As long as any delay of sensing and perturbation, so that a robot's past does not depend on the delays of the others.
+        self._queue = np.zeros((1 + round(2 * LONGEST_DELAY / self._period), size, 4))
         self._tick = 0
         self._pushes: dict[int, int] = {}
         self._chassis = model.body("chassis").id
@@ -154,6 +173,7 @@ class Plant(ABC):
         resistance, back_emf, _ = motor_parameters(self._scratch)
         self.state["resistance"][robot], self.state["back_emf"][robot] = resistance[0], back_emf[0]
         self.state["drive_gain"][robot], self.state["delay"][robot] = perturbation.supply_factor, delay
+        self.state["gravity"][robot] = self._scratch.opt.gravity
 
     def check(self, perturbation: Perturbation) -> None:
         """Refuses a perturbation with which a robot could not stand.
@@ -175,7 +195,7 @@ class Plant(ABC):
         """
         for i in range(self.size):
             self.qpos[i], self.qvel[i] = stand(self._model_of(i), pose[i], twist[i], self.truth[i])
-        self._look()
+        self._begin(slice(None))
         self._queue[..., 2] = self.reading["steering_angle"]
 
     def restart(self, robot: int, pose: Array, twist: Array) -> None:
@@ -196,7 +216,7 @@ class Plant(ABC):
         self._clear(robot)
         self.qpos[robot], self.qvel[robot] = stand(self._model_of(robot), pose, twist, self.truth[robot])
         self.applied[robot] = 0.0
-        self._look()
+        self._begin(slice(robot, robot + 1))
         self._queue[:, robot] = 0.0
         self._queue[:, robot, 2] = self.reading["steering_angle"][robot]
 
@@ -267,8 +287,14 @@ class Plant(ABC):
         """Armature currents left and right at the end of the last control period in A, `(B, 2)`."""
         return self.state["current"]
 
-    def _look(self) -> bool:
-        return look.compiled(self.qpos, self.qvel, self.act, self._address, self._acts, self.state)
+    def _begin(self, rows: slice) -> None:
+        """Reads robots that were just stood on the ground; the second look finds that they do not accelerate."""
+        self._look(rows)
+        self._look(rows)
+
+    def _look(self, rows: slice = slice(None)) -> bool:
+        constants = self._address, self._acts, self.imu, self._period
+        return look.compiled(self.qpos[rows], self.qvel[rows], self.act[rows], *constants, self.state[rows])
 
 
 class PhysicsPlant(Plant):

@@ -61,6 +61,29 @@ def read(qpos: Array, qvel: Array, address: NDArray[np.int64], r: Row) -> None:
 
 
 @kernel
+def imu_motion(qpos: Array, qvel: Array, address: NDArray[np.int64], imu: Array, velocity: Array, axes: Array) -> None:
+    """Velocity of the inertial sensor, and the axes along which it measures.
+
+    Args:
+        qpos: Generalised positions, `(nq,)`.
+        qvel: Generalised velocities, `(nv,)`; those of a free joint are linear in the world and angular in the body.
+        address: As from `addresses`.
+        imu: Position of the sensor in the chassis' frame in m, `(3,)`.
+        velocity: Out: its velocity in the world in m/s, `(3,)`.
+        axes: Out: the chassis' x and y axes in the world, `(2, 3)`.
+    """
+    q, d = address[0], address[1]
+    w, i, j, k = qpos[q + 3], qpos[q + 4], qpos[q + 5], qpos[q + 6]
+    p, r, s = qvel[d + 3], qvel[d + 4], qvel[d + 5]
+    x, y, z = r * imu[2] - s * imu[1], s * imu[0] - p * imu[2], p * imu[1] - r * imu[0]
+    axes[0, 0], axes[0, 1], axes[0, 2] = 1 - 2 * (j * j + k * k), 2 * (i * j + w * k), 2 * (i * k - w * j)
+    axes[1, 0], axes[1, 1], axes[1, 2] = 2 * (i * j - w * k), 1 - 2 * (i * i + k * k), 2 * (j * k + w * i)
+    up = 2 * (i * k + w * j), 2 * (j * k - w * i), 1 - 2 * (i * i + j * j)
+    for n in range(3):
+        velocity[n] = qvel[d + n] + axes[0, n] * x + axes[1, n] * y + up[n] * z
+
+
+@kernel
 def read_all(qpos: Array, qvel: Array, address: NDArray[np.int64], rows: Rows) -> None:
     """`read` for a trajectory or a batch: `(n, nq)`, `(n, nv)` and one record of `READING` each."""
     for i in range(len(rows)):

@@ -1,4 +1,4 @@
-"""The measurement that the controller receives: true motion or odometry from encoders and gyro, noise, and slip."""
+"""The sensors of the robot: wheel encoders, gyro, accelerometer and posture fixes, each with its rate and latency."""
 
 from __future__ import annotations
 
@@ -7,117 +7,206 @@ from collections.abc import Sequence
 import numpy as np
 
 from mrctl.kernel import Array, Row, Rows, kernel
-from mrctl.sensing.slip import slip_ratio
-from mrctl.theory.perturbation import Perturbation
-from mrctl.theory.robot import Robot
+from mrctl.sensing.tiers import Sensing
 
-SEEN = np.dtype(
+BLOCK = 256  # control ticks whose noise is drawn at once
+OUTLIER = 1.0  # m, largest error of an outlying fix in x and y
+
+SENSOR = np.dtype(
     [
-        ("pose", "f8", 3),  # measured x and y in m, θ in rad
-        ("twist", "f8", 2),  # measured V in m/s and θ̇ in rad/s
-        ("slip", "f8"),  # slip ratio of the driven wheel that slips more
-        ("odometry", "?"),  # whether posture and twist come from encoders and gyro
-        ("noise_scale", "f8", 5),  # standard deviations of the noise of x, y, θ, V, θ̇
-        ("noise", "f8", 5),  # samples of that noise in this period
-        ("wheel_speeds", "f8", 2),  # wheel speeds left and right, from encoders and nominal wheel radius, m/s
-        ("elapsed", "f8"),  # time since the last measurement, s; 0 at the start
+        ("quantum", "f8"),  # angle of one encoder count, rad; 0 for an exact encoder
+        ("phase", "f8", 2),  # angle of each encoder at which a count begins, in counts from 0 to 1
+        ("encoder_every", "i8"),  # control periods from one sample to the next; so for the other sensors
+        ("encoder_latency", "i8"),  # age of a sample at its arrival, control periods; so for the other sensors
+        ("gyro_sigma", "f8"),  # standard deviation of the noise of a sample, rad/s
+        ("gyro_bias", "f8"),  # bias now, rad/s
+        ("gyro_step", "f8"),  # standard deviation of the change of the bias in a control period, rad/s
+        ("gyro_every", "i8"),
+        ("gyro_latency", "i8"),
+        ("accelerometer_sigma", "f8"),  # standard deviation of the noise of a sample, m/s²
+        ("accelerometer_bias", "f8", 2),  # biases now, forward and to the left, m/s²
+        ("accelerometer_step", "f8"),  # standard deviation of the change of a bias in a control period, m/s²
+        ("accelerometer_every", "i8"),
+        ("accelerometer_latency", "i8"),
+        ("fix_sigma", "f8", 2),  # standard deviations of the noise of position in m and heading in rad
+        ("fix_every", "i8"),
+        ("fix_latency", "i8"),
+        ("fix_lost", "f8"),  # share of fixes that never arrive
+        ("fix_outliers", "f8"),  # share of fixes that are wrong
+        ("start", "i8"),  # tick at which the run of this robot began
+    ],
+    align=True,
+)
+
+NOISE = np.dtype([("gyro", "f8", 2), ("accelerometer", "f8", 4), ("fix", "f8", 3), ("chance", "f8", 4)])
+# Standard normal numbers of one tick: noise and step of the gyro's bias; noise and steps of the accelerometer's two
+# axes; noise of a fix. And uniform ones from 0 to 1: whether a fix is lost, whether it is wrong, and by how much.
+
+SAMPLE = np.dtype(
+    [
+        ("encoder", "f8", 2),  # measured angles of the rear wheels, left and right, rad
+        ("rate", "f8", 2),  # their measured rates, rad/s; of an encoder that counts, the difference of two samples
+        ("encoder_new", "?"),  # whether the encoders were sampled in this tick; else the last sample is repeated
+        ("gyro", "f8"),  # measured θ̇, rad/s
+        ("gyro_new", "?"),
+        ("acceleration", "f8", 2),  # measured specific force, forward and to the left, m/s²
+        ("acceleration_new", "?"),
+        ("fix", "f8", 3),  # measured posture, m, m, rad
+        ("fix_taken", "?"),  # whether a fix was taken in this tick
+        ("fix_arrives", "?"),  # whether it arrives
+        ("grip", "u1", 2),  # whether the wheels grip, left and right, as an estimator finds
+        ("command", "f8", 2),  # derivative of the commanded twist that was computed in this tick, m/s² and rad/s²
     ],
     align=True,
 )
 
 
 @kernel
-def observe(true_pose: Array, true_twist: Array, s: Row) -> None:
-    """Measured posture and twist of one robot: the truth plus noise, or odometry.
+def sample(tick: int, true: Row, noise: Row, period: float, s: Row, last: Row, now: Row) -> None:
+    """Samples the sensors of one robot.
 
-        V = (v_l + v_r)/2,  θ̇ from the gyro;    ẋ = V cos θ,  ẏ = V sin θ
-
-    Odometry takes V from the encoders, adds noise to V and θ̇, and integrates them from the true initial posture, with
-    mean velocities and the heading at the middle of the period (second-order Runge-Kutta).
+        encoder   q ⌊φ/q + phase⌋ with the angle q of one count, so that the error is bounded in angle
+        gyro      θ̇ + b + n,    b ← b + w          accelerometer alike
+        fix       (x, y, θ) + n, or with an outlier in x and y
 
     Args:
-        true_pose: x and y in m, θ in rad, `(3,)`.
-        true_twist: V in m/s and θ̇ in rad/s, `(2,)`.
-        s: In and out: a record of `SEEN`.
+        tick: Control tick.
+        true: The robot, a record of `PLANT`.
+        noise: Random numbers of the tick, a record of `NOISE`.
+        period: Control period in s.
+        s: In and out: its sensors, a record of `SENSOR`.
+        last: Samples of the last tick, a record of `SAMPLE`.
+        now: Out: samples of this tick.
     """
-    if not s.odometry:
-        for k in range(3):
-            s.pose[k] = true_pose[k] + s.noise[k]
-        s.twist[0], s.twist[1] = true_twist[0] + s.noise[3], true_twist[1] + s.noise[4]
-        return
-    v = (s.wheel_speeds[0] + s.wheel_speeds[1]) / 2 + s.noise[3]
-    omega = true_twist[1] + s.noise[4]
-    mean_v, mean_omega = (v + s.twist[0]) / 2, (omega + s.twist[1]) / 2
-    heading = s.pose[2] + s.elapsed * mean_omega / 2
-    s.pose[0] += s.elapsed * mean_v * np.cos(heading)
-    s.pose[1] += s.elapsed * mean_v * np.sin(heading)
-    s.pose[2] += s.elapsed * mean_omega
-    s.twist[0], s.twist[1] = v, omega
+    since = tick - s.start
+    reading = true.reading
+    now.encoder_new = since % s.encoder_every == 0
+    for k in range(2):
+        if not now.encoder_new:
+            now.encoder[k], now.rate[k] = last.encoder[k], last.rate[k]
+        elif s.quantum == 0:
+            now.encoder[k], now.rate[k] = true.wheel_angles[k], reading.wheel_rates[k]
+        else:
+            now.encoder[k] = s.quantum * np.floor(true.wheel_angles[k] / s.quantum + s.phase[k])
+            if since == 0:
+                now.rate[k] = reading.wheel_rates[k]
+            else:
+                now.rate[k] = (now.encoder[k] - last.encoder[k]) / (period * s.encoder_every)
+    now.gyro_new = since % s.gyro_every == 0
+    s.gyro_bias += s.gyro_step * noise.gyro[1]
+    now.gyro = reading.twist[1] + s.gyro_bias + s.gyro_sigma * noise.gyro[0] if now.gyro_new else last.gyro
+    now.acceleration_new = since % s.accelerometer_every == 0
+    for k in range(2):
+        s.accelerometer_bias[k] += s.accelerometer_step * noise.accelerometer[2 + k]
+        force = true.specific_force[k] + s.accelerometer_bias[k] + s.accelerometer_sigma * noise.accelerometer[k]
+        now.acceleration[k] = force if now.acceleration_new else last.acceleration[k]
+    now.fix_taken = since % s.fix_every == 0
+    now.fix_arrives = now.fix_taken and noise.chance[0] >= s.fix_lost
+    wrong = noise.chance[1] < s.fix_outliers
+    for k in range(3):
+        now.fix[k] = reading.pose[k] + s.fix_sigma[k // 2] * noise.fix[k]
+        if wrong and k < 2:
+            now.fix[k] += OUTLIER * (2 * noise.chance[2 + k] - 1)
+    for k in range(2):
+        now.grip[k], now.command[k] = 1, 0.0
 
 
 @kernel
-def measure(plant: Rows, wheel_radius: float, half_track: float, period: float, seen: Rows) -> None:
-    """Measures all robots: from a record of `PLANT` to one of `SEEN` for each."""
-    for i in range(len(seen)):
-        true, s = plant[i].reading, seen[i]
-        for k in range(2):
-            s.wheel_speeds[k] = wheel_radius * true.wheel_rates[k]
-        observe(true.pose, true.twist, s)
-        s.slip = slip_ratio(s.wheel_speeds, s.twist, half_track, period, s.slip)
-        s.elapsed = period
+def sample_all(tick: int, plant: Rows, noise: Rows, period: float, sensors: Rows, ring: Rows) -> None:
+    """Samples the sensors of all robots into the row of this tick in `ring`, `(N, B)`."""
+    now, last = ring[tick % len(ring)], ring[(tick - 1) % len(ring)]
+    for i in range(len(sensors)):
+        sample(tick, plant[i], noise[i], period, sensors[i], last[i], now[i])
 
 
 class Sensors:
     """The sensors of B robots.
 
     Attributes:
-        seen: Last measurement of each robot, a record of `SEEN`, `(B,)`.
+        period: Control period in s.
+        ring: Samples of the last N ticks, records of `SAMPLE`, `(N, B)`; those of a tick stand in row tick % N.
+        sensors: Constants and biases of each robot's sensors, a record of `SENSOR`, `(B,)`.
     """
 
-    def __init__(self, odometry: Sequence[bool], seeds: Sequence[int], robot: Robot, period: float) -> None:
+    def __init__(self, sensing: Sequence[Sensing], seeds: Sequence[int], period: float) -> None:
         """Builds the sensors.
 
         Args:
-            odometry: For each robot, whether posture and twist come from encoders and gyro.
+            sensing: Sensing of each robot.
             seeds: Seed of the noise of each robot.
-            robot: The nominal robot.
             period: Control period in s.
         """
-        self.seen = np.zeros(len(seeds), SEEN)
-        self.seen["odometry"] = odometry
-        self._constants = robot.wheel_radius, robot.half_track, period
-        self._random = [np.random.default_rng([seed, 2]) for seed in seeds]
-        self._noisy: list[int] = []
+        size = len(sensing)
+        self.period, self._sensing = period, list(sensing)
+        self.sensors = np.zeros(size, SENSOR)
+        waits = [
+            max(s.periods(f"{name}_latency", period) for name in ("encoder", "gyro", "accelerometer", "fix"))
+            + s.periods("delay", period)
+            for s in sensing
+        ]
+        self.ring = np.zeros((max(waits) + 2, size), SAMPLE)
+        self._noise = np.zeros((1, size), NOISE)
+        self._random: list[dict[str, np.random.Generator]] = [{} for _ in range(size)]
+        for row, seed in enumerate(seeds):
+            self.restart(row, seed, 0)
 
-    def set_noise(self, row: int, perturbation: Perturbation) -> None:
-        """Gives the sensors of one robot the noise of a perturbation."""
-        p = perturbation
-        scale = p.position_noise, p.position_noise, p.heading_noise, p.velocity_noise, p.rotation_noise
-        self.seen["noise_scale"][row], self.seen["noise"][row] = scale, 0.0
-        self._noisy = np.flatnonzero(self.seen["noise_scale"].any(axis=1)).tolist()
-
-    def start(self, reading: Rows, rows: int | slice = slice(None)) -> None:
-        """Starts odometry of robots from their true posture and twist, a record of `READING` for each."""
-        for name in ("pose", "twist"):
-            self.seen[name][rows] = reading[name][rows]
-        self.seen["elapsed"][rows] = self.seen["slip"][rows] = 0.0
-
-    def restart(self, row: int, seed: int, reading: Rows) -> None:
-        """Starts the sensors of one robot again, with the noise of another seed."""
-        self._random[row] = np.random.default_rng([seed, 2])
-        self.seen["noise"][row] = 0.0
-        self.start(reading, row)
-
-    def measure(self, plant: Rows) -> Rows:
-        """Measures all robots.
+    def restart(self, row: int, seed: int, tick: int) -> None:
+        """Switches the sensors of one robot on: draws phases and biases, and starts their clocks.
 
         Args:
-            plant: Record of `PLANT` of each robot, `(B,)`.
-
-        Returns:
-            `seen`, `(B,)`.
+            row: Index of the robot.
+            seed: Seed of its noise.
+            tick: The coming control tick.
         """
-        for row in self._noisy:
-            self.seen["noise"][row] = self.seen["noise_scale"][row] * self._random[row].standard_normal(5)
-        measure.compiled(plant, *self._constants, self.seen)
-        return self.seen
+        sensing, period, s = self._sensing[row], self.period, self.sensors[row]
+        random = {name: np.random.default_rng([seed, 2, k]) for k, name in enumerate(("encoder", *(NOISE.names or ())))}
+        for name in ("encoder", "gyro", "accelerometer", "fix"):
+            s[f"{name}_every"] = sensing.periods(f"{name}_rate", period)
+            s[f"{name}_latency"] = sensing.periods(f"{name}_latency", period)
+        counts = sensing["encoder_counts"]
+        s["quantum"], s["phase"] = 2 * np.pi / counts if counts else 0.0, random["encoder"].uniform(size=2)
+        for name in ("gyro", "accelerometer"):
+            # A sample is the mean since the last one, so noise of density N has the deviation N/√duration.
+            s[f"{name}_sigma"] = sensing[f"{name}_noise"] / np.sqrt(period * s[f"{name}_every"])
+            s[f"{name}_step"] = sensing[f"{name}_walk"] * np.sqrt(period)
+            axes = random[name].standard_normal(2)
+            s[f"{name}_bias"] = sensing[f"{name}_bias"] * (axes[0] if name == "gyro" else axes)
+        s["fix_sigma"] = sensing["fix_position_noise"], sensing["fix_heading_noise"]
+        s["fix_lost"], s["fix_outliers"], s["start"] = sensing["fix_lost"], sensing["fix_outliers"], tick
+        self._random[row] = random
+        self.ring[:, row] = np.zeros(1, SAMPLE)
+        if tick % BLOCK:
+            self._draw(row, tick % BLOCK, tick)
+
+    def _draw(self, row: int, first: int, tick: int) -> None:
+        """Draws the noise of one robot for the rest of a block, which the tick `tick` begins at index `first`."""
+        s, random, noise = self.sensors[row], self._random[row], self._noise
+        if not any(s[name] for name in ("gyro_sigma", "gyro_step", "accelerometer_sigma", "accelerometer_step")) and (
+            not s["fix_sigma"].any() and not s["fix_lost"] and not s["fix_outliers"]
+        ):
+            return
+        if len(noise) < BLOCK:
+            self._noise = noise = np.zeros((BLOCK, len(self.sensors)), NOISE)
+        count = BLOCK - first
+        for name in ("gyro", "accelerometer"):
+            noise[name][first:, row] = random[name].standard_normal((count, noise[name].shape[-1]))
+        taken = first + (-(tick - s["start"]) % s["fix_every"]) + s["fix_every"] * np.arange(count)
+        taken = taken[taken < BLOCK]
+        noise["fix"][taken, row] = random["fix"].standard_normal((len(taken), 3))
+        noise["chance"][taken, row] = random["chance"].uniform(size=(len(taken), 4))
+
+    def measure(self, tick: int, plant: Rows) -> None:
+        """Samples the sensors of all robots in a control tick.
+
+        Args:
+            tick: The control tick.
+            plant: Record of `PLANT` of each robot, `(B,)`.
+        """
+        if tick % BLOCK == 0:
+            for row in range(len(self.sensors)):
+                self._draw(row, 0, tick)
+        sample_all.compiled(tick, plant, self._noise[tick % len(self._noise)], self.period, self.sensors, self.ring)
+
+    def command(self, tick: int, derivative: Array) -> None:
+        """Takes the derivative of the commanded twist that was computed in a tick, m/s² and rad/s², `(B, 2)`."""
+        self.ring["command"][tick % len(self.ring)] = derivative

@@ -9,12 +9,12 @@ SLIP_SPEED = 0.3  # m/s, least speed to which a slip is related, so that noise i
 
 
 @kernel
-def slip_ratio(wheel_speeds: Array, twist: Array, half_track: float, period: float, slip: float) -> float:
+def slip_ratio(wheel_speeds: Array, v: float, omega: float, half_track: float, period: float, slip: float) -> float:
     """Slip ratio of the driven wheel that slips more, behind a first-order low-pass.
 
         |v_i − u_i| / max(|v_i|, |u_i|, 0.3 m/s),    u_l,r = V ∓ D θ̇
 
-    where v_i is the speed of a wheel from its encoder, and u_i the speed at which the measured motion carries it over
+    where v_i is the speed of a wheel from its encoder, and u_i the speed at which the estimated motion carries it over
     the floor. The low-pass prevents a jolt from counting as slip, and prolongs a slip until the filters of a learner
     have forgotten it. Odometry, whose V is the mean of the encoders, shows about half of the slip of one wheel. An
     error of the wheel radius of some percent appears as a slip of as much, and noise as one of 0.8 of its standard
@@ -22,7 +22,8 @@ def slip_ratio(wheel_speeds: Array, twist: Array, half_track: float, period: flo
 
     Args:
         wheel_speeds: v left and right, from encoders and nominal wheel radius, in m/s, `(2,)`.
-        twist: Measured V in m/s and θ̇ in rad/s, `(2,)`.
+        v: Estimated V in m/s.
+        omega: Estimated θ̇ in rad/s.
         half_track: D in m.
         period: Control period in s.
         slip: Slip ratio of the last period.
@@ -32,7 +33,7 @@ def slip_ratio(wheel_speeds: Array, twist: Array, half_track: float, period: flo
     """
     worst = 0.0
     for k in range(2):
-        carried = twist[0] + (2 * k - 1) * half_track * twist[1]
+        carried = v + (2 * k - 1) * half_track * omega
         speed = max(abs(wheel_speeds[k]), abs(carried), SLIP_SPEED)
         worst = max(worst, abs(wheel_speeds[k] - carried) / speed)
     return slip + period / (period + SLIP_FILTER) * (worst - slip)

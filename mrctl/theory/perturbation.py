@@ -20,6 +20,13 @@ Factor = Annotated[float, Field(ge=0.05, le=20)]
 class Perturbation(Record):
     """Differences of the plant from its model, which the controller does not know; the default changes nothing."""
 
+    moved = {
+        "velocity_noise": "the noise of the wheel speeds follows from sensing.encoder_counts",
+        "rotation_noise": "set sensing.gyro_noise",
+        "position_noise": "set sensing.fix_position_noise",
+        "heading_noise": "set sensing.fix_heading_noise",
+    }
+
     mass_factor: Factor = 1.0
     """Factor on mass and inertia of every body."""
     inertia_factor: Factor = 1.0
@@ -51,15 +58,7 @@ class Perturbation(Record):
     slope: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     """Inclination of the ground in rad, uphill along the world's +x; gravity is turned, not the floor."""
     control_delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] = 0.0
-    """Delay of voltages and steering commands in s, a multiple of the control period."""
-    velocity_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Standard deviation of the noise on the measured V in m/s."""
-    rotation_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Standard deviation of the noise on the measured θ̇ in rad/s."""
-    position_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Standard deviation of the noise on the measured x and y in m; odometry has none, as it integrates V and θ̇."""
-    heading_noise: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Standard deviation of the noise on the measured θ in rad; odometry has none, as it integrates θ̇."""
+    """Further delay of voltages and steering commands in s, a multiple of the control period."""
 
 
 PERTURBATIONS: dict[str, Perturbation] = {
@@ -80,7 +79,6 @@ PERTURBATIONS: dict[str, Perturbation] = {
     "tyre friction 0.2": Perturbation(tyre_friction_factor=0.2 / 0.9),
     "left tyre on ice": Perturbation(left_tyre_friction_factor=0.1 / 0.9),
     "slope 10°": Perturbation(slope=0.1745),
-    "sensor noise": Perturbation(velocity_noise=0.01, rotation_noise=0.02, position_noise=0.002, heading_noise=0.002),
     "all": Perturbation(mass_factor=1.5, supply_factor=0.8, drive_friction_factor=3.0, resistance_factor=1.3),
 }
 """Named perturbations of the default robot, each of one kind; `all` combines four of them."""

@@ -1,0 +1,302 @@
+"""An extended Kalman filter of posture, twist, gyro bias and wheel radii from encoders, gyro and late posture fixes.
+
+    x = (x, y, θ, V, θ̇, b, o, λ_l, λ_r, s_l, s_r)
+
+    (ẋ, ẏ) = V (cos θ, sin θ) + v_y (−sin θ, cos θ),    v_y = −c V θ̇
+    V̇ = a − o,    θ̈ = θ̈_c,    λ̇_l,r = (V ∓ D θ̇)/(r (1 + s_l,r)),    b, o and s constant;    each plus noise
+
+    encoder_l,r = λ_l,r + quantisation,    gyro = θ̇ + b + noise,    fix = (x, y, θ) + noise
+
+The accelerometer a is an input; its offset o is its bias and its share of gravity. θ̈_c is the commanded acceleration that
+acts in the period. The wheel angles λ are part of the state, so that an encoder's error stays bounded in angle; as noise
+on V, it would grow to a random walk of the position. A fix corrects the state of the moment when it was taken: the filter
+keeps that state, and repeats the periods since then.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrctl.kernel import Array, Row, Rows, kernel
+from mrctl.sensing.prediction import front, predict
+from mrctl.sensing.tiers import IN_FLIGHT
+
+N = 11  # states
+X, Y, THETA, V, OMEGA, BIAS, OFFSET, LEFT, RIGHT, SCALE_LEFT, SCALE_RIGHT = range(N)
+KEPT = IN_FLIGHT + 1  # states that are kept for fixes on their way
+
+# Process noise, all chosen and held to the chi-square test of the filter's error (NEES) in the tests.
+TURN = 0.1  # deviation from the commanded θ̈, rad/s²/√Hz
+SETTLE = 1.0  # s, time in which o follows the faster offset of `find_grip`
+LOOSE_V = 0.5  # of V̇ while no wheel grips, m/s²/√Hz
+INCLINE = 0.02  # change of the accelerometer's share of gravity, m/s²/√s
+SIDE_SLIP, SKID = 2e-4, 0.02  # lateral motion of the rear axle beyond v_y, while both wheels grip and else, m/√s
+CREEP = 1.5e-4  # slip of a rolling tyre, share of the angle, √s
+RADIUS = 0.01  # standard deviation of the scale of a wheel's radius at the start
+RADIUS_WALK = 1e-5  # of that scale, 1/√s
+START_OFFSET = 0.2  # of the accelerometer's share of gravity, m/s²
+START_TWIST = 0.02, 0.02  # standard deviations of V in m/s and θ̇ in rad/s at the start
+
+SIDE = 1.94e-3  # s, c = m/C of the rear tyres of cornering stiffness C; measured on the models of this package
+FIX_GATE = 16.27  # 99.9 % of chi-square with 3 degrees of freedom
+LOST = 10  # fixes refused in a row, after which the filter believes them rather than itself
+LOOSE = 0.5  # m and rad, standard deviation that is then given to the posture
+GRIP = 0.08  # m/s between encoder and inertial speed of a wheel, beyond which it slips
+TWIST = 3e-3  # m/s, difference of the slip of two wheels that grip
+INERTIAL = 5.0  # rad/s, bandwidth of the observer that compares encoders with the accelerometer
+
+EKF = np.dtype(
+    [
+        ("mean", "f8", N),  # estimate of x, in the order and units above
+        ("P", "f8", (N, N)),  # its covariance
+        ("kept_mean", "f8", (KEPT, N)),  # estimates at the ticks of fixes that have not arrived
+        ("kept_P", "f8", (KEPT, N, N)),
+        ("kept_tick", "i8", KEPT),  # these ticks
+        ("g", "f8", N),  # scratch: covariance of the state with a measurement
+        ("tick", "i8"),  # tick of the estimate
+        ("encoder_variance", "f8"),  # rad²
+        ("gyro_variance", "f8"),  # (rad/s)²
+        ("bias_walk", "f8"),  # of the gyro, rad/s/√s
+        ("acceleration_variance", "f8"),  # of a sample, (m/s²)²
+        ("offset_walk", "f8"),  # of o, m/s²/√s
+        ("fix_variance", "f8", 3),  # m², m², rad²
+        ("inertial", "f8"),  # V from accelerometer and the wheels that grip, m/s
+        ("offset", "f8"),  # accelerometer's bias and share of gravity, m/s²
+        ("refused", "i8"),  # fixes refused in a row
+        ("nis", "f8"),  # normalised innovation squared of the last fix, chi-square with 3 degrees of freedom
+        ("innovations", "f8", 3),  # normalised innovations of the last encoder samples and gyro sample
+    ],
+    align=True,
+)
+
+
+@kernel
+def propagate(v_dot: float, omega_dot: float, grip: Array, geometry: Array, period: float, s: Row) -> None:
+    """Predicts the state over one period: P ← F P Fᵀ + Q."""
+    m, P, T = s.mean, s.P, period
+    r, D, side_lag = geometry[0], geometry[1], SIDE - geometry[3]
+    v, omega = m[V] + v_dot * T / 2, m[OMEGA] + omega_dot * T / 2
+    heading = m[THETA] + omega * (T / 2 - side_lag)  # of the motion, which v_y turns outwards
+    c, sn = T * np.cos(heading), T * np.sin(heading)
+    grow_left, grow_right = 1 + m[SCALE_LEFT], 1 + m[SCALE_RIGHT]
+    b_left, b_right = T / (r * grow_left), T / (r * grow_right)
+    turn_left, turn_right = b_left * (v - D * omega), b_right * (v + D * omega)
+    m[X] += v * c
+    m[Y] += v * sn
+    m[THETA] += T * omega
+    m[V] += T * v_dot
+    m[OMEGA] += T * omega_dot
+    m[LEFT] += turn_left
+    m[RIGHT] += turn_right
+    # F is the identity but for the rows of x, y, λ, θ and V. Those of θ and V come last, for the others use the old ones.
+    for transposed in range(2):
+        Q = P.T if transposed else P
+        for j in range(N):
+            direction = v * (Q[THETA, j] + (T / 2 - side_lag) * Q[OMEGA, j])
+            Q[X, j] += c * Q[V, j] - sn * direction
+            Q[Y, j] += sn * Q[V, j] + c * direction
+            Q[LEFT, j] += b_left * (Q[V, j] - D * Q[OMEGA, j]) - turn_left / grow_left * Q[SCALE_LEFT, j]
+            Q[RIGHT, j] += b_right * (Q[V, j] + D * Q[OMEGA, j]) - turn_right / grow_right * Q[SCALE_RIGHT, j]
+            Q[THETA, j] += T * Q[OMEGA, j]
+            Q[V, j] -= T * Q[OFFSET, j]
+    gripping = grip[0] + grip[1]
+    side = (SIDE_SLIP if gripping == 2 else SKID) ** 2 / T
+    P[X, X] += side * sn * sn
+    P[X, Y] -= side * sn * c
+    P[Y, X] -= side * sn * c
+    P[Y, Y] += side * c * c
+    P[V, V] += T**2 * s.acceleration_variance + (T * LOOSE_V**2 if gripping == 0 else 0.0)
+    P[OMEGA, OMEGA] += T * TURN**2
+    P[BIAS, BIAS] += T * s.bias_walk**2
+    P[OFFSET, OFFSET] += T * (s.offset_walk**2 + (s.offset - m[OFFSET]) ** 2 / SETTLE)
+    P[LEFT, LEFT] += CREEP**2 * turn_left**2 / T
+    P[RIGHT, RIGHT] += CREEP**2 * turn_right**2 / T
+    P[SCALE_LEFT, SCALE_LEFT] += T * RADIUS_WALK**2
+    P[SCALE_RIGHT, SCALE_RIGHT] += T * RADIUS_WALK**2
+
+
+@kernel
+def absorb(residual: float, variance: float, s: Row) -> None:
+    """Kalman update by a scalar measurement: g = P Hᵀ is in `s.g`.
+
+        x ← x + g e/S,    P ← P − g gᵀ/S,    S = H g + r
+
+    Args:
+        residual: Innovation e.
+        variance: Its variance S.
+        s: In and out: a record of `EKF`.
+    """
+    g, P = s.g, s.P
+    for i in range(N):
+        gain = g[i] / variance
+        s.mean[i] += gain * residual
+        for j in range(N):
+            P[i, j] -= gain * g[j]
+
+
+@kernel
+def measure(now: Row, omega_dot: float, skew: float, s: Row) -> None:
+    """Updates by encoders and gyro; the encoder of a wheel that slips only says where the wheel is now.
+
+    The gyro's sample is θ̇ of `skew` s ago, for which the commanded θ̈ accounts.
+    """
+    P = s.P
+    if now.encoder_new:
+        for k in range(2):
+            wheel = LEFT + k
+            if now.grip[k] == 1:
+                for i in range(N):
+                    s.g[i] = P[wheel, i]
+                variance = s.g[wheel] + s.encoder_variance
+                residual = now.encoder[k] - s.mean[wheel]
+                s.innovations[k] = residual / np.sqrt(variance)
+                absorb(residual, variance, s)
+            else:
+                for i in range(N):
+                    P[wheel, i] = P[i, wheel] = 0.0
+                P[wheel, wheel], s.mean[wheel] = s.encoder_variance, now.encoder[k]
+    if now.gyro_new:
+        for i in range(N):
+            s.g[i] = P[OMEGA, i] + P[BIAS, i]
+        variance = s.g[OMEGA] + s.g[BIAS] + s.gyro_variance
+        residual = now.gyro - (s.mean[OMEGA] - omega_dot * skew) - s.mean[BIAS]
+        s.innovations[2] = residual / np.sqrt(variance)
+        absorb(residual, variance, s)
+
+
+@kernel
+def absorb_fix(fix: Array, s: Row) -> None:
+    """Updates by a posture fix, unless it lies outside the gate; the filter gives in to the tenth such fix in a row."""
+    P, m = s.P, s.mean
+    e0, e1 = fix[0] - m[X], fix[1] - m[Y]
+    e2 = np.pi - (np.pi - fix[2] + m[THETA]) % (2 * np.pi)
+    a, b, c = P[X, X] + s.fix_variance[0], P[X, Y], P[X, THETA]
+    d, e, f = P[Y, Y] + s.fix_variance[1], P[Y, THETA], P[THETA, THETA] + s.fix_variance[2]
+    # S⁻¹ by its adjugate
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * A + b * B + c * C
+    s.nis = (
+        A * e0 * e0 + (a * f - c * c) * e1 * e1 + (a * d - b * b) * e2 * e2
+        + 2 * (B * e0 * e1 + C * e0 * e2 + (b * c - a * e) * e1 * e2)
+    ) / determinant  # fmt: skip
+    if s.nis > FIX_GATE:
+        s.refused += 1
+        if s.refused < LOST:
+            return
+        for k in range(3):
+            P[k, k] += LOOSE**2
+    s.refused = 0
+    for k in range(3):
+        for i in range(N):
+            s.g[i] = P[k, i]
+        residual = fix[k] - m[k]
+        if k == THETA:
+            residual = np.pi - (np.pi - fix[2] + m[THETA]) % (2 * np.pi)
+        absorb(residual, s.g[k] + s.fix_variance[k], s)
+
+
+@kernel
+def find_grip(now: Row, geometry: Array, period: float, sensor: Row, s: Row) -> None:
+    """Tells which wheels grip, from encoders, gyro and accelerometer, and writes it into the samples.
+
+    An observer follows the wheels' speed, with the accelerometer as its input:
+
+        V ← V + T (a − o) + 2 ω₀ T e,    o ← o − ω₀² T e,    e = mean of v_l,r − (V ∓ D ω) over the wheels that grip
+
+    The offset o is the accelerometer's bias and its share of gravity. A wheel slips if its e is larger than `GRIP`.
+
+    Args:
+        now: In and out: a record of `SAMPLE`, whose `grip` is the result.
+        geometry: As for the estimator `truth`.
+        period: Control period in s.
+        sensor: A record of `SENSOR`.
+        s: In and out: a record of `EKF`.
+    """
+    r, D = geometry[0], geometry[1]
+    omega = now.gyro - s.mean[BIAS]
+    ahead = s.inertial + period * (now.acceleration[0] + geometry[2] * omega * omega - s.offset)
+    bound = GRIP + r * sensor.quantum / (period * sensor.encoder_every)
+    left = r * (1 + s.mean[SCALE_LEFT]) * now.rate[0] - (ahead - D * omega)
+    right = r * (1 + s.mean[SCALE_RIGHT]) * now.rate[1] - (ahead + D * omega)
+    now.grip[0], now.grip[1] = abs(left) < bound, abs(right) < bound
+    P = s.P
+    spread = 4 * (r / (period * sensor.encoder_every)) ** 2 * s.encoder_variance
+    spread += 4 * D * D * (s.gyro_variance + P[BIAS, BIAS])
+    spread += s.inertial**2 * (P[SCALE_LEFT, SCALE_LEFT] + P[SCALE_RIGHT, SCALE_RIGHT])
+    if abs(left - right) > 4 * np.sqrt(spread) + TWIST:  # the gyro tells that one of them slips
+        if abs(left) > abs(right):
+            now.grip[0] = 0
+        else:
+            now.grip[1] = 0
+    count = now.grip[0] + now.grip[1]
+    if count > 0:
+        mean = (now.grip[0] * left + now.grip[1] * right) / count
+        ahead += 2 * INERTIAL * period * mean
+        s.offset -= INERTIAL**2 * period * mean
+    s.inertial = ahead
+
+
+@kernel
+def step(t: int, ring: Rows, i: int, geometry: Array, period: float, delay: int, start: int, s: Row) -> None:
+    """Takes the filter from tick t − 1 to t."""
+    now, p = ring[t % len(ring), i], t - 1 - delay
+    omega_dot = ring[p % len(ring), i].command[1] if p >= start else 0.0
+    forward = now.acceleration[0] + geometry[2] * s.mean[OMEGA] ** 2  # the accelerometer is ahead of the rear axle
+    propagate(forward - s.mean[OFFSET], omega_dot, now.grip, geometry, period, s)
+    measure(now, omega_dot, geometry[3], s)
+    s.tick = t
+
+
+@kernel
+def keep(t: int, s: Row) -> None:
+    """Keeps the state of a tick in which a fix was taken."""
+    oldest = 0
+    for k in range(KEPT):
+        if s.kept_tick[k] == t:
+            oldest = k
+            break
+        if s.kept_tick[k] < s.kept_tick[oldest]:
+            oldest = k
+    s.kept_tick[oldest] = t
+    s.kept_mean[oldest, :] = s.mean
+    s.kept_P[oldest, :, :] = s.P
+
+
+@kernel
+def ekf(
+    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Array, period: float, memory: Row, s: Row
+) -> None:
+    """The estimator `ekf`; the arguments are those of `truth`, of whose robot it reads nothing."""
+    f, now = memory, front(tick, sensor)
+    taken = tick - sensor.fix_latency  # when the fix that arrives now was taken
+    if s.start <= taken < now and ring[taken % len(ring), i].fix_arrives:
+        for k in range(KEPT):
+            if f.kept_tick[k] == taken:
+                f.mean[:] = f.kept_mean[k]
+                f.P[:, :] = f.kept_P[k]
+                absorb_fix(ring[taken % len(ring), i].fix, f)
+                for t in range(taken + 1, now):
+                    step(t, ring, i, geometry, period, s.delay, s.start, f)
+                    if ring[t % len(ring), i].fix_taken:
+                        keep(t, f)
+                break
+    if now >= s.start:
+        sample = ring[now % len(ring), i]
+        if now > s.start:
+            find_grip(sample, geometry, period, sensor, f)
+            step(now, ring, i, geometry, period, s.delay, s.start, f)
+            if sample.grip[0] + sample.grip[1] < 2:
+                f.inertial = f.mean[V]
+        if sample.fix_taken and now - s.start > 0:
+            if sensor.fix_latency <= tick - now:
+                if sample.fix_arrives:
+                    absorb_fix(sample.fix, f)
+            else:
+                keep(now, f)
+    predict(f.mean, max(now, s.start), tick, ring, i, period, s)
+    for k in range(3):
+        s.estimate[k] = s.pose[k]
+    s.estimate[3], s.estimate[4] = s.twist[0], s.twist[1]
+    P = f.P
+    s.variance[0], s.variance[1], s.variance[2] = P[X, X], P[X, Y], P[Y, Y]
+    s.variance[3], s.variance[4], s.variance[5] = P[THETA, THETA], P[V, V], P[OMEGA, OMEGA]

@@ -1,0 +1,209 @@
+"""What the controller is told of posture and twist: the truth, odometry, or the estimate of a filter, predicted.
+
+An estimator sees the samples of the sensors, and estimates posture and twist at the coming control tick. `predict` takes
+the estimate on to the moment when the voltage that is computed now reaches the motors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mrctl.kernel import Array, Kernel, Row, Rows, kernel
+from mrctl.sensing.ekf import EKF, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
+from mrctl.sensing.prediction import SEEN, front, predict
+from mrctl.sensing.sensors import Sensors
+from mrctl.sensing.slip import slip_ratio
+from mrctl.sensing.tiers import Sensing
+from mrctl.theory.robot import Robot
+
+MOTION = np.dtype(
+    [
+        ("mean", "f8", 5),  # x, y in m, θ in rad, V in m/s, θ̇ in rad/s, when the last samples were taken
+        ("told", "f8", 5),  # estimate of a user's estimator, in the same order
+        ("valid", "?"),  # whether it consists of finite numbers
+    ],
+    align=True,
+)
+
+
+@kernel
+def truth(
+    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Array, period: float, memory: Row, s: Row
+) -> None:
+    """The estimator `truth`: the true posture and twist.
+
+    Args:
+        tick: Control tick.
+        true: The robot, a record of `PLANT`.
+        ring: Samples and commands, as in `Sensors`, `(N, B)`.
+        i: Index of the robot.
+        sensor: Its record of `SENSOR`.
+        geometry: Wheel radius r, half track D and distance of the accelerometer ahead of the rear axle in m, `(3,)`.
+        period: Control period in s.
+        memory: In and out: what the estimator keeps of the robot.
+        s: Out: its record of `SEEN`, of which an estimator writes `estimate` and `variance`.
+    """
+    for k in range(3):
+        s.estimate[k] = true.reading.pose[k]
+    s.estimate[3], s.estimate[4] = true.reading.twist[0], true.reading.twist[1]
+
+
+@kernel
+def odometry(
+    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Array, period: float, memory: Row, s: Row
+) -> None:
+    """The estimator `odometry`: distance from the encoders, heading from the gyro, without any correction.
+
+        Δs = r (Δφ_l + Δφ_r)/2,    Δθ = T (ω_k + ω_{k−1})/2,    V = r (φ̇_l + φ̇_r)/2
+
+    The distance is driven in the direction of the middle of the period. The arguments are those of `truth`.
+    """
+    now = front(tick, sensor)
+    m = memory.mean
+    if now > s.start:
+        this, last = ring[now % len(ring), i], ring[(now - 1) % len(ring), i]
+        way = geometry[0] * (this.encoder[0] - last.encoder[0] + this.encoder[1] - last.encoder[1]) / 2
+        turn = period * (this.gyro + last.gyro) / 2
+        m[0] += way * np.cos(m[2] + turn / 2)
+        m[1] += way * np.sin(m[2] + turn / 2)
+        m[2] += turn
+        m[3], m[4] = geometry[0] * (this.rate[0] + this.rate[1]) / 2, this.gyro
+    predict(m, max(now, s.start), tick, ring, i, period, s)
+    for k in range(3):
+        s.estimate[k] = s.pose[k]
+    s.estimate[3], s.estimate[4] = s.twist[0], s.twist[1]
+
+
+@kernel
+def user(
+    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Array, period: float, memory: Row, s: Row
+) -> None:
+    """The estimate that a user's estimator told, or odometry from its last one; the arguments are those of `truth`."""
+    odometry(tick, true, ring, i, sensor, geometry, period, memory, s)
+    if memory.valid:
+        for k in range(5):
+            memory.mean[k] = s.estimate[k] = memory.told[k]
+
+
+observe = truth  # the estimator of `estimate`, which `Kernel.calling` replaces
+
+
+@kernel
+def estimate(
+    tick: int, plant: Rows, ring: Rows, sensors: Rows, geometry: Array, period: float, memory: Rows, seen: Rows
+) -> None:
+    """Estimates posture and twist of all robots with `observe`, and predicts them to the moment when the voltage acts.
+
+    Args:
+        tick: Control tick.
+        plant: Record of `PLANT` of each robot, which the estimator `truth` alone reads, and the driver's telemetry.
+        ring: Samples and commands, as in `Sensors`, `(N, B)`.
+        sensors: Record of `SENSOR` of each robot.
+        geometry: As for `truth`.
+        period: Control period in s.
+        memory: What the estimator keeps of each robot.
+        seen: Out: record of `SEEN` of each robot.
+    """
+    for i in range(len(seen)):
+        s, sensor = seen[i], sensors[i]
+        observe(tick, plant[i], ring, i, sensor, geometry, period, memory[i], s)
+        predict(s.estimate, tick, tick + s.delay, ring, i, period, s)
+        wheels = ring[max(s.start, tick - sensor.encoder_latency) % len(ring), i]
+        force = ring[max(s.start, tick - sensor.accelerometer_latency) % len(ring), i]
+        s.gyro = ring[max(s.start, tick - sensor.gyro_latency) % len(ring), i].gyro
+        for k in range(2):
+            s.encoder[k], s.acceleration[k] = wheels.encoder[k], force.acceleration[k]
+            s.wheel_speeds[k] = geometry[0] * wheels.rate[k]
+        s.slip = slip_ratio(s.wheel_speeds, s.estimate[3], s.estimate[4], geometry[1], period, s.slip)
+        taken = ring[(tick - sensor.fix_latency) % len(ring), i]
+        arrives = taken.fix_arrives and tick - sensor.fix_latency >= s.start
+        for k in range(3):
+            s.fix[k] = taken.fix[k] if arrives else np.nan
+
+
+ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
+    "truth": (truth, MOTION),
+    "odometry": (odometry, MOTION),
+    "ekf": (ekf, EKF),
+    "user": (user, MOTION),
+}
+"""Law and memory of each estimator; `user` repeats what a user's estimator told."""
+
+
+class Estimator:
+    """An estimator for B robots.
+
+    Attributes:
+        seen: What the controllers are told, a record of `SEEN` of each robot, `(B,)`.
+        memory: What the estimator keeps, a record of each robot, `(B,)`.
+    """
+
+    def __init__(
+        self, name: str, sensing: Sequence[Sensing], robot: Robot, sensors: Sensors, imu: Array, skew: float
+    ) -> None:
+        """Builds the estimator.
+
+        Args:
+            name: Name of the estimator, a key of `ESTIMATORS`.
+            sensing: Sensing of each robot.
+            robot: The nominal robot.
+            sensors: The sensors.
+            imu: Position of the accelerometer in the frame of the chassis in m, `(3,)`.
+            skew: By how much velocities lag behind positions in s: half a physics step, as the engine moves positions
+                with the velocities at the end of a step.
+        """
+        law, memory = ESTIMATORS[name]
+        self._law = estimate.calling(observe=law)
+        self._name, self._sensing, self._sensors = name, list(sensing), sensors
+        self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew])
+        self.seen = np.zeros(len(sensing), SEEN)
+        self.memory = np.zeros(len(sensing), memory)
+
+    def start(self, row: int, reading: Row, seed: int, tick: int) -> None:
+        """Starts the estimate of one robot from a first fix, and from a twist that is known roughly.
+
+        Args:
+            row: Index of the robot.
+            reading: Its true state, a record of `READING`.
+            seed: Seed of the errors of the start.
+            tick: The coming control tick.
+        """
+        sensing, sensor, period = self._sensing[row], self._sensors.sensors[row], self._sensors.period
+        random, seen = np.random.default_rng([seed, 3]), self.seen[row]
+        self.seen[row], self.memory[row] = np.zeros((), SEEN), np.zeros((), self.memory.dtype)
+        seen["start"], seen["delay"] = tick, sensing.periods("delay", period)
+        deviation = np.zeros(5)
+        if self._name != "truth":
+            deviation[[0, 1, 2]] = sensor["fix_sigma"][[0, 0, 1]]
+            deviation[3] = START_TWIST[0] if sensor["quantum"] else 0.0
+            deviation[4] = START_TWIST[1] if sensor["gyro_sigma"] else 0.0
+        memory, size = self.memory[row], 5
+        memory["mean"][:size] = np.append(reading["pose"], reading["twist"]) + deviation * random.standard_normal(size)
+        if self._name == "ekf":
+            offset = sensing["accelerometer_bias"] ** 2 + START_OFFSET**2
+            variances = [*deviation**2, sensing["gyro_bias"] ** 2, offset, 0.0, 0.0, RADIUS**2, RADIUS**2]
+            memory["acceleration_variance"] = sensor["accelerometer_sigma"] ** 2
+            memory["offset_walk"] = np.hypot(sensing["accelerometer_walk"], INCLINE)
+            memory["P"][:] = np.diag(np.maximum(variances, 1e-12))
+            memory["encoder_variance"], memory["gyro_variance"] = sensor["quantum"] ** 2 / 12, sensor["gyro_sigma"] ** 2
+            memory["bias_walk"], memory["kept_tick"] = sensing["gyro_walk"], -1
+            memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
+            memory["inertial"] = memory["mean"][3]
+
+    def estimate(self, tick: int, plant: Rows) -> Rows:
+        """Estimates posture and twist of all robots.
+
+        Args:
+            tick: Control tick.
+            plant: Record of `PLANT` of each robot, `(B,)`.
+
+        Returns:
+            `seen`, `(B,)`.
+        """
+        sensors = self._sensors
+        self._law.compiled(
+            tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen
+        )
+        return self.seen

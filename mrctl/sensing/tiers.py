@@ -1,0 +1,168 @@
+"""Sensing tiers: what the robot's sensors, motor driver, battery and steering servo are, from ideal to field."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from mrctl.record import Record
+from mrctl.theory.perturbation import LONGEST_DELAY
+
+Tier = Literal["ideal", "lab", "field"]
+TIERS: tuple[Tier, ...] = ("ideal", "lab", "field")
+EstimatorName = Literal["truth", "odometry", "ekf"]
+IN_FLIGHT = 4
+"""Largest number of fixes that are on their way at the same time."""
+
+DEGREE = 3.141592653589793 / 180
+VALUES: dict[str, tuple[float, float, float]] = {
+    # Lab: 512 pulses on the motor's shaft, four edges each, behind a gear of 43 (Maxon RE25 with an encoder MR 512).
+    # Field: Kobuki's 2578.33 ticks a wheel turn (Yujin Robot, Kobuki user guide).
+    "encoder_counts": (0, 88_064, 2_578),
+    "encoder_rate": (0, 0, 0),  # with the control loop
+    "encoder_latency": (0, 0, 0),
+    # Bosch BMI088: 0.014 °/s/√Hz, with the vibration of a robot 0.017 (chosen). ST L3GD20: 0.03 °/s/√Hz.
+    "gyro_noise": (0, 3e-4, 5e-4),
+    "gyro_bias": (0, 2e-3, 0.5 * DEGREE),  # chosen: after a calibration at rest; within a L3GD20's drift in minutes
+    "gyro_walk": (0, 1.9393e-5, 1e-4),  # lab: ADIS16448 of the EuRoC data sets (Burri et al. 2016); field: chosen
+    "gyro_rate": (0, 0, 0),
+    "gyro_latency": (0, 0, 0),
+    "accelerometer_noise": (0, 1.6e-3, 2.2e-3),  # Bosch BMI088: 160 µg/√Hz. ST LSM303D: 220 µg/√Hz with vibration
+    "accelerometer_bias": (0, 0.05, 0.2),  # chosen: 5 and 20 mg
+    "accelerometer_walk": (0, 1e-3, 3e-3),  # lab: chosen; field: ADIS16448 of the EuRoC data sets
+    "accelerometer_rate": (0, 0, 0),
+    "accelerometer_latency": (0, 0, 0),
+    # All chosen. Lab: a motion-capture system seen over a network. Field: scan matching on a map (AMCL, 10 Hz).
+    "fix_rate": (0, 20, 10),
+    "fix_position_noise": (0, 0.003, 0.02),
+    "fix_heading_noise": (0, 0.003, 0.01),
+    "fix_latency": (0, 0.01, 0.05),
+    "fix_lost": (0, 0, 0.05),
+    "fix_outliers": (0, 0, 0),
+    "delay": (0, 0.01, 0.02),  # chosen: one and two control periods for bus, computation and PWM
+    "dead_zone": (0, 0.2, 0.5),  # chosen, as all that follow
+    "pwm_steps": (0, 1024, 256),
+    "current_limit": (100, 10, 6),
+    "battery_resistance": (0, 0.05, 0.15),
+    "steering_offset": (0, 0.2 * DEGREE, 1 * DEGREE),
+    "steering_backlash": (0, 0, 1 * DEGREE),
+}
+"""Values of the three tiers in the units of the fields of `Sensing`; a rate of 0 is that of the control loop."""
+
+Rate = Annotated[float, Field(ge=0, le=10_000)]
+Latency = Annotated[float, Field(ge=0, le=LONGEST_DELAY)]
+
+
+class Sensing(Record):
+    """What the robot senses and acts with: a tier, and values that replace the tier's."""
+
+    tier: Tier = "ideal"
+    """Quality of sensors, motor driver, battery and steering servo: exact (`ideal`), good (`lab`) or cheap (`field`)."""
+    estimator: EstimatorName | None = None
+    """Source of posture and twist: the `truth`, `odometry` from encoders and gyro, or an extended Kalman filter (`ekf`);
+    by default the truth in the ideal tier and the filter in the others."""
+    encoder_counts: Annotated[int, Field(ge=0, le=10**9)] | None = None
+    """Counts of a wheel's encoder in one turn; 0 reads exact angles and rates."""
+    encoder_rate: Rate | None = None
+    """Rate of the encoders in Hz, a whole fraction of the control rate; 0 is the control rate."""
+    encoder_latency: Latency | None = None
+    """Age of the encoders' samples when they arrive in s, a multiple of the control period."""
+    gyro_noise: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Noise density of the gyro in rad/s/√Hz."""
+    gyro_bias: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Standard deviation of the gyro's bias at the start in rad/s."""
+    gyro_walk: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Random walk of the gyro's bias in rad/s/√s."""
+    gyro_rate: Rate | None = None
+    """Rate of the gyro in Hz, a whole fraction of the control rate; 0 is the control rate."""
+    gyro_latency: Latency | None = None
+    """Age of the gyro's samples when they arrive in s, a multiple of the control period."""
+    accelerometer_noise: Annotated[float, Field(ge=0, le=10)] | None = None
+    """Noise density of the accelerometer in m/s²/√Hz."""
+    accelerometer_bias: Annotated[float, Field(ge=0, le=10)] | None = None
+    """Standard deviation of the accelerometer's bias at the start in m/s²."""
+    accelerometer_walk: Annotated[float, Field(ge=0, le=10)] | None = None
+    """Random walk of the accelerometer's bias in m/s²/√s."""
+    accelerometer_rate: Rate | None = None
+    """Rate of the accelerometer in Hz, a whole fraction of the control rate; 0 is the control rate."""
+    accelerometer_latency: Latency | None = None
+    """Age of the accelerometer's samples when they arrive in s, a multiple of the control period."""
+    fix_rate: Rate | None = None
+    """Rate of the posture fixes in Hz, a whole fraction of the control rate; 0 is the control rate."""
+    fix_position_noise: Annotated[float, Field(ge=0, le=10)] | None = None
+    """Standard deviation of x and y of a fix in m."""
+    fix_heading_noise: Annotated[float, Field(ge=0, le=3)] | None = None
+    """Standard deviation of the heading of a fix in rad."""
+    fix_latency: Latency | None = None
+    """Age of a fix when it arrives in s, a multiple of the control period."""
+    fix_lost: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Share of the fixes that never arrive."""
+    fix_outliers: Annotated[float, Field(ge=0, le=1)] | None = None
+    """Share of the fixes that are wrong by up to 1 m in x and y."""
+    delay: Latency | None = None
+    """Time from the measurement to the voltage in s, a multiple of the control period; the controller knows it."""
+    dead_zone: Annotated[float, Field(ge=0, le=10)] | None = None
+    """Commanded voltage in V below which the motor driver gives none."""
+    pwm_steps: Annotated[int, Field(ge=0, le=2**24)] | None = None
+    """Number of voltage steps of the motor driver from zero to the supply; 0 is continuous."""
+    current_limit: Annotated[float, Field(gt=0, le=100)] | None = None
+    """Current limit of the motor driver for each motor in A; 100 A is never reached."""
+    battery_resistance: Annotated[float, Field(ge=0, le=10)] | None = None
+    """Resistance of the battery and its wires in Ω."""
+    steering_offset: Annotated[float, Field(ge=-0.5, le=0.5)] | None = None
+    """Error of the zero of the steering angle in rad."""
+    steering_backlash: Annotated[float, Field(ge=0, le=0.5)] | None = None
+    """Play of the steering in rad."""
+
+    def __getitem__(self, name: str) -> float:
+        """Returns the value that a field has, its own or the tier's, in the unit of the field."""
+        own = getattr(self, name)
+        return VALUES[name][TIERS.index(self.tier)] if own is None else own
+
+    @property
+    def source(self) -> EstimatorName:
+        """The estimator, the one that was asked for or the tier's."""
+        return self.estimator or ("truth" if self.tier == "ideal" else "ekf")
+
+    def periods(self, name: str, control_period: float) -> int:
+        """Returns a rate, latency or delay in control periods; a tier's own value is rounded, to at least one.
+
+        Args:
+            name: Name of a field, such as `fix_rate` or `delay`.
+            control_period: Control period in s.
+
+        Raises:
+            ValueError: A value that replaces the tier's is no whole number of control periods; the message names it.
+        """
+        value = self[name]
+        if name.endswith("_rate"):
+            value = 1 / value if value else control_period
+        count = round(value / control_period)
+        if getattr(self, name) is None:
+            return max(count, 1 if value else 0)
+        if abs(count * control_period - value) > 1e-6 * control_period:
+            raise ValueError(
+                f"sensing.{name}: {value:g} s is not a whole multiple of control_period ({control_period:g} s)"
+            )
+        return count
+
+    def check(self, control_period: float, duration: float) -> None:
+        """Refuses rates and latencies that do not fit a run.
+
+        Args:
+            control_period: Control period in s.
+            duration: Duration of the run in s.
+
+        Raises:
+            ValueError: A time is no whole number of control periods, more than four fixes are on their way at the same
+                time, or fixes are older than the run.
+        """
+        for name in VALUES:
+            if name.endswith(("_rate", "_latency")) or name == "delay":
+                self.periods(name, control_period)
+        latency = self.periods("fix_latency", control_period)
+        if latency > IN_FLIGHT * self.periods("fix_rate", control_period):
+            raise ValueError(f"sensing.fix_latency: more than {IN_FLIGHT} fixes would be on their way at the same time")
+        if latency * control_period >= duration:
+            raise ValueError(f"sensing.fix_latency: {self['fix_latency']:g} s, but the run takes {duration:g} s")
