@@ -20,6 +20,7 @@ SEEN = np.dtype(
         ("noise_scale", "f8", 5),  # standard deviations of the noise of x, y, θ, V, θ̇
         ("noise", "f8", 5),  # samples of that noise in this period
         ("wheel_speeds", "f8", 2),  # wheel speeds left and right, from encoders and nominal wheel radius, m/s
+        ("lost", "f8", 2),  # voltage applied less commanded by a driver at its current limit, in the last period, V
         ("elapsed", "f8"),  # time since the last measurement, s; 0 at the start
     ],
     align=True,
@@ -62,6 +63,7 @@ def measure(plant: Rows, wheel_radius: float, half_track: float, period: float, 
         true, s = plant[i].reading, seen[i]
         for k in range(2):
             s.wheel_speeds[k] = wheel_radius * true.wheel_rates[k]
+            s.lost[k] = plant[i].lost[k]
         observe(true.pose, true.twist, s)
         s.slip = slip_ratio(s.wheel_speeds, s.twist, half_track, period, s.slip)
         s.elapsed = period
