@@ -91,7 +91,7 @@ def look(
         for k in range(2):
             limit = p.driver.current_limit[k]
             p.applied[k] = chop(p.sent[k], p.emf[k], p.resistance[k], limit)
-            p.lost[k] = (p.applied[k] - p.sent[k]) / p.driver.scale
+            p.lost[k] = (p.applied[k] - p.sent[k]) / p.driver.scale if p.driver.scale > 0 else 0.0
             if len(acts):
                 p.current[k] = max(-limit, min(limit, act[i, acts[k]]))
             else:

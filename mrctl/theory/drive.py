@@ -106,7 +106,8 @@ def battery_voltage(command: Array, emf: Array, resistance: Array, d: Row) -> fl
 
     A motor at its current limit I takes the power p_i = (e_i ± R_i I)(±I) and p_i/U from the battery. With sums g and h
     over the other motors and p over these the law is a quadratic equation, whose larger root is the stable one. The
-    limits only lower the power, so there always is one.
+    limits only lower the power, so there always is one. U is not negative: where the motors would turn the battery's
+    voltage around, the diodes of the bridge short them instead.
 
         (1 + g) U² − (U_0 + h) U + R_b p = 0,    g = R_b Σ δ_i²/R_i,    h = R_b Σ δ_i e_i/R_i
 

@@ -107,6 +107,16 @@ def test_sag_under_a_limit(volts, emf, battery):
     assert d["scale"] * SUPPLY == pytest.approx(low, rel=2e-3)
 
 
+@given(
+    st.tuples(VOLTS, VOLTS), st.tuples(st.floats(-50, 50), st.floats(-50, 50)), st.floats(0.01, 4), st.floats(0.1, 50),
+)  # fmt: skip
+def test_sag_of_anything(volts, emf, battery, limit):
+    """A weak battery, motors that are driven backwards, any limit: the voltage is finite and never turns around."""
+    voltage, d = sent(volts, emf, battery_resistance=battery, current_limit=limit, gain=0.5)
+    assert np.isfinite(voltage).all() and 0 <= d["scale"] < 50
+    assert (voltage * np.sign(volts) >= 0).all()
+
+
 def test_sag_of_a_stalled_robot():
     """Both motors at rest and full duty: U = U_0/(1 + 2 R_b/R), a voltage divider."""
     _, d = sent((SUPPLY, -SUPPLY), battery_resistance=0.15)
