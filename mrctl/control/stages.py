@@ -2,9 +2,9 @@
 
 A stage serves B robots: arrays have a leading axis B, so that robots cannot mix. A factory makes it, which is called
 with the nominal robot and the number of robots. Its two methods receive copies, NumPy arrays of float64, and may return
-NumPy arrays or torch tensors. `mrctl.simulate(…, motion=, feedback=, feedforward=, steering=, estimator=)` takes the factories. The
-limits and the prefilter of the command, the limits of voltage and steering angle, and the guard on the feedforward
-still act.
+NumPy arrays or torch tensors. `mrctl.simulate(…, motion=, feedback=, feedforward=, steering=, estimator=)` takes the
+factories. The limits and the prefilter of the command, the limits of voltage and steering angle, and the guard on the
+feedforward still act.
 
 | stage         | `output` returns                                    | other method                                 |
 | ------------- | --------------------------------------------------- | -------------------------------------------- |

@@ -112,3 +112,23 @@ def allocate(
         s.excess[1] = (lost_right - lost_left) / 2
     if lost_left != 0 or lost_right != 0:
         s.saturated = True
+
+
+@kernel
+def take_loss(lost: Array, rigid: bool, s: Row) -> None:
+    """Counts what the drivers' current limits took in the last period as excess, as if it were taken in this one too.
+
+    A driver reports its limit one period late. Back-calculation then unwinds the integral of the PID, and a learner
+    does not learn.
+
+    Args:
+        lost: Voltages left and right at the terminals less those that were commanded, in commanded V, `(2,)`.
+        rigid: Whether the second channel is steering.
+        s: In and out: a record of `ALLOCATION`.
+    """
+    if lost[0] == 0 and lost[1] == 0:
+        return
+    s.excess[0] += (lost[0] + lost[1]) / 2
+    if not rigid:
+        s.excess[1] += (lost[1] - lost[0]) / 2
+    s.saturated = True

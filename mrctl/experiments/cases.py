@@ -140,7 +140,7 @@ def random_scenario(seed: int, robot: Robot) -> Scenario:
         f"{name}_factor": round(random.uniform(0.5, 1.5), 4)
         for name in ("mass", "inertia", "drive_friction", "resistance", "motor_constant")
     }
-    plain, kind = Perturbation(**body), random.choice(list(_KINDS))
+    plain, kind = Perturbation.from_dict(body), random.choice(list(_KINDS))
     disturbed = plain.model_copy(update=_KINDS[kind](random))
     reference = _spline(random, robot)
     lap = int(random.integers(RANDOM_LAPS - 1))

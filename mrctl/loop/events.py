@@ -26,7 +26,7 @@ class Events:
             period: Control period in s.
         """
         self._plant, self._hierarchy, self._period = plant, hierarchy, period
-        self._delays = [s.sensing.periods("delay", period) for s in scenarios]
+        self._sensing = [s.sensing for s in scenarios]
         self._schedule: dict[int, list[tuple[int, Event]]] = defaultdict(list)
         for row, scenario in enumerate(scenarios):
             self.perturb(row, scenario.perturbation)
@@ -66,6 +66,7 @@ class Events:
 
     def perturb(self, row: int, perturbation: Perturbation) -> None:
         """Replaces the perturbation of one robot from this tick on."""
-        delay = perturbation.control_delay / self._period + self._delays[row]
-        self._plant.perturb(row, perturbation, round(delay))
+        sensing = self._sensing[row]
+        delay = round(perturbation.control_delay / self._period) + sensing.periods("delay", self._period)
+        self._plant.perturb(row, perturbation, delay, sensing.driver, sensing.servo)
         self._hierarchy.set_truth(row, self._plant.truth[row])

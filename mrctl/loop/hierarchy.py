@@ -33,7 +33,7 @@ from mrctl.control.nominal import nominal
 from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import PID, Pid, pid
 from mrctl.control.rls import RecursiveLeastSquares
-from mrctl.control.steering import ALLOCATION, allocate
+from mrctl.control.steering import ALLOCATION, allocate, take_loss
 from mrctl.kernel import Array, Kernel, Row, Rows, kernel
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import Robot
@@ -88,7 +88,7 @@ def command_motion(goal: Row, robot: Row, period: float, s: Row) -> None:
 
 
 @kernel
-def apply_voltages(slip: float, inverse: Array, ones: Array, x: Array, robot: Row, period: float, s: Row) -> bool:
+def apply_voltages(seen: Row, inverse: Array, ones: Array, x: Array, robot: Row, period: float, s: Row) -> bool:
     """Guard and allocation: from feedback and feedforward to voltages and steering; returns whether they are finite."""
     command, derivative, a = s.limiter.command, s.limiter.derivative, s.allocation
     if s.guard.on:
@@ -99,7 +99,8 @@ def apply_voltages(slip: float, inverse: Array, ones: Array, x: Array, robot: Ro
         s.pid.integral, s.feedback,
     )  # fmt: skip
     allocate(command, derivative, s.feedback, s.guard.output, period, robot, a)
-    s.slips = not slip <= SLIPS  # NaN counts as slip
+    take_loss(seen.lost, robot.rigid, a)
+    s.slips = not seen.slip <= SLIPS  # NaN counts as slip
     s.frozen = 1.0 if a.saturated or s.learning_off or s.guard.frozen or s.slips else 0.0
     finite = True
     for k in range(2):
@@ -146,7 +147,7 @@ def update(
         command, derivative = s.limiter.command, s.limiter.derivative
         pid(command, measured.twist, s.allocation.excess, period, s.pid, s.feedback)
         respond(i, command, derivative, robot[0], arrays, s.feedforward)
-        finite &= apply_voltages(measured.slip, inverse, ones, x, robot[0], period, s)
+        finite &= apply_voltages(measured, inverse, ones, x, robot[0], period, s)
         s.weight_norm = learn_one(
             i, command, s.guard.teaching, s.frozen, measured.twist, s.voltage, period, robot[0], arrays, s.added
         )

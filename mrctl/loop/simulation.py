@@ -45,10 +45,11 @@ def simulate(
         scenarios: One scenario, or several; those that differ in world, laws, steering, length or rates run in turn.
         progress: Whether to show a progress bar.
         threads: Number of threads that control and physics run on, which changes no bit; 0 for all cores.
-        stages: The user's stages `motion`, `feedback`, `feedforward`, `steering` or `estimator` in place of the scenario's: a
-            factory, called with the nominal robot and the number of robots, which returns an object with the two
-            methods of that stage in `mrctl.control.stages`. One that raises, or returns an array of the wrong shape,
-            fails all runs that are computed together; one that returns NaN for a robot fails that run.
+        stages: The user's stages `motion`, `feedback`, `feedforward`, `steering` or `estimator` in place of the
+            scenario's: a factory, called with the nominal robot and the number of robots, which returns an object with
+            the two methods of that stage in `mrctl.control.stages`. One that raises, or returns an array of the wrong
+            shape, fails all runs that are computed together; one that returns NaN for a robot fails that run, except
+            for an estimator, instead of which odometry goes on.
 
     Returns:
         The signals of `results.dataset.SIGNALS` with dimensions run and time (time alone for one scenario), with units;
@@ -242,8 +243,8 @@ class Simulation:
         """Applies the events of this tick and measures; further calls in the same tick only return the result.
 
         Returns:
-            Estimate of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each; both are those
-            of the moment when the voltage of this tick acts.
+            Estimate of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each; both are of
+            the moment when the voltage of this tick acts.
         """
         if self._sensed != self.tick:
             self._sensed = self.tick

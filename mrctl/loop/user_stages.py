@@ -123,7 +123,7 @@ def apply_all(
     """Calls `apply_voltages` for all robots; returns whether all are finite, and whether a learner is to be reset."""
     finite, forget = True, False
     for i in range(len(control)):
-        finite &= apply_voltages(seen[i].slip, inverse, ones, x, robot[0], period, control[i])
+        finite &= apply_voltages(seen[i], inverse, ones, x, robot[0], period, control[i])
         forget |= control[i].guard.forget
     return finite, forget
 
@@ -178,7 +178,7 @@ class UserHierarchy(Hierarchy):
         self._read_weight_norm()
         self.finite, forget = apply_all(seen, *self._inverse, *constants, state)
         if stage := self._stages.get("steering"):
-            self._steer(stage)
+            self._steer(stage, seen["lost"].any(axis=1))
         if (added := self._learn(seen["twist"])) is not None:
             state["added"] = added
             hand_over_all(state)
@@ -214,8 +214,8 @@ class UserHierarchy(Hierarchy):
             return self.feedforward.output(command, derivative)
         return self._finite_rows(stage, stage.output(command, derivative))
 
-    def _steer(self, stage: UserStage) -> None:
-        """Calls the user's steering, and limits it as `allocate` does."""
+    def _steer(self, stage: UserStage, lost: NDArray[np.bool]) -> None:
+        """Calls the user's steering, and limits it as `allocate` does; `lost` are the robots with a limited current."""
         state, limit = self.state, self._robot.steering_limit
         allocation, command = state["allocation"], self.command.copy()
         if self._rigid:
@@ -229,7 +229,7 @@ class UserHierarchy(Hierarchy):
             clipped = (self.output[:, :2] != allocation["feedback"] + allocation["feedforward"]).any(axis=1)
             made = command[:, 0] * np.tan(angle) / self._robot.wheelbase
             allocation["excess"][:, 1] = np.where(beyond, made - command[:, 1], 0.0)
-            allocation["saturated"] = beyond | clipped
+            allocation["saturated"] = beyond | clipped | lost
             state["voltage"][:, 1] = command[:, 1] - self.command[:, 1] + allocation["excess"][:, 1]
             state["frozen"] = np.any(
                 [allocation["saturated"], state["learning_off"], state["guard"]["frozen"], state["slips"]], axis=0

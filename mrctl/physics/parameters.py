@@ -9,7 +9,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.physics.elements import REAR, bodies_of, centres, fronts, has, left_tyre_pairs, rolling_fronts, rounded
+from mrctl.physics.elements import (
+    MOTORS,
+    REAR,
+    bodies_of,
+    centres,
+    fronts,
+    has,
+    left_tyre_pairs,
+    rolling_fronts,
+    rounded,
+)
 from mrctl.record import InputError
 from mrctl.theory.robot import ANY_ANGLE, GRAVITY, Robot
 
@@ -19,6 +29,7 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
 
     The front wheel's frictionloss is rolling loss alone and gives the rolling coefficient, which is 0 for a caster that
     slides. A rear wheel's frictionloss is the sum of rolling loss, no-load loss and gearbox loss, which gives the last.
+    Equation (3) has one motor: where the two differ, their mean constant, resistance and loss stand for both.
 
     Args:
         model: Compiled model.
@@ -39,7 +50,8 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
     half_track, wheelbase, trail = _layout(model, data)
     front_wheels = rolling_fronts(model)
     motor = model.actuator("motor_left")
-    gear, constant = motor.gear[0], motor.gainprm[1]
+    resistance, constant = model.actuator_gainprm[[model.actuator(name).id for name in MOTORS], :2].mean(axis=0)
+    gear = motor.gear[0]
     no_load = model.numeric("no_load_current").data[0]
     load = load_torques(model)
     if min(load.values()) <= 0:
@@ -65,7 +77,7 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
             "wheelbase": wheelbase,
             "trail": trail,
             "steering_limit": model.joint("steering").range[1] if has(model, "joint", "steering") else ANY_ANGLE,
-            "resistance": motor.gainprm[0],
+            "resistance": resistance,
             "inductance": _inductance(model),
             "torque_constant": constant,
             "gear_ratio": gear,

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from mrctl.physics.elements import MOTORS, REAR, bodies_of, left_tyre_pairs, rolling_fronts
 from mrctl.physics.parameters import at_rest, load_torques, read_robot
+from mrctl.physics.readout import current_limits
 from mrctl.record import InputError
+from mrctl.theory.drive import NO_LIMIT
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import Robot
 
@@ -28,12 +30,14 @@ PERTURBED = (
     "actuator_gainprm",
     "actuator_dynprm",
     "actuator_ctrlrange",
+    "actuator_forcelimited",
+    "actuator_forcerange",
     "pair_friction",
     "dof_frictionloss",
     "numeric_data",
     "opt.gravity",
 )
-"""The fields of a model that `perturb` writes, as `mujoco.batch` names them."""
+"""The fields of a model that `perturb` and `limit_current` write, as `mujoco.batch` names them."""
 
 
 def perturb(
@@ -42,8 +46,8 @@ def perturb(
     """Writes the nominal model, changed by a perturbation, into another model, and recomputes its constants.
 
     What an earlier perturbation changed in that model is undone. The rolling loss in a wheel's frictionloss grows with
-    the static load on the wheel. Drive gain, delay and noise are no fields of a model: `mrctl.physics.plant` and
-    `mrctl.sensing.sensors` apply them.
+    the static load on the wheel. `limit_current` writes the current limit. The rest of the driver, the steering servo,
+    delay and noise are no fields of a model: `mrctl.physics.plant` and `mrctl.sensing.sensors` apply them.
 
     Args:
         nominal: The nominal model, which is only read.
@@ -73,16 +77,20 @@ def perturb(
         model.geom_rbound[geom] = nominal.geom_rbound[geom] * factor
         model.geom_aabb[geom] = nominal.geom_aabb[geom] * factor
     motors = [nominal.actuator(name).id for name in MOTORS]
+    friction = p.drive_friction_factor * np.array([p.left_drive_friction_factor, p.right_drive_friction_factor])
+    resistance = p.resistance_factor * np.array([p.left_resistance_factor, p.right_resistance_factor])
+    constant = p.motor_constant_factor * np.array([p.left_motor_constant_factor, p.right_motor_constant_factor])
     model.actuator_gainprm[motors] = nominal.actuator_gainprm[motors]
-    model.actuator_gainprm[motors, 0] *= p.resistance_factor
-    model.actuator_gainprm[motors, 1] *= p.motor_constant_factor
+    model.actuator_gainprm[motors, 0] *= resistance
+    model.actuator_gainprm[motors, 1] *= constant
     # A <dcmotor> holds L/R; the winding keeps its inductance L when its resistance changes.
     model.actuator_dynprm[motors] = nominal.actuator_dynprm[motors]
-    model.actuator_dynprm[motors, 0] /= p.resistance_factor
+    model.actuator_dynprm[motors, 0] /= resistance
     inputs = nominal.actuator_ctrladr[motors]
     model.actuator_ctrlrange[inputs] = nominal.actuator_ctrlrange[inputs] * max(1.0, p.supply_factor)
-    # The no-load torque k_M I_0 is a loss: it grows with the drive friction, and not with the motor constant.
-    no_load = nominal.numeric("no_load_current").data * p.drive_friction_factor / p.motor_constant_factor
+    # The no-load torque k_M I_0 is a loss: it grows with the drive friction, and not with the motor constant. The model
+    # holds one current, with which the mean constant of the two motors gives their mean loss.
+    no_load = nominal.numeric("no_load_current").data * friction.mean() / constant.mean()
     model.numeric("no_load_current").data[:] = no_load
     model.pair_friction[:] = nominal.pair_friction
     model.pair_friction[:, :2] *= p.tyre_friction_factor
@@ -96,12 +104,28 @@ def perturb(
     height = at_rest(model)[1][2] + np.mean([model.geom(wheel).size[0] for wheel in REAR])
     if height < 0:
         raise InputError("perturbation.payload_z: the centre of mass lies below the ground")
+    factors = dict(zip(REAR, friction, strict=True))
     for wheel in (*REAR, *rolling_fronts(nominal)):
         dof = nominal.joint(wheel).dofadr[0] + np.arange(len(nominal.joint(wheel).frictionloss))
-        drive = 0.0 if wheel not in REAR else robot.drive_loss * (p.drive_friction_factor - 1)
+        drive = robot.drive_loss * (factors[wheel] - 1) if wheel in factors else 0.0
         rolling = robot.rolling_coefficient * (after[wheel] - before[wheel])
         model.dof_frictionloss[dof] = nominal.dof_frictionloss[dof] + drive + rolling
     mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def limit_current(nominal: mujoco.MjModel, model: mujoco.MjModel, limit: float) -> None:
+    """Limits the currents of both motors, which is the limit k_M I on the torque of a `<dcmotor>`.
+
+    Args:
+        nominal: The nominal model; a limit in its file counts if it is lower.
+        model: The perturbed model, which is written.
+        limit: Largest current I in A; `NO_LIMIT` for none but that of the file.
+    """
+    motors = [nominal.actuator(name).id for name in MOTORS]
+    currents = np.minimum(current_limits(nominal), limit if limit < NO_LIMIT else np.inf)
+    model.actuator_forcelimited[motors] = limited = np.isfinite(currents)
+    torque = np.where(limited, currents, 0.0) * model.actuator_gainprm[motors, 1]
+    model.actuator_forcerange[motors] = np.array([-torque, torque]).T
 
 
 def _upright_axis(model: mujoco.MjModel, body: int) -> int:

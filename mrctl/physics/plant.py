@@ -17,28 +17,34 @@ from dm_control.rl.control import PhysicsError
 from mujoco import batch as mujoco_batch
 from numpy.typing import NDArray
 
-from mrctl.kernel import Array, Rows, kernel
+from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.physics import mjcf
 from mrctl.physics.car import CarPhysics
 from mrctl.physics.elements import has
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.perturb import fields, perturb, write
-from mrctl.physics.readout import READING, addresses, imu_motion, inputs, motor_parameters, read
+from mrctl.physics.perturb import fields, limit_current, perturb, write
+from mrctl.physics.readout import READING, addresses, current_limits, imu_motion, inputs, motor_parameters, read
 from mrctl.physics.stand import stand
+from mrctl.theory.drive import DRIVER, SERVO, Driver, SteeringServo, chop, drive, turn
 from mrctl.theory.perturbation import LONGEST_DELAY, Perturbation
 from mrctl.theory.robot import Robot
 
 TILT = float(np.cos(np.radians(30)))
+IDEAL_DRIVER, IDEAL_SERVO = Driver(), SteeringServo()
 
 PLANT = np.dtype(
     [
         ("delay", "i8"),  # of commands, control periods
-        ("drive_gain", "f8"),  # applied over commanded voltage
+        ("driver", DRIVER),
+        ("servo", SERVO),
         ("resistance", "f8", 2),  # Ω, left and right
         ("back_emf", "f8", 2),  # V·s/rad at the wheel
+        ("emf", "f8", 2),  # back-EMF of the motors, V
         ("before", READING),  # at the beginning of the control period
         ("reading", READING),  # now
-        ("applied", "f8", 2),  # voltages at the terminals, left and right, V
+        ("sent", "f8", 2),  # voltages of the driver without its current limit, left and right, V
+        ("applied", "f8", 2),  # voltages at the terminals, left and right, at the end of the period, V
+        ("lost", "f8", 2),  # applied less sent, what the current limit took, in commanded V
         ("current", "f8", 2),  # armature currents, A
         ("wheel_angles", "f8", 2),  # of the rear wheels, left and right, since the model's zero, rad
         ("imu_velocity", "f8", 3),  # velocity of the inertial sensor in the world, m/s
@@ -51,8 +57,8 @@ PLANT = np.dtype(
 
 
 @kernel
-def drive(command: Array, tick: int, queue: Array, inputs: NDArray[np.int64], plant: Rows, ctrl: Array) -> bool:
-    """Sends each robot the command of `delay` periods ago; returns whether all commands are finite."""
+def send(command: Array, tick: int, queue: Array, inputs: NDArray[np.int64], plant: Rows, ctrl: Array) -> bool:
+    """Sends each robot the command of `delay` periods ago through its driver; returns whether all are finite."""
     finite = True
     for i in range(len(plant)):
         p = plant[i]
@@ -60,11 +66,21 @@ def drive(command: Array, tick: int, queue: Array, inputs: NDArray[np.int64], pl
         queue[tick % len(queue), i] = command[i]
         now = queue[(tick - p.delay) % len(queue), i]
         for k in range(len(inputs)):
-            ctrl[i, inputs[k]] = now[k] * p.drive_gain if k < 2 else now[k]
             finite &= np.isfinite(now[k]) or p.failed
+        back_emf(p)
+        drive(now[:2], p.emf, p.resistance, p.driver, p.sent)
         for k in range(2):
-            p.applied[k] = now[k] * p.drive_gain
+            ctrl[i, inputs[k]] = p.sent[k]
+        if len(inputs) > 2:
+            ctrl[i, inputs[2]], ctrl[i, inputs[3]] = turn(now[2], now[3], p.servo)
     return finite
+
+
+@kernel
+def back_emf(p: Row) -> None:
+    """Back-EMF of the motors of one robot: k_E N ω."""
+    for k in range(2):
+        p.emf[k] = p.back_emf[k] * p.reading.wheel_rates[k]
 
 
 @kernel
@@ -72,7 +88,7 @@ def look(
     qpos: Array, qvel: Array, act: Array, address: NDArray[np.int64], acts: NDArray[np.int64], imu: Array,
     period: float, plant: Rows,
 ) -> bool:  # fmt: skip
-    """Readings and armature currents after a period; returns whether all robots are upright and sane.
+    """Readings, terminal voltages and currents after a period; returns whether all robots are upright and sane.
 
     The specific force is the velocity that was gained in the period less that which gravity gives, over the period.
     """
@@ -88,11 +104,15 @@ def look(
                 p.specific_force[k] += axes[k, n] * ((velocity[n] - p.imu_velocity[n]) / period - p.gravity[n])
         for n in range(3):
             p.imu_velocity[n] = velocity[n]
+        back_emf(p)
         for k in range(2):
+            limit = p.driver.current_limit[k]
+            p.applied[k] = chop(p.sent[k], p.emf[k], p.resistance[k], limit)
+            p.lost[k] = (p.applied[k] - p.sent[k]) / p.driver.scale if p.driver.scale > 0 else 0.0
             if len(acts):
-                p.current[k] = act[i, acts[k]]
+                p.current[k] = max(-limit, min(limit, act[i, acts[k]]))
             else:
-                p.current[k] = (p.applied[k] - p.back_emf[k] * p.reading.wheel_rates[k]) / p.resistance[k]
+                p.current[k] = (p.applied[k] - p.emf[k]) / p.resistance[k]
         upright &= p.reading.upright > TILT or p.failed
     return upright
 
@@ -137,9 +157,10 @@ class Plant(ABC):
         self._acts = np.array(acts, int)
         self.imu = model.site("imu").pos.copy() if has(model, "site", "imu") else np.zeros(3)
         self._period = substeps * model.opt.timestep
-        state["resistance"], state["back_emf"], state["drive_gain"] = resistance, back_emf, 1.0
-        state["gravity"] = model.opt.gravity
-        # As long as any delay of sensing and perturbation, so that a robot's past does not depend on the delays of the others.
+        state["resistance"], state["back_emf"], state["gravity"] = resistance, back_emf, model.opt.gravity
+        state["driver"]["supply"], state["driver"]["gain"], state["driver"]["scale"] = robot.supply, 1.0, 1.0
+        state["driver"]["current_limit"] = current_limits(model)
+        # As long as any delay of sensing and perturbation: the past of a robot does not depend on the others' delays.
         self._queue = np.zeros((1 + round(2 * LONGEST_DELAY / self._period), size, 4))
         self._tick = 0
         self._pushes: dict[int, int] = {}
@@ -153,26 +174,44 @@ class Plant(ABC):
     def _advance(self) -> dict[int, str]:
         """Runs the physics steps of one control period; returns the engine's complaints by robot."""
 
-    def perturb(self, robot: int, perturbation: Perturbation, delay: int) -> None:
-        """Replaces the perturbation of one robot, from now on.
+    def perturb(
+        self,
+        robot: int,
+        perturbation: Perturbation,
+        delay: int,
+        driver: Driver = IDEAL_DRIVER,
+        servo: SteeringServo = IDEAL_SERVO,
+    ) -> None:
+        """Replaces the perturbation of one robot, and its driver and servo, from now on.
 
         Args:
             robot: Its row.
             perturbation: The complete perturbation.
-            delay: `control_delay` in control periods.
+            delay: Delay of commands in control periods.
+            driver: Motor driver and battery, to which the perturbation adds.
+            servo: Servo of the fork, to which the perturbation adds.
 
         Raises:
             InputError: The perturbed robot could not stand.
         """
-        if self._nominal_robots[robot] and perturbation == Perturbation() and delay == 0:
+        driver, servo = perturbation.of_driver(driver), perturbation.of_servo(servo)
+        ideal = driver == IDEAL_DRIVER and servo == IDEAL_SERVO and delay == 0
+        if self._nominal_robots[robot] and ideal and perturbation == Perturbation():
             return
         self._nominal_robots[robot] = False
         perturb(self._nominal, self._scratch, perturbation, self.robot)
+        limit_current(self._nominal, self._scratch, driver.current_limit)
         self._write(robot, self._scratch)
         self.truth[robot] = read_robot(self._scratch, perturbation.supply_factor)
         resistance, back_emf, _ = motor_parameters(self._scratch)
         self.state["resistance"][robot], self.state["back_emf"][robot] = resistance[0], back_emf[0]
-        self.state["drive_gain"][robot], self.state["delay"][robot] = perturbation.supply_factor, delay
+        self.state["delay"][robot] = delay
+        rows = self.state["driver"]
+        for name in ("dead_zone", "pwm_steps", "battery_resistance"):
+            rows[name][robot] = getattr(driver, name)
+        rows["gain"][robot] = rows["scale"][robot] = perturbation.supply_factor
+        rows["current_limit"][robot] = current_limits(self._scratch)
+        self.state["servo"]["offset"][robot], self.state["servo"]["backlash"][robot] = servo.offset, servo.backlash
         self.state["gravity"][robot] = self._scratch.opt.gravity
 
     def check(self, perturbation: Perturbation) -> None:
@@ -196,7 +235,8 @@ class Plant(ABC):
         for i in range(self.size):
             self.qpos[i], self.qvel[i] = stand(self._model_of(i), pose[i], twist[i], self.truth[i])
         self._begin(slice(None))
-        self._queue[..., 2] = self.reading["steering_angle"]
+        self.state["lost"] = 0.0
+        self._queue[..., 2] = self.state["servo"]["play"] = self.reading["steering_angle"]
 
     def restart(self, robot: int, pose: Array, twist: Array) -> None:
         """Stands one robot on the ground again, as `reset` does all of them; what happened to it is forgotten.
@@ -215,10 +255,12 @@ class Plant(ABC):
         self._pushes.pop(robot, None)
         self._clear(robot)
         self.qpos[robot], self.qvel[robot] = stand(self._model_of(robot), pose, twist, self.truth[robot])
-        self.applied[robot] = 0.0
+        self.state["sent"][robot] = 0.0
         self._begin(slice(robot, robot + 1))
+        self.state["lost"][robot] = 0.0
+        angle = self.reading["steering_angle"][robot]
         self._queue[:, robot] = 0.0
-        self._queue[:, robot, 2] = self.reading["steering_angle"][robot]
+        self._queue[:, robot, 2] = self.state["servo"]["play"][robot] = angle
 
     @abstractmethod
     def _clear(self, robot: int) -> None:
@@ -254,7 +296,7 @@ class Plant(ABC):
         if command.shape != (self.size, 4):
             raise ValueError(f"command: shape {command.shape}, expected {(self.size, 4)}")
         # The engine would silently take zero volts instead of what is no number.
-        if not drive.compiled(command, self._tick, self._queue, self._inputs, self.state, self.ctrl):
+        if not send.compiled(command, self._tick, self._queue, self._inputs, self.state, self.ctrl):
             sent = self._queue[(self._tick - self.state["delay"]) % len(self._queue), np.arange(self.size)]
             for robot in np.flatnonzero(~np.isfinite(sent).all(axis=1)):
                 self.fail(int(robot), "non-finite command")

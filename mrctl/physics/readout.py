@@ -114,6 +114,13 @@ def motor_parameters(model: mujoco.MjModel) -> tuple[Array, Array, list[int]]:
     return resistance[None], back_emf[None], acts
 
 
+def current_limits(model: mujoco.MjModel) -> Array:
+    """Largest currents left and right in A, `(2,)`, which limit the torques of the motors; infinite where none do."""
+    motors = [model.actuator(name).id for name in MOTORS]
+    torque = np.where(model.actuator_forcelimited[motors], model.actuator_forcerange[motors, 1], np.inf)
+    return torque / model.actuator_gainprm[motors, 1]
+
+
 def motor_current(
     voltage: Array, rates: Array, act: Array, resistance: Array, back_emf: Array, acts: list[int]
 ) -> Array:

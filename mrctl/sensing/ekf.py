@@ -7,10 +7,10 @@
 
     encoder_l,r = λ_l,r + quantisation,    gyro = θ̇ + b + noise,    fix = (x, y, θ) + noise
 
-The accelerometer a is an input; its offset o is its bias and its share of gravity. θ̈_c is the commanded acceleration that
-acts in the period. The wheel angles λ are part of the state, so that an encoder's error stays bounded in angle; as noise
-on V, it would grow to a random walk of the position. A fix corrects the state of the moment when it was taken: the filter
-keeps that state, and repeats the periods since then.
+The accelerometer a is an input; its offset o is its bias and its share of gravity. θ̈_c is the commanded acceleration
+that acts in the period. The wheel angles λ are part of the state, so that an encoder's error stays bounded in angle; as
+noise on V, it would grow to a random walk of the position. A fix corrects the state of the moment when it was taken:
+the filter keeps that state, and repeats the periods since then.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array, Row, Rows, kernel
-from mrctl.sensing.prediction import front, predict
+from mrctl.sensing.prediction import front, predict, wrapped
 from mrctl.sensing.tiers import IN_FLIGHT
 
 N = 11  # states
@@ -88,7 +88,7 @@ def propagate(v_dot: float, omega_dot: float, grip: Array, geometry: Array, peri
     m[OMEGA] += T * omega_dot
     m[LEFT] += turn_left
     m[RIGHT] += turn_right
-    # F is the identity but for the rows of x, y, λ, θ and V. Those of θ and V come last, for the others use the old ones.
+    # F is the identity but for the rows of x, y, λ, θ and V; those of θ and V come last, for the others use the old.
     for transposed in range(2):
         Q = P.T if transposed else P
         for j in range(N):
@@ -169,7 +169,7 @@ def absorb_fix(fix: Array, s: Row) -> None:
     """Updates by a posture fix, unless it lies outside the gate; the filter gives in to the tenth such fix in a row."""
     P, m = s.P, s.mean
     e0, e1 = fix[0] - m[X], fix[1] - m[Y]
-    e2 = np.pi - (np.pi - fix[2] + m[THETA]) % (2 * np.pi)
+    e2 = wrapped(fix[2] - m[THETA])
     a, b, c = P[X, X] + s.fix_variance[0], P[X, Y], P[X, THETA]
     d, e, f = P[Y, Y] + s.fix_variance[1], P[Y, THETA], P[THETA, THETA] + s.fix_variance[2]
     # S⁻¹ by its adjugate
@@ -191,7 +191,7 @@ def absorb_fix(fix: Array, s: Row) -> None:
             s.g[i] = P[k, i]
         residual = fix[k] - m[k]
         if k == THETA:
-            residual = np.pi - (np.pi - fix[2] + m[THETA]) % (2 * np.pi)
+            residual = wrapped(fix[2] - m[THETA])
         absorb(residual, s.g[k] + s.fix_variance[k], s)
 
 
@@ -294,8 +294,7 @@ def ekf(
             else:
                 keep(now, f)
     predict(f.mean, max(now, s.start), tick, ring, i, period, s)
-    for k in range(3):
-        s.estimate[k] = s.pose[k]
+    s.estimate[0], s.estimate[1], s.estimate[2] = s.pose[0], s.pose[1], wrapped(s.pose[2])
     s.estimate[3], s.estimate[4] = s.twist[0], s.twist[1]
     P = f.P
     s.variance[0], s.variance[1], s.variance[2] = P[X, X], P[X, Y], P[Y, Y]

@@ -1,7 +1,7 @@
 """What the controller is told of posture and twist: the truth, odometry, or the estimate of a filter, predicted.
 
-An estimator sees the samples of the sensors, and estimates posture and twist at the coming control tick. `predict` takes
-the estimate on to the moment when the voltage that is computed now reaches the motors.
+An estimator receives the samples of the sensors, and estimates posture and twist at a control tick. `predict` takes the
+estimate on to the moment when the voltage that is computed in that tick reaches the motors.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from mrctl.kernel import Array, Kernel, Row, Rows, kernel
 from mrctl.sensing.ekf import EKF, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
-from mrctl.sensing.prediction import SEEN, front, predict
+from mrctl.sensing.prediction import SEEN, front, predict, wrapped
 from mrctl.sensing.sensors import Sensors
 from mrctl.sensing.slip import slip_ratio
 from mrctl.sensing.tiers import Sensing
@@ -71,8 +71,7 @@ def odometry(
         m[2] += turn
         m[3], m[4] = geometry[0] * (this.rate[0] + this.rate[1]) / 2, this.gyro
     predict(m, max(now, s.start), tick, ring, i, period, s)
-    for k in range(3):
-        s.estimate[k] = s.pose[k]
+    s.estimate[0], s.estimate[1], s.estimate[2] = s.pose[0], s.pose[1], wrapped(s.pose[2])
     s.estimate[3], s.estimate[4] = s.twist[0], s.twist[1]
 
 
@@ -115,6 +114,7 @@ def estimate(
         s.gyro = ring[max(s.start, tick - sensor.gyro_latency) % len(ring), i].gyro
         for k in range(2):
             s.encoder[k], s.acceleration[k] = wheels.encoder[k], force.acceleration[k]
+            s.lost[k] = plant[i].lost[k]
             s.wheel_speeds[k] = geometry[0] * wheels.rate[k]
         s.slip = slip_ratio(s.wheel_speeds, s.estimate[3], s.estimate[4], geometry[1], period, s.slip)
         taken = ring[(tick - sensor.fix_latency) % len(ring), i]

@@ -12,6 +12,7 @@ SEEN = np.dtype(
         ("twist", "f8", 2),  # V in m/s and θ̇ in rad/s, when the voltage of this tick acts
         ("slip", "f8"),  # slip ratio of the driven wheel that slips more
         ("wheel_speeds", "f8", 2),  # wheel speeds left and right, from encoders and nominal wheel radius, m/s
+        ("lost", "f8", 2),  # voltage applied less commanded by a driver at its current limit, in the last period, V
         ("encoder", "f8", 2),  # angles of the rear wheels that arrived last, left and right, rad
         ("gyro", "f8"),  # θ̇ of the gyro that arrived last, rad/s
         ("acceleration", "f8", 2),  # specific force that arrived last, forward and to the left, m/s²
@@ -76,6 +77,12 @@ def predict(state: Array, first: int, last: int, ring: Rows, i: int, period: flo
             v_dot, omega_dot = command[0], command[1]
         x, y, theta, v, omega = advance(x, y, theta, v, omega, v_dot, omega_dot, period)
     s.pose[0], s.pose[1], s.pose[2], s.twist[0], s.twist[1] = x, y, theta, v, omega
+
+
+@kernel
+def wrapped(angle: float) -> float:
+    """Returns an angle in rad in (−π, π]."""
+    return np.pi - (np.pi - angle) % (2 * np.pi)
 
 
 @kernel

@@ -7,6 +7,17 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from mrctl.record import Record
+from mrctl.theory.drive import (
+    NO_LIMIT,
+    Backlash,
+    BatteryResistance,
+    CurrentLimit,
+    DeadZone,
+    Driver,
+    Offset,
+    PwmSteps,
+    SteeringServo,
+)
 from mrctl.theory.perturbation import LONGEST_DELAY
 
 Tier = Literal["ideal", "lab", "field"]
@@ -43,7 +54,7 @@ VALUES: dict[str, tuple[float, float, float]] = {
     "delay": (0, 0.01, 0.02),  # chosen: one and two control periods for bus, computation and PWM
     "dead_zone": (0, 0.2, 0.5),  # chosen, as all that follow
     "pwm_steps": (0, 1024, 256),
-    "current_limit": (100, 10, 6),
+    "current_limit": (NO_LIMIT, 10, 6),
     "battery_resistance": (0, 0.05, 0.15),
     "steering_offset": (0, 0.2 * DEGREE, 1 * DEGREE),
     "steering_backlash": (0, 0, 1 * DEGREE),
@@ -58,9 +69,9 @@ class Sensing(Record):
     """What the robot senses and acts with: a tier, and values that replace the tier's."""
 
     tier: Tier = "ideal"
-    """Quality of sensors, motor driver, battery and steering servo: exact (`ideal`), good (`lab`) or cheap (`field`)."""
+    """Quality of sensors, motor driver, battery and steering: exact (`ideal`), good (`lab`) or cheap (`field`)."""
     estimator: EstimatorName | None = None
-    """Source of posture and twist: the `truth`, `odometry` from encoders and gyro, or an extended Kalman filter (`ekf`);
+    """Source of posture and twist: the `truth`, `odometry` from encoders and gyro, or an extended Kalman filter, `ekf`;
     by default the truth in the ideal tier and the filter in the others."""
     encoder_counts: Annotated[int, Field(ge=0, le=10**9)] | None = None
     """Counts of a wheel's encoder in one turn; 0 reads exact angles and rates."""
@@ -102,18 +113,18 @@ class Sensing(Record):
     """Share of the fixes that are wrong by up to 1 m in x and y."""
     delay: Latency | None = None
     """Time from the measurement to the voltage in s, a multiple of the control period; the controller knows it."""
-    dead_zone: Annotated[float, Field(ge=0, le=10)] | None = None
-    """Commanded voltage in V below which the motor driver gives none."""
-    pwm_steps: Annotated[int, Field(ge=0, le=2**24)] | None = None
-    """Number of voltage steps of the motor driver from zero to the supply; 0 is continuous."""
-    current_limit: Annotated[float, Field(gt=0, le=100)] | None = None
-    """Current limit of the motor driver for each motor in A; 100 A is never reached."""
-    battery_resistance: Annotated[float, Field(ge=0, le=10)] | None = None
-    """Resistance of the battery and its wires in Ω."""
-    steering_offset: Annotated[float, Field(ge=-0.5, le=0.5)] | None = None
-    """Error of the zero of the steering angle in rad."""
-    steering_backlash: Annotated[float, Field(ge=0, le=0.5)] | None = None
-    """Play of the steering in rad."""
+    dead_zone: DeadZone | None = None
+    """Voltage of the motor driver in V; a commanded voltage that is smaller gives none."""
+    pwm_steps: PwmSteps | None = None
+    """Number of steps of the pulse width from none to the full supply; 0 for a continuous pulse width."""
+    current_limit: CurrentLimit | None = None
+    """Current in A at which the driver chops the voltage of a motor; 1000 A stands for no limit."""
+    battery_resistance: BatteryResistance | None = None
+    """Resistance of battery and cables in Ω, by which the supply sags under the current of both motors."""
+    steering_offset: Offset | None = None
+    """Angle in rad by which the fork stands to the left of its set-point."""
+    steering_backlash: Backlash | None = None
+    """Width in rad of the play between the set-point and the fork."""
 
     def __getitem__(self, name: str) -> float:
         """Returns the value that a field has, its own or the tier's, in the unit of the field."""
@@ -124,6 +135,17 @@ class Sensing(Record):
     def source(self) -> EstimatorName:
         """The estimator, the one that was asked for or the tier's."""
         return self.estimator or ("truth" if self.tier == "ideal" else "ekf")
+
+    @property
+    def driver(self) -> Driver:
+        """Motor driver and battery."""
+        names = "dead_zone", "battery_resistance", "current_limit"
+        return Driver(pwm_steps=int(self["pwm_steps"]), **{name: self[name] for name in names})
+
+    @property
+    def servo(self) -> SteeringServo:
+        """Servo of the steering."""
+        return SteeringServo(offset=self["steering_offset"], backlash=self["steering_backlash"])
 
     def periods(self, name: str, control_period: float) -> int:
         """Returns a rate, latency or delay in control periods; a tier's own value is rounded, to at least one.

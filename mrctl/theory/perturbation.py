@@ -10,6 +10,17 @@ from typing import Annotated
 from pydantic import Field
 
 from mrctl.record import Record
+from mrctl.theory.drive import (
+    NO_LIMIT,
+    Backlash,
+    BatteryResistance,
+    CurrentLimit,
+    DeadZone,
+    Driver,
+    Offset,
+    PwmSteps,
+    SteeringServo,
+)
 
 LONGEST_DELAY = 0.5
 """Longest delay of a command on its way to the motors in s."""
@@ -49,6 +60,30 @@ class Perturbation(Record):
     """Factor on the motors' terminal resistance R_a."""
     motor_constant_factor: Factor = 1.0
     """Factor on the motor constants k_M and k_E together."""
+    left_drive_friction_factor: Annotated[float, Field(ge=0, le=20)] = 1.0
+    """Further factor on the friction of the left gearbox and motor."""
+    right_drive_friction_factor: Annotated[float, Field(ge=0, le=20)] = 1.0
+    """Further factor on the friction of the right gearbox and motor."""
+    left_resistance_factor: Factor = 1.0
+    """Further factor on the resistance of the left motor."""
+    right_resistance_factor: Factor = 1.0
+    """Further factor on the resistance of the right motor."""
+    left_motor_constant_factor: Factor = 1.0
+    """Further factor on the constants k_M and k_E of the left motor."""
+    right_motor_constant_factor: Factor = 1.0
+    """Further factor on the constants k_M and k_E of the right motor."""
+    dead_zone: DeadZone = 0.0
+    """Voltage in V that is added to the dead zone of the motor driver, in which a command gives no voltage."""
+    pwm_steps: PwmSteps = 0
+    """Number of steps of the pulse width to the full supply, if the driver has not fewer; 0 for no such change."""
+    current_limit: CurrentLimit = NO_LIMIT
+    """Current limit of each motor in A, if the driver's is not lower; 1000 A, the default, stands for none."""
+    battery_resistance: BatteryResistance = 0.0
+    """Resistance in Ω that is added to that of the battery, whose voltage then sags under the motors' currents."""
+    steering_offset: Offset = 0.0
+    """Angle in rad that is added to the offset of the fork from its set-point, positive to the left."""
+    steering_backlash: Backlash = 0.0
+    """Width in rad that is added to the play between the steering servo and the fork."""
     supply_factor: Annotated[float, Field(gt=0, le=2)] = 1.0
     """Factor from commanded to applied voltage: a PWM drive on a supply of another voltage."""
     tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
@@ -59,6 +94,21 @@ class Perturbation(Record):
     """Inclination of the ground in rad, uphill along the world's +x; gravity is turned, not the floor."""
     control_delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] = 0.0
     """Further delay of voltages and steering commands in s, a multiple of the control period."""
+
+    def of_driver(self, driver: Driver) -> Driver:
+        """Returns a driver as the perturbation leaves it: what wears adds up, and the narrower limit counts."""
+        changed = {
+            "dead_zone": driver.dead_zone + self.dead_zone,
+            "pwm_steps": min(filter(None, (driver.pwm_steps, self.pwm_steps)), default=0),
+            "current_limit": min(driver.current_limit, self.current_limit),
+            "battery_resistance": driver.battery_resistance + self.battery_resistance,
+        }
+        return driver.model_copy(update=changed)
+
+    def of_servo(self, servo: SteeringServo) -> SteeringServo:
+        """Returns a steering servo with the offset and the backlash of the perturbation added."""
+        changed = {"offset": servo.offset + self.steering_offset, "backlash": servo.backlash + self.steering_backlash}
+        return servo.model_copy(update=changed)
 
 
 PERTURBATIONS: dict[str, Perturbation] = {

@@ -33,6 +33,14 @@ RANGES = {
     "drive_friction_factor": (0.0, 3.0),
     "resistance_factor": (0.8, 1.5),
     "motor_constant_factor": (0.8, 1.2),
+    "left_drive_friction_factor": (0.5, 1.5),
+    "right_resistance_factor": (0.9, 1.2),
+    "left_motor_constant_factor": (0.95, 1.05),
+    "dead_zone": (0.1, 0.6),
+    "current_limit": (1.5, 8.0),
+    "battery_resistance": (0.02, 0.3),
+    "steering_offset": (-0.02, 0.02),
+    "steering_backlash": (0.001, 0.02),
     "supply_factor": (0.7, 1.2),
     "tyre_friction_factor": (0.3, 1.2),
     "slope": (-0.1, 0.1),
@@ -46,7 +54,7 @@ RANGES = {
 def perturbation(rng: np.random.Generator) -> Perturbation:
     """A third of the fields at random, among them delays of 0 to 40 ms."""
     values = {name: float(rng.uniform(*bounds)) for name, bounds in RANGES.items() if rng.random() < 0.35}
-    return Perturbation(**values, control_delay=int(rng.integers(5)) / 100)
+    return Perturbation(**values, pwm_steps=int(rng.choice([0, 100, 255])), control_delay=int(rng.integers(5)) / 100)
 
 
 def event(rng: np.random.Generator) -> Event:

@@ -9,9 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mrctl.physics import mjcf
+from mrctl.physics.elements import MOTORS
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.perturb import fields, perturb, write
+from mrctl.physics.perturb import fields, limit_current, perturb, write
+from mrctl.physics.readout import current_limits, motor_parameters
 from mrctl.record import InputError
+from mrctl.theory.drive import NO_LIMIT
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import GRAVITY, Robot
 
@@ -48,8 +51,10 @@ def test_every_changed_field_is_listed():
     model = perturbed(
         mass_factor=1.5, inertia_factor=1.2, payload=2, payload_y=0.05, left_radius_factor=1.02,
         right_radius_factor=0.98, drive_friction_factor=3, resistance_factor=1.3, motor_constant_factor=0.85,
-        supply_factor=1.2, tyre_friction_factor=0.5, slope=0.1,
+        supply_factor=1.2, tyre_friction_factor=0.5, slope=0.1, left_resistance_factor=1.1,
+        right_motor_constant_factor=0.9, left_drive_friction_factor=1.3,
     )  # fmt: skip
+    limit_current(NOMINAL, model, 3.0)
     copied = mjcf.clone(NOMINAL)
     write(copied, fields(model))
     names = [n for n in dir(model) if not n.startswith("_") and isinstance(getattr(model, n), np.ndarray)]
@@ -68,6 +73,9 @@ def test_every_changed_field_is_listed():
         ({"drive_friction_factor": 3.0}, {"no_load_current": 3.0, "gear_loss": 3.0}),
         ({"resistance_factor": 1.3}, {"resistance": 1.3}),
         ({"motor_constant_factor": 0.85}, {"torque_constant": 0.85, "no_load_current": 1 / 0.85}),
+        ({"left_drive_friction_factor": 2.0}, {"no_load_current": 1.5, "gear_loss": 1.5}),
+        ({"right_resistance_factor": 1.2}, {"resistance": 1.1}),
+        ({"left_motor_constant_factor": 0.8}, {"torque_constant": 0.9, "no_load_current": 1 / 0.9}),
         ({"tyre_friction_factor": 0.5}, {"tyre_friction": 0.5}),
         ({"slope": 0.1}, {}),
         ({"control_delay": 0.02, "velocity_noise": 0.1}, {}),
@@ -76,6 +84,40 @@ def test_every_changed_field_is_listed():
 def test_factor(perturbation, expected):
     """A perturbation changes the parameters it names and no others; the no-load torque is a loss."""
     assert changes(**perturbation) == pytest.approx(expected)
+
+
+def test_unequal_motors():
+    """Each motor has its own constant, resistance and loss; the rolling loss stays, and the robot has the means."""
+    model = perturbed(
+        motor_constant_factor=0.9, left_motor_constant_factor=1.1, resistance_factor=1.3, right_resistance_factor=1.2,
+        drive_friction_factor=2.0, left_drive_friction_factor=0.5, right_drive_friction_factor=1.5,
+    )  # fmt: skip
+    resistance, back_emf, _ = motor_parameters(model)
+    assert resistance[0] == pytest.approx(2.32 * 1.3 * np.array([1.0, 1.2]))
+    assert back_emf[0] == pytest.approx(43 * 0.0234 * 0.9 * np.array([1.1, 1.0]))
+    rolling = NOMINAL.joint("wheel_left").frictionloss[0] - BASE.drive_loss
+    losses = [model.joint(wheel).frictionloss[0] - rolling for wheel in ("wheel_left", "wheel_right")]
+    assert losses == pytest.approx([BASE.drive_loss, 3 * BASE.drive_loss])
+    robot = read_robot(model)
+    assert robot.drive_loss == pytest.approx(2 * BASE.drive_loss)
+    assert robot.resistance == pytest.approx(2.32 * 1.3 * 1.1)
+    assert robot.torque_constant == pytest.approx(0.0234 * 0.9 * 1.05)
+
+
+def test_current_limit():
+    """The limit on the current is one on the torque of each motor, k_M I; a lower one in the file counts."""
+    model = perturbed(left_motor_constant_factor=0.8)
+    limit_current(NOMINAL, model, 3.0)
+    assert current_limits(model) == pytest.approx([3, 3])
+    motors = [model.actuator(name).id for name in MOTORS]
+    assert model.actuator_forcerange[motors] == pytest.approx(0.0234 * 3 * np.array([[-0.8, 0.8], [-1, 1]]))
+    limit_current(NOMINAL, model, NO_LIMIT)
+    assert np.isinf(current_limits(model)).all() and not model.actuator_forcelimited.any()
+    own = mjcf.clone(NOMINAL)
+    own.actuator_forcelimited[motors[0]], own.actuator_forcerange[motors[0]] = True, (-0.0468, 0.0468)
+    for limit, expected in ((NO_LIMIT, [2, np.inf]), (3.0, [2, 3]), (1.0, [1, 1])):
+        limit_current(own, model, limit)
+        assert current_limits(model) == pytest.approx(expected)
 
 
 def test_one_tyre_on_ice():
@@ -199,6 +241,8 @@ FIELDS = {
     "payload_y": (-1, 1), "payload_z": (0, 1), "left_radius_factor": (0.8, 1.2), "right_radius_factor": (0.8, 1.2),
     "drive_friction_factor": (0, 20), "resistance_factor": (0.05, 20), "motor_constant_factor": (0.05, 20),
     "supply_factor": (0.01, 2), "tyre_friction_factor": (0.01, 3), "slope": (-0.5, 0.5),
+    "left_drive_friction_factor": (0, 20), "right_drive_friction_factor": (0, 20),
+    "left_motor_constant_factor": (0.05, 20), "right_resistance_factor": (0.05, 20),
 }  # fmt: skip
 
 
@@ -213,5 +257,7 @@ def test_any_perturbation(values):
         return
     robot = read_robot(model, values.get("supply_factor", 1.0))
     assert isinstance(robot, Robot)
-    assert robot.drive_loss == pytest.approx(values.get("drive_friction_factor", 1) * BASE.drive_loss, abs=1e-9)
+    sides = [values.get(f"{side}_drive_friction_factor", 1) for side in ("left", "right")]
+    friction = values.get("drive_friction_factor", 1) * sum(sides) / 2
+    assert robot.drive_loss == pytest.approx(friction * BASE.drive_loss, abs=1e-9)
     assert robot.rolling_coefficient == pytest.approx(BASE.rolling_coefficient)

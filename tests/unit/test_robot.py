@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mrctl.record import InputError, Record
+from mrctl.theory.drive import NO_LIMIT
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import GRAVITY, Robot
 
@@ -124,4 +125,5 @@ def test_named_perturbations():
         "mass_factor": 1.5, "supply_factor": 0.8, "drive_friction_factor": 3.0, "resistance_factor": 1.3,
     }  # fmt: skip
     nominal = PERTURBATIONS["nominal"].model_dump(exclude={"payload_x", "payload_y", "payload_z"})
+    assert nominal.pop("current_limit") == NO_LIMIT
     assert all(value == (1 if name.endswith("_factor") else 0) for name, value in nominal.items())

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mrctl.control.nominal import nominal
-from mrctl.control.steering import ALLOCATION, REST, allocate
+from mrctl.control.steering import ALLOCATION, REST, allocate, take_loss
 from mrctl.kernel import over_rows
 from mrctl.theory import kinematics
 from mrctl.theory.dynamics import common_differential, inverse_dynamics, left_right
@@ -205,3 +205,19 @@ def test_rows(robot, rigid, twist, acceleration, feedback, feedforward, state):
     together = answer(slice(None), lost=[3])
     for i in (0, 1, 2):
         assert together[i].tobytes() == answer(slice(i, i + 1))[0].tobytes()
+
+
+def test_loss_of_a_driver(robot):
+    """What a current limit took is excess of the two channels, on top of that of the supply, and saturates."""
+    for rigid in (False, True):
+        allocation = Allocation(robot, rigid)
+        allocation((0.5, 0.0), feedback=(30.0, 0.0))
+        excess = allocation.excess.copy()
+        take_loss(np.zeros(2), rigid, allocation._record[0])
+        assert np.array_equal(allocation.excess, excess)
+        take_loss(np.array([-5.0, -1.0]), rigid, allocation._record[0])
+        assert allocation.excess - excess == pytest.approx([-3.0, 0.0 if rigid else 2.0])
+        allocation((0.5, 0.0), feedback=(3.0, 0.0))
+        assert not allocation.saturated
+        take_loss(np.array([0.0, 0.1]), rigid, allocation._record[0])
+        assert allocation.saturated
