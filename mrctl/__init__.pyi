@@ -32,6 +32,7 @@ from .theory.references import StopAndGo as StopAndGo
 from .theory.references import Waypoints as Waypoints
 from .theory.robot import Robot as Robot
 from .theory.robot import RobotFile as RobotFile
+from .theory.timing import Limits as Limits
 from .viewer.embed import replay as replay
 
 __version__: str

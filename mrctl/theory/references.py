@@ -22,6 +22,7 @@ from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 
 from mrctl.record import InputError, Record
 from mrctl.theory.robot import GRAVITY, Robot
+from mrctl.theory.timing import RESERVE, Limits, SmoothLaw, sample_path, smooth
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.complexfloating]
@@ -272,18 +273,22 @@ _LOOP = ((0.0, 0.0), (1.5, 0.0), (3.0, 0.8), (2.5, 2.2), (1.0, 1.6), (-0.8, 2.0)
 
 
 class Waypoints(Record):
-    """A quintic spline through points at constant speed; an open one ends at rest on its last point."""
+    """A quintic spline through points, at constant or changing speed; an open one ends at rest on its last point."""
 
     kind: Literal["waypoints"] = "waypoints"
     """Kind of the reference."""
     points: tuple[tuple[Coordinate, Coordinate], ...] = _LOOP
     """Points (x, y) in m in their order; a closed curve returns to the first by itself."""
     speed: Speed = 0.6
-    """Speed along the path in m/s."""
+    """Speed along the path in m/s; with `timing` = `limits` the largest one."""
     closed: bool = True
     """Close the curve from the last point to the first."""
     stop_time: Duration = 2.0
-    """Duration of the braking at the end of an open curve in s."""
+    """Duration of the braking at the end of an open curve in s, at constant speed before."""
+    timing: Literal["constant", "limits"] = "constant"
+    """Keep the speed all along the path (`constant`), or drive as fast as the `limits` allow, an open one from rest."""
+    limits: Limits = Limits()
+    """Limits that `timing` = `limits` keeps, besides the speed."""
 
     @model_validator(mode="after")
     def _regular(self) -> Waypoints:
@@ -300,13 +305,21 @@ class Waypoints(Record):
         if slow.min() < 0.02:
             where = path.derivative(path.u, 0)[slow.argmin()]
             raise ValueError(f"points: the curve turns on the spot near ({where.real:.2f}, {where.imag:.2f})")
-        if not self.closed and self.speed * self.stop_time / 2 > path.length:
+        if self.timing == "limits":
+            _ = self._law  # refuses limits with which the robot cannot move
+        elif not self.closed and self.speed * self.stop_time / 2 > path.length:
             raise ValueError(f"stop_time: too long to stop from {self.speed:g} m/s within {path.length:.2f} m")
         return self
 
     @property
+    def _law(self) -> SmoothLaw:
+        return _law(self.points, self.closed, self.speed, self.limits)  # type: ignore[arg-type]
+
+    @property
     def period(self) -> float:
         """Time of one lap, or until rest, in s."""
+        if self.timing == "limits":
+            return self._law.duration
         return _spline(self.points, self.closed).length / self.speed + (0 if self.closed else self.stop_time / 2)
 
     def sample(self, t: Array) -> Motion:
@@ -314,6 +327,9 @@ class Waypoints(Record):
 
         A closed spline is periodic with four continuous derivatives. An open one has no curvature at its ends.
         """
+        if self.timing == "limits":
+            s, v, a = self._law.at(t)
+            return along_path(*_spline(self.points, self.closed).at(s), v, a)
         s, v, a = self.speed * t, np.full(t.shape, self.speed), np.zeros(t.shape)
         if not self.closed:
             brake = self.period - self.stop_time
@@ -379,6 +395,46 @@ class _Spline:
 
 
 _spline = lru_cache(maxsize=64)(_Spline)
+
+
+@lru_cache(maxsize=64)
+def _law(points: tuple[tuple[float, float], ...], closed: bool, speed: float, limits: Limits) -> SmoothLaw:
+    """The time law along the spline through the points."""
+    spline = _spline(points, closed)
+    path = sample_path(lambda s: spline.at(s)[2:], spline.s, closed, limits, speed)
+    return smooth(path, limits, speed)
+
+
+def random_spline(
+    random: np.random.Generator, robot: Robot, speed: float = 0.95, reserve: float = RESERVE
+) -> Waypoints:
+    """A random closed spline around the origin, driven at changing speed under the limits of a robot.
+
+    The lateral acceleration is limited further, so that the robot takes the tightest curve at 0.3 to 0.8 of its top
+    speed; a robot whose other limits do not slow it down would drive at constant speed otherwise.
+
+    Args:
+        random: Source of the draws.
+        robot: The robot.
+        speed: Largest V as a share of the robot's limit, between 0 and 1.
+        reserve: Share of its other limits that the spline uses, between 0 and 1.
+    """
+    limits, top = Limits.of(robot, reserve), speed * robot.max_speed
+    while True:
+        count = int(random.integers(4, 9))
+        angles = 2 * np.pi * (np.arange(count) + random.uniform(-0.25, 0.25, count)) / count
+        p = np.round(random.uniform(0.9, 2.0, count) * np.exp(random.choice([-1j, 1j]) * angles), 3)
+        slow = top * random.uniform(0.3, 0.8)
+        try:
+            loop = Waypoints(points=tuple((float(z.real), float(z.imag)) for z in p), speed=top)
+        except ValueError:  # the spline turns on the spot
+            continue
+        spline = _spline(loop.points, loop.closed)
+        tightest = float(np.abs(spline.at(spline.s)[2]).max())
+        if np.arctan(abs(robot.wheelbase) * tightest) > reserve * robot.steering_limit:
+            continue
+        grip = {"lateral_acceleration": min(limits.lateral_acceleration, slow**2 * tightest)}
+        return loop.model_copy(update={"timing": "limits", "limits": limits.model_copy(update=grip)})
 
 
 Reference = Annotated[

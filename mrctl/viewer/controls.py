@@ -76,7 +76,8 @@ class Controls:
 
     def _listen(self, path: tuple[str, ...], handle: Any) -> None:  # noqa: ANN401
         self._inputs[path] = handle
-        field = path[:-2] + path[-1:] if path[:-1] in self._folders else path  # a field's path is without the kind
+        # The path of a field is without the kind.
+        field = tuple(name for i, name in enumerate(path) if path[: i + 1] not in self._folders)
 
         @handle.on_update
         async def _(event: viser.GuiEvent) -> None:

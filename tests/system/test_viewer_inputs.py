@@ -35,8 +35,8 @@ def test_every_input(live):
     kinds = {kind.model_fields["kind"].default: kind() for kind in typing.get_args(Reference.__origin__)}
     seen = []
     for where, handle in list(live._controls._inputs.items()):
-        kind = where[1] if where[0] == "reference" and len(where) == 3 else None
-        path = (where[0], where[2]) if kind else where
+        kind = where[1] if where[0] == "reference" and len(where) > 2 else None
+        path = (where[0], *where[2:]) if kind else where
         live._restart([Scenario(reference=kinds[kind], steering="rigid") if kind else Scenario()])
         live.session.step()
         value = other(handle)

@@ -35,8 +35,12 @@ OPEN = ((0, 0), (2, 0.3), (4, -0.2), (6, 1))
 DEFAULTS = [
     Line(heading=2.5), Circle(), Circle(clockwise=True), Lemniscate(), LaneChange(), LaneChange(shift=-1),
     RoundedSquare(), StopAndGo(), StopAndGo(reverse=False), Waypoints(), Waypoints(points=OPEN, closed=False),
+    Waypoints(speed=1.4, timing="limits"), Waypoints(points=OPEN, closed=False, speed=1.4, timing="limits"),
 ]  # fmt: skip
-CLOSED = [Circle(), Circle(clockwise=True), Lemniscate(), RoundedSquare(), StopAndGo(), Waypoints()]
+CLOSED = [
+    Circle(), Circle(clockwise=True), Lemniscate(), RoundedSquare(), StopAndGo(), Waypoints(),
+    Waypoints(speed=1.4, timing="limits"),
+]  # fmt: skip
 KINDS = TypeAdapter(Reference)
 each = pytest.mark.parametrize("reference", DEFAULTS, ids=lambda r: r.kind)
 

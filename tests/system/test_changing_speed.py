@@ -1,0 +1,28 @@
+"""A nominal robot on random splines at changing speed needs the voltages that the time law foresees."""
+
+import numpy as np
+import pytest
+
+import mrctl
+from mrctl import Scenario
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
+from mrctl.theory.references import random_spline
+from mrctl.theory.timing import Limits
+
+ROBOT = read_robot(mjcf.load())
+
+
+@pytest.mark.parametrize("steering", ["compliant", "rigid"])
+def test_no_saturation(steering):
+    """With the model as feedforward two laps need at most the voltage that the law allows, and the robot tracks."""
+    courses = [random_spline(np.random.default_rng(seed), ROBOT) for seed in range(4)]
+    common = {"steering": steering, "feedforward": "model", "laps": 2, "initial_spread": (0, 0, 0)}
+    for course in courses:
+        result = mrctl.simulate([Scenario(reference=course, **common)], threads=1)
+        voltage = np.abs([result["voltage_left"], result["voltage_right"]]).max()
+        assert 0.5 * ROBOT.supply < voltage < 1.02 * Limits.of(ROBOT).voltage
+        (found,) = mrctl.summary(result).to_dict("records")
+        assert not found["failed"] and found["v_rmse"] < 0.02 and found["position_rmse"] < 0.01
+        acceleration = course.sample(np.linspace(0, course.period, 1000)).acceleration[:, 0]
+        assert acceleration.std() > 0.1  # the mass along x is excited
