@@ -13,6 +13,7 @@ from mrctl.control.pid import PIDS
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.scenario import Event, Scenario
+from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Lemniscate, Waypoints, random_spline
 from mrctl.theory.robot import STEERINGS, Robot
@@ -109,7 +110,9 @@ def cases(seeds: int, random: int, quick: bool) -> list[Case]:
     for name in (*LADDER, "delay 20 ms") if quick else PERTURBATIONS:
         add("steady", name, perturbation=PERTURBATIONS[name])
     if not quick:
-        add("steady", "odometry", measurement="odometry")
+        for tier in ("ideal", "field"):
+            add("steady", f"sensing {tier}", sensing=Sensing(tier=tier))
+        add("steady", "odometry", sensing=Sensing(estimator="odometry"))
         for name in ("nominal", "all"):
             add("steady", f"{name}, PID twice as fast", perturbation=PERTURBATIONS[name], pid=PIDS["fast"])
         add("steady", "patch of ice", world="patch")
@@ -162,7 +165,8 @@ _KINDS = {
     "grip": lambda r: {"tyre_friction_factor": r.uniform(0.4, 1.0)},
     "ice": lambda r: {"left_tyre_friction_factor": r.uniform(0.1, 0.5)},
     "slope": lambda r: {"slope": r.uniform(-0.17, 0.17)},
-    "noise": lambda r: {"velocity_noise": r.uniform(0, 0.02), "rotation_noise": r.uniform(0, 0.04)},
+    "driver": lambda r: {"dead_zone": r.uniform(0, 1), "battery_resistance": r.uniform(0, 0.3)},
+    "motors": lambda r: {f"{side}_motor_constant_factor": r.uniform(0.9, 1.1) for side in ("left", "right")},
 }  # fmt: skip
 
 

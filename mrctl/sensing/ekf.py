@@ -19,11 +19,10 @@ import numpy as np
 
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.sensing.prediction import front, predict, wrapped
-from mrctl.sensing.tiers import IN_FLIGHT
 
 N = 11  # states
 X, Y, THETA, V, OMEGA, BIAS, OFFSET, LEFT, RIGHT, SCALE_LEFT, SCALE_RIGHT = range(N)
-KEPT = IN_FLIGHT + 1  # states that are kept for fixes on their way
+KEPT = 5  # states that are kept for fixes on their way
 
 # Process noise, all chosen and held to the chi-square test of the filter's error (NEES) in the tests.
 TURN = 0.1  # deviation from the commanded θ̈, rad/s²/√Hz

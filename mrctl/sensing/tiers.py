@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from mrctl.record import Record
+from mrctl.sensing.ekf import KEPT
 from mrctl.theory.drive import (
     NO_LIMIT,
     Backlash,
@@ -23,7 +24,7 @@ from mrctl.theory.perturbation import LONGEST_DELAY
 Tier = Literal["ideal", "lab", "field"]
 TIERS: tuple[Tier, ...] = ("ideal", "lab", "field")
 EstimatorName = Literal["truth", "odometry", "ekf"]
-IN_FLIGHT = 4
+IN_FLIGHT = KEPT - 1
 """Largest number of fixes that are on their way at the same time."""
 
 DEGREE = 3.141592653589793 / 180
