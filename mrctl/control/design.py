@@ -1,17 +1,19 @@
 """Design of the velocity PID, and of the motion controller over it, for the plant and the delay that they have.
 
 A PI controller K_p (1 + 1/(T_i s)) is as fast as its delay allows where its integral gain K_i = K_p/T_i is the largest
-that keeps the loop L robust:
+that keeps the loop k L robust, with its own gain and with every smaller one:
 
-    max |S| ≤ M_s,    max |T| ≤ M_t,    S = 1/(1 + L),    T = L/(1 + L)
+    max |S| ≤ M_s,    max |T| ≤ M_t,    S = 1/(1 + k L),    T = k L/(1 + k L),    0 < k ≤ 1
 
 The largest K_i has the least integrated error after a disturbance (Åström, Panagopoulos and Hägglund 1998, Design of PI
 controllers based on non-convex optimization). M_s bounds how close L comes to −1: a gain may grow by M_s/(M_s − 1), 2.7
-for 1.6, before the loop is unstable. M_t bounds the overshoot of the command.
+for 1.6, before the loop is unstable. M_t bounds the overshoot. The gain falls where the supply sags or the voltage is
+limited.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -28,8 +30,10 @@ M_S, M_T = 1.6, 1.1
 """Largest |S| and |T|: 1.2 to 2 and 1 to 1.5 are usual (Åström and Hägglund, Advanced PID Control, 2006, ch. 4)."""
 SPEEDS = 0.5, 0.2, 1.0
 """Shares of the robot's largest speed at which its loops are robust, *chosen*; at the first one they are compared."""
-DAMPING = 1 / np.sqrt(2)
-"""Least damping ratio of the motion controller's loops, *chosen*."""
+DAMPING = 0.5
+"""Damping ratio of the motion controller's loops at the largest speed, *chosen*; it is higher at a lower speed."""
+PUBLISHED = Kanayama(k_x=10.0, k_y=64.0, k_theta=16.0)
+"""Gains that Kanayama et al. (1990) drove with; the motion controller gets none above them."""
 
 
 def plants(robot: Robot, rigid: bool, channel: int) -> list[Linear]:
@@ -45,6 +49,7 @@ def plants(robot: Robot, rigid: bool, channel: int) -> list[Linear]:
     return [linear.steering(robot)] if rigid else [linear.yaw(robot, s * robot.max_speed) for s in SPEEDS]
 
 
+@lru_cache(maxsize=256)
 def design(robot: Robot, rigid: bool, delay: float, lag: float = 0.0, period: float = 0.01) -> tuple[Gains, Gains]:
     """Designs the PI gains of both channels, in V/(m/s) and V/m and in V/(rad/s) and V/rad, or 1 and 1/s if rigid.
 
@@ -73,17 +78,17 @@ def fastest(plants: list[Linear], period: float, delay: float, lag: float) -> Ga
         lag: Time constant of the measurement in s.
     """
     frequency = np.geomspace(1e-4, 1, 500) * np.pi / period * (1 - 1e-9)
-    proportional, integral = (
-        np.concatenate([sampled_loop(frequency, plant, unit, period, delay, lag) for plant in plants])
-        for unit in (Gains(1.0, 0.0), Gains(0.0, 1.0))
-    )
+    loops = [sampled_loop(frequency, plant, Gains(1.0, 0.0), period, delay, lag) for plant in plants]
+    z = np.exp(1j * frequency * period)
 
-    def k_p(log_time: float) -> float:
-        return _largest_gain(proportional + integral / np.exp(log_time))
+    def k_p(logarithm: float) -> float:
+        """The largest K_p where T_i has this natural logarithm."""
+        control = 1 + period * z / (z - 1) / np.exp(logarithm)
+        return min(_largest_gain(control * loop) for loop in loops)
 
     longest = 10 * max(period, *(plant.lag for plant in plants))
-    found = minimize_scalar(
-        lambda log_time: log_time - np.log(k_p(log_time)), bounds=(np.log(period / 10), np.log(longest)), method="bounded"
+    found = minimize_scalar(  # 1/K_i has one minimum
+        lambda x: x - np.log(k_p(x)), bounds=(np.log(period / 10), np.log(longest)), method="bounded"
     )
     gain = k_p(found.x)
     return Gains(gain, gain / float(np.exp(found.x)))
@@ -122,15 +127,16 @@ class Motion(NamedTuple):
 
 
 def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], period: float = 0.01) -> Motion:
-    """Designs the motion controller over the velocity loops, with damping ratio ζ = `DAMPING` at the largest speed.
+    """Designs the motion controller over the velocity loops, with damping ratio ζ ≥ `DAMPING` up to the largest speed.
 
         x:  τ s² + s + K_x = 0,                         ζ = 1/(2 √(K_x τ))
         y:  τ s³ + s² + v_r K_θ s + v_r² K_y = 0,       K_θ = 2 √K_y
 
     A velocity loop follows a slow request with the lag 1/(K K_i), and τ is that lag and the prefilter's. The prefilter
-    takes as long as the slower velocity loop, *chosen*, since a faster request would only strain the motors. K_θ makes
-    the lateral error critically damped where τ = 0. With p = τ s and κ = τ v_r √K_y the second equation is
-    p³ + (p + κ)² = 0; a root r e^(jψ), cos ψ = −ζ, has √r = −sin ψ/cos(3ψ/2) and κ = r^(3/2) sin(3ψ/2) − r cos ψ.
+    takes half as long as the slower velocity loop, *chosen*. K_θ makes the lateral error critically damped where τ = 0.
+    With p = τ s and κ = τ v_r √K_y the second equation is p³ + (p + κ)² = 0; its root r e^(jψ) with cos ψ = −ζ has
+    √r = −sin ψ/cos(3ψ/2) and κ = r^(3/2) sin(3ψ/2) − r cos ψ. No gain is above `PUBLISHED`: larger ones only meet the
+    limits on acceleration.
 
     Args:
         robot: The nominal robot in its steering arrangement.
@@ -139,10 +145,10 @@ def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], period: float 
         period: Control period in s.
     """
     v_lag, omega_lag = (1 / (plants(robot, rigid, k)[0].gain * gains[k].k_i) for k in (0, 1))
-    prefilter = max(period, v_lag, omega_lag)
+    prefilter = max(period, v_lag / 2, omega_lag / 2)
     angle = np.pi - np.arccos(DAMPING)
     root = (np.sin(angle) / np.cos(1.5 * angle)) ** 2
     kappa = root**1.5 * np.sin(1.5 * angle) - root * np.cos(angle)
-    lateral = float(kappa / ((omega_lag + prefilter) * robot.max_speed))
-    k_x = float(1 / (4 * DAMPING**2 * (v_lag + prefilter)))
+    lateral = min(float(kappa / ((omega_lag + prefilter) * robot.max_speed)), PUBLISHED.k_theta / 2)
+    k_x = min(float(1 / (4 * DAMPING**2 * (v_lag + prefilter))), PUBLISHED.k_x)
     return Motion(Kanayama(k_x=k_x, k_y=lateral**2, k_theta=2 * lateral), prefilter, (v_lag, omega_lag))

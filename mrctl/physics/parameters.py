@@ -9,7 +9,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.physics.elements import REAR, bodies_of, centres, fronts, has, knuckles, left_tyre_pairs, rolling_fronts, rounded
+from mrctl.physics.elements import (
+    REAR,
+    bodies_of,
+    centres,
+    fronts,
+    has,
+    knuckles,
+    left_tyre_pairs,
+    rolling_fronts,
+    rounded,
+)
 from mrctl.record import InputError
 from mrctl.theory.robot import ANY_ANGLE, GRAVITY, Robot
 

@@ -8,10 +8,11 @@ the speed V, the rotation θ̇ and the fork's angle φ, the yaw model is
     J_c θ̈ + J_f φ̈ = m_f e V θ̇ − k_s φ − d_s φ̇ − t F
     u̇ = −u/T,    u = (L − t) θ̇ − t φ̇ − V φ
 
-F is the side force of the ground on the tyre and u the side slip of its contact. J_f is the inertia of fork and wheel about the
-steering axis, m_f e their mass times the distance of their centre behind it, J_c = J_f − m_f e L their coupling to the
-yaw, k_s and d_s the servo's stiffness and damping. The servo holds the commanded angle, which does not depend on the
-feedback. At rates far below V/t the fork follows, φ = (L − t) θ̇/V, and its stiffness is a damping k_s (L − t)²/(t V).
+F is the side force of the ground on the tyre and u the side slip of its contact. J_f is the inertia of fork and wheel
+about the steering axis, m_f e their mass times the distance of their centre behind it, J_c = J_f − m_f e L their
+coupling to the yaw, k_s and d_s the servo's stiffness and damping. The servo holds the commanded angle, which does not
+depend on the feedback. At rates far below V/t the fork follows, φ = (L − t) θ̇/V, and its stiffness acts as a damping
+k_s (L − t)²/(t V) of the yaw: at 0.75 m/s it leaves a fifth of the static gain of the default robot's second channel.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class Linear(NamedTuple):
         held[:n, :n], held[:n, n] = self.a, self.b
         held = expm(held * period)
         z = np.exp(1j * frequency * period)[:, None, None]
-        return np.linalg.solve(z * np.eye(n) - held[:n, :n], held[:n, n:])[:, 0, 0]
+        return np.asarray(np.linalg.solve(z * np.eye(n) - held[:n, :n], held[:n, n:])[:, 0, 0], complex)
 
 
 def first_order(gain: float, time_constant: float) -> Linear:
