@@ -134,7 +134,7 @@ def _steering(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, float]:
     for knuckle in knuckles(model):
         ratios[model.joint(knuckle).id] = model.equality(knuckle).data[1]
     stiffness, damping = -model.actuator("steering").biasprm[1:3]
-    inertia = moment = 0.0
+    inertia, moment = 0.0, np.zeros(())
     for joint, ratio in ratios.items():
         dof, carrier = model.jnt_dofadr[joint], model.jnt_bodyid[joint]
         damping += ratio**2 * model.dof_damping[dof]

@@ -50,6 +50,11 @@ class Linear(NamedTuple):
         """Integral of 1 less the unit step response over its final value, in s: the time constant of a first order."""
         return float(np.linalg.solve(self.a, np.linalg.solve(-self.a, self.b))[0] / -self.gain)
 
+    @property
+    def stable(self) -> bool:
+        """Whether every eigenvalue of A has a negative real part."""
+        return bool((np.linalg.eigvals(self.a).real < 0).all())
+
     def response(self, frequency: NDArray[np.float64], period: float) -> NDArray[np.complex128]:
         """Frequency response behind a zero-order hold, from sample to sample; exact.
 

@@ -180,7 +180,7 @@ def test_bad_scenario_is_one_line(
         (["tune", "submarine.xml"], "submarine.xml"),
         (["tune", "--lag", "-1"], "lag"),
         (["tune", "--delay", "0.013"], "control_delay"),
-        (["tune", "--delay", "0.6"], "control_delay"),
+        (["tune", "--delay", "0.6"], "delay: "),
         (["suite", "--seeds", "0"], "seeds"),
         (["dance"], "dance"),
     ],

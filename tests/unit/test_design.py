@@ -99,6 +99,16 @@ def test_every_speed_is_robust(robot, steering):
     assert SPEEDS[0] == 0.5
 
 
+def test_centre_of_mass_behind_the_axle(robot):
+    """Where m c V outweighs the motors' damping the robot turns by itself: that speed is left out."""
+    behind = {"wheelbase": -0.4, "trail": 0.0, "com_offset": -0.2, "steering_limit": np.pi / 2}
+    for top, count in ((0.2, 3), (1.2, 2), (20.0, 1)):
+        tail_heavy = Robot.from_dict(robot.model_dump() | behind | {"max_speed": top})
+        found = plants(tail_heavy, False, 1)
+        assert len(found) == count and all(plant.stable for plant in found)
+        assert min(design(tail_heavy, False, 0.01)[1]) > 0
+
+
 @pytest.mark.parametrize("steering", list(ARRANGEMENTS))
 def test_delay_and_lag_cost_speed(robot, steering):
     """K_i falls with the delay and with the lag, in both channels."""
