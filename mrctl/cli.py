@@ -290,24 +290,41 @@ def suite(
 
 
 def tune(
+    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT.xml")] = CAR.path,
+    /,
+    wheels: tuple[str, ...] = (),
+    steering: tuple[str, ...] = (),
+    chassis: str = "",
     world: str = "flat",
-    time_constant: float = 0.15,
-    delay: tuple[float, ...] = (0.0, 0.02, 0.04),
+    delay: tuple[float, ...] = (0.0, 0.01, 0.02),
+    lag: float = 0.0,
+    time_constant: float | None = None,
     out: Path | None = None,
     json: bool = False,
 ) -> None:
-    """Designs the velocity PID from equation (3), measures its loops on the physics, and says where learning is safe.
+    """Designs the velocity PID and the motion controller, measures the loops, and says where learning is safe.
 
     Args:
+        robot: Robot to design for: `car`, `turtlebot`, `racecar`, or an MJCF file; by default the world's own.
+        wheels: Joints of the two driven wheels, left and right; by default the two with a <dcmotor>.
+        steering: Joints of the steered wheels, at most two; by default the upright joints with an actuator.
+        chassis: Body that carries the wheels; by default the one at their root.
         world: World to measure in: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file.
-        time_constant: Time constant of the closed velocity loop in s.
         delay: Delays of the loop in s beside the sample and hold, each a multiple of the control period.
+        lag: Time constant in s with which the measured velocities will follow, for which the design leaves room.
+        time_constant: Time constant of the closed loop in s, for the IMC rule in place of the design.
         out: Folder for the table, the measured responses and a figure of them.
         json: Print JSON instead of a table.
     """
     from mrctl.experiments import tuning
+    from mrctl.physics.mjcf import load_robot
 
-    print(tuning.tune(world, time_constant, delay, out, json))
+    file = (
+        CAR
+        if (robot, wheels, steering, chassis) == (CAR.path, (), (), "")
+        else load_robot(robot, wheels, steering, chassis)
+    )
+    print(tuning.tune(file, world, time_constant, delay, lag, out, json))
 
 
 def identify(

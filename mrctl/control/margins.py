@@ -7,34 +7,40 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.control.pid import Gains
+from mrctl.theory.linear import Linear
+
+
+class Gains(NamedTuple):
+    """Proportional and integral gain of one channel."""
+
+    k_p: float
+    k_i: float
 
 
 def sampled_loop(
-    frequency: NDArray[np.float64], gain: float, time_constant: float, gains: Gains, period: float, delay: float
+    frequency: NDArray[np.float64], plant: Linear, gains: Gains, period: float, delay: float, lag: float = 0.0
 ) -> NDArray[np.complex128]:
-    """Frequency response of the open velocity loop: PI control, zero-order hold, plant K/(τs + 1) and delay.
+    """Frequency response of the open velocity loop: PI control, zero-order hold, plant P, delay and lag.
 
-        L = (K_p + K_i h z/(z − 1)) · K (1 − a)/(z − a) · e^(−jωT_d),    z = e^(jωh),    a = e^(−h/τ)
+        L = (K_p + K_i h z/(z − 1)) · P(z) · e^(−jωT_d)/(1 + jωT_l),    z = e^(jωh)
 
     The first factor is the integration of `pid`, the second the plant behind the hold.
 
     Args:
         frequency: ω in rad/s, below π/h, `(F,)`.
-        gain: K of the plant, in output units per V.
-        time_constant: τ in s; 0 for a plant that follows within a period.
+        plant: The plant.
         gains: PI gains K_p and K_i.
         period: Control period h in s.
         delay: Loop delay T_d in s, without that of the hold.
+        lag: Time constant T_l of the measurement in s.
 
     Returns:
         L(e^(jωh)), dimensionless, `(F,)`.
     """
     z = np.exp(1j * frequency * period)
-    decay = np.exp(-period / time_constant) if time_constant > 0 else 0.0
-    plant = gain * (1 - decay) / (z - decay)
     control = gains.k_p + gains.k_i * period * z / (z - 1)
-    return np.asarray(control * plant * np.exp(-1j * frequency * delay), complex)
+    late = np.exp(-1j * frequency * delay) / (1 + 1j * frequency * lag)
+    return np.asarray(control * plant.response(frequency, period) * late, complex)
 
 
 class Margins(NamedTuple):
@@ -46,6 +52,7 @@ class Margins(NamedTuple):
         gain: Gain margin as a factor; infinite if the phase never reaches −180°.
         delay: Delay margin in s.
         bandwidth: Frequency in rad/s above which the closed loop passes less than 1/√2.
+        sensitivity: M_s = max |S| with S = 1/(1 + L), the reciprocal of the least distance of L from −1.
     """
 
     crossover: float
@@ -53,6 +60,7 @@ class Margins(NamedTuple):
     gain: float
     delay: float
     bandwidth: float
+    sensitivity: float
 
 
 def margins(frequency: NDArray[np.float64], loop: NDArray[np.complex128]) -> Margins:
@@ -78,6 +86,7 @@ def margins(frequency: NDArray[np.float64], loop: NDArray[np.complex128]) -> Mar
         gain=float(1 / magnitude[inverted[0]]) if inverted.size else float("inf"),
         delay=float(phase_margin / crossover),
         bandwidth=float(bandwidth),
+        sensitivity=float(np.abs(1 / (1 + loop)).max()),
     )
 
 

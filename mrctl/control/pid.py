@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
+from mrctl.control.design import design
+from mrctl.control.margins import Gains
 from mrctl.kernel import Array, Row, kernel
-from mrctl.record import Record
+from mrctl.record import InputError, Record
+from mrctl.theory.perturbation import LONGEST_DELAY
 from mrctl.theory.robot import Robot
 
 PID = np.dtype(
@@ -57,23 +60,34 @@ def pid(command: Array, twist: Array, excess: Array, period: float, s: Row, feed
 class Pid(Record):
     """Design of the velocity controller; the gains follow from the robot's nominal equation (3)."""
 
+    rule: Literal["imc", "designed"] = "imc"
+    """Rule for the gains: `imc` from `time_constant` and equation (3), or `designed`, as fast as the delay allows."""
     time_constant: Annotated[float, Field(ge=0.03, le=2)] = 0.15
     """Closed-loop time constant λ of both channels in s; the IMC rule sets K_p = τ/(K λ) and K_i = 1/(K λ)."""
+    delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] = 0.0
+    """Delay from measurement to voltage in s for which the gains are `designed`; that of the hold is not counted."""
+    lag: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """Time constant in s for which the gains are `designed`: that with which the measured velocities follow."""
     derivative_time: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Derivative time K_d/K_p in s; the rule for a first-order plant needs no derivative action."""
     derivative_filter: Annotated[float, Field(ge=0.005, le=1)] = 0.03
     """Time constant of the filter on the derivative in s."""
     steering_kp: Annotated[float, Field(ge=0, le=10)] = 0.3
-    """Proportional gain of the second channel under `rigid` steering; it is dimensionless, in rad/s per rad/s."""
+    """Proportional gain of the second channel under `rigid` steering by the rule `imc`, in rad/s per rad/s."""
     steering_ki: Annotated[float, Field(ge=0, le=50)] = 5.0
-    """Integral gain of the second channel under `rigid` steering in 1/s."""
+    """Integral gain of the second channel under `rigid` steering by the rule `imc`, in 1/s."""
 
-    def gains(self, robot: Robot, rigid: bool) -> dict[str, tuple[float, float]]:
+    def gains(self, robot: Robot, rigid: bool, period: float = 0.01) -> dict[str, tuple[float, float]]:
         """Returns the settings of the record `PID` by name, each for the common and the second channel.
 
         The common channel is in V per m/s; the second in V per rad/s, or in rad/s per rad/s if `rigid`.
+
+        Args:
+            robot: The nominal robot in its steering arrangement.
+            rigid: Whether the second channel is steering.
+            period: Control period in s.
         """
-        common, second = self.channels(robot, rigid)
+        common, second = self.channels(robot, rigid, period)
         return {
             "k_p": (common.k_p, second.k_p),
             "k_i": (common.k_i, second.k_i),
@@ -81,8 +95,10 @@ class Pid(Record):
             "filter": (self.derivative_filter, self.derivative_filter),
         }
 
-    def channels(self, robot: Robot, rigid: bool) -> tuple[Gains, Gains]:
-        """Returns proportional and integral gains of the two channels, in the units of `gains`."""
+    def channels(self, robot: Robot, rigid: bool, period: float = 0.01) -> tuple[Gains, Gains]:
+        """Returns proportional and integral gains of the two channels, with the arguments and units of `gains`."""
+        if self.rule == "designed":
+            return design(robot, rigid, self.delay, self.lag, period)
         common, differential = imc(robot, self.time_constant)
         return common, Gains(self.steering_kp, self.steering_ki) if rigid else differential
 
@@ -90,8 +106,10 @@ class Pid(Record):
         """Returns the design whose gains are all multiplied by `factor`, the closed-loop time constant divided by it.
 
         Raises:
-            InputError: A field is then out of its range.
+            InputError: A field is then out of its range, or the gains are `designed`, which leaves no room.
         """
+        if self.rule == "designed":
+            raise InputError("rule: designed gains are already as large as the delay allows; use imc")
         changed = {
             "time_constant": self.time_constant / factor,
             "steering_kp": self.steering_kp * factor,
@@ -102,13 +120,6 @@ class Pid(Record):
 
 PIDS: dict[str, Pid] = {"normal": Pid(), "fast": Pid().faster(2)}
 """PIDs of the comparisons: the default, and one twice as fast, which leaves less for a feedforward to gain."""
-
-
-class Gains(NamedTuple):
-    """Proportional and integral gain of one channel."""
-
-    k_p: float
-    k_i: float
 
 
 def imc(robot: Robot, time_constant: float) -> tuple[Gains, Gains]:

@@ -86,7 +86,7 @@ class Shaker:
         self._tick += 1
 
 
-def measure(scenarios: Sequence[Scenario], channel: int) -> tuple[Array, Response]:
+def measure(scenarios: Sequence[Scenario], channel: int, speed: float = Line().speed) -> tuple[Array, Response]:
     """Measures T of one channel on robots that drive straight on, in the complete loop with hold, delay and tyres.
 
     With the gains of the motion controller at zero this is the velocity loop; with its own gains it is the loop that
@@ -95,6 +95,7 @@ def measure(scenarios: Sequence[Scenario], channel: int) -> tuple[Array, Respons
     Args:
         scenarios: Runs that fit one batch; their references, feedforwards and events are replaced.
         channel: 0 for the common channel, 1 for the differential or the steering channel.
+        speed: Speed of the robots in m/s.
 
     Returns:
         ω in rad/s `(F,)` and T `(B, F)`.
@@ -108,7 +109,7 @@ def measure(scenarios: Sequence[Scenario], channel: int) -> tuple[Array, Respons
     scale = STEERING_SCALE if channel == 1 and first.steering == "rigid" else 1.0
     signal[:, channel] = AMPLITUDE * scale * multisine(SAMPLES, harmonics)
     duration = 2 * SAMPLES * first.control_period  # one period to settle, one to measure
-    line = Line(length=Line().speed * duration)
+    line = Line(length=speed * duration, speed=speed)
     steady = {"reference": line, "laps": 1, "events": (), "initial_spread": (0.0, 0.0, 0.0), "feedforward": "none"}
     runs = [s.model_copy(update=steady) for s in scenarios]
     shaker = Shaker(signal, 2 * SAMPLES, len(runs))

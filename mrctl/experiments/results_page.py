@@ -62,7 +62,7 @@ def main(
         table = _read(suite / "table.json", "rows")
         written["The uncertainty suite"] = _section("mrctl suite", table, suite_text(table, _text(suite / "table.md")))
     if tune is not None:
-        table = _read(tune / "table.json", "loops")
+        table = _read(tune / "table.json", "loops", "motion")
         written["Where learning is safe"] = _section("mrctl tune", table, tune_text(table))
     if identify:
         tables = [_read(file, "constants", "robot") for file in identify]

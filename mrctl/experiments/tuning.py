@@ -10,6 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from mrctl.control.design import M_S, M_T, SPEEDS, plants
+from mrctl.control.design import motion as motion_design
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import learning_ratio, margins, sampled_loop
 from mrctl.control.pid import Pid
@@ -17,16 +19,13 @@ from mrctl.experiments.response import Array, Response, measure, refine, safety
 from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder
 from mrctl.loop.hierarchy import TAKE_OVER
 from mrctl.physics import mjcf
-from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
 from mrctl.results import plots
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
+from mrctl.theory.robot import CAR, RobotFile
 
-CHANNELS = (("common", "V/(m/s)", "V/m"), ("differential", "V/(rad/s)", "V/rad"))
-LOOPS = (("compliant", 0), ("compliant", 1), ("caster", 1), ("rigid", 1))
-"""Steering arrangement and channel of each loop; the common channel is the same under all three arrangements."""
-RESPONSES = {"design": "equation (3)", "measured": "measured", "hierarchy": "measured with motion controller"}
+RESPONSES = {"design": "designed", "measured": "measured", "hierarchy": "measured with motion controller"}
 STYLES: dict[str, dict[str, Any]] = {
     "design": {"lw": 0.8},
     "measured": {"ls": "", "marker": ".", "ms": 4},
@@ -37,8 +36,17 @@ MARGINS = {
     "bandwidth": "bandwidth, rad/s",
     "phase": "phase margin, °",
     "gain": "gain margin",
+    "sensitivity": "max \\|S\\|",
 }
 SAFETY = {"positive_to": "Re T > 0 to, rad/s", "lowest": "least Re T", "step": "largest step"}
+GAINS = ("plant gain", "plant lag, s", "K_p", "K_i", "learning ratio")
+UNITS = """\
+Units: common m/s, V/(m/s), V/m; second rad/s, V/(rad/s), V/rad; of rigid steering 1, 1, 1/s. Learning without delay and
+hold converges with a first-order plant if the ratio K_p (1 + K K_p)/(τ K_i) is above 1."""
+MOTION = (
+    *("steering", "delay, ms", "lag of V, ms", "lag of θ̇, ms", "prefilter, ms"),
+    *("K_x, 1/s", "K_y, 1/m²", "K_θ, 1/m"),
+)
 ADVICE = f"""\
 Learning by feedback error is safe at frequencies where Re T > 0; with the hand-over of the built-in learners, where
 Re T > {-TAKE_OVER / (1 - TAKE_OVER):g}. Both hold for commands that do not depend on the motion of the robot; a fast
@@ -46,76 +54,99 @@ motion controller behind a delay narrows them. Above the largest step a learner 
 hand-over: choose at most half of it."""
 
 
-def tune(world: str, time_constant: float, delays: Sequence[float], out: Path | None, json: bool) -> str:
+def tune(
+    robot: RobotFile,
+    world: str,
+    time_constant: float | None,
+    delays: Sequence[float],
+    lag: float,
+    out: Path | None,
+    json: bool,
+) -> str:
     """The command: designs and measures; writes `table.json` and the figure `sensitivity` to `out` unless it is None.
+
+    Without a time constant the gains are `designed`, else they follow the IMC rule.
 
     Raises:
         InputError: As `design`, or the folder cannot be written.
     """
     if out is not None:
         output_folder(out)
-    asked = Pid.from_dict({"time_constant": time_constant})
-    # `faster` also scales the gains of the steering, which go with the time constant.
-    table = design(world, Pid().faster(Pid().time_constant / asked.time_constant), delays)
+    pid = Pid.from_dict({"rule": "designed", "lag": lag})
+    if time_constant is not None:
+        asked = Pid.from_dict({"time_constant": time_constant})
+        # `faster` also scales the gains of the steering, which go with the time constant.
+        pid = Pid().faster(Pid().time_constant / asked.time_constant)
+    table = design(world, pid, delays, robot)
     if out is not None:
         (out / "table.json").write_text(json_text(table) + "\n")
         plots.save(figure(table), out, "sensitivity")
     return json_text(table) if json else text(table)
 
 
-def design(world: str, pid: Pid, delays: Sequence[float]) -> dict[str, Any]:
-    """Margins and safety of the loops of a PID design, by equation (3) and measured on the physics.
+def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR) -> dict[str, Any]:
+    """Gains, margins and safety of every velocity loop of a robot, as designed and as measured on the physics.
+
+    The common channel is measured in the robot's first steering arrangement, since it is the same in all of them, and
+    the second channel in each, at half of the largest speed. The measured twist is the true one, so that a lag for
+    which the PID is designed is headroom in both columns.
 
     Args:
         world: World or MJCF file.
-        pid: The design; equation (3) is evaluated without its derivative part.
+        pid: The PID; a designed one is designed for each delay. Its derivative part is left out of the design.
         delays: Loop delays in s, in whole control periods, in addition to the hold.
+        robot: The robot; by default the world's own.
 
     Returns:
-        For each channel static gain, time constant, PI gains and the ratio of the learning condition; `loops`, a row
-        for each of `LOOPS` and each delay, with `Margins` and `Safety` for each of `RESPONSES`; `frequency` in rad/s
-        and `responses`, T of the same rows.
+        `loops`, a row for each loop and delay with the plant's static gain and lag, the PI gains, the ratio of the
+        learning condition, and `Margins` and `Safety` for each of `RESPONSES`; `motion`, the motion controller that
+        suits the loops of each arrangement and delay; `frequency` in rad/s and `responses`, T of the rows of `loops`.
 
     Raises:
-        InputError: The world or a delay is bad, or the robot fails with that delay.
+        InputError: The world, the robot or a delay is bad, or the robot fails with that delay.
     """
     if not delays:
         raise InputError("delay: at least one delay is needed")
-    scenarios = [
-        Scenario.from_dict(
-            {
-                "world": world,
-                "pid": pid.model_dump(),
-                "kanayama": motion.model_dump(),
-                "perturbation": {"control_delay": delay},
-            }
-        )
-        for motion in (Kanayama(k_x=0, k_y=0, k_theta=0), Kanayama())
-        for delay in delays
-    ]
-    robot = read_robot(mjcf.load(world))
-    period = scenarios[0].control_period
-    plants = (
-        (robot.velocity_gain, robot.velocity_time_constant),
-        (robot.rotation_gain, robot.rotation_time_constant),
-    )
-    table: dict[str, Any] = {"versions": versions(), "machine": machine(), "time_constant": pid.time_constant}
-    table |= {"loops": [], "responses": []}
-    for (name, *_), (gain, tau), gains in zip(CHANNELS, plants, pid.channels(robot, rigid=False), strict=True):
-        table[name] = {"static_gain": gain, "plant_time_constant": tau, **gains._asdict()}
-        table[name]["ratio"] = learning_ratio(gain, tau, gains)
-    for steering, channel in LOOPS:
-        frequency, measured = measure([s.model_copy(update={"steering": steering}) for s in scenarios], channel)
-        rigid = steering == "rigid"
-        plant = (1.0, 0.0) if rigid else plants[channel]  # the steering is taken as ideal
-        gains = pid.channels(robot, rigid)[channel]
-        for k, delay in enumerate(delays):
-            loop = sampled_loop(frequency, *plant, gains, period, delay)
-            found = dict(zip(RESPONSES, (loop / (1 + loop), measured[k], measured[len(delays) + k]), strict=True))
-            row = {"steering": steering, "channel": channel, "delay": delay}
-            table["loops"].append(row | {name: _judge(frequency, found[name], period) for name in RESPONSES})
-            table["responses"].append(row | {n: _parts(t) for n, t in found.items()})
-        table["frequency"] = frequency.tolist()
+    table: dict[str, Any] = {"versions": versions(), "machine": machine(), "robot": robot.model_dump()}
+    table |= {"rule": pid.rule, "time_constant": pid.time_constant, "lag": pid.lag}
+    table |= {"loops": [], "motion": [], "responses": []}
+    offered = mjcf.steerings(mjcf.load(world, mjcf.arrangement(robot), robot=robot))
+    for steering in offered:
+        _, nominal = mjcf.build(world, steering, robot=robot)
+        pids = [Pid.from_dict(pid.model_dump() | {"delay": d}) if pid.rule == "designed" else pid for d in delays]
+        common = {"world": world, "robot": robot.model_dump(), "steering": steering}
+        scenarios = [
+            Scenario.from_dict(
+                common
+                | {
+                    "pid": one.model_dump(),
+                    "kanayama": motion.model_dump(),
+                    "perturbation": {"control_delay": delay},
+                }
+            )
+            for motion in (Kanayama(k_x=0, k_y=0, k_theta=0), Kanayama())
+            for one, delay in zip(pids, delays, strict=True)
+        ]
+        period, rigid = scenarios[0].control_period, steering == "rigid"
+        gains = [one.channels(nominal, rigid, period) for one in pids]
+        for delay, both in zip(delays, gains, strict=True):
+            found = motion_design(nominal, rigid, both, period)
+            lags = dict(zip(("v_lag", "omega_lag"), found.lag, strict=True))
+            suits = found.kanayama.model_dump() | {"prefilter": found.prefilter} | lags
+            table["motion"].append({"steering": steering, "delay": delay} | suits)
+        for channel in (0, 1) if steering == offered[0] else (1,):
+            plant = plants(nominal, rigid, channel)[0]
+            frequency, measured = measure(scenarios, channel, SPEEDS[0] * nominal.max_speed)
+            for k, delay in enumerate(delays):
+                loop = sampled_loop(frequency, plant, gains[k][channel], period, delay)
+                t = dict(zip(RESPONSES, (loop / (1 + loop), measured[k], measured[len(delays) + k]), strict=True))
+                row = {"steering": steering, "channel": channel, "delay": delay}
+                made = {"static_gain": plant.gain, "plant_lag": plant.lag, **gains[k][channel]._asdict()}
+                made["ratio"] = learning_ratio(plant.gain, plant.lag, gains[k][channel])
+                judged = {name: _judge(frequency, t[name], period) for name in RESPONSES}
+                table["loops"].append(row | made | judged)
+                table["responses"].append(row | {name: _parts(one) for name, one in t.items()})
+            table["frequency"] = frequency.tolist()
     return table
 
 
@@ -130,15 +161,23 @@ def _judge(frequency: Array, response: Response, period: float) -> dict[str, flo
 
 def text(table: dict[str, Any]) -> str:
     """The design as text."""
-    lines = [f"closed-loop time constant {table['time_constant']:g} s"]
-    for name, unit_p, unit_i in CHANNELS:
-        c = table[name]
-        verdict = "converges" if c["ratio"] > 1 else "does not converge"
-        lines += [
-            f"{name}: plant gain {c['static_gain']:.4g}, time constant {c['plant_time_constant']:.3f} s, "
-            f"K_p {c['k_p']:.3g} {unit_p}, K_i {c['k_i']:.3g} {unit_i}",
-            f"  learning without delay and hold: K_p (B + b K_p) / (M K_i) = {c['ratio']:.2f}, {verdict} above 1",
+    gains = [
+        [
+            _name(row),
+            f"{1e3 * row['delay']:g}",
+            *(number(row[name]) for name in ("static_gain", "plant_lag", "k_p", "k_i", "ratio")),
         ]
+        for row in table["loops"]
+    ]
+    motions = [
+        [
+            row["steering"],
+            f"{1e3 * row['delay']:g}",
+            *(number(1e3 * row[name]) for name in ("v_lag", "omega_lag", "prefilter")),
+            *(number(row[name]) for name in ("k_x", "k_y", "k_theta")),
+        ]
+        for row in table["motion"]
+    ]
     rows = [
         [
             _name(row),
@@ -148,8 +187,26 @@ def text(table: dict[str, Any]) -> str:
         ]
         for row in table["loops"]
     ]
-    header = ["loop", "delay, ms", *MARGINS.values(), *SAFETY.values()]
-    return "\n".join([*lines, "", f"{' / '.join(RESPONSES.values())}:", "", markdown(header, rows), "", ADVICE])
+    loops = ["loop", "delay, ms"]
+    parts = [
+        f"{_rule(table)}:",
+        markdown([*loops, *GAINS], gains),
+        UNITS,
+        "The motion controller for these loops:",
+        markdown([*MOTION], motions),
+        f"{' / '.join(RESPONSES.values())}:",
+        markdown([*loops, *MARGINS.values(), *SAFETY.values()], rows),
+        ADVICE,
+    ]
+    return "\n\n".join(parts)
+
+
+def _rule(table: dict[str, Any]) -> str:
+    if table["rule"] == "designed":
+        return (
+            f"PI with the largest K_i for which max |S| ≤ {M_S:g} and max |T| ≤ {M_T:g}, lag {1e3 * table['lag']:g} ms"
+        )
+    return f"PID by the IMC rule with λ = {table['time_constant']:g} s"
 
 
 def statement(table: dict[str, Any]) -> str:
@@ -159,10 +216,7 @@ def statement(table: dict[str, Any]) -> str:
         for row in table["loops"]
         if row["delay"] == 0
     ]
-    return (
-        f"PID by the IMC rule with λ = {table['time_constant']:g} s; bandwidth in rad/s / phase margin in degrees / "
-        f"gain margin as measured: {'; '.join(loops)}"
-    )
+    return f"{_rule(table)}; bandwidth in rad/s / phase margin in degrees / gain margin as measured: {'; '.join(loops)}"
 
 
 def _name(row: dict[str, Any]) -> str:
@@ -175,12 +229,13 @@ def _cell(value: float) -> str:
 
 @plots.styled
 def figure(table: dict[str, Any]) -> Figure:
-    """Re T(jω) by equation (3), measured, and in the whole hierarchy; below zero, learning is not safe."""
-    drawn = Figure(figsize=(plots.PAGE, 0.7 * plots.PAGE), layout="constrained")
-    panels = list(drawn.subplots(2, 2, sharex=True, sharey=True).flat)
+    """Re T(jω) as designed, measured, and in the whole hierarchy; below zero, learning is not safe."""
     frequency = table["frequency"]
     marks = np.unique(np.geomspace(1, len(frequency), 30).astype(int) - 1).tolist()  # dots evenly spread
     rows, loops = table["responses"], list(dict.fromkeys(map(_name, table["responses"])))
+    height = len(loops) // 2
+    drawn = Figure(figsize=(plots.PAGE, 0.35 * height * plots.PAGE + 0.5), layout="constrained")
+    panels = list(drawn.subplots(height, 2, sharex=True, sharey=True).flat)
     for axes, name in zip(panels, loops, strict=True):
         axes.axhspan(-2, 0, color="0.93", zorder=0)
         for k, row in enumerate(r for r in rows if _name(r) == name):
@@ -188,7 +243,7 @@ def figure(table: dict[str, Any]) -> Figure:
                 colour = plots.COLOURS[k % len(plots.COLOURS)]
                 axes.plot(frequency, row[kind]["real"], color=colour, markevery=marks, **style)
         axes.set(xscale="log", ylim=(-0.8, 1.6), title=name)
-    for axes in panels[2:]:
+    for axes in panels[-2:]:
         axes.set_xlabel("ω (rad/s)")
     for axes in panels[::2]:
         axes.set_ylabel(r"Re $T(\mathrm{j}\omega)$")

@@ -234,7 +234,7 @@ class Hierarchy:
 
     def set_pid(self, row: int, design: Pid) -> None:
         """Changes the velocity feedback of one robot."""
-        for name, value in design.gains(self._robot, self._rigid).items():
+        for name, value in design.gains(self._robot, self._rigid, self._period).items():
             self.state["pid"][name][row] = value
 
     def set_learning(self, row: int, on: bool) -> None:

@@ -43,6 +43,11 @@ def rolling_fronts(model: mujoco.MjModel) -> list[str]:
     return [name for name in fronts(model) if has(model, "joint", name)]
 
 
+def knuckles(model: mujoco.MjModel) -> list[str]:
+    """Names the joints of two steered wheels, each of which an equality couples to the joint `steering`."""
+    return [f"steering_{wheel}" for wheel in fronts(model) if has(model, "joint", f"steering_{wheel}")]
+
+
 def bodies_of(model: mujoco.MjModel) -> list[int]:
     """Lists the indices of the robot's bodies, which are the chassis and all that it carries."""
     chassis = model.body("chassis").id

@@ -16,6 +16,7 @@ from mrctl.physics.elements import (
     centres,
     fronts,
     has,
+    knuckles,
     left_tyre_pairs,
     rolling_fronts,
     rounded,
@@ -77,6 +78,7 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
             "wheelbase": wheelbase,
             "trail": trail,
             "steering_limit": model.joint("steering").range[1] if has(model, "joint", "steering") else ANY_ANGLE,
+            **_steering(model, data),
             "resistance": resistance,
             "inductance": _inductance(model),
             "torque_constant": constant,
@@ -107,6 +109,7 @@ def at_rest(model: mujoco.MjModel) -> tuple[mujoco.MjData, NDArray[np.float64]]:
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
     bodies, chassis = bodies_of(model), data.body("chassis")
     com = np.average(data.xipos[bodies], axis=0, weights=model.body_mass[bodies])
     return data, chassis.xmat.reshape(3, 3).T @ (com - chassis.xpos)
@@ -120,6 +123,33 @@ def _layout(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float, f
         chassis = data.body("chassis")
         axis = rounded(chassis.xmat.reshape(3, 3).T @ (data.joint("steering").xanchor - chassis.xpos))[0]
     return (left - right) / 2, float(axis), float(rounded(axis - front))
+
+
+def _steering(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, float]:
+    """Returns those parameters of a `Robot` that describe its steering; the data holds the kinematics at rest.
+
+    Two steered wheels turn as the linkage turns them near straight on, and their inertias add to that of the rack.
+    """
+    if not has(model, "joint", "steering"):
+        return {}
+    rack = model.joint("steering")
+    ratios = {rack.id: 1.0}
+    for knuckle in knuckles(model):
+        ratios[model.joint(knuckle).id] = model.equality(knuckle).data[1]
+    stiffness, damping = -model.actuator("steering").biasprm[1:3]
+    inertia, moment = 0.0, np.zeros(())
+    for joint, ratio in ratios.items():
+        dof, carrier = model.jnt_dofadr[joint], model.jnt_bodyid[joint]
+        damping += ratio**2 * model.dof_damping[dof]
+        inertia += ratio**2 * model.dof_M0[dof]
+        behind = (data.xanchor[joint] - data.subtree_com[carrier]) @ data.body("chassis").xmat.reshape(3, 3)[:, 0]
+        moment += ratio * model.body_subtreemass[carrier] * behind
+    return {
+        "steering_stiffness": stiffness,
+        "steering_damping": damping,
+        "fork_inertia": inertia,
+        "fork_moment": float(rounded(moment)),
+    }
 
 
 def load_torques(model: mujoco.MjModel) -> dict[str, float]:

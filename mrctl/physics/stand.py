@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.physics.elements import centres, fronts, has
+from mrctl.physics.elements import centres, fronts, has, knuckles
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
 from mrctl.theory.kinematics import scrub_free_angle
@@ -95,11 +95,6 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | N
     return State(data.qpos.copy(), data.qvel.copy())
 
 
-def _knuckles(model: mujoco.MjModel) -> list[str]:
-    """Names the joints of two steered wheels, each of which an equality couples to the joint `steering`."""
-    return [f"steering_{wheel}" for wheel in fronts(model) if has(model, "joint", f"steering_{wheel}")]
-
-
 def _linkage(model: mujoco.MjModel, knuckle: str, angle: NDArray) -> NDArray:
     """Returns the angles of a knuckle at steering angles, both in rad and of the same shape."""
     return np.polynomial.polynomial.polyval(angle, model.equality(knuckle).data[:5])
@@ -109,7 +104,7 @@ def steer(model: mujoco.MjModel, qpos: NDArray, angle: float) -> None:
     """Writes a steering angle in rad into `qpos`, `(nq,)`: the joint of the fork or rack, and those of the knuckles."""
     if has(model, "joint", "steering"):
         qpos[model.joint("steering").qposadr[0]] = angle
-    for knuckle in _knuckles(model):
+    for knuckle in knuckles(model):
         qpos[model.joint(knuckle).qposadr[0]] = _linkage(model, knuckle, np.array(angle))
 
 
@@ -133,7 +128,7 @@ def front_rates(
     along = v * np.cos(steering) + robot.wheelbase * omega * np.sin(steering)  # speed of the middle of the front axle
     rates = {wheel: along / robot.front_wheel_radius for wheel in fronts(model)}
     # A wheel's speed is proportional to its distance from the turning point, which is L/sin of its angle.
-    for knuckle in _knuckles(model):
+    for knuckle in knuckles(model):
         angle, wheel = _linkage(model, knuckle, steering), knuckle.removeprefix("steering_")
         distance = np.where(np.abs(steering) > 1e-6, np.sin(steering), 1.0) / np.where(
             np.abs(angle) > 1e-6, np.sin(angle), 1.0

@@ -47,6 +47,14 @@ class Robot(Record):
     """Distance of the front contact point behind the steering axis [t] in m."""
     steering_limit: Annotated[float, Field(gt=0, le=ANY_ANGLE)]
     """Largest steering angle in rad; π/2 for a differential drive, which turns on the spot."""
+    steering_stiffness: NonNegative = 0.0
+    """Stiffness of the steering servo [k_s] in N·m/rad; 0 where the fork is free or nothing is steered."""
+    steering_damping: NonNegative = 0.0
+    """Damping of the steering, of servo and bearings together, [d_s] in N·m·s/rad."""
+    fork_inertia: NonNegative = 0.0
+    """Inertia of what the steering turns about its axis [J_f] in kg·m²; 0 where nothing is steered."""
+    fork_moment: float = 0.0
+    """Mass of what the steering turns times the distance of its centre behind the axis [m_f e] in kg·m."""
     resistance: Positive
     """Terminal resistance of a motor [R_a] in Ω."""
     inductance: NonNegative

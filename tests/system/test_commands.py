@@ -99,19 +99,34 @@ def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_tune_states_the_learning_condition(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """The ratio of the learning condition is 1 + τ/λ, from the robot's own time constants."""
-    assert cli.main(["tune", "--delay", "0", "0.03", "--out", str(tmp_path), "--json"]) == 0
+    """By the IMC rule the ratio of the learning condition is 1 + τ/λ, with the robot's own time constant."""
+    by_rule = ["tune", "--time-constant", "0.15", "--delay", "0", "0.03", "--out", str(tmp_path), "--json"]
+    assert cli.main(by_rule) == 0
     printed = capsys.readouterr().out
     table = json.loads(printed)
     assert json.loads((tmp_path / "table.json").read_text()) == table
     assert (tmp_path / "sensitivity.png").stat().st_size > 5000
     assert [row["delay"] for row in table["loops"]] == 4 * [0, 0.03]
-    for channel, tau in (("common", 0.234), ("differential", 0.261)):
-        assert table[channel]["ratio"] == pytest.approx(1 + tau / 0.15, rel=5e-3)
-    assert cli.main(["tune", "--delay", "0"]) == 0
-    out = capsys.readouterr().out
-    assert "converges above 1" in out
-    assert sum(line.startswith(("| common", "| compliant", "| caster", "| rigid")) for line in out.splitlines()) == 4
+    assert table["rule"] == "imc"
+    assert table["loops"][0]["ratio"] == pytest.approx(1 + 0.234 / 0.15, rel=5e-3)
+    assert [row["k_p"] for row in table["loops"][-2:]] == [0.3, 0.3]
+
+
+def test_tune_designs(capsys: pytest.CaptureFixture) -> None:
+    """For any robot it prints gains, the motion controller, and each loop as designed and as measured."""
+    for robot, lines in (("car", 4 + 3 + 4), ("turtlebot", 2 + 1 + 2)):
+        assert cli.main(["tune", robot, "--delay", "0.01"]) == 0
+        out = capsys.readouterr().out
+        assert "max |S| ≤ 1.6" in out and "is above 1" in out
+        rows = [
+            line for line in out.splitlines() if line.startswith(("| common", "| compliant", "| caster", "| rigid"))
+        ]
+        assert len(rows) == lines
+    assert cli.main(["tune", "racecar", "--delay", "0.01", "--lag", "0.02", "--json"]) == 0
+    table = json.loads(capsys.readouterr().out)
+    assert table["robot"]["path"] == "racecar" and table["lag"] == 0.02
+    assert [row["steering"] for row in table["motion"]] == ["rigid"]
+    assert all(row["measured"]["sensitivity"] < 1.6 for row in table["loops"])
 
 
 @pytest.mark.parametrize(
@@ -162,8 +177,10 @@ def test_bad_scenario_is_one_line(
         (["run", "--perturbation.slope", "nan"], "perturbation.slope"),
         (["tune", "--time-constant", "-1"], "time_constant"),
         (["tune", "--world", "moon"], "moon"),
+        (["tune", "submarine.xml"], "submarine.xml"),
+        (["tune", "--lag", "-1"], "lag"),
         (["tune", "--delay", "0.013"], "control_delay"),
-        (["tune", "--delay", "0.6"], "control_delay"),
+        (["tune", "--delay", "0.6"], "delay: "),
         (["suite", "--seeds", "0"], "seeds"),
         (["dance"], "dance"),
     ],

@@ -7,13 +7,15 @@ from scipy import signal
 import mrctl
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import sampled_loop
-from mrctl.control.pid import PIDS
+from mrctl.control.pid import PIDS, Pid
 from mrctl.experiments.response import SAMPLES, Shaker, estimate, lines, measure, multisine, refine, safety
 from mrctl.experiments.tuning import design, statement
 from mrctl.loop.hierarchy import TAKE_OVER
 from mrctl.loop.simulation import Simulation
 from mrctl.physics.mjcf import load
 from mrctl.physics.parameters import read_robot
+from mrctl.theory.linear import first_order
+from mrctl.theory.robot import RobotFile
 
 H = 0.01
 NO_MOTION_CONTROLLER = Kanayama(k_x=0, k_y=0, k_theta=0)
@@ -29,11 +31,11 @@ def scenarios(delays=(0.0,), **changes):
 def on_paper(frequency, channel, delay, pid="normal"):
     """T of equation (3) under the sampled PI."""
     robot = read_robot(load("flat"))
-    gain, tau = (
-        (robot.velocity_gain, robot.velocity_time_constant),
-        (robot.rotation_gain, robot.rotation_time_constant),
+    plant = (
+        first_order(robot.velocity_gain, robot.velocity_time_constant),
+        first_order(robot.rotation_gain, robot.rotation_time_constant),
     )[channel]
-    loop = sampled_loop(frequency, gain, tau, PIDS[pid].channels(robot, rigid=False)[channel], H, delay)
+    loop = sampled_loop(frequency, plant, PIDS[pid].channels(robot, rigid=False)[channel], H, delay)
     return loop / (1 + loop)
 
 
@@ -150,6 +152,46 @@ def test_twice_as_fast():
         assert fast_loop["measured"]["phase"] > 60
     assert "λ = 0.075 s" in statement(fast)
     assert f"common {fast['loops'][0]['measured']['bandwidth']:.1f} / " in statement(fast)
+
+
+@pytest.mark.parametrize("robot", ["car", "turtlebot", "racecar"])
+@pytest.mark.parametrize(("pid", "delays"), [(Pid(rule="designed"), (0.0, 0.01, 0.02)), (Pid(), (0.0,))])
+def test_designed_is_measured(robot, pid, delays):
+    """On the physics every loop has the bandwidth that was designed to 10 %, and M_s, with every steering and delay."""
+    table = design("flat", pid, delays, RobotFile(path=robot))
+    assert len(table["loops"]) == len(delays) * (4 if robot == "car" else 2)
+    for row in table["loops"]:
+        wanted, found = row["design"], row["measured"]
+        assert found["bandwidth"] == pytest.approx(wanted["bandwidth"], rel=0.1), (row["steering"], row["delay"])
+        assert found["sensitivity"] == pytest.approx(wanted["sensitivity"], abs=0.1)
+        if pid.rule == "designed":
+            assert found["sensitivity"] < 1.7 and found["bandwidth"] > 35
+
+
+@pytest.mark.parametrize(
+    ("points", "speed"),
+    [
+        (((0.6, 1.7), (-3.4, 1.0), (-3.9, 0.8), (-3.6, -0.7), (-3.0, -2.1), (-0.1, -2.8), (2.7, -2.2)), 0.94),
+        (((3.6, 1.9), (2.2, 3.2), (0.3, 2.6), (-3.8, 0.9), (-1.1, -1.8)), 1.35),
+    ],
+)
+def test_a_pid_for_its_plant_keeps_the_robot(points, speed):
+    """On splines on which the IMC gains lose a nominal robot, designed gains keep it within 1 mm, also with delay.
+
+    The splines are two of a hundred random ones.
+    """
+    pids = PIDS["normal"], Pid(rule="designed"), Pid(rule="designed", delay=0.01)
+    result = mrctl.simulate(
+        [
+            mrctl.Scenario(
+                reference=mrctl.Waypoints(points=points, speed=speed), laps=1, feedforward="none", pid=pid,
+                perturbation=mrctl.Perturbation(control_delay=pid.delay),
+            )
+            for pid in pids
+        ]
+    )  # fmt: skip
+    assert result["failed"].values.tolist() == [True, False, False]
+    assert (mrctl.per_lap(result)["position_rmse"].values[1:, 0] < 1e-3).all()
 
 
 class Integrator:

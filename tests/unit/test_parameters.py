@@ -12,6 +12,7 @@ from mrctl.physics.files import models_folder
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
 from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.robot import RobotFile
 
 NOMINAL = mjcf.load()
 BASE = read_robot(NOMINAL)
@@ -27,6 +28,10 @@ PUBLISHED = {
     "wheelbase": 0.40,
     "trail": 0.03,
     "steering_limit": math.radians(60),
+    "steering_stiffness": 2.0,
+    "steering_damping": 0.1,
+    "fork_inertia": 0.5e-3 + 0.5 * 0.01**2 + 0.6e-3 + 0.7 * 0.03**2,
+    "fork_moment": 0.5 * 0.01 + 0.7 * 0.03,
     "resistance": 2.32,
     "inductance": 0.0,
     "torque_constant": 0.0234,
@@ -82,6 +87,33 @@ def test_inertia_by_physics():
     yaw[5] = 1
     assert matrix[0, 0] == pytest.approx(BASE.mass)
     assert yaw @ matrix @ yaw == pytest.approx(BASE.yaw_inertia + BASE.mass * BASE.com_offset**2)
+
+
+@pytest.mark.parametrize("robot", ["car", "racecar"])
+def test_steering_by_physics(robot):
+    """What the steering turns has the inertia, and a fork the coupling to the yaw, of the engine's mass matrix."""
+    model = mjcf.load(steering="compliant" if robot == "car" else "rigid", robot=RobotFile(path=robot))
+    data, found = mujoco.MjData(model), read_robot(model)
+    mujoco.mj_forward(model, data)
+    matrix = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, matrix)
+    turn, yaw = np.zeros(model.nv), np.eye(model.nv)[5]
+    turn[model.joint("steering").dofadr[0]] = 1
+    for knuckle in ("steering_front_left", "steering_front_right") if robot == "racecar" else ():
+        turn[model.joint(knuckle).dofadr[0]] = model.equality(knuckle).data[1]
+    assert turn @ matrix @ turn == pytest.approx(found.fork_inertia)
+    if robot == "car":
+        assert turn @ matrix @ yaw == pytest.approx(found.fork_inertia - found.fork_moment * found.wheelbase)
+
+
+def test_steering_of_the_arrangements():
+    """A free fork has no stiffness; a rigid one is 20 times as stiff, and its wheel is under the axis."""
+    caster, rigid = (mjcf.build(steering=name)[1] for name in ("caster", "rigid"))
+    assert (caster.steering_stiffness, caster.steering_damping) == (0, 0.02)
+    assert (rigid.steering_stiffness, rigid.steering_damping) == (40, 1)
+    assert rigid.fork_moment == pytest.approx(0.005) and caster.fork_moment == BASE.fork_moment
+    turtlebot = mjcf.build(steering="caster", robot=RobotFile(path="turtlebot"))[1]
+    assert (turtlebot.steering_stiffness, turtlebot.fork_inertia, turtlebot.fork_moment) == (0, 0, 0)
 
 
 def test_inductance(tmp_path):

@@ -66,10 +66,13 @@ def test_every_changed_field_is_listed():
     assert model.stat.meaninertia == copied.stat.meaninertia
 
 
+MASSES = ("mass", "yaw_inertia", "fork_inertia", "fork_moment", "wheel_inertia", "front_wheel_inertia")
+
+
 @pytest.mark.parametrize(
     ("perturbation", "expected"),
     [
-        ({"mass_factor": 1.5}, {"mass": 1.5, "yaw_inertia": 1.5, "wheel_inertia": 1.5, "front_wheel_inertia": 1.5}),
+        ({"mass_factor": 1.5}, {name: 1.5 for name in MASSES}),
         ({"drive_friction_factor": 3.0}, {"no_load_current": 3.0, "gear_loss": 3.0}),
         ({"resistance_factor": 1.3}, {"resistance": 1.3}),
         ({"motor_constant_factor": 0.85}, {"torque_constant": 0.85, "no_load_current": 1 / 0.85}),

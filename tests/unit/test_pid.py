@@ -6,12 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy import signal
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 
-from mrctl.control.margins import learning_ratio, margins, sampled_loop
-from mrctl.control.pid import PID, PIDS, Gains, Pid, imc, pid
+from mrctl.control.margins import Gains, learning_ratio, margins, sampled_loop
+from mrctl.control.pid import PID, PIDS, Pid, imc, pid
 from mrctl.kernel import over_rows
 from mrctl.record import InputError
+from mrctl.theory.linear import first_order
 
 CLOSED = 0.15  # λ
 
@@ -135,12 +136,17 @@ GRID = np.geomspace(1e-2, 1e3, 200_001)
 def test_margins(closed, delay):
     """L = e^(−sT)/(λs) has margins in closed form; |1 + jλω e^(jωT)| = √2 ends its bandwidth."""
     found = margins(GRID, np.exp(-1j * GRID * delay) / (1j * GRID * closed))
+    # |1 + L|² = 1 − 2 sin(ωT)/(λω) + 1/(λω)² is least a little before the phase turns over.
+    least = minimize_scalar(
+        lambda w: 1 - 2 * np.sin(w * delay) / (closed * w) + (closed * w) ** -2, bounds=(1, np.pi / delay)
+    )
     expected = {
         "crossover": 1 / closed,
         "phase": 90 - np.degrees(delay / closed),
         "gain": np.pi * closed / (2 * delay),
         "delay": np.pi / 2 * closed - delay,
         "bandwidth": brentq(lambda w: abs(1 + 1j * closed * w * np.exp(1j * w * delay)) ** 2 - 2, 1, 4 / closed),
+        "sensitivity": least.fun**-0.5,
     }
     assert found._asdict() == pytest.approx(expected, rel=1e-3)
 
@@ -199,7 +205,7 @@ def test_sampled_loop(robot, delay):
             twist = decay * twist + (1 - decay) * gain * sent[len(answer) - 1]
         found = np.fft.rfft(answer[-400:], axis=0)[harmonic] / np.fft.rfft(command[-400:], axis=0)[harmonic]
         loops = [
-            sampled_loop(np.array([w]), k, t, Gains(k_p, k_i), h, delay * h)[0]
+            sampled_loop(np.array([w]), first_order(k, t), Gains(k_p, k_i), h, delay * h)[0]
             for k, t, k_p, k_i in zip(gain, tau, gains["k_p"], gains["k_i"], strict=True)
         ]
         np.testing.assert_allclose(found, [loop / (1 + loop) for loop in loops], rtol=1e-9)

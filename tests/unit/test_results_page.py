@@ -43,10 +43,13 @@ def reproduction(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def tune(tmp_path: Path) -> Path:
-    channel = {"static_gain": 0.1, "plant_time_constant": 0.2, "k_p": 16.0, "k_i": 68.0, "ratio": 2.5}
+    channel = {"static_gain": 0.1, "plant_lag": 0.2, "k_p": 16.0, "k_i": 68.0, "ratio": 2.5}
     answer = {name: float("inf") for name in (*tuning.MARGINS, *tuning.SAFETY)} | {"phase": 88.5}
-    loop = {"steering": "caster", "channel": 1, "delay": 0.02} | {name: answer for name in tuning.RESPONSES}
-    values = {"time_constant": 0.15, "common": channel, "differential": channel, "loops": [loop]}
+    loop = {"steering": "caster", "channel": 1, "delay": 0.02} | channel
+    loop |= {name: answer for name in tuning.RESPONSES}
+    names = ("k_x", "k_y", "k_theta", "prefilter", "v_lag", "omega_lag")
+    motion = {"steering": "caster", "delay": 0.02} | {name: 0.05 for name in names}
+    values = {"rule": "designed", "time_constant": 0.15, "lag": 0.0, "loops": [loop], "motion": [motion]}
     return written(tmp_path / "tune", values)
 
 

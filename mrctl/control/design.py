@@ -1,0 +1,164 @@
+"""Design of the velocity PID, and of the motion controller over it, for the plant and the delay that they have.
+
+A PI controller K_p (1 + 1/(T_i s)) is as fast as its delay allows where its integral gain K_i = K_p/T_i is the largest
+that keeps the loop k L robust, with its own gain and with every smaller one:
+
+    max |S| ≤ M_s,    max |T| ≤ M_t,    S = 1/(1 + k L),    T = k L/(1 + k L),    0 < k ≤ 1
+
+The largest K_i has the least integrated error after a disturbance (Åström, Panagopoulos and Hägglund 1998, Design of PI
+controllers based on non-convex optimization). M_s bounds how close L comes to −1: a gain may grow by M_s/(M_s − 1), 2.7
+for 1.6, before the loop is unstable. M_t bounds the overshoot. The gain falls where the supply sags or the voltage is
+limited.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from mrctl.control.kanayama import Kanayama
+from mrctl.control.margins import Gains, sampled_loop
+from mrctl.theory import linear
+from mrctl.theory.linear import Linear
+from mrctl.theory.robot import Robot
+
+M_S, M_T = 1.6, 1.1
+"""Largest |S| and |T|: 1.2 to 2 and 1 to 1.5 are usual (Åström and Hägglund, Advanced PID Control, 2006, ch. 4)."""
+SPEEDS = 0.5, 0.2, 1.0
+"""Shares of the robot's largest speed at which its loops are robust, *chosen*; at the first one they are compared."""
+DAMPING = 0.5
+"""Damping ratio of the motion controller's loops at the largest speed, *chosen*; it is higher at a lower speed."""
+PUBLISHED = Kanayama(k_x=10.0, k_y=64.0, k_theta=16.0)
+"""Gains that Kanayama et al. (1990) drove with; the motion controller gets none above them."""
+
+
+def plants(robot: Robot, rigid: bool, channel: int) -> list[Linear]:
+    """Returns the plant of a channel at each of `SPEEDS`, or one plant where the speed does not matter.
+
+    A robot with its centre of mass behind the axle turns by itself above some speed. Speeds at which it does are left
+    out, and where it always does, the plant is that at rest.
+
+    Args:
+        robot: The nominal robot in its steering arrangement.
+        rigid: Whether the second channel is steering.
+        channel: 0 for the common channel, 1 for the second.
+    """
+    if channel == 0:
+        return [linear.common(robot)]
+    if rigid:
+        return [linear.steering(robot)]
+    found = [linear.yaw(robot, share * robot.max_speed) for share in SPEEDS]
+    return [plant for plant in found if plant.stable] or [linear.yaw(robot, 0.0)]
+
+
+def design(robot: Robot, rigid: bool, delay: float, lag: float = 0.0, period: float = 0.01) -> tuple[Gains, Gains]:
+    """Designs the PI gains of both channels, in V/(m/s) and V/m and in V/(rad/s) and V/rad, or 1 and 1/s if rigid.
+
+    It takes some 50 ms, and the answers to the last questions are kept.
+
+    Args:
+        robot: The nominal robot in its steering arrangement.
+        rigid: Whether the second channel is steering.
+        delay: Delay from measurement to voltage in s, without that of the hold.
+        lag: Time constant in s with which the measured twist follows the true one.
+        period: Control period in s.
+    """
+    return _design(robot, rigid, delay, lag, period)  # pyright: ignore[reportArgumentType] (frozen, so hashable)
+
+
+@lru_cache(maxsize=256)
+def _design(robot: Robot, rigid: bool, delay: float, lag: float, period: float) -> tuple[Gains, Gains]:
+    electric = robot.inductance / robot.resistance  # the armature's time constant acts as a lag
+    common = fastest(plants(robot, rigid, 0), period, delay, lag + electric)
+    second = fastest(plants(robot, rigid, 1), period, delay, lag if rigid else lag + electric)
+    return common, second
+
+
+def fastest(plants: list[Linear], period: float, delay: float, lag: float) -> Gains:
+    """Returns the PI gains with the largest K_i that keep `M_S` and `M_T` with every one of some stable plants.
+
+    Args:
+        plants: The plants, of positive static gain.
+        period: Control period in s.
+        delay: Loop delay in s, without that of the hold.
+        lag: Time constant of the measurement in s.
+    """
+    frequency = np.geomspace(1e-4, 1, 500) * np.pi / period * (1 - 1e-9)
+    loops = [sampled_loop(frequency, plant, Gains(1.0, 0.0), period, delay, lag) for plant in plants]
+    z = np.exp(1j * frequency * period)
+
+    def k_p(logarithm: float) -> float:
+        """The largest K_p where T_i has this natural logarithm."""
+        control = 1 + period * z / (z - 1) / np.exp(logarithm)
+        return min(_largest_gain(control * loop) for loop in loops)
+
+    longest = 10 * max(period, *(plant.lag for plant in plants))
+    found: Any = minimize_scalar(  # 1/K_i has one minimum
+        lambda x: x - np.log(k_p(x)), bounds=(np.log(period / 10), np.log(longest)), method="bounded"
+    )
+    gain = k_p(found.x)
+    return Gains(gain, gain / float(np.exp(found.x)))
+
+
+def _largest_gain(loop: NDArray[np.complex128]) -> float:
+    """Returns the least k at which |S| or |T| of the loop k L reaches its bound at one of the frequencies.
+
+    |1 + k L| = 1/M_s and |k L| = M_t |1 + k L| are quadratic equations in k. A loop that is stable at a small gain is
+    stable up to that k, because |S| is infinite where it becomes unstable.
+    """
+    real, square = loop.real, np.abs(loop) ** 2
+    gains = [_least_root(square, 2 * real, 1 - M_S**-2), _least_root((1 - M_T**-2) * square, 2 * real, 1.0)]
+    return float(min(gains))
+
+
+def _least_root(a: NDArray[np.float64], b: NDArray[np.float64], c: float) -> float:
+    """Returns the least positive root of any of the equations a k² + b k + c = 0 with a and c positive."""
+    square = b**2 - 4 * a * c
+    touching = (square >= 0) & (b < 0)
+    return float((2 * c / (np.sqrt(square[touching]) - b[touching])).min(initial=np.inf))
+
+
+class Motion(NamedTuple):
+    """A design of the motion controller.
+
+    Attributes:
+        kanayama: Its gains.
+        prefilter: Time constant in s of the filter on what it adds to the reference.
+        lag: Lags in s of V and of θ̇ behind what it requests, without the prefilter.
+    """
+
+    kanayama: Kanayama
+    prefilter: float
+    lag: tuple[float, float]
+
+
+def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], period: float = 0.01) -> Motion:
+    """Designs the motion controller over the velocity loops, with damping ratio ζ ≥ `DAMPING` up to the largest speed.
+
+        x:  τ s² + s + K_x = 0,                         ζ = 1/(2 √(K_x τ))
+        y:  τ s³ + s² + v_r K_θ s + v_r² K_y = 0,       K_θ = 2 √K_y
+
+    A velocity loop follows a slow request with the lag 1/(K K_i), and τ is that lag and the prefilter's. The prefilter
+    takes half as long as the slower velocity loop, *chosen*. K_θ makes the lateral error critically damped where τ = 0.
+    With p = τ s and κ = τ v_r √K_y the second equation is p³ + (p + κ)² = 0; its root r e^(jψ) with cos ψ = −ζ has
+    √r = −sin ψ/cos(3ψ/2) and κ = r^(3/2) sin(3ψ/2) − r cos ψ. No gain is above `PUBLISHED`: larger ones only meet the
+    limits on acceleration.
+
+    Args:
+        robot: The nominal robot in its steering arrangement.
+        rigid: Whether the second channel is steering.
+        gains: PI gains of both channels.
+        period: Control period in s.
+    """
+    v_lag, omega_lag = (1 / (plants(robot, rigid, k)[0].gain * gains[k].k_i) for k in (0, 1))
+    prefilter = max(period, v_lag / 2, omega_lag / 2)
+    angle = np.pi - np.arccos(DAMPING)
+    root = (np.sin(angle) / np.cos(1.5 * angle)) ** 2
+    kappa = root**1.5 * np.sin(1.5 * angle) - root * np.cos(angle)
+    lateral = min(float(kappa / ((omega_lag + prefilter) * robot.max_speed)), PUBLISHED.k_theta / 2)
+    k_x = min(float(1 / (4 * DAMPING**2 * (v_lag + prefilter))), PUBLISHED.k_x)
+    return Motion(Kanayama(k_x=k_x, k_y=lateral**2, k_theta=2 * lateral), prefilter, (v_lag, omega_lag))

@@ -1,0 +1,185 @@
+"""The design of PID and motion controller against the poles, the Nyquist curve and a search by brute force."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import signal
+
+from mrctl.control.design import DAMPING, M_S, M_T, PUBLISHED, SPEEDS, design, fastest, motion, plants
+from mrctl.control.pid import Pid
+from mrctl.record import InputError
+from mrctl.theory.linear import first_order
+from mrctl.theory.robot import Robot
+
+H = 0.01
+FORK = {"steering_stiffness": 2.0, "steering_damping": 0.1, "fork_inertia": 1.8e-3, "fork_moment": 0.026}
+STIFF = {"steering_stiffness": 40.0, "steering_damping": 1.0, "fork_inertia": 1.15e-3, "trail": 0.0}
+ARRANGEMENTS = {
+    "compliant": FORK,
+    "caster": FORK | {"steering_stiffness": 0.0, "steering_damping": 0.02},
+    "rigid": STIFF,
+}
+
+
+def arranged(robot, steering):
+    return Robot.from_dict(robot.model_dump() | ARRANGEMENTS[steering])
+
+
+def polynomials(plant, gains, periods, h=H):
+    """Numerator and denominator in z of the open loop with a delay of whole periods, by SciPy's discretisation."""
+    n = len(plant.b)
+    a, b, c, d, _ = signal.cont2discrete((plant.a, plant.b[:, None], np.eye(n)[:1], np.zeros((1, 1))), h)
+    numerator, denominator = signal.ss2tf(a, b, c, d)
+    control = [gains.k_p + gains.k_i * h, -gains.k_p]  # K_p + K_i h z/(z − 1)
+    return np.polymul(numerator[0], control), np.polymul(np.polymul(denominator, [1, -1]), [1, *periods * [0]])
+
+
+def peaks(plant, gains, periods, h=H):
+    """Largest |S| and |T| on a fine grid; both infinite if a closed pole lies outside the unit circle."""
+    numerator, denominator = polynomials(plant, gains, periods, h)
+    characteristic = np.polyadd(numerator, denominator)
+    if np.abs(np.roots(characteristic)).max() >= 1:
+        return np.inf, np.inf
+    z = np.exp(1j * np.geomspace(1e-5, np.pi, 20_000))
+    closed = np.polyval(characteristic, z)
+    return np.abs(np.polyval(denominator, z) / closed).max(), np.abs(np.polyval(numerator, z) / closed).max()
+
+
+@given(st.floats(0.01, 1.0), st.floats(0.05, 5.0), st.integers(0, 5))
+@settings(max_examples=40)
+def test_keeps_its_bounds(tau, gain, periods):
+    """The closed loop is stable, keeps both bounds, and touches one of them."""
+    plant = first_order(gain, tau)
+    s, t = peaks(plant, fastest([plant], H, periods * H, 0.0), periods)
+    assert s <= M_S * 1.002 and t <= M_T * 1.002
+    assert s >= M_S * 0.998 or t >= M_T * 0.998
+
+
+@pytest.mark.parametrize("periods", [0, 1, 2])
+@pytest.mark.parametrize("tau", [0.02, 0.25])
+def test_nothing_integrates_faster(tau, periods):
+    """Of 1,800 pairs with a larger K_i, each breaks a bound at its gain or at a smaller one."""
+    plant = first_order(0.1, tau)
+    z = np.exp(1j * np.geomspace(1e-3, np.pi, 300))
+    (b,), a, _ = signal.cont2discrete(([0.1], [tau, 1]), H)
+    parts = np.geomspace(0.005, 1, 60)[:, None] * np.polyval(b, z) / np.polyval(a, z) / z**periods
+
+    def breaks(k_p, k_i):
+        loop = parts * (k_p + k_i * H * z / (z - 1))
+        closed = np.abs(1 / (1 + loop))
+        return closed.max() > 1.002 * M_S or (np.abs(loop) * closed).max() > 1.002 * M_T
+
+    found = fastest([plant], H, periods * H, 0.0)
+    assert not breaks(*found)
+    faster = (
+        (k_p, k_i) for k_p in found.k_p * np.geomspace(0.2, 3, 60) for k_i in found.k_i * np.geomspace(1.01, 2, 30)
+    )
+    assert all(breaks(*pair) for pair in faster)
+
+
+@given(st.floats(0.02, 0.5), st.floats(0.1, 10.0), st.floats(0.2, 5.0))
+@settings(max_examples=20)
+def test_dimensions(tau, gain, factor):
+    """A plant with a times the gain gets gains 1/a as large; with all times b times as long, K_i becomes K_i/b."""
+    base = fastest([first_order(1.0, tau)], H, H, 0.0)
+    scaled = fastest([first_order(gain, factor * tau)], factor * H, factor * H, 0.0)
+    np.testing.assert_allclose([scaled.k_p, scaled.k_i], [base.k_p / gain, base.k_i / gain / factor], rtol=1e-3)
+
+
+@pytest.mark.parametrize("steering", list(ARRANGEMENTS))
+def test_every_speed_is_robust(robot, steering):
+    """The gains keep |S| of a car's loops bounded at all its speeds, with the delays of the sensing tiers."""
+    robot, rigid = arranged(robot, steering), steering == "rigid"
+    for periods in (0, 1, 2):
+        gains = design(robot, rigid, periods * H)
+        for channel in (0, 1):
+            found = [peaks(plant, gains[channel], periods)[0] for plant in plants(robot, rigid, channel)]
+            assert max(found) <= M_S * 1.002
+    assert SPEEDS[0] == 0.5
+
+
+def test_centre_of_mass_behind_the_axle(robot):
+    """Where m c V outweighs the motors' damping the robot turns by itself: that speed is left out."""
+    behind = {"wheelbase": -0.4, "trail": 0.0, "com_offset": -0.2, "steering_limit": np.pi / 2}
+    for top, count in ((0.2, 3), (1.2, 2), (20.0, 1)):
+        tail_heavy = Robot.from_dict(robot.model_dump() | behind | {"max_speed": top})
+        found = plants(tail_heavy, False, 1)
+        assert len(found) == count and all(plant.stable for plant in found)
+        assert min(design(tail_heavy, False, 0.01)[1]) > 0
+
+
+@pytest.mark.parametrize("steering", list(ARRANGEMENTS))
+def test_delay_and_lag_cost_speed(robot, steering):
+    """K_i falls with the delay and with the lag, in both channels."""
+    robot, rigid = arranged(robot, steering), steering == "rigid"
+    for changing in ([(d, 0.0) for d in (0, 0.005, 0.01, 0.02, 0.04)], [(0.01, t) for t in (0, 0.005, 0.02, 0.05)]):
+        k_i = [[channel.k_i for channel in design(robot, rigid, *times)] for times in changing]
+        assert (np.diff(k_i, axis=0) < 0).all()
+
+
+def test_a_slow_sample_costs_speed(robot):
+    """The control period enters the design, and so does the armature's time constant."""
+    slow = design(robot, False, 0.02, 0.0, 0.02)
+    fast = design(robot, False, 0.02, 0.0, 0.005)
+    electric = design(Robot.from_dict(robot.model_dump() | {"inductance": 0.01 * robot.resistance}), False, 0.02)
+    assert all(s.k_i < f.k_i for s, f in zip(slow, fast, strict=True))
+    assert electric == design(robot, False, 0.02, 0.01)
+
+
+def test_the_pid_selects_it(robot):
+    """`designed` gains are those of the design; the IMC gains stay the default."""
+    for rigid in (False, True):
+        wanted = design(robot, rigid, 0.01, 0.02, 0.005)
+        assert Pid(rule="designed", delay=0.01, lag=0.02).channels(robot, rigid, 0.005) == wanted
+        assert Pid().gains(robot, rigid) == Pid(rule="imc", time_constant=0.15).gains(robot, rigid)
+    k_d = Pid(rule="designed", derivative_time=0.1).gains(robot, rigid=False)["k_d"]
+    assert k_d[0] == pytest.approx(0.1 * design(robot, False, 0.0)[0].k_p)
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"rule": "fast"}, "rule"),
+        ({"rule": "designed", "delay": -0.01}, "delay"),
+        ({"rule": "designed", "delay": 0.6}, "delay"),
+        ({"rule": "designed", "lag": float("nan")}, "lag"),
+    ],
+)
+def test_refused(values, says):
+    """A bad value is refused with the name of its field."""
+    with pytest.raises(InputError, match=says):
+        Pid.from_dict(values)
+
+
+def test_designed_gains_cannot_be_faster():
+    """A designed PID leaves no room for larger gains."""
+    with pytest.raises(InputError, match="rule"):
+        Pid(rule="designed").faster(2)
+
+
+@pytest.mark.parametrize("steering", list(ARRANGEMENTS))
+@pytest.mark.parametrize("delay", [0.0, 0.01, 0.02, 0.1])
+def test_motion_controller(robot, steering, delay):
+    """By the roots of the characteristic equations no loop is damped less than promised at any speed."""
+    robot, rigid = arranged(robot, steering), steering == "rigid"
+    gains = design(robot, rigid, delay)
+    kanayama, prefilter, lags = motion(robot, rigid, gains)
+    for k, plant in enumerate(plants(robot, rigid, channel)[0] for channel in (0, 1)):
+        assert lags[k] == pytest.approx(1 / (plant.gain * gains[k].k_i))
+    v, omega = np.array(lags) + prefilter
+
+    def damping(*polynomial):
+        return min(-root.real / abs(root) for root in np.roots(polynomial))
+
+    assert damping(v, 1, kanayama.k_x) >= DAMPING - 1e-9
+    lateral = [
+        damping(omega, 1, speed * kanayama.k_theta, speed**2 * kanayama.k_y)
+        for speed in robot.max_speed * np.array([0.1, 0.5, 1.0])
+    ]
+    assert (np.diff(lateral) < 1e-6).all() and lateral[-1] >= DAMPING - 1e-9
+    assert kanayama.k_theta > omega * robot.max_speed * kanayama.k_y
+    assert kanayama.k_theta**2 == pytest.approx(4 * kanayama.k_y)
+    capped = kanayama.k_x == PUBLISHED.k_x, kanayama.k_y == PUBLISHED.k_y
+    assert capped[0] or damping(v, 1, kanayama.k_x) == pytest.approx(DAMPING)
+    assert capped[1] or lateral[-1] == pytest.approx(DAMPING)
