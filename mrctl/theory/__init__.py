@@ -1,4 +1,4 @@
-"""The robot on paper: parameters, equations (1) to (3), its drive, references and their time laws, perturbations as data.
+"""The robot on paper: parameters, equations (1) to (3), drive, references and their time laws, perturbations as data.
 
 This folder holds formulas on arrays, without MuJoCo and without controllers. It imports `mrctl.record` and
 `mrctl.kernel` alone.
