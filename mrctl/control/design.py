@@ -136,25 +136,31 @@ class Motion(NamedTuple):
     lag: tuple[float, float]
 
 
-def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], period: float = 0.01) -> Motion:
+def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float = 0.0, period: float = 0.01) -> Motion:
     """Designs the motion controller over the velocity loops, with damping ratio ζ ≥ `DAMPING` up to the largest speed.
 
         x:  τ s² + s + K_x = 0,                         ζ = 1/(2 √(K_x τ))
         y:  τ s³ + s² + v_r K_θ s + v_r² K_y = 0,       K_θ = 2 √K_y
 
-    A velocity loop follows a slow request with the lag 1/(K K_i), and τ is that lag and the prefilter's. The prefilter
-    takes half as long as the slower velocity loop, *chosen*. K_θ makes the lateral error critically damped where τ = 0.
-    With p = τ s and κ = τ v_r √K_y the second equation is p³ + (p + κ)² = 0; its root r e^(jψ) with cos ψ = −ζ has
-    √r = −sin ψ/cos(3ψ/2) and κ = r^(3/2) sin(3ψ/2) − r cos ψ. No gain is above `PUBLISHED`: larger ones only meet the
-    limits on acceleration.
+    τ is the lag of the velocity loop and that of the prefilter, which takes half as long as the slower velocity loop,
+    *chosen*. A velocity loop follows a slow command with the lag 1/(K K_i). The steering is commanded to where the
+    wheel does not scrub, so that a fork makes no torque when the robot turns as commanded, and K is that of equation
+    (3) without it. A stiff servo follows angle and rate of the command: the delay and the tyre's lag are left.
+
+    K_θ makes the lateral error critically damped where τ = 0. With p = τ s and κ = τ v_r √K_y the second equation is
+    p³ + (p + κ)² = 0; its root r e^(jψ) with cos ψ = −ζ has √r = −sin ψ/cos(3ψ/2) and
+    κ = r^(3/2) sin(3ψ/2) − r cos ψ. No gain is above `PUBLISHED`: larger ones only meet the limits on acceleration.
 
     Args:
         robot: The nominal robot in its steering arrangement.
         rigid: Whether the second channel is steering.
         gains: PI gains of both channels.
+        delay: Delay from measurement to voltage in s.
         period: Control period in s.
     """
-    v_lag, omega_lag = (1 / (plants(robot, rigid, k)[0].gain * gains[k].k_i) for k in (0, 1))
+    free = linear.yaw(robot.model_copy(update={"fork_inertia": 0.0}), robot.max_speed)
+    v_lag = 1 / (linear.common(robot).gain * gains[0].k_i)
+    omega_lag = linear.TYRE_LAG + delay if rigid else 1 / (free.gain * gains[1].k_i)
     prefilter = max(period, v_lag / 2, omega_lag / 2)
     angle = np.pi - np.arccos(DAMPING)
     root = (np.sin(angle) / np.cos(1.5 * angle)) ** 2

@@ -130,7 +130,7 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
         period, rigid = scenarios[0].control_period, steering == "rigid"
         gains = [one.channels(nominal, rigid, period) for one in pids]
         for delay, both in zip(delays, gains, strict=True):
-            found = motion_design(nominal, rigid, both, period)
+            found = motion_design(nominal, rigid, both, delay, period)
             lags = dict(zip(("v_lag", "omega_lag"), found.lag, strict=True))
             suits = found.kanayama.model_dump() | {"prefilter": found.prefilter} | lags
             table["motion"].append({"steering": steering, "delay": delay} | suits)

@@ -309,13 +309,18 @@ def _tidy() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
+def _short(value: float | str) -> str:
+    """Returns a number or a choice as text."""
+    return value if isinstance(value, str) else f"{value:g}"
+
+
 def _in_words(event: Event, before: dict[str, Any]) -> str:
     """Returns an event in words."""
     parts = []
     for name in CHANGEABLE:
         if (new := getattr(event, name)) is not None:
             parts += [
-                f"{field.replace('_', ' ')} {getattr(before[name], field):g} → {getattr(new, field):g}"
+                f"{field.replace('_', ' ')} {_short(getattr(before[name], field))} → {_short(getattr(new, field))}"
                 for field in type(new).model_fields
                 if getattr(new, field) != getattr(before[name], field)
             ]

@@ -9,7 +9,7 @@ from scipy import signal
 from mrctl.control.design import DAMPING, M_S, M_T, PUBLISHED, SPEEDS, design, fastest, motion, plants
 from mrctl.control.pid import Pid
 from mrctl.record import InputError
-from mrctl.theory.linear import first_order
+from mrctl.theory.linear import TYRE_LAG, first_order
 from mrctl.theory.robot import Robot
 
 H = 0.01
@@ -164,9 +164,11 @@ def test_motion_controller(robot, steering, delay):
     """By the roots of the characteristic equations no loop is damped less than promised at any speed."""
     robot, rigid = arranged(robot, steering), steering == "rigid"
     gains = design(robot, rigid, delay)
-    kanayama, prefilter, lags = motion(robot, rigid, gains)
-    for k, plant in enumerate(plants(robot, rigid, channel)[0] for channel in (0, 1)):
-        assert lags[k] == pytest.approx(1 / (plant.gain * gains[k].k_i))
+    kanayama, prefilter, lags = motion(robot, rigid, gains, delay)
+    assert lags[0] == pytest.approx(1 / (robot.velocity_gain * gains[0].k_i))
+    drag = robot.effective_inertia / robot.rotation_time_constant
+    free = robot.rotation_gain / (1 + robot.mass * robot.com_offset * robot.max_speed / drag)
+    assert lags[1] == pytest.approx(delay + TYRE_LAG if rigid else 1 / (free * gains[1].k_i))
     v, omega = np.array(lags) + prefilter
 
     def damping(*polynomial):
