@@ -101,8 +101,9 @@ class Scenario(Record):
     """Standard deviations of a random offset from that pose: x and y in m, θ in rad."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Seed of the random numbers: initial offset, initial weights and sensor noise."""
-    prefilter: Annotated[float, Field(ge=0.01, le=1)] = 0.05
-    """Time constant in s of the filter on the velocities that the motion controller adds to the reference."""
+    prefilter: Annotated[float, Field(ge=0.01, le=1)] | None = None
+    """Time constant in s of the filter on the velocities that the motion controller adds to the reference; by default
+    it follows from the lag of the velocity loops."""
     physics_step: Annotated[float, Field(ge=1e-5, le=0.01)] = 0.002
     """Duration of one physics step in s."""
     control_period: Annotated[float, Field(ge=1e-3, le=0.1)] = 0.01

@@ -12,14 +12,14 @@ from mrctl.record import Record
 
 
 class Kanayama(Record):
-    """Gains of Kanayama's motion controller."""
+    """Gains of Kanayama's motion controller; those that are not set follow from the lag of the velocity loops."""
 
-    k_x: Annotated[float, Field(ge=0, le=100)] = 3.0
-    """Longitudinal gain K_x in 1/s."""
-    k_y: Annotated[float, Field(ge=0, le=1000)] = 25.0
-    """Lateral gain K_y in 1/m²."""
-    k_theta: Annotated[float, Field(ge=0, le=100)] = 10.0
-    """Heading gain K_θ in 1/m; 2√K_y makes the lateral error critically damped."""
+    k_x: Annotated[float, Field(ge=0, le=100)] | None = None
+    """Longitudinal gain K_x in 1/s; by default it follows from the lag of V."""
+    k_y: Annotated[float, Field(ge=0, le=1000)] | None = None
+    """Lateral gain K_y in 1/m²; by default it follows from the lag of θ̇."""
+    k_theta: Annotated[float, Field(ge=0, le=100)] | None = None
+    """Heading gain K_θ in 1/m; by default 2√K_y, with which the lateral error is critically damped."""
 
 
 GAINS = np.dtype([("k_x", "f8"), ("k_y", "f8"), ("k_theta", "f8")])  # 1/s, 1/m², 1/m

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -10,9 +10,11 @@ from pydantic import Field
 from mrctl.control.design import design
 from mrctl.control.margins import Gains
 from mrctl.kernel import Array, Row, kernel
-from mrctl.record import InputError, Record
+from mrctl.record import Record
 from mrctl.theory.perturbation import LONGEST_DELAY
 from mrctl.theory.robot import Robot
+
+Pair = tuple[float, float]
 
 PID = np.dtype(
     [
@@ -58,26 +60,27 @@ def pid(command: Array, twist: Array, excess: Array, period: float, s: Row, feed
 
 
 class Pid(Record):
-    """Design of the velocity controller; the gains follow from the robot's nominal equation (3)."""
+    """Design of the velocity controller: as fast as its delay allows, or by the IMC rule where λ is given."""
 
-    rule: Literal["imc", "designed"] = "imc"
-    """Rule for the gains: `imc` from `time_constant` and equation (3), or `designed`, as fast as the delay allows."""
-    time_constant: Annotated[float, Field(ge=0.03, le=2)] = 0.15
-    """Closed-loop time constant λ of both channels in s; the IMC rule sets K_p = τ/(K λ) and K_i = 1/(K λ)."""
-    delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] = 0.0
-    """Delay from measurement to voltage in s for which the gains are `designed`; that of the hold is not counted."""
+    time_constant: Annotated[float, Field(ge=0.03, le=2)] | None = None
+    """Closed-loop time constant λ of both channels in s, with which the IMC rule sets K_p = τ/(K λ) and K_i = 1/(K λ);
+    by default the gains are the largest that the delay allows."""
+    delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] | None = None
+    """Delay from measurement to voltage in s that the gains allow for; by default that of the sensing."""
     lag: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """Time constant in s for which the gains are `designed`: that with which the measured velocities follow."""
+    """Time constant in s with which the measured velocities follow the true ones, which the gains allow for as well."""
     derivative_time: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Derivative time K_d/K_p in s; the rule for a first-order plant needs no derivative action."""
     derivative_filter: Annotated[float, Field(ge=0.005, le=1)] = 0.03
     """Time constant of the filter on the derivative in s."""
-    steering_kp: Annotated[float, Field(ge=0, le=10)] = 0.3
-    """Proportional gain of the second channel under `rigid` steering by the rule `imc`, in rad/s per rad/s."""
-    steering_ki: Annotated[float, Field(ge=0, le=50)] = 5.0
-    """Integral gain of the second channel under `rigid` steering by the rule `imc`, in 1/s."""
+    steering_kp: Annotated[float, Field(ge=0, le=10)] | None = None
+    """Proportional gain of the second channel under `rigid` steering in rad/s per rad/s; by default it follows from the
+    delay or from λ."""
+    steering_ki: Annotated[float, Field(ge=0, le=50)] | None = None
+    """Integral gain of the second channel under `rigid` steering in 1/s; by default it follows from the delay or from
+    λ."""
 
-    def gains(self, robot: Robot, rigid: bool, period: float = 0.01) -> dict[str, tuple[float, float]]:
+    def gains(self, robot: Robot, rigid: bool, delay: float = 0.0, period: float = 0.01) -> dict[str, Pair]:
         """Returns the settings of the record `PID` by name, each for the common and the second channel.
 
         The common channel is in V per m/s; the second in V per rad/s, or in rad/s per rad/s if `rigid`.
@@ -85,9 +88,10 @@ class Pid(Record):
         Args:
             robot: The nominal robot in its steering arrangement.
             rigid: Whether the second channel is steering.
+            delay: Delay from measurement to voltage in s, unless `delay` is set.
             period: Control period in s.
         """
-        common, second = self.channels(robot, rigid, period)
+        common, second = self.channels(robot, rigid, delay, period)
         return {
             "k_p": (common.k_p, second.k_p),
             "k_i": (common.k_i, second.k_i),
@@ -95,31 +99,25 @@ class Pid(Record):
             "filter": (self.derivative_filter, self.derivative_filter),
         }
 
-    def channels(self, robot: Robot, rigid: bool, period: float = 0.01) -> tuple[Gains, Gains]:
+    def channels(self, robot: Robot, rigid: bool, delay: float = 0.0, period: float = 0.01) -> tuple[Gains, Gains]:
         """Returns proportional and integral gains of the two channels, with the arguments and units of `gains`."""
-        if self.rule == "designed":
-            return design(robot, rigid, self.delay, self.lag, period)
-        common, differential = imc(robot, self.time_constant)
-        return common, Gains(self.steering_kp, self.steering_ki) if rigid else differential
-
-    def faster(self, factor: float) -> Pid:
-        """Returns the design whose gains are all multiplied by `factor`, the closed-loop time constant divided by it.
-
-        Raises:
-            InputError: A field is then out of its range, or the gains are `designed`, which leaves no room.
-        """
-        if self.rule == "designed":
-            raise InputError("rule: designed gains are already as large as the delay allows; use imc")
-        changed = {
-            "time_constant": self.time_constant / factor,
-            "steering_kp": self.steering_kp * factor,
-            "steering_ki": self.steering_ki * factor,
-        }
-        return Pid.from_dict(self.model_dump() | changed)
+        if self.time_constant is None:
+            allowed = delay if self.delay is None else self.delay
+            common, second = design(robot, rigid, allowed, self.lag, period)
+        else:
+            common, second = imc(robot, self.time_constant)
+            if rigid:
+                faster = STEERING_LAG / self.time_constant
+                second = Gains(STEERING.k_p * faster, STEERING.k_i * faster)
+        if rigid:
+            k_p = second.k_p if self.steering_kp is None else self.steering_kp
+            k_i = second.k_i if self.steering_ki is None else self.steering_ki
+            second = Gains(k_p, k_i)
+        return common, second
 
 
-PIDS: dict[str, Pid] = {"normal": Pid(), "fast": Pid().faster(2)}
-"""PIDs of the comparisons: the default, and one twice as fast, which leaves less for a feedforward to gain."""
+STEERING, STEERING_LAG = Gains(0.3, 5.0), 0.15
+"""Gains on the steering, in rad/s per rad/s and 1/s, and the λ in s to which they belong; *chosen*."""
 
 
 def imc(robot: Robot, time_constant: float) -> tuple[Gains, Gains]:

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from mrctl.control.features import feature_scale
+from mrctl.experiments import paper
 from mrctl.experiments.tables import machine, markdown, number
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.log import Log
@@ -32,6 +33,7 @@ from mrctl.physics.plant import BatchPlant, Plant
 from mrctl.physics.stand import stand
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
+from mrctl.sensing.estimators import Estimator
 from mrctl.sensing.sensors import Sensors
 from mrctl.theory.kinematics import steering_angle
 
@@ -42,7 +44,8 @@ WARM = 20  # control periods before the clock starts
 CONTROLS = ["voltage_left", "voltage_right", "steering_command", "steering_rate_command"]
 PARTS: dict[str, tuple[Any, str]] = {
     "physics": (BatchPlant, "_advance"),
-    "measurement": (Sensors, "measure"),
+    "sensors": (Sensors, "measure"),
+    "estimator": (Estimator, "estimate"),
     "control and learning": (Hierarchy, "update"),
     "actuation (delay, supply)": (Plant, "send"),
     "readout, currents": (Plant, "look"),
@@ -261,7 +264,7 @@ def autograd_loop(ticks: int, stretches: int) -> Iterator[tuple[float, float]]:
     Yields:
         Seconds that a stretch took, and its position RMSE in m.
     """
-    scenario = Scenario()
+    scenario = Scenario(**paper.IDEAL)
     period, substeps = scenario.control_period, round(scenario.control_period / scenario.physics_step)
     physics = CarPhysics.from_world(scenario.world)
     physics.legacy_step = True  # dm_control's default, with which sensors are current after a step

@@ -10,31 +10,47 @@ from typing import Any
 
 import xarray as xr
 
+from mrctl.control.kanayama import Kanayama
+from mrctl.control.pid import Pid
 from mrctl.experiments import kanayama
 from mrctl.experiments.tables import machine, markdown, number, output_folder, write_json
 from mrctl.loop.simulation import simulate
 from mrctl.results import metrics, plots
 from mrctl.results.dataset import versions
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
+from mrctl.sensing.tiers import TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS
 from mrctl.theory.references import Lemniscate
 
 CASE = "all"  # the plant of the figures, which differs from the model in everything
 FAST, SLOW = 12.0, 20.0  # s a lap
 LONG = 60  # laps that show whether learning stays stable
+IDEAL: dict[str, Any] = {
+    "sensing": Sensing(tier="ideal"),
+    "pid": Pid(time_constant=0.15),
+    "kanayama": Kanayama(k_x=3.0, k_y=25.0, k_theta=10.0),
+    "prefilter": 0.05,
+}
+"""The world of the paper: exact measurements without delay, ideal motors, and a PID that is not tuned to its limit."""
 METRICS = ("v_rmse", "omega_rmse", "position_rmse")
 
 
 def scenario(feedforward: FeedforwardName, case: str, period: float = FAST, **changes: Any) -> Scenario:  # noqa: ANN401
-    """A run of the benchmark: the lemniscate at a lap time, on the plant of a named perturbation."""
+    """A run of the benchmark in the world of the paper: the lemniscate, on the plant of a named perturbation."""
     name = f"{feedforward}, {case}, {period:g} s"
-    return Scenario(
-        name=name,
-        feedforward=feedforward,
-        perturbation=PERTURBATIONS[case],
-        reference=Lemniscate(period=period),
-        **changes,
-    )
+    fields: dict[str, Any] = {"feedforward": feedforward, "perturbation": PERTURBATIONS[case]}
+    return Scenario(name=name, reference=Lemniscate(period=period), **fields | IDEAL | changes)
+
+
+def real(tier: Tier) -> list[Scenario]:
+    """The runs of eight laps with sensors and motors of a tier, and with the controllers that are designed for it."""
+    return [
+        Scenario(
+            name=f"{f}, {case}, {tier}", feedforward=f, perturbation=PERTURBATIONS[case], sensing=Sensing(tier=tier)
+        )
+        for case in ("nominal", CASE)
+        for f in FEEDFORWARDS
+    ]
 
 
 def benchmark() -> list[Scenario]:
@@ -72,6 +88,8 @@ def reproduce(out: Path) -> str:
     figures(result, scenarios, out)
     lateral = kanayama.table()
     rows, long_rows = compare(result, scenarios), endure(endured, endurance)
+    tiers = [one for tier in TIERS for one in real(tier)]
+    tier_rows = compare(simulate(tiers, progress=True), tiers)
     write_json(
         out / "table.json",
         {
@@ -80,13 +98,13 @@ def reproduce(out: Path) -> str:
             "seconds": time.monotonic() - began,
             "kanayama": lateral,
             "last_lap": rows,
+            "tiers": tier_rows,
             "endurance": long_rows,
-            "scenarios": [s.model_dump(mode="json") for s in (*scenarios, *endurance)],
+            "scenarios": [s.model_dump(mode="json") for s in (*scenarios, *endurance, *tiers)],
         },
     )
-    return "\n\n".join(
-        [text(rows), endurance_text(long_rows), kanayama_text(lateral), f"Figures and table.json are in {out}."]
-    )
+    parts = [text(rows), endurance_text(long_rows), tiers_text(tier_rows), kanayama_text(lateral)]
+    return "\n\n".join([*parts, f"Figures and table.json are in {out}."])
 
 
 def figures(result: xr.Dataset, scenarios: Sequence[Scenario], out: Path) -> None:
@@ -121,6 +139,8 @@ def compare(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str,
         row: dict[str, Any] = {
             "steering": one.steering,
             "plant": next(name for name, p in PERTURBATIONS.items() if p == one.perturbation),
+            "sensing": one.sensing.tier,
+            "estimator": one.sensing.source,
             "lap_time": one.reference.period,
             "feedforward": one.feedforward,
             "seed": one.seed,
@@ -172,7 +192,26 @@ def text(rows: Sequence[dict[str, Any]]) -> str:
             values = [number(1e3 * row[m]) for m in METRICS]
             values += [f"{r:.2f}" if math.isfinite(r) else "PID fails" for r in ratios]
         cells.append([row["steering"], row["plant"], f"{row['lap_time']:g} s", row["feedforward"], *values])
-    return "RMSE of the last of 8 laps against the reference:\n\n" + markdown(header, cells)
+    title = "RMSE of the last of 8 laps against the reference, with exact measurements and a PID of λ = 0.15 s:"
+    return f"{title}\n\n{markdown(header, cells)}"
+
+
+def tiers_text(rows: Sequence[dict[str, Any]]) -> str:
+    """The runs with sensors and motors of each tier as Markdown."""
+    header = ["sensing", "plant", "feedforward", "V, mm/s", "θ̇, mrad/s", "position, mm", "position to PID"]
+    cells = [
+        [row["sensing"], row["plant"], row["feedforward"]]
+        + (
+            [row["failure"], *[""] * 3]
+            if row["failure"]
+            else [*(number(1e3 * row[m]) for m in METRICS), f"{row['position_rmse_to_pid']:.2f}"]
+        )
+        for row in rows
+    ]
+    title = (
+        "The same on the 12 s lap with sensors, motors and steering of each tier, and the PID that is designed for it:"
+    )
+    return f"{title}\n\n{markdown(header, cells)}"
 
 
 def kanayama_text(rows: Sequence[dict[str, Any]]) -> str:

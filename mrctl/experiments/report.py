@@ -15,10 +15,10 @@ from jinja2 import Environment, StrictUndefined
 from pandas.io.formats.style import Styler
 
 from mrctl.control.feedforward import InverseDynamics
-from mrctl.control.pid import PIDS
+from mrctl.control.pid import Pid
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
-from mrctl.experiments.cases import BAND, Choices, Outcome
+from mrctl.experiments.cases import BAND, SLOW, Choices, Outcome
 from mrctl.experiments.tables import number
 from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation
@@ -157,7 +157,7 @@ def page(
         tables={title: _plain(table) for title, table in tables.items()},
         command=command(outcome, choices),
         versions=versions(),
-        pids=[tuning.statement(tuning.design("flat", pid, (0.0,))) for pid in PIDS.values()],
+        pids=[tuning.statement(tuning.design("flat", pid, (0.0,))) for pid in (Pid(), SLOW)],
     )
 
 

@@ -65,19 +65,14 @@ def tune(
 ) -> str:
     """The command: designs and measures; writes `table.json` and the figure `sensitivity` to `out` unless it is None.
 
-    Without a time constant the gains are `designed`, else they follow the IMC rule.
+    Without a time constant the gains are designed, else they follow the IMC rule.
 
     Raises:
         InputError: As `design`, or the folder cannot be written.
     """
     if out is not None:
         output_folder(out)
-    pid = Pid.from_dict({"rule": "designed", "lag": lag})
-    if time_constant is not None:
-        asked = Pid.from_dict({"time_constant": time_constant})
-        # `faster` also scales the gains of the steering, which go with the time constant.
-        pid = Pid().faster(Pid().time_constant / asked.time_constant)
-    table = design(world, pid, delays, robot)
+    table = design(world, Pid.from_dict({"time_constant": time_constant, "lag": lag}), delays, robot)
     if out is not None:
         (out / "table.json").write_text(json_text(table) + "\n")
         plots.save(figure(table), out, "sensitivity")
@@ -108,13 +103,13 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
     if not delays:
         raise InputError("delay: at least one delay is needed")
     table: dict[str, Any] = {"versions": versions(), "machine": machine(), "robot": robot.model_dump()}
-    table |= {"rule": pid.rule, "time_constant": pid.time_constant, "lag": pid.lag}
+    table |= {"time_constant": pid.time_constant, "lag": pid.lag}
     table |= {"loops": [], "motion": [], "responses": []}
     offered = mjcf.steerings(mjcf.load(world, mjcf.arrangement(robot), robot=robot))
     for steering in offered:
         _, nominal = mjcf.build(world, steering, robot=robot)
-        pids = [Pid.from_dict(pid.model_dump() | {"delay": d}) if pid.rule == "designed" else pid for d in delays]
-        common = {"world": world, "robot": robot.model_dump(), "steering": steering}
+        pids = [Pid.from_dict(pid.model_dump() | {"delay": delay}) for delay in delays]
+        common = {"world": world, "robot": robot.model_dump(), "steering": steering, "sensing": {"tier": "ideal"}}
         scenarios = [
             Scenario.from_dict(
                 common
@@ -128,7 +123,7 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
             for one, delay in zip(pids, delays, strict=True)
         ]
         period, rigid = scenarios[0].control_period, steering == "rigid"
-        gains = [one.channels(nominal, rigid, period) for one in pids]
+        gains = [one.channels(nominal, rigid, period=period) for one in pids]
         for delay, both in zip(delays, gains, strict=True):
             found = motion_design(nominal, rigid, both, delay, period)
             lags = dict(zip(("v_lag", "omega_lag"), found.lag, strict=True))
@@ -202,7 +197,7 @@ def text(table: dict[str, Any]) -> str:
 
 
 def _rule(table: dict[str, Any]) -> str:
-    if table["rule"] == "designed":
+    if table["time_constant"] is None:
         return (
             f"PI with the largest K_i for which max |S| ≤ {M_S:g} and max |T| ≤ {M_T:g}, lag {1e3 * table['lag']:g} ms"
         )

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mrctl.control import guard as guarding
 from mrctl.control.composite import CompositeAdaptation
+from mrctl.control.design import Motion, motion
 from mrctl.control.features import features, linear
 from mrctl.control.feedforward import (
     CompiledFeedforward,
@@ -213,8 +214,14 @@ class Hierarchy:
         self._nominal = InverseDynamics([robot] * size, self._rigid)
         self._inverse = self._nominal.coefficients[0], np.ones(8), np.zeros(8)
         self.state = state = np.zeros(size, CONTROL)
-        state["limiter"]["time_constant"] = [max(s.prefilter, s.control_period) for s in scenarios]
+        self._delays = [s.sensing.periods("delay", self._period) * self._period for s in scenarios]
+        self._motions: list[Motion] = []
         for row, scenario in enumerate(scenarios):
+            gains = scenario.pid.channels(robot, self._rigid, self._delays[row], self._period)
+            designed = motion(robot, self._rigid, gains, self._delays[row], self._period)
+            self._motions.append(designed)
+            prefilter = designed.prefilter if scenario.prefilter is None else scenario.prefilter
+            state["limiter"]["time_constant"][row] = max(prefilter, self._period)
             self.set_kanayama(row, scenario.kanayama)
             self.set_pid(row, scenario.pid)
         volts = np.broadcast_to(getattr(self.feedforward, "weight_volts", 0.0), size)
@@ -229,12 +236,16 @@ class Hierarchy:
         self.finite = True
 
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
-        """Changes the motion controller of one robot."""
-        self.state["kanayama"][row] = gains.k_x, gains.k_y, gains.k_theta
+        """Changes the motion controller of one robot; gains that are not set follow from its first PID."""
+        designed = self._motions[row].kanayama.model_dump()
+        chosen = designed | gains.model_dump(exclude_none=True)
+        if gains.k_y is not None and gains.k_theta is None:
+            chosen["k_theta"] = 2 * np.sqrt(gains.k_y)
+        self.state["kanayama"][row] = chosen["k_x"], chosen["k_y"], chosen["k_theta"]
 
     def set_pid(self, row: int, design: Pid) -> None:
         """Changes the velocity feedback of one robot."""
-        for name, value in design.gains(self._robot, self._rigid, self._period).items():
+        for name, value in design.gains(self._robot, self._rigid, self._delays[row], self._period).items():
             self.state["pid"][name][row] = value
 
     def set_learning(self, row: int, on: bool) -> None:

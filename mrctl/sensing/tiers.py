@@ -69,7 +69,7 @@ Latency = Annotated[float, Field(ge=0, le=LONGEST_DELAY)]
 class Sensing(Record):
     """What the robot senses and acts with: a tier, and values that replace the tier's."""
 
-    tier: Tier = "ideal"
+    tier: Tier = "lab"
     """Quality of sensors, motor driver, battery and steering: exact (`ideal`), good (`lab`) or cheap (`field`)."""
     estimator: EstimatorName | None = None
     """Source of posture and twist: the `truth`, `odometry` from encoders and gyro, or an extended Kalman filter, `ekf`;
