@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mrctl import PERTURBATIONS, Circle, Event, Lemniscate, Perturbation, Scenario, simulate
+from mrctl.experiments.paper import IDEAL
 from mrctl.loop.simulation import Simulation
 from mrctl.results.dataset import SIGNALS
 
@@ -12,7 +13,7 @@ ROUGH = Perturbation(
     steering_backlash=0.02, left_motor_constant_factor=0.95, right_resistance_factor=1.1,
     left_drive_friction_factor=1.4, control_delay=0.02,
 )  # fmt: skip
-BASE = Scenario(reference=Circle(period=4, radius=0.6), laps=1)
+BASE = Scenario(**IDEAL, reference=Circle(period=4, radius=0.6), laps=1)
 
 
 def limited(feedforward, amperes, period, laps, seeds, told):
@@ -23,7 +24,7 @@ def limited(feedforward, amperes, period, laps, seeds, told):
     """
     perturbation = PERTURBATIONS["all"].model_copy(update={"current_limit": amperes})
     scenario = Scenario(
-        reference=Lemniscate(period=period), laps=laps, feedforward=feedforward, perturbation=perturbation
+        **IDEAL, reference=Lemniscate(period=period), laps=laps, feedforward=feedforward, perturbation=perturbation
     )
     simulation = Simulation([scenario.model_copy(update={"seed": seed}) for seed in seeds])
     while simulation.running:

@@ -19,15 +19,16 @@ from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Episodes
 from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
+from mrctl.sensing.tiers import Sensing
 
 IDS = [f"mrctl/{action.capitalize()}Tracking-v0" for action in ACTION_KINDS]
 SHORT = Scenario(reference=Circle(period=2.2, radius=0.3), laps=1)
-# All that a robot remembers: weights, delays, filters, odometry, noise, a perturbation and a push under way.
+# All that a robot remembers: weights, delays, filters, sensors, the estimate, a perturbation and a push under way.
 BUSY = Scenario(
     reference=Circle(period=2.2, radius=0.3),
     laps=1,
-    measurement="odometry",
-    perturbation=Perturbation(control_delay=0.02, velocity_noise=0.01, rotation_noise=0.01, mass_factor=1.3),
+    sensing=Sensing(tier="field"),
+    perturbation=Perturbation(control_delay=0.02, mass_factor=1.3),
     events=(
         Event(time=0.5, perturbation=PERTURBATIONS["all"]),
         Event(time=1.9, push=(30.0, 0.0, 0.0), push_duration=0.3),

@@ -33,7 +33,7 @@ def first_difference(one, other) -> int:
     [
         {"perturbation": PAYLOAD},
         {"perturbation": Perturbation(control_delay=0.02)},
-        {"perturbation": Perturbation(velocity_noise=0.01)},
+        {"perturbation": Perturbation(dead_zone=2.0)},
         {"push": (10, 0, 0)},
         {"kanayama": Kanayama(k_x=1)},
         {"pid": Pid(time_constant=0.3)},
@@ -140,7 +140,9 @@ def test_delay():
 
 def test_gains():
     """New gains are in use from their tick on: the same error asks for another command."""
-    simulation = Simulation([with_events(Event(time=0.02, kanayama=Kanayama(k_x=9), pid=Pid(time_constant=0.3)))])
+    base = BASE.model_copy(update={"kanayama": Kanayama(k_x=3), "pid": Pid(time_constant=0.15)})
+    event = Event(time=0.02, kanayama=Kanayama(k_x=9), pid=Pid(time_constant=0.3))
+    simulation = Simulation([with_events(event, base=base)])
     hierarchy = simulation.hierarchy
     for tick in range(4):
         simulation.step()

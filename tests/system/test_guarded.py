@@ -20,11 +20,13 @@ from mrctl import (
     simulate,
 )
 from mrctl.experiments import single
+from mrctl.experiments.paper import IDEAL
 from mrctl.results.dataset import SIGNALS
+from mrctl.sensing.tiers import Sensing
 
 OFF = Guard(on=False)
 ERRORS = ("position_rmse", "v_rmse", "omega_rmse")
-DELAYED = Scenario(reference=Lemniscate(period=12.0), laps=4, perturbation=Perturbation(control_delay=0.04))
+DELAYED = Scenario(**IDEAL, reference=Lemniscate(period=12.0), laps=4, perturbation=Perturbation(control_delay=0.04))
 # Both ten times as fast as by default.
 FAST = {"fel": Fel(step=1.0), "rls": Rls(step=0.2, initial_covariance=2.0, covariance_bound=2.0)}
 
@@ -59,11 +61,11 @@ def test_too_fast(steering, name):
 def test_silent():
     """Learners in order: nothing happens, and every bit is what it is without a guard."""
     push = (Event(time=6.0, push=(0.0, 40.0, 0.0)), Event(time=9.0, perturbation=Perturbation(payload=5.0)))
-    noise = Perturbation(velocity_noise=0.01, rotation_noise=0.02, position_noise=0.002, heading_noise=0.005)
+    noise = Sensing(tier="lab")
     cases = (
         {"perturbation": PERTURBATIONS["all"]},
         {"events": push, "perturbation": Perturbation()},
-        {"perturbation": noise},
+        {"sensing": noise},
         {"perturbation": Perturbation(control_delay=0.04)},
     )
     for name in FAST:

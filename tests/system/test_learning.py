@@ -5,12 +5,18 @@ import pytest
 
 from mrctl import PERTURBATIONS, Fel, InputError, Lemniscate, Scenario, per_lap, save_weights
 from mrctl.control.weights import initial_weights, unflatten
+from mrctl.experiments.paper import IDEAL
 from mrctl.loop.simulation import simulate
 
 pytestmark = pytest.mark.xdist_group("learning")  # what its tests share is made once
 
 BASE = Scenario(
-    reference=Lemniscate(), laps=3, feedforward="fel", initial_spread=(0, 0, 0), perturbation=PERTURBATIONS["all"]
+    **IDEAL,
+    reference=Lemniscate(),
+    laps=3,
+    feedforward="fel",
+    initial_spread=(0, 0, 0),
+    perturbation=PERTURBATIONS["all"],
 )
 TICKS = round(BASE.reference.period / BASE.control_period)
 
@@ -124,6 +130,6 @@ def test_torch_module(runs):
 
 def test_too_small_a_bound():
     """A network at the bound of its weights helps less, but does not talk the PID out of what it holds."""
-    small = Scenario(laps=2, fel=Fel(weight_bound=7.0, output_scale=0.76), initial_spread=(0, 0, 0))
+    small = Scenario(**IDEAL, laps=2, fel=Fel(weight_bound=7.0, output_scale=0.76), initial_spread=(0, 0, 0))
     bound, alone = per_lap(simulate([small, small.model_copy(update={"feedforward": "none"})])).position_rmse[:, 1]
     assert bound < alone

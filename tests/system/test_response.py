@@ -7,7 +7,8 @@ from scipy import signal
 import mrctl
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import sampled_loop
-from mrctl.control.pid import PIDS, Pid
+from mrctl.control.pid import Pid
+from mrctl.experiments.paper import IDEAL
 from mrctl.experiments.response import SAMPLES, Shaker, estimate, lines, measure, multisine, refine, safety
 from mrctl.experiments.tuning import design, statement
 from mrctl.loop.hierarchy import TAKE_OVER
@@ -19,11 +20,14 @@ from mrctl.theory.robot import RobotFile
 
 H = 0.01
 NO_MOTION_CONTROLLER = Kanayama(k_x=0, k_y=0, k_theta=0)
+PIDS = {"normal": Pid(time_constant=0.15), "fast": Pid(time_constant=0.075)}
 
 
 def scenarios(delays=(0.0,), **changes):
     return [
-        mrctl.Scenario(perturbation=mrctl.Perturbation(control_delay=d), kanayama=NO_MOTION_CONTROLLER, **changes)
+        mrctl.Scenario(
+            perturbation=mrctl.Perturbation(control_delay=d), **IDEAL | {"kanayama": NO_MOTION_CONTROLLER} | changes
+        )
         for d in delays
     ]
 
@@ -155,7 +159,7 @@ def test_twice_as_fast():
 
 
 @pytest.mark.parametrize("robot", ["car", "turtlebot", "racecar"])
-@pytest.mark.parametrize(("pid", "delays"), [(Pid(rule="designed"), (0.0, 0.01, 0.02)), (Pid(), (0.0,))])
+@pytest.mark.parametrize(("pid", "delays"), [(Pid(), (0.0, 0.01, 0.02)), (PIDS["normal"], (0.0,))])
 def test_designed_is_measured(robot, pid, delays):
     """On the physics every loop has the bandwidth that was designed to 10 %, and M_s, with every steering and delay."""
     table = design("flat", pid, delays, RobotFile(path=robot))
@@ -164,7 +168,7 @@ def test_designed_is_measured(robot, pid, delays):
         wanted, found = row["design"], row["measured"]
         assert found["bandwidth"] == pytest.approx(wanted["bandwidth"], rel=0.1), (row["steering"], row["delay"])
         assert found["sensitivity"] == pytest.approx(wanted["sensitivity"], abs=0.1)
-        if pid.rule == "designed":
+        if pid.time_constant is None:
             assert found["sensitivity"] < 1.7 and found["bandwidth"] > 35
 
 
@@ -180,12 +184,12 @@ def test_a_pid_for_its_plant_keeps_the_robot(points, speed):
 
     The splines are two of a hundred random ones.
     """
-    pids = PIDS["normal"], Pid(rule="designed"), Pid(rule="designed", delay=0.01)
+    pids = PIDS["normal"], Pid(delay=0.0), Pid(delay=0.01)
     result = mrctl.simulate(
         [
             mrctl.Scenario(
-                reference=mrctl.Waypoints(points=points, speed=speed), laps=1, feedforward="none", pid=pid,
-                perturbation=mrctl.Perturbation(control_delay=pid.delay),
+                reference=mrctl.Waypoints(points=points, speed=speed), laps=1, feedforward="none",
+                perturbation=mrctl.Perturbation(control_delay=pid.delay or 0.0), **IDEAL | {"pid": pid},
             )
             for pid in pids
         ]
@@ -212,8 +216,8 @@ class Integrator:
 def test_foretells_instability(steering, channel):
     """Behind 40 ms, learning settles at 0.7 of the step that T allows, and oscillates for ever at 1.3 of it."""
     scenario = mrctl.Scenario(
-        steering=steering, reference=mrctl.Line(length=24), laps=1, perturbation=mrctl.Perturbation(control_delay=0.04),
-        guard=mrctl.Guard(on=False),
+        **IDEAL, steering=steering, reference=mrctl.Line(length=24), laps=1, guard=mrctl.Guard(on=False),
+        perturbation=mrctl.Perturbation(control_delay=0.04),
     )  # fmt: skip
     frequency, (t,) = measure([scenario], channel)
     limit = safety(*refine(frequency, t), H).step

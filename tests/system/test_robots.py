@@ -5,6 +5,7 @@ import pytest
 
 import mrctl
 from mrctl import Circle, Event, Fel, Lemniscate, Perturbation, RobotFile, Scenario, cli
+from mrctl.sensing.tiers import TIERS, Sensing
 from mrctl.viewer.recording import Recording
 
 TURTLE = {"robot": RobotFile(path="turtlebot"), "steering": "caster"}
@@ -38,7 +39,7 @@ def scenarios(robot, course, seed):
             left_radius_factor=random.uniform(0.97, 1.03), resistance_factor=random.uniform(0.9, 1.3),
             supply_factor=random.uniform(0.8, 1.1), drive_friction_factor=random.uniform(0.5, 2),
             tyre_friction_factor=random.uniform(0.7, 1.0), slope=random.uniform(-0.03, 0.03),
-            control_delay=random.integers(3) / 100, velocity_noise=0.01, rotation_noise=0.01, position_noise=0.002,
+            control_delay=random.integers(3) / 100, dead_zone=random.uniform(0, 0.2),
         )  # fmt: skip
 
     events = (
@@ -48,7 +49,7 @@ def scenarios(robot, course, seed):
     )
     return Scenario(
         **robot, reference=course, laps=1, seed=seed, perturbation=change(), events=events, fel=Fel(step=0.05),
-        measurement=("truth", "odometry")[seed % 2], world=("flat", "patch")[seed % 3 == 0],
+        sensing=Sensing(tier=TIERS[seed % 3]), world=("flat", "patch")[seed % 3 == 0],
     )  # fmt: skip
 
 

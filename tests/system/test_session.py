@@ -32,7 +32,7 @@ def test_saved_session(reference, tmp_path):
     ]
     session = Session(scenarios)
     drive(session, 37)
-    session.apply(perturbation=Perturbation(payload=6, payload_x=0.05, velocity_noise=0.01))
+    session.apply(perturbation=Perturbation(payload=6, payload_x=0.05, dead_zone=0.3))
     session.apply(push=(0.0, 30.0, 0.0))
     drive(session, 101)
     session.apply(learning=False)

@@ -140,34 +140,23 @@ def test_a_slow_sample_costs_speed(robot):
 
 
 def test_the_pid_selects_it(robot):
-    """`designed` gains are those of the design; the IMC gains stay the default."""
+    """The gains are those of the design for the delay of the sensing, unless a delay or λ is given."""
     for rigid in (False, True):
         wanted = design(robot, rigid, 0.01, 0.02, 0.005)
-        assert Pid(rule="designed", delay=0.01, lag=0.02).channels(robot, rigid, 0.005) == wanted
-        assert Pid().gains(robot, rigid) == Pid(rule="imc", time_constant=0.15).gains(robot, rigid)
-    k_d = Pid(rule="designed", derivative_time=0.1).gains(robot, rigid=False)["k_d"]
+        assert Pid(lag=0.02).channels(robot, rigid, 0.01, 0.005) == wanted
+        assert Pid(delay=0.01, lag=0.02).channels(robot, rigid, 0.3, 0.005) == wanted
+        assert Pid(time_constant=0.15).channels(robot, rigid)[0] != wanted[0]
+    k_d = Pid(derivative_time=0.1).gains(robot, rigid=False)["k_d"]
     assert k_d[0] == pytest.approx(0.1 * design(robot, False, 0.0)[0].k_p)
 
 
 @pytest.mark.parametrize(
-    ("values", "says"),
-    [
-        ({"rule": "fast"}, "rule"),
-        ({"rule": "designed", "delay": -0.01}, "delay"),
-        ({"rule": "designed", "delay": 0.6}, "delay"),
-        ({"rule": "designed", "lag": float("nan")}, "lag"),
-    ],
+    ("values", "says"), [({"delay": -0.01}, "delay"), ({"delay": 0.6}, "delay"), ({"lag": float("nan")}, "lag")]
 )
 def test_refused(values, says):
     """A bad value is refused with the name of its field."""
     with pytest.raises(InputError, match=says):
         Pid.from_dict(values)
-
-
-def test_designed_gains_cannot_be_faster():
-    """A designed PID leaves no room for larger gains."""
-    with pytest.raises(InputError, match="rule"):
-        Pid(rule="designed").faster(2)
 
 
 @pytest.mark.parametrize("steering", list(ARRANGEMENTS))

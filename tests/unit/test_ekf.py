@@ -8,7 +8,21 @@ from hypothesis import strategies as st
 from mrctl.physics.plant import PLANT
 from mrctl.sensing import ekf as laws
 from mrctl.sensing.ekf import (
-    BIAS, EKF, FIX_GATE, LEFT, LOST, OFFSET, OMEGA, RIGHT, SCALE_LEFT, SCALE_RIGHT, THETA, V, X, Y, N,
+    BIAS,
+    EKF,
+    FIX_GATE,
+    LEFT,
+    LOST,
+    OFFSET,
+    OMEGA,
+    RIGHT,
+    SCALE_LEFT,
+    SCALE_RIGHT,
+    THETA,
+    N,
+    V,
+    X,
+    Y,
 )  # fmt: skip
 from mrctl.sensing.estimators import Estimator
 from mrctl.sensing.prediction import wrapped

@@ -15,7 +15,7 @@ from mrctl.loop.courses import GOAL
 from mrctl.loop.hierarchy import TAKE_OVER, Hierarchy
 from mrctl.loop.user_stages import UserHierarchy, UserStage
 from mrctl.scenario import FEEDFORWARDS, Scenario
-from mrctl.sensing.sensors import SEEN
+from mrctl.sensing.prediction import SEEN
 from mrctl.theory.dynamics import inverse_dynamics
 from mrctl.theory.robot import STEERINGS, Robot
 
@@ -96,7 +96,9 @@ def test_nothing_wrong(robot, name):
 
 def test_slow_motion_controller(robot):
     """A motion controller of 50 ms answers every fifth tick; between, its correction rides on the live reference."""
-    hierarchy = build(robot, 2, feedforward="none", motion_period=0.05, prefilter=0.01)
+    hierarchy = build(
+        robot, 2, feedforward="none", motion_period=0.05, prefilter=0.01, kanayama=Kanayama(k_x=3, k_y=25, k_theta=10)
+    )
     inputs = pose, _, motion, _ = signals(2, 43)
     reference, twist = motion[..., :3], motion[..., 3:5]
     log = drive(hierarchy, inputs)

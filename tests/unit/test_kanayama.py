@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
+from mrctl.control.kanayama import GAINS, kanayama, posture_error
 from mrctl.kernel import over_rows
 from mrctl.theory.kinematics import pose_rates
 
@@ -138,8 +138,3 @@ def test_rows(pose, reference, twist, gains):
     together = np.hstack(follow(pose, reference, twist, gains))
     for i in (0, 1, 3):
         assert together[i].tobytes() == alone[i].tobytes()
-
-
-def test_defaults():
-    """The default gains are critically damped: K_θ² = 4 K_y."""
-    assert Kanayama().k_theta ** 2 == 4 * Kanayama().k_y

@@ -81,7 +81,7 @@ MASSES = ("mass", "yaw_inertia", "fork_inertia", "fork_moment", "wheel_inertia",
         ({"left_motor_constant_factor": 0.8}, {"torque_constant": 0.9, "no_load_current": 1 / 0.9}),
         ({"tyre_friction_factor": 0.5}, {"tyre_friction": 0.5}),
         ({"slope": 0.1}, {}),
-        ({"control_delay": 0.02, "velocity_noise": 0.1}, {}),
+        ({"control_delay": 0.02, "dead_zone": 0.1}, {}),
     ],
 )
 def test_factor(perturbation, expected):

@@ -9,9 +9,8 @@ from scipy import signal
 from scipy.optimize import brentq, minimize_scalar
 
 from mrctl.control.margins import Gains, learning_ratio, margins, sampled_loop
-from mrctl.control.pid import PID, PIDS, Pid, imc, pid
+from mrctl.control.pid import PID, Pid, imc, pid
 from mrctl.kernel import over_rows
-from mrctl.record import InputError
 from mrctl.theory.linear import first_order
 
 CLOSED = 0.15  # λ
@@ -64,11 +63,11 @@ def test_published_gains(robot):
     half = 0.098 * 2.32 / (2 * emf * CLOSED)
     integral = emf / 0.098 / CLOSED
     np.testing.assert_allclose(found, [[m_e * half, integral], [j_e / 0.188 * half, 0.188 * integral]], rtol=1e-12)
-    gains = Pid(derivative_time=0.02, derivative_filter=0.04).gains(robot, rigid=False)
+    gains = Pid(time_constant=CLOSED, derivative_time=0.02, derivative_filter=0.04).gains(robot, rigid=False)
     assert list(gains) == ["k_p", "k_i", "k_d", "filter"]
     expected = np.hstack([found, 0.02 * found[:, :1], [[0.04], [0.04]]])
     np.testing.assert_allclose(table(gains), expected, rtol=1e-12)
-    assert table(Pid().gains(robot, rigid=True))[1].tolist() == [0.3, 5.0, 0.0, 0.03]
+    assert table(Pid(time_constant=0.15).gains(robot, rigid=True))[1].tolist() == [0.3, 5.0, 0.0, 0.03]
 
 
 @pytest.mark.parametrize("closed", [0.05, 0.15, 0.4])
@@ -86,7 +85,7 @@ def test_antiwindup(robot):
     """After three seconds of asking for more than the supply can give, the loop recovers; without, it overshoots."""
     gain, tau = plants(robot)
     command = np.repeat([[3.0, 15.0], [1.0, 5.0]], 300, axis=0)
-    gains = Pid().gains(robot, rigid=False)
+    gains = Pid(time_constant=CLOSED).gains(robot, rigid=False)
     outside = []
     for unwinding in (True, False):
         twists, voltages = loop(gain, tau, gains, command, 0.01, 24.0, unwinding)
@@ -192,7 +191,7 @@ def test_learning_ratio(robot):
 def test_sampled_loop(robot, delay):
     """The loop on paper is that of the law itself: the response to a sine of the compiled PID on exact plants."""
     gain, tau = plants(robot)
-    gains, h, ticks = Pid().gains(robot, rigid=False), 0.01, 4000
+    gains, h, ticks = Pid(time_constant=CLOSED).gains(robot, rigid=False), 0.01, 4000
     for harmonic in (1, 7, 40, 190):
         w = 2 * np.pi * harmonic / 400 / h
         command = np.repeat(np.sin(w * h * np.arange(ticks))[:, None], 2, axis=1)
@@ -214,11 +213,10 @@ def test_sampled_loop(robot, delay):
 @pytest.mark.parametrize("rigid", [False, True])
 def test_twice_as_fast(robot, rigid):
     """Half the time constant is twice every gain, in both channels of every steering arrangement."""
-    normal, fast = (table(PIDS[name].gains(robot, rigid)) for name in ("normal", "fast"))
-    assert PIDS["normal"] == Pid()
+    normal, fast = (table(Pid(time_constant=closed).gains(robot, rigid)) for closed in (CLOSED, CLOSED / 2))
     np.testing.assert_allclose(fast[:, :3], 2 * normal[:, :3], rtol=1e-12)
-    with pytest.raises(InputError, match="time_constant"):
-        Pid().faster(10)
+    own = table(Pid(time_constant=CLOSED, steering_kp=0.7, steering_ki=0.0).gains(robot, rigid))
+    np.testing.assert_array_equal(own[1, :2], [0.7, 0.0] if rigid else normal[1, :2])
 
 
 def numbers(*shape, low=-5.0, high=5.0):

@@ -14,17 +14,24 @@ from mrctl import Circle, Event, Fel, Perturbation, Scenario
 from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
 from mrctl.results.dataset import SIGNALS, open_result, save, scenarios_of, versions
+from mrctl.sensing.tiers import Sensing
 
 CIRCLE = Circle(period=4, radius=0.5)
 SCENARIOS = [
     Scenario(reference=CIRCLE, laps=1, feedforward="fel", fel=Fel(hidden=4), name="gelernt ✓"),
-    Scenario(reference=Circle(period=5, radius=0.5), laps=1, feedforward="none", seed=3, measurement="odometry"),
+    Scenario(
+        reference=Circle(period=5, radius=0.5),
+        laps=1,
+        feedforward="none",
+        seed=3,
+        sensing=Sensing(estimator="odometry"),
+    ),
     Scenario(
         reference=CIRCLE,
         laps=1,
         feedforward="rls",
         steering="rigid",
-        perturbation=Perturbation(payload=2, velocity_noise=0.01, control_delay=0.01),
+        perturbation=Perturbation(payload=2, dead_zone=0.1, control_delay=0.01),
         events=(Event(time=1, push=(1e4, 1e4, 0)),),
     ),
 ]

@@ -13,6 +13,7 @@ from mrctl.control.feedforward import NoFeedforward
 from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
 from mrctl.scenario import LONGEST, whole
+from mrctl.sensing.tiers import Sensing
 from mrctl.theory.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
 
 values = (
@@ -153,7 +154,7 @@ FULL = Scenario(
     reference=Waypoints(points=((0, 0), (1, 0), (1, 1))),
     laps=3,
     feedforward="rls",
-    measurement="odometry",
+    sensing=Sensing(tier="field", estimator="odometry", gyro_noise=1e-3),
     kanayama=Kanayama(k_x=2.5),
     pid=Pid(time_constant=0.3),
     fel=Fel(hidden=3, weights="w.safetensors", frozen=True),
