@@ -249,7 +249,7 @@ def lab(**values):
 def test_late_fix():
     """A fix of 80 ms ago leaves the filter where the same fix would, had it come at once.
 
-    They differ by less than a hundredth of a deviation, because the observer that finds slip goes on from its own state.
+    They differ by less than a hundredth of a deviation, as the observer that finds slip goes on from its own state.
     """
     drive = Drive([lab(fix_rate=10, fix_latency=0.08), lab(fix_rate=10, fix_latency=0.0)])
     memory = drive.filters.memory
