@@ -35,6 +35,7 @@ from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
 from mrctl.sensing.estimators import Estimator
 from mrctl.sensing.sensors import Sensors
+from mrctl.sensing.tiers import Sensing, Tier
 from mrctl.theory.kinematics import steering_angle
 
 SIZES = (1, 16, 64, 256, 1024)
@@ -66,17 +67,22 @@ def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int
         chunk: Control periods of one turn, summed over the robots.
 
     Returns:
-        `machine`; `robots`, a row a size on one thread; `threads`, rows on one and on two; `parts`, µs a control
-        period by component for the smallest and the largest size; `today`, the dm_control and autograd loop.
+        `machine`; `robots`, a row a size on one thread; `threads`, rows on one and on two; `lab`, such a row with the
+        sensors, the filter and the motor driver of that tier, whose rollouts have other bits; `parts`, µs a control
+        period in that tier by component for the smallest and the largest size; `sensing_share`, the share that sensors
+        and estimator have in it; `today`, the dm_control and autograd loop.
     """
     threads = [1, 2] if (os.cpu_count() or 1) > 1 else [1]
     middle = sizes[len(sizes) // 2]
     rows = [_compare(size, 1, repetitions, chunk) for size in sizes]
+    parts = {str(size): _parts(size, 10 * chunk) for size in (sizes[0], sizes[-1])}
     return {
         "machine": {**machine(), **versions()},
         "robots": rows,
         "threads": [_compare(middle, count, repetitions, chunk) for count in threads],
-        "parts": {str(size): _parts(size, 10 * chunk) for size in (sizes[0], sizes[-1])},
+        "lab": _compare(middle, 1, repetitions, chunk, "lab"),
+        "parts": parts,
+        "sensing_share": {size: (p["sensors"] + p["estimator"]) / sum(p.values()) for size, p in parts.items()},
         "today": _today(repetitions, chunk),
     }
 
@@ -101,6 +107,7 @@ def text(figures: dict[str, Any]) -> str:
 
     sizes = list(figures["parts"])
     parts = [[name, *(f"{figures['parts'][size][name]:.2f}" for size in sizes)] for name in figures["parts"][sizes[0]]]
+    shares = [f"{100 * share:.1f} % with {size}" for size, share in figures["sensing_share"].items()]
     exact = all(r["replayed_exactly"] for r in figures["robots"] + figures["threads"])
     return "\n\n".join(
         [
@@ -109,25 +116,29 @@ def text(figures: dict[str, Any]) -> str:
             "open-loop rollouts of the same controls. Ratio: of their speeds. µs a tick: what the loop takes longer.",
             table(figures["robots"]),
             table(figures["threads"]),
-            f"The rollouts came to the same bits: {'yes' if exact else 'NO'}",
+            "With the sensors, the filter and the motor driver of `lab`:",
+            table([figures["lab"]]),
+            f"There, sensors and filter take {' and '.join(shares)} robots of the loop.",
+            f"The rollouts of the other tables came to the same bits: {'yes' if exact else 'NO'}",
             f"One dm_control physics, NumPy laws and torch autograd: {today['steps_per_second']:,.0f} steps/s; "
             f"the closed loop with one robot is {today['closed_loop_is_faster_by']:.1f} times as fast.",
-            "µs a control period:",
+            "µs a control period in `lab`:",
             markdown(["part", *(f"{size} robot{'s' * (size != '1')}" for size in sizes)], parts),
         ]
     )
 
 
-def build(size: int, ticks: int, threads: int = 1) -> list[Simulation]:
+def build(size: int, ticks: int, threads: int = 1, tier: Tier = "ideal") -> list[Simulation]:
     """Closed loops with `fel` in every robot on the batch engine, also for one robot, past their first moments.
 
     Args:
         size: Number of robots, which differ in their seeds.
         ticks: Control periods that will be asked of them.
         threads: Number of threads, each of which gets a simulation with its share of the robots, as in `simulate`.
+        tier: Sensing tier; the record of `ideal` alone holds the voltages that act.
     """
     laps = math.ceil((WARM + ticks) / Scenario(laps=1).ticks)
-    scenarios = [Scenario(seed=seed, laps=laps) for seed in range(size)]
+    scenarios = [Scenario(seed=seed, laps=laps, sensing=Sensing(tier=tier)) for seed in range(size)]
     with mock.patch("mrctl.loop.simulation.build", BatchPlant):
         simulations = [simulation for _, simulation in split(scenarios, list(range(size)), threads)]
     run_all(simulations, ticks=WARM)
@@ -172,11 +183,11 @@ def turn(simulations: Sequence[Simulation], ticks: int) -> tuple[float, float, b
     return closed, limit, same
 
 
-def _compare(size: int, threads: int, repetitions: int, chunk: int) -> dict[str, Any]:
+def _compare(size: int, threads: int, repetitions: int, chunk: int, tier: Tier = "ideal") -> dict[str, Any]:
     gc.collect()
     memory = _resident()
     ticks = max(2, threads * chunk // size)
-    simulations = build(size, ticks * repetitions, threads)
+    simulations = build(size, ticks * repetitions, threads, tier)
     turns = []
     for _ in range(repetitions):
         gc.collect()
@@ -220,7 +231,7 @@ def _today(repetitions: int, chunk: int) -> dict[str, float]:
 def _parts(size: int, chunk: int) -> dict[str, float]:
     """µs a control period by component, as they run in the loop."""
     ticks = max(2, chunk // size)
-    (simulation,) = build(size, ticks)
+    (simulation,) = build(size, ticks, tier="lab")
     whole = []
     with _stopwatches() as seconds:
         for _ in range(ticks):

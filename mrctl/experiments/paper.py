@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import time
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import xarray as xr
@@ -24,6 +26,7 @@ from mrctl.theory.references import Lemniscate
 
 CASE = "all"  # the plant of the figures, which differs from the model in everything
 FAST, SLOW = 12.0, 20.0  # s a lap
+DRAWS = 4  # of noise and biases, for the runs with real sensors
 LONG = 60  # laps that show whether learning stays stable
 IDEAL: dict[str, Any] = {
     "sensing": Sensing(tier="ideal"),
@@ -43,13 +46,21 @@ def scenario(feedforward: FeedforwardName, case: str, period: float = FAST, **ch
 
 
 def real(tier: Tier) -> list[Scenario]:
-    """The runs of eight laps with sensors and motors of a tier, and with the controllers that are designed for it."""
+    """The runs of eight laps with sensors and motors of a tier, and with the controllers that are designed for it.
+
+    Each feedforward has the same draws of noise, biases and initial offset.
+    """
     return [
         Scenario(
-            name=f"{f}, {case}, {tier}", feedforward=f, perturbation=PERTURBATIONS[case], sensing=Sensing(tier=tier)
+            name=f"{f}, {case}, {tier}",
+            feedforward=f,
+            perturbation=PERTURBATIONS[case],
+            sensing=Sensing(tier=tier),
+            seed=seed,
         )
         for case in ("nominal", CASE)
         for f in FEEDFORWARDS
+        for seed in range(DRAWS)
     ]
 
 
@@ -197,20 +208,21 @@ def text(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def tiers_text(rows: Sequence[dict[str, Any]]) -> str:
-    """The runs with sensors and motors of each tier as Markdown."""
+    """The runs with sensors and motors of each tier as Markdown: means over the draws."""
     header = ["sensing", "plant", "feedforward", "V, mm/s", "θ̇, mrad/s", "position, mm", "position to PID"]
-    cells = [
-        [row["sensing"], row["plant"], row["feedforward"]]
-        + (
-            [row["failure"], *[""] * 3]
-            if row["failure"]
-            else [*(number(1e3 * row[m]) for m in METRICS), f"{row['position_rmse_to_pid']:.2f}"]
-        )
-        for row in rows
-    ]
-    title = (
-        "The same on the 12 s lap with sensors, motors and steering of each tier, and the PID that is designed for it:"
-    )
+    groups: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        groups[row["sensing"], row["plant"], row["feedforward"]].append(row)
+    means = {key: {m: fmean(row[m] for row in group) for m in METRICS} for key, group in groups.items()}
+    cells = []
+    for key, group in groups.items():
+        if lost := sum(bool(row["failure"]) for row in group):
+            cells.append([*key, f"{lost} of {len(group)} fail", *[""] * 3])
+            continue
+        ratio = means[key]["position_rmse"] / means[*key[:2], "none"]["position_rmse"]
+        told = f"{ratio:.2f}" if math.isfinite(ratio) else "PID fails"
+        cells.append([*key, *(number(1e3 * means[key][m]) for m in METRICS), told])
+    title = f"On the 12 s lap with the sensors, motors and controllers of each tier, mean of {DRAWS} draws:"
     return f"{title}\n\n{markdown(header, cells)}"
 
 
