@@ -88,8 +88,8 @@ class Page(ABC):
         if lines:
             size = f"<b>Errors are drawn {magnified} times.</b>" if magnified > 1 else "Errors have their true size."
             lines.append(
-                f"Outline: estimated posture. Black point: true position. Ellipse: 3σ of x and y (98.9 %). Small points: "
-                f"fixes of the last {sensors.FIX_AGE:g} s. {size}"
+                "Outline: estimated posture. Black point: true position. Ellipse: 3σ of x and y (98.9 %). "
+                f"Small points: fixes of the last {sensors.FIX_AGE:g} s. {size}"
             )
         write(self._sensed, block("sensors", *lines))
 
