@@ -330,7 +330,7 @@ def tune(
 def identify(
     world: str = "flat",
     robot: RobotFile = CAR,
-    perturbation: Perturbation = PERTURBATIONS["sensor noise"],
+    perturbation: Perturbation = PERTURBATIONS["nominal"],
     seed: int = 0,
     json: bool = False,
 ) -> None:
@@ -442,9 +442,11 @@ def export(
         number: Number of the run to write; by default all runs, whose numbers are in a column or before each topic.
     """
     from mrctl.results import export as exporting
-    from mrctl.sweep import store
+    from mrctl.sweep import jobs, store
 
-    count = exporting.export(store.open(file), to, out, number)
+    result = store.open(file)
+    of_sweep = None if "scenarios" in result.attrs else partial(jobs.scenario_of, file)
+    count = exporting.export(result, to, out, number, of_sweep)
     print(f"{out}: {count} {'run' if count == 1 else 'runs'}")
 
 

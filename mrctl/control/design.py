@@ -32,8 +32,10 @@ SPEEDS = 0.5, 0.2, 1.0
 """Shares of the robot's largest speed at which its loops are robust, *chosen*; at the first one they are compared."""
 DAMPING = 0.5
 """Damping ratio of the motion controller's loops at the largest speed, *chosen*; it is higher at a lower speed."""
-PUBLISHED = Kanayama(k_x=10.0, k_y=64.0, k_theta=16.0)
-"""Gains that Kanayama et al. (1990) drove with; the motion controller gets none above them."""
+ERROR = 0.05
+"""Longitudinal or lateral error in m that the motion controller corrects within the limits, *chosen*."""
+PUBLISHED_K_X, PUBLISHED_K_THETA = 10.0, 16.0
+"""Gains in 1/s and 1/m that Kanayama et al. (1990) drove with; the motion controller gets none above them."""
 
 
 def plants(robot: Robot, rigid: bool, channel: int) -> list[Linear]:
@@ -149,7 +151,11 @@ def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float =
 
     K_θ makes the lateral error critically damped where τ = 0. With p = τ s and κ = τ v_r √K_y the second equation is
     p³ + (p + κ)² = 0; its root r e^(jψ) with cos ψ = −ζ has √r = −sin ψ/cos(3ψ/2) and
-    κ = r^(3/2) sin(3ψ/2) − r cos ψ. No gain is above `PUBLISHED`: larger ones only meet the limits on acceleration.
+    κ = r^(3/2) sin(3ψ/2) − r cos ψ.
+
+    An error of `ERROR` must not ask for more than the robot's accelerations, which would limit the rate of the loop and
+    make it oscillate: K_x² e ≤ V̇_max, and v² K_y^(3/2) e ≤ θ̈_max, as the loops move within 1/K_x and 1/(v √K_y). No
+    gain is above those of Kanayama et al. (1990).
 
     Args:
         robot: The nominal robot in its steering arrangement.
@@ -165,6 +171,8 @@ def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float =
     angle = np.pi - np.arccos(DAMPING)
     root = (np.sin(angle) / np.cos(1.5 * angle)) ** 2
     kappa = root**1.5 * np.sin(1.5 * angle) - root * np.cos(angle)
-    lateral = min(float(kappa / ((omega_lag + prefilter) * robot.max_speed)), PUBLISHED.k_theta / 2)
-    k_x = min(float(1 / (4 * DAMPING**2 * (v_lag + prefilter))), PUBLISHED.k_x)
+    damped = float(kappa / ((omega_lag + prefilter) * robot.max_speed))
+    reached = (robot.max_rotation_acceleration / (robot.max_speed**2 * ERROR)) ** (1 / 3)
+    lateral = min(damped, reached, PUBLISHED_K_THETA / 2)
+    k_x = min(float(1 / (4 * DAMPING**2 * (v_lag + prefilter))), (robot.max_acceleration / ERROR) ** 0.5, PUBLISHED_K_X)
     return Motion(Kanayama(k_x=k_x, k_y=lateral**2, k_theta=2 * lateral), prefilter, (v_lag, omega_lag))

@@ -396,6 +396,8 @@ class _Adoption:
     def _renamed(self) -> Iterable[tuple[str, str, str]]:
         """Lists the elements that get another name: kind, old name, new name."""
         yield "body", self.chassis, "chassis"
+        if has(self.model, "site", "imu") and self.model.site("imu").bodyid[0] == self.model.body(self.chassis).id:
+            yield "site", "imu", "imu"
         wheels = (*zip(REAR, self.rear, strict=True), *zip(self._front_names(), self.front, strict=True))
         for name, wheel in wheels:
             yield "geom", f"contact {name}", name

@@ -3,23 +3,33 @@
 Tables hold every signal of `results.dataset.SIGNALS`; where a run has failed, they end. With several runs there is a
 column `run`, or in MCAP a name `/runK` before each topic.
 
-| topic           | message                     | content                                                           |
-| --------------- | --------------------------- | ----------------------------------------------------------------- |
-| `odom`          | nav_msgs/Odometry           | true posture and twist, V, lateral velocity and θ̇ in `base_link`  |
-| `reference`     | nav_msgs/Odometry           | reference posture and twist                                       |
-| `cmd_vel`       | geometry_msgs/TwistStamped  | commanded twist                                                   |
-| `measured`      | geometry_msgs/TwistStamped  | measured twist                                                    |
-| `joint_states`  | sensor_msgs/JointState      | wheels and fork; wheel angles integrated, the fork's rate derived |
-| `imu`           | sensor_msgs/Imu             | at P: heading, θ̇ as measured, accelerations derived, gravity      |
+| topic            | message                                 | content                                              |
+| ---------------- | --------------------------------------- | ---------------------------------------------------- |
+| `odom`           | nav_msgs/Odometry                       | true posture and twist, with the lateral velocity    |
+| `reference`      | nav_msgs/Odometry                       | reference posture and twist                          |
+| `cmd_vel`        | geometry_msgs/TwistStamped              | commanded twist                                      |
+| `joint_states`   | sensor_msgs/JointState                  | true angles and rates of wheels and fork             |
+| `estimate`       | nav_msgs/Odometry                       | estimated posture and twist with their covariances   |
+| `fix`            | geometry_msgs/PoseWithCovarianceStamped | posture fixes                                        |
+| `imu`            | sensor_msgs/Imu                         | gyro and accelerometer                               |
+| `encoders`       | sensor_msgs/JointState                  | angles of the rear wheels by their encoders          |
+| `encoder_counts` | std_msgs/Int64MultiArray                | the same in counts, left and right; no exact encoder |
 
-Time stamps are simulated time, from zero. Integrals and derivatives are the trapezoid rule and central differences.
+Times are simulated, from zero. A sample of a sensor is logged when it arrives, and its header has the time when it was
+taken. Covariances of sensors are those of their white noise; in those of the estimate and of a fix, which are planar,
+the entries of z, roll and pitch are 0. The gyro measures θ̇ alone and the accelerometer two axes: the variances of the
+other axes are `UNMEASURED`, and z shows gravity. Each `imu` message is a sample of the gyro with the last one of the
+accelerometer; the covariance of its orientation begins with −1, which says that there is none. In `joint_states`, wheel
+angles are integrated by the trapezoid rule, and the fork's rate is a central difference.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -31,11 +41,15 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
 from mrctl.record import InputError
-from mrctl.results.dataset import SIGNALS
+from mrctl.results.dataset import SIGNALS, require, scenarios_of
+from mrctl.scenario import Scenario
 from mrctl.theory.robot import GRAVITY
 
 Format = Literal["mcap", "csv", "parquet", "npz"]
 Columns = dict[str, NDArray]
+Message = dict[str, Any]
+
+UNMEASURED = 1e6  # variance of what a sensor does not measure, as in diff_drive_controller of ros2_controllers
 
 # The definitions of ROS 2, without their comments.
 TIME = "int32 sec\nuint32 nanosec"
@@ -43,19 +57,26 @@ HEADER = "builtin_interfaces/Time stamp\nstring frame_id"
 VECTOR = "float64 x\nfloat64 y\nfloat64 z"
 QUATERNION = "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1"
 TWIST = "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular"
+POSTURE = {
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+    "geometry_msgs/Point": VECTOR,
+    "geometry_msgs/Quaternion": QUATERNION,
+}
 MESSAGES: dict[str, tuple[str, dict[str, str]]] = {
     "nav_msgs/msg/Odometry": (
         "std_msgs/Header header\nstring child_frame_id\n"
         "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist",
-        {
-            "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
-            "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
-            "geometry_msgs/Point": VECTOR,
-            "geometry_msgs/Quaternion": QUATERNION,
+        POSTURE
+        | {
             "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance",
             "geometry_msgs/Twist": TWIST,
             "geometry_msgs/Vector3": VECTOR,
         },
+    ),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": (
+        "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose",
+        POSTURE,
     ),
     "geometry_msgs/msg/TwistStamped": (
         "std_msgs/Header header\ngeometry_msgs/Twist twist",
@@ -71,10 +92,23 @@ MESSAGES: dict[str, tuple[str, dict[str, str]]] = {
         "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance",
         {"geometry_msgs/Quaternion": QUATERNION, "geometry_msgs/Vector3": VECTOR},
     ),
+    "std_msgs/msg/Int64MultiArray": (
+        "std_msgs/MultiArrayLayout layout\nint64[] data",
+        {
+            "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim\nuint32 data_offset",
+            "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride",
+        },
+    ),
 }
 
 
-def export(result: xr.Dataset, to: Format, out: str | Path, run: int | None = None) -> int:
+def export(
+    result: xr.Dataset,
+    to: Format,
+    out: str | Path,
+    run: int | None = None,
+    scenario: Callable[[int], Scenario] | None = None,
+) -> int:
     """Writes a result for other tools, whole or not at all.
 
     Args:
@@ -82,13 +116,15 @@ def export(result: xr.Dataset, to: Format, out: str | Path, run: int | None = No
         to: Format of the file.
         out: The file to write.
         run: Number of the run to write; by default all runs.
+        scenario: Returns the scenario of a run from its number, which `mcap` needs for the sensors; by default it is
+            that which the result holds. The dataset of a sweep holds none.
 
     Returns:
         The number of runs that were written.
 
     Raises:
-        InputError: There is no such format or run, the result has no signals, the file exists or cannot be written, or
-            the library for the format is missing.
+        InputError: There is no such format or run, the result has no signals or no scenarios, the file exists or cannot
+            be written, or the library for the format is missing.
     """
     if to not in get_args(Format):
         raise InputError(f"to: {to!r} is not {', '.join(get_args(Format))}")
@@ -103,18 +139,18 @@ def export(result: xr.Dataset, to: Format, out: str | Path, run: int | None = No
     if out.exists():
         raise InputError(f"{out}: exists already, nothing was overwritten")
     writers: dict[Format, Callable[[xr.Dataset, Path], None]] = {
-        "mcap": _mcap, "csv": _csv, "parquet": _parquet, "npz": _npz,
+        "mcap": partial(_mcap, scenario), "csv": _csv, "parquet": _parquet, "npz": _npz,
     }  # fmt: skip
-    partial = out.with_name(out.name + ".partial")
+    unfinished = out.with_name(out.name + ".partial")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        writers[to](whole, partial)
-        partial.rename(out)
+        writers[to](whole, unfinished)
+        unfinished.rename(out)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror or error}") from None
     finally:
         with contextlib.suppress(OSError):
-            partial.unlink()
+            unfinished.unlink()
     return whole.sizes["run"]
 
 
@@ -181,95 +217,130 @@ def _definition(name: str) -> str:
     return own + "".join(f"\n{'=' * 80}\nMSG: {part}\n{text}" for part, text in parts.items())
 
 
-def _mcap(whole: xr.Dataset, path: Path) -> None:
+def _mcap(scenario: Callable[[int], Scenario] | None, whole: xr.Dataset, path: Path) -> None:
     try:
         from mcap_ros2.writer import Writer
     except ImportError:
         raise InputError("to: mcap needs a library, pip install 'mrctl[mcap]'") from None
+    require(whole, SIGNALS)
+    if scenario is None and "scenarios" not in whole.attrs:
+        raise InputError("result: does not hold its scenarios; mrctl export STORE --to mcap finds those of a sweep")
+    held = dict(zip(whole["run"].values.tolist(), scenarios_of(whole), strict=True)) if scenario is None else {}
     several = whole.sizes["run"] > 1
     with open(path, "wb") as file, Writer(file) as writer:
         writer.add_metadata("mrctl", {name: str(value) for name, value in whole.attrs.items()})
         schemas = {name: writer.register_msgdef(name, _definition(name)) for name in MESSAGES}
         for number, columns in _runs(whole):
-            before = f"/run{number}/" if several else "/"
-            for k, (nanoseconds, messages) in enumerate(_messages(columns)):
-                for topic, (name, message) in messages.items():
-                    writer.write_message(before + topic, schemas[name], message, nanoseconds, nanoseconds, k)
+            before, count = f"/run{number}/" if several else "/", Counter[str]()
+            for nanoseconds, topic, name, message in _messages(columns, scenario(number) if scenario else held[number]):
+                writer.write_message(before + topic, schemas[name], message, nanoseconds, nanoseconds, count[topic])
+                count[topic] += 1
 
 
-def _messages(columns: Columns) -> Iterator[tuple[int, dict[str, tuple[str, dict[str, Any]]]]]:
-    """The time of each sample in ns, and its messages by topic."""
-    if not (size := len(columns["time"])):
-        return
-    t = columns["time"]
-    rate = (lambda y: np.gradient(y, t)) if size > 1 else np.zeros_like
+def _messages(columns: Columns, scenario: Scenario) -> Iterator[tuple[int, str, str, Message]]:
+    """When a message is logged in ns, its topic, its type and itself, for all samples of a run."""
+    t, sensing, period = columns["time"], scenario.sensing, scenario.control_period
     turned = {side: cumulative_trapezoid(columns[f"wheel_rate_{side}"], t, initial=0) for side in ("left", "right")}
     c = {name: values.tolist() for name, values in columns.items()}
     c |= {f"turned_{side}": values.tolist() for side, values in turned.items()}
-    c["fork_rate"] = rate(columns["steering_angle"]).tolist()
-    v, lateral, omega = columns["v"], columns["v_lateral"], columns["omega"]
-    c["ahead"], c["aside"] = (rate(v) - omega * lateral).tolist(), (rate(lateral) + omega * v).tolist()
-    still = [0.0] * size
-    joints = ["wheel_left", "wheel_right", "steering"]
+    c["fork_rate"] = np.gradient(columns["steering_angle"], t).tolist() if len(t) > 1 else [0.0] * len(t)
+    wheels = ["wheel_left", "wheel_right"]
+    counts = sensing["encoder_counts"]
+    gyro, force = (
+        sensing[f"{name}_noise"] ** 2 / (period * sensing.periods(f"{name}_rate", period))
+        for name in ("gyro", "accelerometer")
+    )
+    position, heading = sensing["fix_position_noise"] ** 2, sensing["fix_heading_noise"] ** 2
+    taken = {name: _taken(scenario, name, t) for name in ("encoder", "gyro", "fix")}
+    new = {name: np.diff(times, prepend=-1) > 0 for name, times in taken.items()} | {"fix": ~np.isnan(columns["fix_x"])}
 
     for k, now in enumerate(c["time"]):
-        nanoseconds = round(now * 1e9)
-        stamp = {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
-        body, odom = ({"stamp": stamp, "frame_id": frame} for frame in ("base_link", "odom"))
+        logged = round(now * 1e9)
+        body, odom = _header(logged, "base_link"), _header(logged, "odom")
 
-        def twist(v: str, omega: str, lateral: list[float] = still, k: int = k) -> dict[str, Any]:
-            return {"linear": _xyz(c[v][k], lateral[k]), "angular": _xyz(z=c[omega][k])}
+        def odometry(after: str, k: int = k, odom: Message = odom) -> Message:
+            seen, lateral = after == "_measured", 0.0 if after else c["v_lateral"][k]
+            names = "variance_x", "covariance_xy", "variance_y", "variance_theta", "variance_v", "variance_omega"
+            x, xy, y, theta, v, omega = (c[name][k] if seen else 0.0 for name in names)
+            at = c["x" + after][k], c["y" + after][k], c["theta" + after][k]
+            moves = {"linear": _xyz(c["v" + after][k], lateral), "angular": _xyz(z=c["omega" + after][k])}
+            return {
+                "header": odom,
+                "child_frame_id": "base_link",
+                "pose": _posture(*at, _planar(x, xy, y, theta)),
+                "twist": {"twist": moves, "covariance": _planar(v, 0.0, 0.0, omega)},
+            }
 
-        def odometry(after: str, lateral: list[float] = still, k: int = k, header: Any = odom) -> dict[str, Any]:  # noqa: ANN401
-            position = _xyz(c["x" + after][k], c["y" + after][k])
-            pose = {"position": position, "orientation": _heading(c["theta" + after][k])}
-            moves = {"twist": twist("v" + after, "omega" + after, lateral), "covariance": [0.0] * 36}
-            posture = {"pose": pose, "covariance": [0.0] * 36}
-            return {"header": header, "child_frame_id": "base_link", "pose": posture, "twist": moves}
-
-        yield (
-            nanoseconds,
-            {
-                "odom": ("nav_msgs/msg/Odometry", odometry("", c["v_lateral"])),
-                "reference": ("nav_msgs/msg/Odometry", odometry("_ref")),
-                "cmd_vel": (
-                    "geometry_msgs/msg/TwistStamped",
-                    {"header": body, "twist": twist("v_command", "omega_command")},
-                ),
-                "measured": (
-                    "geometry_msgs/msg/TwistStamped",
-                    {"header": body, "twist": twist("v_measured", "omega_measured")},
-                ),
-                "joint_states": (
-                    "sensor_msgs/msg/JointState",
-                    {
-                        "header": body,
-                        "name": joints,
-                        "position": [c["turned_left"][k], c["turned_right"][k], c["steering_angle"][k]],
-                        "velocity": [c["wheel_rate_left"][k], c["wheel_rate_right"][k], c["fork_rate"][k]],
-                        "effort": [],
-                    },
-                ),
-                "imu": (
-                    "sensor_msgs/msg/Imu",
-                    {
-                        "header": body,
-                        "orientation": _heading(c["theta"][k]),
-                        "orientation_covariance": [0.0] * 9,
-                        "angular_velocity": _xyz(z=c["omega_measured"][k]),
-                        "angular_velocity_covariance": [0.0] * 9,
-                        "linear_acceleration": _xyz(c["ahead"][k], c["aside"][k], GRAVITY),
-                        "linear_acceleration_covariance": [0.0] * 9,
-                    },
-                ),
-            },
-        )
+        for topic, after in (("odom", ""), ("reference", "_ref"), ("estimate", "_measured")):
+            yield logged, topic, "nav_msgs/msg/Odometry", odometry(after)
+        command = {"linear": _xyz(c["v_command"][k]), "angular": _xyz(z=c["omega_command"][k])}
+        yield logged, "cmd_vel", "geometry_msgs/msg/TwistStamped", {"header": body, "twist": command}
+        joints = {
+            "header": body,
+            "name": [*wheels, "steering"],
+            "position": [c["turned_left"][k], c["turned_right"][k], c["steering_angle"][k]],
+            "velocity": [c["wheel_rate_left"][k], c["wheel_rate_right"][k], c["fork_rate"][k]],
+            "effort": [],
+        }
+        yield logged, "joint_states", "sensor_msgs/msg/JointState", joints
+        if new["fix"][k]:
+            pose = _posture(c["fix_x"][k], c["fix_y"][k], c["fix_theta"][k], _planar(position, 0.0, position, heading))
+            message = {"header": _header(taken["fix"][k], "odom"), "pose": pose}
+            yield logged, "fix", "geometry_msgs/msg/PoseWithCovarianceStamped", message
+        if new["gyro"][k]:
+            message = {
+                "header": _header(taken["gyro"][k], "imu_link"),
+                "orientation": _heading(0.0),
+                "orientation_covariance": [-1.0] + [0.0] * 8,
+                "angular_velocity": _xyz(z=c["gyro"][k]),
+                "angular_velocity_covariance": _diagonal(UNMEASURED, UNMEASURED, gyro),
+                "linear_acceleration": _xyz(c["acceleration_x"][k], c["acceleration_y"][k], GRAVITY),
+                "linear_acceleration_covariance": _diagonal(force, force, UNMEASURED),
+            }
+            yield logged, "imu", "sensor_msgs/msg/Imu", message
+        if new["encoder"][k]:
+            angles = [c["encoder_left"][k], c["encoder_right"][k]]
+            joints = {"name": wheels, "position": angles, "velocity": [], "effort": []}
+            header = _header(taken["encoder"][k], "base_link")
+            yield logged, "encoders", "sensor_msgs/msg/JointState", {"header": header} | joints
+            if counts:
+                layout = {"dim": [{"label": "wheel", "size": 2, "stride": 2}], "data_offset": 0}
+                message = {"layout": layout, "data": [round(angle * counts / (2 * np.pi)) for angle in angles]}
+                yield logged, "encoder_counts", "std_msgs/msg/Int64MultiArray", message
 
 
-def _xyz(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> dict[str, float]:
+def _taken(scenario: Scenario, sensor: str, t: NDArray) -> NDArray[np.int64]:
+    """When the sample of a sensor was taken that had arrived last at each time `t`, in ns."""
+    sensing, period = scenario.sensing, scenario.control_period
+    every, latency = (sensing.periods(f"{sensor}_{name}", period) for name in ("rate", "latency"))
+    ticks = np.maximum(np.rint(t / period).astype(int) - latency, 0)
+    return np.rint(ticks // every * every * period * 1e9).astype(int)
+
+
+def _header(nanoseconds: int, frame: str) -> Message:
+    stamp = {"sec": int(nanoseconds // 10**9), "nanosec": int(nanoseconds % 10**9)}
+    return {"stamp": stamp, "frame_id": frame}
+
+
+def _xyz(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Message:
     return {"x": x, "y": y, "z": z}
 
 
-def _heading(theta: float) -> dict[str, float]:
+def _heading(theta: float) -> Message:
     """A rotation about z as a quaternion."""
     return {"x": 0.0, "y": 0.0, "z": float(np.sin(theta / 2)), "w": float(np.cos(theta / 2))}
+
+
+def _posture(x: float, y: float, theta: float, covariance: list[float]) -> Message:
+    return {"pose": {"position": _xyz(x, y), "orientation": _heading(theta)}, "covariance": covariance}
+
+
+def _planar(x: float, xy: float, y: float, turn: float) -> list[float]:
+    """A covariance of x, y, z, roll, pitch and yaw, 6 by 6, of which the entries of the plane are given."""
+    found = np.zeros((6, 6))
+    found[0, :2], found[1, :2], found[5, 5] = (x, xy), (xy, y), turn
+    return found.ravel().tolist()
+
+
+def _diagonal(*variances: float) -> list[float]:
+    return np.diag(variances).ravel().tolist()

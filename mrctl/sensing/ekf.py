@@ -286,6 +286,8 @@ def ekf(
             step(now, ring, i, geometry, period, s.delay, s.start, f)
             if sample.grip[0] + sample.grip[1] < 2:
                 f.inertial = f.mean[V]
+        else:
+            f.mean[LEFT], f.mean[RIGHT] = sample.encoder[0], sample.encoder[1]
         if sample.fix_taken and now - s.start > 0:
             if sensor.fix_latency <= tick - now:
                 if sample.fix_arrives:

@@ -183,11 +183,12 @@ class Estimator:
         memory["mean"][:size] = np.append(reading["pose"], reading["twist"]) + deviation * random.standard_normal(size)
         if self._name == "ekf":
             offset = sensing["accelerometer_bias"] ** 2 + START_OFFSET**2
-            variances = [*deviation**2, sensing["gyro_bias"] ** 2, offset, 0.0, 0.0, RADIUS**2, RADIUS**2]
+            count = sensor["quantum"] ** 2 / 12
+            variances = [*deviation**2, sensing["gyro_bias"] ** 2, offset, count, count, RADIUS**2, RADIUS**2]
             memory["acceleration_variance"] = sensor["accelerometer_sigma"] ** 2
             memory["offset_walk"] = np.hypot(sensing["accelerometer_walk"], INCLINE)
             memory["P"][:] = np.diag(np.maximum(variances, 1e-12))
-            memory["encoder_variance"], memory["gyro_variance"] = sensor["quantum"] ** 2 / 12, sensor["gyro_sigma"] ** 2
+            memory["encoder_variance"], memory["gyro_variance"] = count, sensor["gyro_sigma"] ** 2
             memory["bias_walk"], memory["kept_tick"] = sensing["gyro_walk"], -1
             memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
             memory["inertial"] = memory["mean"][3]

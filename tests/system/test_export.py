@@ -20,12 +20,14 @@ from mrctl import Circle, Event, InputError, Scenario, Sweep, save
 from mrctl.cli import main
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
-from mrctl.results.export import export
+from mrctl.results.export import UNMEASURED, export
+from mrctl.sensing.tiers import Sensing
 from mrctl.sweep import jobs
 
 pytestmark = pytest.mark.xdist_group("export")  # what its tests share is made once
 
-SHORT = Scenario(reference=Circle(period=3, radius=0.4), laps=1, feedforward="none")
+IDEAL, FIELD = Sensing(tier="ideal"), Sensing(tier="field", fix_lost=0.2, encoder_rate=50, encoder_latency=0.01)
+SHORT = Scenario(reference=Circle(period=3, radius=0.4), laps=1, feedforward="none", sensing=IDEAL)
 FAILS = SHORT.model_copy(update={"seed": 1, "events": (Event(time=1.0, push=(1e12, 0.0, 1e15)),)})
 ROS = get_typestore(Stores.ROS2_HUMBLE)
 
@@ -53,74 +55,150 @@ def messages(file: Path):
     return found
 
 
+def stamps(some):
+    return [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in some]
+
+
+def twist(message):
+    return message.twist if hasattr(message.twist, "linear") else message.twist.twist
+
+
+def heading(pose):
+    return 2 * np.arctan2(pose.orientation.z, pose.orientation.w)
+
+
+KINDS = {
+    "/odom": "nav_msgs/msg/Odometry", "/reference": "nav_msgs/msg/Odometry", "/estimate": "nav_msgs/msg/Odometry",
+    "/cmd_vel": "geometry_msgs/msg/TwistStamped", "/fix": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "/joint_states": "sensor_msgs/msg/JointState", "/encoders": "sensor_msgs/msg/JointState",
+    "/imu": "sensor_msgs/msg/Imu",
+}  # fmt: skip
+
+
 def test_mcap(result, path, tmp_path):
-    """Odometry, twists, joints and IMU: values to the bit, stamps to the nanosecond."""
+    """Odometry, twists, joints and ideal sensors: values to the bit, stamps to the nanosecond."""
     out = tmp_path / "run.mcap"
     assert export(mrctl.open(path), "mcap", out, 0) == 1
     found = messages(out)
-    assert {topic: kind for topic, (kind, _, _) in found.items()} == {
-        "/odom": "nav_msgs/msg/Odometry", "/reference": "nav_msgs/msg/Odometry",
-        "/cmd_vel": "geometry_msgs/msg/TwistStamped", "/measured": "geometry_msgs/msg/TwistStamped",
-        "/joint_states": "sensor_msgs/msg/JointState", "/imu": "sensor_msgs/msg/Imu",
-    }  # fmt: skip
+    assert {topic: kind for topic, (kind, _, _) in found.items()} == KINDS
     run = result.isel(run=0)
     for _, times, some in found.values():
-        assert times == [10_000_000 * k for k in range(300)]
-        assert [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in some] == times
+        assert times == stamps(some) == [10_000_000 * k for k in range(300)]
 
     def same(topic, read, name):
         assert np.array_equal([read(m) for m in found[topic][2]], run[name].values), (topic, name)
 
-    for topic, after in (("/odom", ""), ("/reference", "_ref")):
+    for topic, after in (("/odom", ""), ("/reference", "_ref"), ("/estimate", "_measured")):
         same(topic, lambda m: m.pose.pose.position.x, "x" + after)
         same(topic, lambda m: m.pose.pose.position.y, "y" + after)
-        same(topic, lambda m: m.twist.twist.linear.x, "v" + after)
-        same(topic, lambda m: m.twist.twist.angular.z, "omega" + after)
-        turned = [2 * np.arctan2(m.pose.pose.orientation.z, m.pose.pose.orientation.w) for m in found[topic][2]]
+        turned = [heading(m.pose.pose) for m in found[topic][2]]
         apart = np.angle(np.exp(1j * (np.array(turned) - run["theta" + after].values)))
         np.testing.assert_allclose(apart, 0, atol=1e-12)
+    for topic, after in (("/odom", ""), ("/reference", "_ref"), ("/estimate", "_measured"), ("/cmd_vel", "_command")):
+        same(topic, lambda m: twist(m).linear.x, "v" + after)
+        same(topic, lambda m: twist(m).angular.z, "omega" + after)
     same("/odom", lambda m: m.twist.twist.linear.y, "v_lateral")
-    for topic, after in (("/cmd_vel", "_command"), ("/measured", "_measured")):
-        same(topic, lambda m: m.twist.linear.x, "v" + after)
-        same(topic, lambda m: m.twist.angular.z, "omega" + after)
     for k, side in enumerate(("left", "right")):
         same("/joint_states", lambda m, k=k: m.velocity[k], f"wheel_rate_{side}")
+        same("/encoders", lambda m, k=k: m.position[k], f"encoder_{side}")
     same("/joint_states", lambda m: m.position[2], "steering_angle")
-    same("/imu", lambda m: m.angular_velocity.z, "omega_measured")
+    same("/imu", lambda m: m.angular_velocity.z, "omega")
+    same("/fix", lambda m: m.pose.pose.position.x, "x")
     assert found["/odom"][2][0].header.frame_id == "odom" and found["/odom"][2][0].child_frame_id == "base_link"
     assert found["/joint_states"][2][0].name == ["wheel_left", "wheel_right", "steering"]
+    assert found["/encoders"][2][0].name == ["wheel_left", "wheel_right"]
+
+
+def test_sensors(tmp_path):
+    """Cheap sensors: each sample once, logged when it arrived and stamped when it was taken, with its noise."""
+    scenario = SHORT.model_copy(update={"sensing": FIELD})
+    run = simulate(scenario)
+    save(run, tmp_path / "field.zarr")
+    export(mrctl.open(tmp_path / "field.zarr"), "mcap", tmp_path / "field.mcap")
+    found = messages(tmp_path / "field.mcap")
+    assert {topic: kind for topic, (kind, _, _) in found.items()} == KINDS | {
+        "/encoder_counts": "std_msgs/msg/Int64MultiArray"
+    }
+
+    _, times, fixes = found["/fix"]
+    arrived = np.flatnonzero(np.isfinite(run.fix_x))
+    assert times == [10_000_000 * k for k in arrived] and 15 < len(times) < 30  # of 30, a fifth is lost
+    assert stamps(fixes) == [time - 50_000_000 for time in times]
+    truth = run.isel(time=np.array(stamps(fixes)) // 10_000_000)  # where the robot was when the fix was taken
+    for read, name, sigma in (
+        (lambda m: m.pose.pose.position.x, "x", 0.02),
+        (lambda m: m.pose.pose.position.y, "y", 0.02),
+        (lambda m: heading(m.pose.pose), "theta", 0.01),
+    ):
+        off = np.array([read(m) for m in fixes]) - truth[name].values
+        off = np.angle(np.exp(1j * off)) if name == "theta" else off
+        assert 0.6 * sigma < off.std() < 1.4 * sigma and abs(off.mean()) < 0.8 * sigma
+    covariance = fixes[0].pose.covariance.reshape(6, 6)
+    np.testing.assert_allclose(covariance, np.diag([4e-4, 4e-4, 0, 0, 0, 1e-4]), rtol=1e-12)
+
+    _, times, angles = found["/encoders"]
+    assert times == [0, *(10_000_000 * k for k in range(3, 300, 2))]  # 50 Hz, and the sample is 10 ms old
+    assert stamps(angles) == [10_000_000 * k for k in range(0, 300, 2)]
+    _, logged, counts = found["/encoder_counts"]
+    assert logged == times and all(m.data.dtype == np.int64 for m in counts)
+    position = np.array([m.position for m in angles])
+    np.testing.assert_allclose(position, 2 * np.pi / 2578 * np.array([m.data for m in counts]), rtol=1e-12)
+    rolled = np.array([m.position[:2] for m in found["/joint_states"][2]])[np.array(stamps(angles)) // 10_000_000]
+    assert np.abs((position - position[0]) - rolled).max() < 0.01  # in 10 ms they turn by 0.2 rad
+
+    _, times, imu = found["/imu"]
+    assert times == stamps(imu) == [10_000_000 * k for k in range(300)]
+    assert np.array_equal([m.angular_velocity.z for m in imu], run.gyro)
+    assert np.array_equal([m.linear_acceleration.x for m in imu], run.acceleration_x)
+    assert np.array_equal([m.linear_acceleration.y for m in imu], run.acceleration_y)
+    assert {m.linear_acceleration.z for m in imu} == {9.81} and {m.header.frame_id for m in imu} == {"imu_link"}
+    one = imu[0]
+    assert one.orientation_covariance[0] == -1 and one.angular_velocity_covariance[0] == UNMEASURED
+    noise = run.gyro - run.omega
+    assert one.angular_velocity_covariance[8] == pytest.approx(0.005**2)  # of 5e-4 rad/s/√Hz in 10 ms
+    assert one.angular_velocity_covariance[8] == pytest.approx(float(noise.var()), rel=0.3)
+    assert one.linear_acceleration_covariance[4] == pytest.approx(0.022**2)
+
+    estimate = found["/estimate"][2][200]
+    covariance, at = estimate.pose.covariance.reshape(6, 6), run.isel(time=200)
+    assert covariance[1, 0] == covariance[0, 1] == at.covariance_xy
+    assert covariance.diagonal().tolist() == [at.variance_x, at.variance_y, 0, 0, 0, at.variance_theta]
+    covariance = estimate.twist.covariance.reshape(6, 6)
+    assert covariance.diagonal().tolist() == [at.variance_v, 0, 0, 0, 0, at.variance_omega]
+    assert (covariance > 0).sum() == 2 and at.variance_x > 0
 
 
 def test_derived(result, path, tmp_path):
-    """What is not recorded but follows: a wheel has rolled as far as P has come, a circle presses with v ω."""
+    """What is not recorded but follows: a wheel has rolled as far as P has come."""
     out = tmp_path / "run.mcap"
     export(mrctl.open(path), "mcap", out, 0)
     found, run = messages(out), result.isel(run=0)
     rolled = np.mean([m.position[:2] for m in found["/joint_states"][2]], axis=1) * 0.098
     np.testing.assert_allclose(rolled[-1], np.trapezoid(run.v, run.time), rtol=0.01)
-    late = found["/imu"][2][150:]
-    aside = np.array([m.linear_acceleration.y for m in late])
-    np.testing.assert_allclose(aside.mean(), float((run.v * run.omega)[150:].mean()), rtol=0.02)
-    assert {m.linear_acceleration.z for m in late} == {9.81}
 
 
-def test_definitions(path, tmp_path):
+def test_definitions(tmp_path):
     """The definitions in the file are those of ROS: read by them alone, the messages are the same."""
     out = tmp_path / "run.mcap"
-    export(mrctl.open(path), "mcap", out, 0)
-    theirs = messages(out)
+    export(simulate(SHORT.model_copy(update={"sensing": FIELD})), "mcap", out)
+    theirs, seen = messages(out), set()
     with open(out, "rb") as file:
         decoded = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
-        for _, channel, message, mine in islice(decoded, 30):
+        for _, channel, message, mine in islice(decoded, 300):
             other = theirs[channel.topic][2][message.sequence]
+            seen.add(channel.topic)
             if channel.topic == "/imu":
                 assert mine.linear_acceleration.x == other.linear_acceleration.x
-            elif channel.topic == "/joint_states":
-                assert list(mine.velocity) == list(other.velocity)
+            elif channel.topic in ("/joint_states", "/encoders"):
+                assert list(mine.position) == list(other.position) and list(mine.velocity) == list(other.velocity)
+            elif channel.topic == "/encoder_counts":
+                assert list(mine.data) == list(other.data) and mine.layout.dim[0].label == "wheel"
+            elif channel.topic == "/fix":
+                assert list(mine.pose.covariance) == list(other.pose.covariance)
             else:
-                deep = channel.topic in ("/odom", "/reference")
-                a, b = (m.twist.twist if deep else m.twist for m in (mine, other))
+                a, b = twist(mine), twist(other)
                 assert a.linear.x == b.linear.x and a.angular.z == b.angular.z
+    assert seen == set(theirs)
     with AnyReader([out]) as reader:
         for connection in reader.connections:
             embedded = reader.typestore.fielddefs[connection.msgtype]
@@ -132,7 +210,7 @@ def test_several(result, path, tmp_path):
     out = tmp_path / "runs.mcap"
     assert export(mrctl.open(path), "mcap", out) == 2
     found = messages(out)
-    assert {topic.split("/")[1] for topic in found} == {"run0", "run1"} and len(found) == 12
+    assert {topic.split("/")[1] for topic in found} == {"run0", "run1"} and len(found) == 16
     driven = int(np.isfinite(result.x[1]).sum())
     assert len(found["/run0/odom"][1]) == 300 and len(found["/run1/odom"][1]) == driven < 110
 
@@ -207,8 +285,22 @@ def test_sweep(tmp_path):
     table, signals = pd.read_parquet(out), mrctl.open(tmp_path / "decimated")
     assert table["run"].value_counts().to_dict() == {0: 30, 1: 30, 2: 30}
     assert np.array_equal(table["omega"].to_numpy().reshape(3, 30), signals.omega.values)
+    assert main(["export", str(tmp_path / "decimated"), "--to", "mcap", "--out", str(tmp_path / "sweep.mcap")]) == 0
+    found = messages(tmp_path / "sweep.mcap")
+    assert len(found) == 3 * 8 and found["/run1/imu"][1] == [100_000_000 * k for k in range(30)]
+    assert np.array_equal([m.angular_velocity.z for m in found["/run2/imu"][2]], signals.gyro[2])
+    with pytest.raises(InputError, match="does not hold its scenarios"):
+        export(signals, "mcap", tmp_path / "none.mcap")
     with pytest.raises(InputError, match="holds metrics only"):
         export(mrctl.open(tmp_path / "metrics"), "csv", tmp_path / "none.csv")
+
+
+def test_older(result, tmp_path):
+    """A result of an older mrctl, which lacks what a topic needs: one line that names it; tables need nothing."""
+    older = result.drop_vars("gyro").assign_attrs(versions='{"mrctl": "0.1.0"}')
+    with pytest.raises(InputError, match="gyro: not a variable of this result, which mrctl 0.1.0 wrote"):
+        export(older, "mcap", tmp_path / "run.mcap")
+    assert export(older, "csv", tmp_path / "run.csv") == 2
 
 
 def test_command(path, tmp_path, capsys):

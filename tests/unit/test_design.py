@@ -6,7 +6,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from mrctl.control.design import DAMPING, M_S, M_T, PUBLISHED, SPEEDS, design, fastest, motion, plants
+from mrctl.control.design import (
+    DAMPING,
+    ERROR,
+    M_S,
+    M_T,
+    PUBLISHED_K_THETA,
+    PUBLISHED_K_X,
+    SPEEDS,
+    design,
+    fastest,
+    motion,
+    plants,
+)
 from mrctl.control.pid import Pid
 from mrctl.record import InputError
 from mrctl.theory.linear import TYRE_LAG, first_order
@@ -182,6 +194,11 @@ def test_motion_controller(robot, steering, delay):
     assert (np.diff(lateral) < 1e-6).all() and lateral[-1] >= DAMPING - 1e-9
     assert kanayama.k_theta > omega * robot.max_speed * kanayama.k_y
     assert kanayama.k_theta**2 == pytest.approx(4 * kanayama.k_y)
-    capped = kanayama.k_x == PUBLISHED.k_x, kanayama.k_y == PUBLISHED.k_y
+    # A step of the error is corrected within the limits on acceleration: at K e, and as fast as the loop moves.
+    reach = kanayama.k_x**2 * ERROR, robot.max_speed**2 * kanayama.k_y**1.5 * ERROR
+    limits = robot.max_acceleration, robot.max_rotation_acceleration
+    assert all(most <= limit * (1 + 1e-9) for most, limit in zip(reach, limits, strict=True))
+    capped = [most == pytest.approx(limit) for most, limit in zip(reach, limits, strict=True)]
+    capped = capped[0] or kanayama.k_x == PUBLISHED_K_X, capped[1] or kanayama.k_theta == PUBLISHED_K_THETA
     assert capped[0] or damping(v, 1, kanayama.k_x) == pytest.approx(DAMPING)
     assert capped[1] or lateral[-1] == pytest.approx(DAMPING)

@@ -1,174 +1,363 @@
-"""The sensors show the controller the truth to the bit, or odometry that integrates as it should, and slip."""
+"""Each sensor shows what its data sheet would: counts, densities, rates, ages; and what MuJoCo's own sensors show."""
 
+import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
-from mrctl.kernel import over_rows
-from mrctl.physics.plant import PLANT
-from mrctl.sensing.sensors import SEEN, Sensors, observe
+from mrctl import Circle, Perturbation, Scenario, simulate
+from mrctl.physics import mjcf
+from mrctl.physics.files import models_folder
+from mrctl.physics.plant import PLANT, BatchPlant, PhysicsPlant
+from mrctl.sensing.sensors import OUTLIER, SAMPLE, Sensors
 from mrctl.sensing.slip import SLIP_FILTER, slip_ratio
+from mrctl.sensing.tiers import Sensing
+from mrctl.theory.robot import CAR, RobotFile
+
+PERIOD = 0.01
+NOISY = {"gyro_noise": 1e-3, "gyro_walk": 1e-3, "gyro_bias": 0.01, "accelerometer_noise": 1e-3,
+         "accelerometer_walk": 1e-3, "accelerometer_bias": 0.1, "encoder_counts": 1000, "fix_position_noise": 0.01,
+         "fix_heading_noise": 0.02, "fix_lost": 0.2, "fix_outliers": 0.1}  # fmt: skip
+STREAMS = [name for name in SAMPLE.names or () if name not in ("grip", "command")]
 
 
-def numbers(*shape, bound=5.0):
-    return arrays(float, shape, elements=st.floats(-bound, bound))
+def ideal(**values):
+    """Returns exact sensors but for these values."""
+    return Sensing(tier="ideal", **values)
 
 
-def records(size, **fields):
-    """Returns `size` records of `SEEN` with these fields; `speed` in m/s is what the encoders show of V, `(B,)`."""
-    seen = np.zeros(size, SEEN)
-    if "speed" in fields:
-        seen["wheel_speeds"] = np.reshape(fields.pop("speed"), (-1, 1))
-    for name, value in fields.items():
-        seen[name] = value
-    return seen
+def plants(size=1):
+    """Returns robots that rest at the origin, on level ground."""
+    plant = np.zeros(size, PLANT)
+    plant["gravity"] = 0, 0, -9.81
+    return plant
 
 
-def circle(start, v, omega, time):
-    """Returns the pose after `time` at a constant twist, computed with complex numbers."""
-    p = complex(*start[:2]) + v / (1j * omega) * np.exp(1j * start[2]) * (np.exp(1j * omega * time) - 1)
-    return np.array([p.real, p.imag, start[2] + omega * time])
+def stream(sensing, ticks, seeds=(0,), plant=None, first=0):
+    """Returns the samples of some ticks, `(ticks, B)`, of robots with the same or with their own sensing."""
+    seeds = list(seeds)
+    sensors = Sensors(sensing if isinstance(sensing, list) else [sensing] * len(seeds), seeds, PERIOD)
+    return samples(sensors, ticks, plants(len(seeds)) if plant is None else plant, first)
 
 
-def dead_reckoning(start, v, omega, duration, period, noise=(0, 0, 0, 0, 0), shown=None):
-    """Returns odometry's last pose at a constant twist for which the encoders show the speed `shown`."""
-    shown = v if shown is None else shown
-    twist = shown + noise[3], omega + noise[4]
-    s = records(1, pose=start, twist=twist, odometry=True, noise=noise, speed=shown, elapsed=period)[0]
-    lost = np.full(3, np.nan)  # odometry never looks at the true pose
-    for _ in range(round(duration / period)):
-        observe(lost, np.array([v, omega]), s)
-    return s["pose"]
+def samples(sensors, ticks, plant, first=0):
+    found = np.zeros((ticks, len(plant)), SAMPLE)
+    for k in range(ticks):
+        plant["wheel_angles"] += 0.002, 0.003
+        sensors.measure(first + k, plant)
+        found[k] = sensors.ring[(first + k) % len(sensors.ring)]
+    return found
 
 
-@given(numbers(4, 3), numbers(4, 2), numbers(4, 3))
-def test_truth(true_pose, true_twist, before):
-    """Without noise the truth passes to the bit, whatever was measured before and whatever the encoders show."""
-    seen = records(4, pose=before, twist=1.0, speed=99.0, elapsed=0.01)
-    over_rows(observe, true_pose, true_twist, seen)
-    np.testing.assert_array_equal(seen["pose"], true_pose)
-    np.testing.assert_array_equal(seen["twist"], true_twist)
-
-
-@given(numbers(4, 3), numbers(4, 2), numbers(4, 5, bound=0.1))
-def test_noise(true_pose, true_twist, noise):
-    """Each sample of the noise is added to its own signal."""
-    seen = records(4, noise=noise, elapsed=0.01)
-    over_rows(observe, true_pose, true_twist, seen)
-    measured = np.hstack([seen["pose"], seen["twist"]])
-    np.testing.assert_array_equal(measured, np.hstack([true_pose, true_twist]) + noise)
-
-
-def test_odometry_order():
-    """At a constant twist the heading is exact, and half the period makes the position error a quarter."""
-    start, exact = [0.3, -0.2, 0.5], circle([0.3, -0.2, 0.5], 0.8, 1.3, 2.0)
-    errors = [dead_reckoning(start, 0.8, 1.3, 2.0, h) - exact for h in (0.2, 0.1, 0.05, 0.01)]
-    sizes = [np.hypot(*error[:2]) for error in errors]
-    assert sizes[0] / sizes[1] == pytest.approx(4, rel=0.02)
-    assert sizes[1] / sizes[2] == pytest.approx(4, rel=0.01)
-    assert sizes[-1] < 1e-4
-    np.testing.assert_allclose([error[2] for error in errors], 0, atol=1e-12)
-
-
-def test_odometry_of_a_varying_twist():
-    """Odometry takes a changing twist at the middle of the period, so it is of second order there too."""
-
-    def end(h):
-        s = records(1, twist=(0.5, 0.0), odometry=True, elapsed=h)[0]
-        for t in h * np.arange(1, round(2 / h) + 1):
-            v, omega = 0.5 + 0.4 * np.sin(2 * t), np.sin(3 * t)
-            s["wheel_speeds"] = v
-            observe(np.zeros(3), np.array([9.0, omega]), s)
-        return s["pose"]
-
-    exact = end(1e-4)
-    errors = [np.abs(end(h) - exact).max() for h in (0.1, 0.05)]
-    assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
-    assert exact[2] == pytest.approx((1 - np.cos(6)) / 3, abs=1e-7)
-
-
-@pytest.mark.parametrize("factor", [0.95, 1.05])
-def test_wrong_wheel_radius(factor):
-    """With encoders that show 5 % too much, odometry has the same turns and a path that is 5 % too large."""
-    start = np.array([1.0, 2.0, 0.4])
-    true = dead_reckoning(start, 0.8, 1.3, 3.0, 0.01)
-    seen = dead_reckoning(start, 0.8, 1.3, 3.0, 0.01, shown=0.8 * factor)
-    np.testing.assert_allclose(seen[:2] - start[:2], factor * (true - start)[:2], atol=1e-12)
-    assert seen[2] == true[2]
-
-
-def test_odometry_noise():
-    """Only the noise of encoders and gyro reaches odometry, which integrates it."""
-    biased = dead_reckoning([0, 0, 0], 0.8, 1.3, 1.0, 0.01, noise=(9, 9, 9, 0.05, -0.1))
-    np.testing.assert_allclose(biased, dead_reckoning([0, 0, 0], 0.85, 1.2, 1.0, 0.01), atol=1e-12)
+# -- encoders ----------------------------------------------------------------------------------------------------------
 
 
 @given(
-    numbers(4, 3), numbers(4, 2), numbers(4, 5), arrays(bool, 4), numbers(4), numbers(4, 3), numbers(4, 2),
+    st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=12), st.integers(1, 10**6), st.integers(0, 2**32 - 1),
+    st.sampled_from([0, 50, 25]),
 )  # fmt: skip
-def test_rows(true_pose, true_twist, noise, odometry, speed, pose, twist):
-    """Robots do not mix: a row has the same bits alone and beside others, one of which has no finite twist."""
-
-    def answer(rows, lost=()):
-        fields = {"noise": noise, "odometry": odometry, "speed": speed, "pose": pose, "twist": twist}
-        chosen = {name: values[rows] for name, values in fields.items()}
-        seen = records(len(chosen["pose"]), elapsed=0.01, **chosen)
-        true = true_twist[rows].copy()
-        true[list(lost)] = np.nan
-        over_rows(observe, true_pose[rows], true, seen)
-        return np.hstack([seen["pose"], seen["twist"]])
-
-    together = answer(slice(None), lost=[1])
-    for i in (0, 2, 3):
-        assert together[i].tobytes() == answer(slice(i, i + 1))[0].tobytes()
-
-
-def test_start(robot):
-    """The first measurement is the true posture for odometry too, which integrates from the second one on."""
-    start, v, omega, period = np.array([0.3, -0.2, 0.5]), 0.8, 1.3, 0.01
-    plant = np.zeros(2, PLANT)
-    reading = plant["reading"]
-    reading["pose"], reading["twist"] = start, (v, omega)
-    reading["wheel_rates"] = (v + np.array([-1, 1]) * robot.half_track * omega) / robot.wheel_radius
-    sensors = Sensors([True, False], [0, 1], robot, period)
-    sensors.start(reading)
-    assert np.array_equal(sensors.measure(plant)["pose"], [start, start])
-    seen = sensors.measure(plant)
-    np.testing.assert_allclose(seen["pose"], [circle(start, v, omega, period), start], atol=1e-6)
-    np.testing.assert_allclose(seen["twist"], [(v, omega)] * 2, atol=1e-12)
-    sensors.restart(0, 0, reading)
-    assert np.array_equal(sensors.measure(plant)["pose"], [start, start])
+def test_encoder_counts(angles, counts, seed, rate):
+    """An encoder is never more than a count off, whatever its phase; its rate is the difference of two samples."""
+    sensors = Sensors([ideal(encoder_counts=counts, encoder_rate=rate)], [seed], PERIOD)
+    plant, count, every = plants(), 2 * np.pi / counts, round(100 / rate) if rate else 1
+    before = None
+    for tick, angle in enumerate(angles):
+        plant["wheel_angles"] = angle, -angle
+        plant["reading"]["wheel_rates"] = 7.0, 8.0
+        sensors.measure(tick, plant)
+        now = sensors.ring[tick % len(sensors.ring), 0].copy()
+        assert now["encoder_new"] == (tick % every == 0)
+        if now["encoder_new"]:
+            assert (np.abs(now["encoder"] - [angle, -angle]) <= count + 1e-9).all()
+            whole = now["encoder"] / count
+            np.testing.assert_allclose(whole, np.round(whole), atol=1e-6)
+            expected = (7.0, 8.0) if before is None else (now["encoder"] - before["encoder"]) / (every * PERIOD)
+        assert before is None or now["encoder_new"] or (now["encoder"] == before["encoder"]).all()
+        np.testing.assert_allclose(now["rate"], expected, rtol=1e-12, atol=1e-9)
+        before = now
 
 
-def slip_of(wheels, twist, ticks=400):
+def test_encoder_error_does_not_grow():
+    """The angle that the rates add up to stays within a count after thousands of ticks: the error is no random walk."""
+    counts, ticks = 200, 3000
+    sensors, plant = Sensors([ideal(encoder_counts=counts)], [3], PERIOD), plants()
+    angle = np.cumsum(0.03 + 0.02 * np.sin(np.arange(ticks) / 50))
+    total, worst, first = 0.0, 0.0, None
+    for tick in range(ticks):
+        plant["wheel_angles"] = angle[tick]
+        sensors.measure(tick, plant)
+        now = sensors.ring[tick % len(sensors.ring), 0]
+        first = now["encoder"][0] if first is None else first
+        total += now["rate"][0] * PERIOD if tick else 0.0
+        worst = max(worst, abs(first + total - angle[tick]))
+    assert 0.3 < worst / (2 * np.pi / counts) < 1 + 1e-9
+
+
+def test_phases():
+    """The phases of the encoders differ from wheel to wheel and from seed to seed, evenly from 0 to 1."""
+    phases = Sensors([ideal(encoder_counts=100)] * 500, list(range(500)), PERIOD).sensors["phase"]
+    assert phases.min() >= 0 and phases.max() < 1
+    np.testing.assert_allclose(
+        np.quantile(phases, [0.1, 0.5, 0.9], axis=0), [[0.1] * 2, [0.5] * 2, [0.9] * 2], atol=0.06
+    )
+    assert abs(np.corrcoef(phases.T)[0, 1]) < 0.15
+
+
+# -- gyro and accelerometer --------------------------------------------------------------------------------------------
+
+
+def allan(samples, period, lengths):
+    """Returns the overlapping Allan deviation at averaging times of some samples, over robots together, `(n, B)`."""
+    angle = np.vstack([np.zeros(samples.shape[1]), np.cumsum(samples, 0)]) * period
+    second = [angle[2 * m :] - 2 * angle[m:-m] + angle[: -2 * m] for m in lengths]
+    return np.array([np.sqrt((d**2).mean() / 2) / (m * period) for d, m in zip(second, lengths, strict=True)])
+
+
+@pytest.mark.parametrize("rate", [0, 50])
+@pytest.mark.parametrize("name", ["gyro", "accelerometer"])
+def test_allan_deviation(name, rate):
+    """The Allan deviation is N/√τ at short and K√(τ/3) at long averaging times, with slopes −½ and +½."""
+    density, walk, ticks = 1e-3, 3e-3, 50_000  # the two are equal at √3 N/K = 0.6 s
+    sensing = ideal(**{f"{name}_noise": density, f"{name}_walk": walk, f"{name}_rate": rate})
+    found = stream(sensing, ticks, range(48))
+    every = 2 if rate else 1
+    values = found["gyro"] if name == "gyro" else found["acceleration"].reshape(ticks, -1)
+    values, period = values[::every], every * PERIOD
+    for lengths, expected, slope in (
+        (np.array([1, 2, 3]), lambda tau: density / np.sqrt(tau), -0.5),
+        (np.array([6, 12, 20, 30]) * round(1 / period), lambda tau: walk * np.sqrt(tau / 3), 0.5),
+    ):
+        tau, deviation = lengths * period, allan(values, period, lengths)
+        np.testing.assert_allclose(deviation, expected(tau), rtol=0.1)
+        assert np.polyfit(np.log(tau), np.log(deviation), 1)[0] == pytest.approx(slope, rel=0.1)
+
+
+def test_bias():
+    """The biases at the start have the deviation of the data sheet, and are added to the truth."""
+    plant = plants(2000)
+    plant["reading"]["twist"][:, 1], plant["specific_force"] = 0.4, (1.0, -2.0)
+    first = stream(ideal(gyro_bias=0.03, accelerometer_bias=0.2), 1, range(2000), plant)[0]
+    assert first["gyro"].std() == pytest.approx(0.03, rel=0.06)
+    assert first["gyro"].mean() == pytest.approx(0.4, abs=0.003)
+    np.testing.assert_allclose(first["acceleration"].std(0), 0.2, rtol=0.06)
+    np.testing.assert_allclose(first["acceleration"].mean(0), [1, -2], atol=0.02)
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.7, np.pi / 2])
+def test_gravity(heading):
+    """On a slope of 10° that climbs along the world's x, a resting accelerometer feels g sin 10° towards the summit."""
+    model, robot = mjcf.build()
+    slope = np.radians(10)
+    for plant in (PhysicsPlant(model, robot, 5), BatchPlant(model, robot, 2, 5)):
+        for row in range(plant.size):
+            plant.perturb(row, Perturbation(slope=slope), 0)
+        plant.reset(np.tile([0, 0, heading], (plant.size, 1)), np.zeros((plant.size, 2)))
+        sensors = Sensors([ideal()] * plant.size, range(plant.size), PERIOD)
+        sensors.measure(0, plant.state)
+        expected = 9.81 * np.sin(slope) * np.array([np.cos(heading), -np.sin(heading)])
+        np.testing.assert_allclose(sensors.ring[0]["acceleration"], np.tile(expected, (plant.size, 1)), atol=1e-9)
+
+
+def chassis_acceleration(model, data):
+    """Returns the specific force at the site `imu` as MuJoCo's accelerometer computes it, `(3,)`."""
+    mujoco.mj_rnePostConstraint(model, data)
+    found = np.zeros(6)
+    mujoco.mj_objectAcceleration(model, data, mujoco.mjtObj.mjOBJ_SITE, model.site("imu").id, found, 1)
+    return found[3:]
+
+
+@pytest.mark.parametrize("name", ["car", "turtlebot", "racecar"])
+def test_engine(name):
+    """In a driven run encoders, gyro and accelerometer show what MuJoCo's own sensors at the wheels and `imu` show."""
+    chosen = CAR if name == "car" else RobotFile(path=name)
+    model, robot = mjcf.build("flat", mjcf.arrangement(chosen), 0.001, chosen)
+    plant, substeps = PhysicsPlant(model, robot, 10), 10
+    plant.reset(np.zeros((1, 3)), np.array([[0.2, 0.3]]))
+    counts, data = 2000, mujoco.MjData(model)
+    sensors = Sensors([ideal(encoder_counts=counts)], [0], PERIOD)
+    rng = np.random.default_rng(4)
+    ours, engine = [], []
+    for tick in range(150):
+        if tick % 15 == 0:
+            command = np.array([[*rng.uniform(0.1, 0.5, 2) * robot.supply, 0.1, 0.0]])
+        data.qpos[:], data.qvel[:], data.act[:] = plant.qpos[0], plant.qvel[0], plant.act[0]
+        plant.step(command)
+        data.ctrl[:] = plant.ctrl[0]
+        force = np.zeros(3)
+        for _ in range(substeps):
+            mujoco.mj_forward(model, data)
+            felt = chassis_acceleration(model, data)
+            if name == "car":
+                np.testing.assert_allclose(felt, data.sensor("accelerometer").data, atol=1e-9)
+            force += felt / substeps
+            mujoco.mj_step(model, data)
+        mujoco.mj_forward(model, data)
+        sensors.measure(tick, plant.state)
+        now = sensors.ring[tick % len(sensors.ring), 0]
+        wheels = [data.joint(f"wheel_{side}").qpos[0] for side in ("left", "right")]
+        spin = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, model.site("imu").id, spin, 1)
+        if name == "car":
+            assert wheels == [data.sensor(f"encoder_{side}").data[0] for side in ("left", "right")]
+            assert spin[2] == pytest.approx(data.sensor("gyro").data[2], abs=1e-12)
+        assert (np.abs(now["encoder"] - wheels) <= 2 * np.pi / counts).all()
+        assert now["gyro"] == pytest.approx(spin[2], abs=1e-9)
+        ours.append(now["acceleration"].copy())
+        engine.append(force[:2])
+    ours, engine = np.array(ours), np.array(engine)
+    for k in range(2):
+        assert np.sqrt(np.mean((ours - engine)[:, k] ** 2)) < 0.01 * np.sqrt(np.mean(engine[:, k] ** 2))
+
+
+@pytest.mark.parametrize("name", ["car", "turtlebot", "racecar"])
+def test_models(name):
+    """Every robot's file has encoders, gyro and accelerometer, at the place that `Plant.imu` names."""
+    model = mujoco.MjModel.from_xml_path(str(models_folder() / f"{name}.xml"))
+    chosen = CAR if name == "car" else RobotFile(path=name)
+    world, robot = mjcf.build("flat", mjcf.arrangement(chosen), 0.002, chosen)
+    plant = PhysicsPlant(world, robot, 5)
+    assert plant.imu[0] > 0 and np.array_equal(plant.imu, model.site("imu").pos)  # P is the origin of all three files
+    data = mujoco.MjData(model)
+    data.qpos[7:], data.qvel[3:6] = np.arange(1, model.nq - 6), (0, 0, 0.7)
+    mujoco.mj_forward(model, data)
+    assert data.sensor("gyro").data[2] == pytest.approx(0.7)
+    for side, motor in zip(("left", "right"), range(2), strict=True):
+        driven = model.joint(model.actuator_trnid[motor, 0])
+        assert side in driven.name and data.sensor(f"encoder_{side}").data[0] == data.qpos[driven.qposadr[0]]
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.sensor("accelerometer").data, 0, atol=1e-9)  # these files have no floor: free fall
+
+
+# -- fixes -------------------------------------------------------------------------------------------------------------
+
+
+def test_fixes():
+    """The errors of fixes have the deviations of the data sheet, and the stated shares are lost and wrong."""
+    plant = plants(50)
+    plant["reading"]["pose"] = 1.0, -2.0, 0.5
+    sensing = ideal(fix_position_noise=0.01, fix_heading_noise=0.02, fix_lost=0.3, fix_outliers=0.2)
+    found = stream(sensing, 2000, range(50), plant)
+    assert found["fix_taken"].all()
+    assert found["fix_arrives"].mean() == pytest.approx(0.7, abs=0.01)
+    error = found["fix"] - (1.0, -2.0, 0.5)
+    wrong = (np.abs(error[..., :2]) > 0.06).any(-1)
+    assert wrong.mean() == pytest.approx(0.2, abs=0.01)  # of which hardly one in 250 is smaller than six deviations
+    np.testing.assert_allclose(error[~wrong].std(0), [0.01, 0.01, 0.02], rtol=0.02)
+    np.testing.assert_allclose(error[~wrong].mean(0), 0, atol=3e-4)
+    assert np.abs(np.corrcoef(error[~wrong].T) - np.eye(3)).max() < 0.02
+    outliers = error[wrong][:, :2]
+    assert np.abs(outliers).max() < OUTLIER + 0.05
+    np.testing.assert_allclose(outliers.std(0), OUTLIER / np.sqrt(3), rtol=0.03)
+    assert error[wrong][:, 2].std() == pytest.approx(0.02, rel=0.03)
+    lost = ~found["fix_arrives"]
+    assert abs(np.corrcoef(lost.ravel(), wrong.ravel())[0, 1]) < 0.02
+
+
+# -- rates, latencies, seeds -------------------------------------------------------------------------------------------
+
+
+def test_rates_and_latencies():
+    """Every sensor has its own rate and latency: a slow run shows the signals of a quick one, later and held."""
+    base = Scenario(reference=Circle(period=4, radius=0.6), laps=1, feedforward="none", seed=2)
+    own = {"encoder": (50, 0.03), "gyro": (25, 0.01), "accelerometer": (20, 0.02), "fix": (10, 0.05)}
+    values = {f"{name}_rate": rate for name, (rate, _) in own.items()}
+    values |= {f"{name}_latency": latency for name, (_, latency) in own.items()}
+    quick = simulate(base.model_copy(update={"sensing": ideal()}))
+    slow = simulate(base.model_copy(update={"sensing": ideal(**values)}))
+    signals = {
+        "encoder": ("encoder_left", "encoder_right"), "gyro": ("gyro",), "fix": ("fix_x", "fix_y", "fix_theta"),
+        "accelerometer": ("acceleration_x", "acceleration_y"),
+    }  # fmt: skip
+    ticks = np.arange(quick.sizes["time"])
+    assert np.array_equal(quick.v, slow.v)
+    for name, (rate, latency) in own.items():
+        every, late = round(100 / rate), round(latency / PERIOD)
+        taken = np.maximum(ticks - late, 0) // every * every
+        for signal in signals[name]:
+            expected = quick[signal].values[taken]
+            if name == "fix":
+                expected = np.where(
+                    (ticks >= late) & ((ticks - late) % every == 0), quick[signal].values[taken], np.nan
+                )
+            assert np.array_equal(slow[signal].values, expected, equal_nan=True), signal
+    for signal, true in (("gyro", "omega"), ("fix_x", "x"), ("fix_y", "y"), ("fix_theta", "theta")):
+        assert np.array_equal(quick[signal], quick[true])
+
+
+def test_company():
+    """The same seed gives the same bits, alone, and beside other robots with other sensors; another seed, others."""
+    sensing = ideal(**NOISY)
+    alone = stream(sensing, 600, [7])
+    beside = stream([Sensing(tier="field"), sensing, sensing, ideal()], 600, [1, 7, 8, 9])
+    assert alone[:, 0].tobytes() == stream(sensing, 600, [7])[:, 0].tobytes()
+    for name in STREAMS:
+        assert np.array_equal(beside[name][:, 1], alone[name][:, 0]), name
+        if not name.endswith("_new") and name != "fix_taken":
+            assert not np.array_equal(beside[name][:, 2], alone[name][:, 0]), name
+
+
+@pytest.mark.parametrize("off", ["gyro", "accelerometer", "encoder", "fix", "fix_lost", "fix_outliers"])
+def test_streams(off):
+    """A sensor that loses its noise changes no number of the others."""
+    quiet = {name: value for name, value in NOISY.items() if not name.startswith(off)}
+    one, other = stream(ideal(**NOISY), 600), stream(ideal(**quiet), 600)
+    changed = {name for name in STREAMS if not np.array_equal(one[name], other[name])}
+    expected = {
+        "gyro": {"gyro"}, "accelerometer": {"acceleration"}, "encoder": {"encoder", "rate"},
+        "fix": {"fix", "fix_arrives"}, "fix_lost": {"fix_arrives"}, "fix_outliers": {"fix"},
+    }[off]  # fmt: skip
+    assert changed == expected
+    if off == "fix_outliers":
+        same = (one["fix"] == other["fix"]).all(-1)
+        assert same.mean() == pytest.approx(0.9, abs=0.05)
+
+
+@given(st.integers(0, 600), st.integers(0, 100))
+@settings(max_examples=25)
+def test_restart(tick, seed):
+    """Sensors that are switched on in the middle of a run of others give the bits of a run from the beginning."""
+    sensing = ideal(**NOISY, gyro_rate=50, fix_rate=20)
+    fresh = stream(sensing, 300, [seed])
+    sensors = Sensors([sensing, sensing], [1, 2], PERIOD)
+    sensors.measure(max(tick - 1, 0) // 256 * 256, plants(2))  # draws the block in which the restart falls
+    sensors.restart(1, seed, tick)
+    later = samples(sensors, 300, plants(2), tick)
+    for name in STREAMS:
+        taken = fresh["fix_taken"][:, 0] if name == "fix" else slice(None)
+        assert np.array_equal(later[name][taken, 1], fresh[name][taken, 0]), name
+
+
+# -- slip --------------------------------------------------------------------------------------------------------------
+
+
+def slip_of(wheels, v, omega, ticks=400):
     """Returns the slip ratio after a slip has lasted for some ticks."""
     slip = 0.0
     for _ in range(ticks):
-        slip = slip_ratio(np.array(wheels, float), np.array(twist, float), 0.2, 0.01, slip)
+        slip = slip_ratio(np.array(wheels, float), float(v), float(omega), 0.2, PERIOD, slip)
     return slip
 
 
-@given(numbers(2))
-def test_rolling_is_no_slip(twist):
+@given(st.floats(-5, 5), st.floats(-5, 5))
+def test_rolling_is_no_slip(v, omega):
     """Wheels that turn as fast as the floor passes below them do not slip, at any twist."""
-    v, omega = twist
-    assert slip_of([v - 0.2 * omega, v + 0.2 * omega], twist) == pytest.approx(0, abs=1e-12)
+    assert slip_of([v - 0.2 * omega, v + 0.2 * omega], v, omega) == pytest.approx(0, abs=1e-12)
 
 
 def test_slip_ratio():
     """The slip ratio shows driving and braking of either wheel in both directions, and hardly shows noise at rest."""
     for sign in (1, -1):
-        assert slip_of([sign * 1.0, sign * 1.25], [sign * 1.0, 0.0]) == pytest.approx(0.2)
-        assert slip_of([sign * 0.8, sign * 1.0], [sign * 1.0, 0.0]) == pytest.approx(0.2)
-    assert slip_of([0.8, 1.2], [1.0, 0.0]) == pytest.approx(0.2)  # a robot that does not turn as its wheels do
-    assert slip_of([0.015, 0.0], [0.0, 0.0]) == pytest.approx(0.05)
+        assert slip_of([sign * 1.0, sign * 1.25], sign * 1.0, 0.0) == pytest.approx(0.2)
+        assert slip_of([sign * 0.8, sign * 1.0], sign * 1.0, 0.0) == pytest.approx(0.2)
+    assert slip_of([0.8, 1.2], 1.0, 0.0) == pytest.approx(0.2)  # a robot that does not turn as its wheels do
+    assert slip_of([0.015, 0.0], 0.0, 0.0) == pytest.approx(0.05)
 
 
 def test_slip_lasts():
     """A slip that has ended fades with the filter's time constant."""
     slip = 1.0
     for _ in range(round(SLIP_FILTER / 0.001)):
-        slip = slip_ratio(np.ones(2), np.array([1.0, 0.0]), 0.2, 0.001, slip)
+        slip = slip_ratio(np.ones(2), 1.0, 0.0, 0.2, 0.001, slip)
     assert slip == pytest.approx(np.exp(-1), rel=0.01)

@@ -1,0 +1,343 @@
+"""The extended Kalman filter against a textbook's, written with dense matrices, and against what it should not do."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mrctl.physics.plant import PLANT
+from mrctl.sensing import ekf as laws
+from mrctl.sensing.ekf import (
+    BIAS, EKF, FIX_GATE, LEFT, LOST, OFFSET, OMEGA, RIGHT, SCALE_LEFT, SCALE_RIGHT, THETA, V, X, Y, N,
+)  # fmt: skip
+from mrctl.sensing.estimators import Estimator
+from mrctl.sensing.prediction import wrapped
+from mrctl.sensing.sensors import SAMPLE, Sensors
+from mrctl.sensing.tiers import Sensing
+
+T, SKEW = 0.01, 0.001
+RADIUS, HALF, AHEAD = 0.098, 0.188, 0.1
+GEOMETRY = np.array([RADIUS, HALF, AHEAD, SKEW])
+
+
+# -- the filter of a textbook ------------------------------------------------------------------------------------------
+
+
+def motion(x, acceleration, theta_dot_dot):
+    """Returns the state a period later, from the equations in the filter's documentation, by the midpoint rule."""
+    v, omega = x[V] + acceleration * T / 2, x[OMEGA] + theta_dot_dot * T / 2
+    # The rear axle moves along θ − c θ̇; velocities are half a physics step behind positions.
+    heading = x[THETA] + omega * T / 2 - (laws.SIDE - SKEW) * omega
+    new = np.array(x)
+    new[X] += T * v * np.cos(heading)
+    new[Y] += T * v * np.sin(heading)
+    new[THETA] += T * omega
+    new[V] += T * acceleration
+    new[OMEGA] += T * theta_dot_dot
+    new[LEFT] += T * (v - HALF * omega) / (RADIUS * (1 + x[SCALE_LEFT]))
+    new[RIGHT] += T * (v + HALF * omega) / (RADIUS * (1 + x[SCALE_RIGHT]))
+    return new
+
+
+def jacobian(f, x):
+    """Returns ∂f/∂x to rounding, with complex steps."""
+    columns = [f(x.astype(complex) + 1e-30j * np.eye(len(x))[j]).imag / 1e-30 for j in range(len(x))]
+    return np.stack(columns, axis=1)
+
+
+def process_noise(x, grip, s, acceleration, theta_dot_dot):
+    """Returns the covariance that a period adds."""
+    v, omega = x[V] + acceleration * T / 2, x[OMEGA] + theta_dot_dot * T / 2
+    heading = x[THETA] + omega * T / 2 - (laws.SIDE - SKEW) * omega
+    across = np.array([-np.sin(heading), np.cos(heading)])
+    Q = np.zeros((N, N))
+    Q[:2, :2] = T * (laws.SIDE_SLIP if grip.all() else laws.SKID) ** 2 * np.outer(across, across)
+    Q[V, V] = T**2 * s["acceleration_variance"] + (0 if grip.any() else T * laws.LOOSE_V**2)
+    Q[OMEGA, OMEGA] = T * laws.TURN**2
+    Q[BIAS, BIAS] = T * s["bias_walk"] ** 2
+    Q[OFFSET, OFFSET] = T * (s["offset_walk"] ** 2 + (s["offset"] - x[OFFSET]) ** 2 / laws.SETTLE)
+    for wheel, scale, side in ((LEFT, SCALE_LEFT, -1), (RIGHT, SCALE_RIGHT, 1)):
+        rate = (v + side * HALF * omega) / (RADIUS * (1 + x[scale]))
+        Q[wheel, wheel] = T * (laws.CREEP * rate) ** 2
+        Q[scale, scale] = T * laws.RADIUS_WALK**2
+    return Q
+
+
+def joseph(x, P, residual, H, R):
+    """Updates by a measurement, with the covariance in Joseph's form, which holds for any gain."""
+    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    rest = np.eye(N) - gain @ H
+    return x + gain @ residual, rest @ P @ rest.T + gain @ R @ gain.T
+
+
+def textbook(s, sample, theta_dot_dot):
+    """Returns mean and covariance of one step of the filter: prediction, encoders, gyro."""
+    x, P, grip = s["mean"].copy(), s["P"].copy(), sample["grip"] == 1
+    acceleration = sample["acceleration"][0] + AHEAD * x[OMEGA] ** 2 - x[OFFSET]
+    F = jacobian(lambda z: motion(z, acceleration, theta_dot_dot), x)
+    F[V, OFFSET] = -T  # the acceleration is an input less the offset, whose effect of T²/2 on x, y and λ is left out
+    Q = process_noise(x, grip, s, acceleration, theta_dot_dot)
+    x, P = motion(x, acceleration, theta_dot_dot), F @ P @ F.T + Q
+    for k, wheel in enumerate((LEFT, RIGHT)):
+        if not grip[k]:  # the angle of a wheel that slips says nothing of the robot, and is known afresh
+            P[wheel], P[:, wheel] = 0, 0
+            x[wheel], P[wheel, wheel] = sample["encoder"][k], s["encoder_variance"]
+    rows = np.array([np.eye(N)[LEFT], np.eye(N)[RIGHT], np.eye(N)[OMEGA] + np.eye(N)[BIAS]])
+    z = np.array([*sample["encoder"], sample["gyro"] + theta_dot_dot * SKEW])
+    used = [*grip, True]
+    R = np.diag([s["encoder_variance"], s["encoder_variance"], s["gyro_variance"]])
+    H = rows[used]
+    return joseph(x, P, (z - rows @ x)[used], H, R[np.ix_(used, used)])
+
+
+def random_filter(seed, spread=1.0):
+    """Returns a filter in a random state, with a covariance of full rank on the scales of a run in the tier `lab`."""
+    rng = np.random.default_rng(seed)
+    s = np.zeros(1, EKF)[0]
+    scale = spread * np.array([3e-3, 3e-3, 3e-3, 5e-3, 1e-2, 2e-3, 5e-2, 1e-4, 1e-4, 5e-3, 5e-3])
+    mixed = rng.normal(size=(N, N))
+    P = mixed @ mixed.T / N + 0.3 * np.eye(N)
+    s["P"] = P * np.outer(scale, scale)
+    s["mean"] = rng.normal(size=N) * [1, 1, 1, 0.8, 1, 2e-3, 0.1, 50, 50, 5e-3, 5e-3]
+    s["encoder_variance"], s["gyro_variance"] = (2 * np.pi / 88_064) ** 2 / 12, 3e-3**2
+    s["bias_walk"], s["acceleration_variance"], s["offset_walk"] = 2e-5, 0.016**2, 0.02
+    s["fix_variance"], s["offset"] = (9e-6, 9e-6, 9e-6), 0.05
+    s["kept_tick"] = -1
+    return s, rng
+
+
+def sample_of(s, rng, grip=(1, 1)):
+    sample = np.zeros(1, SAMPLE)[0]
+    sample["encoder"] = s["mean"][[LEFT, RIGHT]] + rng.normal(size=2) * 1e-2
+    sample["gyro"], sample["acceleration"] = s["mean"][OMEGA] + rng.normal() * 0.01, rng.normal(size=2)
+    sample["encoder_new"] = sample["gyro_new"] = True
+    sample["grip"] = grip
+    return sample
+
+
+def ring_of(*samples):
+    ring = np.zeros((len(samples), 1), SAMPLE)
+    for k, sample in enumerate(samples):
+        ring[k, 0] = sample
+    return ring
+
+
+def near(found, expected, scale, tolerance=1e-9):
+    """Equality relative to a scale for each element."""
+    np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=tolerance)
+
+
+@given(st.integers(0, 10**6), st.sampled_from([(1, 1), (0, 1), (1, 0), (0, 0)]), st.floats(-6, 6))
+def test_step(seed, grip, theta_dot_dot):
+    """One step is that of the textbook, whichever wheels grip."""
+    s, rng = random_filter(seed)
+    now, before = sample_of(s, rng, grip), np.zeros(1, SAMPLE)[0]
+    before["command"] = 0.0, theta_dot_dot
+    mean, P = textbook(s, now, theta_dot_dot)
+    laws.step(1, ring_of(before, now), 0, GEOMETRY, T, 0, 0, s)
+    deviation = np.sqrt(np.diag(P))
+    near(s["mean"], mean, np.maximum(deviation, np.abs(mean)))
+    near(s["P"], P, np.outer(deviation, deviation))
+    assert s["tick"] == 1
+
+
+@given(st.integers(0, 10**6))
+def test_fix(seed):
+    """A fix is the textbook's update by all three of its numbers at once, and its innovation has the right length."""
+    s, rng = random_filter(seed)
+    R, H = np.diag(s["fix_variance"]), np.eye(N)[:3]
+    S = H @ s["P"] @ H.T + R
+    residual = 0.7 * np.linalg.cholesky(S) @ rng.normal(size=3)
+    fix = s["mean"][:3] + residual
+    fix[2] = wrapped(fix[2])
+    mean, P = joseph(s["mean"].copy(), s["P"].copy(), residual, H, R)
+    length = residual @ np.linalg.solve(S, residual)
+    laws.absorb_fix(fix, s)
+    assert s["nis"] == pytest.approx(length, rel=1e-9)
+    if length < FIX_GATE:
+        deviation = np.sqrt(np.diag(P))
+        near(s["mean"], mean, np.maximum(deviation, np.abs(mean)))
+        near(s["P"], P, np.outer(deviation, deviation))
+
+
+@given(st.integers(0, 10**6), st.floats(-3, 3), st.floats(-6, 6))
+def test_jacobian(seed, v_dot, omega_dot):
+    """`propagate` moves the covariance by the derivative of how it moves the mean."""
+    s, _ = random_filter(seed)
+    grip = np.ones(2, np.uint8)
+
+    def moved(mean):
+        other = s.copy()
+        other["mean"] = mean
+        laws.propagate(v_dot - (mean[OFFSET] - s["mean"][OFFSET]), omega_dot, grip, GEOMETRY, T, other)
+        return other["mean"]
+
+    scale = np.array([1, 1, 1, 1, 1, 1, 1, 10, 10, 1, 1]) * 1e-5
+    F = np.stack([(moved(s["mean"] + h) - moved(s["mean"] - h)) / 2 / h.sum() for h in np.diag(scale)], axis=1)
+    F[[X, Y, LEFT, RIGHT], OFFSET] = 0  # T²/2 times velocities, which the filter leaves out
+    P = s["P"].copy()
+    quiet = s.copy()
+    quiet["P"] = 0
+    laws.propagate(v_dot, omega_dot, grip, GEOMETRY, T, s)
+    laws.propagate(v_dot, omega_dot, grip, GEOMETRY, T, quiet)  # leaves Q
+    expected = F @ P @ F.T
+    deviation = np.sqrt(np.diag(expected))
+    near(s["P"] - quiet["P"], expected, np.outer(deviation, deviation), 1e-6)
+
+
+# -- streams of samples ------------------------------------------------------------------------------------------------
+
+
+class Drive:
+    """A robot on a smooth course, seen by sensors, and filters that are shown the samples."""
+
+    def __init__(self, sensing, seed=0, skew=0.0):
+        self.plant = np.zeros(len(sensing), PLANT)
+        self.sensors = Sensors(sensing, [seed] * len(sensing), T)
+        robot = type("Robot", (), {"wheel_radius": RADIUS, "half_track": HALF})()
+        self.filters = Estimator("ekf", sensing, robot, self.sensors, np.array([AHEAD, 0, 0]), skew)
+        self.tick = 0
+        self.state = np.array([0.0, 0.0, 0.3])
+        self.angles = np.array([0.2, 0.1])
+        self._read()
+        for row in range(len(sensing)):
+            self.filters.start(row, self.plant["reading"][row], seed, 0)
+
+    def twist(self, t):
+        return 0.6 + 0.3 * np.sin(1.1 * t), np.sin(0.7 * t), 0.33 * np.cos(1.1 * t), 0.7 * np.cos(0.7 * t)
+
+    def _read(self):
+        v, omega, v_dot, _ = self.twist(self.tick * T)
+        reading = self.plant["reading"]
+        reading["pose"], reading["twist"] = self.state, (v, omega)
+        reading["wheel_rates"] = (v - HALF * omega) / RADIUS, (v + HALF * omega) / RADIUS
+        self.plant["wheel_angles"] = self.angles
+        self.plant["specific_force"] = self.twist((self.tick - 0.5) * T)[2] - AHEAD * omega**2, v * omega
+
+    def step(self):
+        """Measures and estimates, then drives on for a period along v_y = −c V θ̇."""
+        self._read()
+        self.sensors.measure(self.tick, self.plant)
+        self.filters.estimate(self.tick, self.plant)
+        self.sensors.command(self.tick, np.tile(self.twist((self.tick + 0.5) * T)[2:], (len(self.plant), 1)))
+        for k in range(10):
+            v, omega, _, _ = self.twist((self.tick + (k + 0.5) / 10) * T)
+            direction = self.state[2] + omega * T / 20 - laws.SIDE * omega
+            self.state = self.state + T / 10 * np.array([v * np.cos(direction), v * np.sin(direction), omega])
+            self.angles = self.angles + T / 10 * np.array([v - HALF * omega, v + HALF * omega]) / RADIUS
+        self.tick += 1
+
+
+def lab(**values):
+    return Sensing(tier="lab", delay=0.0, **values)
+
+
+def test_late_fix():
+    """A fix of 80 ms ago leaves the filter where the same fix would, had it come at once.
+
+    They differ by less than a hundredth of a deviation, because the observer that finds slip goes on from its own state.
+    """
+    drive = Drive([lab(fix_rate=10, fix_latency=0.08), lab(fix_rate=10, fix_latency=0.0)])
+    memory = drive.filters.memory
+    for tick in range(300):
+        drive.step()
+        if tick % 10 in (8, 9):
+            deviation = np.sqrt(np.diag(memory["P"][1]))
+            near(memory["mean"][0], memory["mean"][1], deviation, 0.01)
+            near(memory["P"][0], memory["P"][1], np.outer(deviation, deviation), 0.01)
+        elif tick > 10:
+            assert not np.allclose(memory["P"][0], memory["P"][1], rtol=0.01)
+
+
+def test_several_fixes_on_their_way():
+    """So do fixes that are older than the time between two of them, of which four are on their way."""
+    drive = Drive([lab(fix_rate=20, fix_latency=0.2), lab(fix_rate=20, fix_latency=0.0)])
+    late, prompt = [], []
+    for _ in range(300):
+        drive.step()
+        late.append(drive.filters.memory["nis"][0])
+        prompt.append(drive.filters.memory["nis"][1])
+    np.testing.assert_allclose(late[60:], prompt[40:-20], rtol=1e-2)
+
+
+@given(st.integers(0, 10**6), st.sampled_from(["lab", "field"]), st.floats(0, 0.5), st.floats(0, 0.5))
+@settings(max_examples=10)
+def test_positive_definite(seed, tier, lost, outliers):
+    """The covariance stays symmetric and positive definite, whatever the wheels and the fixes do."""
+    rng = np.random.default_rng(seed)
+    drive = Drive([Sensing(tier=tier, fix_lost=lost, fix_outliers=outliers)], seed)
+    for tick in range(300):
+        if tick % 40 == 0:
+            slip = rng.normal(0, 0.05, 2) * rng.integers(0, 2, 2)
+        drive.angles = drive.angles + slip
+        drive.step()
+        P = drive.filters.memory["P"][0]
+        np.testing.assert_allclose(P, P.T, rtol=0, atol=1e-9 * np.sqrt(np.outer(np.diag(P), np.diag(P))).max())
+        deviation = np.sqrt(np.diag(P))
+        assert np.linalg.eigvalsh(P / np.outer(deviation, deviation)).min() > 1e-9
+
+
+# -- the gate ----------------------------------------------------------------------------------------------------------
+
+
+def test_outlier():
+    """A fix that is wrong by half a metre moves nothing; the tenth in a row is believed."""
+    s, _ = random_filter(1)
+    where = s["mean"][:3].copy()
+    fix = where + (0.4, -0.3, 0.1)
+    before = s.copy()
+    for k in range(1, LOST):
+        laws.absorb_fix(fix, s)
+        assert s["refused"] == k and s["nis"] > FIX_GATE
+        assert np.array_equal(s["mean"], before["mean"]) and np.array_equal(s["P"], before["P"])
+    laws.absorb_fix(fix, s)
+    assert s["refused"] == 0
+    np.testing.assert_allclose(s["mean"][:3], fix, atol=1e-3)
+    np.testing.assert_allclose(np.diag(s["P"])[:3], s["fix_variance"], rtol=0.01)
+
+
+def test_one_good_fix_between_outliers():
+    """Only refusals in a row count."""
+    s, _ = random_filter(2)
+    good, bad = s["mean"][:3].copy(), s["mean"][:3] + 0.5
+    for _ in range(3):
+        for _ in range(LOST - 1):
+            laws.absorb_fix(bad, s)
+        assert s["refused"] == LOST - 1
+        laws.absorb_fix(good, s)
+        assert s["refused"] == 0
+    np.testing.assert_allclose(s["mean"][:3], good, atol=1e-12)
+
+
+def test_gate_is_of_chi_square():
+    """Of the fixes that the filter's own covariance expects, one in a thousand is refused."""
+    s, rng = random_filter(3)
+    S = s["P"][:3, :3] + np.diag(s["fix_variance"])
+    root, refused, count = np.linalg.cholesky(S), 0, 20_000
+    for e in rng.normal(size=(count, 3)):
+        other = s.copy()
+        laws.absorb_fix(s["mean"][:3] + root @ e, other)
+        refused += other["refused"]
+    assert refused == pytest.approx(count / 1000, abs=4 * np.sqrt(count / 1000))
+
+
+@given(st.floats(-50, 50))
+def test_wrapped(angle):
+    """An angle is wrapped into (−π, π] by whole turns."""
+    found = wrapped(angle)
+    assert -np.pi < found <= np.pi
+    turns = (angle - found) / (2 * np.pi)
+    assert turns == pytest.approx(round(turns), abs=1e-9)
+
+
+def test_heading_across_the_cut():
+    """A fix on the other side of ±π corrects by the short way."""
+    s, _ = random_filter(4)
+    s["mean"][THETA] = 3.1415
+    fix = np.array([*s["mean"][:2], -3.1415])
+    laws.absorb_fix(fix, s)
+    assert s["refused"] == 0 and 3.1415 < s["mean"][THETA] < 2 * np.pi - 3.1415
+    s["mean"][THETA] = 3.1415 + 6 * np.pi  # the filter's heading goes on growing
+    s["P"][:] = np.diag(np.diag(s["P"]))
+    laws.absorb_fix(fix, s)
+    assert s["refused"] == 0 and 3.1415 < s["mean"][THETA] - 6 * np.pi < 2 * np.pi - 3.1415
