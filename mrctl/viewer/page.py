@@ -82,7 +82,7 @@ class Page(ABC):
         lines = []
         for label, row in zip(labels[:MAX_MARKED], last, strict=False):
             if on and np.isfinite(off := np.hypot(*sensors.error(row))):
-                size = " × ".join(f"{1e3 * a:.1f}" for a in sensors.radii(row))
+                size = " × ".join(f"{1e3 * a:.1f}" for a in sensors.ellipse(row)[0][::-1])
                 known = f", 3σ {size} mm" if row["variance_x"] > 0 else ""
                 lines.append(f"{html.escape(label)}: {1e3 * off:.1f} mm off{known}")
         if lines:

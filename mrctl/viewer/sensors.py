@@ -18,6 +18,7 @@ FIX_AGE = 2.0  # s, after which a fix has faded
 MAX_FIXES = 20  # number of fixes that are shown of a robot
 MAGNIFICATIONS = (1, 10, 100)
 WIDEST = 0.5  # m, to which errors are magnified at the beginning
+RIM = 0.06  # width of the rim of an ellipse, as a share of its half axes
 UP = np.array([0.0, 0.0, 1.0])
 TURN = np.linspace(0, 2 * np.pi, 49)
 # Height in m of the first robot's marks over the ground, above the trails, and from one robot's marks to the next, and
@@ -30,25 +31,18 @@ def magnification(spread: float) -> int:
     return max(m for m in MAGNIFICATIONS if m == 1 or m * spread <= WIDEST)
 
 
-def ellipse(estimate: Row) -> Array:
-    """Returns points of the 3σ ellipse around the estimated x and y in m, `(n, 2)`.
-
-    With the Cholesky factor L of the covariance, the points are 3 L (cos φ, sin φ).
+def ellipse(estimate: Row) -> tuple[Array, float]:
+    """Returns the half axes of the 3σ ellipse of the estimated x and y in m, `(2,)`, and its angle in rad.
 
     Args:
         estimate: Record of `TICK`.
+
+    Returns:
+        The half axes, the shorter one first, and the angle from the world's x axis to the shorter one.
     """
-    first = np.sqrt(max(estimate["variance_x"], 0.0))
-    mixed = estimate["covariance_xy"] / first if first > 0 else 0.0
-    second = np.sqrt(max(estimate["variance_y"] - mixed**2, 0.0))
-    return SIGMAS * np.stack([first * np.cos(TURN), mixed * np.cos(TURN) + second * np.sin(TURN)], axis=-1)
-
-
-def radii(estimate: Row) -> Array:
-    """Returns the half axes of the 3σ ellipse in m, the longer one first, `(2,)`."""
     mixed = estimate["covariance_xy"]
-    covariance = np.array([[estimate["variance_x"], mixed], [mixed, estimate["variance_y"]]])
-    return SIGMAS * np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[::-1], 0))
+    variances, axes = np.linalg.eigh([[estimate["variance_x"], mixed], [mixed, estimate["variance_y"]]])
+    return SIGMAS * np.sqrt(np.maximum(variances, 0)), float(np.arctan2(axes[1, 0], axes[0, 0]))
 
 
 def error(log: Rows) -> Array:
@@ -78,12 +72,13 @@ class Marks:
         self._estimate = scene.add_mesh_simple(
             f"{name}/estimate", *ribbons(_outline(footprint), 0.014), color=colour, **plain
         )
-        point = disc(0.016 * np.column_stack([np.cos(TURN), np.sin(TURN)]))
+        circle = np.column_stack([np.cos(TURN), np.sin(TURN)])
+        point = disc(0.016 * circle)
         self._truth = scene.add_mesh_simple(f"{name}/truth", *point, color=(20, 20, 20), **plain)
-        self._ellipse = scene.add_mesh_simple(f"{name}/ellipse", *point, color=colour, opacity=0.5, **plain)
-        self._rim = scene.add_mesh_simple(
-            f"{name}/rim", *ribbons(np.zeros((1, len(TURN), 3)), 0.006), color=colour, **plain
-        )
+        self._ellipse = scene.add_frame(f"{name}/ellipse", show_axes=False)
+        self._area = scene.add_mesh_simple(f"{name}/ellipse/area", *disc(circle), color=colour, opacity=0.5, **plain)
+        rim = ribbons(np.pad((1 - RIM / 2) * circle, [(0, 0), (0, 1)])[None], RIM)
+        self._rim = scene.add_mesh_simple(f"{name}/ellipse/rim", *rim, color=colour, **plain)
         dark = np.tile(np.array(colour, np.uint8) // 2, (MAX_FIXES, 1))
         self._fixes = scene.add_batched_meshes_simple(
             f"{name}/fixes", *point, np.tile([1.0, 0, 0, 0], (MAX_FIXES, 1)), np.zeros((MAX_FIXES, 3)),
@@ -108,12 +103,12 @@ class Marks:
         estimate = middle + [*magnified * error(last), 0]  # the robot may be drawn a moment after the sample
         self._estimate.position, self._estimate.wxyz = estimate + NEXT_MARK * UP, (np.cos(turn), 0.0, 0.0, np.sin(turn))
         self._truth.position = middle + 3 * NEXT_MARK * UP
-        self._ellipse.visible = self._rim.visible = bool(last["variance_x"] > 0)
+        self._ellipse.visible = bool(last["variance_x"] > 0)
         if self._ellipse.visible:
-            around = magnified * ellipse(last)
-            self._ellipse.position = self._rim.position = estimate
-            self._ellipse.vertices = disc(around)[0]
-            self._rim.vertices = ribbons(np.pad(around, [(0, 0), (0, 1)])[None], 0.006)[0]
+            (a, b), angle = ellipse(last)
+            self._ellipse.position = estimate
+            self._ellipse.wxyz = np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)
+            self._area.scale = self._rim.scale = (magnified * a, magnified * b, 1.0)
         arrived = np.flatnonzero(np.isfinite(log["fix_x"]))
         age = (len(log) - 1 - arrived) * period
         recent = np.flatnonzero((age < FIX_AGE) & (arrived >= latency))[-MAX_FIXES:]
