@@ -12,9 +12,39 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic.fields import FieldInfo
 
 from mrctl.record import Record
+from mrctl.sensing.tiers import VALUES, Sensing
 
 OnChange = Callable[[tuple[str, ...], Any], None]
 WORLDS = ("flat", "slope", "rough", "patch")
+SENSORS = {"encoders": "encoder", "gyro": "gyro", "accelerometer": "accelerometer", "posture fixes": "fix"}
+DRIVER = ("dead_zone", "pwm_steps", "current_limit", "battery_resistance")
+WIDEST = 1e3  # ratio of the limits of a number, beyond which a slider would show only the largest ones
+STEERING = ("steering_offset", "steering_backlash")
+# Fields of large records in groups, by the name of the field that holds the record. The first group of a perturbation
+# is open; what is in no group stands above them.
+GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
+    "perturbation": {
+        "mass and payload": ("mass_factor", "inertia_factor", "payload", "payload_x", "payload_y", "payload_z"),
+        "motors": tuple(
+            f"{side}{name}_factor"
+            for side in ("", "left_", "right_")
+            for name in ("drive_friction", "resistance", "motor_constant")
+        ),
+        "driver and battery": ("supply_factor", *DRIVER, "control_delay"),
+        "steering": STEERING,
+        "wheels and ground": (
+            "left_radius_factor",
+            "right_radius_factor",
+            "tyre_friction_factor",
+            "left_tyre_friction_factor",
+            "slope",
+        ),
+    },
+    "sensing": {
+        group: tuple(name for name in VALUES if name.startswith(f"{sensor}_")) for group, sensor in SENSORS.items()
+    }
+    | {"driver and battery": ("delay", *DRIVER), "steering": STEERING},
+}
 
 
 class Controls:
@@ -39,9 +69,15 @@ class Controls:
             path: Names of the fields that lead to the record.
             only: Names of the fields that get an input; by default all.
         """
+        groups = GROUPS.get(path[-1], {}) if path else {}
+        grouped = [name for names in groups.values() for name in names]
         for name, field in type(record).model_fields.items():
-            if only is None or name in only:
-                self._add(getattr(record, name), field, (*path, name))
+            if name not in grouped and (only is None or name in only):
+                self._add(_shown(record, name), field, (*path, name))
+        for group, names in groups.items():
+            with self._gui.add_folder(group, expand_by_default=group == "mass and payload"):
+                for name in names:
+                    self._add(_shown(record, name), type(record).model_fields[name], (*path, name))
 
     def _add(self, value: Any, field: FieldInfo, path: tuple[str, ...]) -> None:  # noqa: ANN401
         label, hint = path[-1].replace("_", " "), field.description
@@ -56,17 +92,19 @@ class Controls:
                     with self._folders[*path, name]:
                         self.add(value if name == kind else alternative(), (*path, name))
                 return
-        if typing.get_origin(field.annotation) is Literal and len(typing.get_args(field.annotation)) > 1:
-            handle = self._gui.add_dropdown(label, typing.get_args(field.annotation), initial_value=value, hint=hint)
+        kind = _kind(field)
+        if typing.get_origin(kind.annotation) is Literal and len(typing.get_args(kind.annotation)) > 1:
+            handle = self._gui.add_dropdown(label, typing.get_args(kind.annotation), initial_value=value, hint=hint)
         elif path == ("world",):
             handle = self._gui.add_dropdown(label, tuple(dict.fromkeys([value, *WORLDS])), initial_value=value)
         elif isinstance(value, bool):
             handle = self._gui.add_checkbox(label, value, hint=hint)
-        elif isinstance(value, int | float) and (limits := _limits(field, value)):
+        elif isinstance(value, int | float) and (limits := _limits(kind, _scale(path, value))):
             low, high, step = limits
             # Whole numbers are floats too: viser accepts an int of any size from a page, and then fails to pack it for
             # the other pages.
-            if high - low > 1e4 * step:
+            decades = any(isinstance(m, Ge) and low > 0 for m in kind.metadata) and high > WIDEST * low
+            if high - low > 1e4 * step or kind is not field or decades:
                 handle = self._gui.add_number(label, float(value), min=low, max=high, step=step, hint=hint)
             else:
                 handle = self._gui.add_slider(label, low, high, step, float(value), hint=hint)
@@ -87,7 +125,7 @@ class Controls:
     def show(self, record: Record, path: tuple[str, ...] = ()) -> None:
         """Sets the inputs of a record, whose path is given, to its values."""
         for name, field in type(record).model_fields.items():
-            value, where = getattr(record, name), (*path, name)
+            value, where = _shown(record, name), (*path, name)
             if isinstance(value, Record):
                 if where in self._inputs:
                     kind = type(value).model_fields["kind"].default
@@ -102,6 +140,26 @@ class Controls:
     def _set(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
         if self._inputs[path].value != value:
             self._inputs[path].value = value
+
+
+def _shown(record: Record, name: str) -> Any:  # noqa: ANN401
+    """Returns the value of a field; a field of `Sensing` that is not set has the value of the tier."""
+    if isinstance(record, Sensing) and getattr(record, name) is None:
+        return record.source if name == "estimator" else record[name]
+    return getattr(record, name)
+
+
+def _kind(field: FieldInfo) -> FieldInfo:
+    """Returns the field itself, or the one that it is if it is set, with its limits."""
+    kinds = typing.get_args(field.annotation)
+    return FieldInfo.from_annotation(kinds[0]) if len(kinds) == 2 and type(None) in kinds else field
+
+
+def _scale(path: tuple[str, ...], value: float) -> float:
+    """Returns the number on which the step of an input depends: its present value, or the least one of any tier."""
+    if path[0] != "sensing":
+        return value
+    return min((v for v in VALUES[path[-1]] if v > 0), default=1.0)
 
 
 def _kinds(field: FieldInfo) -> dict[str, type[Record]]:

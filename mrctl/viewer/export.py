@@ -90,7 +90,12 @@ def _curves(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
                 "title": chart.title,
                 "range": [float(known.min()), float(known.max())] if known.size else [0.0, 1.0],
                 "curves": [
-                    {"colour": f"rgb{curve.colour}", "dashed": curve.dashed, "values": _rounded(v)}
+                    {
+                        "colour": f"rgb{curve.colour}",
+                        "dashed": curve.dashed,
+                        "width": curve.width,
+                        "values": _rounded(v),
+                    }
                     for curve, v in zip(chart.curves, values, strict=True)
                 ],
             }

@@ -17,11 +17,13 @@ from typing_extensions import override
 
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
+from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.controls import Controls
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.scene import Scene
+from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import CHANGEABLE, Session, changed
 
@@ -38,7 +40,7 @@ BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
     "Push": {"push": {"push": (0.0, 60.0, 0.0)}, "spin": {"push": (0.0, 0.0, 15.0)}},
 }
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
-NEW_RUN = ("world", "steering", "reference", "measurement", "seed", "prefilter")
+NEW_RUN = ("world", "steering", "sensing", "reference", "seed", "prefilter")
 HIDDEN = (
     "name",
     "laps",
@@ -72,7 +74,8 @@ class Live(Page):
         self._due = 0.0  # number of ticks that are due
         self._changed_inputs: dict[tuple[str, ...], Any] = {}
         self._shown_setup: tuple[object, ...] | None = None  # world, robot, steering and labels of the present scene
-        self._drawn: tuple[int, bool] | None = None
+        self._shown_sensing: list[Sensing] | None = None
+        self._drawn: tuple[object, ...] | None = None
         self._plotted: int | None = None
         self._plots_since_mark = 0
         self._tidied = time.monotonic()
@@ -94,6 +97,7 @@ class Live(Page):
             for label, choices in BUTTONS.items():
                 group = gui.add_button_group(label, tuple(choices))
                 self.on(group, partial(self._press, choices))
+            self.add_sensors()
             self._timeline = gui.add_html("")
             save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
 
@@ -122,7 +126,7 @@ class Live(Page):
     def _show_session(self) -> None:
         """Shows the robots of a new session in the scene and in the plots."""
         session, first = self.session, self.session.start[0]
-        labels = [s.name or s.feedforward for s in session.start]
+        self._labels = labels = [s.name or s.feedforward for s in session.start]
         setup = (first.world, first.robot, first.steering, labels)
         if self._shown_setup != setup:
             if self._shown_setup is not None:
@@ -130,6 +134,12 @@ class Live(Page):
             self._shown_setup = setup
             self._scene = Scene(self.server, session.simulations[0][1].model, labels)
             self._plots.set_robots(labels, session.period)
+        sensing = [s.sensing for s in session.start]
+        if self._shown_sensing != sensing:
+            self._shown_sensing = sensing
+            spread = max(np.inf if s.source == "odometry" else s["fix_position_noise"] for s in sensing)
+            self.set_marks(any(s.source != "truth" for s in sensing), spread)
+        self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
         self._scene.show_reference(first)
         self._scene.forget_trails()
         self._controls.show(first)
@@ -184,6 +194,10 @@ class Live(Page):
             value = round(value / self.session.period) * self.session.period
         if path == ("reference",):
             value = {"kind": value}
+        if path == ("sensing", "tier"):  # with all values of the tier
+            path, value = path[:1], {"tier": value}
+        if name == "sensing":
+            value = _in_periods(path[-1], value, self.session.period)
         if name in CHANGEABLE:
             return self._apply_event(**{name: changed(self.session.state()[name], rest, value)})
         start = self.session.start
@@ -247,13 +261,19 @@ class Live(Page):
 
     @override
     def draw(self) -> None:
-        session, now = self.session, (self.session.tick, self._follow.value)
+        session, (marked, magnified) = self.session, self.marks
+        now = session.tick, self._follow.value, marked, magnified
         if now == self._drawn:
             return
         self._drawn = now
         for row in range(session.size):
             self._scene.show(row, session.qpos(row))
+        logs = []
+        if marked:
+            ticks = round(FIX_AGE / session.period) + max(self._latencies)
+            logs = list(session.log(max(0, session.tick - ticks)).T)
         with self.server.atomic():
+            self._scene.show_sensors(logs, session.period, self._latencies, magnified)
             self._scene.flush(self._follow.value)
 
     @override
@@ -286,6 +306,8 @@ class Live(Page):
             log = session.log(first)
             times = np.arange(first, first + len(log), dtype=float) * session.period
             self._plots.show(times, log, step)
+        if session.tick:
+            self.describe_estimates(self._labels, session.log(session.tick - 1)[-1])
 
     def _describe(self) -> None:
         """Writes the timeline, and sets the inputs to the present values."""
@@ -300,6 +322,15 @@ class Live(Page):
         self._scene.show_payload(state["perturbation"])
         for name in CHANGEABLE:
             self._controls.show(state[name], (name,))
+
+
+def _in_periods(name: str, value: Any, period: float) -> Any:  # noqa: ANN401
+    """Returns a value of a field of `Sensing`, a time or a rate rounded to whole control periods of `period` in s."""
+    if name.endswith("_latency") or name == "delay":
+        return round(value / period) * period
+    if name.endswith("_rate") and value > 0:
+        return 1 / (max(1, round(1 / (value * period))) * period)
+    return value
 
 
 def _tidy() -> None:

@@ -8,13 +8,17 @@ import sys
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
 import viser
 
+from mrctl.kernel import Rows
 from mrctl.record import InputError
+from mrctl.viewer import sensors
+from mrctl.viewer.scene import MAX_MARKED
 from mrctl.viewer.server import Server
 
 FRAME, REFRESH = 1 / 25, 1 / 15  # s of wall time between two pictures, and between two updates of the plots
@@ -47,6 +51,47 @@ class Page(ABC):
         panel.dock_left()
         panel.set_width(430)
         server.gui.main_panel.dock_right()
+
+    def add_sensors(self) -> None:
+        """Adds the inputs that say whether and how estimates and fixes are drawn, in the present context of the GUI."""
+        gui = self.server.gui
+        self.sensors = gui.add_checkbox("Sensors", False, hint="Draws what the robot knows of its posture.")
+        self.magnified = gui.add_dropdown(
+            "Errors drawn", tuple(f"{m}×" for m in sensors.MAGNIFICATIONS),
+            hint="Factor on errors of x and y in the picture, about the true position; headings are not magnified.",
+        )  # fmt: skip
+        self._sensed = gui.add_html("")
+
+    @property
+    def marks(self) -> tuple[bool, int]:
+        """Whether estimates and fixes are drawn, and the factor on their errors."""
+        return self.sensors.value, int(self.magnified.value.removesuffix("×"))
+
+    def set_marks(self, on: bool, spread: float) -> None:
+        """Sets the inputs: whether estimates are drawn, and the factor that suits errors of `spread` in m."""
+        self.sensors.value, self.magnified.value = on, f"{sensors.magnification(spread)}×"
+
+    def describe_estimates(self, labels: Sequence[str], last: Rows) -> None:
+        """Writes what the marks mean, and the errors that they show.
+
+        Args:
+            labels: Label of each robot.
+            last: Record of `TICK` of each robot, `(B,)`.
+        """
+        on, magnified = self.marks
+        lines = []
+        for label, row in zip(labels[:MAX_MARKED], last, strict=False):
+            if on and np.isfinite(off := np.hypot(*sensors.error(row))):
+                size = " × ".join(f"{1e3 * a:.1f}" for a in sensors.ellipse(row)[0][::-1])
+                known = f", 3σ {size} mm" if row["variance_x"] > 0 else ""
+                lines.append(f"{html.escape(label)}: {1e3 * off:.1f} mm off{known}")
+        if lines:
+            size = f"<b>Errors are drawn {magnified} times.</b>" if magnified > 1 else "Errors have their true size."
+            lines.append(
+                "Outline: estimated posture. Black point: true position. Ellipse: 3σ of x and y (98.9 %). "
+                f"Small points: fixes of the last {sensors.FIX_AGE:g} s. {size}"
+            )
+        write(self._sensed, block("sensors", *lines))
 
     def ask(self, action: Callable[..., None], *arguments: Any) -> None:  # noqa: ANN401
         """Queues an action for the loop; any thread may call this."""

@@ -29,6 +29,7 @@ class Curve(NamedTuple):
     colour: Colour
     dashed: bool
     values: Array
+    width: float = 1.5  # pixels
 
 
 class Chart(NamedTuple):
@@ -56,7 +57,11 @@ def charts(log: Rows, labels: Sequence[str], period: float) -> list[Chart]:
 
     def tracked(title: str, name: str) -> Chart:
         reference = Curve("reference", REFERENCE_COLOUR, False, signal(f"{name}_ref", 0))
-        return Chart(title, [reference, *each(name, [signal(name, r) for r in shown])])
+        estimated = [
+            Curve(f"{labels[r]} {name} estimated", pale(colour_of(r)), False, signal(f"{name}_measured", r), 4.5)
+            for r in shown
+        ]
+        return Chart(title, [reference, *estimated, *each(name, [signal(name, r) for r in shown])])
 
     def voltages(title: str, sign: float) -> Chart:
         parts = {
@@ -88,6 +93,12 @@ def charts(log: Rows, labels: Sequence[str], period: float) -> list[Chart]:
             + each("guard", [signal("guard", r) for r in shown], dashed=True),
         ),
     ]
+
+
+def pale(colour: Colour) -> Colour:
+    """Returns the colour of an estimated quantity of a robot with a colour."""
+    red, green, blue = (255 - (255 - c) // 2 for c in colour)
+    return red, green, blue
 
 
 def _moving_mean(values: Array, window: int) -> Array:
@@ -150,15 +161,17 @@ def legend(labels: Sequence[str]) -> str:
     """Returns the legend of robots and their colours in HTML."""
     keys = [f'<span style="color:rgb{colour_of(k)}">■ {html.escape(name)}</span>' for k, name in enumerate(labels)]
     keys = [*keys[:MAX_ROBOTS], f'<span style="color:rgb{REFERENCE_COLOUR}">■ reference</span>']
+    keys += [f'<span style="color:rgb{pale(colour_of(0))}">■ pale: estimated V, θ̇</span>']
     return f'<p style="margin:0.3em 1em">{" &nbsp; ".join(keys)}</p>'
 
 
 def _add(gui: viser.GuiApi, chart: Chart, cursor: bool) -> viser.GuiUplotHandle:
     colours = [curve.colour for curve in chart.curves] + [CURSOR_COLOUR] * cursor
     dashes = [curve.dashed for curve in chart.curves] + [False] * cursor
+    widths = [curve.width for curve in chart.curves] + [1.5] * cursor
     series = [
-        uplot.Series(label="", stroke=f"rgb{colour}", width=1.5, dash=(5, 4) if dashed else (), points={"show": False})
-        for colour, dashed in zip(colours, dashes, strict=True)
+        uplot.Series(label="", stroke=f"rgb{colour}", width=w, dash=(5, 4) if dashed else (), points={"show": False})
+        for colour, dashed, w in zip(colours, dashes, widths, strict=True)
     ]
     return gui.add_uplot(
         tuple(np.zeros(2) for _ in range(1 + len(series))),

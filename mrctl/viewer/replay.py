@@ -15,6 +15,7 @@ from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, labels_of
 from mrctl.viewer.scene import Scene, colour_of
+from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
 
 SAMPLES = 800  # about the largest number of samples in a curve
@@ -41,7 +42,7 @@ class Replay(Page):
         self.library = library
         self.time = 0.0
         self.recordings: list[Recording] = []
-        self._drawn: tuple[float, bool] | None = None
+        self._drawn: tuple[object, ...] | None = None
         self._plotted: float | None = None
         self._build(runs[0])
         self._show(runs)
@@ -61,6 +62,7 @@ class Replay(Page):
                 lambda name: setattr(self, "speed", SPEEDS[name]),
             )
             self._follow = gui.add_checkbox("Camera follows", False)
+            self.add_sensors()
             self._chosen = gui.add_number(
                 "Run", float(run), min=float(table.index[0]), max=float(table.index[-1]), step=1.0
             )
@@ -140,6 +142,14 @@ class Replay(Page):
         self._scene.show_recordings(recordings)
         self._plots.set_robots(labels, recordings[0].period)
         self._times, self._log = joint_log(recordings)
+        self._labels, sensing = labels, [r.scenario.sensing for r in recordings]
+        self._latencies = [s.periods("fix_latency", r.period) for s, r in zip(sensing, recordings, strict=True)]
+        off = np.nan_to_num(np.hypot(*np.moveaxis(error(self._log), -1, 0)))
+        estimated = np.isfinite(self._log["x_measured"][0])
+        self.set_marks(
+            any(estimated & [s.source != "truth" for s in sensing]),
+            max(np.sqrt(np.mean(off**2, axis=0)).max(), *(s["fix_position_noise"] for s in sensing)),
+        )
         self.duration = float(self._times[-1])
         self.scrubber.max = self.duration
         self._scrub(self.time, pause=False)
@@ -166,14 +176,22 @@ class Replay(Page):
 
     @override
     def draw(self) -> None:
-        now = (self.time, self._follow.value)
+        marked, magnified = self.marks
+        now = self.time, self._follow.value, marked, magnified
         if now == self._drawn:
             return
         self._drawn = now
         for row, recording in enumerate(self.recordings):
             self._scene.show(row, recording.qpos(recording.index(self.time)))
         self._scene.show_payload(self.recordings[0].perturbation(self.time))
+        period, logs = self.recordings[0].period, []
+        if marked:
+            ticks = round(FIX_AGE / period)
+            for recording, latency in zip(self.recordings, self._latencies, strict=True):
+                index = recording.index(self.time)
+                logs.append(recording.log[max(0, index + 1 - ticks - latency) : index + 1])
         with self.server.atomic():
+            self._scene.show_sensors(logs, period, self._latencies, magnified)
             self._scene.flush(self._follow.value)
 
     @override
@@ -189,6 +207,8 @@ class Replay(Page):
         if self.message:
             lines.append(warning(self.message))
         write(self._status, block("status", *lines))
+        last = np.stack([r.log[r.index(self.time)] for r in self.recordings])
+        self.describe_estimates(self._labels, last)
         if self.time != self._plotted:
             self._plotted = self.time
             self.scrubber.value = self.time

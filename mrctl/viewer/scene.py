@@ -14,6 +14,7 @@ import viser
 from mjviser.conversions import merge_geoms
 from numpy.typing import NDArray
 
+from mrctl.kernel import Rows
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.stand import ground
@@ -21,6 +22,8 @@ from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.recording import Recording
+from mrctl.viewer.sensors import Marks
+from mrctl.viewer.shapes import ribbons
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -30,10 +33,13 @@ COLOURS: list[Colour] = [
     (37, 99, 235), (234, 88, 12), (22, 163, 74), (147, 51, 234), (8, 145, 178), (202, 138, 4), (219, 39, 119),
 ]  # fmt: skip
 REFERENCE_COLOUR: Colour = (110, 115, 122)
+GLASS: Colour = (150, 155, 160)  # of the first robot while marks are drawn, which have its colour
 TRAIL_POINTS = 240  # number of points in the trail of a robot
 TRAIL_POINTS_OF_ALL = 1600  # largest number of points in the trails of all robots
 # Initial camera, relative to the middle of the reference and in units of its size.
 CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])
+GHOST_OPACITY, GLASS_OPACITY = 0.4, 0.55
+MAX_MARKED = 4  # number of robots whose estimates are drawn
 LEAST_VIEW = 1.2  # m, least width of the view
 SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
 
@@ -71,6 +77,8 @@ class Scene:
         self._positions = np.zeros((self.size, len(self._bodies), 3))
         self._quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (self.size, len(self._bodies), 1))
         self._draw_world()
+        self._looks: list[tuple[viser.GlbHandle, viser.MeshHandle]] = []  # of each body, solid and translucent
+        self._footprint = np.array([[np.inf, np.inf], [-np.inf, -np.inf]])
         self._solid, self._ghosts = self._draw_robots()
         self._labels = [
             self._scene.add_label(f"/world/label{row}", label, font_screen_scale=0.8)
@@ -80,6 +88,10 @@ class Scene:
         self._payload = self._scene.add_box(
             "/world/robot/chassis/payload", (120, 72, 40), (0.1, 0.1, 0.1), cast_shadow=False, visible=False
         )
+        self._sensors = self._scene.add_frame("/world/sensors", show_axes=False, visible=False)
+        self._marks = [
+            Marks(self._scene, row, self._footprint, colour_of(row)) for row in range(min(self.size, MAX_MARKED))
+        ]
         self._shown = None
         self._trails: Array | None = None
         self._ribbons: list[viser.MeshHandle] = []
@@ -120,14 +132,25 @@ class Scene:
             if not geoms:
                 continue
             mesh = merge_geoms(model, geoms)
-            self._scene.add_mesh_trimesh(f"/world/robot/{name}/mesh", mesh, cast_shadow=False, receive_shadow=False)
+            solid_mesh = self._scene.add_mesh_trimesh(
+                f"/world/robot/{name}/mesh", mesh, cast_shadow=False, receive_shadow=False
+            )
+            rough = _rough(model, geoms)
+            glass = self._scene.add_mesh_simple(
+                f"/world/robot/{name}/glass", rough.vertices, rough.faces, color=GLASS, opacity=GLASS_OPACITY,
+                flat_shading=True, cast_shadow=False, receive_shadow=False, visible=False,
+            )  # fmt: skip
+            self._looks.append((solid_mesh, glass))
+            corners = mesh.vertices @ self._data.xmat[body].reshape(3, 3).T
+            corners = (corners + self._data.xpos[body] - self._data.xpos[self._bodies[self._chassis]])[:, :2]
+            low, high = self._footprint
+            self._footprint = np.array([np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))])
             if others:
-                rough = _rough(model, geoms)
                 handle = self._scene.add_batched_meshes_simple(
                     f"/world/ghosts/{name}", rough.vertices, rough.faces, self._quaternions[1:, k],
                     self._positions[1:, k],
                     batched_colors=np.array([colour_of(row + 1) for row in range(others)], np.uint8),
-                    opacity=0.4, lod="off", cast_shadow=False, receive_shadow=False,
+                    opacity=GHOST_OPACITY, lod="off", cast_shadow=False, receive_shadow=False,
                 )  # fmt: skip
                 ghosts.append((k, handle))
         return solid, ghosts
@@ -146,7 +169,7 @@ class Scene:
 
     def _draw_lines(self, name: str, lines: Array, width: float, colour: Colour) -> viser.MeshHandle:
         """Draws lines `(B, n, 3)` as one mesh; each segment of a thick line of viser's costs about as much."""
-        vertices, faces = _ribbons(lines, width)
+        vertices, faces = ribbons(lines, width)
         return self._scene.add_mesh_simple(
             name, vertices, faces, color=colour, side="double", cast_shadow=False, receive_shadow=False
         )
@@ -200,6 +223,22 @@ class Scene:
             box.dimensions = (side, side, side)
             box.position = (p.payload_x, p.payload_y, p.payload_z - self._radius)
 
+    def show_sensors(self, logs: Sequence[Rows], period: float, latencies: Sequence[int], magnified: int) -> None:
+        """Draws what the robots know of their postures; the first robot becomes translucent, or it would hide that.
+
+        Args:
+            logs: For each robot that has it, a record of `TICK` of each of its last samples, `(T,)`; none hides it all.
+            period: Time between samples in s.
+            latencies: For each of them the number of samples between the moment of a fix and its arrival.
+            magnified: Factor on errors of position.
+        """
+        self._sensors.visible = bool(logs)
+        for solid, glass in self._looks:
+            solid.visible, glass.visible = not logs, bool(logs)
+        ground = self._positions[:, self._chassis] - [0, 0, self._radius]
+        for marks, here, log, latency in zip(self._marks, ground, logs, latencies, strict=False):
+            marks.show(here, log, period, latency, magnified)
+
     def mark_trails(self) -> None:
         """Adds the present positions of the robots to their trails."""
         here = self._positions[:, self._chassis] - [0, 0, self._radius - 0.01]
@@ -217,7 +256,7 @@ class Scene:
             ]
             return
         for ribbon, group in zip(self._ribbons, groups, strict=True):
-            ribbon.vertices = _ribbons(group, 0.012)[0]
+            ribbon.vertices = ribbons(group, 0.012)[0]
 
     def forget_trails(self) -> None:
         """Removes the trails; new ones begin at the next mark."""
@@ -247,18 +286,3 @@ def _rough(model: mujoco.MjModel, geoms: Sequence[int]) -> trimesh.Trimesh:
     whole = trimesh.util.concatenate(parts)
     assert isinstance(whole, trimesh.Trimesh)  # the types of trimesh allow any geometry
     return whole
-
-
-def _ribbons(lines: Array, width: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Returns vertices `(2Bn, 3)` and triangles `(2B(n − 1), 3)` of level ribbons along lines `(B, n, 3)`."""
-    along = np.gradient(lines[..., :2], axis=1)
-    length = np.linalg.norm(along, axis=-1, keepdims=True)
-    across = np.stack([-along[..., 1], along[..., 0]], axis=-1) / np.where(length > 0, length, 1)
-    half = np.zeros_like(lines)
-    half[..., :2] = width / 2 * across
-    vertices = np.stack([lines - half, lines + half], axis=2).reshape(-1, 3)
-    right = 2 * np.arange(lines.shape[0] * lines.shape[1]).reshape(lines.shape[:2])[:, :-1].ravel()
-    faces = np.concatenate(
-        [np.stack([right, right + 2, right + 1], -1), np.stack([right + 1, right + 2, right + 3], -1)]
-    )
-    return vertices.astype(np.float32), faces.astype(np.uint32)

@@ -13,6 +13,7 @@ from PIL import Image
 from mrctl import Circle, Event, Perturbation, Scenario, Sweep, save
 from mrctl.cli import main
 from mrctl.loop.simulation import simulate
+from mrctl.sensing.tiers import Sensing
 from mrctl.sweep import jobs
 from mrctl.viewer.live import Live
 from mrctl.viewer.recording import Library
@@ -218,6 +219,114 @@ def test_replay(browser, tmp_path):
         picture(page, tmp_path / "replay.png")
         t, *_, cursor = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
         assert t[np.argmax(cursor)] == pytest.approx(7.5) and t[-1] == pytest.approx(11.99)
+
+
+PLACES = """(name) => {
+    const vertices = [], node = window.__viserMutable.nodeRefFromName[name];
+    if (!node || !node.visible) return [];
+    node.updateWorldMatrix(true, true);
+    node.traverse((part) => {
+        const at = part.geometry?.attributes.position, point = node.position.clone();
+        if (part.instancesCount !== undefined)
+            for (let k = 0; k < part.instancesCount; k++) {
+                const place = part.getPositionAt(k).applyMatrix4(part.matrixWorld);
+                vertices.push([...place.toArray(), part.getOpacityAt(k)]);
+            }
+        else if (at && !vertices.length)
+            for (let k = 0; k < at.count; k++)
+                vertices.push(point.fromBufferAttribute(at, k).applyMatrix4(part.matrixWorld).toArray());
+    });
+    return vertices;
+}"""
+MARKS = "/world/sensors/0"
+
+
+def places(page, name):
+    """Points of a mark on the ground in m, `(n, 2)`, as the browser has them; of fixes also their opacity."""
+    return np.array(page.evaluate(PLACES, name))
+
+
+def check_marks(page, log, period, robot, times):
+    """Estimate, 3σ ellipse and fixes stand where the signals have them, with errors drawn so many times."""
+    now = log[-1]
+    off = times * np.array([now["x_measured"] - now["x"], now["y_measured"] - now["y"]])
+    covariance = times**2 * np.array(
+        [[now["variance_x"], now["covariance_xy"]], [now["covariance_xy"], now["variance_y"]]]
+    )
+    until(lambda: np.allclose(node(page, f"{MARKS}/estimate")[:2], robot + off, atol=1e-5), "the estimate")
+
+    def distances():
+        rim = places(page, f"{MARKS}/ellipse/area")[1:, :2] - robot - off
+        return np.sqrt(np.einsum("ni,ij,nj->n", rim, np.linalg.inv(covariance), rim))
+
+    until(lambda: np.allclose(distances(), 3, rtol=1e-2), "the ellipse at three standard deviations all around")
+    latency = 5  # 50 ms
+    arrived = np.flatnonzero(np.isfinite(log["fix_x"]) & (np.arange(len(log)) > len(log) - 1 - 2.0 / period))[-20:]
+    true = np.stack([log[axis][arrived - latency] for axis in ("x", "y")], axis=-1)
+    fixes = np.stack([log[f"fix_{axis}"][arrived] for axis in ("x", "y")], axis=-1)
+    opacity = 1 - (len(log) - 1 - arrived) * period / 2.0
+    expected = np.column_stack([true + times * (fixes - true), opacity])
+
+    def seen():
+        found = places(page, f"{MARKS}/fixes")
+        return found[found[:, 3] > 0][:, [0, 1, 3]]
+
+    until(lambda: (found := seen()).shape == expected.shape and np.allclose(found, expected, atol=1e-4), "the fixes")
+    assert len(expected) > 10
+
+
+FIELD = BASE.model_copy(update={"sensing": Sensing(tier="field"), "feedforward": "model"})
+
+
+def test_estimate_live(browser, tmp_path):
+    """What a robot with cheap sensors knows of its posture stands beside the truth, and its V in the same chart."""
+    with serving(lambda server: Live([FIELD], server)) as (live, url), visit(browser, url) as page:
+        until(lambda: live.session.time > 2.5 and node(page, f"{MARKS}/estimate") is not None, "the robot to drive")
+        live.ask(live._command, "pause")
+        until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
+        log, robot = live.session.log()[:, 0], live.session.qpos(0)[:2]
+        check_marks(page, log, live.session.period, robot, 10)
+        off = 1e3 * np.hypot(log["x_measured"] - log["x"], log["y_measured"] - log["y"])[-1]
+        assert f"{off:.1f} mm off" in page.inner_text("#mrctl-sensors")
+        assert "10 times" in page.inner_text("#mrctl-sensors")
+
+        def chart():
+            t, reference, estimated, true = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
+            return len(t) > 60 and (t, estimated, true)
+
+        t, estimated, true = until(chart, "the curves of V")
+        at = np.round(t / live.session.period).astype(int)
+        np.testing.assert_allclose(true, log["v"][at])
+        np.testing.assert_allclose(estimated, log["v_measured"][at])
+        assert np.abs(estimated - true).max() > 1e-3
+        picture(page, tmp_path / "estimate.png")
+
+        page.get_by_label("Sensors").click()
+        shown = f"window.__viserMutable.nodeRefFromName[{MARKS!r}].parent.visible"
+        until(lambda: not page.evaluate(shown), "the marks to vanish")
+
+
+def test_estimate_replay(browser, tmp_path):
+    """The marks of a replay are those of the recorded signals; a result of an earlier version has none."""
+    result = simulate([FIELD.model_copy(update={"laps": 1})])
+    save(result, tmp_path / "result.zarr")
+    library = Library(tmp_path / "result.zarr")
+    with serving(lambda server: Replay(library, [0], server)) as (replay, url), visit(browser, url) as page:
+        until(lambda: node(page, f"{MARKS}/estimate") is not None, "the scene")
+        replay.ask(replay._scrub, 3.1)
+        replay.ask(setattr, replay.magnified, "value", "1×")
+        log = replay.recordings[0].log[:311]
+        check_marks(page, log, 0.01, np.array([log["x"][-1], log["y"][-1]]), 1)
+        measured = result.isel(run=0).sel(time=3.1, method="nearest")
+        assert np.allclose(node(page, f"{MARKS}/estimate")[:2], [measured.x_measured, measured.y_measured], atol=1e-5)
+    old = result.drop_vars([name for name in result if "measured" in str(name) or str(name).startswith("fix_")])
+    save(old, tmp_path / "old.zarr")
+    with serving(lambda server: Replay(Library(tmp_path / "old.zarr"), [0], server)) as (replay, _):
+        assert not replay.marks[0]
+        replay.sensors.value = True
+        replay.draw()
+        replay.refresh()
+        assert replay.message == "" and not replay._scene._marks[0]._root.visible
 
 
 def test_export(browser, tmp_path):

@@ -27,7 +27,8 @@ def other(handle):
         return next(option for option in reversed(handle.options) if option != handle.value)
     if isinstance(handle.value, bool):
         return not handle.value
-    return handle.value + round((handle.max - handle.value) / 4 / handle.step) * handle.step
+    far = handle.max if handle.value < handle.max else handle.min
+    return handle.value + round((far - handle.value) / 4 / handle.step) * handle.step
 
 
 def test_every_input(live):
@@ -42,6 +43,8 @@ def test_every_input(live):
         value = other(handle)
         if path == ("perturbation", "control_delay"):
             value = 0.12  # in whole control periods
+        if path[0] == "sensing" and path[1].endswith(("rate", "latency", "delay")):
+            value = 50.0 if path[1].endswith("rate") else 0.03
         if path == ("reference",):
             value = "circle"
         if kind and isinstance(value, float):  # a little, within what the robot can do
@@ -64,7 +67,7 @@ def test_every_input(live):
         live.draw()
         live.refresh()
         seen.append(kind)
-    assert len(seen) > 55 and set(seen) == {None, *kinds}
+    assert len(seen) > 90 and set(seen) == {None, *kinds}
 
 
 def test_refusals(live):

@@ -10,14 +10,15 @@ from mjviser.conversions import merge_geoms
 
 from mrctl.physics import mjcf
 from mrctl.theory.robot import CAR, RobotFile
-from mrctl.viewer.scene import SEEN, _ribbons, _rough
+from mrctl.viewer.scene import SEEN, _rough
+from mrctl.viewer.shapes import ribbons
 
 
 def test_ribbon_of_a_circle():
     """A closed ribbon around a circle is the ring between two circles, level and facing up."""
     turn = np.linspace(0, 2 * np.pi, 801)
     circle = np.stack([np.cos(turn), np.sin(turn), np.full(801, 0.3)], axis=-1)
-    vertices, faces = _ribbons(np.stack([circle, 2 * circle + [5, 0, 0]]), 0.1)
+    vertices, faces = ribbons(np.stack([circle, 2 * circle + [5, 0, 0]]), 0.1)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert mesh.area == pytest.approx(2 * np.pi * 0.1 * (1 + 2), rel=1e-3)
     assert (mesh.face_normals @ [0, 0, 1] > 0.999).all()
@@ -29,7 +30,7 @@ def test_ribbon_of_a_circle():
 @given(arrays(float, (2, 5, 3), elements=st.floats(-10, 10)))
 def test_ribbon_of_anything(lines):
     """A robot that stands or comes back the way it went leaves no hole in the data, and lines stay apart."""
-    vertices, faces = _ribbons(lines, 0.02)
+    vertices, faces = ribbons(lines, 0.02)
     assert np.isfinite(vertices).all()
     pairs = vertices.reshape(2, 5, 2, 3)
     np.testing.assert_allclose(pairs.mean(axis=2), lines, atol=1e-5)

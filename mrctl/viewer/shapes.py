@@ -1,0 +1,36 @@
+"""Level shapes on the ground, as vertices and triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mesh = tuple[NDArray[np.float32], NDArray[np.uint32]]
+
+
+def ribbons(lines: Array, width: float) -> Mesh:
+    """Returns vertices `(2Bn, 3)` and triangles `(2B(n − 1), 3)` of level ribbons along lines `(B, n, 3)`."""
+    along = np.gradient(lines[..., :2], axis=1)
+    length = np.linalg.norm(along, axis=-1, keepdims=True)
+    across = np.stack([-along[..., 1], along[..., 0]], axis=-1) / np.where(length > 0, length, 1)
+    half = np.zeros_like(lines)
+    half[..., :2] = width / 2 * across
+    vertices = np.stack([lines - half, lines + half], axis=2).reshape(-1, 3)
+    right = 2 * np.arange(lines.shape[0] * lines.shape[1]).reshape(lines.shape[:2])[:, :-1].ravel()
+    faces = np.concatenate(
+        [np.stack([right, right + 2, right + 1], -1), np.stack([right + 1, right + 2, right + 3], -1)]
+    )
+    return vertices.astype(np.float32), faces.astype(np.uint32)
+
+
+def disc(around: Array) -> Mesh:
+    """Returns vertices `(n + 1, 3)` and triangles `(n − 1, 3)` of the level area around the origin.
+
+    Args:
+        around: Closed line around the origin in m, `(n, 2)`.
+    """
+    vertices = np.zeros((len(around) + 1, 3), np.float32)
+    vertices[1:, :2] = around
+    corner = np.arange(1, len(around), dtype=np.uint32)
+    return vertices, np.stack([np.zeros_like(corner), corner, corner + 1], axis=-1)
