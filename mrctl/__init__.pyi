@@ -18,6 +18,7 @@ from .results.metrics import per_lap as per_lap
 from .results.metrics import summary as summary
 from .scenario import Event as Event
 from .scenario import Scenario as Scenario
+from .sensing.tiers import Sensing as Sensing
 from .sweep.plan import Axis as Axis
 from .sweep.plan import Sweep as Sweep
 from .sweep.store import open as open

@@ -1,4 +1,4 @@
-"""The measurements that the controller receives: posture, twist, and the slip of the driven wheels.
+"""What the controllers are told: samples of sensors, and the posture, twist and slip that an estimator makes of them.
 
 Imports `mrctl.kernel` and `mrctl.theory`.
 """
