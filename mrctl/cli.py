@@ -24,11 +24,14 @@ from pydantic import ValidationError
 from mrctl import __version__
 from mrctl.record import InputError, Record, describe
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
+from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, RobotFile
 
 FIRST = ("name", "world", "steering", "reference", "laps", "feedforward", "measurement", "seed")
 """Fields of `Scenario` that `mrctl run --help` explains; it lists the others, which `mrctl run --help-all` explains."""
+
+LAB = Sensing(tier="lab")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -331,21 +334,23 @@ def identify(
     world: str = "flat",
     robot: RobotFile = CAR,
     perturbation: Perturbation = PERTURBATIONS["nominal"],
+    sensing: Sensing = LAB,
     seed: int = 0,
     json: bool = False,
 ) -> None:
-    """Identifies the constants of equation (3) from two drives, with intervals, and compares them with the model's.
+    """Identifies the constants of equation (3) from two drives, and says which of them the sensors can tell.
 
     Args:
         world: World to drive in, which must be level: `flat`, or the path of an MJCF file.
         robot: Robot to identify; by default the world's own.
-        perturbation: Differences of the plant from its model, and the noise of its sensors.
-        seed: Seed of the test signals and of the noise.
+        perturbation: Differences of the plant from its model.
+        sensing: Encoders, gyro and motor driver; delays, accelerometer, fixes and the estimator play no part.
+        seed: Seed of the test signals and of the sensors.
         json: Print JSON instead of a table.
     """
     from mrctl.experiments import identify as identification
 
-    print(identification.run(world, robot, perturbation, seed, json))
+    print(identification.run(world, robot, perturbation, sensing, seed, json))
 
 
 def train(out: Path = Path("composite.safetensors"), plants: int = 120, seed: int = 0) -> None:

@@ -1,21 +1,26 @@
-"""`mrctl identify`: the constants of equation (3) from two drives, from voltages, currents and the measured twist.
+"""`mrctl identify`: the constants of equation (3) from two drives, from voltages, currents, encoders and gyro.
 
 Robots drive open loop under periodic multisines, always forwards, so that Coulomb friction is constant. They drive
 straight on first, then in turns with the front wheel held straight and without grip, as on a sheet of ice, because a
-front wheel that steers or trails makes a part of the torque that equation (3) attributes to the motors. The constants
-are fitted by least squares to signals averaged over periods and low-pass filtered to their lowest harmonics:
+front wheel that steers or trails makes a part of the torque that equation (3) attributes to the motors. The equations
 
-    motors, straight on      ω = U/(N k) − i R_a/(N k),    ω = V/r
-    straight on              V̇ = [ (N k/r) (i_d + i_s) − F_c ] / M_e
+    motors, straight on      φ̇ = U/(N k) − i R_a/(N k)
+    straight on              V̇ = [ (N k/r) (i_d + i_s) − F_c ] / M_e,    V = r (φ̇_d + φ̇_s)/2
     turning                  θ̈ = [ (N k D/r) (i_d − i_s) − m c V θ̇ ] / J_e + constant
 
-with F_c = 2 τ_loss/r + F_roll. The currents give torques, so masses are identified in kg; without current sensors only
-ratios such as M_e/(N k) are. V̇ is the difference of two samples over a tick and thus its mean in between, as is the
-current beside it. The noisy signal stands alone on the left, where noise does not bias the estimate.
+with F_c = 2 τ_loss/r + F_roll are fitted by least squares to the lowest harmonics of the signals. An encoder's error is
+bounded in its angle φ and that of a gyro is white in θ̇, so a line at the frequency ω is weighted by 1/ω for each
+derivative that was taken of the sample; this is the equation, integrated as often. The noisy signal stands alone on the
+left, where noise does not bias the estimate: when the robot turns, the gyro gives θ̈, and the encoders V θ̇. The gyro's
+bias is the constant, and its drift is removed as a linear trend.
 
-Each robot drives its own signal and gives one estimate. The interval around their mean is that of Student's t for noise
-and signals, and in quadrature 1.5 % for effects that equation (3) leaves out and repetition does not show: creep and
-sinkage of the tyres, and the engine's time step.
+The motor driver is assumed to measure voltages and currents exactly, and every sample to have its time. The currents
+give torques, so masses are identified in kg; without current sensors only ratios such as M_e/(N k) are.
+
+Each robot drives its own signal with its own sensors and gives one estimate. The interval around their mean is that of
+Student's t for sensors and signals, and in quadrature 1.5 % for effects that equation (3) leaves out and repetition
+does not show: creep and sinkage of the tyres, and the engine's time step. A constant can be told if half of its
+interval is at most a tenth of it.
 """
 
 from __future__ import annotations
@@ -34,10 +39,13 @@ from mrctl.physics.parameters import read_robot
 from mrctl.physics.plant import Plant, build
 from mrctl.record import InputError
 from mrctl.results.dataset import versions
-from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
+from mrctl.sensing.sensors import Sensors
+from mrctl.sensing.tiers import Sensing
+from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import CAR, Robot, RobotFile
 
 Array = NDArray[np.float64]
+Lines = NDArray[np.complex128]
 
 PERIOD = 10.0  # s of the excitation
 PERIODS = 2  # periods that are averaged, after one in which the robot settles
@@ -45,7 +53,8 @@ REPEATS = 8  # number of robots, each under its own signal
 TICK = 0.005  # s, for which a voltage is held
 FINE = 100  # physics steps in a time constant; the first-order engine adds the damping over half a step to the mass
 MODEL = 0.015  # relative error that effects outside equation (3) may cause
-NOISE = PERTURBATIONS["sensor noise"]
+TOLD = 0.1  # of the value, largest half of the interval of a constant that can be told; chosen
+LAB, NOMINAL = Sensing(tier="lab"), Perturbation()
 NOT_IDENTIFIABLE = """\
 For c, the mass m is taken from a scale. These drives do not identify m, J_w and J_m, which enter only M_e and J_e;
 I_0, gear loss and rolling loss, which enter only F_c; N and k_M, which enter only N k (k_E equals k_M in SI units)."""
@@ -66,70 +75,82 @@ class Constant(NamedTuple):
         """Relative error of the estimate."""
         return self.estimate / self.true - 1
 
+    @property
+    def told(self) -> bool:
+        """Whether the interval is narrow enough to tell the constant."""
+        return self.high - self.low <= 2 * TOLD * abs(self.estimate)
+
 
 class Drive(NamedTuple):
-    """Measured signals of one robot over one period, averaged over periods; each is `(N, 2)`, a row for each tick.
+    """Measured signals of one robot: their mean and their harmonics 1 to K, as complex amplitudes.
 
-    The columns are left and right, or V and θ̇. A signal is the mean over a tick or the value at its end.
+    A signal has its value at the end of a tick, with the time of that end.
     """
 
-    twist: Array
-    """Mean V in m/s and θ̇ in rad/s."""
-    rate: Array
-    """Mean V̇ in m/s² and θ̈ in rad/s²."""
-    end: Array
-    """V in m/s and θ̇ in rad/s at the end of the tick."""
-    voltage: Array
-    """Voltage at the terminals in V, constant within a tick."""
-    current: Array
-    """Current at the end of the tick in A."""
+    wheels: Lines
+    """Rates φ̇ of the wheels, left and right, from the encoders, in rad/s, `(K + 1, 2)`."""
+    turn: Lines
+    """θ̇ of the gyro in rad/s, with its bias but without a linear drift, `(K + 1,)`."""
+    voltage: Lines
+    """Voltages at the terminals, left and right, in V, constant within a tick, `(K + 1, 2)`."""
+    current: Lines
+    """Currents, left and right, in A, `(K + 1, 2)`."""
 
 
-def run(world: str, robot: RobotFile, perturbation: Perturbation, seed: int, json: bool) -> str:
+def run(world: str, robot: RobotFile, perturbation: Perturbation, sensing: Sensing, seed: int, json: bool) -> str:
     """The command: drives, identifies, and prints a table or JSON.
 
     Args:
         world: World to drive in; its ground must be level.
         robot: Robot whose constants are identified.
-        perturbation: How the plant differs from its model, and the noise of its sensors.
-        seed: Seed of signals and noise.
+        perturbation: How the plant differs from its model.
+        sensing: Encoders, gyro and motor driver.
+        seed: Seed of signals and sensors.
         json: Whether to return JSON instead of a table.
 
     Raises:
-        InputError: The robot cannot drive there.
+        InputError: The robot cannot drive there, or the sensors are too slow.
     """
-    found = identify(world, robot, perturbation, seed)
+    found = identify(world, robot, perturbation, sensing, seed)
     if json:
-        rows: list[dict[str, Any]] = [c._asdict() | {"error": c.error} for c in found]
+        rows: list[dict[str, Any]] = [c._asdict() | {"error": c.error, "told": c.told} for c in found]
         source = {"versions": versions(), "machine": machine(), "world": world, "robot": robot.model_dump()}
-        return json_text(source | {"constants": rows})
+        return json_text(source | {"sensing": sensing.model_dump(mode="json"), "constants": rows})
     return text(found)
 
 
 def text(constants: Sequence[Constant]) -> str:
     """The constants as a Markdown table, and which others such drives do not show."""
-    header = ["constant", "unit", "estimate", "95 % interval", "true", "error"]
+    header = ["constant", "unit", "estimate", "95 % interval", "true", "error", "can be told"]
     numbers = [[f"{x:.4g}" for x in (c.estimate, c.low, c.high, c.true)] for c in constants]
     cells = [
-        [c.name, c.unit, estimate, f"{low} to {high}", true, f"{100 * c.error:+.2f} %"]
+        [c.name, c.unit, estimate, f"{low} to {high}", true, f"{100 * c.error:+.2f} %", "yes" if c.told else "no"]
         for c, (estimate, low, high, true) in zip(constants, numbers, strict=True)
     ]
-    return f"{markdown(header, cells)}\n\n{NOT_IDENTIFIABLE}"
+    parts = [markdown(header, cells), NOT_IDENTIFIABLE]
+    if vague := [c.name for c in constants if not c.told]:
+        parts.insert(1, f"These sensors cannot tell within {100 * TOLD:g} %: {', '.join(vague)}.")
+    return "\n\n".join(parts)
 
 
 def identify(
-    world: str = "flat", robot: RobotFile = CAR, perturbation: Perturbation = NOISE, seed: int = 0
+    world: str = "flat",
+    robot: RobotFile = CAR,
+    perturbation: Perturbation = NOMINAL,
+    sensing: Sensing = LAB,
+    seed: int = 0,
 ) -> list[Constant]:
     """Identifies those constants of equation (3) that the drives show.
 
     Args:
         world: World to drive in; its ground must be level.
         robot: Robot whose constants are identified.
-        perturbation: How the plant differs from its model, and the noise of its sensors.
-        seed: Seed of signals and noise.
+        perturbation: How the plant differs from its model.
+        sensing: Encoders, gyro and motor driver; delays, accelerometer, fixes and the estimator play no part.
+        seed: Seed of signals and sensors.
 
     Raises:
-        InputError: The robot fails during a drive.
+        InputError: The robot fails during a drive, or the encoders or the gyro are too slow for the signals.
     """
     own = mjcf.arrangement(robot)
     steering = "rigid" if own == "compliant" else own
@@ -138,14 +159,16 @@ def identify(
     substeps = max(5, int(np.ceil(FINE * TICK / tau)))
     model = mjcf.load(world, steering, TICK / substeps, robot)
     plants = [build(one, nominal, REPEATS, substeps, threads=1) for one in (model, on_skid(model))]
+    for plant in plants:
+        for row in range(REPEATS):
+            delay = round(perturbation.control_delay / TICK)
+            plant.perturb(row, perturbation, delay, sensing.driver, sensing.servo)
     random = np.random.default_rng([seed, 3])
-    ahead, true = excite(plants[0], nominal, perturbation, random, turns=False)
-    turning, _ = excite(plants[1], nominal, perturbation, random, turns=True)
-    highest = round(2 * _bandwidth(nominal) * PERIOD)
-    rows = []
+    ahead, turning = (excite(plant, nominal, sensing, random, k == 1) for k, plant in enumerate(plants))
+    rows, true = [], plants[0].truth[0]
     for straight, turn in zip(ahead, turning, strict=True):
-        found = drive_constants(straight, nominal.wheel_radius, highest)
-        found |= turn_constants(turn, found["R_a"], found["N k"], nominal, highest)
+        found = drive_constants(straight, nominal.wheel_radius)
+        found |= turn_constants(turn, found["R_a"], found["N k"], nominal)
         rows.append(found | {"c": found["m c"] / true.mass})
     facts = {
         "R_a": ("Ω", true.resistance),
@@ -204,55 +227,116 @@ def signals(robot: Robot, random: np.random.Generator, turns: bool) -> Array:
     return found + [speed / robot.velocity_gain + loss, 0.0]
 
 
-def excite(
-    plant: Plant, robot: Robot, perturbation: Perturbation, random: np.random.Generator, turns: bool
-) -> tuple[list[Drive], Robot]:
-    """Drives `REPEATS` robots open loop; returns the measured signals of each, and the true parameters."""
+def excite(plant: Plant, robot: Robot, sensing: Sensing, random: np.random.Generator, turns: bool) -> list[Drive]:
+    """Drives `REPEATS` robots open loop; returns the measured signals of each.
+
+    Raises:
+        InputError: A robot fails, or encoders or gyro are too slow for the signals.
+    """
     period = np.stack([signals(robot, random, turns) for _ in range(REPEATS)], axis=1)  # (N, B, 2)
-    samples = len(period)
-    for row in range(REPEATS):
-        plant.perturb(row, perturbation, round(perturbation.control_delay / TICK))
+    highest, ticks = 2 * round(_bandwidth(robot) * PERIOD), (1 + PERIODS) * len(period)
+    try:
+        sensing.check(TICK, ticks * TICK)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    for name in ("encoder_rate", "gyro_rate"):
+        if (rate := 1 / (TICK * sensing.periods(name, TICK))) <= 2 * highest / PERIOD:
+            raise InputError(f"sensing.{name}: {rate:g} Hz, but the signals need more than {2 * highest / PERIOD:g} Hz")
     plant.reset(np.zeros((REPEATS, 3)), np.tile([robot.max_speed / 2, 0.0], (REPEATS, 1)))
-    ticks = (1 + PERIODS) * samples
-    twist, voltage, current = np.zeros((ticks + 1, REPEATS, 2)), *np.zeros((2, ticks, REPEATS, 2))
+    sensors = Sensors([sensing] * REPEATS, random.integers(2**31, size=REPEATS).tolist(), TICK)
+    samples = np.zeros((ticks + 1, REPEATS), sensors.ring.dtype)
+    voltage, current = np.zeros((2, ticks + 1, REPEATS, 2))
     command = np.zeros((REPEATS, 4))
-    for k in range(ticks):
-        common, differential = period[k % samples].T
+    for k in range(ticks + 1):
+        sensors.measure(k, plant.state)
+        samples[k] = sensors.ring[k % len(sensors.ring)]
+        voltage[k], current[k] = plant.applied, plant.current()  # of the tick that ends
+        common, differential = period[k % len(period)].T
         command[:, 0], command[:, 1] = common - differential, common + differential
-        twist[k] = plant.reading["twist"]
         plant.step(command)
-        voltage[k], current[k] = plant.applied, plant.current()
-    twist[ticks] = plant.reading["twist"]
     if plant.failed.any():
         raise InputError(f"identify: a robot failed during the drive: {next(filter(None, plant.failure))}")
-    twist += random.standard_normal(twist.shape) * [perturbation.velocity_noise, perturbation.rotation_noise]
 
-    def mean(values: Array) -> Array:
-        return values[-PERIODS * samples :].reshape(PERIODS, samples, REPEATS, 2).mean(axis=0).transpose(1, 0, 2)
+    time = TICK * np.arange(ticks + 1)[-PERIODS * len(period) :]
 
-    first, last = twist[:-1], twist[1:]
-    measured = map(mean, ((first + last) / 2, (last - first) / TICK, last, voltage, current))
-    return [Drive(*row) for row in zip(*measured, strict=True)], plant.truth[0]
+    def seen(values: Array, new: NDArray[np.bool] | slice = slice(None)) -> tuple[Lines, Array]:
+        return lines(time[new], values[-len(time) :][new], highest)
+
+    fresh = {name: samples[f"{name}_new"][-len(time) :, 0] for name in ("encoder", "gyro")}
+    wheels = derivative(*seen(samples["encoder"], fresh["encoder"]))
+    measured = wheels, seen(samples["gyro"], fresh["gyro"])[0], seen(voltage)[0], seen(current)[0]
+    return [Drive(*(values[:, row] for values in measured)) for row in range(REPEATS)]
 
 
-def drive_constants(drive: Drive, wheel_radius: float, highest: int) -> dict[str, float]:
+def lines(time: NDArray, values: NDArray, highest: int) -> tuple[Lines, Array]:
+    """Mean and harmonics of signals that are periodic but for a linear trend, by least squares.
+
+    Args:
+        time: Times of the samples in s, over whole periods, `(n,)`.
+        values: Samples, `(n, …)`.
+        highest: Highest harmonic K, below half of the number of samples in a period.
+
+    Returns:
+        Mean and complex amplitudes c of c e^{jωt} + conjugate, `(K + 1, …)`, and the trend in a second, `(…)`.
+    """
+    angle = 2 * np.pi / PERIOD * np.outer(time, np.arange(1, highest + 1))
+    slope = (time - time.mean()) / PERIOD
+    basis = np.column_stack([np.ones_like(time), slope, 2 * np.cos(angle), -2 * np.sin(angle)])
+    # The columns are nearly orthogonal, so that the normal equations lose nothing.
+    found = np.linalg.solve(basis.T @ basis, basis.T @ values.reshape(len(time), -1))
+    found = found.reshape(-1, *values.shape[1:])
+    mean, trend, real, imaginary = found[:1], found[1] / PERIOD, *np.split(found[2:], 2)
+    return np.asarray(np.concatenate([mean + 0j, real + 1j * imaginary]), complex), np.asarray(trend, float)
+
+
+def derivative(of: Lines, trend: Array | float = 0.0) -> Lines:
+    """Derivative of a signal with these lines and this trend in a second."""
+    found = _shaped(1j * frequencies(len(of)), of) * of
+    found[0] = trend
+    return found
+
+
+def frequencies(count: int) -> Array:
+    """Angular frequencies of the mean and the harmonics in rad/s, `(count,)`."""
+    return np.asarray(2 * np.pi / PERIOD * np.arange(count), float)
+
+
+def _shaped(factors: NDArray, like: Lines) -> NDArray:
+    return factors.reshape(-1, *[1] * (like.ndim - 1))
+
+
+def average(of: Lines) -> Lines:
+    """Lines of the mean over the tick that ends, for a signal with these lines at the ends of ticks."""
+    shift = 1j * TICK * frequencies(len(of))[1:]
+    return _shaped(np.append(1.0, (1 - np.exp(-shift)) / shift), of) * of
+
+
+def product(first: Lines, second: Lines) -> Lines:
+    """Lines of the product of two signals, `(K + 1,)`; harmonics beyond K, which the two lack, do not count."""
+    count = 4 * len(first)
+    values = [np.fft.irfft(one, count) * count for one in (first, second)]
+    return np.fft.rfft(values[0] * values[1])[: len(first)] / count
+
+
+def drive_constants(drive: Drive, wheel_radius: float) -> dict[str, float]:
     """R_a, N k, M_e and F_c from a drive straight on.
 
     Args:
         drive: Measured signals.
         wheel_radius: Radius of the driven wheels in m.
-        highest: Highest harmonic that the low-pass filter keeps.
     """
-    rate = np.repeat(drive.end[:, :1] / wheel_radius, 2, axis=1)  # of both wheels: their motors are alike
-    speed_per_volt, fall = _fit(highest, rate.T, drive.voltage.T, -drive.current.T)
+    omega = frequencies(len(drive.turn))
+    omega[0] = omega[1]  # for the weight of the means; both motors are alike
+    speed_per_volt, fall = _fit(omega**-1, drive.wheels.T, drive.voltage.T, -drive.current.T)
     resistance, constant = fall / speed_per_volt, 1 / speed_per_volt
     force = constant / wheel_radius * _mean_current(drive, resistance).sum(axis=1)
-    lighter, loss = _fit(highest, drive.rate[:, 0], force, -np.ones_like(force))
-    found = {"R_a": resistance, "N k": constant, "M_e": 1 / lighter, "F_c": loss / lighter}
-    return {name: float(value) for name, value in found.items()}
+    loss = force[0].real  # the motion is periodic, so that V̇ is zero in the mean
+    v = wheel_radius * drive.wheels.mean(axis=1)
+    (lighter,) = _fit(omega[1:] ** -2, average(derivative(v))[1:], force[1:])
+    return {"R_a": float(resistance), "N k": float(constant), "M_e": float(1 / lighter), "F_c": float(loss)}
 
 
-def turn_constants(drive: Drive, resistance: float, constant: float, robot: Robot, highest: int) -> dict[str, float]:
+def turn_constants(drive: Drive, resistance: float, constant: float, robot: Robot) -> dict[str, float]:
     """J_e and m c from a drive in turns.
 
     Args:
@@ -260,28 +344,27 @@ def turn_constants(drive: Drive, resistance: float, constant: float, robot: Robo
         resistance: R_a in Ω.
         constant: N k in N·m/A.
         robot: Robot whose wheel radius and half track are used, which a ruler measures.
-        highest: Highest harmonic that the low-pass filter keeps.
     """
     current = _mean_current(drive, resistance)
     torque = constant * robot.half_track / robot.wheel_radius * (current[:, 1] - current[:, 0])
-    v, omega = drive.twist.T
-    nimbler, drag, _ = _fit(highest, drive.rate[:, 1], torque, -v * omega, np.ones_like(v))
+    left, right = robot.wheel_radius * drive.wheels.T
+    bend = average(product((left + right) / 2, (right - left) / (2 * robot.half_track)))
+    nimbler, drag = _fit(1 / frequencies(len(bend))[1:], average(derivative(drive.turn))[1:], torque[1:], -bend[1:])
     return {"J_e": float(1 / nimbler), "m c": float(drag / nimbler)}
 
 
-def _mean_current(drive: Drive, resistance: float) -> Array:
+def _mean_current(drive: Drive, resistance: float) -> Lines:
     """Mean current of each tick: at its beginning the current jumps with the voltage, then it runs on to its end."""
-    jump = (drive.voltage - np.roll(drive.voltage, 1, axis=0)) / resistance
-    return (np.roll(drive.current, 1, axis=0) + jump + drive.current) / 2
+    before = np.exp(-1j * TICK * frequencies(len(drive.current)))[:, None]
+    jump = (1 - before) * drive.voltage / resistance
+    return (before * drive.current + jump + drive.current) / 2
 
 
-def _fit(highest: int, left: Array, *right: Array) -> Array:
-    """Least-squares coefficients of signals `(…, N)` over whole periods, low-pass filtered to the lowest harmonics."""
+def _fit(weight: Array, left: Lines, *right: Lines) -> Array:
+    """Real least-squares coefficients of lines `(…, n)` with weights `(n,)`."""
 
-    def low(signal: Array) -> Array:
-        spectrum = np.fft.rfft(signal)
-        spectrum[..., highest + 1 :] = 0
-        return np.fft.irfft(spectrum, signal.shape[-1]).ravel()
+    def real(of: Lines) -> Array:
+        return (of * weight).ravel().view(float)
 
-    found = np.linalg.lstsq(np.stack([low(r) for r in right], axis=1), low(left), rcond=None)[0]
+    found = np.linalg.lstsq(np.stack([real(r) for r in right], axis=1), real(left), rcond=None)[0]
     return np.asarray(found, float)

@@ -1,40 +1,61 @@
-"""`mrctl identify` on the physics: within 5 %, with intervals that hold the truth, for the default robot and others."""
+"""`mrctl identify` on the physics, in all tiers: intervals hold the truth, for the default robot and others."""
 
 import json
 
 import pytest
 
-from mrctl import Perturbation, RobotFile, cli
-from mrctl.experiments.identify import NOISE, identify
+from mrctl import InputError, Perturbation, RobotFile, cli
+from mrctl.experiments.identify import identify
+from mrctl.sensing.tiers import Sensing
+
+LAB, FIELD = Sensing(tier="lab"), Sensing(tier="field")
 
 
 def test_default_robot(capsys):
-    """All constants within 1 % with the noise of ordinary sensors, and inside of their intervals; the table says so."""
+    """All constants within 1 % from the sensors of the lab, and inside of their intervals; the table says so."""
     assert cli.main(["identify", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["constants"]
-    assert [row["name"] for row in rows] == ["R_a", "N k", "M_e", "F_c", "J_e", "m c", "c"]
-    for row in rows:
-        assert abs(row["error"]) < 0.01, row
+    found = json.loads(capsys.readouterr().out)
+    assert found["sensing"]["tier"] == "lab"
+    assert [row["name"] for row in found["constants"]] == ["R_a", "N k", "M_e", "F_c", "J_e", "m c", "c"]
+    for row in found["constants"]:
+        assert abs(row["error"]) < 0.01 and row["told"], row
         assert row["low"] < row["true"] < row["high"], row
         assert row["high"] - row["low"] < 0.05 * row["true"], row
 
 
-def test_another_than_modelled():
+@pytest.mark.parametrize("tier", ["ideal", "field"])
+def test_another_than_modelled(tier):
     """It is the plant that is identified, not its model: heavier, weaker motors, more friction, a sagging supply."""
-    change = {"mass_factor": 1.5, "resistance_factor": 1.3, "drive_friction_factor": 2.0, "supply_factor": 0.9}
-    for c in identify(perturbation=NOISE.model_copy(update=change), seed=1):
-        assert abs(c.error) < 0.02 and c.low < c.true < c.high, c
+    change = Perturbation(mass_factor=1.5, resistance_factor=1.3, drive_friction_factor=2.0, supply_factor=0.9)
+    for c in identify(perturbation=change, sensing=Sensing(tier=tier), seed=1):
+        assert abs(c.error) < 0.02 and c.low < c.true < c.high and c.told, c
         if c.name == "M_e":
             assert c.true == pytest.approx(31.7, rel=0.01)  # half as much again as 21.3, but for the rotors
 
 
 def test_racing_car():
     """Steered wheels are held straight: the motors make θ̇ there, too."""
-    for c in identify(robot=RobotFile(path="racecar"), perturbation=Perturbation()):
+    for c in identify(robot=RobotFile(path="racecar"), sensing=FIELD):
         assert abs(c.error) < 0.02 and c.low < c.true < c.high, c
 
 
+def test_what_sensors_cannot_tell():
+    """A gyro a thousand times as noisy tells nothing of turns, but encoders of a count in 15° tell the rest; at rates
+    and latencies of their own."""
+    bad = FIELD.model_copy(
+        update={"gyro_noise": 0.5, "encoder_counts": 24, "encoder_rate": 50, "encoder_latency": 0.02}
+    )
+    found = {c.name: c for c in identify(sensing=bad)}
+    assert {name for name, c in found.items() if not c.told} == {"J_e", "m c", "c"}
+    for c in found.values():
+        assert c.low < c.true < c.high, c
+        assert not c.told or abs(c.error) < 0.01, c
+
+
 def test_refused(capsys):
-    """One line for a robot that is not there."""
+    """One line for a robot that is not there, and for sensors that do not fit the signals."""
     assert cli.main(["identify", "--robot.path", "none.xml"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+    for change, message in (({"gyro_rate": 4}, "gyro_rate: 4 Hz, but"), ({"encoder_rate": 30}, "encoder_rate: 0.0333")):
+        with pytest.raises(InputError, match=message):
+            identify(sensing=LAB.model_copy(update=change))

@@ -4,25 +4,25 @@ import numpy as np
 import pytest
 
 from mrctl.experiments import identify
-from mrctl.experiments.identify import TICK, Drive, drive_constants, signals, turn_constants
+from mrctl.experiments.identify import TICK, Drive, derivative, drive_constants, lines, signals, turn_constants
 from mrctl.theory.robot import Robot
 
 
 def integrate(robot: Robot, volts, start):
-    """Twist at the ticks `(N + 1, B, 2)` under voltages `(N, B, 2)` left and right, both wheels turning forwards."""
+    """V, θ̇, distance and heading at the ticks `(N + 1, B, 4)` under voltages `(N, B, 2)`, wheels turning forwards."""
     r, d, k = robot.wheel_radius, robot.half_track, robot.back_emf
     lever, loss = robot.mass * robot.com_offset, 2 * robot.drive_loss / r + robot.rolling_force
 
     def rate(state, left, right):
-        v, omega = state
+        v, omega = state[:2]
         pull = k / r / robot.resistance * (left + right - 2 * k * v / r)
         twist = d * k / r / robot.resistance * (right - left - 2 * k * d * omega / r)
-        return np.stack([
-            (pull + lever * omega**2 - loss) / robot.effective_mass,
-            (twist - lever * v * omega) / robot.effective_inertia,
-        ])  # fmt: skip
+        v_dot = (pull + lever * omega**2 - loss) / robot.effective_mass
+        return np.stack([v_dot, (twist - lever * v * omega) / robot.effective_inertia, v, omega])
 
-    state, out = np.array(start).T, [np.array(start)]
+    state = np.array(start).T
+    state = np.concatenate([state, 0 * state])
+    out = [state.T]
     for left, right in np.moveaxis(volts, -1, 1):
         k1 = rate(state, left, right)
         k2 = rate(state + TICK / 2 * k1, left, right)
@@ -33,16 +33,25 @@ def integrate(robot: Robot, volts, start):
     return np.array(out)
 
 
-def drives(robot, count, random, turns, noise=(0.0, 0.0)):
-    """Drives of several robots, the second period of two."""
+def both(robot, mean, turn):
+    """Left and right wheel from the motion of the axle, `(…, 2)`."""
+    return (mean[..., None] + [-robot.half_track, robot.half_track] * turn[..., None]) / robot.wheel_radius
+
+
+def drives(robot, count, random, turns, quantum=0.0, noise=0.0):
+    """Drives of several robots, the second period of two; encoders with counts, and a noisy gyro that drifts."""
     common, apart = np.moveaxis(np.stack([signals(robot, random, turns) for _ in range(count)], 1), -1, 0)
-    volts = np.stack([common - apart, common + apart], -1)
-    twist = integrate(robot, np.tile(volts, (2, 1, 1)), np.tile([robot.max_speed / 2, 0.0], (count, 1)))[len(volts) :]
-    rates = (twist[1:, :, :1] + [-robot.half_track, robot.half_track] * twist[1:, :, 1:]) / robot.wheel_radius
-    current = (volts - robot.back_emf * rates) / robot.resistance
-    seen = twist + random.standard_normal(twist.shape) * noise
-    first, last = seen[:-1], seen[1:]
-    parts = ((first + last) / 2, (last - first) / TICK, last, volts, current)
+    volts = np.tile(np.stack([common - apart, common + apart], -1), (2, 1, 1))
+    v, omega, way, heading = integrate(robot, volts, np.tile([robot.max_speed / 2, 0.0], (count, 1)))[1:].T
+    current = (volts - robot.back_emf * both(robot, v, omega).swapaxes(0, 1)) / robot.resistance
+    encoders = both(robot, way, heading).swapaxes(0, 1)
+    if quantum:
+        encoders = quantum * np.floor(encoders / quantum + random.random((count, 2)))
+    time = TICK * np.arange(1, len(volts) + 1)
+    gyro = omega.T + noise * (random.standard_normal(omega.T.shape) + 0.1 * time[:, None])
+    whole, highest = len(volts) // 2, 2 * round(identify._bandwidth(robot) * identify.PERIOD)
+    seen = [lines(time[whole:], signal[whole:], highest) for signal in (encoders, gyro, volts, current)]
+    parts = derivative(*seen[0]), *(part for part, _ in seen[1:])
     return [Drive(*(part[:, b] for part in parts)) for b in range(count)]
 
 
@@ -54,9 +63,39 @@ def truths(robot):
     }  # fmt: skip
 
 
-def constants(robot, straight, turn, highest=60):
-    found = drive_constants(straight, robot.wheel_radius, highest)
-    return found | turn_constants(turn, found["R_a"], found["N k"], robot, highest)
+def constants(robot, straight, turn):
+    found = drive_constants(straight, robot.wheel_radius)
+    return found | turn_constants(turn, found["R_a"], found["N k"], robot)
+
+
+def test_lines():
+    """Mean, harmonics and trend of a signal that is written down, from samples of which every third is missing."""
+    time = 0.05 * np.array([k for k in range(400) if k % 3])
+    turn = 2 * np.pi / identify.PERIOD * time
+    values = 3.0 + 0.5 * (time - time.mean()) + 2.0 * np.cos(turn) - 0.4 * np.sin(5 * turn)
+    found, trend = lines(time, np.stack([values, 2 * values], axis=1), 7)
+    expected = np.zeros(8, complex)
+    expected[[0, 1, 5]] = 3.0, 1.0, 0.2j
+    np.testing.assert_allclose(found, np.outer(expected, [1, 2]), atol=1e-12)
+    assert trend == pytest.approx([0.5, 1.0])
+    slope = derivative(found, trend)[:, 0]
+    omega = 2 * np.pi / identify.PERIOD
+    assert slope[[0, 1, 5]] == pytest.approx([0.5, 1j * omega, -omega]) and np.abs(slope[[2, 3, 4, 6, 7]]).max() < 1e-12
+
+
+def test_average_and_product():
+    """The mean over a tick against an integral, and the product of two signals against that of their samples."""
+    random = np.random.default_rng(0)
+    first, second = random.standard_normal((2, 6)) + 1j * np.pad(random.standard_normal((2, 5)), ((0, 0), (1, 0)))
+
+    def at(of, time):
+        return of[0].real + 2 * (of[1:, None] * np.exp(1j * np.outer(identify.frequencies(6)[1:], time))).real.sum(0)
+
+    fine = 3.0 - TICK + TICK * (np.arange(1000) + 0.5) / 1000
+    assert at(identify.average(first), 3.0)[0] == pytest.approx(at(first, fine).mean(), rel=1e-6)
+    time = identify.PERIOD * np.arange(40) / 40
+    expected = np.fft.rfft(at(first, time) * at(second, time))[:6] / 40
+    np.testing.assert_allclose(identify.product(first, second), expected, atol=1e-12)
 
 
 def test_exact(robot):
@@ -89,26 +128,41 @@ def test_tells_apart(robot, field, factor, moves):
 
 
 def test_intervals_cover(robot):
-    """Of 180 intervals, each from 8 noisy drives and without the share for the model, some 95 % hold the truth."""
-    random, noise, repeats, groups = np.random.default_rng(3), (0.02, 0.04), identify.REPEATS, 30
-    ahead, turning = (drives(robot, repeats * groups, random, turns, noise) for turns in (False, True))
+    """Of 120 intervals, each from 8 noisy drives and without the share for the model, some 95 % hold the truth.
+
+    The sensors are bad enough for their errors to exceed the 0.2 % that currents within a tick cost.
+    """
+    random, repeats, groups = np.random.default_rng(3), identify.REPEATS, 20
+    ahead, turning = (drives(robot, repeats * groups, random, turns, 0.5, 0.5) for turns in (False, True))
     rows = [constants(robot, *pair) for pair in zip(ahead, turning, strict=True)]
     covered = 0
     for name, true in truths(robot).items():
         values = np.array([row[name] for row in rows]).reshape(groups, repeats)
         reach = identify.scatter(values)
         covered += int(np.sum(np.abs(values.mean(axis=1) - true) <= reach))
-    assert 160 <= covered <= 179, covered
+    assert 106 <= covered <= 119, covered
+
+
+def test_told():
+    """A constant is told if half of its interval is at most a tenth of it; the table says which are not."""
+    good = identify.Constant("M_e", "kg", 20.0, 18.1, 21.9, 20.5)
+    bad = identify.Constant("m c", "kg·m", 2.0, 1.7, 2.3, 2.1)
+    assert good.told and not bad.told
+    text = identify.text([good, bad])
+    assert "within 10 %: m c." in text and "cannot tell" not in identify.text([good])
 
 
 def test_signals(robot):
     """Predicted from equation (3), the drive keeps to the robot's limits, and both wheels turn forwards."""
     for turns in (False, True):
-        random = np.random.default_rng(4)
-        for drive in drives(robot, 3, random, turns):
-            v, omega = drive.twist.T
-            assert v.min() > robot.half_track * np.abs(omega).max() and v.max() < robot.max_speed
-            assert np.abs(drive.rate[:, 0]).max() < robot.max_acceleration
-            assert np.abs(drive.rate[:, 1]).max() < robot.max_rotation_acceleration
-            assert np.abs(drive.voltage).max() < robot.supply
-            assert (np.abs(omega).max() > 0.05) == turns
+        period = np.stack([signals(robot, np.random.default_rng([4, k]), turns) for k in range(3)], axis=1)
+        common, apart = np.moveaxis(period, -1, 0)
+        volts = np.tile(np.stack([common - apart, common + apart], -1), (2, 1, 1))
+        path = integrate(robot, volts, np.tile([robot.max_speed / 2, 0.0], (3, 1)))[len(period) :]
+        v, omega = path[..., 0], path[..., 1]
+        v_dot, omega_dot = (np.diff(one, axis=0) / TICK for one in (v, omega))
+        assert v.min() > robot.half_track * np.abs(omega).max() and v.max() < robot.max_speed
+        assert np.abs(v_dot).max() < robot.max_acceleration
+        assert np.abs(omega_dot).max() < robot.max_rotation_acceleration
+        assert np.abs(volts).max() < robot.supply
+        assert (np.abs(omega).max() > 0.05) == turns
