@@ -38,11 +38,18 @@ def robot() -> Robot:
     )  # fmt: skip
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks what runs the whole system, so that `pytest -m "not system"` is a quick loop for developers."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Marks what runs the whole system, so that `pytest -m "not system"` is a quick loop for developers.
+
+    Tests of the mark `full` are left out, unless `-m` asks for them.
+    """
     for item in items:
         if "system" in item.path.parts:
             item.add_marker("system")
+    if "full" not in config.option.markexpr:
+        left_out = [item for item in items if item.get_closest_marker("full")]
+        items[:] = [item for item in items if item not in left_out]
+        config.hook.pytest_deselected(items=left_out)
 
 
 @pytest.hookimpl(tryfirst=True)

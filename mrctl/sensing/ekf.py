@@ -30,7 +30,8 @@ SETTLE = 1.0  # s, time in which o follows the faster offset of `find_grip`
 LOOSE_V = 0.5  # of V̇ while no wheel grips, m/s²/√Hz
 INCLINE = 0.02  # change of the accelerometer's share of gravity, m/s²/√s
 SIDE_SLIP, SKID = 2e-4, 0.02  # lateral motion of the rear axle beyond v_y, while both wheels grip and else, m/√s
-CREEP = 1.5e-4  # slip of a rolling tyre, share of the angle, √s
+CREEP = 0.8e-4  # slip of a rolling tyre, share of the angle, √s
+JOLT = 1e-3  # slip of a tyre while its force changes, rad/(m/s²); measured where a motor's current jumps by 4.7 A
 RADIUS = 0.01  # standard deviation of the scale of a wheel's radius at the start
 RADIUS_WALK = 1e-5  # of that scale, 1/√s
 START_OFFSET = 0.2  # of the accelerometer's share of gravity, m/s²
@@ -70,8 +71,10 @@ EKF = np.dtype(
 
 
 @kernel
-def propagate(v_dot: float, omega_dot: float, grip: Array, geometry: Array, period: float, s: Row) -> None:
-    """Predicts the state over one period: P ← F P Fᵀ + Q."""
+def propagate(
+    v_dot: float, omega_dot: float, jolt: float, grip: Array, geometry: Array, period: float, s: Row
+) -> None:
+    """Predicts the state over one period: P ← F P Fᵀ + Q; `jolt` is the change of the acceleration in m/s²."""
     m, P, T = s.mean, s.P, period
     r, D, side_lag = geometry[0], geometry[1], SIDE - geometry[3]
     v, omega = m[V] + v_dot * T / 2, m[OMEGA] + omega_dot * T / 2
@@ -108,8 +111,8 @@ def propagate(v_dot: float, omega_dot: float, grip: Array, geometry: Array, peri
     P[OMEGA, OMEGA] += T * TURN**2
     P[BIAS, BIAS] += T * s.bias_walk**2
     P[OFFSET, OFFSET] += T * (s.offset_walk**2 + (s.offset - m[OFFSET]) ** 2 / SETTLE)
-    P[LEFT, LEFT] += CREEP**2 * turn_left**2 / T
-    P[RIGHT, RIGHT] += CREEP**2 * turn_right**2 / T
+    P[LEFT, LEFT] += CREEP**2 * turn_left**2 / T + JOLT**2 * jolt**2
+    P[RIGHT, RIGHT] += CREEP**2 * turn_right**2 / T + JOLT**2 * jolt**2
     P[SCALE_LEFT, SCALE_LEFT] += T * RADIUS_WALK**2
     P[SCALE_RIGHT, SCALE_RIGHT] += T * RADIUS_WALK**2
 
@@ -241,7 +244,8 @@ def step(t: int, ring: Rows, i: int, geometry: Array, period: float, delay: int,
     now, p = ring[t % len(ring), i], t - 1 - delay
     omega_dot = ring[p % len(ring), i].command[1] if p >= start else 0.0
     forward = now.acceleration[0] + geometry[2] * s.mean[OMEGA] ** 2  # the accelerometer is ahead of the rear axle
-    propagate(forward - s.mean[OFFSET], omega_dot, now.grip, geometry, period, s)
+    jolt = now.acceleration[0] - ring[(t - 1) % len(ring), i].acceleration[0]
+    propagate(forward - s.mean[OFFSET], omega_dot, jolt, now.grip, geometry, period, s)
     measure(now, omega_dot, geometry[3], s)
     s.tick = t
 

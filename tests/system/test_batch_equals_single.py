@@ -8,6 +8,7 @@ import pytest
 from mrctl import Circle, Event, Fel, Kanayama, LaneChange, Lemniscate, Line, Perturbation, Pid, Scenario, StopAndGo
 from mrctl.loop.simulation import Simulation, simulate
 from mrctl.physics.plant import BatchPlant, PhysicsPlant
+from mrctl.sensing.tiers import TIERS, Sensing
 
 pytestmark = pytest.mark.xdist_group("batch_equals_single")  # what its tests share is made once
 
@@ -44,11 +45,42 @@ RANGES = {
     "supply_factor": (0.7, 1.2),
     "tyre_friction_factor": (0.3, 1.2),
     "slope": (-0.1, 0.1),
-    "velocity_noise": (0.0, 0.02),
-    "rotation_noise": (0.0, 0.02),
-    "position_noise": (0.0, 0.01),
-    "heading_noise": (0.0, 0.01),
 }
+
+SENSES = {
+    "encoder_counts": (50, 100_000),
+    "gyro_noise": (0.0, 0.002),
+    "gyro_bias": (0.0, 0.02),
+    "gyro_walk": (0.0, 0.001),
+    "accelerometer_noise": (0.0, 0.01),
+    "accelerometer_bias": (0.0, 0.3),
+    "accelerometer_walk": (0.0, 0.01),
+    "fix_position_noise": (0.0, 0.03),
+    "fix_heading_noise": (0.0, 0.02),
+    "fix_lost": (0.0, 0.5),
+    "fix_outliers": (0.0, 0.3),
+    "dead_zone": (0.0, 0.5),
+    "current_limit": (4.0, 12.0),
+    "battery_resistance": (0.0, 0.2),
+    "steering_offset": (-0.02, 0.02),
+    "steering_backlash": (0.0, 0.02),
+}
+SENSORS = ("encoder", "gyro", "accelerometer", "fix")
+
+
+def sensing(rng: np.random.Generator, alike: bool) -> Sensing:
+    """Any tier and estimator, with a third of the fields at random: noise, rates, latencies, driver and steering."""
+    values = {name: float(rng.uniform(*bounds)) for name, bounds in SENSES.items() if rng.random() < 0.35}
+    if "encoder_counts" in values:
+        values["encoder_counts"] = int(values["encoder_counts"])
+    for name in SENSORS:
+        if rng.random() < 0.35:
+            values[f"{name}_rate"] = float(rng.choice([50, 25, 20]))
+        if rng.random() < 0.35:
+            values[f"{name}_latency"] = int(rng.integers(5)) / 100
+    values["delay"] = 0.01 if alike else int(rng.integers(4)) / 100
+    estimator = "ekf" if alike else str(rng.choice(["truth", "odometry", "ekf", "ekf"]))
+    return Sensing(tier=str(rng.choice(TIERS)), estimator=estimator, **values)
 
 
 def perturbation(rng: np.random.Generator) -> Perturbation:
@@ -85,7 +117,7 @@ def scenario(seed: int) -> Scenario:
         feedforward="fel"
         if alike
         else str(rng.choice(["none", "model", "oracle", "observer", "fel", "rls", "composite"])),
-        measurement=str(rng.choice(["truth", "odometry"])),
+        sensing=sensing(rng, alike),
         kanayama=Kanayama(k_x=float(rng.uniform(2, 4))),
         fel=Fel(step=float(rng.uniform(0, 0.1))),
         perturbation=perturbation(rng) if rng.random() < 0.8 else Perturbation(),
@@ -132,8 +164,10 @@ def test_scenarios_differ(scenarios, alone):
     events = [e for s in scenarios for e in s.events]
     for field in ("perturbation", "push", "kanayama", "pid", "learning"):
         assert any(getattr(e, field) is not None for e in events)
-    for field, kinds in {"world": 4, "steering": 3, "feedforward": 7, "measurement": 2, "motion_period": 2}.items():
+    for field, kinds in {"world": 4, "steering": 3, "feedforward": 7, "motion_period": 2}.items():
         assert len({getattr(s, field) for s in scenarios}) == kinds
+    assert {s.sensing.tier for s in scenarios} == set(TIERS)
+    assert {s.sensing.source for s in scenarios} == {"truth", "odometry", "ekf"}
     assert {s.perturbation.control_delay for s in scenarios} == {0, 0.01, 0.02, 0.03, 0.04}
     assert 1 <= sum(bool(run.failed) for run in alone) <= COUNT // 4
 

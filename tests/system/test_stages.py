@@ -10,7 +10,6 @@ from mrctl.cli import main
 from mrctl.control.kanayama import GAINS, kanayama, posture_error
 from mrctl.control.nominal import nominal
 from mrctl.control.pid import PID, pid
-from mrctl.control.stages import METHODS
 from mrctl.control.steering import ALLOCATION, allocate
 from mrctl.kernel import over_rows
 from mrctl.loop.simulation import simulate
@@ -20,6 +19,7 @@ from mrctl.sweep import jobs
 SHORT = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
 THREE = [SHORT.model_copy(update={"seed": seed}) for seed in range(3)]
 LAP = Scenario(reference=Lemniscate(period=10), laps=1)
+STAGES = "motion", "feedback", "feedforward", "steering"  # and the estimator, whose faults differ: test_estimators.py
 
 
 def posture_errors(pose, reference):
@@ -208,7 +208,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("stage", METHODS)
+@pytest.mark.parametrize("stage", STAGES)
 def test_fault(stage, fault):
     """A stage that raises or answers in another shape ends its group, whose record is kept; other groups go on."""
     other = SHORT.model_copy(update={"steering": "caster"})
@@ -228,7 +228,7 @@ def test_fault(stage, fault):
     assert text.startswith(f"{stage} Breaks: ") and "(1, 2)" in text if "shape" in message else text
 
 
-@pytest.mark.parametrize("stage", METHODS)
+@pytest.mark.parametrize("stage", STAGES)
 def test_not_finite(stage):
     """A number that is not finite stops the run of its row, whose failure names stage and tick, and no other run."""
     whole, sound = simulate(THREE, **breaking(stage, spoilt)), simulate(THREE)
@@ -267,7 +267,7 @@ def test_inputs_are_copies():
 @pytest.mark.parametrize(
     ("own", "message"),
     [
-        ({"motor": Kanayama}, "motor: no such stage; there are motion, feedback, feedforward, steering"),
+        ({"motor": Kanayama}, "motor: no such stage; there are motion, feedback, feedforward, steering, estimator"),
         ({"motion": lambda robot: None}, "motion <lambda>: TypeError: "),
         ({"motion": Silent}, "motion Silent: has no method reset"),
         ({"feedforward": Kanayama}, "feedforward Kanayama: has no method learn"),
@@ -318,7 +318,10 @@ def test_command_line(tmp_path, capsys):
     )
     for name, message in (
         (f"{file}:Mine", "feedforward Mine: has no method learn"),
-        (f"motor={file}:Mine", "controller: 'motor' is no stage; there are motion, feedback, feedforward, steering"),
+        (
+            f"motor={file}:Mine",
+            "controller: 'motor' is no stage; there are motion, feedback, feedforward, steering, estimator",
+        ),
         (f"motion={file}:Mine,motion={file}:Mine", "controller: motion is there twice"),
         (f"motion={file}:Other", "controller: mine.py has no Other"),
         ("motion=nowhere.py:Mine", "controller: no file nowhere.py"),

@@ -1,0 +1,325 @@
+"""Estimators in the loop: the filter knows how wrong it is, survives what robots meet, and a user's own replaces it."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from mrctl import InputError, LaneChange, Perturbation, Scenario, simulate
+from mrctl.loop.simulation import Simulation
+from mrctl.results.dataset import SIGNALS
+from mrctl.sensing import ekf
+from mrctl.sensing.prediction import wrapped
+from mrctl.sensing.tiers import Sensing
+
+SETTLED, APART = 300, 337  # ticks before the first look at the errors, and from one look to the next
+TIERS = "lab", "field"
+POSTURE, POSTURE_AND_TWIST = [0, 1, 2], [0, 1, 2, 3, 4]
+STATES = "x", "y", "theta", "v", "omega"
+
+
+def watched(scenarios):
+    """Returns what the filters of a group of runs believed, tick by tick.
+
+    Returns:
+        Errors of posture and twist `(ticks, B, 5)`, their covariances `(ticks, B, 5, 5)`, the normalised innovations
+        squared of the fixes, NaN where none arrived `(ticks, B)`, and which robots failed `(B,)`.
+    """
+    simulation = Simulation(scenarios)
+    length, size = simulation.ticks, len(scenarios)
+    errors, covariances = np.full((length, size, 5), np.nan), np.full((length, size, 5, 5), np.nan)
+    innovations = np.full((length, size), np.nan)
+    while simulation.running:
+        seen, tick = simulation.sense()[0], simulation.tick
+        true = np.hstack([simulation.plant.reading["pose"], simulation.plant.reading["twist"]])
+        error = seen["estimate"] - true
+        error[:, 2] = np.pi - (np.pi - error[:, 2]) % (2 * np.pi)
+        errors[tick], covariances[tick] = error, simulation.estimator.memory["P"][:, :5, :5]
+        arrived = ~np.isnan(seen["fix"][:, 0])
+        innovations[tick] = np.where(arrived, simulation.estimator.memory["nis"], np.nan)
+        simulation.step()
+    return errors, covariances, innovations, simulation.plant.failed.copy()
+
+
+def normalised(errors, covariances, states=slice(None)):
+    """Returns errors squared over their covariances, eᵀ P⁻¹ e."""
+    e, P = errors[..., states], covariances[..., states, :][..., states]
+    return np.einsum("...i,...i", e, np.linalg.solve(P, e[..., None])[..., 0])
+
+
+@cache
+def nominal(tier, runs):
+    """Returns what `watched` does of nominal robots that differ in their seeds."""
+    scenario = Scenario(sensing=Sensing(tier=tier, estimator="ekf"), feedforward="composite", laps=2)
+    return watched([scenario.model_copy(update={"seed": seed}) for seed in range(runs)])
+
+
+@pytest.mark.parametrize("runs", [24, pytest.param(100, marks=pytest.mark.full)])
+@pytest.mark.parametrize("tier", TIERS)
+def test_consistent(tier, runs):
+    """The errors of nominal robots are as large as the filter says; `pytest -m full` takes 100 runs.
+
+    Errors squared over their covariance (NEES) of posture and twist are of chi-square with 3 and 5 degrees of freedom.
+    Of the looks, 3.37 s apart, so that a lap of 12 s is seen at other places, most means over the runs are in the band
+    of 95 %. Innovations of the fixes (NIS) are white: their means are, at nearly every fix.
+    """
+    errors, covariances, innovations, failed = nominal(tier, runs)
+    assert not failed.any()
+    errors, covariances = errors[SETTLED::APART], covariances[SETTLED::APART]
+    for states in POSTURE, POSTURE_AND_TWIST:
+        found = normalised(errors, covariances, states)
+        low, high = chi2.ppf((0.025, 0.975), runs * len(states)) / runs
+        means = found.mean(1)
+        assert np.mean((means > low) & (means < high)) >= 0.7, (low, high, means)
+        # All looks together, which are not independent: the errors of a run last for some seconds.
+        assert 0.75 < means.mean() / len(states) < 1.25
+        assert np.mean(found < chi2.ppf(0.95, len(states))) > 0.9
+    for k, name in enumerate(STATES):  # V of nominal robots is surer than the filter's prior of the radii allows
+        found = normalised(errors, covariances, [k])
+        assert (0.2 if name == "v" else 0.7) < found.mean() < 1.4, name
+        assert np.mean(found < 9) > 0.98, name
+    innovations = innovations[SETTLED:]
+    innovations = innovations[~np.isnan(innovations).all(1)]
+    number = 3 * np.sum(~np.isnan(innovations), axis=1)
+    sums = np.nansum(innovations, axis=1)
+    inside = (sums > chi2.ppf(0.025, number)) & (sums < chi2.ppf(0.975, number))
+    assert inside.mean() > 0.9
+    assert np.nansum(innovations) / number.sum() == pytest.approx(1, abs=4 * np.sqrt(2 / number.sum()) + 0.01)
+
+
+@pytest.mark.parametrize("tier", TIERS)
+def test_start(tier):
+    """V is as wrong as the filter says from the first tick on, though the motors brake until a voltage comes."""
+    errors, covariances, _, _ = nominal(tier, 24)
+    early = normalised(errors[:100], covariances[:100], [3])
+    assert early.mean(1).max() < 5 and np.mean(early < 9) > 0.98
+
+
+# What a robot meets: changes of the scenario, and the least share of time in which each of posture and twist is within
+# three standard deviations. With one wheel on ice heading and V are not.
+MEETS = {
+    "lost fixes": ({"fix_lost": 0.5}, {}, (0.98,) * 5),
+    "outlying fixes": ({"fix_outliers": 0.2}, {}, (0.98,) * 5),
+    "lifted wheel": ({}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.5)}, (0.98,) * 5),
+    "slipping wheel": (
+        {}, {"perturbation": Perturbation(left_tyre_friction_factor=0.1 / 0.9)}, (0.9, 0.9, 0.7, 0.7, 0.95)
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MEETS)
+@pytest.mark.parametrize("tier", TIERS)
+def test_within_three_deviations(tier, name):
+    """With lost or outlying fixes, a wheel off the ground or on ice, errors stay where the filter says."""
+    sensing, changes, least = MEETS[name]
+    scenario = Scenario(
+        sensing=Sensing(tier=tier, estimator="ekf", **sensing), feedforward="composite", laps=1, **changes
+    )
+    errors, covariances, innovations, failed = watched([scenario.model_copy(update={"seed": k}) for k in range(6)])
+    assert not failed.any()
+    for k, share in enumerate(least):
+        within = normalised(errors, covariances, [k])[SETTLED:] < 9
+        assert within.mean() >= share, STATES[k]
+    if name == "outlying fixes":  # of which hardly one lies within the gate
+        refused = np.mean(innovations[~np.isnan(innovations)] > ekf.FIX_GATE)
+        assert 0.15 < refused < 0.25
+    if name == "lost fixes":
+        expected = 0.5 * {"lab": 20, "field": 10}[tier]
+        assert np.mean(~np.isnan(innovations)) == pytest.approx(expected / 100, rel=0.1)
+
+
+def test_lateral_slip():
+    """The constant of the filter's rear tyres is that of the models: v_y = −c V θ̇."""
+    run = simulate(Scenario(sensing=Sensing(tier="ideal"), feedforward="model", laps=1)).isel(time=slice(100, None))
+    product = (run.v * run.omega).values
+    slope = (product @ run.v_lateral.values) / (product @ product)
+    assert -slope == pytest.approx(ekf.SIDE, rel=0.02)
+    rest = run.v_lateral.values - slope * product
+    assert rest.std() < 0.01 * run.v_lateral.values.std()
+
+
+# -- a user's own estimator --------------------------------------------------------------------------------------------
+
+LANE = Scenario(
+    reference=LaneChange(length=2.4, shift=0.3, speed=0.6), laps=1, feedforward="none",
+    sensing=Sensing(tier="lab", estimator="odometry"),
+)  # fmt: skip
+LANES = [LANE.model_copy(update={"seed": seed}) for seed in range(3)]
+
+
+class Odometry:
+    """The built-in odometry as a user's estimator."""
+
+    def __init__(self, robot, size):
+        self.radius, self.calls = robot.wheel_radius, 0
+
+    def reset(self, pose, twist, period):
+        self.state, self.period, self.last = np.hstack([pose, twist]), period, None
+
+    def output(self, encoders, gyro, acceleration, fix, age):
+        assert encoders.shape == acceleration.shape == (len(gyro), 2)
+        assert fix.shape == (len(gyro), 3) and np.isin(age, (-1, 0.01)).all() and not fix[age < 0].any()
+        m, r, T = self.state, self.radius, self.period
+        if self.last is not None:
+            before, rotation = self.last
+            for i in range(len(m)):
+                way = r * (encoders[i, 0] - before[i, 0] + encoders[i, 1] - before[i, 1]) / 2
+                turn = T * (gyro[i] + rotation[i]) / 2
+                m[i, 0] += way * math.cos(m[i, 2] + turn / 2)
+                m[i, 1] += way * math.sin(m[i, 2] + turn / 2)
+                m[i, 2] += turn
+                rates = (encoders[i] - before[i]) / T
+                m[i, 3], m[i, 4] = r * (rates[0] + rates[1]) / 2, gyro[i]
+        self.last = encoders.copy(), gyro.copy()
+        self.calls += 1
+        return np.column_stack([m[:, :2], [wrapped(angle) for angle in m[:, 2]], m[:, 3:]])
+
+
+def after(ticks, fault):
+    """Returns an estimator that is odometry for some ticks, and then answers what `fault` makes of it."""
+
+    class Breaks(Odometry):
+        def output(self, *samples):
+            answer = super().output(*samples)
+            return fault(answer) if self.calls > ticks else answer
+
+    return Breaks
+
+
+def same(one, other):
+    """Two results have the same bits in every signal."""
+    for name in (*SIGNALS, "failed", "failure_time", "failure"):
+        a, b = one[name].values, other[name].values
+        assert np.array_equal(a, b, equal_nan=a.dtype.kind == "f"), name
+
+
+def test_own_odometry():
+    """Odometry written by a user gives the bits of the built-in one, alone and in a batch."""
+    builtin = simulate(LANES)
+    found = simulate(LANES, estimator=Odometry)
+    same(found, builtin)
+    same(simulate(LANES[1], estimator=Odometry), builtin.isel(run=1))
+    assert (found.estimator_fault == "").all() and str(found.label[0].item()) == "none + Odometry"
+
+
+def test_not_finite():
+    """NaN is reported with its tick, and the robot coasts on odometry from then on; the others notice nothing."""
+
+    def spoil(answer):
+        answer[1, 3] = np.nan
+        return answer
+
+    found = simulate(LANES, estimator=after(100, spoil))
+    assert [str(text) for text in found.estimator_fault.values] == ["", "estimator Breaks: not finite, tick 100", ""]
+    builtin = simulate(LANES)
+    for run in (0, 2):
+        same(found.isel(run=run), builtin.isel(run=run))
+    for name in SIGNALS:  # to rounding, as odometry goes on from a heading that was wrapped
+        np.testing.assert_allclose(found[name][1], builtin[name][1], atol=1e-9, err_msg=name)
+
+
+def test_blind():
+    """A robot whose estimator tells nothing from the start drives on odometry."""
+    found = simulate(LANES, estimator=after(0, lambda answer: np.full_like(answer, np.inf)))
+    assert [str(text) for text in found.estimator_fault.values] == ["estimator Breaks: not finite, tick 0"] * 3
+    same(found, simulate(LANES))
+
+
+def fail(answer):
+    raise ZeroDivisionError("too near")
+
+
+FAULTS = {
+    "raises": (fail, "ZeroDivisionError: too near (test_estimators.py, line "),
+    "shape": (lambda answer: answer[:, :3], "output is shape (3, 3), expected shape (3, 5)"),
+    "one": (lambda answer: answer[:1], "output is shape (1, 5), expected shape (3, 5)"),
+    "nothing": (lambda answer: None, "output is nothing, expected shape (3, 5)"),
+    "text": (lambda answer: "here", "ValueError: could not convert string to float: 'here'"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_fault(fault):
+    """One that raises or answers in another shape ends the run with one line, and what was recorded is kept."""
+    what, message = FAULTS[fault]
+    found, sound = simulate(LANES, estimator=after(100, what)), simulate(LANES)
+    for run in range(3):
+        text = str(found.failure[run].item())
+        assert text.startswith(f"estimator Breaks: {message}") and text.endswith(", tick 100"), text
+        assert np.array_equal(found.v_measured[run, :100], sound.v_measured[run, :100])
+        assert np.isnan(found.v_measured[run, 100:]).all()
+
+
+def test_no_estimator():
+    """An object without the two methods is refused before anything is computed."""
+    for method, text in (("reset", "has no method output"), ("output", "has no method reset")):
+        half = type("Half", (), {"__init__": lambda self, robot, size: None, method: lambda self, *values: None})
+        with pytest.raises(InputError, match=f"^estimator Half: {text}$"):
+            simulate(LANE, estimator=half)
+
+
+def test_command_line(tmp_path, capsys):
+    """`--controller estimator=FILE:NAME` takes it too."""
+    from mrctl.cli import main
+
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import numpy as np\n"
+        "class Mine:\n"
+        "    def __init__(self, robot, size): pass\n"
+        "    def reset(self, pose, twist, period): self.state = np.hstack([pose, twist])\n"
+        "    def output(self, encoders, gyro, acceleration, fix, age): return self.state[:, :4]\n"
+    )
+    scenario = tmp_path / "scenario.toml"
+    scenario.write_text(LANE.to_toml())
+    assert main(["run", str(scenario), "--controller", f"estimator={file}:Mine"]) == 1
+    assert "estimator Mine: output is shape (1, 4), expected shape (1, 5), tick 0" in capsys.readouterr().out
+
+
+# -- bad input ---------------------------------------------------------------------------------------------------------
+
+REFUSED = {
+    "sensing.tier": {"sensing": {"tier": "perfect"}},
+    "sensing.estimator": {"sensing": {"estimator": "kalman"}},
+    "sensing.gyro_rate": {"sensing": {"gyro_rate": -1}},
+    "sensing.encoder_rate": {"sensing": {"encoder_rate": 30}},
+    "sensing.fix_rate": {"sensing": {"tier": "field", "fix_rate": 1000}},
+    "sensing.fix_latency": {
+        "sensing": {"fix_latency": 0.4, "fix_rate": 5},
+        "reference": {"kind": "line", "length": 0.1},
+    },
+    "sensing.fix_latency: more than 4": {"sensing": {"tier": "lab", "fix_latency": 0.5}},
+    "sensing.gyro_latency": {"sensing": {"gyro_latency": 0.013}},
+    "sensing.delay": {"sensing": {"delay": 0.015}},
+    "sensing.fix_lost": {"sensing": {"fix_lost": 1.5}},
+    "sensing.encoder_counts": {"sensing": {"encoder_counts": 2.5}},
+    "sensing.gyro_noise": {"sensing": {"gyro_noise": float("nan")}},
+    "sensing.lidar": {"sensing": {"lidar": True}},
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused(name, tmp_path, capsys):
+    """What no sensor can do is refused with one line that names the field, from Python and from a file."""
+    with pytest.raises(InputError) as error:
+        Scenario.from_dict({"laps": 1, **REFUSED[name]})
+    assert str(error.value).startswith(name) and "\n" not in str(error.value), error.value
+
+
+@pytest.mark.parametrize(
+    ("old", "successor"),
+    [
+        ({"measurement": "odometry"}, "sensing.estimator"),
+        ({"perturbation": {"velocity_noise": 0.01}}, "sensing.encoder_counts"),
+        ({"perturbation": {"rotation_noise": 0.01}}, "sensing.gyro_noise"),
+        ({"perturbation": {"position_noise": 0.01}}, "sensing.fix_position_noise"),
+        ({"events": [{"time": 1, "perturbation": {"heading_noise": 0.01}}]}, "sensing.fix_heading_noise"),
+    ],
+)
+def test_old_keys(old, successor):
+    """A key of an earlier version names its successor."""
+    with pytest.raises(InputError) as error:
+        Scenario.from_dict(old)
+    assert successor in str(error.value) and "\n" not in str(error.value), error.value
