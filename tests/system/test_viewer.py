@@ -223,18 +223,21 @@ def test_replay(browser, tmp_path):
 
 PLACES = """(name) => {
     const vertices = [], node = window.__viserMutable.nodeRefFromName[name];
-    if (!node || !node.visible) return [];
+    if (!node) return [];
+    const world = window.__viserMutable.nodeRefFromName['/world'];
     node.updateWorldMatrix(true, true);
     node.traverse((part) => {
         const at = part.geometry?.attributes.position, point = node.position.clone();
         if (part.instancesCount !== undefined)
             for (let k = 0; k < part.instancesCount; k++) {
-                const place = part.getPositionAt(k).applyMatrix4(part.matrixWorld);
+                const place = world.worldToLocal(part.getPositionAt(k).applyMatrix4(part.matrixWorld));
                 vertices.push([...place.toArray(), part.getOpacityAt(k)]);
             }
         else if (at && !vertices.length)
             for (let k = 0; k < at.count; k++)
-                vertices.push(point.fromBufferAttribute(at, k).applyMatrix4(part.matrixWorld).toArray());
+                vertices.push(
+                    world.worldToLocal(point.fromBufferAttribute(at, k).applyMatrix4(part.matrixWorld)).toArray()
+                );
     });
     return vertices;
 }"""
