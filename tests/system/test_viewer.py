@@ -241,6 +241,11 @@ PLACES = """(name) => {
     });
     return vertices;
 }"""
+VISIBLE = """(name) => {
+    let node = window.__viserMutable.nodeRefFromName[name];
+    while (node && node.visible) node = node.parent;
+    return !node;
+}"""
 MARKS = "/world/sensors/0"
 
 
@@ -292,6 +297,7 @@ def test_estimate_live(browser, tmp_path):
         off = 1e3 * np.hypot(log["x_measured"] - log["x"], log["y_measured"] - log["y"])[-1]
         assert f"{off:.1f} mm off" in page.inner_text("#mrctl-sensors")
         assert "10 times" in page.inner_text("#mrctl-sensors")
+        assert page.evaluate(VISIBLE, f"{MARKS}/estimate")
 
         def chart():
             t, reference, estimated, true = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
@@ -305,8 +311,7 @@ def test_estimate_live(browser, tmp_path):
         picture(page, tmp_path / "estimate.png")
 
         page.get_by_label("Sensors").click()
-        shown = f"window.__viserMutable.nodeRefFromName[{MARKS!r}].parent.visible"
-        until(lambda: not page.evaluate(shown), "the marks to vanish")
+        until(lambda: not page.evaluate(VISIBLE, f"{MARKS}/estimate"), "the marks to vanish")
 
 
 def test_estimate_replay(browser, tmp_path):
