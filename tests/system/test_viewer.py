@@ -223,20 +223,28 @@ def test_replay(browser, tmp_path):
 
 PLACES = """(name) => {
     const vertices = [], node = window.__viserMutable.nodeRefFromName[name];
-    if (!node || !node.visible) return [];
+    if (!node) return [];
+    const world = window.__viserMutable.nodeRefFromName['/world'];
     node.updateWorldMatrix(true, true);
     node.traverse((part) => {
         const at = part.geometry?.attributes.position, point = node.position.clone();
         if (part.instancesCount !== undefined)
             for (let k = 0; k < part.instancesCount; k++) {
-                const place = part.getPositionAt(k).applyMatrix4(part.matrixWorld);
+                const place = world.worldToLocal(part.getPositionAt(k).applyMatrix4(part.matrixWorld));
                 vertices.push([...place.toArray(), part.getOpacityAt(k)]);
             }
         else if (at && !vertices.length)
             for (let k = 0; k < at.count; k++)
-                vertices.push(point.fromBufferAttribute(at, k).applyMatrix4(part.matrixWorld).toArray());
+                vertices.push(
+                    world.worldToLocal(point.fromBufferAttribute(at, k).applyMatrix4(part.matrixWorld)).toArray()
+                );
     });
     return vertices;
+}"""
+VISIBLE = """(name) => {
+    let node = window.__viserMutable.nodeRefFromName[name];
+    while (node && node.visible) node = node.parent;
+    return !node;
 }"""
 MARKS = "/world/sensors/0"
 
@@ -289,6 +297,7 @@ def test_estimate_live(browser, tmp_path):
         off = 1e3 * np.hypot(log["x_measured"] - log["x"], log["y_measured"] - log["y"])[-1]
         assert f"{off:.1f} mm off" in page.inner_text("#mrctl-sensors")
         assert "10 times" in page.inner_text("#mrctl-sensors")
+        assert page.evaluate(VISIBLE, f"{MARKS}/estimate")
 
         def chart():
             t, reference, estimated, true = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
@@ -302,8 +311,7 @@ def test_estimate_live(browser, tmp_path):
         picture(page, tmp_path / "estimate.png")
 
         page.get_by_label("Sensors").click()
-        shown = f"window.__viserMutable.nodeRefFromName[{MARKS!r}].parent.visible"
-        until(lambda: not page.evaluate(shown), "the marks to vanish")
+        until(lambda: not page.evaluate(VISIBLE, f"{MARKS}/estimate"), "the marks to vanish")
 
 
 def test_estimate_replay(browser, tmp_path):
