@@ -71,9 +71,7 @@ EKF = np.dtype(
 
 
 @kernel
-def propagate(
-    v_dot: float, omega_dot: float, jolt: float, grip: Array, geometry: Array, period: float, s: Row
-) -> None:
+def propagate(v_dot: float, omega_dot: float, jolt: float, grip: Array, geometry: Array, period: float, s: Row) -> None:
     """Predicts the state over one period: P ← F P Fᵀ + Q; `jolt` is the change of the acceleration in m/s²."""
     m, P, T = s.mean, s.P, period
     r, D, side_lag = geometry[0], geometry[1], SIDE - geometry[3]

@@ -10,6 +10,7 @@ from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import Pid
 from mrctl.control.rls import RecursiveLeastSquares
+from mrctl.experiments.paper import IDEAL
 from mrctl.kernel import over_rows
 from mrctl.loop.courses import GOAL
 from mrctl.loop.hierarchy import TAKE_OVER, Hierarchy
@@ -135,7 +136,7 @@ def test_rows(robot, name, steering):
     """Through the whole hierarchy robots keep to themselves: each has the same bits alone and among others."""
     body = robot.model_copy(update={"trail": 0.0}) if steering == "rigid" else robot
     inputs = signals(3, 120)
-    scenarios = [Scenario(feedforward=name, steering=steering, seed=seed) for seed in range(3)]
+    scenarios = [Scenario(**IDEAL, feedforward=name, steering=steering, seed=seed) for seed in range(3)]
 
     def answer(rows):
         chosen = scenarios[rows]
