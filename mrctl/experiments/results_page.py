@@ -56,7 +56,7 @@ def main(
     """
     written: dict[str, str] = {}
     if reproduce is not None:
-        table = _read(reproduce / "table.json", "last_lap", "endurance", "kanayama")
+        table = _read(reproduce / "table.json", "last_lap", "endurance", "tiers", "kanayama")
         written["The paper"] = _section("mrctl reproduce", table, paper_text(table))
     if suite is not None:
         table = _read(suite / "table.json", "rows")
@@ -90,9 +90,9 @@ def sections(page: str) -> dict[str, str]:
 
 
 def paper_text(table: Table) -> str:
-    """The tables of `mrctl reproduce`: the last lap, the long runs, and Kanayama's table."""
+    """The tables of `mrctl reproduce`: the last lap, the long runs, the sensing tiers, and Kanayama's table."""
     last_lap, long_runs = paper.text(table["last_lap"]), paper.endurance_text(table["endurance"])
-    return "\n\n".join([last_lap, long_runs, paper.kanayama_text(table["kanayama"])])
+    return "\n\n".join([last_lap, long_runs, paper.tiers_text(table["tiers"]), paper.kanayama_text(table["kanayama"])])
 
 
 def suite_text(table: Table, everything: str) -> str:

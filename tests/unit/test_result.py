@@ -18,7 +18,9 @@ from mrctl.sensing.tiers import Sensing
 
 CIRCLE = Circle(period=4, radius=0.5)
 SCENARIOS = [
-    Scenario(reference=CIRCLE, laps=1, feedforward="fel", fel=Fel(hidden=4), name="gelernt ✓"),
+    Scenario(
+        reference=CIRCLE, laps=1, feedforward="fel", fel=Fel(hidden=4), name="gelernt ✓", sensing=Sensing(tier="ideal")
+    ),
     Scenario(
         reference=Circle(period=5, radius=0.5),
         laps=1,

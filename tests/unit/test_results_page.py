@@ -38,7 +38,9 @@ def reproduction(tmp_path: Path) -> Path:
     row |= {m: 0.00321 for m in paper.METRICS} | {f"{m}_to_pid": float("nan") for m in paper.METRICS}
     long = {"run": "fel, all", "laps": 60} | {m: {"lap_8": 0.002, "last": 0.001} for m in paper.METRICS}
     case = {"case": "an offset", "unit": "%", "target": 9.1, "value": 9.06, "value_10ms": 8.95}
-    return written(tmp_path / "reproduction", {"last_lap": [row], "endurance": [long], "kanayama": [case]})
+    tiers = [row | {"sensing": "lab", "feedforward": f, "position_rmse": e} for f, e in (("none", 4e-3), ("fel", 1e-3))]
+    values = {"last_lap": [row], "endurance": [long], "tiers": tiers, "kanayama": [case]}
+    return written(tmp_path / "reproduction", values)
 
 
 @pytest.fixture
@@ -49,7 +51,7 @@ def tune(tmp_path: Path) -> Path:
     loop |= {name: answer for name in tuning.RESPONSES}
     names = ("k_x", "k_y", "k_theta", "prefilter", "v_lag", "omega_lag")
     motion = {"steering": "caster", "delay": 0.02} | {name: 0.05 for name in names}
-    values = {"rule": "designed", "time_constant": 0.15, "lag": 0.0, "loops": [loop], "motion": [motion]}
+    values = {"time_constant": None, "lag": 0.0, "loops": [loop], "motion": [motion]}
     return written(tmp_path / "tune", values)
 
 
@@ -69,7 +71,9 @@ def figures(tmp_path: Path) -> Path:
         "machine": SOURCE["machine"] | SOURCE["versions"],
         "robots": [row],
         "threads": [row],
+        "lab": row,
         "parts": {"1": {"physics": 31.4}, "16": {"physics": 500.0}},
+        "sensing_share": {"1": 0.05, "16": 0.03},
         "today": {"steps_per_second": 9884.0, "closed_loop_is_faster_by": 9.1},
     }
     (tmp_path / "bench.json").write_text(json.dumps(values))
@@ -91,6 +95,7 @@ def test_sections(suite: Path, reproduction: Path, tune: Path, identified: Path,
     assert "| all     | fel         | 2/2    | –  " in short
     assert [text.split("</summary>")[0] for text in folded] == ["<summary>Steady", "<summary>A step"]
     assert "| fel         | 3.21    | 3.21       | 3.21         | PID fails |" in page["The paper"]
+    assert "| lab     | " in page["The paper"] and "| 1.00         | 0.25 " in page["The paper"]
     assert "2.00 → 1.00" in page["The paper"] and "| an offset | 9.1 %" in page["The paper"]
     assert "| caster, second | 20 " in page["Where learning is safe"] and "88.5" in page["Where learning is safe"]
     assert "`mrctl identify --robot.path racecar`" in page["Identification"]
