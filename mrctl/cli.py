@@ -28,7 +28,7 @@ from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, RobotFile
 
-FIRST = ("name", "world", "steering", "reference", "laps", "feedforward", "measurement", "seed")
+FIRST = ("name", "world", "steering", "reference", "laps", "feedforward", "seed")
 """Fields of `Scenario` that `mrctl run --help` explains; it lists the others, which `mrctl run --help-all` explains."""
 
 LAB = Sensing(tier="lab")
