@@ -5,6 +5,7 @@ import pytest
 
 import mrctl
 from mrctl import Scenario
+from mrctl.experiments.paper import IDEAL
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.theory.references import random_spline
@@ -19,7 +20,7 @@ def test_no_saturation(steering):
     courses = [random_spline(np.random.default_rng(seed), ROBOT) for seed in range(4)]
     common = {"steering": steering, "feedforward": "model", "laps": 2, "initial_spread": (0, 0, 0)}
     for course in courses:
-        result = mrctl.simulate([Scenario(reference=course, **common)], threads=1)
+        result = mrctl.simulate([Scenario(**IDEAL, reference=course, **common)], threads=1)
         voltage = np.abs([result["voltage_left"], result["voltage_right"]]).max()
         assert 0.5 * ROBOT.supply < voltage < 1.02 * Limits.of(ROBOT).voltage
         (found,) = mrctl.summary(result).to_dict("records")
