@@ -32,14 +32,18 @@ NEAR = 0.05  # m off the reference at which the reward is a half
 
 @kernel
 def observe(
-    plant: Rows, seen: Rows, goal: Rows, control: Rows, half_track: float, observation: Array, reward: Array
-) -> None:
-    """What `Episodes.observe` returns, from one record of `PLANT`, `SEEN`, `GOAL` and `CONTROL` a robot."""
+    plant: Rows, seen: Rows, wanted: Rows, goal: Rows, control: Rows, half_track: float, observation: Array,
+    reward: Array,
+) -> None:  # fmt: skip
+    """What `Episodes.observe` returns, from one record of `PLANT`, `SEEN`, `GOAL` and `CONTROL` a robot.
+
+    The robot is told the reference `wanted` of the moment when its voltage acts, and judged by that of now, `goal`.
+    """
     error = np.empty(3)
     for i in range(len(plant)):
-        p, s, g, out = plant[i], seen[i], goal[i], observation[i]
+        p, s, g, out = plant[i], seen[i], wanted[i], observation[i]
         posture_error(s.pose, g.pose, out[:3])
-        posture_error(p.reading.pose, g.pose, error)
+        posture_error(p.reading.pose, goal[i].pose, error)
         for k in range(2):
             out[3 + k], out[5 + k], out[7 + k] = s.twist[k], g.twist[k], g.acceleration[k]
             out[9 + k], out[12 + k] = p.reading.wheel_rates[k], control[i].allocation.command[k]
@@ -181,10 +185,10 @@ class Episodes(Simulation):
             a half where the rear wheels are 5 cm off, zero where a robot has failed. That distance is the root mean
             square of the two wheels', √(e_x² + e_y² + (D e_θ)²), of the true posture.
         """
-        seen, goal = self.sense()
+        seen, wanted = self.sense()
         size, half_track = len(self.scenarios), self.plant.robot.half_track
         observation, reward = np.empty((size, sum(OBSERVATIONS.values()))), np.empty(size)
-        observe(self.plant.state, seen, goal, self.hierarchy.state, half_track, observation, reward)
+        observe(self.plant.state, seen, wanted, self._goal, self.hierarchy.state, half_track, observation, reward)
         return observation, reward
 
     def over(self) -> NDArray[np.bool]:

@@ -76,10 +76,13 @@ def test_flags_override_the_file(capsys: pytest.CaptureFixture, scenario: Path) 
 def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """`--out` writes result, figures and weights, from which learning goes on, and does not overwrite them."""
     out = tmp_path / "out"
-    command = ["run", "--out", str(out), "--feedforward", "fel", *SHORT]
+    ideal = {"sensing": mrctl.Sensing(tier="ideal"), "pid": mrctl.Pid(time_constant=0.15)}
+    flags = ["--sensing.tier", "ideal", "--pid.time-constant", "0.15"]
+    command = ["run", "--out", str(out), "--feedforward", "fel", *flags, *SHORT]
     assert cli.main(command) == 0
     result = mrctl.open(out / "result.zarr")
-    again = mrctl.simulate(mrctl.Scenario(feedforward="fel", laps=1, reference=mrctl.Circle(radius=0.5, period=5)))
+    circle = mrctl.Circle(radius=0.5, period=5)
+    again = mrctl.simulate(mrctl.Scenario(feedforward="fel", laps=1, reference=circle, **ideal))
     np.testing.assert_array_equal(result["voltage_left"].values[0], again["voltage_left"].values)
     for name in ("path", "velocities", "errors", "voltages", "learning"):
         assert (out / f"{name}.png").stat().st_size > 5000
@@ -92,7 +95,8 @@ def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.Cap
     first = float(mrctl.per_lap(result)["v_rmse"].values[0, 0])
     carried = mrctl.Scenario(
         laps=1,
-        reference=mrctl.Circle(radius=0.5, period=5),
+        reference=circle,
+        **ideal,
         fel=mrctl.Fel(weights=str(out / "weights.safetensors"), frozen=True),
     )
     assert float(mrctl.per_lap(mrctl.simulate([carried]))["v_rmse"].values[0, 0]) < first
@@ -107,7 +111,7 @@ def test_tune_states_the_learning_condition(tmp_path: Path, capsys: pytest.Captu
     assert json.loads((tmp_path / "table.json").read_text()) == table
     assert (tmp_path / "sensitivity.png").stat().st_size > 5000
     assert [row["delay"] for row in table["loops"]] == 4 * [0, 0.03]
-    assert table["rule"] == "imc"
+    assert table["time_constant"] == 0.15
     assert table["loops"][0]["ratio"] == pytest.approx(1 + 0.234 / 0.15, rel=5e-3)
     assert [row["k_p"] for row in table["loops"][-2:]] == [0.3, 0.3]
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mrctl import Circle, Event, Fel, InputError, Kanayama, Line, Perturbation, Pid, Scenario
+from mrctl.experiments.paper import IDEAL
 from mrctl.loop.simulation import Simulation, simulate
 from mrctl.physics import mjcf
 from mrctl.physics.perturb import fields
@@ -11,7 +12,7 @@ from mrctl.results.dataset import SIGNALS
 from mrctl.theory.dynamics import inverse_coefficients
 
 PERIOD = 0.01
-BASE = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="model")
+BASE = Scenario(**IDEAL, reference=Circle(period=4, radius=0.5), laps=1, feedforward="model")
 PAYLOAD = Perturbation(payload=5, payload_x=0.15, payload_y=0.05)
 
 
@@ -115,7 +116,9 @@ def test_oracle_is_better():
 
 def test_push():
     """The run's velocity jumps by the impulse over the mass that the motors move, while they cannot hold against it."""
-    base = Scenario(reference=Line(speed=0.5, length=1.5), laps=1, feedforward="model", initial_spread=(0, 0, 0))
+    base = Scenario(
+        **IDEAL, reference=Line(speed=0.5, length=1.5), laps=1, feedforward="model", initial_spread=(0, 0, 0)
+    )
     runs = simulate([with_events(Event(time=1, push=(300, 0, 0), push_duration=0.02), base=base), base])
     jump = float(runs.v[0, 102] - runs.v[1, 102])
     assert jump == pytest.approx(300 * 0.02 / 21.3, rel=0.1)

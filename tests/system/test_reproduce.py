@@ -89,4 +89,4 @@ def test_table_says_where_it_came_from(table: dict) -> None:
     """Seeds, versions and the scenarios that gave the numbers."""
     assert {"mrctl", "mujoco", "dm-control", "numpy", "numba", "torch"} <= set(table["versions"])
     assert all("seed" in entry for entry in table["last_lap"])
-    assert len(table["scenarios"]) == len(table["last_lap"]) + len(table["endurance"])
+    assert len(table["scenarios"]) == sum(len(table[name]) for name in ("last_lap", "endurance", "tiers"))
