@@ -265,7 +265,7 @@ def test_version(capsys: pytest.CaptureFixture) -> None:
     assert "mrctl --version" in out and f"{{{','.join(COMMANDS)}}}" in out
 
 
-UNIT = r"(?<=[ (])(1/)?(k?g|m|s|rad|V|A|N|H|Ω|Hz)([·/](m|s|rad|V|A|kg))*[²³]?(?=[ .,;:)])"
+UNIT = r"(?<=[ (])(1/)?(k?g|m|s|rad|V|A|N|H|Ω|Hz)([·/]√?(m|s|rad|V|A|kg|Hz)[²³]?)*[²³]?(?=[ .,;:)])"
 DIMENSIONLESS = r"\b([Ff]actor|[Rr]atio|[Ss]hare|[Cc]oefficient|[Nn]umber of|[Dd]imensionless)\b"
 
 

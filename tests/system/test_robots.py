@@ -5,6 +5,7 @@ import pytest
 
 import mrctl
 from mrctl import Circle, Event, Fel, Lemniscate, Perturbation, RobotFile, Scenario, cli
+from mrctl.experiments.paper import IDEAL
 from mrctl.sensing.tiers import TIERS, Sensing
 from mrctl.viewer.recording import Recording
 
@@ -20,7 +21,7 @@ COURSES = {
 def test_learning_beats_pid(name):
     """In the last of 8 laps of the lemniscate V, θ̇ and position are at least twice as good with the network."""
     robot, course, _ = COURSES[name]
-    pair = [Scenario(**robot, reference=course, feedforward=f) for f in ("none", "fel")]
+    pair = [Scenario(**robot, **IDEAL, reference=course, feedforward=f) for f in ("none", "fel")]
     found = mrctl.summary(mrctl.simulate(pair, threads=1))
     assert not found["failed"].any()
     for metric in ("v_rmse", "omega_rmse", "position_rmse"):
