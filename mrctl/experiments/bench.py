@@ -286,7 +286,8 @@ def autograd_loop(ticks: int, stretches: int) -> Iterator[tuple[float, float]]:
     gains = scenario.pid.gains(robot, rigid=False)
     k_p, k_i = np.array(gains["k_p"]), np.array(gains["k_i"])
     k_x, k_y, k_theta = scenario.kanayama.model_dump().values()
-    smooth = period / scenario.prefilter
+    prefilter: float = paper.IDEAL["prefilter"]
+    smooth = period / prefilter
     scale = feature_scale(robot)
     last = torch.nn.Linear(24, 2)
     torch.nn.init.zeros_(last.weight)
@@ -314,7 +315,7 @@ def autograd_loop(ticks: int, stretches: int) -> Iterator[tuple[float, float]]:
                 wanted[1] + wanted[0] * (k_y * error[1] + k_theta * np.sin(turn)),
             ]
         )
-        rate = (request - wanted - correction) / scenario.prefilter
+        rate = (request - wanted - correction) / prefilter
         correction = correction + smooth * (request - wanted - correction)
         command, derivative = wanted + correction, acceleration + rate
         deviation = command - twist

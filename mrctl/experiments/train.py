@@ -23,6 +23,7 @@ from torch import Tensor
 from mrctl.control.composite import Composite
 from mrctl.control.features import INPUTS, PHYSICAL, UNITS, feature_matrix, feature_scale
 from mrctl.control.weights import Training, save_training
+from mrctl.experiments.paper import IDEAL
 from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.kernel import Array
 from mrctl.loop.simulation import simulate
@@ -125,6 +126,7 @@ def draw(robot: Robot, plants: int, seed: Sequence[int]) -> list[Scenario]:
             reference, laps = _reference(rng, robot)
             scenarios.append(
                 Scenario(
+                    **IDEAL,
                     steering=STEERINGS[plant % len(STEERINGS)], reference=reference, laps=laps, feedforward="model",
                     perturbation=perturbation, seed=int(rng.integers(2**32)),
                 )

@@ -50,7 +50,7 @@ def scenarios(robot, course, seed):
     )
     return Scenario(
         **robot, reference=course, laps=1, seed=seed, perturbation=change(), events=events, fel=Fel(step=0.05),
-        sensing=Sensing(tier=TIERS[seed % 3]), world=("flat", "patch")[seed % 3 == 0],
+        sensing=Sensing(tier=TIERS[seed % 2]), world=("flat", "patch")[seed % 3 == 0],
     )  # fmt: skip
 
 

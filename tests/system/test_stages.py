@@ -11,14 +11,15 @@ from mrctl.control.kanayama import GAINS, kanayama, posture_error
 from mrctl.control.nominal import nominal
 from mrctl.control.pid import PID, pid
 from mrctl.control.steering import ALLOCATION, allocate
+from mrctl.experiments.paper import IDEAL
 from mrctl.kernel import over_rows
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
 
-SHORT = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
+SHORT = Scenario(**IDEAL, reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
 THREE = [SHORT.model_copy(update={"seed": seed}) for seed in range(3)]
-LAP = Scenario(reference=Lemniscate(period=10), laps=1)
+LAP = Scenario(**IDEAL, reference=Lemniscate(period=10), laps=1)
 STAGES = "motion", "feedback", "feedforward", "steering"  # and the estimator, whose faults differ: test_estimators.py
 
 
@@ -76,7 +77,7 @@ class Feedback:
 
     def __init__(self, robot, size, rigid=False):
         self.state = np.zeros(size, PID)
-        for name, value in mrctl.Pid().gains(robot, rigid).items():
+        for name, value in IDEAL["pid"].gains(robot, rigid).items():
             self.state[name] = value
         self.integral = self.state["integral"]
 
