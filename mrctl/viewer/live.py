@@ -164,6 +164,8 @@ class Live(Page):
         self.speed, self._due = speed, 0.0
 
     def _press(self, choices: dict[str, dict[str, Any]], name: str) -> None:
+        if name not in choices:
+            raise InputError(f"{name}: not one of the choices")
         change = choices[name]
         if "push" in change:
             return self._apply_event(**change)

@@ -130,9 +130,11 @@ def changed(record: AnyRecord, path: Sequence[str], value: object) -> AnyRecord:
     """Returns a copy of the record in which the field at a path has another value.
 
     Raises:
-        InputError: The record refuses the value.
+        InputError: The record refuses the value, or has no such field, as its kind has changed meanwhile.
     """
     name, *rest = path
+    if name not in type(record).model_fields:
+        raise InputError(f"{name}: not a field of {type(record).__name__}")
     if rest:
         value = changed(getattr(record, name), rest, value)
     fields = {field: getattr(record, field) for field in type(record).model_fields}

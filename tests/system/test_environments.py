@@ -82,7 +82,8 @@ def test_dm_env_bits(steering):
 @pytest.mark.parametrize("feedforward", FEEDFORWARDS)
 def test_vector_bits(feedforward):
     """Robots that begin again at different moments, some after a failure: each episode is its run alone."""
-    scenarios = [s.model_copy(update={"feedforward": feedforward}) for s in (BUSY, SHORT, BUSY, SHORT)]
+    changes = {"feedforward": feedforward, "sensing": BUSY.sensing}
+    scenarios = [s.model_copy(update=changes) for s in (BUSY, SHORT, BUSY, SHORT)]
     env = TrackingVectorEnv(4, scenarios, threads=1)
     loop, zero = env.episodes, np.zeros((4, 2))
     env.reset(seed=[1, 2, 3, 4])

@@ -34,7 +34,7 @@ def first_difference(one, other) -> int:
     [
         {"perturbation": PAYLOAD},
         {"perturbation": Perturbation(control_delay=0.02)},
-        {"perturbation": Perturbation(dead_zone=2.0)},
+        {"perturbation": Perturbation(supply_factor=0.9)},
         {"push": (10, 0, 0)},
         {"kanayama": Kanayama(k_x=1)},
         {"pid": Pid(time_constant=0.3)},
