@@ -164,7 +164,7 @@ def test_rough_treatment(server, capfd):
         live.ask(live._command, "reset")
         live.ask(live._command, "play")
         live.ask(live._set_speed, 1.0)
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 150  # laws that the inputs chose are compiled at their first call
         while not (live.playing and 5 < live.session.tick) and time.monotonic() < deadline:
             time.sleep(0.05)
         assert live.playing and live.session.tick > 5 and live.message == ""
