@@ -251,7 +251,7 @@ def sweep(
 
 
 def reproduce(out: Path = Path("reproduction")) -> None:
-    """Reproduces the paper's figures, Kanayama's table and the comparison of PID with the neural feedforward.
+    """Reproduces the paper's figures and tables, and compares the feedforwards in every sensing tier.
 
     Args:
         out: Folder for the figures in PNG and PDF, and for `table.json` with every number.
@@ -314,7 +314,7 @@ def tune(
         chassis: Body that carries the wheels; by default the one at their root.
         world: World to measure in: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file.
         delay: Delays of the loop in s beside the sample and hold, each a multiple of the control period.
-        lag: Time constant in s with which the measured velocities will follow, for which the design leaves room.
+        lag: Time constant in s of the measured velocities behind the true ones that the design assumes.
         time_constant: Time constant of the closed loop in s, for the IMC rule in place of the design.
         out: Folder for the table, the measured responses and a figure of them.
         json: Print JSON instead of a table.
@@ -338,13 +338,13 @@ def identify(
     seed: int = 0,
     json: bool = False,
 ) -> None:
-    """Identifies the constants of equation (3) from two drives, and says which of them the sensors can tell.
+    """Identifies the constants of equation (3) from two drives, and says which of them the sensors identify.
 
     Args:
         world: World to drive in, which must be level: `flat`, or the path of an MJCF file.
         robot: Robot to identify; by default the world's own.
         perturbation: Differences of the plant from its model.
-        sensing: Encoders, gyro and motor driver; delays, accelerometer, fixes and the estimator play no part.
+        sensing: Encoders, gyro and motor driver; delays, accelerometer, fixes and the estimator have no effect.
         seed: Seed of the test signals and of the sensors.
         json: Print JSON instead of a table.
     """

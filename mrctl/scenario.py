@@ -26,7 +26,7 @@ from mrctl.theory.robot import CAR, RobotFile, Steering
 FeedforwardName = Literal["none", "model", "oracle", "observer", "fel", "rls", "composite"]
 FEEDFORWARDS: tuple[FeedforwardName, ...] = ("none", "model", "oracle", "observer", "fel", "rls", "composite")
 LONGEST = 10_000_000
-"""Largest number of control periods in a run; the record of one takes 290 bytes."""
+"""Largest number of control periods in a run; the record of one takes 432 bytes."""
 
 Spread = Annotated[float, Field(ge=0, le=0.2)]
 
@@ -43,11 +43,11 @@ class Event(Record):
     push_duration: Annotated[float, Field(gt=0, le=10)] = 0.1
     """Duration of the push in s."""
     reference: Reference | None = None
-    """Reference from then on, which begins at its own start; laps are still counted by the scenario's reference."""
+    """Reference from then on, which begins at its own start; laps still have the period of the scenario's reference."""
     kanayama: Kanayama | None = None
     """Gains of the motion controller from then on."""
     pid: Pid | None = None
-    """Settings of the velocity PID from then on."""
+    """Settings of the velocity PID from then on; the gains of the motion controller stay."""
     learning: bool | None = None
     """Whether the feedforward learns from then on."""
 
@@ -76,11 +76,11 @@ class Scenario(Record):
     feedforward: FeedforwardName = "fel"
     """Feedforward that is added to the velocity PID; `none` is PID alone."""
     sensing: Sensing = Sensing()
-    """Sensors, estimator, motor driver, battery and steering servo."""
+    """Sensors, estimator, motor driver, battery, steering servo and delay, by a tier."""
     kanayama: Kanayama = Kanayama()
-    """Gains of the motion controller."""
+    """Gains of the motion controller, by default designed for the velocity loops."""
     pid: Pid = Pid()
-    """Settings of the velocity PID."""
+    """Settings of the velocity PID, by default designed for the delay of `sensing`."""
     fel: Fel = Fel()
     """Settings of the `fel` feedforward."""
     rls: Rls = Rls()
@@ -100,7 +100,7 @@ class Scenario(Record):
     initial_spread: tuple[Spread, Spread, Annotated[float, Field(ge=0, le=0.5)]] = (0.02, 0.02, 0.03)
     """Standard deviations of a random offset from that pose: x and y in m, θ in rad."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    """Seed of the random numbers: initial offset, initial weights and sensor noise."""
+    """Seed of the random numbers: initial offset, initial weights, noise and biases of the sensors."""
     prefilter: Annotated[float, Field(ge=0.01, le=1)] | None = None
     """Time constant in s of the filter on the velocities that the motion controller adds to the reference; by default
     it follows from the lag of the velocity loops."""

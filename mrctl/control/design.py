@@ -1,14 +1,14 @@
-"""Design of the velocity PID, and of the motion controller over it, for the plant and the delay that they have.
+"""Design of the velocity PID, and of the motion controller around it, for a given plant and delay.
 
-A PI controller K_p (1 + 1/(T_i s)) is as fast as its delay allows where its integral gain K_i = K_p/T_i is the largest
-that keeps the loop k L robust, with its own gain and with every smaller one:
+The PI controller K_p (1 + 1/(T_i s)) gets the largest integral gain K_i = K_p/T_i with which the loop L keeps these
+bounds at its own gain and at every smaller one:
 
     max |S| ≤ M_s,    max |T| ≤ M_t,    S = 1/(1 + k L),    T = k L/(1 + k L),    0 < k ≤ 1
 
 The largest K_i has the least integrated error after a disturbance (Åström, Panagopoulos and Hägglund 1998, Design of PI
-controllers based on non-convex optimization). M_s bounds how close L comes to −1: a gain may grow by M_s/(M_s − 1), 2.7
-for 1.6, before the loop is unstable. M_t bounds the overshoot. The gain falls where the supply sags or the voltage is
-limited.
+controllers based on non-convex optimization). M_s bounds how close L comes to −1: the gain may grow by M_s/(M_s − 1),
+2.7 for 1.6, before the loop is unstable. M_t bounds the overshoot. Smaller gains count because a sagging supply or a
+limit of the voltage reduces the gain of the loop.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from mrctl.theory.robot import Robot
 M_S, M_T = 1.6, 1.1
 """Largest |S| and |T|: 1.2 to 2 and 1 to 1.5 are usual (Åström and Hägglund, Advanced PID Control, 2006, ch. 4)."""
 SPEEDS = 0.5, 0.2, 1.0
-"""Shares of the robot's largest speed at which its loops are robust, *chosen*; at the first one they are compared."""
+"""Shares of the robot's largest speed at which its loops keep the bounds, *chosen*; `mrctl tune` uses the first one."""
 DAMPING = 0.5
 """Damping ratio of the motion controller's loops at the largest speed, *chosen*; it is higher at a lower speed."""
 ERROR = 0.05
-"""Longitudinal or lateral error in m that the motion controller corrects within the limits, *chosen*."""
+"""Longitudinal or lateral error in m whose correction stays within the robot's limits on acceleration, *chosen*."""
 PUBLISHED_K_X, PUBLISHED_K_THETA = 10.0, 16.0
-"""Gains in 1/s and 1/m that Kanayama et al. (1990) drove with; the motion controller gets none above them."""
+"""Gains K_x in 1/s and K_θ in 1/m of Kanayama et al. (1990); upper bounds of the designed ones."""
 
 
 def plants(robot: Robot, rigid: bool, channel: int) -> list[Linear]:
     """Returns the plant of a channel at each of `SPEEDS`, or one plant where the speed does not matter.
 
-    A robot with its centre of mass behind the axle turns by itself above some speed. Speeds at which it does are left
-    out, and where it always does, the plant is that at rest.
+    The yaw of a robot with its centre of mass behind the axle is unstable above some speed. Speeds at which it is
+    unstable are left out; if none is left, the plant is that at rest.
 
     Args:
         robot: The nominal robot in its steering arrangement.
@@ -60,7 +60,7 @@ def plants(robot: Robot, rigid: bool, channel: int) -> list[Linear]:
 def design(robot: Robot, rigid: bool, delay: float, lag: float = 0.0, period: float = 0.01) -> tuple[Gains, Gains]:
     """Designs the PI gains of both channels, in V/(m/s) and V/m and in V/(rad/s) and V/rad, or 1 and 1/s if rigid.
 
-    It takes some 50 ms, and the answers to the last questions are kept.
+    A design takes about 50 ms; the last 256 are cached.
 
     Args:
         robot: The nominal robot in its steering arrangement.
@@ -74,7 +74,7 @@ def design(robot: Robot, rigid: bool, delay: float, lag: float = 0.0, period: fl
 
 @lru_cache(maxsize=256)
 def _design(robot: Robot, rigid: bool, delay: float, lag: float, period: float) -> tuple[Gains, Gains]:
-    electric = robot.inductance / robot.resistance  # the armature's time constant acts as a lag
+    electric = robot.inductance / robot.resistance  # s, time constant of the armature, which counts as a lag
     common = fastest(plants(robot, rigid, 0), period, delay, lag + electric)
     second = fastest(plants(robot, rigid, 1), period, delay, lag if rigid else lag + electric)
     return common, second
@@ -144,18 +144,19 @@ def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float =
         x:  τ s² + s + K_x = 0,                         ζ = 1/(2 √(K_x τ))
         y:  τ s³ + s² + v_r K_θ s + v_r² K_y = 0,       K_θ = 2 √K_y
 
-    τ is the lag of the velocity loop and that of the prefilter, which takes half as long as the slower velocity loop,
-    *chosen*. A velocity loop follows a slow command with the lag 1/(K K_i). The steering is commanded to where the
-    wheel does not scrub, so that a fork makes no torque when the robot turns as commanded, and K is that of equation
-    (3) without it. A stiff servo follows angle and rate of the command: the delay and the tyre's lag are left.
+    τ is the sum of the lags of the velocity loop and of the prefilter; the prefilter has half the lag of the slower
+    velocity loop, *chosen*. A velocity loop follows a slow command with the lag 1/(K K_i). The steering is commanded to
+    the angle at which the wheel does not scrub, so that the fork makes no torque when the robot turns as commanded, and
+    K is that of equation (3) without the fork. A stiff servo (`rigid`) follows angle and rate of the command, which
+    leaves the delay and the lag of the tyre.
 
     K_θ makes the lateral error critically damped where τ = 0. With p = τ s and κ = τ v_r √K_y the second equation is
     p³ + (p + κ)² = 0; its root r e^(jψ) with cos ψ = −ζ has √r = −sin ψ/cos(3ψ/2) and
     κ = r^(3/2) sin(3ψ/2) − r cos ψ.
 
-    An error of `ERROR` must not ask for more than the robot's accelerations, which would limit the rate of the loop and
-    make it oscillate: K_x² e ≤ V̇_max, and v² K_y^(3/2) e ≤ θ̈_max, as the loops move within 1/K_x and 1/(v √K_y). No
-    gain is above those of Kanayama et al. (1990).
+    An error e = `ERROR` must not request more than the limits on acceleration, because a rate limit in the loop makes
+    it oscillate: K_x² e ≤ V̇_max, and v² K_y^(3/2) e ≤ θ̈_max, as the loops have the time constants 1/K_x and
+    1/(v √K_y). No gain is above those of Kanayama et al. (1990).
 
     Args:
         robot: The nominal robot in its steering arrangement.

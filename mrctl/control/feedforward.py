@@ -47,7 +47,7 @@ class Feedforward(Protocol):
         Args:
             feedback: Feedback in the channels and units of `output`, `(B, 2)`.
             saturated: 1 where a limit acted, a driven wheel slips, or this robot must not learn, else 0, `(B,)`.
-            twist: Measured V in m/s and θ̇ in rad/s, on which `voltage` has not acted yet, `(B, 2)`.
+            twist: Estimated V in m/s and θ̇ in rad/s, on which `voltage` has not acted yet, `(B, 2)`.
             voltage: Voltage of the coming period, after the limits, in the channels and units of `output`, `(B, 2)`.
 
         Returns:

@@ -12,14 +12,14 @@ from mrctl.record import Record
 
 
 class Kanayama(Record):
-    """Gains of Kanayama's motion controller; those that are not set follow from the lag of the velocity loops."""
+    """Gains of Kanayama's motion controller; by default they follow from the velocity loops and the robot's limits."""
 
     k_x: Annotated[float, Field(ge=0, le=100)] | None = None
-    """Longitudinal gain K_x in 1/s; by default it follows from the lag of V."""
+    """Longitudinal gain K_x in 1/s; by default it follows from the lag of V and the limit on V̇."""
     k_y: Annotated[float, Field(ge=0, le=1000)] | None = None
-    """Lateral gain K_y in 1/m²; by default it follows from the lag of θ̇."""
+    """Lateral gain K_y in 1/m²; by default it follows from the lag of θ̇ and the limit on θ̈."""
     k_theta: Annotated[float, Field(ge=0, le=100)] | None = None
-    """Heading gain K_θ in 1/m; by default 2√K_y, with which the lateral error is critically damped."""
+    """Heading gain K_θ in 1/m; by default 2√K_y, critical damping of the lateral error where θ̇ has no lag."""
 
 
 GAINS = np.dtype([("k_x", "f8"), ("k_y", "f8"), ("k_theta", "f8")])  # 1/s, 1/m², 1/m
@@ -33,7 +33,7 @@ def posture_error(pose: Array, reference: Array, error: Array) -> None:
 
     Args:
         pose: Posture x, y, θ in m, m, rad, `(3,)`.
-        reference: Reference posture `(3,)`.
+        reference: Reference posture in the same units, `(3,)`.
         error: Out: x_e and y_e in m, θ_e in rad, `(3,)`.
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])

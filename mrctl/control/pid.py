@@ -1,4 +1,4 @@
-"""The velocity controller: PID on linear and rotation velocity, and its design from equation (3)."""
+"""The velocity controller: PID on linear and rotation velocity, with gains by `design` or by the IMC rule."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def pid(command: Array, twist: Array, excess: Array, period: float, s: Row, feed
 
     Args:
         command: Commanded V in m/s and θ̇ in rad/s, `(2,)`.
-        twist: Measured V in m/s and θ̇ in rad/s, `(2,)`.
+        twist: Estimated V in m/s and θ̇ in rad/s, `(2,)`.
         excess: Excess of the last period, in the units of `feedback`, `(2,)`.
         period: Control period in s.
         s: In and out: a record of `PID`.
@@ -60,17 +60,17 @@ def pid(command: Array, twist: Array, excess: Array, period: float, s: Row, feed
 
 
 class Pid(Record):
-    """Design of the velocity controller: as fast as its delay allows, or by the IMC rule where λ is given."""
+    """Settings of the velocity PID: gains as large as its delay allows, or by the IMC rule where λ is given."""
 
     time_constant: Annotated[float, Field(ge=0.03, le=2)] | None = None
-    """Closed-loop time constant λ of both channels in s, with which the IMC rule sets K_p = τ/(K λ) and K_i = 1/(K λ);
-    by default the gains are the largest that the delay allows."""
+    """Closed-loop time constant λ of both channels in s, with which the IMC rule sets K_p = τ/(K λ) and K_i = 1/(K λ)
+    for the plant K/(τ s + 1); by default the gains are the largest that the delay allows."""
     delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] | None = None
-    """Delay from measurement to voltage in s that the gains allow for; by default that of the sensing."""
+    """Delay from measurement to voltage in s that the design of the gains assumes; by default that of `sensing`."""
     lag: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """Time constant in s with which the measured velocities follow the true ones, which the gains allow for as well."""
+    """Time constant in s of the measured velocities behind the true ones that the design of the gains assumes."""
     derivative_time: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """Derivative time K_d/K_p in s; the rule for a first-order plant needs no derivative action."""
+    """Derivative time K_d/K_p in s; none by default, as the gains are designed for PI control."""
     derivative_filter: Annotated[float, Field(ge=0.005, le=1)] = 0.03
     """Time constant of the filter on the derivative in s."""
     steering_kp: Annotated[float, Field(ge=0, le=10)] | None = None
@@ -117,7 +117,7 @@ class Pid(Record):
 
 
 STEERING, STEERING_LAG = Gains(0.3, 5.0), 0.15
-"""Gains on the steering, in rad/s per rad/s and 1/s, and the λ in s to which they belong; *chosen*."""
+"""Gains of a steering channel, in rad/s per rad/s and 1/s, at this λ in s; they scale with 1/λ. *Chosen*."""
 
 
 def imc(robot: Robot, time_constant: float) -> tuple[Gains, Gains]:
@@ -125,7 +125,7 @@ def imc(robot: Robot, time_constant: float) -> tuple[Gains, Gains]:
 
         K_p = τ/(K λ),    K_i = 1/(K λ)        (Rivera, Morari and Skogestad 1986)
 
-    The gains are in V/(m/s) and V/m, and in V/(rad/s) and V/rad.
+    K and τ are those of equation (3), without the fork. The gains are in V/(m/s) and V/m, and in V/(rad/s) and V/rad.
 
     Args:
         robot: The nominal robot.

@@ -1,15 +1,17 @@
 """The stages of figure 3 that a user can replace, with the estimator before them, and the methods that each needs.
 
-A stage serves B robots: arrays have a leading axis B, so that robots cannot mix. A factory makes it, which is called
-with the nominal robot and the number of robots. Its two methods receive copies, NumPy arrays of float64, and may return
-NumPy arrays or torch tensors. `mrctl.simulate(…, motion=, feedback=, feedforward=, steering=, estimator=)` takes the
-factories. The limits and the prefilter of the command, the limits of voltage and steering angle, and the guard on the
-feedforward still act.
+A stage serves B robots: arrays have a leading axis B, one row for each robot. A factory makes it, which is called with
+the nominal robot and B. Its two methods receive copies, NumPy arrays of float64, and may return NumPy arrays or torch
+tensors. `mrctl.simulate(…, motion=, feedback=, feedforward=, steering=, estimator=)` takes the factories. The limits
+and the prefilter of the command, the limits of voltage and steering angle, and the guard on the feedforward still act.
+
+Estimated posture and twist are predicted over the delay of the sensing tier, to the time at which the voltage of the
+tick reaches the motors; the reference is that of the same time.
 
 | stage         | `output` returns                                    | other method                                 |
 | ------------- | --------------------------------------------------- | -------------------------------------------- |
 | `Motion`      | requested twist from posture and reference          | `reset` before the first tick                |
-| `Feedback`    | voltages from commanded and measured twist          | `reset` to the voltages of the initial motion |
+| `Feedback`    | voltages from commanded and estimated twist         | `reset` to the voltages of the initial motion |
 | `Feedforward` | voltages from commanded twist and its derivative    | `learn` from the feedback and the motion     |
 | `Steering`    | angle and rate of the fork from commanded twist     | `reset` to the initial angle                 |
 | `Estimator`   | posture and twist from the samples of the sensors   | `reset` to a first estimate                  |
@@ -42,8 +44,8 @@ class Motion(Protocol):
         """Returns the requested twist.
 
         Args:
-            pose: Measured x, y in m and θ in rad, `(B, 3)`.
-            twist: Measured V in m/s and θ̇ in rad/s, `(B, 2)`.
+            pose: Estimated x, y in m and θ in rad, `(B, 3)`.
+            twist: Estimated V in m/s and θ̇ in rad/s, `(B, 2)`.
             reference: x_r and y_r in m, θ_r in rad, V_r in m/s, θ̇_r in rad/s, V̇_r in m/s², θ̈_r in rad/s², `(B, 7)`.
 
         Returns:
@@ -55,8 +57,8 @@ class Motion(Protocol):
 class Feedback(Protocol):
     """The velocity controller without its feedforward, which is called once in a control period.
 
-    It may have a member `integral`, a float64 array `(B, 2)`. The hierarchy then subtracts from it what a learner takes
-    over, and the guard sets it at the beginning of a fallback.
+    It may have a member `integral`, a float64 array `(B, 2)`. The hierarchy then subtracts from it a share of what a
+    learner adds to the feedforward, and the guard sets it at the beginning of a fallback.
     """
 
     def reset(self, steady: Array, period: float) -> None:
@@ -73,9 +75,9 @@ class Feedback(Protocol):
 
         Args:
             command: Commanded V in m/s and θ̇ in rad/s, after limits and prefilter, `(B, 2)`.
-            twist: Measured V in m/s and θ̇ in rad/s, `(B, 2)`.
-            excess: Last command after the limits less that before them, for anti-windup, in the units of the output,
-                `(B, 2)`.
+            twist: Estimated V in m/s and θ̇ in rad/s, `(B, 2)`.
+            excess: Last sum of feedback and feedforward after the limits less that before them, for anti-windup, in the
+                units of the output, `(B, 2)`.
 
         Returns:
             U_Σ and U_Δ in V, `(B, 2)`; under `rigid` steering the second channel is a correction of θ̇ in rad/s.
@@ -112,8 +114,9 @@ class Steering(Protocol):
 class Estimator(Protocol):
     """The estimator of posture and twist, which is called once in a control period.
 
-    Its estimate is predicted to the moment when the voltage of the period acts. A robot for which it returns a number
-    that is not finite goes on with odometry from the last estimate; the result names the tick in `estimator_fault`.
+    Its estimate is predicted to the time at which the voltage of the period acts. Where it returns a number that is not
+    finite, odometry continues from the last estimate of that robot; `estimator_fault` of the result names the first
+    such tick.
     """
 
     def reset(self, pose: Array, twist: Array, period: float) -> None:
@@ -130,9 +133,9 @@ class Estimator(Protocol):
         """Returns the estimate at the moment of the call.
 
         Args:
-            encoders: Angles of the rear wheels that arrived last, left and right, in rad, `(B, 2)`.
-            gyro: Last θ̇ of the gyro in rad/s, `(B,)`.
-            acceleration: Last specific force, forward and to the left, in m/s², `(B, 2)`.
+            encoders: Angles of the rear wheels in the last samples that arrived, left and right, in rad, `(B, 2)`.
+            gyro: θ̇ in the last sample of the gyro that arrived, in rad/s, `(B,)`.
+            acceleration: Specific force in the last such sample, forward and to the left, in m/s², `(B, 2)`.
             fix: Posture fix that arrived in this period in m, m, rad, `(B, 3)`; zeros where none did.
             age: Age of that fix in s, `(B,)`; −1 where none arrived.
 

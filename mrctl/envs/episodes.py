@@ -24,8 +24,9 @@ ACTION_KINDS: tuple[Action, ...] = ("twist", "voltage", "residual")
 OBSERVATIONS: dict[str, int] = {
     "error": 3, "twist": 2, "reference": 4, "wheel_rates": 2, "steering_angle": 1, "voltage": 2,
 }  # fmt: skip
-"""Names and sizes: measured posture error in the robot's frame (m, m, rad); measured V and θ̇ (m/s, rad/s); those of the
-reference and their derivatives; rates of the rear wheels (rad/s); angle of the fork (rad); voltages sent last (V)."""
+"""Names and sizes: estimated posture error in the robot's frame (m, m, rad); estimated V and θ̇ (m/s, rad/s); those of
+the reference and their derivatives; true rates of the rear wheels (rad/s); true angle of the fork (rad); voltages sent
+last (V)."""
 RESIDUAL = 0.25  # of the supply, what a residual may add
 NEAR = 0.05  # m off the reference at which the reward is a half
 

@@ -47,7 +47,7 @@ class Courses:
     """The references of a uniform group of scenarios; robots with the same reference share its samples."""
 
     def __init__(self, scenarios: Sequence[Scenario], lead: int = 0) -> None:
-        """Takes the scenario of each robot, and by how many control ticks references are asked for ahead of time."""
+        """Takes the scenario of each robot, and the largest number of control ticks `ahead` of `at`."""
         self._ticks, self._lead = scenarios[0].ticks, lead
         self._courses, self._place = distinct_courses(scenarios)
         self._own = len(self._courses) == len(scenarios)  # whether no two robots share a course

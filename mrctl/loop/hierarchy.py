@@ -39,7 +39,7 @@ from mrctl.kernel import Array, Kernel, Row, Rows, kernel
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import Robot
 
-SLIPS = 0.1  # slip ratio beyond which the voltage of a wheel does not explain the motion
+SLIPS = 0.1  # slip ratio above which the voltage does not explain the motion, and nothing is learned
 # Share of the change of the feedforward by learning that the PID's integral gives up at once. With 0, both contain the
 # same voltage until the error has unwound the integral: the first lap overshoots, and the loop has one fast integrator
 # too many. With 1, learning has no integral action of its own, and the position is tracked less well.
@@ -236,7 +236,7 @@ class Hierarchy:
         self.finite = True
 
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
-        """Changes the motion controller of one robot; gains that are not set follow from its first PID."""
+        """Changes the motion controller of one robot; gains that are not set are designed for its PID at the start."""
         designed = self._motions[row].kanayama.model_dump()
         chosen = designed | gains.model_dump(exclude_none=True)
         if gains.k_y is not None and gains.k_theta is None:
@@ -275,7 +275,7 @@ class Hierarchy:
         self._tick = 0
 
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
-        """Starts without a bump: the integral holds the voltage that the nominal robot needs for its initial motion.
+        """Bumpless start: the integral holds the voltage that the nominal robot needs for its initial motion.
 
         Args:
             twist: Initial twist of the robots in m/s and rad/s, `(B, 2)`.
@@ -293,8 +293,8 @@ class Hierarchy:
         """Computes the commands of one control tick.
 
         Args:
-            seen: Measurement of each robot, a record of `SEEN`, `(B,)`.
-            goal: Reference of each robot, a record of `GOAL`, `(B,)`.
+            seen: Estimate of each robot, a record of `SEEN`, `(B,)`.
+            goal: Reference of each robot at the time when the voltage acts, a record of `GOAL`, `(B,)`.
 
         Returns:
             `output`, `(B, 4)`.

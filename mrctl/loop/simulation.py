@@ -49,7 +49,7 @@ def simulate(
             scenario's: a factory, called with the nominal robot and the number of robots, which returns an object with
             the two methods of that stage in `mrctl.control.stages`. One that raises, or returns an array of the wrong
             shape, fails all runs that are computed together; one that returns NaN for a robot fails that run, except
-            for an estimator, instead of which odometry goes on.
+            for an estimator, which odometry then replaces.
 
     Returns:
         The signals of `results.dataset.SIGNALS` with dimensions run and time (time alone for one scenario), with units;
@@ -120,7 +120,7 @@ def run(
 
     def drive(simulation: Simulation) -> None:
         last = simulation.ticks if ticks is None else simulation.tick + ticks
-        with np.errstate(invalid="ignore", over="ignore"):  # a robot that blew up is computed on in NaN, to no effect
+        with np.errstate(invalid="ignore", over="ignore"):  # NaN of a failed robot have no effect on the others
             while simulation.running and simulation.tick < last and not stop.is_set():
                 simulation.step()
                 if progress:
@@ -153,7 +153,7 @@ class Simulation:
         model: The compiled world with the nominal robot.
         courses: The references that the robots follow.
         sensors: The sensors of the robots.
-        estimator: The posture and the twist that the controllers are told.
+        estimator: The estimator of the posture and the twist that the controllers use.
         hierarchy: The controllers.
         plant: The physics.
         events: The perturbations, pushes and other changes during the run.
@@ -194,7 +194,7 @@ class Simulation:
         self.hierarchy = UserHierarchy(scenarios, robot, users) if users else Hierarchy(scenarios, robot)
         sensing = [s.sensing for s in scenarios]
         self.sensors = Sensors(sensing, [s.seed for s in scenarios], self.period)
-        # The engine moves positions with the velocities at the end of a step, so velocities are half a step behind.
+        # The engine integrates positions with the velocities at the end of a step: velocities are half a step behind.
         parts = sensing, robot, self.sensors, self.plant.imu, first.physics_step / 2
         self.estimator = UserEstimator(own, *parts) if own else Estimator(first.sensing.source, *parts)
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period)
@@ -235,7 +235,7 @@ class Simulation:
             self.courses = Courses(self.scenarios, self._lead)
 
     def step(self) -> None:
-        """One control period, as in figure 3."""
+        """Computes one control period, as in figure 3."""
         self.plant.step(self.decide())
         self.settle()
 
@@ -243,8 +243,8 @@ class Simulation:
         """Applies the events of this tick and measures; further calls in the same tick only return the result.
 
         Returns:
-            Estimate of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each; both are of
-            the moment when the voltage of this tick acts.
+            Estimate of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each; both are
+            predicted to the time at which the voltage of this tick acts.
         """
         if self._sensed != self.tick:
             self._sensed = self.tick

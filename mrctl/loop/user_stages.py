@@ -150,7 +150,7 @@ class UserHierarchy(Hierarchy):
         self.faults: dict[int, str] = {}
 
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
-        """Starts without a bump; see `Hierarchy.reset`."""
+        """Bumpless start; see `Hierarchy.reset`."""
         self.command[rows] = twist[rows]
         self.state["allocation"]["angle"][rows] = steering_angle[rows]
         integral = self._nominal.output(twist, acceleration) - self._forward(twist, acceleration)
@@ -272,7 +272,7 @@ class UserHierarchy(Hierarchy):
 
 
 class UserEstimator(Estimator):
-    """A user's estimator, with odometry for robots of which it tells nothing.
+    """A user's estimator, with odometry in place of an estimate that is not finite.
 
     Attributes:
         faults: For each robot the message of the first tick at which the estimate was not finite, or "".

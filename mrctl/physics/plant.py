@@ -1,7 +1,8 @@
 """The physics boundary: one robot through dm_control, many through `mujoco.batch`, behind one interface.
 
 Every array has a leading batch dimension. Both plants share the code below but for a few methods, so robot i of a batch
-is the same scenario run alone, bit for bit. Only `qpos` and `qvel` are read: a batch's sensor data is a substep old.
+is the same scenario run alone, bit for bit. The readouts use `qpos`, `qvel` and `act` only, because the sensor data of
+a batch is a substep old.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -44,9 +45,9 @@ PLANT = np.dtype(
         ("reading", READING),  # now
         ("sent", "f8", 2),  # voltages of the driver without its current limit, left and right, V
         ("applied", "f8", 2),  # voltages at the terminals, left and right, at the end of the period, V
-        ("lost", "f8", 2),  # applied less sent, what the current limit took, in commanded V
+        ("lost", "f8", 2),  # applied less sent voltage, the change by the current limit, at the nominal supply, V
         ("current", "f8", 2),  # armature currents, A
-        ("wheel_angles", "f8", 2),  # of the rear wheels, left and right, since the model's zero, rad
+        ("wheel_angles", "f8", 2),  # of the rear wheels, left and right, from the zero of the model, rad
         ("imu_velocity", "f8", 3),  # velocity of the inertial sensor in the world, m/s
         ("specific_force", "f8", 2),  # forward and to the left at the inertial sensor, mean over the period, m/s²
         ("gravity", "f8", 3),  # in the world, m/s²
@@ -88,9 +89,9 @@ def look(
     qpos: Array, qvel: Array, act: Array, address: NDArray[np.int64], acts: NDArray[np.int64], imu: Array,
     period: float, plant: Rows,
 ) -> bool:  # fmt: skip
-    """Readings, terminal voltages and currents after a period; returns whether all robots are upright and sane.
+    """Readings, terminal voltages and currents after a period; returns whether all robots are upright and finite.
 
-    The specific force is the velocity that was gained in the period less that which gravity gives, over the period.
+    The specific force is the mean acceleration in the period less gravity.
     """
     upright, velocity, axes = True, np.empty(3), np.empty((2, 3))
     for i in range(len(plant)):
@@ -118,7 +119,7 @@ def look(
 
 
 class Plant(ABC):
-    """B robots in physics. Robots that fail stop alone; their state stays as it was found.
+    """B robots in physics. A robot that fails stops alone, and its state stays as it was.
 
     Attributes:
         state: One record of `PLANT` a robot; `reading`, `applied` and `failed` are views of it.
@@ -127,8 +128,8 @@ class Plant(ABC):
         reading: One record of `READING` a robot, current after `reset` and `step`.
         applied: Voltages at the terminals, left and right, `(B, 2)` in V.
         failed: Which robots have stopped, `(B,)`.
-        failure: Why, one string a robot.
-        running: How many have not.
+        failure: Reason of the failure of each robot, or "".
+        running: Number of robots that have not failed.
         imu: Position of the inertial sensor in the frame of the chassis in m, `(3,)`.
     """
 
@@ -160,7 +161,7 @@ class Plant(ABC):
         state["resistance"], state["back_emf"], state["gravity"] = resistance, back_emf, model.opt.gravity
         state["driver"]["supply"], state["driver"]["gain"], state["driver"]["scale"] = robot.supply, 1.0, 1.0
         state["driver"]["current_limit"] = current_limits(model)
-        # As long as any delay of sensing and perturbation: the past of a robot does not depend on the others' delays.
+        # Long enough for the largest delays of sensing and perturbation, whatever those of this batch are.
         self._queue = np.zeros((1 + round(2 * LONGEST_DELAY / self._period), size, 4))
         self._tick = 0
         self._pushes: dict[int, int] = {}
@@ -172,7 +173,7 @@ class Plant(ABC):
 
     @abstractmethod
     def _advance(self) -> dict[int, str]:
-        """Runs the physics steps of one control period; returns the engine's complaints by robot."""
+        """Runs the physics steps of one control period; returns the engine's errors by robot."""
 
     def perturb(
         self,
@@ -185,7 +186,7 @@ class Plant(ABC):
         """Replaces the perturbation of one robot, and its driver and servo, from now on.
 
         Args:
-            robot: Its row.
+            robot: Index of the robot.
             perturbation: The complete perturbation.
             delay: Delay of commands in control periods.
             driver: Motor driver and battery, to which the perturbation adds.
@@ -242,7 +243,7 @@ class Plant(ABC):
         """Stands one robot on the ground again, as `reset` does all of them; what happened to it is forgotten.
 
         Args:
-            robot: Its row.
+            robot: Index of the robot.
             pose: `(3,)` in m, m, rad.
             twist: `(2,)` in m/s, rad/s.
 
@@ -274,7 +275,7 @@ class Plant(ABC):
         """Pushes the chassis of one robot.
 
         Args:
-            robot: Its row.
+            robot: Index of the robot.
             force: Forces along the world's x and y in N at the chassis' centre of mass, torque about z in N·m, `(3,)`.
             periods: For how many control periods.
         """
@@ -295,7 +296,7 @@ class Plant(ABC):
         """
         if command.shape != (self.size, 4):
             raise ValueError(f"command: shape {command.shape}, expected {(self.size, 4)}")
-        # The engine would silently take zero volts instead of what is no number.
+        # The engine would silently replace NaN by zero volts.
         if not send.compiled(command, self._tick, self._queue, self._inputs, self.state, self.ctrl):
             sent = self._queue[(self._tick - self.state["delay"]) % len(self._queue), np.arange(self.size)]
             for robot in np.flatnonzero(~np.isfinite(sent).all(axis=1)):
@@ -308,7 +309,7 @@ class Plant(ABC):
                 self.fail(robot, reason)
 
     def look(self) -> None:
-        """Readouts after the physics; judges whether robots are still what they should be."""
+        """Readouts after the physics; fails robots that have tilted or whose state is not finite."""
         self._tick += 1
         if self._pushes:
             for robot in [r for r, end in self._pushes.items() if end == self._tick]:
@@ -330,7 +331,7 @@ class Plant(ABC):
         return self.state["current"]
 
     def _begin(self, rows: slice) -> None:
-        """Reads robots that were just stood on the ground; the second look finds that they do not accelerate."""
+        """Reads robots at the start; the second reading makes their acceleration zero."""
         self._look(rows)
         self._look(rows)
 

@@ -1,4 +1,4 @@
-"""What the controllers are told: samples of sensors, and the posture, twist and slip that an estimator makes of them.
+"""Sensors, and the estimators that compute posture, twist and slip from their samples; the sensing tiers.
 
 Imports `mrctl.kernel` and `mrctl.theory`.
 """

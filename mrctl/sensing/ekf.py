@@ -1,4 +1,4 @@
-"""An extended Kalman filter of posture, twist, gyro bias and wheel radii from encoders, gyro and late posture fixes.
+"""An extended Kalman filter of posture, twist, sensor biases and wheel radii, with posture fixes that arrive late.
 
     x = (x, y, θ, V, θ̇, b, o, λ_l, λ_r, s_l, s_r)
 
@@ -7,10 +7,11 @@
 
     encoder_l,r = λ_l,r + quantisation,    gyro = θ̇ + b + noise,    fix = (x, y, θ) + noise
 
-The accelerometer a is an input; its offset o is its bias and its share of gravity. θ̈_c is the commanded acceleration
-that acts in the period. The wheel angles λ are part of the state, so that an encoder's error stays bounded in angle; as
-noise on V, it would grow to a random walk of the position. A fix corrects the state of the moment when it was taken:
-the filter keeps that state, and repeats the periods since then.
+b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii. The accelerometer a, corrected for its
+place ahead of the axle, is an input; its offset o is the sum of its bias and a component of gravity. θ̈_c is the
+commanded acceleration that acts in the period. The wheel angles λ are part of the state, so that the error of an
+encoder stays bounded in angle; modelled as noise on V, it would become a random walk of the position. A fix corrects
+the state at the time when it was taken: the filter stores that state, and repeats the periods since then.
 """
 
 from __future__ import annotations
@@ -20,28 +21,30 @@ import numpy as np
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.sensing.prediction import front, predict, wrapped
 
-N = 11  # states
+N = 11  # number of states
 X, Y, THETA, V, OMEGA, BIAS, OFFSET, LEFT, RIGHT, SCALE_LEFT, SCALE_RIGHT = range(N)
-KEPT = 5  # states that are kept for fixes on their way
+KEPT = 5  # largest number of states that are stored for fixes that have not arrived
 
-# Process noise, all chosen and held to the chi-square test of the filter's error (NEES) in the tests.
+# Process noise. All values but JOLT are chosen, and tests check them by the filter's error (NEES, chi-square).
 TURN = 0.1  # deviation from the commanded θ̈, rad/s²/√Hz
 SETTLE = 1.0  # s, time in which o follows the faster offset of `find_grip`
 LOOSE_V = 0.5  # of V̇ while no wheel grips, m/s²/√Hz
-INCLINE = 0.02  # change of the accelerometer's share of gravity, m/s²/√s
-SIDE_SLIP, SKID = 2e-4, 0.02  # lateral motion of the rear axle beyond v_y, while both wheels grip and else, m/√s
-CREEP = 0.8e-4  # slip of a rolling tyre, share of the angle, √s
+INCLINE = 0.02  # random walk of the component of gravity in the accelerometer, m/s²/√s
+SIDE_SLIP, SKID = 2e-4, 0.02  # lateral motion of the rear axle beyond v_y, while both wheels grip and otherwise, m/√s
+CREEP = 0.8e-4  # noise of the slip ratio of a rolling tyre, √s
 JOLT = 1e-3  # slip of a tyre while its force changes, rad/(m/s²); measured where a motor's current jumps by 4.7 A
-RADIUS = 0.01  # standard deviation of the scale of a wheel's radius at the start
-RADIUS_WALK = 1e-5  # of that scale, 1/√s
-START_OFFSET = 0.2  # of the accelerometer's share of gravity, m/s²
+RADIUS = 0.01  # standard deviation of the relative error of a wheel's radius at the start
+RADIUS_WALK = 1e-5  # random walk of that error, 1/√s
+START_OFFSET = 0.2  # standard deviation of the component of gravity in the accelerometer at the start, m/s²
 START_TWIST = 0.02, 0.02  # standard deviations of V in m/s and θ̇ in rad/s at the start
 
-SIDE = 1.94e-3  # s, c = m/C of the rear tyres of cornering stiffness C; measured on the models of this package
+# s, c = m/C, where C in N·s/m is the side force of the rear tyres over their lateral velocity; measured on the models
+# of this package.
+SIDE = 1.94e-3
 FIX_GATE = 16.27  # 99.9 % of chi-square with 3 degrees of freedom
-LOST = 10  # fixes refused in a row, after which the filter believes them rather than itself
-LOOSE = 0.5  # m and rad, standard deviation that is then given to the posture
-GRIP = 0.08  # m/s between encoder and inertial speed of a wheel, beyond which it slips
+LOST = 10  # number of a rejected fix in a row at which the filter accepts it
+LOOSE = 0.5  # m and rad, standard deviation that is then added to the posture
+GRIP = 0.08  # m/s, difference of encoder and inertial speed of a wheel above which it slips
 TWIST = 3e-3  # m/s, difference of the slip of two wheels that grip
 INERTIAL = 5.0  # rad/s, bandwidth of the observer that compares encoders with the accelerometer
 
@@ -61,8 +64,8 @@ EKF = np.dtype(
         ("offset_walk", "f8"),  # of o, m/s²/√s
         ("fix_variance", "f8", 3),  # m², m², rad²
         ("inertial", "f8"),  # V from accelerometer and the wheels that grip, m/s
-        ("offset", "f8"),  # accelerometer's bias and share of gravity, m/s²
-        ("refused", "i8"),  # fixes refused in a row
+        ("offset", "f8"),  # offset o of the accelerometer by the observer of `find_grip`, m/s²
+        ("refused", "i8"),  # number of fixes rejected in a row
         ("nis", "f8"),  # normalised innovation squared of the last fix, chi-square with 3 degrees of freedom
         ("innovations", "f8", 3),  # normalised innovations of the last encoder samples and gyro sample
     ],
@@ -72,7 +75,7 @@ EKF = np.dtype(
 
 @kernel
 def propagate(v_dot: float, omega_dot: float, jolt: float, grip: Array, geometry: Array, period: float, s: Row) -> None:
-    """Predicts the state over one period: P ← F P Fᵀ + Q; `jolt` is the change of the acceleration in m/s²."""
+    """Predicts the state over one period: P ← F P Fᵀ + Q; `jolt` is the change of the measured acceleration in m/s²."""
     m, P, T = s.mean, s.P, period
     r, D, side_lag = geometry[0], geometry[1], SIDE - geometry[3]
     v, omega = m[V] + v_dot * T / 2, m[OMEGA] + omega_dot * T / 2
@@ -88,7 +91,7 @@ def propagate(v_dot: float, omega_dot: float, jolt: float, grip: Array, geometry
     m[OMEGA] += T * omega_dot
     m[LEFT] += turn_left
     m[RIGHT] += turn_right
-    # F is the identity but for the rows of x, y, λ, θ and V; those of θ and V come last, for the others use the old.
+    # F is the identity except in the rows of x, y, λ, θ and V. Those of θ and V come last, as the others use the old.
     for transposed in range(2):
         Q = P.T if transposed else P
         for j in range(N):
@@ -136,9 +139,9 @@ def absorb(residual: float, variance: float, s: Row) -> None:
 
 @kernel
 def measure(now: Row, omega_dot: float, skew: float, s: Row) -> None:
-    """Updates by encoders and gyro; the encoder of a wheel that slips only says where the wheel is now.
+    """Updates by encoders and gyro; the encoder of a wheel that slips only resets the angle of that wheel.
 
-    The gyro's sample is θ̇ of `skew` s ago, for which the commanded θ̈ accounts.
+    The gyro measures θ̇ of `skew` s ago; the commanded θ̈ accounts for the difference.
     """
     P = s.P
     if now.encoder_new:
@@ -166,7 +169,7 @@ def measure(now: Row, omega_dot: float, skew: float, s: Row) -> None:
 
 @kernel
 def absorb_fix(fix: Array, s: Row) -> None:
-    """Updates by a posture fix, unless it lies outside the gate; the filter gives in to the tenth such fix in a row."""
+    """Updates by a posture fix, unless it lies outside the gate; the tenth such fix in a row is accepted."""
     P, m = s.P, s.mean
     e0, e1 = fix[0] - m[X], fix[1] - m[Y]
     e2 = wrapped(fix[2] - m[THETA])
@@ -197,13 +200,15 @@ def absorb_fix(fix: Array, s: Row) -> None:
 
 @kernel
 def find_grip(now: Row, geometry: Array, period: float, sensor: Row, s: Row) -> None:
-    """Tells which wheels grip, from encoders, gyro and accelerometer, and writes it into the samples.
+    """Decides which wheels grip, from encoders, gyro and accelerometer, and writes the result into the samples.
 
     An observer follows the wheels' speed, with the accelerometer as its input:
 
         V ← V + T (a − o) + 2 ω₀ T e,    o ← o − ω₀² T e,    e = mean of v_l,r − (V ∓ D ω) over the wheels that grip
 
-    The offset o is the accelerometer's bias and its share of gravity. A wheel slips if its e is larger than `GRIP`.
+    It has the bandwidth ω₀ = `INERTIAL`, and its offset o is faster than that of the filter. A wheel slips if its own
+    difference is larger than `GRIP` plus one count, or if it is the larger one and the two together contradict the
+    gyro.
 
     Args:
         now: In and out: a record of `SAMPLE`, whose `grip` is the result.
@@ -223,7 +228,7 @@ def find_grip(now: Row, geometry: Array, period: float, sensor: Row, s: Row) -> 
     spread = 4 * (r / (period * sensor.encoder_every)) ** 2 * s.encoder_variance
     spread += 4 * D * D * (s.gyro_variance + P[BIAS, BIAS])
     spread += s.inertial**2 * (P[SCALE_LEFT, SCALE_LEFT] + P[SCALE_RIGHT, SCALE_RIGHT])
-    if abs(left - right) > 4 * np.sqrt(spread) + TWIST:  # the gyro tells that one of them slips
+    if abs(left - right) > 4 * np.sqrt(spread) + TWIST:  # by the gyro, one of them slips
         if abs(left) > abs(right):
             now.grip[0] = 0
         else:
@@ -238,7 +243,7 @@ def find_grip(now: Row, geometry: Array, period: float, sensor: Row, s: Row) -> 
 
 @kernel
 def step(t: int, ring: Rows, i: int, geometry: Array, period: float, delay: int, start: int, s: Row) -> None:
-    """Takes the filter from tick t − 1 to t."""
+    """Runs the filter from tick t − 1 to t."""
     now, p = ring[t % len(ring), i], t - 1 - delay
     omega_dot = ring[p % len(ring), i].command[1] if p >= start else 0.0
     forward = now.acceleration[0] + geometry[2] * s.mean[OMEGA] ** 2  # the accelerometer is ahead of the rear axle
@@ -250,7 +255,7 @@ def step(t: int, ring: Rows, i: int, geometry: Array, period: float, delay: int,
 
 @kernel
 def keep(t: int, s: Row) -> None:
-    """Keeps the state of a tick in which a fix was taken."""
+    """Stores the state of a tick in which a fix was taken, in place of the oldest one."""
     oldest = 0
     for k in range(KEPT):
         if s.kept_tick[k] == t:
@@ -267,7 +272,7 @@ def keep(t: int, s: Row) -> None:
 def ekf(
     tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Array, period: float, memory: Row, s: Row
 ) -> None:
-    """The estimator `ekf`; the arguments are those of `truth`, of whose robot it reads nothing."""
+    """The estimator `ekf`; the arguments are those of `truth`, and `true` is not read."""
     f, now = memory, front(tick, sensor)
     taken = tick - sensor.fix_latency  # when the fix that arrives now was taken
     if s.start <= taken < now and ring[taken % len(ring), i].fix_arrives:

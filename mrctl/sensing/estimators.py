@@ -1,7 +1,8 @@
-"""What the controller is told of posture and twist: the truth, odometry, or the estimate of a filter, predicted.
+"""Estimators of posture and twist: the truth, odometry, an extended Kalman filter, or one of the user.
 
-An estimator receives the samples of the sensors, and estimates posture and twist at a control tick. `predict` takes the
-estimate on to the moment when the voltage that is computed in that tick reaches the motors.
+An estimator receives the samples of the sensors and estimates posture and twist at a control tick. `predict` then
+predicts the estimate to the time at which the voltage that is computed in that tick reaches the motors; the controllers
+receive this prediction.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ MOTION = np.dtype(
     [
         ("mean", "f8", 5),  # x, y in m, θ in rad, V in m/s, θ̇ in rad/s, when the last samples were taken
         ("told", "f8", 5),  # estimate of a user's estimator, in the same order
-        ("valid", "?"),  # whether it consists of finite numbers
+        ("valid", "?"),  # whether all five numbers of `told` are finite
     ],
     align=True,
 )
@@ -40,9 +41,10 @@ def truth(
         ring: Samples and commands, as in `Sensors`, `(N, B)`.
         i: Index of the robot.
         sensor: Its record of `SENSOR`.
-        geometry: Wheel radius r, half track D and distance of the accelerometer ahead of the rear axle in m, `(3,)`.
+        geometry: Wheel radius r, half track D and distance of the accelerometer ahead of the rear axle in m, and the
+            time `skew` in s by which velocities lag behind positions (see `Estimator`), `(4,)`.
         period: Control period in s.
-        memory: In and out: what the estimator keeps of the robot.
+        memory: In and out: state of the estimator for this robot.
         s: Out: its record of `SEEN`, of which an estimator writes `estimate` and `variance`.
     """
     for k in range(3):
@@ -58,7 +60,7 @@ def odometry(
 
         Δs = r (Δφ_l + Δφ_r)/2,    Δθ = T (ω_k + ω_{k−1})/2,    V = r (φ̇_l + φ̇_r)/2
 
-    The distance is driven in the direction of the middle of the period. The arguments are those of `truth`.
+    The heading in the middle of the period is the direction of Δs. The arguments are those of `truth`.
     """
     now = front(tick, sensor)
     m = memory.mean
@@ -79,7 +81,7 @@ def odometry(
 def user(
     tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Array, period: float, memory: Row, s: Row
 ) -> None:
-    """The estimate that a user's estimator told, or odometry from its last one; the arguments are those of `truth`."""
+    """The estimate of a user's estimator, or odometry from its last valid one; the arguments are those of `truth`."""
     odometry(tick, true, ring, i, sensor, geometry, period, memory, s)
     if memory.valid:
         for k in range(5):
@@ -97,12 +99,13 @@ def estimate(
 
     Args:
         tick: Control tick.
-        plant: Record of `PLANT` of each robot, which the estimator `truth` alone reads, and the driver's telemetry.
+        plant: Record of `PLANT` of each robot; only the estimator `truth` reads its motion, and the loss that the
+            driver reports is copied.
         ring: Samples and commands, as in `Sensors`, `(N, B)`.
         sensors: Record of `SENSOR` of each robot.
         geometry: As for `truth`.
         period: Control period in s.
-        memory: What the estimator keeps of each robot.
+        memory: State of the estimator for each robot.
         seen: Out: record of `SEEN` of each robot.
     """
     for i in range(len(seen)):
@@ -129,7 +132,7 @@ ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
     "ekf": (ekf, EKF),
     "user": (user, MOTION),
 }
-"""Law and memory of each estimator; `user` repeats what a user's estimator told."""
+"""Law and state of each estimator; `user` passes on the estimate of a user's estimator."""
 
 
 class Estimator:
@@ -137,7 +140,7 @@ class Estimator:
 
     Attributes:
         seen: What the controllers are told, a record of `SEEN` of each robot, `(B,)`.
-        memory: What the estimator keeps, a record of each robot, `(B,)`.
+        memory: State of the estimator, a record of each robot, `(B,)`.
     """
 
     def __init__(
@@ -151,8 +154,8 @@ class Estimator:
             robot: The nominal robot.
             sensors: The sensors.
             imu: Position of the accelerometer in the frame of the chassis in m, `(3,)`.
-            skew: By how much velocities lag behind positions in s: half a physics step, as the engine moves positions
-                with the velocities at the end of a step.
+            skew: Time in s by which velocities lag behind positions: half a physics step, because the engine integrates
+                positions with the velocities at the end of the step.
         """
         law, memory = ESTIMATORS[name]
         self._law = estimate.calling(observe=law)
@@ -162,7 +165,7 @@ class Estimator:
         self.memory = np.zeros(len(sensing), memory)
 
     def start(self, row: int, reading: Row, seed: int, tick: int) -> None:
-        """Starts the estimate of one robot from a first fix, and from a twist that is known roughly.
+        """Starts the estimate of one robot from a first fix and an uncertain twist.
 
         Args:
             row: Index of the robot.

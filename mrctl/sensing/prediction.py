@@ -12,12 +12,12 @@ SEEN = np.dtype(
         ("twist", "f8", 2),  # V in m/s and θ̇ in rad/s, when the voltage of this tick acts
         ("slip", "f8"),  # slip ratio of the driven wheel that slips more
         ("wheel_speeds", "f8", 2),  # wheel speeds left and right, from encoders and nominal wheel radius, m/s
-        ("lost", "f8", 2),  # voltage applied less commanded by a driver at its current limit, in the last period, V
+        ("lost", "f8", 2),  # change of the voltage by the driver's current limit in the last period, left and right, V
         ("encoder", "f8", 2),  # angles of the rear wheels that arrived last, left and right, rad
         ("gyro", "f8"),  # θ̇ of the gyro that arrived last, rad/s
         ("acceleration", "f8", 2),  # specific force that arrived last, forward and to the left, m/s²
         ("estimate", "f8", 5),  # x, y in m, θ in rad, V in m/s, θ̇ in rad/s now
-        ("variance", "f8", 6),  # of that: of x, of x and y, of y, of θ, V and θ̇; 0 where it is not known
+        ("variance", "f8", 6),  # of `estimate`: var x, cov (x, y), var y, var θ, var V, var θ̇; 0 where it is not known
         ("fix", "f8", 3),  # posture fix that arrived in this tick, m, m, rad; NaN where none did
         ("delay", "i8"),  # control periods from the measurement to the voltage
         ("start", "i8"),  # tick at which the run of this robot began
@@ -30,7 +30,7 @@ SEEN = np.dtype(
 def advance(
     x: float, y: float, theta: float, v: float, omega: float, v_dot: float, omega_dot: float, period: float
 ) -> tuple[float, float, float, float, float]:
-    """Moves posture and twist on by one period, with the second-order Runge-Kutta method.
+    """Integrates posture and twist over one period, with the second-order Runge-Kutta method.
 
         ẋ = V cos θ,  ẏ = V sin θ,    V̇ and θ̈ given and constant
 
@@ -56,14 +56,14 @@ def advance(
 
 @kernel
 def predict(state: Array, first: int, last: int, ring: Rows, i: int, period: float, s: Row) -> None:
-    """Predicts posture and twist from the begin of period `first` to that of `last`, as the commands have it.
+    """Predicts posture and twist from the beginning of period `first` to that of `last`, with commanded accelerations.
 
-    The commanded acceleration that acts in a period was computed `delay` periods earlier.
+    The commanded acceleration that acts in a period was computed `delay` periods earlier; before the run it is zero.
 
     Args:
-        state: x, y in m, θ in rad, V in m/s, θ̇ in rad/s at the begin, `(5,)`.
+        state: x, y in m, θ in rad, V in m/s, θ̇ in rad/s at the beginning, `(5,)`.
         first: First control period.
-        last: Control period at whose begin the prediction ends.
+        last: Control period at whose beginning the prediction ends.
         ring: Samples and commands, as in `Sensors`, `(N, B)`.
         i: Index of the robot.
         period: Control period in s.

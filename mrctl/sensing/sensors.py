@@ -32,15 +32,15 @@ SENSOR = np.dtype(
         ("fix_every", "i8"),
         ("fix_latency", "i8"),
         ("fix_lost", "f8"),  # share of fixes that never arrive
-        ("fix_outliers", "f8"),  # share of fixes that are wrong
+        ("fix_outliers", "f8"),  # share of fixes that are outliers
         ("start", "i8"),  # tick at which the run of this robot began
     ],
     align=True,
 )
 
 NOISE = np.dtype([("gyro", "f8", 2), ("accelerometer", "f8", 4), ("fix", "f8", 3), ("chance", "f8", 4)])
-# Standard normal numbers of one tick: noise and step of the gyro's bias; noise and steps of the accelerometer's two
-# axes; noise of a fix. And uniform ones from 0 to 1: whether a fix is lost, whether it is wrong, and by how much.
+# Standard normal numbers of one tick: noise of the gyro and step of its bias; noise of the accelerometer's two axes and
+# steps of their biases; noise of a fix. `chance` is uniform in [0, 1): loss of a fix, outlier, its errors in x and y.
 
 SAMPLE = np.dtype(
     [
@@ -54,7 +54,7 @@ SAMPLE = np.dtype(
         ("fix", "f8", 3),  # measured posture, m, m, rad
         ("fix_taken", "?"),  # whether a fix was taken in this tick
         ("fix_arrives", "?"),  # whether it arrives
-        ("grip", "u1", 2),  # whether the wheels grip, left and right, as an estimator finds
+        ("grip", "u1", 2),  # whether the wheels grip, left and right; an estimator writes it
         ("command", "f8", 2),  # derivative of the commanded twist that was computed in this tick, m/s² and rad/s²
     ],
     align=True,
@@ -66,7 +66,7 @@ def sample(tick: int, true: Row, noise: Row, period: float, s: Row, last: Row, n
     """Samples the sensors of one robot.
 
         encoder   q ⌊φ/q + phase⌋ with the angle q of one count, so that the error is bounded in angle
-        gyro      θ̇ + b + n,    b ← b + w          accelerometer alike
+        gyro      θ̇ + b + n,    b ← b + w          accelerometer likewise
         fix       (x, y, θ) + n, or with an outlier in x and y
 
     Args:
@@ -124,7 +124,7 @@ class Sensors:
 
     Attributes:
         period: Control period in s.
-        ring: Samples of the last N ticks, records of `SAMPLE`, `(N, B)`; those of a tick stand in row tick % N.
+        ring: Samples of the last N ticks, records of `SAMPLE`, `(N, B)`; row tick % N holds those of a tick.
         sensors: Constants and biases of each robot's sensors, a record of `SENSOR`, `(B,)`.
     """
 

@@ -1,4 +1,4 @@
-"""Sensing tiers: what the robot's sensors, motor driver, battery and steering servo are, from ideal to field."""
+"""Sensing tiers: values of the robot's sensors, motor driver, battery, steering servo and delay, `ideal` to `field`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Tier = Literal["ideal", "lab", "field"]
 TIERS: tuple[Tier, ...] = ("ideal", "lab", "field")
 EstimatorName = Literal["truth", "odometry", "ekf"]
 IN_FLIGHT = KEPT - 1
-"""Largest number of fixes that are on their way at the same time."""
+"""Largest number of fixes that have been taken and have not arrived."""
 
 DEGREE = 3.141592653589793 / 180
 VALUES: dict[str, tuple[float, float, float]] = {
@@ -67,7 +67,7 @@ Latency = Annotated[float, Field(ge=0, le=LONGEST_DELAY)]
 
 
 class Sensing(Record):
-    """What the robot senses and acts with: a tier, and values that replace the tier's."""
+    """Sensors, estimator, motor driver, battery, steering servo and delay: a tier, and values that replace its own."""
 
     tier: Tier = "lab"
     """Quality of sensors, motor driver, battery and steering: exact (`ideal`), good (`lab`) or cheap (`field`)."""
@@ -113,19 +113,19 @@ class Sensing(Record):
     fix_outliers: Annotated[float, Field(ge=0, le=1)] | None = None
     """Share of the fixes that are wrong by up to 1 m in x and y."""
     delay: Latency | None = None
-    """Time from the measurement to the voltage in s, a multiple of the control period; the controller knows it."""
+    """Delay from the measurement to the voltage in s, a multiple of the control period; the controller knows it."""
     dead_zone: DeadZone | None = None
-    """Voltage of the motor driver in V; a commanded voltage that is smaller gives none."""
+    """Dead zone of the motor driver in V; a smaller commanded voltage has no effect."""
     pwm_steps: PwmSteps | None = None
-    """Number of steps of the pulse width from none to the full supply; 0 for a continuous pulse width."""
+    """Number of steps of the pulse width from zero to the full supply; 0 for a continuous pulse width."""
     current_limit: CurrentLimit | None = None
     """Current in A at which the driver chops the voltage of a motor; 1000 A stands for no limit."""
     battery_resistance: BatteryResistance | None = None
-    """Resistance of battery and cables in Ω, by which the supply sags under the current of both motors."""
+    """Resistance of battery and cables in Ω, through which the current of both motors lowers the supply voltage."""
     steering_offset: Offset | None = None
-    """Angle in rad by which the fork stands to the left of its set-point."""
+    """Constant error of the fork's angle in rad, positive to the left."""
     steering_backlash: Backlash | None = None
-    """Width in rad of the play between the set-point and the fork."""
+    """Backlash between the steering servo and the fork in rad, the full width of the play."""
 
     def __getitem__(self, name: str) -> float:
         """Returns the value that a field has, its own or the tier's, in the unit of the field."""
@@ -134,7 +134,7 @@ class Sensing(Record):
 
     @property
     def source(self) -> EstimatorName:
-        """The estimator, the one that was asked for or the tier's."""
+        """The estimator: `estimator`, or by default the tier's."""
         return self.estimator or ("truth" if self.tier == "ideal" else "ekf")
 
     @property
@@ -149,7 +149,9 @@ class Sensing(Record):
         return SteeringServo(offset=self["steering_offset"], backlash=self["steering_backlash"])
 
     def periods(self, name: str, control_period: float) -> int:
-        """Returns a rate, latency or delay in control periods; a tier's own value is rounded, to at least one.
+        """Returns the period of a rate, or a latency or delay, in control periods; a value of the tier is rounded.
+
+        A value of the tier that is not zero is rounded to at least one period.
 
         Args:
             name: Name of a field, such as `fix_rate` or `delay`.

@@ -1,6 +1,6 @@
-"""What lies between commands and a robot: motor driver, battery, and the servo of the fork.
+"""Motor driver, battery and steering servo: from commands to the voltages of the motors and the set-point of the fork.
 
-The laws are those of one robot. Their defaults are ideal and change nothing.
+The laws are those of one robot. The defaults of the records are ideal; a sensing tier sets other values.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ DRIVER = np.dtype(
         ("pwm_steps", "f8"),
         ("current_limit", "f8", 2),  # of the motors left and right, A; infinite for none
         ("battery_resistance", "f8"),  # Ω
-        ("supply", "f8"),  # voltage of a command for the full pulse width, V
+        ("supply", "f8"),  # nominal supply voltage U_n, the command for the full pulse width, V
         ("gain", "f8"),  # open-circuit voltage of the battery over `supply`
         # Result
         ("scale", "f8"),  # voltage of the battery over `supply`
@@ -52,22 +52,22 @@ class Driver(Record):
     """Motor driver and battery of a robot; the default is ideal."""
 
     dead_zone: DeadZone = 0.0
-    """Voltage in V; a commanded voltage that is smaller gives none."""
+    """Dead zone in V; a smaller commanded voltage has no effect."""
     pwm_steps: PwmSteps = 0
-    """Number of steps of the pulse width from none to the full supply; 0 for a continuous pulse width."""
+    """Number of steps of the pulse width from zero to the full supply; 0 for a continuous pulse width."""
     current_limit: CurrentLimit = NO_LIMIT
     """Current in A at which the driver chops the voltage of a motor; 1000 A, the default, stands for no limit."""
     battery_resistance: BatteryResistance = 0.0
-    """Resistance of battery and cables in Ω, by which the supply sags under the current of both motors."""
+    """Resistance of battery and cables in Ω, through which the current of both motors lowers the supply voltage."""
 
 
 class SteeringServo(Record):
     """Imperfections of the servo that steers the fork; the default has none."""
 
     offset: Offset = 0.0
-    """Angle in rad by which the fork stands to the left of its set-point, as after a careless assembly."""
+    """Constant error of the fork's angle in rad, positive to the left."""
     backlash: Backlash = 0.0
-    """Width in rad of the play between the set-point and the fork, which moves only at the ends of the play."""
+    """Backlash between the servo and the fork in rad, the full width of the play."""
 
 
 @kernel
@@ -76,9 +76,9 @@ def drive(command: Array, emf: Array, resistance: Array, d: Row, voltage: Array)
 
         u → 0 if |u| < dead zone → δ = round(n u/U_n)/n → U = δ U_bat
 
-    The order is that of the parts. The controller's number first meets the threshold of the driver, then the register
-    of the pulse width with its n steps; the bridge switches the battery's voltage, which has sagged, for the share δ of
-    the time. What chops the current comes last, for it watches the motor itself: see `chop`.
+    The order is that of the parts: the dead zone of the driver, the n steps of the pulse width, and the bridge, which
+    applies the sagging voltage of the battery for the share δ of the time. The current limit comes last, because it
+    depends on the current of the motor: see `chop`.
 
     Args:
         command: Commanded voltages left and right in V, `(2,)`.
@@ -104,15 +104,15 @@ def battery_voltage(command: Array, emf: Array, resistance: Array, d: Row) -> fl
 
         U = U_0 − R_b Σ δ_i i_i,    i_i = (δ_i U − e_i)/R_i
 
-    A motor at its current limit I takes the power p_i = (e_i ± R_i I)(±I) and p_i/U from the battery. With sums g and h
-    over the other motors and p over these the law is a quadratic equation, whose larger root is the stable one. The
-    limits only lower the power, so there always is one. U is not negative: where the motors would turn the battery's
-    voltage around, the diodes of the bridge short them instead.
+    A motor at its current limit I takes the power p_i = (e_i ± R_i I)(±I), and the current p_i/U from the battery. With
+    p the sum over these motors, and g and h sums over the others, the law is a quadratic equation. Its larger root is
+    the stable one, and exists because the limits only lower the power. U is not negative: where the motors would
+    reverse it, the diodes of the bridge conduct, and U is 0.
 
         (1 + g) U² − (U_0 + h) U + R_b p = 0,    g = R_b Σ δ_i²/R_i,    h = R_b Σ δ_i e_i/R_i
 
-    Which motors are at their limit follows from U without limits. Currents are those at the beginning of the control
-    period for which U is held; within it the back-EMF of a robot on the ground changes by a few percent of the voltage.
+    U without limits decides which motors are at their limit. Currents are those at the beginning of the control period
+    for which U is held; within it the back-EMF of a robot on the ground changes by a few percent of the voltage.
 
     Args:
         command: Voltages left and right in V for the nominal supply: δ U_n, `(2,)`.
@@ -142,8 +142,8 @@ def chop(voltage: float, emf: float, resistance: float, limit: float) -> float:
     """Terminal voltage of a motor whose current the driver limits by chopping: U within [e − R I, e + R I].
 
     MuJoCo applies the same limit to the torque k_M i in each of its steps, so that |i| ≤ I within a control period too;
-    this is the mean voltage that belongs to that torque. The current of a winding with inductance follows within L/R,
-    which is short against a step.
+    U is the mean voltage for that torque. The current of a winding with inductance follows within L/R, which is short
+    compared with a step.
 
     Args:
         voltage: Voltage without the limit in V.

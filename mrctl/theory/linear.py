@@ -1,8 +1,8 @@
-"""The channels of the velocity controller, linearised about driving straight on: what the PID is designed for.
+"""Linear plants of the velocity controller's channels about driving straight on, for the design of the PID.
 
 The common channel is equation (3), and so is the differential channel of a robot without a steered wheel. A steered
 wheel that trails resists rotation: its tyre turns the fork against the servo, whose torque acts back on the robot. With
-the speed V, the rotation θ̇ and the fork's angle φ, the yaw model is
+the speed V, the yaw rate θ̇ and the fork's angle φ, the yaw model is
 
     J_e θ̈ + J_c φ̈ = (2 D N k_M/(r R_a)) U_Δ − (2 D² N² k_M k_E/(r² R_a) + m c V) θ̇ + (L − t) F
     J_c θ̈ + J_f φ̈ = m_f e V θ̇ − k_s φ − d_s φ̇ − t F
@@ -47,7 +47,7 @@ class Linear(NamedTuple):
 
     @property
     def lag(self) -> float:
-        """Integral of 1 less the unit step response over its final value, in s: the time constant of a first order."""
+        """∫ (1 − y(t)/y(∞)) dt of the step response y, in s; the time constant of a first-order plant."""
         return float(np.linalg.solve(self.a, np.linalg.solve(-self.a, self.b))[0] / -self.gain)
 
     @property
@@ -111,12 +111,12 @@ def yaw(robot: Robot, speed: float) -> Linear:
 
 
 def steering(robot: Robot) -> Linear:
-    """θ̇ in rad/s under a correction of the θ̇ that determines the angle of a stiff servo, also in rad/s.
+    """θ̇ in rad/s under a correction u of the θ̇ that determines the angle of a stiff servo, also in rad/s.
 
         T θ̈ = δ − θ̇,    J_f δ̈ + d_s δ̇ + k_s δ = k_s u
 
-    δ is the rotation for which the wheel stands, the servo's angle times V over the wheelbase, so that neither speed
-    nor wheelbase is left in the equations. Of a robot whose servo is not known only the tyre's lag is left.
+    δ is the yaw rate at which the wheel rolls without slip, its angle times V over the wheelbase; scaled like this, the
+    equations contain neither speed nor wheelbase. If the servo is not known, only the lag T of the tyre is left.
     """
     if robot.steering_stiffness == 0 or robot.fork_inertia == 0:
         return first_order(1.0, TYRE_LAG)

@@ -29,7 +29,7 @@ Factor = Annotated[float, Field(ge=0.05, le=20)]
 
 
 class Perturbation(Record):
-    """Differences of the plant from its model, which the controller does not know; the default changes nothing."""
+    """Differences of the plant from the model that the controller knows; the default changes nothing."""
 
     moved = {
         "velocity_noise": "the noise of the wheel speeds follows from sensing.encoder_counts",
@@ -73,19 +73,19 @@ class Perturbation(Record):
     right_motor_constant_factor: Factor = 1.0
     """Further factor on the constants k_M and k_E of the right motor."""
     dead_zone: DeadZone = 0.0
-    """Voltage in V that is added to the dead zone of the motor driver, in which a command gives no voltage."""
+    """Voltage in V that is added to the dead zone of the motor driver, below which a command has no effect."""
     pwm_steps: PwmSteps = 0
-    """Number of steps of the pulse width to the full supply, if the driver has not fewer; 0 for no such change."""
+    """Number of steps of the pulse width to the full supply, where the driver has more or none; 0 for no change."""
     current_limit: CurrentLimit = NO_LIMIT
-    """Current limit of each motor in A, if the driver's is not lower; 1000 A, the default, stands for none."""
+    """Current limit of each motor in A, where that of the driver is higher; 1000 A, the default, stands for none."""
     battery_resistance: BatteryResistance = 0.0
-    """Resistance in Ω that is added to that of the battery, whose voltage then sags under the motors' currents."""
+    """Resistance in Ω that is added to that of the battery, so that the motors' currents lower its voltage further."""
     steering_offset: Offset = 0.0
-    """Angle in rad that is added to the offset of the fork from its set-point, positive to the left."""
+    """Angle in rad that is added to the constant error of the fork's angle, positive to the left."""
     steering_backlash: Backlash = 0.0
-    """Width in rad that is added to the play between the steering servo and the fork."""
+    """Width in rad that is added to the backlash between the steering servo and the fork."""
     supply_factor: Annotated[float, Field(gt=0, le=2)] = 1.0
-    """Factor from commanded to applied voltage: a PWM drive on a supply of another voltage."""
+    """Factor on the supply voltage, and by the PWM driver on every applied voltage."""
     tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
     """Factor on the friction of every tyre on the floor."""
     left_tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
@@ -93,10 +93,10 @@ class Perturbation(Record):
     slope: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
     """Inclination of the ground in rad, uphill along the world's +x; gravity is turned, not the floor."""
     control_delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] = 0.0
-    """Further delay of voltages and steering commands in s, a multiple of the control period."""
+    """Delay of voltages and steering commands in s beyond that of `sensing`, a multiple of the control period."""
 
     def of_driver(self, driver: Driver) -> Driver:
-        """Returns a driver as the perturbation leaves it: what wears adds up, and the narrower limit counts."""
+        """Returns the perturbed driver: dead zones and resistances add; the lower limit and number of steps hold."""
         changed = {
             "dead_zone": driver.dead_zone + self.dead_zone,
             "pwm_steps": min(filter(None, (driver.pwm_steps, self.pwm_steps)), default=0),

@@ -9,11 +9,11 @@ so that every limit is |a u + b x + c √x + d| ≤ 1 with coefficients that dep
 voltages, because the inverse of equation (3) is linear in the features of `mrctl.theory.dynamics.regressor`; c is their
 back-EMF and d their friction. The robot drives forward.
 
-`fastest` finds the law that takes the least time: a pass backwards finds the largest x from which the limits can be
-kept up to the end, and a pass forwards accelerates as hard as these allow (Pham and Pham, "A new approach to
-time-optimal path parameterization based on reachability analysis", IEEE Transactions on Robotics 34(3), 2018). Its
-acceleration jumps. `smooth` gives the moving average over time of a law that is a little slower. Its acceleration is
-continuous, and it keeps the same limits.
+`fastest` finds the law that takes the least time: a backward pass finds at each place the largest x from which the
+limits can be kept up to the end, and a forward pass accelerates as hard as this bound and the limits allow (Pham and
+Pham, "A new approach to time-optimal path parameterization based on reachability analysis", IEEE Transactions on
+Robotics 34(3), 2018). Its acceleration has steps. `smooth` returns the moving average over time of a law that is a
+little slower. Its acceleration is continuous, and it keeps the same limits.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import GRAVITY, Robot
 
 RESERVE = 0.9
-"""Share of the robot's limits that a reference may use, so that the feedback has room; chosen."""
+"""Share of the robot's limits that a reference may use; the rest is for the feedback. Chosen."""
 
 PER_TURN = 40  # intervals for each rad of a curve, at least; chosen
 MOST_INTERVALS = 20_000
@@ -60,7 +60,7 @@ class Limits(Record):
     )  # fmt: skip
     """Common and differential voltage in V per unit of V, θ̇, V̇, θ̈, V θ̇, θ̇², sgn V_l and sgn V_r; empty for no limit."""
     smoothing: Annotated[float, Field(ge=0.05, le=2)] = 0.2
-    """Duration in s over which the acceleration is averaged, so that it does not jump."""
+    """Duration in s over which the acceleration is averaged, so that it has no steps."""
 
     @model_validator(mode="after")
     def _complete(self) -> Limits:
@@ -129,7 +129,7 @@ def sample_path(shape: Shape, s: Array, closed: bool, limits: Limits, speed: flo
         s = np.union1d(s, np.concatenate([near, length - near]))
         slow = times * (1 + np.sqrt(np.minimum(s / distance, 1)) - np.sqrt(np.minimum((length - s) / distance, 1)))
     k, dk = shape(s)
-    turning = np.maximum(np.abs(k), np.sqrt(np.abs(dk)))  # the inverse of a length that shows the curve, 1/m
+    turning = np.maximum(np.abs(k), np.sqrt(np.abs(dk)))  # inverse of the length over which the path turns, 1/m
     density = np.maximum(1 / step, PER_TURN * turning)
     count = np.append(0, np.cumsum(np.diff(s) * (density[1:] + density[:-1]) / 2)) + slow
     intervals = int(np.clip(np.ceil(count[-1]), 2, MOST_INTERVALS))
@@ -174,8 +174,9 @@ def speed_caps(path: Path, limits: Limits, speed: float) -> Array:
 def acceleration_range(rows: Array, x: float) -> tuple[float, float]:
     """Smallest and largest u = s̈ in m/s² that keep all limits at x = ṡ²; the smallest is larger where none does.
 
-    A limit is a u + b x + c √x + d ≤ 1 and ≥ −1 for all coefficients between a lower and an upper bound. As x and √x
-    are not negative, the upper bounds of b, c and d decide on the first, and both bounds of a on u.
+    A limit is −1 ≤ a u + b x + c √x + d ≤ 1 for all coefficients between a lower and an upper bound. As x and √x are
+    not negative, the upper bounds of b, c and d determine the upper limit and their lower bounds the lower limit; u
+    must keep both with either bound of a.
 
     Args:
         rows: Lower and upper bounds of the coefficients of each limit, shape (2, R, 4).
@@ -370,8 +371,8 @@ def smooth(path: Path, limits: Limits, speed: float) -> SmoothLaw:
     It is the average of a law s*(t) over a window, s(t) = mean s*(t + τ). A limit that is convex in ṡ and s̈ holds for
     the average of the motions s*(t + τ) if it holds for each of them with the coefficients of the place s(t). The law
     s* must therefore keep its limits with the coefficients of all places that the average can be at meanwhile. These
-    are within what the time-optimal law covers in that time, because no other law overtakes it. Only b x = b ṡ² is not
-    convex where it takes load off (b < 0 in an upper limit, b > 0 in a lower one); there it counts as zero.
+    lie on the stretch that the time-optimal law covers in that time, because no other law overtakes it. Only b x = b ṡ²
+    is not convex where it relaxes the limit (b < 0 in an upper limit, b > 0 in a lower one); there it counts as zero.
 
     Args:
         path: The path.
