@@ -7,7 +7,7 @@ import ctypes
 import gc
 import html
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -150,6 +150,13 @@ class Live(Page):
         self._describe()
 
     # -- requests of visitors, carried out by the loop --------------------------------------------------------------
+
+    @override
+    def ask(self, action: Callable[..., None], *arguments: Any) -> None:
+        """Queues an action for the loop; inputs that were changed before it are applied before it."""
+        if action != self._note_input:
+            super().ask(self._apply_inputs)
+        super().ask(action, *arguments)
 
     def _command(self, name: str) -> None:
         if name == "reset":

@@ -86,6 +86,17 @@ def test_refusals(live):
     assert "mass_factor" in live.message and len(live.session.saved()[0].events) == 1
 
 
+def test_order(live):
+    """What a visitor does after changing an input comes after it: a reset removes it."""
+    live._restart([Scenario()])
+    live.ask(live._note_input, ("perturbation", "payload"), 5.0)
+    live.ask(live._note_input, ("perturbation", "mass_factor"), "heavy")
+    live.ask(live._command, "reset")
+    live._run_requests()
+    live.refresh()
+    assert live.session.saved()[0].events == () and live.message == ""
+
+
 def test_robot_that_stops(live):
     """The page says that a robot has stopped and why, and waits."""
     live._restart([Scenario()])
