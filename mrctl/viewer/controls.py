@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Callable, Sequence
-from math import floor, log10
+from collections.abc import Callable, Mapping, Sequence
+from math import floor, isfinite, log10
 from typing import Any, Literal
 
 import viser
@@ -53,6 +53,13 @@ class Controls:
     A record that comes in several kinds has a folder for each kind, of which only that of the present kind is visible.
     No folder is ever removed: a slow browser applies several messages at once, removals first, and then reports errors
     for messages to what it has removed.
+
+    The input of a field that is not set and follows from the design shows the designed value, and its label says so; a
+    field that is set has a button that returns it to the design.
+
+    Attributes:
+        designed: Values by path, in the units of the fields, that fields have while they are not set; those that have
+            no effect at present are None and hidden. Whoever adds or shows a record sets them before.
     """
 
     def __init__(self, gui: viser.GuiApi, on_change: OnChange) -> None:
@@ -60,6 +67,8 @@ class Controls:
         self._gui, self._on_change = gui, on_change
         self._inputs: dict[tuple[str, ...], Any] = {}
         self._folders: dict[tuple[str, ...], viser.GuiFolderHandle] = {}
+        self._buttons: dict[tuple[str, ...], viser.GuiButtonHandle] = {}
+        self.designed: Mapping[tuple[str, ...], float | None] = {}
 
     def add(self, record: Record, path: tuple[str, ...] = (), only: Sequence[str] | None = None) -> None:
         """Adds inputs in the present context of the GUI.
@@ -73,14 +82,14 @@ class Controls:
         grouped = [name for names in groups.values() for name in names]
         for name, field in type(record).model_fields.items():
             if name not in grouped and (only is None or name in only):
-                self._add(_shown(record, name), field, (*path, name))
+                self._add(self._shown(record, (*path, name)), field, (*path, name))
         for group, names in groups.items():
             with self._gui.add_folder(group, expand_by_default=group == "mass and payload"):
                 for name in names:
-                    self._add(_shown(record, name), type(record).model_fields[name], (*path, name))
+                    self._add(self._shown(record, (*path, name)), type(record).model_fields[name], (*path, name))
 
     def _add(self, value: Any, field: FieldInfo, path: tuple[str, ...]) -> None:  # noqa: ANN401
-        label, hint = path[-1].replace("_", " "), field.description
+        label, hint = _label(path), field.description
         if isinstance(value, Record):
             with self._gui.add_folder(label, expand_by_default=len(path) == 1):
                 if not (kinds := _kinds(field)):
@@ -99,6 +108,8 @@ class Controls:
             handle = self._gui.add_dropdown(label, tuple(dict.fromkeys([value, *WORLDS])), initial_value=value)
         elif isinstance(value, bool):
             handle = self._gui.add_checkbox(label, value, hint=hint)
+        elif path in self.designed:
+            return self._add_designed(value, kind, path)
         elif isinstance(value, int | float) and (limits := _limits(kind, _scale(path, value))):
             low, high, step = limits
             # Whole numbers are floats too: viser accepts an int of any size from a page, and then fails to pack it for
@@ -110,9 +121,27 @@ class Controls:
                 handle = self._gui.add_slider(label, low, high, step, float(value), hint=hint)
         else:
             return
+        self._listen(path, handle, whole=kind.annotation is int)
+
+    def _add_designed(self, value: float | None, kind: FieldInfo, path: tuple[str, ...]) -> None:
+        """Adds the input of a number that follows from the design while it is not set, and the button to the design."""
+        value = float(value or 0)
+        limits = _limits(kind, value / 10)  # three digits
+        assert limits is not None
+        low, high, step = limits
+        handle = self._gui.add_number(
+            _label(path), value, min=min(low, value), max=max(high, value), step=step, hint=kind.description
+        )
+        self._buttons[path] = button = self._gui.add_button(f"{_label(path)} as designed", visible=False, color="gray")
         self._listen(path, handle)
 
-    def _listen(self, path: tuple[str, ...], handle: Any) -> None:  # noqa: ANN401
+        @button.on_click
+        async def _(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                self._on_change(path, None)
+
+    def _listen(self, path: tuple[str, ...], handle: Any, whole: bool = False) -> None:  # noqa: ANN401
+        """Reports the values of an input, rounded if the field is a whole number."""
         self._inputs[path] = handle
         # The path of a field is without the kind.
         field = tuple(name for i, name in enumerate(path) if path[: i + 1] not in self._folders)
@@ -120,12 +149,16 @@ class Controls:
         @handle.on_update
         async def _(event: viser.GuiEvent) -> None:
             if event.client is not None:
-                self._on_change(field, handle.value)
+                value = handle.value
+                if isinstance(value, float) and value < getattr(handle, "min", value):
+                    return  # somebody types: 0.05 begins with 0, and a page raises what is left below the limit
+                self._on_change(field, round(value) if whole and isfinite(value) else value)
 
     def show(self, record: Record, path: tuple[str, ...] = ()) -> None:
         """Sets the inputs of a record, whose path is given, to its values."""
         for name, field in type(record).model_fields.items():
-            value, where = _shown(record, name), (*path, name)
+            where = (*path, name)
+            value = self._shown(record, where)
             if isinstance(value, Record):
                 if where in self._inputs:
                     kind = type(value).model_fields["kind"].default
@@ -135,18 +168,36 @@ class Controls:
                     where = (*where, kind)
                 self.show(value, where)
             elif where in self._inputs:
-                self._set(where, value)
+                if where in self._buttons:
+                    self._show_design(where, value, getattr(record, name) is not None)
+                if value is not None:
+                    self._set(where, value)
+
+    def _show_design(self, path: tuple[str, ...], value: float | None, own: bool) -> None:
+        """Says whether a field has a value of its own or that of the design, which may be beyond what may be set."""
+        handle, self._buttons[path].visible = self._inputs[path], own
+        handle.label = _label(path) if own else f"{_label(path)} (designed)"
+        handle.visible = value is not None
+        if value is not None:  # a page would move a value that is beyond the limits of its input
+            handle.min, handle.max = min(handle.min, value), max(handle.max, value)
 
     def _set(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
         if self._inputs[path].value != value:
             self._inputs[path].value = value
 
+    def _shown(self, record: Record, path: tuple[str, ...]) -> Any:  # noqa: ANN401
+        """Returns the value of a field; one that is not set has the value of the tier or of the design."""
+        name = path[-1]
+        if (own := getattr(record, name)) is not None:
+            return own
+        if isinstance(record, Sensing):
+            return record.source if name == "estimator" else record[name]
+        return self.designed.get(path)
 
-def _shown(record: Record, name: str) -> Any:  # noqa: ANN401
-    """Returns the value of a field; a field of `Sensing` that is not set has the value of the tier."""
-    if isinstance(record, Sensing) and getattr(record, name) is None:
-        return record.source if name == "estimator" else record[name]
-    return getattr(record, name)
+
+def _label(path: tuple[str, ...]) -> str:
+    """Returns the name of a field in words."""
+    return path[-1].replace("_", " ")
 
 
 def _kind(field: FieldInfo) -> FieldInfo:

@@ -7,7 +7,7 @@ import ctypes
 import gc
 import html
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -39,6 +39,7 @@ BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
     "Floor": {"slippery patch": {"tyre_friction_factor": 0.15}, "dry": {"tyre_friction_factor": 1.0}},
     "Push": {"push": {"push": (0.0, 60.0, 0.0)}, "spin": {"push": (0.0, 0.0, 15.0)}},
 }
+RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
 NEW_RUN = ("world", "steering", "sensing", "reference", "seed", "prefilter")
 HIDDEN = (
@@ -106,6 +107,7 @@ class Live(Page):
                 self.ask(self._save, event.client)
 
         self._controls = Controls(gui, partial(self.ask, self._note_input))
+        self._controls.designed = self.session.designed()
         first, changing = self.session.start[0], [name for name in Scenario.model_fields if name not in HIDDEN]
         with tabs.add_tab("Robot"):
             self._controls.add(first, only=["perturbation"])
@@ -119,6 +121,7 @@ class Live(Page):
                     self.on(ghost, partial(self._compare, name))
             self._learning = gui.add_checkbox("learning", True)
             self.on(self._learning, lambda on: self._apply_event(learning=on))
+            self._gains = gui.add_html("")
             self._controls.add(first, only=[n for n in changing if n not in (*NEW_RUN, "perturbation", "feedforward")])
         with tabs.add_tab("Run"):
             self._controls.add(first, only=NEW_RUN)
@@ -142,7 +145,6 @@ class Live(Page):
         self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
         self._scene.show_reference(first)
         self._scene.forget_trails()
-        self._controls.show(first)
         for name, ghost in self._ghosts.items():
             ghost.value = any(s.feedforward == name for s in session.start[1:])
         self._drawn = self._plotted = None
@@ -150,6 +152,13 @@ class Live(Page):
         self._describe()
 
     # -- requests of visitors, carried out by the loop --------------------------------------------------------------
+
+    @override
+    def ask(self, action: Callable[..., None], *arguments: Any) -> None:
+        """Queues an action for the loop; inputs that were changed before it are applied before it."""
+        if action != self._note_input:
+            super().ask(self._apply_inputs)
+        super().ask(action, *arguments)
 
     def _command(self, name: str) -> None:
         if name == "reset":
@@ -198,6 +207,8 @@ class Live(Page):
             value = {"kind": value}
         if path == ("sensing", "tier"):  # with all values of the tier
             path, value = path[:1], {"tier": value}
+        if path == ("pid", "time_constant"):
+            value = value or None  # the input of the design shows 0
         if name == "sensing":
             value = _in_periods(path[-1], value, self.session.period)
         if name in CHANGEABLE:
@@ -320,10 +331,15 @@ class Live(Page):
             lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_in_words(event, before))}")
             before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
         write(self._timeline, block("timeline", *(reversed(lines[-50:]) if lines else ["no events yet"])))
-        state = self.session.state()
-        self._scene.show_payload(state["perturbation"])
-        for name in CHANGEABLE:
-            self._controls.show(state[name], (name,))
+        present = self._present(self.session.start[0])
+        self._scene.show_payload(present.perturbation)
+        self._controls.designed = self.session.designed()
+        self._controls.show(present)
+        units = ("V/(m/s)", "V/m"), RIGID_UNITS if present.steering == "rigid" else ("V/(rad/s)", "V/rad")
+        lines = ["<b>Present gains of the velocity PID</b>"]
+        for channel, gains, (k_p, k_i) in zip(("common", "second"), self.session.gains(), units, strict=True):
+            lines.append(f"{channel}: K_p {gains.k_p:.3g} {k_p}, K_i {gains.k_i:.3g} {k_i}")
+        write(self._gains, block("gains", *lines))
 
 
 def _in_periods(name: str, value: Any, period: float) -> Any:  # noqa: ANN401
@@ -342,9 +358,9 @@ def _tidy() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _short(value: float | str) -> str:
+def _short(value: float | str | None) -> str:
     """Returns a number or a choice as text."""
-    return value if isinstance(value, str) else f"{value:g}"
+    return "designed" if value is None else value if isinstance(value, str) else f"{value:g}"
 
 
 def _in_words(event: Event, before: dict[str, Any]) -> str:

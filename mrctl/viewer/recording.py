@@ -22,7 +22,7 @@ from mrctl.physics.parameters import read_robot
 from mrctl.physics.stand import front_rates, stand, steer
 from mrctl.record import InputError
 from mrctl.results.dataset import SIGNALS, blank, scenarios_of
-from mrctl.results.metrics import summary
+from mrctl.results.metrics import as_runs, summary
 from mrctl.scenario import Scenario
 from mrctl.sweep import store
 from mrctl.sweep.store import Store
@@ -145,8 +145,7 @@ class Library:
             Store(path)  # raises if the folder is not a sweep
             self.table = pd.read_parquet(path / "runs.parquet").set_index("run", drop=False)
         else:
-            result = store.open(path)
-            self._result = result if "run" in result.dims else result.expand_dims("run")
+            self._result = as_runs(store.open(path))
             self.table = summary(self._result).set_index(np.arange(self._result.sizes["run"]))
         if self.table.empty:
             raise InputError(f"{path}: there is no run in it yet")

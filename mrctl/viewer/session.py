@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import ceil, floor
+from math import ceil, floor, sqrt
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.control.design import motion
+from mrctl.control.margins import Gains
 from mrctl.kernel import Rows
 from mrctl.loop.simulation import Simulation, uniform
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank
 from mrctl.scenario import Event, Scenario
+from mrctl.theory.robot import Robot
 
 HOUR = 3600.0  # s of simulated time after which a session ends
 SHARED_FIELDS = ("world", "robot", "steering", "control_period", "physics_step")
@@ -92,6 +95,43 @@ class Session:
     def state(self) -> dict[str, Any]:
         """Returns the present values of the fields `CHANGEABLE`, and `learning`."""
         return state(max(self.saved(), key=lambda s: len(s.events)), self.time)
+
+    def designed(self) -> dict[tuple[str, ...], float | None]:
+        """Returns what fields of the first robot are while they are not set, by path, as `Hierarchy` designs them.
+
+        The values are in the units of the fields, to three digits. `pid.time_constant` is 0, as the designed gains are
+        not those of any; the gains on the steering are None unless it is rigid.
+        """
+        robot, rigid, delay, period = self._design
+        over = motion(robot, rigid, self.start[0].pid.channels(*self._design), delay, period)
+        own = self.state()["kanayama"].k_y
+        k_y = over.kanayama.k_y if own is None else own
+        assert k_y is not None
+        values: dict[tuple[str, ...], float | None] = {
+            ("prefilter",): max(over.prefilter, period),
+            ("kanayama", "k_x"): over.kanayama.k_x,
+            ("kanayama", "k_y"): k_y,
+            ("kanayama", "k_theta"): 2 * sqrt(k_y),
+            ("pid", "time_constant"): 0.0,
+            ("pid", "delay"): delay,
+        }
+        _, second = self.gains()
+        values |= {
+            ("pid", "steering_kp"): second.k_p if rigid else None,
+            ("pid", "steering_ki"): second.k_i if rigid else None,
+        }
+        return {path: None if value is None else float(f"{value:.3g}") for path, value in values.items()}
+
+    def gains(self) -> tuple[Gains, Gains]:
+        """Returns the present gains of both channels of the first robot, in the units of `Pid.channels`."""
+        return self.state()["pid"].channels(*self._design)
+
+    @property
+    def _design(self) -> tuple[Robot, bool, float, float]:
+        """For what the controllers are designed: robot, whether its steering is rigid, delay and period in s."""
+        start, (sim, _) = self.start[0], self._place[0]
+        delay = start.sensing.periods("delay", self.period) * self.period
+        return sim.plant.robot, start.steering == "rigid", delay, self.period
 
     def saved(self) -> list[Scenario]:
         """Returns scenarios that repeat the session, to the end of the present lap of each robot."""

@@ -1,10 +1,13 @@
 """What an input of the page changes is what the same scenario file would change."""
 
+import asyncio
 import typing
 
 import pytest
+import viser
 
-from mrctl import Scenario
+from mrctl import Kanayama, Pid, Scenario
+from mrctl.sensing.tiers import Sensing
 from mrctl.theory.references import Reference
 from mrctl.viewer import live as module
 from mrctl.viewer.live import Live
@@ -84,6 +87,82 @@ def test_refusals(live):
     live._note_input(("perturbation", "mass_factor"), "heavy")
     live._apply_inputs()
     assert "mass_factor" in live.message and len(live.session.saved()[0].events) == 1
+
+
+def visitor_sets(live, handle, value):
+    """What viser does with an input of a page."""
+    handle.value = value
+    (called,) = handle._impl.update_cb
+    asyncio.run(called(viser.GuiEvent(live.server, 0, handle)))
+
+
+@pytest.mark.parametrize("steering", ["compliant", "rigid"])
+@pytest.mark.parametrize("tier", ["ideal", "field"])
+def test_design(live, steering, tier):
+    """What is not set shows the value that the controllers were designed with, and says so, until it is set."""
+    live._restart([Scenario(steering=steering, sensing=Sensing(tier=tier), pid=Pid(time_constant=0.2))])
+    live._note_input(("pid", "time_constant"), 0.0)
+    live._apply_inputs()
+    live.session.step()
+    inputs, state = live._controls._inputs, live.session.simulations[0][1].hierarchy.state[0]
+    second = {f"steering_{name}": state["pid"][name][1] for name in ("k_p", "k_i")}
+    known = {("prefilter",): state["limiter"]["time_constant"], ("pid", "delay"): 0.02 if tier == "field" else 0.0}
+    known |= {("kanayama", name): state["kanayama"][name] for name in Kanayama.model_fields}
+    known |= {("pid", name.replace("k_", "k")): value for name, value in second.items() if steering == "rigid"}
+    for path, value in known.items():
+        assert inputs[path].value == pytest.approx(value, rel=5e-3) and inputs[path].visible, path
+        assert inputs[path].min <= inputs[path].value <= inputs[path].max
+        assert inputs[path].label.endswith("(designed)") and not live._controls._buttons[path].visible
+    assert inputs["pid", "steering_kp"].visible == (steering == "rigid")
+    assert inputs["pid", "time_constant"].value == 0 and "(designed)" in inputs["pid", "time_constant"].label
+    assert f"K_p {state['pid']['k_p'][0]:.3g} V/(m/s)" in live._gains.content
+
+    live._note_input(("kanayama", "k_y"), 9.0)
+    live._apply_inputs()
+    assert inputs["kanayama", "k_y"].label == "k y" and live._controls._buttons["kanayama", "k_y"].visible
+    assert inputs["kanayama", "k_theta"].value == 6 and "designed → 9" in live._timeline.content
+    live._note_input(("kanayama", "k_y"), None)
+    live._apply_inputs()
+    assert inputs["kanayama", "k_y"].value == pytest.approx(state["kanayama"]["k_y"], rel=5e-3)
+    assert live.session.state()["kanayama"] == Kanayama() and live.message == ""
+
+
+def test_typing(live):
+    """While somebody types 0.05, what is below the limit yet neither changes nor resets anything."""
+    live._restart([Scenario()])
+    handle = live._controls._inputs["prefilter",]
+    assert handle.min == 0.01
+    for text in ("0", "0.", "0.0", "0.05"):
+        visitor_sets(live, handle, float(text))
+        live._run_requests()
+        live._apply_inputs()
+        assert handle.value == float(text) and live.message == ""
+    assert live.session.start[0].prefilter == 0.05
+
+
+def test_whole_numbers(live):
+    """A fraction that a page sends for a whole number is rounded; what is no number is refused by the record."""
+    live._restart([Scenario()])
+    controls = live._controls
+    for path in (("seed",), ("sensing", "encoder_counts"), ("sensing", "pwm_steps"), ("perturbation", "pwm_steps")):
+        for value, noted in ((12.6, 13), (float("inf"), float("inf"))):
+            visitor_sets(live, controls._inputs[path], value)
+            live._run_requests()
+            assert live._changed_inputs == {path: noted}
+            live._apply_inputs()
+            assert (live.message == "") == (value == 12.6), live.message
+        assert controls._inputs[path].value == 13
+
+
+def test_order(live):
+    """What a visitor does after changing an input comes after it: a reset removes it."""
+    live._restart([Scenario()])
+    live.ask(live._note_input, ("perturbation", "payload"), 5.0)
+    live.ask(live._note_input, ("perturbation", "mass_factor"), "heavy")
+    live.ask(live._command, "reset")
+    live._run_requests()
+    live.refresh()
+    assert live.session.saved()[0].events == () and live.message == ""
 
 
 def test_robot_that_stops(live):

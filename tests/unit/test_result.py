@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 
@@ -15,6 +16,7 @@ from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
 from mrctl.results.dataset import SIGNALS, open_result, save, scenarios_of, versions
 from mrctl.sensing.tiers import Sensing
+from mrctl.viewer.recording import Library
 
 CIRCLE = Circle(period=4, radius=0.5)
 SCENARIOS = [
@@ -86,6 +88,16 @@ def test_round_trip(result, single, tmp_path):
     save(opened, str(tmp_path / "b.zarr"))
     assert open_result(str(tmp_path / "b.zarr")).identical(result)
     assert sorted(p.name for p in tmp_path.rglob("*.partial")) == []
+
+
+def test_single_run_in_the_viewer(result, tmp_path):
+    """The viewer opens the saved result of one scenario, whose label and seed have no dimension, like that of many."""
+    save(result.isel(run=0), tmp_path / "one")
+    save(result.isel(run=[0]), tmp_path / "list")
+    one, listed = Library(tmp_path / "one"), Library(tmp_path / "list")
+    pd.testing.assert_frame_equal(one.table, listed.table, check_dtype=False)
+    assert one.recording(0).label == "gelernt ✓" and one.recording(0).scenario == SCENARIOS[0]
+    assert one.recording(0).log.tobytes() == listed.recording(0).log.tobytes()
 
 
 def test_run_again(result, tmp_path):
