@@ -49,6 +49,7 @@ PLANT = np.dtype(
         ("current", "f8", 2),  # armature currents, A
         ("wheel_angles", "f8", 2),  # of the rear wheels, left and right, from the zero of the model, rad
         ("imu_velocity", "f8", 3),  # velocity of the inertial sensor in the world, m/s
+        ("imu_axes", "f8", (2, 3)),  # its axes forward and to the left, in the world
         ("specific_force", "f8", 2),  # forward and to the left at the inertial sensor, mean over the period, m/s²
         ("gravity", "f8", 3),  # in the world, m/s²
         ("failed", "?"),  # whether the robot has stopped
@@ -102,9 +103,9 @@ def look(
             p.wheel_angles[k] = qpos[i, address[2 + 2 * k]]
             p.specific_force[k] = 0.0
             for n in range(3):
-                p.specific_force[k] += axes[k, n] * ((velocity[n] - p.imu_velocity[n]) / period - p.gravity[n])
-        for n in range(3):
-            p.imu_velocity[n] = velocity[n]
+                axis = (p.imu_axes[k, n] + axes[k, n]) / 2
+                p.specific_force[k] += axis * ((velocity[n] - p.imu_velocity[n]) / period - p.gravity[n])
+        p.imu_velocity[:], p.imu_axes[:, :] = velocity, axes
         back_emf(p)
         for k in range(2):
             limit = p.driver.current_limit[k]
@@ -236,8 +237,6 @@ class Plant(ABC):
         for i in range(self.size):
             self.qpos[i], self.qvel[i] = stand(self._model_of(i), pose[i], twist[i], self.truth[i])
         self._begin(slice(None))
-        self.state["lost"] = 0.0
-        self._queue[..., 2] = self.state["servo"]["play"] = self.reading["steering_angle"]
 
     def restart(self, robot: int, pose: Array, twist: Array) -> None:
         """Stands one robot on the ground again, as `reset` does all of them; what happened to it is forgotten.
@@ -258,10 +257,6 @@ class Plant(ABC):
         self.qpos[robot], self.qvel[robot] = stand(self._model_of(robot), pose, twist, self.truth[robot])
         self.state["sent"][robot] = 0.0
         self._begin(slice(robot, robot + 1))
-        self.state["lost"][robot] = 0.0
-        angle = self.reading["steering_angle"][robot]
-        self._queue[:, robot] = 0.0
-        self._queue[:, robot, 2] = self.state["servo"]["play"][robot] = angle
 
     @abstractmethod
     def _clear(self, robot: int) -> None:
@@ -331,9 +326,17 @@ class Plant(ABC):
         return self.state["current"]
 
     def _begin(self, rows: slice) -> None:
-        """Reads robots at the start; the second reading makes their acceleration zero."""
+        """Reads robots that were just stood on the ground; the second look finds that they do not accelerate.
+
+        Until the first command of a delayed robot arrives, its motors get their nominal back-EMF, and the robot coasts.
+        At 0 V they would brake it hard.
+        """
         self._look(rows)
         self._look(rows)
+        state, queue = self.state[rows], self._queue[:, rows]
+        state["lost"] = queue[...] = 0.0
+        queue[..., :2] = self.robot.back_emf * state["reading"]["wheel_rates"]
+        queue[..., 2] = state["servo"]["play"] = state["reading"]["steering_angle"]
 
     def _look(self, rows: slice = slice(None)) -> bool:
         constants = self._address, self._acts, self.imu, self._period

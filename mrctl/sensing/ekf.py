@@ -31,8 +31,9 @@ SETTLE = 1.0  # s, time in which o follows the faster offset of `find_grip`
 LOOSE_V = 0.5  # of V̇ while no wheel grips, m/s²/√Hz
 INCLINE = 0.02  # random walk of the component of gravity in the accelerometer, m/s²/√s
 SIDE_SLIP, SKID = 2e-4, 0.02  # lateral motion of the rear axle beyond v_y, while both wheels grip and otherwise, m/√s
-CREEP = 0.8e-4  # noise of the slip ratio of a rolling tyre, √s
+CREEP = 0.7e-4  # noise of the slip ratio of a rolling tyre, √s
 JOLT = 1e-3  # slip of a tyre while its force changes, rad/(m/s²); measured where a motor's current jumps by 4.7 A
+LOADING, LOAD = 0.1, 2.0  # s at the start in which the tyres take up their load, as if such jolts acted, m/s²
 RADIUS = 0.01  # standard deviation of the relative error of a wheel's radius at the start
 RADIUS_WALK = 1e-5  # random walk of that error, 1/√s
 START_OFFSET = 0.2  # standard deviation of the component of gravity in the accelerometer at the start, m/s²
@@ -56,7 +57,6 @@ EKF = np.dtype(
         ("kept_P", "f8", (KEPT, N, N)),
         ("kept_tick", "i8", KEPT),  # these ticks
         ("g", "f8", N),  # scratch: covariance of the state with a measurement
-        ("tick", "i8"),  # tick of the estimate
         ("encoder_variance", "f8"),  # rad²
         ("gyro_variance", "f8"),  # (rad/s)²
         ("bias_walk", "f8"),  # of the gyro, rad/s/√s
@@ -78,7 +78,8 @@ def propagate(v_dot: float, omega_dot: float, jolt: float, grip: Array, geometry
     """Predicts the state over one period: P ← F P Fᵀ + Q; `jolt` is the change of the measured acceleration in m/s²."""
     m, P, T = s.mean, s.P, period
     r, D, side_lag = geometry[0], geometry[1], SIDE - geometry[3]
-    v, omega = m[V] + v_dot * T / 2, m[OMEGA] + omega_dot * T / 2
+    middle = T / 2 + geometry[3]  # of the period of positions, behind which velocities lag
+    v, omega = m[V] + v_dot * middle, m[OMEGA] + omega_dot * middle
     heading = m[THETA] + omega * (T / 2 - side_lag)  # of the motion, which v_y turns outwards
     c, sn = T * np.cos(heading), T * np.sin(heading)
     grow_left, grow_right = 1 + m[SCALE_LEFT], 1 + m[SCALE_RIGHT]
@@ -248,9 +249,10 @@ def step(t: int, ring: Rows, i: int, geometry: Array, period: float, delay: int,
     omega_dot = ring[p % len(ring), i].command[1] if p >= start else 0.0
     forward = now.acceleration[0] + geometry[2] * s.mean[OMEGA] ** 2  # the accelerometer is ahead of the rear axle
     jolt = now.acceleration[0] - ring[(t - 1) % len(ring), i].acceleration[0]
+    if (t - start) * period < LOADING:
+        jolt = max(abs(jolt), LOAD)
     propagate(forward - s.mean[OFFSET], omega_dot, jolt, now.grip, geometry, period, s)
     measure(now, omega_dot, geometry[3], s)
-    s.tick = t
 
 
 @kernel

@@ -84,8 +84,9 @@ def user(
     """The estimate of a user's estimator, or odometry from its last valid one; the arguments are those of `truth`."""
     odometry(tick, true, ring, i, sensor, geometry, period, memory, s)
     if memory.valid:
-        for k in range(5):
-            memory.mean[k] = s.estimate[k] = memory.told[k]
+        for k in range(5):  # the mean is as old as the samples, so that odometry can go on from it
+            memory.mean[k] += memory.told[k] - s.estimate[k]
+            s.estimate[k] = memory.told[k]
 
 
 observe = truth  # the estimator of `estimate`, which `Kernel.calling` replaces

@@ -50,7 +50,6 @@ SAMPLE = np.dtype(
         ("gyro", "f8"),  # measured θ̇, rad/s
         ("gyro_new", "?"),
         ("acceleration", "f8", 2),  # measured specific force, forward and to the left, m/s²
-        ("acceleration_new", "?"),
         ("fix", "f8", 3),  # measured posture, m, m, rad
         ("fix_taken", "?"),  # whether a fix was taken in this tick
         ("fix_arrives", "?"),  # whether it arrives
@@ -88,18 +87,18 @@ def sample(tick: int, true: Row, noise: Row, period: float, s: Row, last: Row, n
             now.encoder[k], now.rate[k] = true.wheel_angles[k], reading.wheel_rates[k]
         else:
             now.encoder[k] = s.quantum * np.floor(true.wheel_angles[k] / s.quantum + s.phase[k])
-            if since == 0:
-                now.rate[k] = reading.wheel_rates[k]
-            else:
-                now.rate[k] = (now.encoder[k] - last.encoder[k]) / (period * s.encoder_every)
+            gap, before = period * s.encoder_every, last.encoder[k]
+            if since == 0:  # the robot has been rolling
+                earlier = true.wheel_angles[k] - gap * reading.wheel_rates[k]
+                before = s.quantum * np.floor(earlier / s.quantum + s.phase[k])
+            now.rate[k] = (now.encoder[k] - before) / gap
     now.gyro_new = since % s.gyro_every == 0
     s.gyro_bias += s.gyro_step * noise.gyro[1]
     now.gyro = reading.twist[1] + s.gyro_bias + s.gyro_sigma * noise.gyro[0] if now.gyro_new else last.gyro
-    now.acceleration_new = since % s.accelerometer_every == 0
     for k in range(2):
         s.accelerometer_bias[k] += s.accelerometer_step * noise.accelerometer[2 + k]
         force = true.specific_force[k] + s.accelerometer_bias[k] + s.accelerometer_sigma * noise.accelerometer[k]
-        now.acceleration[k] = force if now.acceleration_new else last.acceleration[k]
+        now.acceleration[k] = force if since % s.accelerometer_every == 0 else last.acceleration[k]
     now.fix_taken = since % s.fix_every == 0
     now.fix_arrives = now.fix_taken and noise.chance[0] >= s.fix_lost
     wrong = noise.chance[1] < s.fix_outliers

@@ -63,7 +63,7 @@ def test_consistent(tier, runs):
 
     Errors squared over their covariance (NEES) of posture and twist are of chi-square with 3 and 5 degrees of freedom.
     Of the looks, 3.37 s apart, so that a lap of 12 s is seen at other places, most means over the runs are in the band
-    of 95 % or, in the tier `lab`, below it: there the filter is too careful, 0.87 instead of 1 for the posture.
+    of 95 %. With V they may be below it in the tier `lab`: there V is surer than the filter knows, 0.3 instead of 1.
     Innovations of the fixes (NIS) are white: their means are in the band at nearly every fix.
     """
     errors, covariances, innovations, failed = nominal(tier, runs)
@@ -73,7 +73,7 @@ def test_consistent(tier, runs):
         found = normalised(errors, covariances, states)
         low, high = chi2.ppf((0.025, 0.975), runs * len(states)) / runs
         means = found.mean(1)
-        least = 0.7 * low if tier == "lab" else low
+        least = 0.7 * low if tier == "lab" and 3 in states else low
         assert np.mean((means > least) & (means < high)) >= 0.7, (low, high, means)
         # All looks together, which are not independent: the errors of a run last for some seconds.
         assert 0.75 < means.mean() / len(states) < 1.25

@@ -96,16 +96,19 @@ def test_views():
 
 @pytest.mark.parametrize("delay", [1, 3, 50])
 def test_delay(delay):
-    """Voltages and steering come exactly d periods late; before that, none and the angle at the start."""
+    """Voltages and steering come exactly d periods late; before that, the back-EMF and the angle at the start."""
     for plant in plants():
         plant.perturb(plant.size - 1, Perturbation(), delay)
         plant.reset(np.zeros((plant.size, 3)), np.tile([0.5, 0.4], (plant.size, 1)))
-        angle = plant.reading["steering_angle"][0]
+        angle, coasting = plant.reading["steering_angle"][0], ROBOT.back_emf * plant.reading["wheel_rates"][-1]
         commands = np.random.default_rng(1).uniform(0, 12, (delay + 20, 4)) * (1, 1, 0.02, 0)
         for tick, command in enumerate(commands):
             plant.step(np.tile(command, (plant.size, 1)))
-            expected = commands[tick - delay] if tick >= delay else (0, 0, angle, 0)
-            assert np.array_equal(plant.ctrl[-1], expected) and np.array_equal(plant.applied[-1], expected[:2])
+            expected = commands[tick - delay] if tick >= delay else (*coasting, angle, 0)
+            np.testing.assert_allclose(plant.ctrl[-1], expected, rtol=1e-12)
+            assert np.array_equal(plant.applied[-1], plant.ctrl[-1, :2])
+            if tick < min(delay, 5):  # 0 V would brake with more than 2 A
+                assert np.abs(plant.current()[-1]).max() < 0.05
             if plant.size > 1:
                 assert np.array_equal(plant.ctrl[0], command)
 

@@ -58,7 +58,10 @@ def samples(sensors, ticks, plant, first=0):
     st.sampled_from([0, 50, 25]),
 )  # fmt: skip
 def test_encoder_counts(angles, counts, seed, rate):
-    """An encoder is never more than a count off, whatever its phase; its rate is the difference of two samples."""
+    """An encoder is never more than a count off, whatever its phase; its rate is the difference of two samples.
+
+    The rate of the first sample is that of a wheel that has been rolling, to a count.
+    """
     sensors = Sensors([ideal(encoder_counts=counts, encoder_rate=rate)], [seed], PERIOD)
     plant, count, every = plants(), 2 * np.pi / counts, round(100 / rate) if rate else 1
     before = None
@@ -72,7 +75,12 @@ def test_encoder_counts(angles, counts, seed, rate):
             assert (np.abs(now["encoder"] - [angle, -angle]) <= count + 1e-9).all()
             whole = now["encoder"] / count
             np.testing.assert_allclose(whole, np.round(whole), atol=1e-6)
-            expected = (7.0, 8.0) if before is None else (now["encoder"] - before["encoder"]) / (every * PERIOD)
+            step = count / (every * PERIOD)
+            if before is None:
+                expected = np.round(now["rate"] / step) * step
+                assert (np.abs(expected - (7.0, 8.0)) <= step * (1 + 1e-6) + 1e-6).all()
+            else:
+                expected = (now["encoder"] - before["encoder"]) / (every * PERIOD)
         assert before is None or now["encoder_new"] or (now["encoder"] == before["encoder"]).all()
         np.testing.assert_allclose(now["rate"], expected, rtol=1e-12, atol=1e-9)
         before = now
