@@ -107,7 +107,7 @@ def test_delay(delay):
             expected = commands[tick - delay] if tick >= delay else (*coasting, angle, 0)
             np.testing.assert_allclose(plant.ctrl[-1], expected, rtol=1e-12)
             assert np.array_equal(plant.applied[-1], plant.ctrl[-1, :2])
-            if tick < min(delay, 5):  # 0 V would brake with more than 2 A
+            if tick < min(delay, 3):  # 0 V would brake with more than 2 A
                 assert np.abs(plant.current()[-1]).max() < 0.05
             if plant.size > 1:
                 assert np.array_equal(plant.ctrl[0], command)
