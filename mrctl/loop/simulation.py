@@ -31,6 +31,7 @@ from mrctl.sensing.estimators import Estimator
 from mrctl.sensing.sensors import Sensors
 from mrctl.theory.references import check
 
+CORES = len(os.sched_getaffinity(0))
 LEAST = 8  # robots in a thread, for fewer do not pay for it
 
 
@@ -42,7 +43,8 @@ def simulate(
     One scenario runs through dm_control, several run together on MuJoCo's batch engine, with the same bits.
 
     Args:
-        scenarios: One scenario, or several; those that differ in world, laws, steering, length or rates run in turn.
+        scenarios: One scenario, or several; those that differ in world, laws, steering, length or
+            rates run in batches of their own.
         progress: Whether to show a progress bar.
         threads: Number of threads that control and physics run on, which changes no bit; 0 for all cores.
         stages: The user's stages `motion`, `feedback`, `feedforward`, `steering` or `estimator` in place of the
@@ -65,12 +67,11 @@ def simulate(
     if len({s.control_period for s in several}) > 1:
         raise InputError("control_period: runs of one result share their time axis, so also their control period")
     # Built first, so that bad input is refused before anything is computed.
-    groups = [split(several, rows, threads, **stages) for rows in uniform(several)]
-    parts = [part for group in groups for part in group]
+    parts = [part for rows in uniform(several) for part in split(several, rows, threads, **stages)]
     total = sum(simulation.ticks * len(rows) for rows, simulation in parts)
+    at_once = 1 if any(stages.values()) else threads
     with tqdm(total=total, unit="tick", unit_scale=True, disable=not progress) as bar:
-        for group in groups:
-            run([simulation for _, simulation in group], bar.update if progress else None)
+        run([simulation for _, simulation in parts], bar.update if progress else None, threads=at_once)
     whole = dataset.combine([(rows, simulation.result()) for rows, simulation in parts], several)
     return whole.isel(run=0) if isinstance(scenarios, Scenario) else whole
 
@@ -101,20 +102,24 @@ def split(
     """
     if any(stages.values()):
         return [(rows, Simulation([scenarios[row] for row in rows], threads=threads, **stages))]
-    count = min(threads or len(os.sched_getaffinity(0)), max(1, len(rows) // LEAST))
+    count = min(threads or CORES, max(1, len(rows) // LEAST))
     parts = [part.tolist() for part in np.array_split(rows, count)]
     return [(part, Simulation([scenarios[row] for row in part], threads=1)) for part in parts]
 
 
 def run(
-    simulations: Sequence[Simulation], progress: Callable[[int], object] | None = None, ticks: int | None = None
+    simulations: Sequence[Simulation],
+    progress: Callable[[int], object] | None = None,
+    ticks: int | None = None,
+    threads: int = 0,
 ) -> None:
-    """Runs simulations at the same time, each in a thread of its own; control and physics release the global lock.
+    """Runs simulations, as many at the same time as there are threads; control and physics release the global lock.
 
     Args:
         simulations: The simulations.
         progress: Is called after every tick of a simulation with the number of its robots.
         ticks: Number of control periods; by default to the end of the runs.
+        threads: Number of threads; 0 for all cores.
     """
     stop = threading.Event()
 
@@ -126,9 +131,12 @@ def run(
                 if progress:
                     progress(simulation.plant.size)
 
-    if len(simulations) == 1:
-        return drive(simulations[0])
-    with ThreadPoolExecutor(len(simulations)) as pool:
+    count = min(threads or CORES, len(simulations))
+    if count == 1:
+        for simulation in simulations:
+            drive(simulation)
+        return
+    with ThreadPoolExecutor(count) as pool:
         try:
             for future in [pool.submit(drive, simulation) for simulation in simulations]:
                 future.result()
