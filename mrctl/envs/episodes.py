@@ -25,16 +25,16 @@ OBSERVATIONS: dict[str, int] = {
     "error": 3, "twist": 2, "reference": 4, "wheel_rates": 2, "steering_angle": 1, "voltage": 2,
 }  # fmt: skip
 """Names and sizes: estimated posture error in the robot's frame (m, m, rad); estimated V and θ̇ (m/s, rad/s); those of
-the reference and their derivatives; true rates of the rear wheels (rad/s); true angle of the fork (rad); voltages sent
-last (V)."""
+the reference and their derivatives; rates of the rear wheels from the encoders (rad/s); commanded angle of the fork
+(rad); voltages sent last (V)."""
 RESIDUAL = 0.25  # of the supply, what a residual may add
 NEAR = 0.05  # m off the reference at which the reward is a half
 
 
 @kernel
 def observe(
-    plant: Rows, seen: Rows, wanted: Rows, goal: Rows, control: Rows, half_track: float, observation: Array,
-    reward: Array,
+    plant: Rows, seen: Rows, wanted: Rows, goal: Rows, control: Rows, radius: float, half_track: float,
+    observation: Array, reward: Array,
 ) -> None:  # fmt: skip
     """What `Episodes.observe` returns, from one record of `PLANT`, `SEEN`, `GOAL` and `CONTROL` a robot.
 
@@ -47,8 +47,8 @@ def observe(
         posture_error(p.reading.pose, goal[i].pose, error)
         for k in range(2):
             out[3 + k], out[5 + k], out[7 + k] = s.twist[k], g.twist[k], g.acceleration[k]
-            out[9 + k], out[12 + k] = p.reading.wheel_rates[k], control[i].allocation.command[k]
-        out[11] = p.reading.steering_angle
+            out[9 + k], out[12 + k] = s.wheel_speeds[k] / radius, control[i].allocation.command[k]
+        out[11] = control[i].allocation.angle
         x, y, theta = error[0], error[1], half_track * error[2]
         reward[i] = 1 / (1 + (x * x + y * y + theta * theta) / NEAR**2)
         if p.failed:
@@ -187,9 +187,10 @@ class Episodes(Simulation):
             square of the two wheels', √(e_x² + e_y² + (D e_θ)²), of the true posture.
         """
         seen, wanted = self.sense()
-        size, half_track = len(self.scenarios), self.plant.robot.half_track
+        size, robot = len(self.scenarios), self.plant.robot
+        constants = robot.wheel_radius, robot.half_track
         observation, reward = np.empty((size, sum(OBSERVATIONS.values()))), np.empty(size)
-        observe(self.plant.state, seen, wanted, self._goal, self.hierarchy.state, half_track, observation, reward)
+        observe(self.plant.state, seen, wanted, self._goal, self.hierarchy.state, *constants, observation, reward)
         return observation, reward
 
     def over(self) -> NDArray[np.bool]:

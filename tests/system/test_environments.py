@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from mrctl import PERTURBATIONS, Circle, Event, InputError, Line, Perturbation, Scenario
+from mrctl import PERTURBATIONS, Circle, Event, InputError, Line, Perturbation, Scenario, Sensing
 from mrctl.envs.dm_env import SUITE, Environment, Tracking, register
 from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Episodes
 from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
@@ -236,8 +236,19 @@ def test_observation():
         np.testing.assert_allclose(seen["error"], ahead, atol=1e-12)
         np.testing.assert_array_equal(seen["twist"], physics.twist())
         np.testing.assert_allclose(seen["reference"], [*twist, *acceleration], atol=1e-12)
-        np.testing.assert_array_equal(seen["wheel_rates"], physics.wheel_rates())
-        assert seen["steering_angle"] == physics.steering_angle()
+        np.testing.assert_allclose(seen["wheel_rates"], physics.wheel_rates(), rtol=1e-12)
+        assert seen["steering_angle"] == pytest.approx(physics.steering_angle(), abs=5e-3)
+
+
+def test_only_what_a_robot_knows():
+    """With real sensors the rates are those of encoders that count, and not the true ones."""
+    env = SUITE["residual"](SHORT.model_copy(update={"sensing": Sensing(tier="field")}))
+    env.reset()
+    for _ in range(5):
+        seen = env.step(np.zeros(2)).observation
+        counts = seen["wheel_rates"] / (2 * np.pi / 2578 / 0.01)
+        np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
+        assert (seen["wheel_rates"] != env.physics.wheel_rates()).all()
 
 
 def test_reward():
