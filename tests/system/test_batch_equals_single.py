@@ -12,7 +12,7 @@ from mrctl.sensing.tiers import TIERS, Sensing
 
 pytestmark = pytest.mark.xdist_group("batch_equals_single")  # what its tests share is made once
 
-COUNT = 60
+COUNT, ALL = 60, 100  # of scenarios in the usual run, and with `pytest -m full`
 REFERENCES = (  # four seconds each, so that they share batches, but for the last two
     Circle(period=4, radius=0.5),
     Circle(period=4, radius=0.6, clockwise=True),
@@ -181,6 +181,15 @@ def test_equal(scenarios, alone, chunk):
         whole = simulate([scenarios[row] for row in rows])
         for run, row in enumerate(rows):
             equal(alone[row], whole, run)
+
+
+@pytest.mark.full
+def test_all_equal():
+    """A hundred at once."""
+    scenarios = [scenario(seed) for seed in range(ALL)]
+    whole = simulate(scenarios)
+    for run, one in enumerate(scenarios):
+        equal(simulate(one), whole, run)
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from mrctl import PERTURBATIONS, Circle, Event, InputError, Line, Perturbation, Scenario, Sensing
+from mrctl import PERTURBATIONS, Circle, Event, InputError, Line, Perturbation, Scenario
 from mrctl.envs.dm_env import SUITE, Environment, Tracking, register
 from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Episodes
 from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv

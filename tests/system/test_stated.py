@@ -1,0 +1,52 @@
+"""What the README states of the tier `lab`: a few draws in the usual run, all of them with `pytest -m full`."""
+
+import numpy as np
+import pytest
+
+from mrctl import PERTURBATIONS, Scenario, Sensing, simulate, summary
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
+from mrctl.scenario import FEEDFORWARDS
+from mrctl.theory.references import random_spline
+
+
+@pytest.mark.parametrize(
+    ("draws", "plants", "feedforwards"),
+    [
+        (3, ("all",), ("none", "composite")),
+        pytest.param(20, ("nominal", "all"), FEEDFORWARDS, marks=pytest.mark.full),
+    ],
+)
+def test_estimate_adds_as_independent_errors_do(draws, plants, feedforwards):
+    """Position error in the last lap: at most 1.25 √(a² + b²) from true measurements a and from the estimate b.
+
+    That of `composite` is at most 1.5 mm, and that of its yaw rate at most 10 mrad/s, in every draw.
+    """
+    for plant in plants:
+        for feedforward in feedforwards:
+            common = {"feedforward": feedforward, "perturbation": PERTURBATIONS[plant]}
+            estimators = {"ekf": None, "truth": None}
+            for name in estimators:
+                sensing = Sensing(tier="lab", estimator=name)
+                estimators[name] = simulate([Scenario(sensing=sensing, seed=k, **common) for k in range(draws)])
+            found, true = (summary(run) for run in estimators.values())
+            assert not found.failed.any()
+            last = estimators["ekf"].isel(time=slice(-round(12 / 0.01), None))
+            estimate = np.square(last.x_measured - last.x) + np.square(last.y_measured - last.y)
+            parts = np.mean(true.position_rmse**2) + float(estimate.mean())
+            assert np.sqrt(np.mean(found.position_rmse**2)) < 1.25 * np.sqrt(parts), (plant, feedforward)
+            if feedforward == "composite":
+                assert found.position_rmse.max() < 1.5e-3 and found.omega_rmse.max() < 10e-3
+
+
+@pytest.mark.parametrize("count", [8, pytest.param(1000, marks=pytest.mark.full)])
+def test_pid_alone(count):
+    """On random splines at changing speed up to 0.95 of its limit, PID alone loses no nominal robot."""
+    robot = read_robot(mjcf.load())
+    courses = [random_spline(np.random.default_rng(seed), robot) for seed in range(count)]
+    for tier in ("ideal", "lab"):
+        for seed, course in enumerate(courses):
+            sensing = Sensing(tier=tier)
+            run = simulate(Scenario(reference=course, sensing=sensing, feedforward="none", laps=1, seed=seed))
+            assert not run.failed, (tier, seed, str(run.failure.item()))
+            assert np.abs(run.v_ref).max() > 0.9 * robot.max_speed
