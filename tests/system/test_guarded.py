@@ -27,8 +27,18 @@ from mrctl.sensing.tiers import Sensing
 OFF = Guard(on=False)
 ERRORS = ("position_rmse", "v_rmse", "omega_rmse")
 DELAYED = Scenario(**IDEAL, reference=Lemniscate(period=12.0), laps=4, perturbation=Perturbation(control_delay=0.04))
-# Both ten times as fast as by default.
-FAST = {"fel": Fel(step=1.0), "rls": Rls(step=0.2, initial_covariance=2.0, covariance_bound=2.0)}
+
+
+def fast(times):
+    """Settings with which both learn so many times as fast as by default; 1 is the largest step of `fel`."""
+    rate = 0.02 * times
+    return {
+        "fel": Fel(step=min(0.1 * times, 1.0)),
+        "rls": Rls(step=rate, initial_covariance=10 * rate, covariance_bound=10 * rate),
+    }
+
+
+FAST = fast(10)
 
 
 def of(scenario, feedforward, guard=OFF, **changes):
@@ -41,11 +51,14 @@ def same(one, other):
     return all(np.array_equal(one[name].values, other[name].values, equal_nan=True) for name in SIGNALS)
 
 
-@pytest.mark.parametrize(("steering", "name"), [("compliant", "rls"), ("caster", "rls"), ("rigid", "fel")])
-def test_too_fast(steering, name):
-    """40 ms of delay and ten times the learning rate: without the guard it shakes the robot, with it it tracks."""
-    base = of(DELAYED, "none", steering=steering)
-    runs = simulate([base, of(base, name, **FAST), of(base, name, Guard(), **FAST)])
+@pytest.mark.parametrize(
+    ("steering", "name", "delay", "times"),
+    [("compliant", "rls", 0.06, 10), ("caster", "rls", 0.04, 25), ("rigid", "fel", 0.04, 10)],
+)
+def test_too_fast(steering, name, delay, times):
+    """Delay and many times the learning rate: without the guard it shakes the robot, with it it tracks."""
+    base = of(DELAYED, "none", steering=steering, perturbation=Perturbation(control_delay=delay))
+    runs = simulate([base, of(base, name, **fast(times)), of(base, name, Guard(), **fast(times))])
     laps = per_lap(runs)
     pid, bare, guarded = (np.array([laps[error].values[k] for error in ERRORS]) for k in range(3))
     assert (bare[:, 0] > 2 * pid[:, 0]).sum() >= 2 and np.abs(runs.feedforward_right[1]).max() > 30
@@ -78,10 +91,10 @@ def test_silent():
 
 def test_batch():
     """A guard that acts in one row does what it does alone, and nothing to the others."""
-    fast = of(DELAYED, "fel", Guard(), steering="rigid", laps=1, **FAST)
-    calm = of(fast, "fel", Guard(), fel=Fel(), seed=3)
-    together = simulate([calm, fast, calm])
-    alone = simulate(fast)
+    hasty = of(DELAYED, "fel", Guard(), steering="rigid", laps=1, **FAST)
+    calm = of(hasty, "fel", Guard(), fel=Fel(step=0.02), seed=3)
+    together = simulate([calm, hasty, calm])
+    alone = simulate(hasty)
     assert set(guard_events(together)["run"]) == {1} and not guard_events(alone).empty
     assert same(together.isel(run=1), alone)
     assert same(together.isel(run=0), simulate(calm)) and same(together.isel(run=0), together.isel(run=2))
