@@ -51,7 +51,8 @@ def scenarios(robot, course, seed):
     return Scenario(
         **robot, reference=course, laps=1, seed=seed, perturbation=change(), events=events, fel=Fel(step=0.05),
         # With real sensors and the network, one in ten of these TurtleBots tips over.
-        feedforward=("fel", "composite")[seed % 2], sensing=Sensing(tier=TIERS[seed % 2]), world=("flat", "patch")[seed % 3 == 0],
+        feedforward=("fel", "composite")[seed % 2], sensing=Sensing(tier=TIERS[seed % 2]),
+        world=("flat", "patch")[seed % 3 == 0],
     )  # fmt: skip
 
 
