@@ -44,9 +44,10 @@ def test_pid_alone(count):
     """On random splines at changing speed up to 0.95 of its limit, PID alone loses no nominal robot."""
     robot = read_robot(mjcf.load())
     courses = [random_spline(np.random.default_rng(seed), robot) for seed in range(count)]
+    fastest = max(course.sample(np.linspace(0, course.period, 500)).twist[:, 0].max() for course in courses)
+    assert fastest > 0.94 * robot.max_speed  # the tightest splines are slower
     for tier in ("ideal", "lab"):
         for seed, course in enumerate(courses):
             sensing = Sensing(tier=tier)
             run = simulate(Scenario(reference=course, sensing=sensing, feedforward="none", laps=1, seed=seed))
             assert not run.failed, (tier, seed, str(run.failure.item()))
-            assert np.abs(run.v_ref).max() > 0.9 * robot.max_speed
