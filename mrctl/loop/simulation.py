@@ -31,7 +31,6 @@ from mrctl.sensing.estimators import Estimator
 from mrctl.sensing.sensors import Sensors
 from mrctl.theory.references import check
 
-CORES = len(os.sched_getaffinity(0))
 LEAST = 8  # robots in a thread, for fewer do not pay for it
 
 
@@ -76,6 +75,12 @@ def simulate(
     return whole.isel(run=0) if isinstance(scenarios, Scenario) else whole
 
 
+def cores() -> int:
+    """Number of processor cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)  # only Linux has it
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
 def uniform(scenarios: Sequence[Scenario]) -> list[list[int]]:
     """The scenarios that can run in one simulation, by their indices."""
     groups: dict[Hashable, list[int]] = defaultdict(list)
@@ -102,7 +107,7 @@ def split(
     """
     if any(stages.values()):
         return [(rows, Simulation([scenarios[row] for row in rows], threads=threads, **stages))]
-    count = min(threads or CORES, max(1, len(rows) // LEAST))
+    count = min(threads or cores(), max(1, len(rows) // LEAST))
     parts = [part.tolist() for part in np.array_split(rows, count)]
     return [(part, Simulation([scenarios[row] for row in part], threads=1)) for part in parts]
 
@@ -131,7 +136,7 @@ def run(
                 if progress:
                     progress(simulation.plant.size)
 
-    count = min(threads or CORES, len(simulations))
+    count = min(threads or cores(), len(simulations))
     if count == 1:
         for simulation in simulations:
             drive(simulation)

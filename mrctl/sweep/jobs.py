@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
@@ -19,7 +18,7 @@ from tqdm import tqdm
 from mrctl import __version__
 from mrctl.control.stages import METHODS, Stages
 from mrctl.loop import user_files
-from mrctl.loop.simulation import Simulation, simulate
+from mrctl.loop.simulation import Simulation, cores, simulate
 from mrctl.physics import mjcf
 from mrctl.record import InputError
 from mrctl.results import metrics
@@ -79,7 +78,7 @@ def run(
             pending = sorted(set(range(store.jobs)) - store.done())
             aside = {}
             if pending:
-                count = workers or len(os.sched_getaffinity(0))
+                count = workers or cores()
                 pool = Cluster(work, str(path), scheduler) if scheduler else Processes(work, str(path), count)
                 try:
                     aside = _drive(store, pending, pool, progress)

@@ -1,4 +1,4 @@
-"""What the README states of the tier `lab`: a few draws in the usual run, all of them with `pytest -m full`."""
+"""What must hold in the tier `lab`: a few draws in the usual run, all of them with `pytest -m full`."""
 
 import numpy as np
 import pytest
