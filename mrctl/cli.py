@@ -28,7 +28,7 @@ from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, RobotFile
 
-FIRST = ("name", "world", "steering", "reference", "laps", "feedforward", "seed")
+FIRST = ("name", "world", "steering", "reference", "laps", "prior", "learner", "seed")
 """Fields of `Scenario` that `mrctl run --help` explains; it lists the others, which `mrctl run --help-all` explains."""
 
 LAB = Sensing(tier="lab")
@@ -262,7 +262,7 @@ def reproduce(out: Path = Path("reproduction")) -> None:
 
 
 def suite(
-    feedforward: tuple[FeedforwardName, ...] = FEEDFORWARDS,
+    feedforward: tuple[FeedforwardName, ...] = tuple(FEEDFORWARDS),
     controller: tuple[str, ...] = (),
     seeds: int | None = None,
     random: int | None = None,
@@ -354,7 +354,7 @@ def identify(
 
 
 def train(out: Path = Path("composite.safetensors"), plants: int = 120, seed: int = 0) -> None:
-    """Trains the features of the `composite` feedforward on randomised plants, in less than five minutes.
+    """Trains the features of the learner `composite` on randomised plants, in less than five minutes.
 
     `mrctl run --composite.weights FILE` uses them; by default a run uses the features that come with mrctl.
 

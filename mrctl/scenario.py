@@ -6,7 +6,7 @@ A `Scenario` is read from TOML or made in Python; its fields are the flags of `m
 from __future__ import annotations
 
 from math import ceil
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, model_validator
 
@@ -23,8 +23,22 @@ from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Lemniscate, Reference
 from mrctl.theory.robot import CAR, RobotFile, Steering
 
-FeedforwardName = Literal["none", "model", "oracle", "observer", "fel", "rls", "composite"]
-FEEDFORWARDS: tuple[FeedforwardName, ...] = ("none", "model", "oracle", "observer", "fel", "rls", "composite")
+PriorName = Literal["none", "model", "true_model"]
+LearnerName = Literal["none", "observer", "fel", "rls", "composite"]
+
+
+def named(prior: str, learner: str) -> str:
+    """Returns the name of a feedforward in tables: `none`, `model`, `fel`, or `model+fel` for both."""
+    return "+".join(part for part in (prior, learner) if part != "none") or "none"
+
+
+FeedforwardName = Literal[
+    "none", "model", "true_model", "model+observer", "fel", "model+fel", "rls", "model+rls", "composite",
+    "model+composite",
+]  # fmt: skip
+_PAIRS = {named(p, n): {"prior": p, "learner": n} for p in get_args(PriorName) for n in get_args(LearnerName)}
+FEEDFORWARDS: dict[FeedforwardName, dict[str, Any]] = {name: _PAIRS[name] for name in get_args(FeedforwardName)}
+"""Priors and learners that the tables compare, as fields of a scenario, by the name of the pair."""
 LONGEST = 10_000_000
 """Largest number of control periods in a run; the record of one takes 432 bytes."""
 
@@ -59,10 +73,13 @@ class Event(Record):
 class Scenario(Record):
     """One run of a robot along a reference; the same scenario gives the same result, bit for bit."""
 
-    moved = {"measurement": "set sensing.estimator to truth or odometry"}
+    moved = {
+        "measurement": "set sensing.estimator to truth or odometry",
+        "feedforward": "set prior and learner, such as prior model and learner composite",
+    }
 
     name: str = ""
-    """Label of the run in tables and figures; by default the name of the feedforward."""
+    """Label of the run in tables and figures; by default that of the feedforward."""
     world: str = "flat"
     """World to drive in: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file."""
     robot: RobotFile = CAR
@@ -73,8 +90,10 @@ class Scenario(Record):
     """Reference trajectory that the robot follows."""
     laps: Annotated[int, Field(ge=1, le=10_000)] = 8
     """Number of laps."""
-    feedforward: FeedforwardName = "fel"
-    """Feedforward that is added to the velocity PID; `none` is PID alone."""
+    prior: PriorName = "none"
+    """What the feedforward knows at the start: nothing, the nominal model, or, for reference, the true one."""
+    learner: LearnerName = "fel"
+    """What the feedforward learns with, beyond the prior; with `none` and prior `none` the PID is alone."""
     sensing: Sensing = Sensing()
     """Sensors, estimator, motor driver, battery, steering servo and delay, by a tier."""
     kanayama: Kanayama = Kanayama()
@@ -82,13 +101,13 @@ class Scenario(Record):
     pid: Pid = Pid()
     """Settings of the velocity PID, by default designed for the delay of `sensing`."""
     fel: Fel = Fel()
-    """Settings of the `fel` feedforward."""
+    """Settings of the learner `fel`."""
     rls: Rls = Rls()
-    """Settings of the `rls` feedforward."""
+    """Settings of the learner `rls`."""
     observer: Observer = Observer()
-    """Settings of the `observer` feedforward."""
+    """Settings of the learner `observer`."""
     composite: Composite = Composite()
-    """Settings of the `composite` feedforward."""
+    """Settings of the learner `composite`."""
     guard: Guard = Guard()
     """Settings of the guard, which limits or stops a learner that makes the loop worse."""
     perturbation: Perturbation = Perturbation()
@@ -119,6 +138,8 @@ class Scenario(Record):
         changes += [(f"events.{i}.perturbation", e.perturbation) for i, e in enumerate(self.events) if e.perturbation]
         for name, perturbation in changes:
             whole(perturbation.control_delay, self.control_period, f"{name}.control_delay", "control_period")
+        if self.learner == "observer" and self.prior == "none":
+            raise ValueError("prior: the learner observer compares the robot with a model; set model")
         if not 1 <= self.duration / self.control_period <= LONGEST:
             raise ValueError(f"laps: a run of {self.duration:g} s is not between 1 and {LONGEST:,} control periods")
         self.sensing.check(self.control_period, self.duration)
@@ -132,6 +153,11 @@ class Scenario(Record):
         """
         values = {name: getattr(self, name) for name in Scenario.model_fields}
         return Scenario.from_dict(values | {"events": (*self.events, event)})
+
+    @property
+    def feedforward(self) -> str:
+        """Name of prior and learner in tables."""
+        return named(self.prior, self.learner)
 
     @property
     def duration(self) -> float:

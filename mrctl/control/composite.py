@@ -1,11 +1,11 @@
-"""Composite adaptation: the model plus features whose weights follow prediction errors and tracking errors.
+"""Composite adaptation: features whose weights follow prediction errors and tracking errors.
 
-    U = model(x) + φ(x)ᵀ a + d,      φ = 8 physical features, gravity on a slope, 16 tanh units,      a(0) = 0, d(0) = 0
+    U = φ(x)ᵀ a + d,      φ = 8 physical features, gravity on a slope, 16 tanh units,      a(0) = 0, d(0) = 0
 
 A Kalman filter (`predict`) estimates the weights a and the disturbance d from the voltage that acted and the motion
 that followed, both low-passed; the tracking term (`track`) moves a by a share of the feedback voltage e:
 
-    U_f = model(x_f) + φ(x_f)ᵀ a + d + noise,      x_f = (V_f, V̇_f)
+    U_f = prior(x_f) + φ(x_f)ᵀ a + d + noise,      x_f = (V_f, V̇_f)
     a ← a + P φ(x_c) · step · e / (φ(x_c)ᵀ P φ(x_c)),      x_c = commanded motion
 
 Slotine and Li (1989) combine the two errors; Neural-Fly (O'Connell et al. 2022) and MAGIC-VFM (Lupu et al. 2024) use
@@ -40,11 +40,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import FEATURES, INPUTS, PHYSICAL, feature_scale, features
-from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, CompiledFeedforward
+from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, explained
 from mrctl.control.weights import SHIPPED, load_training
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
-from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
 CHANNELS = 2
@@ -57,6 +56,7 @@ NOTHING = 1e-9  # V² or (rad/s)²; features whose φᵀ P φ is smaller explain
 # V of noise in a sample for each m/s of noise in the measured wheel speed; tuned with sensor noise of 10 mm/s and
 # 20 mrad/s behind filters of 0.03 s, at a control period of 10 ms.
 SCATTER = 300.0
+UNKNOWN = 6.0  # V, standard deviation of the weight of a physical feature without a model
 SETTLED = 6.0  # time constants until the two filters have forgotten their initial state
 LEARNED = 12.0  # s of learning after which a plant is stored, and during which a former one is sought
 LOOK = 2.0  # s over which the prediction error of former plants is averaged, and the least time of averaging
@@ -66,7 +66,7 @@ SIGNALS = 6  # filtered signals: voltage of the two channels, twist, cosine and 
 
 
 class Composite(Record):
-    """Settings of the `composite` feedforward; one setting serves every robot, steering and perturbation."""
+    """Settings of the learner `composite`; one setting serves every robot, steering and perturbation."""
 
     noise: Annotated[float, Field(gt=0, le=100)] = 0.2
     """Standard deviation of one sample of the regression in V, if the motion is measured without noise; the noise that
@@ -112,7 +112,7 @@ COMPOSITE = np.dtype(
         ("x", "f8", PHYSICAL),  # physical features at the filtered motion, or at the command
         ("phi", "f8", FEATURES + 1),  # (φ, 1) at the filtered motion
         ("phi_c", "f8", FEATURES + 1),  # (φ, 1) at the command
-        ("residual", "f8", CHANNELS),  # filtered voltage less the model's, V
+        ("residual", "f8", CHANNELS),  # filtered voltage less the prior's, V
         # What is learned
         ("a", "f8", (CHANNELS, FEATURES + 1)),  # weights of φ and, last, the disturbance d, V
         ("P", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)),  # their covariance, V²
@@ -322,30 +322,26 @@ def filter_motion(command: Array, twist: Array, voltage: Array, period: float, r
 
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
-    """U = model(x_c) + φ(x_c)ᵀ a + d at the commanded motion x_c; under `rigid` steering, less the command itself."""
-    rows, scale, model, units, _ = arrays
+    """U = φ(x_c)ᵀ a + d at the commanded motion x_c."""
+    rows, scale, units, _ = arrays
     s = rows[i]
     features(command, derivative, robot.half_track, scale, s.x)
     s.x[8], s.x[9] = np.cos(s.heading), np.sin(s.heading)
     basis(s.x, units, s.phi_c)
     for k in range(CHANNELS):
         voltage[k] = learned_voltage(s.a[k], s.phi_c) + s.a[k, FEATURES]
-        for j in range(INPUTS):
-            voltage[k] += model[k, j] * s.x[j]
-    if robot.rigid:
-        voltage[1] -= command[1]
 
 
 @kernel
 def learn(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    arrays: tuple[Any, ...], added: Array,
+    prior: Row, arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
     """One step of prediction and tracking; while the robot must not learn, the disturbance decays.
 
     `added` leaves the disturbance out, so that the PID's integral keeps its part of it, as with `observer`.
     """
-    rows, scale, model, units, priors = arrays
+    rows, scale, units, priors = arrays
     s = rows[i]
     filter_motion(command, twist, voltage, period, robot, s)
     added[0] = added[1] = 0.0
@@ -354,10 +350,9 @@ def learn(
         features(s.twice[2:4], s.rate, robot.half_track, scale, s.x)
         s.x[8], s.x[9] = s.twice[4], s.twice[5]
         basis(s.x, units, s.phi)
+        explained(s.twice[2:4], s.rate, robot.rigid, prior, s.residual)
         for k in range(CHANNELS):
-            s.residual[k] = s.twice[k]
-            for j in range(INPUTS):
-                s.residual[k] -= model[k, j] * s.x[j]
+            s.residual[k] = s.twice[k] - s.residual[k]
             added[k] = learned_voltage(s.a[k], s.phi_c)
             predict(k, priors[k], s)
             track(k, feedback[k], s)
@@ -371,8 +366,8 @@ def learn(
     return s.norm
 
 
-class CompositeAdaptation(CompiledFeedforward):
-    """The feedforward `composite` for B robots.
+class CompositeAdaptation(Learner):
+    """The learner `composite` for B robots.
 
     Attributes:
         rows: One record of `COMPOSITE` a robot.
@@ -383,10 +378,15 @@ class CompositeAdaptation(CompiledFeedforward):
     respond, learn_one = respond, learn
     weight_volts = 1.0
 
-    def __init__(self, robot: Robot, settings: list[Composite], rigid: bool, period: float) -> None:
-        """Takes the nominal robot, the settings of each robot, whether channel two is steering, and the period in s.
+    def __init__(self, robot: Robot, settings: list[Composite], rigid: bool, period: float, prior: bool = True) -> None:
+        """Makes the learners; all robots use the weights file of the first.
 
-        All robots use the weights file of the first.
+        Args:
+            robot: The nominal robot.
+            settings: Settings of each robot.
+            rigid: Whether channel two is steering.
+            period: Control period in s.
+            prior: Whether a model is the prior; otherwise P₀ allows weights as large as those of a model.
 
         Raises:
             InputError: The weights file is missing, broken or of another shape.
@@ -395,11 +395,10 @@ class CompositeAdaptation(CompiledFeedforward):
         training = load_training(settings[0].weights or SHIPPED)
         self._priors = np.zeros((CHANNELS, FEATURES + 1, FEATURES + 1))
         self._priors[:, :FEATURES, :FEATURES] = training.priors[[0, 2 if rigid else 1]]
+        if not prior:  # the geometry of a steering channel is known in any case
+            for P in self._priors[: 1 if rigid else 2]:
+                P[range(INPUTS), range(INPUTS)] += UNKNOWN**2
         scale = feature_scale(robot)
-        model = np.ascontiguousarray((inverse_coefficients(robot) * scale[:, None]).T)
-        if rigid:  # the nominal steering makes the rotation that is commanded
-            model[1] = 0.0
-            model[1, 1] = scale[1]
         self.rows = rows = np.zeros(len(settings), COMPOSITE)
         unit = np.array([1.0, STEERING_SCALE if rigid else 1.0])
         for row, s in zip(rows, settings, strict=True):
@@ -413,7 +412,7 @@ class CompositeAdaptation(CompiledFeedforward):
             row["scatter"] = SCATTER * unit * (1.0, robot.half_track)
             row["brief"], row["lasting"] = period / (period + BRIEF), period / (period + LASTING)
             row["filter"] = period / (period + s.filter)
-        self.arrays = rows, scale, model, training.units, self._priors
+        self.arrays = rows, scale, training.units, self._priors
         self.restore(np.arange(len(settings)))
 
     def restore(self, rows: NDArray[np.intp]) -> None:

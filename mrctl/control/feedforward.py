@@ -1,4 +1,13 @@
-"""The interface of every feedforward, and the feedforwards that do not learn: `none`, `model`, `oracle`."""
+"""The feedforward: what the controller knows at the start (prior), and what it learns while driving (learner).
+
+    U_ff = prior(x_c) + learner(x_c),      prior = cᵀ x, the inverse of equation (3),      x_c = commanded motion
+
+| prior        | coefficients c                                                     |
+| ------------ | ------------------------------------------------------------------ |
+| `none`       | 0: the learner starts from nothing, as in the paper                |
+| `model`      | those of the nominal robot                                         |
+| `true_model` | those of the robot as it is; nobody knows them: for reference only |
+"""
 
 from __future__ import annotations
 
@@ -21,7 +30,9 @@ STEERING_SHARE = 0.1  # factor on the step of a steering channel, whose geometry
 
 
 class Feedforward(Protocol):
-    """The stage that turns the commanded motion into voltages: any object with these two methods.
+    """The stage that learns to turn the commanded motion into voltages: any object with these two methods.
+
+    The voltage of the prior is added to its output.
 
     A stage serves B robots; its memory belongs in arrays with a leading axis B, so that robots cannot mix. It may have
     three further members for the guard (`mrctl.control.guard`): `weight_norm`, a float64 array `(B,)`; `weight_volts`,
@@ -56,15 +67,89 @@ class Feedforward(Protocol):
         ...
 
 
-class CompiledFeedforward(ABC):
-    """A feedforward whose two laws are kernels for one robot, so that a whole control tick is one compiled call.
+PRIOR = np.dtype(
+    [
+        ("c", "f8", (8, 2)),  # coefficients of the unscaled features in the two channels, V per unit of the feature
+        ("half_track", "f8"),  # D of the robot that they belong to, m
+        ("ones", "f8", 8),  # scale of unscaled features
+        ("x", "f8", 8),  # scratch: features of a motion
+    ],
+    align=True,
+)
+
+
+@kernel
+def inverse_dynamics(command: Array, derivative: Array, prior: Row, voltage: Array) -> None:
+    """Writes cᵀ x, the inverse of equation (3) at a motion.
+
+    Args:
+        command: V in m/s and θ̇ in rad/s, `(2,)`.
+        derivative: V̇ in m/s² and θ̈ in rad/s², `(2,)`.
+        prior: A record of `PRIOR`.
+        voltage: Out: U_Σ and U_Δ in V, `(2,)`; the second is 0 under `rigid` steering, where the angle makes θ̇.
+    """
+    features(command, derivative, prior.half_track, prior.ones, prior.x)
+    linear(prior.x, prior.c, voltage)
+
+
+@kernel
+def explained(twist: Array, acceleration: Array, rigid: bool, prior: Row, voltage: Array) -> None:
+    """Writes the voltage that the prior needs for a motion of the robot, `(2,)`; a rigid fork makes θ̇ without any.
+
+    What was sent to a steering channel is then compared with θ̇ itself, in rad/s.
+    """
+    inverse_dynamics(twist, acceleration, prior, voltage)
+    if rigid:
+        voltage[1] = twist[1]
+
+
+@kernel
+def inverse_dynamics_of_rows(command: Array, derivative: Array, prior: Rows, voltage: Array) -> None:
+    """`inverse_dynamics` of all robots."""
+    for i in range(len(voltage)):
+        inverse_dynamics(command[i], derivative[i], prior[i], voltage[i])
+
+
+class Prior:
+    """What the feedforward of B robots starts from.
+
+    Attributes:
+        rows: One record of `PRIOR` a robot.
+    """
+
+    def __init__(self, robots: Sequence[Robot | None], rigid: bool) -> None:
+        """Takes for each robot that whose inverse dynamics it starts from, or None, and whether the fork makes θ̇."""
+        self._rigid = rigid
+        self.rows = np.zeros(len(robots), PRIOR)
+        self.rows["ones"] = 1.0
+        for row, robot in enumerate(robots):
+            if robot is not None:
+                self.set_robot(row, robot)
+
+    def set_robot(self, row: int, robot: Robot) -> None:
+        """Replaces the coefficients of one robot."""
+        self.rows["half_track"][row] = robot.half_track
+        self.rows["c"][row] = inverse_coefficients(robot)
+        if self._rigid:
+            self.rows["c"][row, :, 1] = 0.0
+
+    def output(self, command: Array, derivative: Array) -> Array:
+        """Returns the voltages of the two channels of all robots, `(B, 2)` in V; see `Feedforward.output`."""
+        voltage = np.empty((len(self.rows), 2))
+        inverse_dynamics_of_rows(_own(command), _own(derivative), self.rows, voltage)
+        return voltage
+
+
+class Learner(ABC):
+    """A learner whose two laws are kernels for one robot, so that a whole control tick is one compiled call.
 
     `output` and `learn` call the same kernels for all robots, which makes it a `Feedforward` like any other.
 
     Attributes:
         respond: `(i, command, derivative, robot, arrays, voltage)` writes the output of robot i to `voltage`, `(2,)`.
-        learn_one: `(i, command, feedback, frozen, twist, voltage, period, robot, arrays, added)` learns, writes what
-            that added to the output of robot i to `added`, `(2,)`, and returns the norm of the weights.
+        learn_one: `(i, command, feedback, frozen, twist, voltage, period, robot, prior, arrays, added)` learns, writes
+            what that added to the output of robot i to `added`, `(2,)`, and returns the norm of the weights. `prior` is
+            the record of `PRIOR` of robot i.
         arrays: Memory and constants of the kernels, a tuple of arrays.
         guarded: Whether the guard watches it.
         weight_norm: Norm of the weights, `(B,)`.
@@ -87,7 +172,7 @@ class CompiledFeedforward(ABC):
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets the robots with these indices to their initial memory."""
 
-    def take(self, row: int, other: CompiledFeedforward) -> None:
+    def take(self, row: int, other: Learner) -> None:
         """Copies the memory of the same stage for one robot into a row of this stage."""
         size = len(self.weight_norm)
         self.weight_norm[row] = other.weight_norm[0]
@@ -101,11 +186,11 @@ class CompiledFeedforward(ABC):
         _respond_all(type(self))(self._command, _own(derivative), self.robot, self.arrays, self._voltage)
         return self._voltage
 
-    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
-        """Lets all robots learn; see `Feedforward.learn`."""
+    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array, prior: Rows) -> Array:
+        """Lets all robots learn; see `Feedforward.learn`. `prior` has a record of `PRIOR` for each."""
         _learn_all(type(self))(
             self._command, _own(feedback), _own(saturated), _own(twist), _own(voltage), self.period, self.robot,
-            self.arrays, self._added, self.weight_norm,
+            prior, self.arrays, self._added, self.weight_norm,
         )  # fmt: skip
         return self._added
 
@@ -121,12 +206,12 @@ def _own(values: Array) -> Array:
 
 
 @cache
-def _respond_all(stage: type[CompiledFeedforward]) -> Kernel:
+def _respond_all(stage: type[Learner]) -> Kernel:
     return respond_all.calling(respond=stage.respond)
 
 
 @cache
-def _learn_all(stage: type[CompiledFeedforward]) -> Kernel:
+def _learn_all(stage: type[Learner]) -> Kernel:
     return learn_all.calling(learn_one=stage.learn_one)
 
 
@@ -139,7 +224,7 @@ def nothing(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
 @kernel
 def learn_nothing(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    arrays: tuple[Any, ...], added: Array,
+    prior: Row, arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
     """Learns nothing."""
     added[0] = added[1] = 0.0
@@ -159,58 +244,20 @@ def respond_all(command: Array, derivative: Array, robot: Rows, arrays: tuple[An
 @kernel
 def learn_all(
     command: Array, feedback: Array, frozen: Array, twist: Array, voltage: Array, period: float, robot: Rows,
-    arrays: tuple[Any, ...], added: Array, norm: Array,
+    prior: Rows, arrays: tuple[Any, ...], added: Array, norm: Array,
 ) -> None:  # fmt: skip
     """Does one learning step of all robots."""
     for i in range(len(added)):
         norm[i] = learn_one(
-            i, command[i], feedback[i], frozen[i], twist[i], voltage[i], period, robot[0], arrays, added[i]
+            i, command[i], feedback[i], frozen[i], twist[i], voltage[i], period, robot[0], prior[i], arrays, added[i]
         )
 
 
-class NoFeedforward(CompiledFeedforward):
-    """The feedforward `none`: PID alone, the paper's baseline."""
+class NoLearner(Learner):
+    """The learner `none`: the prior alone, or with no prior PID alone, the paper's baseline."""
 
     respond, learn_one, guarded = nothing, learn_nothing, False
     arrays = ()
-
-    def restore(self, rows: NDArray[np.intp]) -> None:
-        """Does nothing, since nothing is learned."""
-
-
-@kernel
-def inverse_dynamics(
-    i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array
-) -> None:
-    """U = cᵀ x: the inverse of equation (3), with the unscaled features x and the robot's coefficients c."""
-    half_track, coefficients, ones, x = arrays
-    features(command, derivative, half_track[i], ones, x)
-    linear(x, coefficients[i], voltage)
-
-
-class InverseDynamics(CompiledFeedforward):
-    """The inverse of the corrected equation (3): `model` has the nominal parameters, `oracle` the plant's own.
-
-    Attributes:
-        coefficients: Coefficients of the unscaled features in the two channels, `(B, 8, 2)`.
-    """
-
-    respond, learn_one, guarded = inverse_dynamics, learn_nothing, False
-
-    def __init__(self, robots: Sequence[Robot], rigid: bool) -> None:
-        """Takes the robots, and whether the second channel is steering."""
-        super().__init__(robots[0], len(robots), rigid, 0.0)
-        self._half_track, self.coefficients = np.zeros(len(robots)), np.zeros((len(robots), 8, 2))
-        self.arrays = self._half_track, self.coefficients, np.ones(8), np.zeros(8)
-        for row, robot in enumerate(robots):
-            self.set_robot(row, robot)
-
-    def set_robot(self, row: int, robot: Robot) -> None:
-        """Replaces the parameters of one robot."""
-        self._half_track[row] = robot.half_track
-        self.coefficients[row] = inverse_coefficients(robot)
-        if self.robot["rigid"][0]:  # the steering angle φ_c makes θ̇, without a correction from this channel
-            self.coefficients[row, :, 1] = 0.0
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Does nothing, since nothing is learned."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import INPUTS, OUTPUTS, feature_scale, features
-from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, CompiledFeedforward
+from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner
 from mrctl.control.weights import initial_weights, load_weights
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
@@ -30,7 +30,7 @@ REGULARISATION = 1e-3  # ε: keeps the normalised step finite at rest, where the
 
 
 class Fel(Record):
-    """Settings of the `fel` feedforward; one setting serves every robot, steering arrangement and perturbation."""
+    """Settings of the learner `fel`; one setting serves every robot, steering arrangement and perturbation."""
 
     hidden: Annotated[int, Field(ge=1, le=256)] = 24
     """Number of hidden tanh units."""
@@ -212,7 +212,7 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
 @kernel
 def learn(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    arrays: tuple[Any, ...], added: Array,
+    prior: Row, arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
     """One step of `update` on the features of the last output, unless the robot must not learn.
 
@@ -230,8 +230,8 @@ def learn(
     return s.norm
 
 
-class FeedbackErrorLearning(CompiledFeedforward):
-    """The feedforward `fel` for B robots.
+class FeedbackErrorLearning(Learner):
+    """The learner `fel` for B robots.
 
     Attributes:
         weights: Flat weights W, `(B, n)`.

@@ -1,4 +1,4 @@
-"""Nominal model with a disturbance observer on the voltage: the classical method, which does not learn.
+"""A disturbance observer on the voltage beside a model as prior: the classical method, which does not learn.
 
 Ohnishi (1987), Umeno and Hori (1991): the voltage that was sent, less the voltage that the nominal inverse dynamics
 needs for the measured motion, is the disturbance. The next voltage contains its low-pass:
@@ -24,16 +24,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import features
-from mrctl.control.feedforward import CompiledFeedforward, InverseDynamics, inverse_dynamics
+from mrctl.control.feedforward import Learner, explained
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
-from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
 
 class Observer(Record):
-    """Settings of the `observer` feedforward."""
+    """Settings of the learner `observer`."""
 
     time_constant: Annotated[float, Field(ge=0.02, le=10)] = 0.055
     """Time constant T of the filter Q in s. The default is the shortest, to 5 ms, that keeps the sensitivity below 2
@@ -49,7 +47,7 @@ OBSERVER = np.dtype(
         ("sent", "f8", 2),  # voltage that was applied in the last period, V
         ("disturbance", "f8", 2),  # d̂ of the two channels, V
         ("started", "?"),  # whether there was a last period
-        ("x", "f8", 8),  # features of the measured motion
+        ("steady", "f8", 2),  # voltage of the model at the measured twist, without acceleration, V
         ("rate", "f8", 2),  # Q of its acceleration, m/s² and rad/s²
     ],
     align=True,
@@ -57,7 +55,7 @@ OBSERVER = np.dtype(
 
 
 @kernel
-def observe(twist: Array, sent: Array, c: Array, ones: Array, half_track: float, period: float, s: Row) -> None:
+def observe(twist: Array, sent: Array, rigid: bool, prior: Row, period: float, s: Row) -> None:
     """One step of the observer, for the model c · x = c_V V + c_ω ω + c_V̇ V̇ + c_ω̇ ω̇ + ….
 
         d̂ = Q (U − c · x|V̇=ω̇=0) − c_V̇ (V − Q V)/T − c_ω̇ (ω − Q ω)/T
@@ -67,75 +65,65 @@ def observe(twist: Array, sent: Array, c: Array, ones: Array, half_track: float,
     Args:
         twist: Measured V in m/s and θ̇ in rad/s, on which `sent` has not acted yet, `(2,)`.
         sent: Voltage of the coming period in the two channels, after the limits, in V, `(2,)`.
-        c: Coefficients of the nominal inverse dynamics on unscaled features, `(8, 2)`.
-        ones: Scale of unscaled features: ones, `(8,)`.
-        half_track: D in m.
+        rigid: Whether the second channel is steering.
+        prior: The model, a record of `PRIOR`.
         period: Control period in s.
         s: In and out: a record of `OBSERVER`, whose `disturbance` is the result.
     """
     share = period / (s.time_constant + period)
     s.rate[0] = s.rate[1] = 0.0
-    features(twist, s.rate, half_track, ones, s.x)
+    explained(twist, s.rate, rigid, prior, s.steady)
     for k in range(2):
         if s.started:
-            residual = s.sent[k]
-            for j in range(8):
-                residual -= c[j, k] * s.x[j]
-            s.voltage[k] += share * (residual - s.voltage[k])
+            s.voltage[k] += share * (s.sent[k] - s.steady[k] - s.voltage[k])
             s.twist[k] += share * (twist[k] - s.twist[k])
             s.rate[k] = (twist[k] - s.twist[k]) / s.time_constant
         else:
             s.twist[k] = twist[k]
         s.sent[k] = sent[k]
     for k in range(2):
-        s.disturbance[k] = s.voltage[k] - c[2, k] * s.rate[0] - c[3, k] * s.rate[1]
+        s.disturbance[k] = s.voltage[k] - prior.c[2, k] * s.rate[0] - prior.c[3, k] * s.rate[1]
     s.started = True
 
 
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
-    """U = model(command) + d̂, with the latest d̂."""
-    model, rows, _, _ = arrays
-    inverse_dynamics(i, command, derivative, robot, model, voltage)
+    """U = d̂, the latest."""
+    rows, _ = arrays
     for k in range(2):
-        voltage[k] += rows[i].disturbance[k]
+        voltage[k] = rows[i].disturbance[k]
 
 
 @kernel
 def learn(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    arrays: tuple[Any, ...], added: Array,
+    prior: Row, arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
     """One step of the observer, which also runs while the robot must not learn; it hands nothing over to the PID."""
-    model, rows, coefficients, sent = arrays
+    rows, sent = arrays
     sent[0], sent[1] = voltage[0], voltage[1]
     if robot.rigid:
         sent[1] += command[1]  # a steering channel adds a correction to the commanded rotation
-    observe(twist, sent, coefficients, model[2], robot.half_track, period, rows[i])
+    observe(twist, sent, robot.rigid, prior, period, rows[i])
     added[0] = added[1] = 0.0
     return 0.0
 
 
-class DisturbanceObserver(CompiledFeedforward):
-    """The feedforward `observer` for B robots.
+class DisturbanceObserver(Learner):
+    """The learner `observer` for B robots, whose prior is a model.
 
     Attributes:
         rows: One record of `OBSERVER` a robot.
     """
 
-    respond, learn_one = respond, learn
+    respond, learn_one, guarded = respond, learn, False
 
     def __init__(self, robot: Robot, settings: list[Observer], rigid: bool, period: float) -> None:
         """Takes the nominal robot, the settings of each robot, whether channel two is steering, and the period in s."""
         super().__init__(robot, len(settings), rigid, period)
-        coefficients = inverse_coefficients(robot)
-        if rigid:  # the nominal steering makes the rotation that is commanded
-            coefficients[:, 1] = 0.0
-            coefficients[1, 1] = 1.0
         self.rows = np.zeros(len(settings), OBSERVER)
         self.rows["time_constant"] = [s.time_constant for s in settings]
-        model = InverseDynamics([robot] * len(settings), rigid)
-        self.arrays = model.arrays, self.rows, np.ascontiguousarray(coefficients), np.zeros(2)
+        self.arrays = self.rows, np.zeros(2)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets the observers of the robots with these indices."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import feature_scale, features, linear
-from mrctl.control.feedforward import STEERING_SHARE, CompiledFeedforward
+from mrctl.control.feedforward import STEERING_SHARE, Learner
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot
@@ -67,7 +67,7 @@ def update(x: Array, feedback: Array, s: Row) -> None:
 
 
 class Rls(Record):
-    """Settings of the `rls` feedforward."""
+    """Settings of the learner `rls`."""
 
     step: Annotated[float, Field(gt=0, le=1)] = 0.02
     """Largest share of the feedback that one control period moves into the feedforward. With a larger one, the
@@ -95,7 +95,7 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
 @kernel
 def learn(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
-    arrays: tuple[Any, ...], added: Array,
+    prior: Row, arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
     """One step of `update` on the features of the last output, unless the robot must not learn."""
     s = arrays[0][i]
@@ -109,8 +109,8 @@ def learn(
     return s.norm
 
 
-class RecursiveLeastSquares(CompiledFeedforward):
-    """The feedforward `rls` for B robots: U_ff = θᵀ x, with θ = 0 at the start.
+class RecursiveLeastSquares(Learner):
+    """The learner `rls` for B robots: U_ff = θᵀ x, with θ = 0 at the start.
 
     Attributes:
         rows: One record of `RLS` a robot.

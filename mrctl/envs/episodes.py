@@ -118,11 +118,11 @@ class Episodes(Simulation):
         if action not in ACTION_KINDS:
             raise InputError(f"action: {action!r} is not {', '.join(ACTION_KINDS)}")
         if len(set(map(group_of, scenarios))) > 1:
-            raise InputError("scenarios: differ in world, steering, feedforward, length or rates")
+            raise InputError("scenarios: differ in world, steering, prior, learner, length or rates")
         if len(scenarios) > 1 and first.motion_period != first.control_period:
             raise InputError("motion_period: robots that begin at different times need that of control_period")
         if action == "voltage":  # nobody shall learn from feedback that does not act
-            scenarios = [s.model_copy(update={"feedforward": "none"}) for s in scenarios]
+            scenarios = [s.model_copy(update={"prior": "none", "learner": "none"}) for s in scenarios]
         self._agent: AgentMotion | None = None
         super().__init__(scenarios, threads=threads, motion=self._make_agent if action == "twist" else None)
         self._kind = action

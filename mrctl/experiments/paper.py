@@ -41,7 +41,7 @@ METRICS = ("v_rmse", "omega_rmse", "position_rmse")
 def scenario(feedforward: FeedforwardName, case: str, period: float = FAST, **changes: Any) -> Scenario:  # noqa: ANN401
     """A run of the benchmark in the world of the paper: the lemniscate, on the plant of a named perturbation."""
     name = f"{feedforward}, {case}, {period:g} s"
-    fields: dict[str, Any] = {"feedforward": feedforward, "perturbation": PERTURBATIONS[case]}
+    fields: dict[str, Any] = FEEDFORWARDS[feedforward] | {"perturbation": PERTURBATIONS[case]}
     return Scenario(name=name, reference=Lemniscate(period=period), **fields | IDEAL | changes)
 
 
@@ -53,7 +53,7 @@ def real(tier: Tier) -> list[Scenario]:
     return [
         Scenario(
             name=f"{f}, {case}, {tier}",
-            feedforward=f,
+            **FEEDFORWARDS[f],
             perturbation=PERTURBATIONS[case],
             sensing=Sensing(tier=tier),
             seed=seed,
@@ -146,7 +146,7 @@ def compare(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str,
     table = metrics.summary(result)
     rows = []
     for k, one in enumerate(scenarios):
-        bare = scenarios.index(one.model_copy(update={"feedforward": "none", "name": _bare(one)}))
+        bare = scenarios.index(one.model_copy(update=FEEDFORWARDS["none"] | {"name": _bare(one)}))
         row: dict[str, Any] = {
             "steering": one.steering,
             "plant": next(name for name, p in PERTURBATIONS.items() if p == one.perturbation),

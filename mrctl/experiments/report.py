@@ -14,7 +14,7 @@ import xarray as xr
 from jinja2 import Environment, StrictUndefined
 from pandas.io.formats.style import Styler
 
-from mrctl.control.feedforward import InverseDynamics
+from mrctl.control.feedforward import Prior
 from mrctl.control.pid import Pid
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
@@ -26,9 +26,9 @@ from mrctl.results import metrics, plots
 from mrctl.results.comparison import superiority
 from mrctl.results.dataset import versions
 from mrctl.results.plots import InverseMap
-from mrctl.scenario import Scenario
+from mrctl.scenario import FEEDFORWARDS, Scenario
 
-STATIC = ("none", "model", "oracle")  # feedforwards that do not learn
+STATIC = ("none", "model", "true_model")  # feedforwards that do not learn
 GRID = 41  # points along each side of a heat map
 TEMPLATE = Path(__file__).with_name("report.html")
 
@@ -110,17 +110,17 @@ def _labelled(runs: Mapping[str, xr.Dataset]) -> xr.Dataset:
 def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
     """Drives a scenario again and evaluates the feedforward in steady motion, beside the true inverse dynamics."""
     stages: Stages = user_files.load(choice["controller"]) if "controller" in choice else {}
-    scenario = scenario.model_copy(update={"feedforward": choice.get("feedforward", "none")})
+    scenario = scenario.model_copy(update=FEEDFORWARDS[choice.get("feedforward", "none")])
     simulation = Simulation([scenario], **stages)
     while simulation.running:
         simulation.step()
     lap = simulation.log.ticks[-round(scenario.reference.period / scenario.control_period) :, 0]
     path = np.stack([lap["v_command"], lap["omega_command"]], axis=1)
     v, omega, shape = np.linspace(0, 1.2, GRID), np.linspace(-2, 2, GRID), (GRID, GRID, 2)
-    truth = InverseDynamics([simulation.plant.truth[0]], rigid=scenario.steering == "rigid")
+    truth = Prior([simulation.plant.truth[0]], rigid=scenario.steering == "rigid")
     mine, true = (
-        np.reshape([np.array(stage.output(np.array([[x, y]]), np.zeros((1, 2))))[0] for y in omega for x in v], shape)
-        for stage in (simulation.hierarchy.feedforward, truth)
+        np.reshape([np.array(law(np.array([[x, y]]), np.zeros((1, 2))))[0] for y in omega for x in v], shape)
+        for law in (simulation.hierarchy.feedforward, truth.output)
     )
     return InverseMap(v, omega, mine, true, path)
 
@@ -176,12 +176,12 @@ def scorecard(outcome: Outcome) -> str:
     """The position error of every case under every feedforward, coloured by its ratio to that of PID alone."""
     cells: dict[str, dict[str, Cell]] = {}
     for case, rows in _by_case(outcome, steps=False).items():
-        best = min((_mean(row) for row in rows if row["feedforward"] != "oracle"), default=np.inf)
+        best = min((_mean(row) for row in rows if row["feedforward"] != "true_model"), default=np.inf)
         for row in rows:
             error = row["position_rmse"]
             text = number(1e3 * error["value"]) if error["samples"] else ""
             lost = f"{row['failed']} failed" if row["failed"] else ""
-            bold = _mean(row) <= best < np.inf and row["feedforward"] != "oracle"
+            bold = _mean(row) <= best < np.inf and row["feedforward"] != "true_model"
             ratio = error.get("to_PID", {"value": 1.0})["value"]
             cells.setdefault(case, {})[row["feedforward"]] = Cell(", ".join(filter(None, (text, lost))), ratio, bold)
     return _coloured("scorecard", cells)

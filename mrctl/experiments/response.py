@@ -19,7 +19,7 @@ from mrctl.control.feedforward import STEERING_SCALE
 from mrctl.loop.hierarchy import TAKE_OVER
 from mrctl.loop.simulation import Simulation
 from mrctl.record import InputError
-from mrctl.scenario import Scenario
+from mrctl.scenario import FEEDFORWARDS, Scenario
 from mrctl.theory.references import Line
 
 Array = NDArray[np.float64]
@@ -110,7 +110,7 @@ def measure(scenarios: Sequence[Scenario], channel: int, speed: float = Line().s
     signal[:, channel] = AMPLITUDE * scale * multisine(SAMPLES, harmonics)
     duration = 2 * SAMPLES * first.control_period  # one period to settle, one to measure
     line = Line(length=speed * duration, speed=speed)
-    steady = {"reference": line, "laps": 1, "events": (), "initial_spread": (0.0, 0.0, 0.0), "feedforward": "none"}
+    steady = {"reference": line, "laps": 1, "events": (), "initial_spread": (0.0, 0.0, 0.0)} | FEEDFORWARDS["none"]
     runs = [s.model_copy(update=steady) for s in scenarios]
     shaker = Shaker(signal, 2 * SAMPLES, len(runs))
     simulation = Simulation(runs, feedforward=lambda robot, size: shaker)

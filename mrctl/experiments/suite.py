@@ -19,7 +19,7 @@ from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority
 from mrctl.results.dataset import versions
-from mrctl.scenario import FeedforwardName, Scenario
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.sweep import jobs, store
 from mrctl.sweep.plan import Sweep
 
@@ -88,7 +88,7 @@ def run(chosen: Sequence[Case], choices: Choices, workers: int | None, out: Path
     """
     laps, aside = {}, []
     for place, (name, choice) in enumerate(choices.items(), 1):
-        feedforward = {"feedforward": choice.get("feedforward", "none")}
+        feedforward = FEEDFORWARDS[choice.get("feedforward", "none")]
         scenarios = [s.model_copy(update=feedforward) for case in chosen for s in case.scenarios]
         chunk = min(CHUNK, -(-len(scenarios) // 4))
         sweep = Sweep.of(scenarios, record="laps", chunk=chunk, controller=choice.get("controller"))
@@ -196,7 +196,7 @@ def tables(rows: Sequence[dict[str, Any]]) -> dict[str, pd.DataFrame]:
         if own:
             laps = [f"laps to {BAND:g}× the final V / θ̇ / position"] if unchanged else []
             found[title] = pd.DataFrame(cells, columns=[*header, *laps])
-    if any(row["feedforward"] != "oracle" for row in rows):
+    if any(row["feedforward"] != "true_model" for row in rows):
         best = pd.DataFrame(leaders(rows), columns=["case", *COLUMNS.values()])
         found["Best in each case, and who is level with it"] = best
     header = ["case", "feedforward", "failed", "first lap", "one lap later; worst 5 %", "recovered in V / θ̇ / position"]
@@ -223,11 +223,11 @@ def leaders(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
     """For each case and metric the feedforward with the least mean error, and those that are level with it.
 
     A feedforward is level if the best does not beat it with 95 % confidence in the same runs. One with a failed run is
-    left out, and so is the oracle, which knows the plant.
+    left out, and so is `true_model`, which knows the plant.
     """
     lines = []
     for case in dict.fromkeys(row["case"] for row in rows):
-        own = {str(r["feedforward"]): r for r in rows if r["case"] == case and r["feedforward"] != "oracle"}
+        own = {str(r["feedforward"]): r for r in rows if r["case"] == case and r["feedforward"] != "true_model"}
         fine = [name for name, row in own.items() if not row["failed"]] or list(own)
         cells = []
         for metric in COLUMNS:

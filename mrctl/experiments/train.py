@@ -31,7 +31,7 @@ from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
 from mrctl.results.dataset import versions
-from mrctl.scenario import Scenario
+from mrctl.scenario import FEEDFORWARDS, Scenario
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Circle, Lemniscate, Reference, RoundedSquare, Waypoints, check
@@ -127,7 +127,8 @@ def draw(robot: Robot, plants: int, seed: Sequence[int]) -> list[Scenario]:
             scenarios.append(
                 Scenario(
                     **IDEAL,
-                    steering=STEERINGS[plant % len(STEERINGS)], reference=reference, laps=laps, feedforward="model",
+                    **FEEDFORWARDS["model"],
+                    steering=STEERINGS[plant % len(STEERINGS)], reference=reference, laps=laps,
                     perturbation=perturbation, seed=int(rng.integers(2**32)),
                 )
             )  # fmt: skip

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from mrctl.control import guard as guarding
 from mrctl.control.composite import CompositeAdaptation
 from mrctl.control.design import Motion, motion
-from mrctl.control.features import features, linear
 from mrctl.control.feedforward import (
-    CompiledFeedforward,
     Feedforward,
-    InverseDynamics,
-    NoFeedforward,
+    Learner,
+    NoLearner,
+    Prior,
+    inverse_dynamics,
     learn_nothing,
     nothing,
 )
@@ -54,7 +54,8 @@ CONTROL = np.dtype(
         ("limiter", LIMITER),
         ("pid", PID),
         ("feedback", "f8", 2),  # output of the PID, V (rad/s on a steering channel)
-        ("feedforward", "f8", 2),  # output of the feedforward stage, V (rad/s on a steering channel)
+        ("prior", "f8", 2),  # feedforward of the prior, V
+        ("feedforward", "f8", 2),  # that of prior and learner, V (rad/s on a steering channel)
         ("nominal", "f8", 2),  # output of the nominal inverse dynamics, if the guard is on, V (rad/s)
         ("guard", GUARD),
         ("allocation", ALLOCATION),
@@ -68,7 +69,7 @@ CONTROL = np.dtype(
     align=True,
 )
 
-respond, learn_one = nothing, learn_nothing  # the feedforward of `update`, which `Kernel.calling` replaces
+respond, learn_one = nothing, learn_nothing  # the learner of `update`, which `Kernel.calling` replaces
 
 
 @kernel
@@ -89,12 +90,11 @@ def command_motion(goal: Row, robot: Row, period: float, s: Row) -> None:
 
 
 @kernel
-def apply_voltages(seen: Row, inverse: Array, ones: Array, x: Array, robot: Row, period: float, s: Row) -> bool:
+def apply_voltages(seen: Row, model: Row, robot: Row, period: float, s: Row) -> bool:
     """Guard and allocation: from feedback and feedforward to voltages and steering; returns whether they are finite."""
     command, derivative, a = s.limiter.command, s.limiter.derivative, s.allocation
     if s.guard.on:
-        features(command, derivative, robot.half_track, ones, x)
-        linear(x, inverse, s.nominal)
+        inverse_dynamics(command, derivative, model, s.nominal)
     guard(
         s.guard, s.feedforward, s.nominal, s.error, s.weight_norm, a.saturated, s.voltage, period, robot.rigid,
         s.pid.integral, s.feedback,
@@ -119,21 +119,20 @@ def hand_over(s: Row) -> None:
 
 @kernel
 def update(
-    moves: bool, seen: Rows, goal: Rows, robot: Rows, inverse: Array, ones: Array, x: Array, period: float,
+    moves: bool, seen: Rows, goal: Rows, robot: Rows, model: Rows, period: float, prior: Rows,
     arrays: tuple[Any, ...], control: Rows,
 ) -> tuple[bool, bool]:  # fmt: skip
-    """One control tick of all robots, with the feedforward `respond` and `learn_one`.
+    """One control tick of all robots, with the learner `respond` and `learn_one`.
 
     Args:
         moves: Whether the motion controller acts in this tick.
         seen: Record of `SEEN` of each robot.
         goal: Record of `GOAL` of each robot.
         robot: The nominal robot, one record of `NOMINAL`.
-        inverse: Coefficients of its inverse dynamics on unscaled features, `(8, 2)`.
-        ones: Scale of unscaled features: ones, `(8,)`.
-        x: Scratch for the features, `(8,)`.
+        model: Its inverse dynamics, records of `PRIOR`, of which the first is read.
         period: Control period in s.
-        arrays: Memory and constants of the feedforward.
+        prior: Record of `PRIOR` of each robot.
+        arrays: Memory and constants of the learner.
         control: In and out: record of `CONTROL` of each robot.
 
     Returns:
@@ -147,44 +146,51 @@ def update(
         command_motion(wanted, robot[0], period, s)
         command, derivative = s.limiter.command, s.limiter.derivative
         pid(command, measured.twist, s.allocation.excess, period, s.pid, s.feedback)
+        inverse_dynamics(command, derivative, prior[i], s.prior)
         respond(i, command, derivative, robot[0], arrays, s.feedforward)
-        finite &= apply_voltages(measured, inverse, ones, x, robot[0], period, s)
+        for k in range(2):
+            s.feedforward[k] += s.prior[k]
+        finite &= apply_voltages(measured, model[0], robot[0], period, s)
         s.weight_norm = learn_one(
-            i, command, s.guard.teaching, s.frozen, measured.twist, s.voltage, period, robot[0], arrays, s.added
-        )
+            i, command, s.guard.teaching, s.frozen, measured.twist, s.voltage, period, robot[0], prior[i], arrays,
+            s.added,
+        )  # fmt: skip
         hand_over(s)
         forget |= s.guard.forget
     return finite, forget
 
 
 @cache
-def update_with(stage: type[CompiledFeedforward]) -> Kernel:
-    """Returns the kernel `update` with the two laws of a feedforward."""
+def update_with(stage: type[Learner]) -> Kernel:
+    """Returns the kernel `update` with the two laws of a learner."""
     return update.calling(respond=stage.respond, learn_one=stage.learn_one)
 
 
-def feedforward_of(scenarios: Sequence[Scenario], robot: Robot) -> CompiledFeedforward:
-    """Returns the feedforward that a uniform group of scenarios names."""
+def learner_of(scenarios: Sequence[Scenario], robot: Robot) -> Learner:
+    """Returns the learner that a uniform group of scenarios names."""
     first = scenarios[0]
     rigid, period = first.steering == "rigid", first.control_period
-    if first.feedforward == "none":
-        return NoFeedforward(robot, len(scenarios), rigid, period)
-    if first.feedforward in ("model", "oracle"):  # the events tell the oracle the truth
-        return InverseDynamics([robot] * len(scenarios), rigid)
-    if first.feedforward == "observer":
-        return DisturbanceObserver(robot, [s.observer for s in scenarios], rigid, period)
-    if first.feedforward == "composite":
-        return CompositeAdaptation(robot, [s.composite for s in scenarios], rigid, period)
-    if first.feedforward == "rls":
-        return RecursiveLeastSquares(robot, [s.rls for s in scenarios], rigid, period)
-    return FeedbackErrorLearning(robot, [s.fel for s in scenarios], [s.seed for s in scenarios], rigid, period)
+    match first.learner:
+        case "none":
+            return NoLearner(robot, len(scenarios), rigid, period)
+        case "observer":
+            return DisturbanceObserver(robot, [s.observer for s in scenarios], rigid, period)
+        case "composite":
+            settings = [s.composite for s in scenarios]
+            return CompositeAdaptation(robot, settings, rigid, period, prior=first.prior != "none")
+        case "rls":
+            return RecursiveLeastSquares(robot, [s.rls for s in scenarios], rigid, period)
+        case "fel":
+            seeds = [s.seed for s in scenarios]
+            return FeedbackErrorLearning(robot, [s.fel for s in scenarios], seeds, rigid, period)
 
 
 class Hierarchy:
     """Both controllers for B robots that share steering arrangement and rates.
 
     Attributes:
-        feedforward: The feedforward stage.
+        learner: The learner, or a user's feedforward stage in its place.
+        prior: What the feedforward starts from, beside the learner.
         state: Record of `CONTROL` of each robot, `(B,)`; the following arrays are views of it.
         command: Commanded V in m/s and θ̇ in rad/s, after prefilter and limits, `(B, 2)`.
         derivative: Its derivative in m/s² and rad/s², `(B, 2)`.
@@ -201,18 +207,18 @@ class Hierarchy:
         Args:
             scenarios: A uniform group of scenarios.
             robot: The nominal robot.
-            feedforward: Feedforward stage in place of the one that the scenarios name.
+            feedforward: Feedforward stage in place of the learner that the scenarios name.
         """
         first, size = scenarios[0], len(scenarios)
-        self.feedforward: Feedforward = feedforward_of(scenarios, robot) if feedforward is None else feedforward
-        self._oracle = feedforward is None and first.feedforward == "oracle"
         self._robot, self._rigid = robot, first.steering == "rigid"
+        self.learner: Learner | Feedforward = learner_of(scenarios, robot) if feedforward is None else feedforward
+        self.prior = Prior([None if first.prior == "none" else robot] * size, self._rigid)  # events tell the truth
+        self._told = first.prior == "true_model"
         self._period = first.control_period
         self._every = round(first.motion_period / first.control_period)
         self._tick = 0
         self._record = nominal(robot, self._rigid)
-        self._nominal = InverseDynamics([robot] * size, self._rigid)
-        self._inverse = self._nominal.coefficients[0], np.ones(8), np.zeros(8)
+        self._model = Prior([robot] * size, self._rigid)
         self.state = state = np.zeros(size, CONTROL)
         self._delays = [s.sensing.periods("delay", self._period) * self._period for s in scenarios]
         self._motions: list[Motion] = []
@@ -224,15 +230,14 @@ class Hierarchy:
             state["limiter"]["time_constant"][row] = max(prefilter, self._period)
             self.set_kanayama(row, scenario.kanayama)
             self.set_pid(row, scenario.pid)
-        volts = np.broadcast_to(getattr(self.feedforward, "weight_volts", 0.0), size)
+        volts = np.broadcast_to(getattr(self.learner, "weight_volts", 0.0), size)
         state["guard"] = guarding.fresh([s.guard for s in scenarios], self._record, volts)
-        if not getattr(self.feedforward, "guarded", True):
+        if not getattr(self.learner, "guarded", True):
             state["guard"]["on"] = False
         self.command, self.derivative = state["limiter"]["command"], state["limiter"]["derivative"]
         self.feedback, self.weight_norm = state["feedback"], state["weight_norm"]
         self.output, self.saturated = state["allocation"]["command"], state["allocation"]["saturated"]
-        built_in = isinstance(self.feedforward, CompiledFeedforward)
-        self._update = update_with(type(self.feedforward)) if built_in else update
+        self._update = update_with(type(self.learner)) if isinstance(self.learner, Learner) else update
         self.finite = True
 
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
@@ -253,9 +258,9 @@ class Hierarchy:
         self.state["learning_off"][row] = not on
 
     def set_truth(self, row: int, robot: Robot) -> None:
-        """Tells the feedforward `oracle` the true parameters of one robot; other feedforwards ignore them."""
-        if self._oracle and isinstance(self.feedforward, InverseDynamics):
-            self.feedforward.set_robot(row, robot)
+        """Tells the prior `true_model` the true parameters of one robot; other priors ignore them."""
+        if self._told:
+            self.prior.set_robot(row, robot)
 
     def renew(self, row: int, scenario: Scenario) -> None:
         """Gives one robot the settings and the initial memory of a scenario, before `reset`.
@@ -266,8 +271,9 @@ class Hierarchy:
         """
         renewed = Hierarchy([scenario], self._robot)
         self.state[row] = renewed.state[0]
-        mine, other = self.feedforward, renewed.feedforward
-        assert isinstance(mine, CompiledFeedforward) and isinstance(other, CompiledFeedforward)
+        self.prior.rows[row] = renewed.prior.rows[0]
+        mine, other = self.learner, renewed.learner
+        assert isinstance(mine, Learner) and isinstance(other, Learner)
         mine.take(row, other)
 
     def restart_clock(self) -> None:
@@ -285,9 +291,15 @@ class Hierarchy:
         """
         self.command[rows] = twist[rows]
         self.state["allocation"]["angle"][rows] = steering_angle[rows]
-        # The feedforward already gives a part of the voltage that the nominal robot needs.
-        integral = self._nominal.output(twist, acceleration) - self.feedforward.output(twist, acceleration)
-        self.state["pid"]["integral"][rows] = integral[rows]
+        self.state["pid"]["integral"][rows] = self._steady(twist, acceleration)[rows]
+
+    def _steady(self, twist: Array, acceleration: Array) -> Array:
+        """Returns what the nominal robot needs for a motion beyond what the feedforward gives already, `(B, 2)`."""
+        return self._model.output(twist, acceleration) - self.feedforward(twist, acceleration)
+
+    def feedforward(self, command: Array, derivative: Array) -> Array:
+        """Returns the feedforward of prior and learner at a motion, `(B, 2)`."""
+        return self.prior.output(command, derivative) + self.learner.output(command, derivative)
 
     def update(self, seen: Rows, goal: Rows) -> Array:
         """Computes the commands of one control tick.
@@ -299,12 +311,12 @@ class Hierarchy:
         Returns:
             `output`, `(B, 4)`.
         """
-        stage = self.feedforward
-        assert isinstance(stage, CompiledFeedforward)
+        stage = self.learner
+        assert isinstance(stage, Learner)
         moves = self._tick % self._every == 0
         self._tick += 1
         self.finite, forget = self._update.compiled(
-            moves, seen, goal, self._record, *self._inverse, self._period, stage.arrays, self.state
+            moves, seen, goal, self._record, self._model.rows, self._period, self.prior.rows, stage.arrays, self.state
         )
         if forget:
             self._forget()
@@ -323,8 +335,8 @@ class Hierarchy:
             self.state["guard"]["gain"][rows] *= UNSURE
 
     def _restore(self, rows: NDArray[np.intp]) -> bool:
-        """Resets the learners of these robots; returns whether the feedforward can be reset."""
-        assert isinstance(self.feedforward, CompiledFeedforward)
-        self.feedforward.restore(rows)
+        """Resets the learners of these robots; returns whether the stage can be reset."""
+        assert isinstance(self.learner, Learner)
+        self.learner.restore(rows)
         self.weight_norm[rows] = 0.0
         return True

@@ -26,7 +26,7 @@ from mrctl.physics import mjcf
 from mrctl.physics.plant import Plant, build
 from mrctl.record import InputError
 from mrctl.results import dataset
-from mrctl.scenario import Event, Scenario
+from mrctl.scenario import Event, Scenario, named
 from mrctl.sensing.estimators import Estimator
 from mrctl.sensing.sensors import Sensors
 from mrctl.theory.references import check
@@ -155,7 +155,7 @@ def group_of(s: Scenario) -> Hashable:
     net = s.fel.hidden, s.composite.weights
     rates = s.ticks, s.physics_step, s.control_period, s.motion_period
     chain = s.sensing.source, s.sensing.periods("delay", s.control_period)
-    return s.world, s.robot, s.steering, s.feedforward, *rates, *net, *chain
+    return s.world, s.robot, s.steering, s.prior, s.learner, *rates, *net, *chain
 
 
 class Simulation:
@@ -197,7 +197,7 @@ class Simulation:
         factories: dict[str, Any] = {name: factory for name, factory in stages.items() if factory}
         users = {name: UserStage(name, factory, robot, size) for name, factory in factories.items()}
         names = {name: getattr(factory, "__name__", "custom") for name, factory in factories.items()}
-        self._feedforward = names.pop("feedforward", first.feedforward)
+        self._feedforward = named(first.prior, names.pop("feedforward", first.learner))
         self._label = " + ".join([self._feedforward, *names.values()])
 
         self._lead = first.sensing.periods("delay", self.period)
@@ -308,7 +308,7 @@ class Simulation:
 
     def result(self) -> xr.Dataset:
         """Returns the signals so far; if every robot has failed, of the whole run, with NaN at the end."""
-        stage = self.hierarchy.feedforward
+        stage = self.hierarchy.learner
         weights = stage.weights.copy() if isinstance(stage, FeedbackErrorLearning) else None
         size, robot = len(self.scenarios), self.plant.robot
         length = self.tick if self.running else self.ticks

@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.control.feedforward import Learner
 from mrctl.control.kanayama import posture_error
 from mrctl.control.pid import pid
 from mrctl.control.stages import METHODS, Factory
@@ -117,13 +118,11 @@ def command_all(seen: Rows, goal: Rows, robot: Rows, period: float, control: Row
 
 
 @kernel
-def apply_all(
-    seen: Rows, inverse: Array, ones: Array, x: Array, robot: Rows, period: float, control: Rows
-) -> tuple[bool, bool]:
+def apply_all(seen: Rows, model: Rows, robot: Rows, period: float, control: Rows) -> tuple[bool, bool]:
     """Calls `apply_voltages` for all robots; returns whether all are finite, and whether a learner is to be reset."""
     finite, forget = True, False
     for i in range(len(control)):
-        finite &= apply_voltages(seen[i], inverse, ones, x, robot[0], period, control[i])
+        finite &= apply_voltages(seen[i], model[0], robot[0], period, control[i])
         forget |= control[i].guard.forget
     return finite, forget
 
@@ -153,7 +152,7 @@ class UserHierarchy(Hierarchy):
         """Bumpless start; see `Hierarchy.reset`."""
         self.command[rows] = twist[rows]
         self.state["allocation"]["angle"][rows] = steering_angle[rows]
-        integral = self._nominal.output(twist, acceleration) - self._forward(twist, acceleration)
+        integral = self._steady(twist, acceleration)
         self.state["pid"]["integral"][rows] = integral[rows]
         if stage := self._stages.get("feedback"):
             stage.call("reset", integral, self._period)
@@ -174,9 +173,9 @@ class UserHierarchy(Hierarchy):
         feedback = self._stages.get("feedback")
         if feedback:
             self._feed_back(feedback, seen["twist"])
-        state["feedforward"] = self._forward(self.command, self.derivative)
+        state["feedforward"] = self.feedforward(self.command, self.derivative)
         self._read_weight_norm()
-        self.finite, forget = apply_all(seen, *self._inverse, *constants, state)
+        self.finite, forget = apply_all(seen, self._model.rows, *constants, state)
         if stage := self._stages.get("steering"):
             self._steer(stage, seen["lost"].any(axis=1))
         if (added := self._learn(seen["twist"])) is not None:
@@ -207,12 +206,13 @@ class UserHierarchy(Hierarchy):
         known = 0.0 if integral is None else stage.checked(integral, self.feedback.shape, "`integral`")
         state["pid"]["integral"] = known
 
-    def _forward(self, command: Array, derivative: Array) -> Array:
-        """Returns the output of the feedforward, the user's or a built-in one."""
+    def feedforward(self, command: Array, derivative: Array) -> Array:
+        """Returns the feedforward of the prior and of the learner, the user's or a built-in one."""
         stage = self._feedforward_stage
         if not stage:
-            return self.feedforward.output(command, derivative)
-        return self._finite_rows(stage, stage.output(command, derivative))
+            return super().feedforward(command, derivative)
+        learned = self._finite_rows(stage, stage.output(command, derivative))
+        return self.prior.output(command, derivative) + learned
 
     def _steer(self, stage: UserStage, lost: NDArray[np.bool]) -> None:
         """Calls the user's steering, and limits it as `allocate` does; `lost` are the robots with a limited current."""
@@ -239,8 +239,9 @@ class UserHierarchy(Hierarchy):
         """Lets the feedforward learn, the user's or a built-in one; returns the change of its output."""
         state, stage = self.state, self._feedforward_stage
         values = state["guard"]["teaching"], state["frozen"], twist, state["voltage"]
-        if not stage:
-            return self.feedforward.learn(*values)
+        if isinstance(self.learner, Learner):
+            return self.learner.learn(*values, self.prior.rows)
+        assert stage
         added = stage.call("learn", *values)
         if added is None:
             return None
@@ -248,19 +249,19 @@ class UserHierarchy(Hierarchy):
 
     def _read_weight_norm(self) -> None:
         """Reads the norm of the learner's weights, if the feedforward has it."""
-        norm = getattr(self.feedforward, "weight_norm", None)
+        norm = getattr(self.learner, "weight_norm", None)
         if norm is None:
             return
         stage = self._feedforward_stage
         self.weight_norm[:] = stage.checked(norm, self.weight_norm.shape, "`weight_norm`") if stage else norm
 
     def _restore(self, rows: NDArray[np.intp]) -> bool:
-        if not getattr(self.feedforward, "restore", None):
+        if not getattr(self.learner, "restore", None):
             return False
         if self._feedforward_stage:
             self._feedforward_stage.call("restore", rows)
         else:
-            cast(Any, self.feedforward).restore(rows)
+            cast(Any, self.learner).restore(rows)
         return True
 
     def _finite_rows(self, stage: UserStage, answer: Array) -> Array:

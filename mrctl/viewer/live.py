@@ -41,6 +41,7 @@ BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
 }
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
+DRIVER = ("prior", "learner")  # what the ghosts differ in
 NEW_RUN = ("world", "steering", "sensing", "reference", "seed", "prefilter")
 HIDDEN = (
     "name",
@@ -112,7 +113,7 @@ class Live(Page):
         with tabs.add_tab("Robot"):
             self._controls.add(first, only=["perturbation"])
         with tabs.add_tab("Controllers"):
-            self._controls.add(first, only=["feedforward"])
+            self._controls.add(first, only=DRIVER)
             with gui.add_folder("compare with"):
                 self._ghosts: dict[FeedforwardName, viser.GuiCheckboxHandle] = {
                     name: gui.add_checkbox(name, False) for name in FEEDFORWARDS
@@ -122,7 +123,7 @@ class Live(Page):
             self._learning = gui.add_checkbox("learning", True)
             self.on(self._learning, lambda on: self._apply_event(learning=on))
             self._gains = gui.add_html("")
-            self._controls.add(first, only=[n for n in changing if n not in (*NEW_RUN, "perturbation", "feedforward")])
+            self._controls.add(first, only=[n for n in changing if n not in (*NEW_RUN, "perturbation", *DRIVER)])
         with tabs.add_tab("Run"):
             self._controls.add(first, only=NEW_RUN)
 
@@ -214,10 +215,11 @@ class Live(Page):
         if name in CHANGEABLE:
             return self._apply_event(**{name: changed(self.session.state()[name], rest, value)})
         start = self.session.start
-        touched = start[:1] if name == "feedforward" else start
+        touched = start[:1] if name in DRIVER else start
         others = start[len(touched) :]
         new = [changed(self._present(s), path, value) for s in touched] + [self._present(s) for s in others]
-        new = [new[0], *(s for s in new[1:] if name != "feedforward" or s.feedforward != value)]
+        if name in DRIVER:
+            new = [new[0], *(s for s in new[1:] if s.feedforward != new[0].feedforward)]
         self._restart(new)
 
     def _present(self, scenario: Scenario) -> Scenario:
@@ -229,7 +231,7 @@ class Live(Page):
         first, *ghosts = map(self._present, self.session.start)
         ghosts = [s for s in ghosts if s.feedforward != name]
         if wanted and name != first.feedforward:
-            ghosts.append(first.model_copy(update={"feedforward": name, "name": ""}))
+            ghosts.append(first.model_copy(update=FEEDFORWARDS[name] | {"name": ""}))
         self._restart([first, *ghosts])
 
     def _restart(self, scenarios: Sequence[Scenario]) -> None:

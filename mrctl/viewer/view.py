@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
-from mrctl.scenario import FeedforwardName, Scenario
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
 if TYPE_CHECKING:
     from mrctl.viewer.page import Page
@@ -52,7 +52,7 @@ def view(
     if run is not None:
         raise InputError("run: only a result or a sweep has several")
     scenario = Scenario() if file is None else Scenario.from_toml(file)
-    ghosts = [scenario.model_copy(update={"feedforward": name, "name": ""}) for name in compare]
+    ghosts = [scenario.model_copy(update=FEEDFORWARDS[name] | {"name": ""}) for name in compare]
     if export is not None:
         result = simulate([scenario, *ghosts], progress=True)
         recordings = [Recording(result.isel(run=k)) for k in range(result.sizes["run"])]
