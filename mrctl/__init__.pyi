@@ -16,8 +16,10 @@ from .results.export import export as export
 from .results.metrics import guard_events as guard_events
 from .results.metrics import per_lap as per_lap
 from .results.metrics import summary as summary
+from .scenario import FEEDFORWARDS as FEEDFORWARDS
 from .scenario import Event as Event
 from .scenario import Scenario as Scenario
+from .scenario import replicates as replicates
 from .sensing.tiers import Sensing as Sensing
 from .sweep.plan import Axis as Axis
 from .sweep.plan import Sweep as Sweep

@@ -262,7 +262,10 @@ def reproduce(out: Path = Path("reproduction")) -> None:
 
 
 def suite(
-    feedforward: tuple[FeedforwardName, ...] = tuple(FEEDFORWARDS),
+    feedforward: Annotated[tuple[FeedforwardName | Literal["hindsight"], ...], tyro.conf.arg(metavar="NAME ...")] = (
+        *FEEDFORWARDS,
+        "hindsight",
+    ),
     controller: tuple[str, ...] = (),
     seeds: int | None = None,
     random: int | None = None,
@@ -270,12 +273,13 @@ def suite(
     workers: int | None = None,
     out: Path = Path("suite"),
 ) -> None:
-    """Compares feedforwards under every uncertainty, with the same seeds; the same command resumes after an interrupt.
+    """Compares feedforwards under every uncertainty, with the same draws; the same command resumes after an interrupt.
 
     Args:
-        feedforward: Feedforwards to compare.
+        feedforward: Feedforwards to compare, such as fel or model+composite; hindsight is the best fixed one, which is
+            found for each run by repeating it.
         controller: Controllers of your own to compare, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion.
-        seeds: Number of runs of each case; by default 10, or 3 with --quick.
+        seeds: Number of replicates of each case; by default 20, or 3 with --quick.
         random: Number of random scenarios; by default 300, or 20 with --quick.
         quick: Run a selection of cases with fewer laps, in two minutes instead of half an hour.
         workers: Number of processes on this machine; by default one for each core.
@@ -283,7 +287,7 @@ def suite(
     """
     from mrctl.experiments import suite as uncertainty
 
-    default_seeds, default_random = (3, 20) if quick else (10, 300)
+    default_seeds, default_random = (3, 20) if quick else (20, 300)
     seeds = default_seeds if seeds is None else seeds
     random = default_random if random is None else random
     report = uncertainty.suite(feedforward, controller, seeds, random, quick, workers, out)
@@ -410,7 +414,7 @@ def bench(json: bool = False) -> None:
 def view(
     file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml|RESULT")] = None,
     /,
-    compare: tuple[FeedforwardName, ...] = (),
+    compare: Annotated[tuple[FeedforwardName, ...], tyro.conf.arg(metavar="NAME ...")] = (),
     number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
     export: Path | None = None,
     host: str = "127.0.0.1",
@@ -420,7 +424,8 @@ def view(
 
     Args:
         file: Scenario file, or result of `mrctl run --out` or `mrctl sweep`; by default a live default scenario.
-        compare: Feedforwards of further robots, which are shown as ghosts with the same seed and events.
+        compare: Feedforwards of further robots, such as none or model+composite, which are shown as ghosts with the
+            same seed and events.
         number: Number of the run to show first, in a result or sweep.
         export: HTML file to write instead of serving a page; it plays without a server.
         host: Address to listen on; an address other than 127.0.0.1 lets others in without a password.

@@ -8,6 +8,7 @@ from __future__ import annotations
 from math import ceil
 from typing import Annotated, Any, Literal, get_args
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from mrctl.control.composite import Composite
@@ -168,6 +169,34 @@ class Scenario(Record):
     def ticks(self) -> int:
         """Number of control periods in the run."""
         return round(self.duration / self.control_period)
+
+
+def replicates(scenario: Scenario, count: int, first: int = 0) -> list[Scenario]:
+    """Returns independent repetitions of a run: each is another robot of the kind, on another day.
+
+    Two runs that differ in their noise alone are nearly copies, and say little about robots. A replicate draws its
+    seed, and what nobody knows about a robot: see `Perturbation.drawn`. Replicate k has the same draws whatever the
+    scenario is, so that replicates of two scenarios are pairs; an event's perturbation has those of the start.
+
+    Args:
+        scenario: The run; its seed is replaced.
+        count: Number of replicates.
+        first: Number of the first one, which is its seed.
+
+    Raises:
+        InputError: A drawn perturbation is beyond its limits.
+    """
+    found = []
+    for draw in range(first, first + count):
+        events = tuple(
+            e.model_copy(update={"perturbation": e.perturbation.drawn(np.random.default_rng([draw, 5]))})
+            if e.perturbation
+            else e
+            for e in scenario.events
+        )
+        drawn = {"perturbation": scenario.perturbation.drawn(np.random.default_rng([draw, 5]))}
+        found.append(scenario.model_copy(update={**drawn, "events": events, "seed": draw}))
+    return found
 
 
 def whole(value: float, unit: float, name: str, unit_name: str) -> int:

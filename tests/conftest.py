@@ -15,7 +15,7 @@ import sys
 from mrctl import Line, Scenario, per_lap, simulate
 
 for name in sys.argv[1:]:
-    runs = [Scenario(reference=Line(length=0.8), laps=1, feedforward=name, seed=seed) for seed in range(2)]
+    runs = [Scenario(reference=Line(length=0.8), laps=1, prior="model", learner=name, seed=seed) for seed in range(2)]
     per_lap(simulate(runs))
 """
 
@@ -58,7 +58,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     cache, digest = session.config.cache, kernel_files_digest()
     if hasattr(session.config, "workerinput") or cache is None or cache.get("mrctl/compiled", "") == digest:
         return
-    halves = ("fel", "none", "model"), ("composite", "rls", "observer")
+    halves = ("fel", "none"), ("composite", "rls", "observer")
     processes = [subprocess.Popen([sys.executable, "-c", COMPILE, *names]) for names in halves]
     if not any(process.wait() for process in processes):
         cache.set("mrctl/compiled", digest)

@@ -151,6 +151,7 @@ class Learner(ABC):
             what that added to the output of robot i to `added`, `(2,)`, and returns the norm of the weights. `prior` is
             the record of `PRIOR` of robot i.
         arrays: Memory and constants of the kernels, a tuple of arrays.
+        prior: What is added to its output; at first nothing.
         guarded: Whether the guard watches it.
         weight_norm: Norm of the weights, `(B,)`.
         weight_volts: Voltage in V that weights of norm one give for features of size one; 0 if there are no weights.
@@ -165,6 +166,7 @@ class Learner(ABC):
     def __init__(self, robot: Robot, size: int, rigid: bool, period: float) -> None:
         """Takes the nominal robot, the number of robots, whether channel two is steering, and the period in s."""
         self.robot, self.period = nominal(robot, rigid), period
+        self.prior = Prior([None] * size, rigid)
         self.weight_norm = np.zeros(size)
         self._command, self._voltage, self._added = np.zeros((3, size, 2))
 
@@ -186,11 +188,11 @@ class Learner(ABC):
         _respond_all(type(self))(self._command, _own(derivative), self.robot, self.arrays, self._voltage)
         return self._voltage
 
-    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array, prior: Rows) -> Array:
-        """Lets all robots learn; see `Feedforward.learn`. `prior` has a record of `PRIOR` for each."""
+    def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
+        """Lets all robots learn; see `Feedforward.learn`."""
         _learn_all(type(self))(
             self._command, _own(feedback), _own(saturated), _own(twist), _own(voltage), self.period, self.robot,
-            prior, self.arrays, self._added, self.weight_norm,
+            self.prior.rows, self.arrays, self._added, self.weight_norm,
         )  # fmt: skip
         return self._added
 

@@ -163,7 +163,7 @@ def squared_norm(vector: Array) -> float:
 
 
 @kernel
-def update(feedback: Array, s: Row, w: Array, prior: Array, hidden: Array, gradient: Array) -> None:
+def update(feedback: Array, s: Row, w: Array, initial: Array, hidden: Array, gradient: Array) -> None:
     """One normalised step of feedback-error learning, with leak, dead zone and projection.
 
         ΔW = μ Jᵀe / (‖Jᵀe‖²/‖e‖² + ε) − leak (W − W₀),    ‖W − W₀‖ ≤ bound
@@ -175,7 +175,7 @@ def update(feedback: Array, s: Row, w: Array, prior: Array, hidden: Array, gradi
         feedback: Feedback of the two channels in V (rad/s on a steering channel), `(2,)`.
         s: In and out: a record of `FEL`, whose `x` and `output` are those of the last output.
         w: In and out: flat weights W, `(n,)`.
-        prior: Initial weights W₀, `(n,)`.
+        initial: Initial weights W₀, `(n,)`.
         hidden: In and out: activations at `x`, `(units,)`.
         gradient: Scratch, `(n,)`.
     """
@@ -189,12 +189,12 @@ def update(feedback: Array, s: Row, w: Array, prior: Array, hidden: Array, gradi
     rate = s.step / (squared_norm(gradient) / power + REGULARISATION)
     distance = gradient  # from here on W − W₀, in the same memory
     for n in range(w.shape[0]):
-        w[n] += rate * gradient[n] - s.leak * (w[n] - prior[n])
-        distance[n] = w[n] - prior[n]
+        w[n] += rate * gradient[n] - s.leak * (w[n] - initial[n])
+        distance[n] = w[n] - initial[n]
     s.norm = np.sqrt(squared_norm(distance))
     if s.norm > s.bound:
         for n in range(w.shape[0]):
-            w[n] = prior[n] + (w[n] - prior[n]) * s.bound / s.norm
+            w[n] = initial[n] + (w[n] - initial[n]) * s.bound / s.norm
         s.norm = s.bound
     network(s.x, w, hidden, s.scale, s.output)
 
@@ -219,12 +219,12 @@ def learn(
     At the bound of the weights `added` is zero: the projection takes away elsewhere what the step adds here, so the
     PID's integral must not give up its share.
     """
-    rows, _, weights, prior, hidden, gradient = arrays
+    rows, _, weights, initial, hidden, gradient = arrays
     s = rows[i]
     added[0] = added[1] = 0.0
     if frozen == 0 and s.step > 0:
         before, before_second = s.output[0], s.output[1]
-        update(feedback, s, weights[i], prior[i], hidden[i], gradient)
+        update(feedback, s, weights[i], initial[i], hidden[i], gradient)
         if s.norm < s.bound:
             added[0], added[1] = s.output[0] - before, s.output[1] - before_second
     return s.norm
@@ -235,7 +235,7 @@ class FeedbackErrorLearning(Learner):
 
     Attributes:
         weights: Flat weights W, `(B, n)`.
-        prior: Initial weights W₀, to which leak and projection refer, `(B, n)`.
+        initial: Initial weights W₀, to which leak and projection refer, `(B, n)`.
         weight_norm: ‖W − W₀‖, `(B,)`.
         weight_volts: Output scale in V, `(B,)`.
     """
@@ -256,19 +256,19 @@ class FeedbackErrorLearning(Learner):
             InputError: A weights file is missing, broken or of another shape.
         """
         super().__init__(robot, len(settings), rigid, period)
-        self.prior = np.array(
+        self.initial = np.array(
             [
                 load_weights(s.weights, s.hidden) if s.weights else initial_weights(s.hidden, seed)
                 for s, seed in zip(settings, seeds, strict=True)
             ]
         )
-        self.weights = self.prior.copy()
+        self.weights = self.initial.copy()
         self.weight_volts = np.array([s.output_scale for s in settings])
         self.rows = fresh(settings, rigid)
-        hidden = np.zeros((len(settings), settings[0].hidden))
-        self.arrays = self.rows, feature_scale(robot), self.weights, self.prior, hidden, np.zeros(self.prior.shape[1])
+        hidden, gradient = np.zeros((len(settings), settings[0].hidden)), np.zeros(self.initial.shape[1])
+        self.arrays = self.rows, feature_scale(robot), self.weights, self.initial, hidden, gradient
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to their initial weights."""
-        self.weights[rows] = self.prior[rows]
+        self.weights[rows] = self.initial[rows]
         self.rows["norm"][rows] = self.weight_norm[rows] = 0.0

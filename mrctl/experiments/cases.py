@@ -12,17 +12,21 @@ from scipy.optimize import brentq
 from mrctl.control.pid import Pid
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
-from mrctl.scenario import Event, Scenario
+from mrctl.scenario import Event, Scenario, replicates
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Lemniscate, Waypoints, random_spline
 from mrctl.theory.robot import STEERINGS, Robot
 
+HINDSIGHT = "hindsight"  # the best fixed feedforward, which is found by repeating the run
+REFERENCES = ("true_model", HINDSIGHT)  # feedforwards that know the plant, and compete with nobody
 LADDER = ("nominal", "mass +50 %", "supply -20 %", "all")  # plants of every steering arrangement
 STEPS = (
     "mass +50 %", "payload ahead", "payload aside", "left wheel +5 %", "drive friction x3", "resistance +30 %",
     "motor constant -15 %", "supply -20 %", "delay 20 ms", "tyre friction 0.2", "left tyre on ice", "slope 10°", "all",
 )  # fmt: skip
+LASTING = ("left_radius_factor", "right_radius_factor", "slope")  # what does not change while a robot drives
+FLOOR = ("nominal", "all")  # plants that are also driven with half the physics step
 SHORT, LONG = 12.0, 18.0  # s, lap times of the benchmark, and of slower laps to learn on
 LAP_TIMES = (8.0, 10.0, 12.0, 16.0, 20.0, 24.0, 30.0)  # s, of random splines; few, so that runs share a batch
 RANDOM_LAPS = 4
@@ -32,7 +36,7 @@ BAND = 1.2  # ratio to the error before a step, or to the final error, that coun
 
 
 class Case(NamedTuple):
-    """Runs that differ in their seeds alone, or the random scenarios."""
+    """Replicates of one run, which differ in their draws, or the random scenarios."""
 
     name: str
     part: str
@@ -76,6 +80,7 @@ PARTS = {
     "learning": "Learning switched on, and off",
     "steering": "Other steering arrangements",
     "random": "Random robots, splines and perturbations",
+    "floor": "Half the physics step: what the integrator resolves",
 }
 
 
@@ -83,7 +88,8 @@ def cases(seeds: int, random: int, quick: bool) -> list[Case]:
     """The cases of the suite, the longest runs first.
 
     Args:
-        seeds: Number of runs of each case; all cases have the same seeds.
+        seeds: Number of replicates of each case; all cases have the same draws. After a step and its return the robot
+            is not quite the one before, but another draw.
         random: Number of random scenarios.
         quick: Whether to take a selection of the cases with fewer laps.
     """
@@ -93,8 +99,10 @@ def cases(seeds: int, random: int, quick: bool) -> list[Case]:
 
     def add(part: str, name: str, change: int = 0, back: int = 0, **fields: Any) -> None:  # noqa: ANN401
         changed = base.model_copy(update=fields)
-        runs = tuple(changed.model_copy(update={"name": name, "seed": seed}) for seed in range(seeds))
-        found.append(Case(name, part, runs, change, back))
+        runs = [run.model_copy(update={"name": name}) for run in replicates(changed, seeds)]
+        if back:
+            runs = [_another_on_return(run) for run in runs]
+        found.append(Case(name, part, tuple(runs), change, back))
 
     for name in ("supply -20 %", "payload ahead") if quick else STEPS:
         events = (
@@ -112,6 +120,8 @@ def cases(seeds: int, random: int, quick: bool) -> list[Case]:
         add("learning", f"{name}, learning from half time", half + 1, perturbation=PERTURBATIONS[name], events=events)
     for name in (*LADDER, "delay 20 ms") if quick else PERTURBATIONS:
         add("steady", name, perturbation=PERTURBATIONS[name])
+    for name in FLOOR:
+        add("floor", f"{name}, half the step", perturbation=PERTURBATIONS[name], physics_step=base.physics_step / 2)
     if not quick:
         for tier in ("ideal", "field"):
             add("steady", f"sensing {tier}", sensing=Sensing(tier=tier))
@@ -126,6 +136,14 @@ def cases(seeds: int, random: int, quick: bool) -> list[Case]:
     if random:
         found.append(Case("random", "random", tuple(random_scenarios(random))))
     return found
+
+
+def _another_on_return(run: Scenario) -> Scenario:
+    """The run whose last event brings back a robot of another draw; its wheels and the floor stay what they were."""
+    *before, last = run.events
+    back = Perturbation().drawn(np.random.default_rng([run.seed, 6]))
+    back = back.model_copy(update={name: getattr(run.perturbation, name) for name in LASTING})
+    return run.model_copy(update={"events": (*before, last.model_copy(update={"perturbation": back}))})
 
 
 def random_scenarios(count: int) -> list[Scenario]:

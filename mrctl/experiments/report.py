@@ -18,7 +18,7 @@ from mrctl.control.feedforward import Prior
 from mrctl.control.pid import Pid
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
-from mrctl.experiments.cases import BAND, SLOW, Choices, Outcome
+from mrctl.experiments.cases import BAND, REFERENCES, SLOW, Choices, Outcome
 from mrctl.experiments.tables import number
 from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation
@@ -28,7 +28,7 @@ from mrctl.results.dataset import versions
 from mrctl.results.plots import InverseMap
 from mrctl.scenario import FEEDFORWARDS, Scenario
 
-STATIC = ("none", "model", "true_model")  # feedforwards that do not learn
+STATIC = ("none", "model", *REFERENCES)  # feedforwards that do not learn
 GRID = 41  # points along each side of a heat map
 TEMPLATE = Path(__file__).with_name("report.html")
 
@@ -176,12 +176,12 @@ def scorecard(outcome: Outcome) -> str:
     """The position error of every case under every feedforward, coloured by its ratio to that of PID alone."""
     cells: dict[str, dict[str, Cell]] = {}
     for case, rows in _by_case(outcome, steps=False).items():
-        best = min((_mean(row) for row in rows if row["feedforward"] != "true_model"), default=np.inf)
+        best = min((_mean(row) for row in rows if row["feedforward"] not in REFERENCES), default=np.inf)
         for row in rows:
             error = row["position_rmse"]
             text = number(1e3 * error["value"]) if error["samples"] else ""
             lost = f"{row['failed']} failed" if row["failed"] else ""
-            bold = _mean(row) <= best < np.inf and row["feedforward"] != "true_model"
+            bold = _mean(row) <= best < np.inf and row["feedforward"] not in REFERENCES
             ratio = error.get("to_PID", {"value": 1.0})["value"]
             cells.setdefault(case, {})[row["feedforward"]] = Cell(", ".join(filter(None, (text, lost))), ratio, bold)
     return _coloured("scorecard", cells)

@@ -214,6 +214,8 @@ class Hierarchy:
         self.learner: Learner | Feedforward = learner_of(scenarios, robot) if feedforward is None else feedforward
         self.prior = Prior([None if first.prior == "none" else robot] * size, self._rigid)  # events tell the truth
         self._told = first.prior == "true_model"
+        if isinstance(self.learner, Learner):
+            self.learner.prior = self.prior
         self._period = first.control_period
         self._every = round(first.motion_period / first.control_period)
         self._tick = 0

@@ -10,7 +10,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.control.feedforward import Learner
 from mrctl.control.kanayama import posture_error
 from mrctl.control.pid import pid
 from mrctl.control.stages import METHODS, Factory
@@ -239,9 +238,8 @@ class UserHierarchy(Hierarchy):
         """Lets the feedforward learn, the user's or a built-in one; returns the change of its output."""
         state, stage = self.state, self._feedforward_stage
         values = state["guard"]["teaching"], state["frozen"], twist, state["voltage"]
-        if isinstance(self.learner, Learner):
-            return self.learner.learn(*values, self.prior.rows)
-        assert stage
+        if not stage:
+            return self.learner.learn(*values)
         added = stage.call("learn", *values)
         if added is None:
             return None

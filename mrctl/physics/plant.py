@@ -125,7 +125,7 @@ class Plant(ABC):
     Attributes:
         state: One record of `PLANT` a robot; `reading`, `applied` and `failed` are views of it.
         robot: The nominal robot, which is all that a controller may know.
-        truth: The robots as perturbed, for the oracle.
+        truth: The robots as perturbed, for the prior `true_model`.
         reading: One record of `READING` a robot, current after `reset` and `step`.
         applied: Voltages at the terminals, left and right, `(B, 2)` in V.
         failed: Which robots have stopped, `(B,)`.

@@ -95,7 +95,7 @@ def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_00
     return Ratio(value, low, high, int(both.sum()), int((~fine[0]).sum()), int((~fine[1]).sum()))
 
 
-def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95) -> Superiority:
+def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 0.0) -> Superiority:
     """Probability that the error of A is below that of B in the same run, ties counting half, failures as infinite.
 
     The interval is Wilson's (1927) score interval, which keeps its width where all pairs agree; a bootstrap would not.
@@ -104,6 +104,7 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95) -> Superiority:
         a: One number a run (n,); NaN or infinite where it failed.
         b: The same runs under the other controller (n,).
         level: Confidence level, between 0 and 1.
+        floor: Difference up to which two errors are a tie, in their unit: what the integrator does not resolve.
 
     Raises:
         InputError: `a` and `b` differ in length.
@@ -111,7 +112,9 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95) -> Superiority:
     if not 0 < level < 1:
         raise InputError(f"level: {level} is not between 0 and 1")
     first, second = (np.where(np.isfinite(one), one, np.inf) for one in _pairs(a, b))
-    wins, ties, n = int((first < second).sum()), int((first == second).sum()), len(first)
+    tied = first == second
+    np.less_equal(np.abs(first - second, where=~tied, out=np.zeros(len(first))), floor, where=~tied, out=tied)
+    wins, ties, n = int(((first < second) & ~tied).sum()), int(tied.sum()), len(first)
     if not n:
         return Superiority(np.nan, np.nan, np.nan, 0, 0, 0)
     p, z = (wins + ties / 2) / n, NormalDist().inv_cdf((1 + level) / 2)

@@ -319,6 +319,50 @@ def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor
     return xr.DataArray(number, {"run": laps["run"].values}, ("run",), "recovery_laps", attrs)
 
 
+def over_laps(laps: xr.Dataset, metric: str) -> xr.DataArray:
+    """Returns a root mean square over all laps of each run, such as that of `position_rmse`; NaN if the run failed.
+
+    Args:
+        laps: What `per_lap` returns; all laps of a run last as long.
+        metric: Name of an RMS metric.
+
+    Raises:
+        InputError: There is no such metric, or it is no RMS.
+    """
+    if not known(metric).endswith("_rmse"):
+        raise InputError(f"metric: {metric!r} is not a root mean square")
+    count = laps["laps"].values
+    values = laps[metric].transpose("run", "lap").values
+    there = np.arange(values.shape[1]) < count[:, None]
+    mean = np.square(np.where(there, values, 0.0)).sum(axis=1) / count
+    attrs = {"units": METRICS[metric][0], "long_name": f"{METRICS[metric][1]} over all laps"}
+    return xr.DataArray(np.sqrt(mean), {"run": laps["run"].values}, ("run",), metric, attrs)
+
+
+def excess(laps: xr.Dataset, metric: str, change: int, until: int) -> xr.DataArray:
+    """Returns the integral over time of the error beyond the settled one, from a change on: T Σ (e_k − e_until).
+
+    Args:
+        laps: What `per_lap` returns, with the lap time T.
+        metric: Name of the metric e.
+        change: Number of the lap, from 1, at whose beginning the change came; 1 for the transient of the start.
+        until: Number of the lap whose error counts as settled.
+
+    Returns:
+        Integral in the metric's unit times s, (run,); NaN if the run failed before.
+
+    Raises:
+        InputError: There is no such metric or lap.
+    """
+    known(metric)
+    if not 1 <= change <= until <= laps.sizes["lap"]:
+        raise InputError(f"change: lap {change} and lap {until} are not in order within 1 to {laps.sizes['lap']}")
+    error = laps[metric].transpose("run", "lap").values[:, change - 1 : until]
+    total = laps["lap_time"].values * (error - error[:, -1:]).sum(axis=1)
+    attrs = {"units": f"{METRICS[metric][0]} s", "long_name": f"excess of the {METRICS[metric][1]}"}
+    return xr.DataArray(total, {"run": laps["run"].values}, ("run",), "excess", attrs)
+
+
 def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
     """A row for each run: its description, whether it failed, and its metrics in one lap.
 

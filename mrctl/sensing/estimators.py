@@ -8,6 +8,7 @@ receive this prediction.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 
@@ -136,6 +137,12 @@ ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
 """Law and state of each estimator; `user` passes on the estimate of a user's estimator."""
 
 
+@cache
+def estimate_with(name: str) -> Kernel:
+    """Returns the kernel `estimate` with the law of an estimator, the same for all runs: each takes memory for good."""
+    return estimate.calling(observe=ESTIMATORS[name][0])
+
+
 class Estimator:
     """An estimator for B robots.
 
@@ -158,8 +165,7 @@ class Estimator:
             skew: Time in s by which velocities lag behind positions: half a physics step, because the engine integrates
                 positions with the velocities at the end of the step.
         """
-        law, memory = ESTIMATORS[name]
-        self._law = estimate.calling(observe=law)
+        self._law, memory = estimate_with(name), ESTIMATORS[name][1]
         self._name, self._sensing, self._sensors = name, list(sensing), sensors
         self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew])
         self.seen = np.zeros(len(sensing), SEEN)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import xarray as xr
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -171,12 +172,18 @@ def _models(sweep: Sweep) -> dict[str, str]:
     return worlds | ({sweep.controller: user_files.digest(sweep.controller)} if sweep.controller else {})
 
 
-def compute(path: str, job: int) -> Outcome:
-    """Computes the runs of a job in a worker and writes them to the store."""
+def compute(path: str, job: int, drive: Callable[..., xr.Dataset] = simulate) -> Outcome:
+    """Computes the runs of a job in a worker and writes them to the store.
+
+    Args:
+        path: Folder of the store.
+        job: Number of the job.
+        drive: What drives scenarios, with the arguments and the result of `simulate`.
+    """
     try:
         store = Store(path)
         sweep = _agreed(json.dumps(store.manifest))
-        rows, signals = _compute(sweep, store.runs(job), store.samples)
+        rows, signals = _compute(sweep, store.runs(job), store.samples, drive)
         store.write(job, _table(sweep, rows), signals)
         return Outcome(job, failed=sum(row["failed"] for row in rows))
     except InputError as error:
@@ -205,7 +212,9 @@ def _agreed(manifest: str) -> Sweep:
     return sweep
 
 
-def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict[str, Any]], NDArray | None]:
+def _compute(
+    sweep: Sweep, runs: Sequence[int], samples: int, drive: Callable[..., xr.Dataset] = simulate
+) -> tuple[list[dict[str, Any]], NDArray | None]:
     """Rows of the table, and signals `(runs, samples, signals)` if the store keeps them."""
     rows: dict[int, dict[str, Any]] = {}
     signals = np.full((len(runs), samples, len(SIGNALS)), np.nan) if samples else None
@@ -220,7 +229,7 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
     queue = list(batches.values())
     for batch in queue:
         try:
-            result = simulate(list(batch.values()), threads=1, **stages)
+            result = drive(list(batch.values()), threads=1, **stages)
         except InputError as error:
             if len(batch) == 1:
                 rows |= {run: _row(sweep, run, str(error)) for run in batch}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field
 
 from mrctl.record import Record
@@ -95,6 +96,19 @@ class Perturbation(Record):
     control_delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] = 0.0
     """Delay of voltages and steering commands in s beyond that of `sensing`, a multiple of the control period."""
 
+    def drawn(self, random: np.random.Generator) -> Perturbation:
+        """Returns the perturbation of one robot on one day: what nobody knows of a robot is drawn and added.
+
+        Factors of `UNKNOWN` are uniform about those of the perturbation, with these half widths; so is the slope, with
+        `UNKNOWN_SLOPE`.
+
+        Args:
+            random: Source of the draw, which always takes the same number of values from it.
+        """
+        changed = {name: getattr(self, name) * (1 + random.uniform(-w, w)) for name, w in UNKNOWN.items()}
+        changed["slope"] = self.slope + random.uniform(-UNKNOWN_SLOPE, UNKNOWN_SLOPE)
+        return Perturbation.from_dict(self.model_dump() | changed)
+
     def of_driver(self, driver: Driver) -> Driver:
         """Returns the perturbed driver: dead zones and resistances add; the lower limit and number of steps hold."""
         changed = {
@@ -110,6 +124,18 @@ class Perturbation(Record):
         changed = {"offset": servo.offset + self.steering_offset, "backlash": servo.backlash + self.steering_backlash}
         return servo.model_copy(update=changed)
 
+
+UNKNOWN = {
+    "mass_factor": 0.03,
+    "drive_friction_factor": 0.2,
+    "resistance_factor": 0.05,
+    "left_motor_constant_factor": 0.03,
+    "right_motor_constant_factor": 0.03,
+    "left_radius_factor": 0.005,
+    "right_radius_factor": 0.005,
+}
+"""Half widths of the factors in which two robots of one kind differ (chosen: tolerances of bought parts)."""
+UNKNOWN_SLOPE = 0.01  # rad, 0.6°: a floor that passes for level
 
 PERTURBATIONS: dict[str, Perturbation] = {
     "nominal": Perturbation(),

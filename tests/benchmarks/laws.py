@@ -16,8 +16,8 @@ from itertools import pairwise
 from typing import Any
 from unittest import mock
 
-from mrctl import Scenario
-from mrctl.control.feedforward import CompiledFeedforward, learn_nothing, nothing
+from mrctl import FEEDFORWARDS, Scenario
+from mrctl.control.feedforward import Learner, learn_nothing, nothing
 from mrctl.control.guard import guard
 from mrctl.control.kanayama import kanayama, posture_error
 from mrctl.control.limiter import limit
@@ -29,7 +29,7 @@ from mrctl.loop.simulation import Simulation
 
 OWN = ("control tick", "feedforward", "learning")  # the rows that depend on the feedforward
 EMPTY = (nothing, learn_nothing)  # laws that have no cost to measure
-FEEDFORWARDS = ("fel", "none", "model", "observer", "rls", "composite")
+MEASURED = ("fel", "none", "model+observer", "rls", "model+composite")
 TURNS = 41
 TICKS = 50  # control ticks of a turn
 CALLS = 100  # calls of a law in a turn; a learner that is taught the same for longer leaves what it meets in a drive
@@ -47,10 +47,15 @@ def repeat(times: int, *arguments: Any) -> None:
 
 def laws(simulation: Simulation) -> dict[str, tuple[Kernel, tuple[Any, ...]]]:
     """The laws by name, with copies of the arguments that they have at this moment of a drive."""
-    stage = simulation.hierarchy.feedforward
-    assert isinstance(stage, CompiledFeedforward)
+    stage = simulation.hierarchy.learner
+    assert isinstance(stage, Learner)
     seen, goal, state = (records.copy()[0] for records in (*simulation.sense(), simulation.hierarchy.state))
-    robot, period, arrays = stage.robot[0], simulation.scenarios[0].control_period, copy.deepcopy(stage.arrays)
+    robot, prior, period, arrays = (
+        stage.robot[0],
+        stage.prior.rows[0],
+        simulation.scenarios[0].control_period,
+        copy.deepcopy(stage.arrays),
+    )
     limiter, allocation = state["limiter"], state["allocation"]
     command, derivative = limiter["command"], limiter["derivative"]
     feedback, feedforward, voltage = state["feedback"], state["feedforward"], state["voltage"]
@@ -72,7 +77,7 @@ def laws(simulation: Simulation) -> dict[str, tuple[Kernel, tuple[Any, ...]]]:
         "feedforward": (stage.respond, (0, command, derivative, robot, arrays, feedforward)),
         "learning": (
             stage.learn_one,
-            (0, command, feedback, 0.0, seen["twist"], voltage, period, robot, arrays, state["added"]),
+            (0, command, feedback, 0.0, seen["twist"], voltage, period, robot, prior, arrays, state["added"]),
         ),
     }  # fmt: skip
     return {name: (function, arguments) for name, (function, arguments) in named.items() if function not in EMPTY}
@@ -115,7 +120,7 @@ def law_cost(function: Kernel, arguments: tuple[Any, ...]) -> float:
 def measure(feedforward: str) -> list[list[str]]:
     """A row of text for the control tick with a feedforward and for each law: name, ns, ratio to the tick."""
     laps = math.ceil((WARM + TURNS * TICKS + 1) / Scenario(laps=1).ticks)
-    simulation = Simulation([Scenario.from_dict({"feedforward": feedforward, "laps": laps})], threads=1)
+    simulation = Simulation([Scenario.from_dict({**FEEDFORWARDS[feedforward], "laps": laps})], threads=1)
     for _ in range(WARM):
         simulation.step()
     ticks, costs = [], {name: [] for name in laws(simulation)}
@@ -131,7 +136,7 @@ def measure(feedforward: str) -> list[list[str]]:
 
 
 if __name__ == "__main__":
-    first, *others = FEEDFORWARDS
+    first, *others = MEASURED
     table = measure(first)
     for other in others:
         table += [row for row in measure(other) if row[0].endswith(f"({other})")]

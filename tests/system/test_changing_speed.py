@@ -18,7 +18,7 @@ ROBOT = read_robot(mjcf.load())
 def test_no_saturation(steering):
     """With the model as feedforward two laps need at most the voltage that the law allows, and the robot tracks."""
     courses = [random_spline(np.random.default_rng(seed), ROBOT) for seed in range(4)]
-    common = {"steering": steering, "feedforward": "model", "laps": 2, "initial_spread": (0, 0, 0)}
+    common = {"steering": steering, "prior": "model", "learner": "none", "laps": 2, "initial_spread": (0, 0, 0)}
     for course in courses:
         result = mrctl.simulate([Scenario(**IDEAL, reference=course, **common)], threads=1)
         voltage = np.abs([result["voltage_left"], result["voltage_right"]]).max()

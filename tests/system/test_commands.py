@@ -21,7 +21,7 @@ from mrctl.theory.robot import Robot
 
 SHORT = ["--laps", "1", "reference:circle", "--reference.radius", "0.5", "--reference.period", "5"]
 SCENARIO = """
-feedforward = "rls"
+learner = "rls"
 laps = 1
 [reference]
 kind = "circle"
@@ -49,7 +49,7 @@ def refused(capsys: pytest.CaptureFixture, *arguments: str) -> str:
 
 def test_run_prints_a_row_per_lap(capsys: pytest.CaptureFixture) -> None:
     """The table has a row for each lap and names the feedforward."""
-    assert cli.main(["run", "--laps", "2", "--feedforward", "model", *SHORT[2:]]) == 0
+    assert cli.main(["run", "--laps", "2", "--prior", "model", "--learner", "none", *SHORT[2:]]) == 0
     out = capsys.readouterr().out
     assert "feedforward model" in out
     assert [line.split("|")[1].strip() for line in out.splitlines()[3:]] == ["1", "2"]
@@ -67,9 +67,9 @@ def test_run_json_is_the_simulation(capsys: pytest.CaptureFixture, scenario: Pat
 
 def test_flags_override_the_file(capsys: pytest.CaptureFixture, scenario: Path) -> None:
     """Flags override the values of the file, and other values are the file's."""
-    assert cli.main(["run", str(scenario), "--feedforward", "none", "--json"]) == 0
+    assert cli.main(["run", str(scenario), "--learner", "none", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)["scenario"]
-    assert printed["feedforward"] == "none"
+    assert printed["learner"] == "none"
     assert printed["reference"]["kind"] == "circle"
 
 
@@ -78,11 +78,11 @@ def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.Cap
     out = tmp_path / "out"
     ideal = {"sensing": mrctl.Sensing(tier="ideal"), "pid": mrctl.Pid(time_constant=0.15)}
     flags = ["--sensing.tier", "ideal", "--pid.time-constant", "0.15"]
-    command = ["run", "--out", str(out), "--feedforward", "fel", *flags, *SHORT]
+    command = ["run", "--out", str(out), "--learner", "fel", *flags, *SHORT]
     assert cli.main(command) == 0
     result = mrctl.open(out / "result.zarr")
     circle = mrctl.Circle(radius=0.5, period=5)
-    again = mrctl.simulate(mrctl.Scenario(feedforward="fel", laps=1, reference=circle, **ideal))
+    again = mrctl.simulate(mrctl.Scenario(learner="fel", laps=1, reference=circle, **ideal))
     np.testing.assert_array_equal(result["voltage_left"].values[0], again["voltage_left"].values)
     for name in ("path", "velocities", "errors", "voltages", "learning"):
         assert (out / f"{name}.png").stat().st_size > 5000
@@ -137,7 +137,9 @@ def test_tune_designs(capsys: pytest.CaptureFixture) -> None:
     ("text", "says"),
     [
         ("feedforwar = 'fel'", "feedforwar"),
-        ("feedforward = 'magic'", "feedforward"),
+        ("learner = 'magic'", "learner"),
+        ("feedforward = 'composite'", "set prior and learner"),
+        ("learner = 'observer'", "prior"),
         ("laps = 0", "laps"),
         ("[fel]\nstep = nan", "fel.step"),
         ("[perturbation]\nmass_factor = -1", "perturbation.mass_factor"),
@@ -177,7 +179,7 @@ def test_bad_scenario_is_one_line(
         (["run", "missing.toml"], "missing.toml"),
         (["run", "--fel.step", "7"], "fel.step"),
         (["run", "--fel.stride", "1"], "--fel.stride"),
-        (["run", "--feedforward", "magic"], "--feedforward"),
+        (["run", "--learner", "magic"], "--learner"),
         (["run", "--perturbation.slope", "nan"], "perturbation.slope"),
         (["tune", "--time-constant", "-1"], "time_constant"),
         (["tune", "--world", "moon"], "moon"),
@@ -233,7 +235,17 @@ def test_short_help_of_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     """The short help explains the usual flags, and names each further flag or its group."""
     monkeypatch.setenv("COLUMNS", "80")
     short = help_texts(capsys, "run", "--help")
-    for flag in ("SCENARIO.toml", "--laps", "--feedforward", "--steering", "--seed", "--out", "--json", "--controller"):
+    for flag in (
+        "SCENARIO.toml",
+        "--laps",
+        "--prior",
+        "--learner",
+        "--steering",
+        "--seed",
+        "--out",
+        "--json",
+        "--controller",
+    ):
         assert any(name.startswith(flag) for name in short), flag
     with pytest.raises(SystemExit):
         cli.main(["run", "--kanayama.k-x", "2", "--help"])

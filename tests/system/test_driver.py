@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrctl import PERTURBATIONS, Circle, Event, Lemniscate, Perturbation, Scenario, simulate
+from mrctl import FEEDFORWARDS, PERTURBATIONS, Circle, Event, Lemniscate, Perturbation, Scenario, simulate
 from mrctl.experiments.paper import IDEAL
 from mrctl.loop.simulation import Simulation
 from mrctl.results.dataset import SIGNALS
@@ -24,7 +24,7 @@ def limited(feedforward, amperes, period, laps, seeds, told):
     """
     perturbation = PERTURBATIONS["all"].model_copy(update={"current_limit": amperes})
     scenario = Scenario(
-        **IDEAL, reference=Lemniscate(period=period), laps=laps, feedforward=feedforward, perturbation=perturbation
+        **IDEAL, reference=Lemniscate(period=period), laps=laps, **FEEDFORWARDS[feedforward], perturbation=perturbation
     )
     simulation = Simulation([scenario.model_copy(update={"seed": seed}) for seed in seeds])
     while simulation.running:
@@ -48,7 +48,7 @@ def test_least_squares_under_a_limit():
     assert told.max() < 1.5 and guarded.max() < 0.05
 
 
-@pytest.mark.parametrize(("feedforward", "gain"), [("none", 2.0), ("fel", 2.0), ("composite", 1.3)])
+@pytest.mark.parametrize(("feedforward", "gain"), [("none", 2.0), ("fel", 2.0), ("model+composite", 1.3)])
 def test_hard_limit(feedforward, gain):
     """A lap that needs 1.5 A with 1.3 A: who is told tracks better in the end, and the guard leaves him alone."""
     untold, _ = limited(feedforward, 1.3, 12.0, 6, [0], told=False)
@@ -85,7 +85,7 @@ def test_event_in_the_driver():
     """A limit that comes and goes as an event acts from its tick to its end, on the motors of that robot alone."""
     hard = PERTURBATIONS["all"].model_copy(update={"current_limit": 1.0})
     events = (Event(time=1.0, perturbation=hard), Event(time=2.0, perturbation=PERTURBATIONS["all"]))
-    base = BASE.model_copy(update={"perturbation": PERTURBATIONS["all"], "feedforward": "model"})
+    base = BASE.model_copy(update={"perturbation": PERTURBATIONS["all"], "prior": "model", "learner": "none"})
     runs = simulate([base, base.model_copy(update={"events": events})])
     plain, changed = (
         np.maximum(abs(run.current_left), abs(run.current_right)).values for run in (runs[{"run": 0}], runs[{"run": 1}])
@@ -97,7 +97,7 @@ def test_event_in_the_driver():
 def test_power():
     """The power of a result is that at the terminals, after the limit: what the shafts get, k_E N ω i, and heat."""
     perturbation = Perturbation(current_limit=0.6, battery_resistance=0.2)
-    result = simulate(BASE.model_copy(update={"perturbation": perturbation, "feedforward": "none"}))
+    result = simulate(BASE.model_copy(update={"perturbation": perturbation, "prior": "none", "learner": "none"}))
     assert float(np.abs(result.current_left).max()) == pytest.approx(0.6)
     rates = result.wheel_rate_left.values[1:], result.wheel_rate_right.values[1:]
     currents = result.current_left.values[:-1], result.current_right.values[:-1]

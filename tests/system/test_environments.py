@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from mrctl import PERTURBATIONS, Circle, Event, InputError, Line, Perturbation, Scenario
+from mrctl import FEEDFORWARDS, PERTURBATIONS, Circle, Event, InputError, Line, Perturbation, Scenario
 from mrctl.envs.dm_env import SUITE, Environment, Tracking, register
 from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Episodes
 from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
@@ -37,7 +37,7 @@ BUSY = Scenario(
     ),
 )
 PRESENT = [k for k, name in enumerate(SIGNALS) if not name.startswith("fix_")]  # a tick without a fix has NaN
-FEEDFORWARDS = ("none", "oracle", "observer", "fel", "rls", "composite")
+COMPARED = ("none", "true_model", "model+observer", "fel", "rls", "model+composite")
 
 
 def expected(scenario, seed):
@@ -51,10 +51,10 @@ def last(loop, row=0):
     return np.array(loop.log.at(loop.tick - 1)[row].item())
 
 
-@pytest.mark.parametrize("feedforward", FEEDFORWARDS)
+@pytest.mark.parametrize("feedforward", COMPARED)
 def test_gym_bits(feedforward):
     """Episodes with a zero residual are the scenario's own run, the first as the second."""
-    scenario = BUSY.model_copy(update={"feedforward": feedforward})
+    scenario = BUSY.model_copy(update=FEEDFORWARDS[feedforward])
     env = TrackingEnv(scenario)
     for seed in (3, 8, 3):
         env.reset(seed=seed)
@@ -80,10 +80,10 @@ def test_dm_env_bits(steering):
         assert np.array_equal(found, expected(scenario, seed), equal_nan=True), seed
 
 
-@pytest.mark.parametrize("feedforward", FEEDFORWARDS)
+@pytest.mark.parametrize("feedforward", COMPARED)
 def test_vector_bits(feedforward):
     """Robots that begin again at different moments, some after a failure: each episode is its run alone."""
-    changes = {"feedforward": feedforward, "sensing": BUSY.sensing}
+    changes = {**FEEDFORWARDS[feedforward], "sensing": BUSY.sensing}
     scenarios = [s.model_copy(update=changes) for s in (BUSY, SHORT, BUSY, SHORT)]
     env = TrackingVectorEnv(4, scenarios, threads=1)
     loop, zero = env.episodes, np.zeros((4, 2))
@@ -266,7 +266,12 @@ def test_reward():
 
 def test_actions():
     """What is acted is what is sent: a twist is driven, volts are volts, a residual adds to the controllers'."""
-    changes = {"reference": Line(speed=0.5, length=2.0), "initial_spread": (0, 0, 0), "feedforward": "model"}
+    changes = {
+        "reference": Line(speed=0.5, length=2.0),
+        "initial_spread": (0, 0, 0),
+        "prior": "model",
+        "learner": "none",
+    }
     straight = EXACT.model_copy(update=changes)
     env = TrackingEnv(straight, "twist")
     env.reset(seed=0)

@@ -52,7 +52,7 @@ def normalised(errors, covariances, states=slice(None)):
 @cache
 def nominal(tier, runs):
     """Returns what `watched` does of nominal robots; their seeds are not among those that the filter was tuned with."""
-    scenario = Scenario(sensing=Sensing(tier=tier, estimator="ekf"), feedforward="composite", laps=2)
+    scenario = Scenario(sensing=Sensing(tier=tier, estimator="ekf"), prior="model", learner="composite", laps=2)
     return watched([scenario.model_copy(update={"seed": 1000 + k}) for k in range(runs)])
 
 
@@ -123,7 +123,7 @@ def test_within_three_deviations(tier, name):
     """With lost or outlying fixes or a wheel off the ground, errors stay where the filter says; on ice, less often."""
     sensing, changes, least = MEETS[name]
     scenario = Scenario(
-        sensing=Sensing(tier=tier, estimator="ekf", **sensing), feedforward="composite", laps=1, **changes
+        sensing=Sensing(tier=tier, estimator="ekf", **sensing), prior="model", learner="composite", laps=1, **changes
     )
     errors, covariances, innovations, failed = watched([scenario.model_copy(update={"seed": k}) for k in range(6)])
     assert not failed.any()
@@ -140,7 +140,9 @@ def test_within_three_deviations(tier, name):
 
 def test_lateral_slip():
     """The constant of the filter's rear tyres is that of the models: v_y = −c V θ̇."""
-    run = simulate(Scenario(sensing=Sensing(tier="ideal"), feedforward="model", laps=1)).isel(time=slice(100, None))
+    run = simulate(Scenario(sensing=Sensing(tier="ideal"), prior="model", learner="none", laps=1)).isel(
+        time=slice(100, None)
+    )
     product = (run.v * run.omega).values
     slope = (product @ run.v_lateral.values) / (product @ product)
     assert -slope == pytest.approx(ekf.SIDE, rel=0.02)
@@ -151,7 +153,7 @@ def test_lateral_slip():
 # -- a user's own estimator --------------------------------------------------------------------------------------------
 
 LANE = Scenario(
-    reference=LaneChange(length=2.4, shift=0.3, speed=0.6), laps=1, feedforward="none",
+    reference=LaneChange(length=2.4, shift=0.3, speed=0.6), laps=1, learner="none",
     sensing=Sensing(tier="lab", estimator="odometry"),
 )  # fmt: skip
 LANES = [LANE.model_copy(update={"seed": seed}) for seed in range(3)]

@@ -12,7 +12,7 @@ from mrctl.results.dataset import SIGNALS
 from mrctl.theory.dynamics import inverse_coefficients
 
 PERIOD = 0.01
-BASE = Scenario(**IDEAL, reference=Circle(period=4, radius=0.5), laps=1, feedforward="model")
+BASE = Scenario(**IDEAL, reference=Circle(period=4, radius=0.5), laps=1, prior="model", learner="none")
 PAYLOAD = Perturbation(payload=5, payload_x=0.15, payload_y=0.05)
 
 
@@ -50,7 +50,7 @@ def test_tick(change, time, tick):
 
 def test_learning_switch():
     """Learning stops at its tick and goes on at the other; in between the weights stand still."""
-    base = BASE.model_copy(update={"feedforward": "fel"})
+    base = BASE.model_copy(update={"prior": "none", "learner": "fel"})
     run = simulate(with_events(Event(time=1, learning=False), Event(time=2, learning=True), base=base))
     norm = run.weight_norm.values
     moves = np.flatnonzero(np.diff(norm)) + 1
@@ -74,9 +74,9 @@ def test_same_moment():
 
 @pytest.mark.parametrize("size", [1, 2])
 def test_payload_is_taken_off_again(size):
-    """Dropped and removed: every parameter of the plant is the nominal one again, to the bit, and so is the oracle."""
+    """Dropped and removed: every parameter of the plant is the nominal one again, to the bit, and so is the prior."""
     events = (Event(time=0.1, perturbation=PAYLOAD), Event(time=0.2, perturbation=Perturbation()))
-    simulation = Simulation([with_events(*events, feedforward="oracle")] * size)
+    simulation = Simulation([with_events(*events, prior="true_model", learner="none")] * size)
     nominal = fields(mjcf.load())
     masses = []
     for _ in range(40):
@@ -90,25 +90,27 @@ def test_payload_is_taken_off_again(size):
     assert simulation.plant.truth[-1] == simulation.plant.robot
 
 
-def test_oracle_follows():
+def test_true_model_follows():
     """It is told of each change: its coefficients are those of the plant as it is."""
     heavy = Perturbation(mass_factor=1.5, supply_factor=0.8, resistance_factor=1.3)
     event = Event(time=0.05, perturbation=heavy)
-    simulation = Simulation([with_events(event, feedforward="oracle"), with_events(feedforward="oracle")])
+    simulation = Simulation(
+        [with_events(event, prior="true_model", learner="none"), with_events(prior="true_model", learner="none")]
+    )
     for tick in range(10):
         simulation.step()
         changed = tick >= 5
-        stage, truth = simulation.hierarchy.feedforward, simulation.plant.truth
+        stage, truth = simulation.hierarchy.prior, simulation.plant.truth
         assert (truth[0] != simulation.plant.robot) == changed and truth[1] == simulation.plant.robot
         for row in range(2):
-            assert np.array_equal(stage.coefficients[row], inverse_coefficients(truth[row]))
+            assert np.array_equal(stage.rows["c"][row], inverse_coefficients(truth[row]))
 
 
-def test_oracle_is_better():
-    """After a change in the middle the oracle tracks as before; the model does not."""
+def test_true_model_is_better():
+    """After a change in the middle the true model tracks as before; the model does not."""
     event = Event(time=1, perturbation=Perturbation(mass_factor=1.5, supply_factor=0.7, drive_friction_factor=3))
     base = BASE.model_copy(update={"initial_spread": (0, 0, 0), "laps": 2})
-    runs = simulate([with_events(event, base=base, feedforward=kind) for kind in ("oracle", "model")])
+    runs = simulate([with_events(event, base=base, prior=kind, learner="none") for kind in ("true_model", "model")])
     late = runs.isel(time=slice(150, 800))
     error = np.hypot(late.x - late.x_ref, late.y - late.y_ref).mean("time")
     assert error[0] < error[1] / 2
@@ -117,7 +119,7 @@ def test_oracle_is_better():
 def test_push():
     """The run's velocity jumps by the impulse over the mass that the motors move, while they cannot hold against it."""
     base = Scenario(
-        **IDEAL, reference=Line(speed=0.5, length=1.5), laps=1, feedforward="model", initial_spread=(0, 0, 0)
+        **IDEAL, reference=Line(speed=0.5, length=1.5), laps=1, prior="model", learner="none", initial_spread=(0, 0, 0)
     )
     runs = simulate([with_events(Event(time=1, push=(300, 0, 0), push_duration=0.02), base=base), base])
     jump = float(runs.v[0, 102] - runs.v[1, 102])
@@ -179,6 +181,6 @@ def test_impossible_reference():
 def test_frozen_from_the_start():
     """`frozen` and learning switched off at once are the same run."""
     off, frozen = with_events(Event(time=0, learning=False)), BASE.model_copy(update={"fel": Fel(frozen=True)})
-    pair = simulate([run.model_copy(update={"feedforward": "fel"}) for run in (off, frozen)])
+    pair = simulate([run.model_copy(update={"prior": "none", "learner": "fel"}) for run in (off, frozen)])
     assert first_difference(pair.isel(run=0), pair.isel(run=1)) == 400
     assert (pair.weight_norm == 0).all()

@@ -27,7 +27,7 @@ from mrctl.sweep import jobs
 pytestmark = pytest.mark.xdist_group("export")  # what its tests share is made once
 
 IDEAL, FIELD = Sensing(tier="ideal"), Sensing(tier="field", fix_lost=0.2, encoder_rate=50, encoder_latency=0.01)
-SHORT = Scenario(reference=Circle(period=3, radius=0.4), laps=1, feedforward="none", sensing=IDEAL)
+SHORT = Scenario(reference=Circle(period=3, radius=0.4), laps=1, learner="none", sensing=IDEAL)
 FAILS = SHORT.model_copy(update={"seed": 1, "events": (Event(time=1.0, push=(1e12, 0.0, 1e15)),)})
 ROS = get_typestore(Stores.ROS2_HUMBLE)
 

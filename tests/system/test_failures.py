@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from mrctl import Circle, Event, Guard, Line, Perturbation, Scenario
-from mrctl.control.feedforward import NoFeedforward
+from mrctl.control.feedforward import NoLearner
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 PERIOD = 0.01
-HEALTHY = [Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="none", seed=seed) for seed in range(3)]
+HEALTHY = [Scenario(reference=Circle(period=4, radius=0.5), laps=1, learner="none", seed=seed) for seed in range(3)]
 
 
 class BreaksAfter:
@@ -43,7 +43,7 @@ DIVERGING = {
         Scenario(
             reference=Circle(period=4, radius=0.5),
             laps=2,
-            feedforward="none",
+            learner="none",
             steering="caster",
             perturbation=Perturbation(mass_factor=4, tyre_friction_factor=0.05),
         ),
@@ -96,7 +96,7 @@ def test_non_finite_stage():
     bare = [scenario.model_copy(update={"guard": Guard(on=False)}) for scenario in HEALTHY]
     whole, sound = (
         simulate(bare, feedforward=BreaksAfter),
-        simulate(bare, feedforward=lambda robot, size: NoFeedforward(robot, size, False, PERIOD)),
+        simulate(bare, feedforward=lambda robot, size: NoLearner(robot, size, False, PERIOD)),
     )
     tick = round(float(whole.failure_time[1]) / PERIOD) - 1
     check_record(whole.isel(run=1), f"feedforward BreaksAfter: not finite, tick {tick}")
@@ -128,7 +128,7 @@ def test_all_fail():
 def test_no_ground():
     """Off the edge of the world is a failure like any other, here by driving off it."""
     edge = Scenario(
-        world="rough", reference=Line(speed=1.0, length=8.0), laps=1, feedforward="none", initial_spread=(0, 0, 0)
+        world="rough", reference=Line(speed=1.0, length=8.0), laps=1, learner="none", initial_spread=(0, 0, 0)
     )
     run = simulate(edge)
     assert bool(run.failed) and 5.5 < float(run.failure_time) < 7.5

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mrctl import (
+    FEEDFORWARDS,
     PERTURBATIONS,
     Event,
     Fel,
@@ -43,7 +44,7 @@ FAST = fast(10)
 
 def of(scenario, feedforward, guard=OFF, **changes):
     """The scenario with another learner and guard."""
-    return scenario.model_copy(update={"feedforward": feedforward, "guard": guard, **changes})
+    return scenario.model_copy(update={**FEEDFORWARDS[feedforward], "guard": guard, **changes})
 
 
 def same(one, other):

@@ -14,7 +14,7 @@ BASE = Scenario(
     **IDEAL,
     reference=Lemniscate(),
     laps=3,
-    feedforward="fel",
+    learner="fel",
     initial_spread=(0, 0, 0),
     perturbation=PERTURBATIONS["all"],
 )
@@ -44,7 +44,7 @@ def position(part):
 @pytest.fixture(scope="module")
 def runs():
     """Learning, and the PID alone."""
-    return simulate([BASE, variant(feedforward="none")])
+    return simulate([BASE, variant(learner="none")])
 
 
 def test_beats_pid(runs):
@@ -131,5 +131,7 @@ def test_torch_module(runs):
 def test_too_small_a_bound():
     """A network at the bound of its weights helps less, but does not talk the PID out of what it holds."""
     small = Scenario(**IDEAL, laps=2, fel=Fel(weight_bound=7.0, output_scale=0.76), initial_spread=(0, 0, 0))
-    bound, alone = per_lap(simulate([small, small.model_copy(update={"feedforward": "none"})])).position_rmse[:, 1]
+    bound, alone = per_lap(
+        simulate([small, small.model_copy(update={"prior": "none", "learner": "none"})])
+    ).position_rmse[:, 1]
     assert bound < alone

@@ -188,7 +188,7 @@ def test_a_pid_for_its_plant_keeps_the_robot(points, speed):
     result = mrctl.simulate(
         [
             mrctl.Scenario(
-                reference=mrctl.Waypoints(points=points, speed=speed), laps=1, feedforward="none",
+                reference=mrctl.Waypoints(points=points, speed=speed), laps=1, learner="none",
                 perturbation=mrctl.Perturbation(control_delay=pid.delay or 0.0), **IDEAL | {"pid": pid},
             )
             for pid in pids

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import mrctl
-from mrctl import Circle, Event, Fel, Lemniscate, Perturbation, RobotFile, Scenario, cli
+from mrctl import FEEDFORWARDS, Circle, Event, Fel, Lemniscate, Perturbation, RobotFile, Scenario, cli
 from mrctl.experiments.paper import IDEAL
 from mrctl.sensing.tiers import TIERS, Sensing
 from mrctl.viewer.recording import Recording
@@ -21,7 +21,7 @@ COURSES = {
 def test_learning_beats_pid(name):
     """In the last of 8 laps of the lemniscate V, θ̇ and position are at least twice as good with the network."""
     robot, course, _ = COURSES[name]
-    pair = [Scenario(**robot, **IDEAL, reference=course, feedforward=f) for f in ("none", "fel")]
+    pair = [Scenario(**robot, **IDEAL, reference=course, learner=f) for f in ("none", "fel")]
     found = mrctl.summary(mrctl.simulate(pair, threads=1))
     assert not found["failed"].any()
     for metric in ("v_rmse", "omega_rmse", "position_rmse"):
@@ -51,7 +51,7 @@ def scenarios(robot, course, seed):
     return Scenario(
         **robot, reference=course, laps=1, seed=seed, perturbation=change(), events=events, fel=Fel(step=0.05),
         # With real sensors and the network, one in ten of these TurtleBots tips over.
-        feedforward=("fel", "composite")[seed % 2], sensing=Sensing(tier=TIERS[seed % 2]),
+        **FEEDFORWARDS[("fel", "model+composite")[seed % 2]], sensing=Sensing(tier=TIERS[seed % 2]),
         world=("flat", "patch")[seed % 3 == 0],
     )  # fmt: skip
 
@@ -82,7 +82,7 @@ def test_together_with_the_car():
 def test_differential_drive_reverses():
     """Nothing trails: forth and back is allowed, where the tricycle's fork would jackknife."""
     shuttle = mrctl.StopAndGo(distance=0.6, move_time=3.0, pause=0.5, reverse=True)
-    result = mrctl.simulate(Scenario(**TURTLE, reference=shuttle, laps=1, feedforward="model"))
+    result = mrctl.simulate(Scenario(**TURTLE, reference=shuttle, laps=1, prior="model", learner="none"))
     assert str(result["failure"].values) == "" and float(result["v"].min()) < -0.2
     assert float(np.abs(result["lateral_error"]).max()) < 0.1
     with pytest.raises(mrctl.InputError, match="reverses"):
@@ -117,7 +117,9 @@ def test_sweep(tmp_path):
         {"robot": {"path": n}, "steering": COURSES[n][0]["steering"], "reference": COURSES[n][2].model_dump()}
         for n in COURSES
     ]
-    sweep = mrctl.Sweep.of([Scenario.from_dict({**pair, "laps": 1, "feedforward": "none"}) for pair in pairs])
+    sweep = mrctl.Sweep.of(
+        [Scenario.from_dict({**pair, "laps": 1, "prior": "none", "learner": "none"}) for pair in pairs]
+    )
     assert {robot.path for _, _, robot in sweep.worlds} == set(COURSES)
     from mrctl.sweep import jobs
 
@@ -127,7 +129,7 @@ def test_sweep(tmp_path):
 
 def test_command(capsys):
     """From the shell; and one line for what cannot be."""
-    flags = ["--robot.path", "turtlebot", "--laps", "1", "--feedforward", "model", "--json"]
+    flags = ["--robot.path", "turtlebot", "--laps", "1", "--prior", "model", "--learner", "none", "--json"]
     assert cli.main(["run", *flags, "--steering", "caster", "reference:circle", "--reference.radius", "0.5",
                      "--reference.period", "10"]) == 0  # fmt: skip
     assert '"path": "turtlebot"' in capsys.readouterr().out

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrctl import Circle, Event, InputError, Perturbation, RoundedSquare, Scenario
+from mrctl import FEEDFORWARDS, Circle, Event, InputError, Perturbation, RoundedSquare, Scenario
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.viewer.session import Session, changed
@@ -28,7 +28,7 @@ def same(session, results):
 def test_saved_session(reference, tmp_path):
     """Payload, noise, delay, gains, push and the switch, at odd ticks, for three controllers; through a file."""
     scenarios = [
-        BASE.model_copy(update={"feedforward": name, "reference": reference}) for name in ("fel", "none", "oracle")
+        BASE.model_copy(update={**FEEDFORWARDS[name], "reference": reference}) for name in ("fel", "none", "true_model")
     ]
     session = Session(scenarios)
     drive(session, 37)
@@ -90,7 +90,9 @@ def test_events_of_the_file():
 
 def test_stopped_robot():
     """A robot that has stopped leaves the others driving; its record ends in NaN."""
-    weak = BASE.model_copy(update={"feedforward": "none", "perturbation": Perturbation(supply_factor=0.05)})
+    weak = BASE.model_copy(
+        update={"prior": "none", "learner": "none", "perturbation": Perturbation(supply_factor=0.05)}
+    )
     session = Session([BASE, weak])
     drive(session, 1500)
     assert "lateral error" in session.failure(1) and session.failure(0) == ""
@@ -110,7 +112,7 @@ def test_must_share():
 
 def test_new_reference():
     """Another course from a moment on, added under way and brought along by the file, over a boundary of blocks."""
-    session = Session([BASE, BASE.model_copy(update={"feedforward": "none"})])
+    session = Session([BASE, BASE.model_copy(update={"prior": "none", "learner": "none"})])
     drive(session, 200)
     event = Event(time=2.5, reference=Circle(radius=0.5, period=5.0, clockwise=True))
     for _, simulation in session.simulations:

@@ -17,7 +17,7 @@ from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
 
-SHORT = Scenario(**IDEAL, reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
+SHORT = Scenario(**IDEAL, reference=Circle(period=4, radius=0.5), laps=1, learner="none")
 THREE = [SHORT.model_copy(update={"seed": seed}) for seed in range(3)]
 LAP = Scenario(**IDEAL, reference=Lemniscate(period=10), laps=1)
 STAGES = "motion", "feedback", "feedforward", "steering"  # and the estimator, whose faults differ: test_estimators.py

@@ -13,18 +13,18 @@ from mrctl.theory.references import random_spline
 @pytest.mark.parametrize(
     ("draws", "plants", "feedforwards"),
     [
-        (3, ("all",), ("none", "composite")),
+        (3, ("all",), ("none", "model+composite")),
         pytest.param(20, ("nominal", "all"), FEEDFORWARDS, marks=pytest.mark.full),
     ],
 )
 def test_estimate_adds_as_independent_errors_do(draws, plants, feedforwards):
     """Position error in the last lap: at most 1.25 √(a² + b²) from true measurements a and from the estimate b.
 
-    That of `composite` is at most 1.5 mm, and that of its yaw rate at most 10 mrad/s, in every draw.
+    That of `model+composite` is at most 1.5 mm, and that of its yaw rate at most 10 mrad/s, in every draw.
     """
     for plant in plants:
         for feedforward in feedforwards:
-            common = {"feedforward": feedforward, "perturbation": PERTURBATIONS[plant]}
+            common = {**FEEDFORWARDS[feedforward], "perturbation": PERTURBATIONS[plant]}
             estimators = {"ekf": None, "truth": None}
             for name in estimators:
                 sensing = Sensing(tier="lab", estimator=name)
@@ -35,7 +35,7 @@ def test_estimate_adds_as_independent_errors_do(draws, plants, feedforwards):
             estimate = np.square(last.x_measured - last.x) + np.square(last.y_measured - last.y)
             parts = np.mean(true.position_rmse**2) + float(estimate.mean())
             assert np.sqrt(np.mean(found.position_rmse**2)) < 1.25 * np.sqrt(parts), (plant, feedforward)
-            if feedforward == "composite":
+            if feedforward == "model+composite":
                 assert found.position_rmse.max() < 1.5e-3 and found.omega_rmse.max() < 10e-3
 
 
@@ -49,5 +49,5 @@ def test_pid_alone(count):
     for tier in ("ideal", "lab"):
         for seed, course in enumerate(courses):
             sensing = Sensing(tier=tier)
-            run = simulate(Scenario(reference=course, sensing=sensing, feedforward="none", laps=1, seed=seed))
+            run = simulate(Scenario(reference=course, sensing=sensing, learner="none", laps=1, seed=seed))
             assert not run.failed, (tier, seed, str(run.failure.item()))

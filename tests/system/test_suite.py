@@ -24,7 +24,8 @@ import mrctl
 from mrctl import cli
 from mrctl.experiments import report, suite, tuning
 from mrctl.experiments.cases import Case
-from mrctl.results import plots
+from mrctl.experiments.hindsight import best_fixed
+from mrctl.results import metrics, plots
 
 pytestmark = pytest.mark.xdist_group("suite")  # what its tests share is made once
 
@@ -41,6 +42,9 @@ class Gain:
     def learn(self, feedback, saturated, twist, voltage):
         self.ticks += 1
 """
+
+
+WINDOWS = {"first": lambda e: e[:, 0], "all": lambda e: np.sqrt(np.mean(e**2, axis=1))}
 
 
 def tiny(seeds: int, random: int, quick: bool) -> list[Case]:
@@ -114,7 +118,7 @@ def test_table(whole: Path) -> None:
     found = {(row["case"], row["feedforward"]): row for row in table["rows"]}
     for case in ("all", "caster", "random"):
         alone = {
-            name: mrctl.summary(mrctl.simulate([s.model_copy(update={"feedforward": name}) for s in cases[case]]))
+            name: mrctl.summary(mrctl.simulate([s.model_copy(update=mrctl.FEEDFORWARDS[name]) for s in cases[case]]))
             for name in ("none", "rls")
         }
         row = found[case, "rls"]["omega_rmse"]
@@ -126,7 +130,11 @@ def test_table(whole: Path) -> None:
         if case != "random":
             laps = alone["rls"]["laps_to_converge"].mean()
             assert found[case, "rls"]["position_rmse"]["laps_to_converge"]["value"] == pytest.approx(laps)
-    assert (whole / "table.md").read_text().count("| rls ") == 7  # six cases, and the recovery
+        for window, errors in WINDOWS.items():
+            stated = found[case, "rls"]["position_rmse"][window]
+            laps = mrctl.per_lap(mrctl.simulate([s.model_copy(update=mrctl.FEEDFORWARDS["rls"]) for s in cases[case]]))
+            assert stated["value"] == pytest.approx(errors(laps.position_rmse.values).mean(), rel=1e-12)
+    assert (whole / "table.md").read_text().count("| rls ") == 13  # six cases twice, and the recovery
 
 
 def test_recovery(whole: Path) -> None:
@@ -152,22 +160,55 @@ def test_step_over_settled() -> None:
 
 
 def test_leaders() -> None:
-    """The least mean, and whom it does not beat by Wilson's interval; the oracle and who failed are out of it."""
+    """The least mean, and whom it does not beat by Wilson's interval; the true model and who failed are out of it."""
     random = np.random.default_rng(0)
     errors = {"none": 5 + random.random(10), "model": 2 + random.random(10), "rls": 2.1 + random.random(10)}
-    errors |= {"oracle": random.random(10), "fel": np.where(np.arange(10) == 3, np.nan, 0.1)}
+    errors |= {"true_model": random.random(10), "fel": np.where(np.arange(10) == 3, np.nan, 0.1)}
     rows = []
     for name, own in errors.items():
         row = {"case": "a", "feedforward": name, "failed": int(np.isnan(own).sum())}
         for metric in suite.COLUMNS:
-            row[metric] = {"value": np.nanmean(own)}
+            row[metric] = {"value": np.nanmean(own), "first": {"value": 0.0}, "all": {"value": 0.0}}
             for rival, theirs in errors.items():
                 wins = int((np.nan_to_num(own, nan=np.inf) < np.nan_to_num(theirs, nan=np.inf)).sum())
                 low = stats.binomtest(wins, 10).proportion_ci(method="wilson").low
-                row[metric][f"beats_{'PID' if rival == 'none' else rival}"] = {"low": low}
+                for window in (row[metric], row[metric]["first"], row[metric]["all"]):
+                    window[f"beats_{'PID' if rival == 'none' else rival}"] = {"low": low}
+                row[metric]["first"]["value"] = row[metric]["all"]["value"] = np.nanmean(own)
         rows.append(row)
     assert 0.2 < np.mean(errors["model"] < errors["rls"]) < 0.9
-    assert suite.leaders(rows) == [["a", *["model, rls"] * 3]]
+    assert suite.leaders(rows) == [["a", *["model, rls"] * 5]]
+
+
+def test_hindsight(tmp_path: Path) -> None:
+    """The best fixed feedforward is that of `best_fixed`, and the regret of the model is what it does worse."""
+    words = ["suite", "--feedforward", "model", "hindsight", "--seeds", "1", "--random", "0", "--workers", "1"]
+    assert cli.main([*words, "--out", str(tmp_path)]) == 0
+    rows = json.loads((tmp_path / "table.json").read_text())["rows"]
+    all_laps = {r["feedforward"]: r["position_rmse"]["all"]["value"] for r in rows if r["case"] == "all"}
+    (scenario,) = next(case.scenarios for case in tiny(1, 0, False) if case.name == "all")
+    laps = mrctl.per_lap(best_fixed([scenario])).position_rmse.values
+    assert all_laps["hindsight"] == pytest.approx(np.sqrt(np.mean(laps**2)), rel=1e-9)
+    lines = (tmp_path / "table.md").read_text().partition("Position error in mm")[2].splitlines()
+    (line,) = (one for one in lines if re.match(r"\| all +\| model ", one) and one.count("|") == 8)
+    regret = 1e3 * (all_laps["model"] - all_laps["hindsight"])
+    assert line.split("|")[6].strip() == f"{regret:.2f}"
+
+
+def test_floors() -> None:
+    """The largest change of a mean when the step is halved; a feedforward that lost a run says nothing."""
+
+    def laps(last: list[float]) -> xr.Dataset:
+        error = (("run", "lap"), np.stack([np.ones(2), last], axis=1))
+        names = {name: error for name in metrics.METRICS}
+        per_run = {"laps": ("run", [2, 2]), "failed": ("run", [False, False]), "failure_time": ("run", [np.nan] * 2)}
+        return xr.Dataset(names | per_run, {"run": [0, 1], "lap": [1, 2]})
+
+    whole = {"model": laps([1.0, 3.0]), "fel": laps([1.0, 1.0])}
+    half = {"model": laps([1.5, 2.9]), "fel": laps([1.1, np.nan])}
+    found = suite.floors({"nominal": whole, "nominal, half the step": half})
+    assert found == dict.fromkeys(suite.COLUMNS, pytest.approx(0.2))
+    assert suite.floors({"nominal": whole}) == dict.fromkeys(suite.COLUMNS, 0.0)
 
 
 def test_goes_on_where_it_stopped(whole: Path, tmp_path: Path) -> None:

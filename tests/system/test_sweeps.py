@@ -36,10 +36,10 @@ chunk = 5
 record = "decimated"
 [base]
 laps = 1
-feedforward = "none"
+learner = "none"
 reference = { kind = "line", length = 0.8 }
 [[axes]]
-field = "feedforward"
+field = "learner"
 values = ["none", "fel"]
 paired = true
 [[axes]]
@@ -143,7 +143,7 @@ def test_metrics_only(file, tmp_path):
 def test_every_lap(tmp_path):
     """A store of laps opens as what `per_lap` returns, shorter runs ending in NaN; a run of it repeats."""
     axes = [{"field": "laps", "values": [1, 3]}, {"field": "perturbation.mass_factor", "values": [1.0, 1.5]}]
-    base = {"feedforward": "none", "reference": {"kind": "line", "length": 0.8}}
+    base = {"prior": "none", "learner": "none", "reference": {"kind": "line", "length": 0.8}}
     sweep = Sweep.from_dict({"base": base, "axes": axes, "record": "laps", "chunk": 2})
     jobs.run(sweep, tmp_path / "store", 1)
     opened = mrctl.open(tmp_path / "store")
@@ -160,7 +160,7 @@ def test_full_with_runs_of_different_length(tmp_path):
     """Shorter runs end in NaN; a run that diverges says when and why and costs only itself."""
     push = {"time": 0.5, "push": [4000.0, 4000.0, 0.0]}
     axes = [{"field": "laps", "values": [1, 2]}, {"field": "events", "values": [[], [push]]}]
-    base = {"feedforward": "none", "reference": {"kind": "line", "length": 0.8}}
+    base = {"prior": "none", "learner": "none", "reference": {"kind": "line", "length": 0.8}}
     sweep = Sweep.from_dict({"base": base, "axes": axes, "record": "full", "chunk": 3})
     report = jobs.run(sweep, tmp_path / "store", 1)
     opened = mrctl.open(tmp_path / "store")

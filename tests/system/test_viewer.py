@@ -107,11 +107,12 @@ def curves(page, title):
 
 def test_live(browser, tmp_path):
     """Two robots drive along the reference, pause holds them, a payload is dropped, seen, listed, and felt."""
-    scenarios = [BASE, BASE.model_copy(update={"feedforward": "none"})]
+    scenarios = [BASE, BASE.model_copy(update={"prior": "none", "learner": "none"})]
     with serving(lambda server: Live(scenarios, server)) as (live, url), visit(browser, url) as page:
         until(lambda: node(page, ROBOT) is not None, "the scene")
         start = node(page, ROBOT)
         until(lambda: np.linalg.norm(node(page, ROBOT) - start) > 0.3, "the robot to move")
+        until(lambda: live.session.time > 3.0, "the offset at the start to be gone")
         page.get_by_text("pause", exact=True).click()
         until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
         page.mouse.move(640, 700)
@@ -196,7 +197,7 @@ def test_visitors_come_and_go(browser):
 def test_replay(browser, tmp_path):
     """A saved result: the scrubber puts the robots where they were, and the curves have its cursor."""
     event = Event(time=4.0, perturbation=Perturbation(payload=8))
-    result = simulate([BASE.model_copy(update={"feedforward": f, "events": (event,)}) for f in ("fel", "none")])
+    result = simulate([BASE.model_copy(update={"learner": f, "events": (event,)}) for f in ("fel", "none")])
     save(result, tmp_path / "result.zarr")
     library = Library(tmp_path / "result.zarr")
     with serving(lambda server: Replay(library, [0, 1], server)) as (replay, url), visit(browser, url) as page:
@@ -283,7 +284,7 @@ def check_marks(page, log, period, robot, times):
     assert len(expected) > 10
 
 
-FIELD = BASE.model_copy(update={"sensing": Sensing(tier="field"), "feedforward": "model"})
+FIELD = BASE.model_copy(update={"sensing": Sensing(tier="field"), "prior": "model", "learner": "none"})
 
 
 def test_estimate_live(browser, tmp_path):
@@ -367,7 +368,12 @@ TO_SCREEN = """([x, y, z]) => {
 
 def test_sweep(browser, tmp_path):
     """All runs of a sweep on a board behind the track: a click opens the one under the mouse, as `mrctl run` has it."""
-    base = {"laps": 1, "reference": {"kind": "circle", "period": 4.0, "radius": 0.5}, "feedforward": "model"}
+    base = {
+        "laps": 1,
+        "reference": {"kind": "circle", "period": 4.0, "radius": 0.5},
+        "prior": "model",
+        "learner": "none",
+    }
     axis = {"field": "perturbation.mass_factor", "uniform": [0.5, 2.0]}
     jobs.run(Sweep.from_dict({"runs": 6, "base": base, "axes": [axis]}), tmp_path / "store", workers=1)
     library = Library(tmp_path / "store")

@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 
-from mrctl import PERTURBATIONS, Scenario
+from mrctl import PERTURBATIONS, Perturbation, Scenario
 from mrctl.experiments import cases
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
+from mrctl.theory.perturbation import UNKNOWN
 from mrctl.theory.references import check
+
+PLAIN = Perturbation()
 
 
 @pytest.fixture(scope="module")
@@ -25,13 +28,16 @@ def test_complete_and_paired(quick):
     for case in found:
         if case.part != "random":
             assert [s.seed for s in case.scenarios] == [0, 1, 2]
-            assert len({s.model_copy(update={"seed": 0}) for s in case.scenarios}) == 1
+            assert len({s.perturbation for s in case.scenarios}) == 3  # replicates, not copies
+            same = {s.model_copy(update={"seed": 0, "perturbation": PLAIN, "events": ()}) for s in case.scenarios}
+            assert len(same) == 1
         assert len({s.laps for s in case.scenarios}) == 1
     if not quick:
-        steady = {s.perturbation for case in found if case.part == "steady" for s in case.scenarios}
-        assert steady >= set(PERTURBATIONS.values())
+        drawn = {name: p.drawn(np.random.default_rng([0, 5])) for name, p in PERTURBATIONS.items()}
+        steady = {case.scenarios[0].perturbation for case in found if case.part == "steady"}
+        assert steady >= set(drawn.values())
         ladder = {(s.steering, s.perturbation) for case in found if not case.change for s in case.scenarios}
-        assert ladder >= {(steering, PERTURBATIONS[p]) for steering in cases.STEERINGS for p in cases.LADDER}
+        assert ladder >= {(steering, drawn[p]) for steering in cases.STEERINGS for p in cases.LADDER}
 
 
 def test_steps_are_where_the_laps_say():
@@ -41,7 +47,12 @@ def test_steps_are_where_the_laps_say():
         if case.part == "step":
             laps = [1 + event.time / case.scenarios[0].reference.period for event in events]
             assert laps == [case.change, case.back] and case.back + 1 <= case.scenarios[0].laps
-            assert events[0].perturbation != events[1].perturbation == case.scenarios[0].perturbation
+            start, changed, back = case.scenarios[0].perturbation, *(e.perturbation for e in events)
+            assert len({start, changed, back}) == 3
+            for name, width in UNKNOWN.items():  # another draw, but of the wheels, which stay what they are
+                assert abs(getattr(back, name) - 1) <= width
+                assert (getattr(back, name) == getattr(start, name)) == ("radius" in name)
+            assert back.slope == start.slope
 
 
 def test_frozen_laps_count_whole():

@@ -119,3 +119,9 @@ def test_bad_input(call, field):
     """One line that begins with the field."""
     with pytest.raises(InputError, match=rf"^{field}: .+"):
         call()
+
+
+def test_floor():
+    """Errors that differ by no more than the floor are a tie; one that failed loses at any floor."""
+    found = comparison.superiority([1.0, 2.0, 3.0, np.nan, 1.0], [1.05, 1.0, 3.5, 9.0, np.nan], floor=0.1)
+    assert (found.wins, found.ties, found.losses) == (2, 1, 2) and found.value == pytest.approx(0.5)

@@ -18,7 +18,7 @@ from mrctl.control.composite import (
     track,
 )
 from mrctl.control.features import FEATURES, INPUTS, PHYSICAL, UNITS, feature_scale
-from mrctl.control.feedforward import STEERING_SCALE, InverseDynamics
+from mrctl.control.feedforward import STEERING_SCALE, NoLearner, Prior
 from mrctl.control.weights import Training, load_training, save_training
 from mrctl.record import InputError
 from mrctl.theory.dynamics import accelerations, inverse_coefficients, left_right
@@ -131,16 +131,24 @@ def test_basis(x, units):
 
 
 def stage(robot, size=1, rigid=False, **settings):
-    return CompositeAdaptation(robot, [Composite(**settings)] * size, rigid, PERIOD)
+    """Learners whose prior is the nominal model."""
+    pupil = CompositeAdaptation(robot, [Composite(**settings)] * size, rigid, PERIOD)
+    pupil.prior = Prior([robot] * size, rigid)
+    return pupil
+
+
+def total(pupil, command, derivative):
+    """The voltage of prior and learner."""
+    return pupil.prior.output(command, derivative) + pupil.output(command, derivative)
 
 
 @pytest.mark.parametrize("rigid", [False, True])
 def test_begins_as_model(robot, rigid):
-    """Before it has seen anything it is the model, and stays so while it may not learn."""
-    pupil, model = stage(robot, 3, rigid), InverseDynamics([robot] * 3, rigid)
+    """Before it has seen anything it adds nothing to the model, nor while it may not learn."""
+    pupil = stage(robot, 3, rigid)
     for _ in range(100):
         command, derivative = RNG.uniform(-1, 1, (2, 3, 2))
-        np.testing.assert_allclose(pupil.output(command, derivative), model.output(command, derivative), atol=1e-12)
+        assert not pupil.output(command, derivative).any()
         added = pupil.learn(RNG.normal(size=(3, 2)), np.ones(3), command, RNG.normal(size=(3, 2)))
         assert not added.any()
     assert not pupil.weight_norm.any()
@@ -159,7 +167,7 @@ def drive(pupil, plant, seconds, disturbance=0.0, watch=None):
         a = np.array([[0.25, 0.15], [0.8, 0.4]])
         command = np.array([0.8, 0.0]) + (a * np.sin(w * t)).sum(1)
         derivative = (a * w * np.cos(w * t)).sum(1)
-        feedforward = pupil.output(command[None], derivative[None])[0]
+        feedforward = total(pupil, command[None], derivative[None])[0]
         feedback = np.array([10.0, 2.0]) * (command - twist)
         voltage = feedback + feedforward
         pupil.learn(feedback[None], np.zeros(1), twist[None], voltage[None])
@@ -262,7 +270,7 @@ def test_noise_counts(robot, channel, rigid):
     pupil = stage(robot, rigid=rigid)
     sigma = np.array([0.02, 0.0]) if channel == 0 else np.array([0.0, 0.1])
     start = np.array([[0.8, 0.0]])
-    voltage = pupil.output(start, np.zeros((1, 2))).copy()
+    voltage = total(pupil, start, np.zeros((1, 2)))
     for _ in range(3000):
         pupil.learn(np.zeros((1, 2)), np.ones(1), start + sigma * random.standard_normal(2), voltage)
     assert np.sqrt(pupil.rows["variance"][0, channel]) == pytest.approx(sigma[channel], rel=0.2)
@@ -291,7 +299,9 @@ def test_finds_the_plant(robot, tmp_path):
     flat[:, range(INPUTS), range(INPUTS)] = 4.0
     save_training(tmp_path / "flat.safetensors", Training(np.zeros((UNITS, INPUTS + 1)), flat), {})
     pupil = stage(robot, weights=str(tmp_path / "flat.safetensors"), noise=0.05, disturbance=0, step=0.002, memory=1e6)
-    feedback, untaught = drive(pupil, plant, 40), drive(InverseDynamics([robot], False), plant, 40)
+    model = NoLearner(robot, 1, False, PERIOD)
+    model.prior = Prior([robot], False)
+    feedback, untaught = drive(pupil, plant, 40), drive(model, plant, 40)
     assert np.sqrt((feedback[-1000:] ** 2).mean()) < 0.06 * np.sqrt((untaught[-1000:] ** 2).mean())
     missing = ((inverse_coefficients(plant) - inverse_coefficients(robot)) * feature_scale(robot)[:, None]).T
     found = pupil.rows["a"][0]

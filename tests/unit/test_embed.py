@@ -14,7 +14,7 @@ def result():
     circle = mrctl.Circle(radius=0.8, period=6.0)
     event = mrctl.Event(time=2.0, perturbation=mrctl.Perturbation(payload=5.0))
     base = mrctl.Scenario(reference=circle, laps=1, events=(event,))
-    return mrctl.simulate([base.model_copy(update={"feedforward": f}) for f in ("model", "none")])
+    return mrctl.simulate([base.model_copy(update=mrctl.FEEDFORWARDS[f]) for f in ("model", "none")])
 
 
 def data(replay):

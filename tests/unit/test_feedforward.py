@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mrctl.control.features import NAMES, SIGN_SPEED, feature_matrix, feature_scale, linear
-from mrctl.control.feedforward import InverseDynamics, NoFeedforward
+from mrctl.control.feedforward import NoLearner, Prior
 from mrctl.kernel import over_rows
 from mrctl.theory import dynamics
 from mrctl.theory.references import Lemniscate
@@ -39,10 +39,10 @@ def test_scales(robot):
 
 
 def test_inverse_dynamics(robot):
-    """`model` and `oracle` are the corrected equation (3) solved for (U_Σ, U_Δ), a robot a row."""
+    """Priors are the corrected equation (3) solved for (U_Σ, U_Δ), a robot a row."""
     others = [robot.model_copy(update={"mass": 20.0 + i, "half_track": 0.15 + 0.001 * i}) for i in range(50)]
     others[7] = robot.model_copy(update={"drive_gain": 0.8, "resistance": 3.0, "gear_loss": 0.3})
-    found = InverseDynamics(others, rigid=False).output(COMMANDS, DERIVATIVES)
+    found = Prior(others, rigid=False).output(COMMANDS, DERIVATIVES)
     for row, other in enumerate(others):
         volts = dynamics.inverse_dynamics(COMMANDS[row], DERIVATIVES[row], other, sign_speed=SIGN_SPEED)
         np.testing.assert_allclose(found[row], dynamics.common_differential(volts), rtol=1e-12, atol=1e-12)
@@ -50,7 +50,7 @@ def test_inverse_dynamics(robot):
 
 def test_rigid(robot):
     """Under rigid steering the second channel is the steering's, which needs no correction from the model."""
-    free, rigid = (InverseDynamics([robot] * 50, r).output(COMMANDS, DERIVATIVES) for r in (False, True))
+    free, rigid = (Prior([robot] * 50, r).output(COMMANDS, DERIVATIVES) for r in (False, True))
     np.testing.assert_array_equal(rigid[:, 0], free[:, 0])
     assert not rigid[:, 1].any()
     assert free[:, 1].all()
@@ -59,21 +59,20 @@ def test_rigid(robot):
 def test_set_robot(robot):
     """Changing one row changes that row alone, and to what it would have been from the start."""
     heavy = robot.model_copy(update={"mass": 30.0, "half_track": 0.2})
-    stage = InverseDynamics([robot] * 4, rigid=False)
+    stage = Prior([robot] * 4, rigid=False)
     slow, derivative = 0.05 * COMMANDS[:4], DERIVATIVES[:4]  # where the half track shows in the smooth signs
     before = stage.output(slow, derivative).copy()
     stage.set_robot(2, heavy)
-    stage.learn(np.ones((4, 2)), np.zeros(4), UNUSED[:4], UNUSED[:4])
     after = stage.output(slow, derivative)
     np.testing.assert_array_equal(np.delete(after, 2, 0), np.delete(before, 2, 0))
-    alone = InverseDynamics([heavy], rigid=False).output(slow[2:3], derivative[2:3])
+    alone = Prior([heavy], rigid=False).output(slow[2:3], derivative[2:3])
     np.testing.assert_array_equal(after[2], alone[0])
     assert (after[2] != before[2]).all()
 
 
 def test_none(robot):
     """`none` gives nothing and learns nothing."""
-    stage = NoFeedforward(robot, 50, rigid=False, period=0.01)
+    stage = NoLearner(robot, 50, rigid=False, period=0.01)
     stage.learn(np.ones((50, 2)), np.zeros(50), UNUSED, UNUSED)
     np.testing.assert_array_equal(stage.output(COMMANDS, DERIVATIVES), np.zeros((50, 2)))
 

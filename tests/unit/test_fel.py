@@ -227,7 +227,7 @@ def test_rows(robot, motion, feedback, data):
         command, derivative = motion[:, rows].copy()
         command[list(lost)] = np.nan
         stage, _, _ = taught(robot, settings, size=len(command))
-        stage.prior[:], stage.weights[:] = prior[rows], prior[rows] + 0.01
+        stage.initial[:], stage.weights[:] = prior[rows], prior[rows] + 0.01
         output = stage.output(command, derivative).copy()
         added = teach(stage, feedback[rows], frozen[rows])
         return np.hstack([stage.weights, stage.weight_norm[:, None], output, added, stage.rows["output"]])
@@ -268,7 +268,7 @@ def test_files(robot, tmp_path, suffix):
     stage, command, derivative = taught(robot, Fel(hidden=HIDDEN, weights=str(path)))
     x = feature_matrix(command, derivative, robot.half_track, feature_scale(robot))
     np.testing.assert_array_equal(stage.output(command, derivative)[0], answer(x[0], weights, [6, 6]))
-    np.testing.assert_array_equal(stage.prior, weights[None])
+    np.testing.assert_array_equal(stage.initial, weights[None])
 
 
 def test_single_precision(tmp_path):

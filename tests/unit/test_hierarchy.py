@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrctl.control.composite import CompositeAdaptation
-from mrctl.control.feedforward import InverseDynamics, NoFeedforward
+from mrctl.control.feedforward import NoLearner, Prior
 from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.control.observer import DisturbanceObserver
@@ -15,6 +15,7 @@ from mrctl.kernel import over_rows
 from mrctl.loop.courses import GOAL
 from mrctl.loop.hierarchy import TAKE_OVER, Hierarchy
 from mrctl.loop.user_stages import UserHierarchy, UserStage
+from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, Scenario
 from mrctl.sensing.prediction import SEEN
 from mrctl.theory.dynamics import inverse_dynamics
@@ -61,33 +62,44 @@ def drive(hierarchy, inputs):
 
 def weights(hierarchy):
     """What a learner knows of its robots, `(B, …)`; a disturbance, which fades while nothing is learned, is no part."""
-    stage = hierarchy.feedforward
+    stage = hierarchy.learner
     if isinstance(stage, CompositeAdaptation):
         return stage.rows["a"][..., :26]
     return stage.rows["theta"] if isinstance(stage, RecursiveLeastSquares) else stage.weights
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
+    ("learner", "kind"),
     [
-        ("none", NoFeedforward), ("model", InverseDynamics), ("oracle", InverseDynamics),
-        ("observer", DisturbanceObserver), ("fel", FeedbackErrorLearning), ("rls", RecursiveLeastSquares),
-        ("composite", CompositeAdaptation),
+        ("none", NoLearner), ("observer", DisturbanceObserver), ("fel", FeedbackErrorLearning),
+        ("rls", RecursiveLeastSquares), ("composite", CompositeAdaptation),
     ],
 )  # fmt: skip
-def test_feedforwards(robot, name, kind):
-    """Each name is its law; those that know the model give something before they have learned."""
-    stage = build(robot, 2, feedforward=name).feedforward
-    assert type(stage) is kind
-    assert stage.output(np.ones((2, 2)), np.ones((2, 2))).any() == (name not in ("none", "fel", "rls"))
+def test_feedforwards(robot, learner, kind):
+    """Each name is its law; before anything is learned the feedforward is the prior."""
+    motion = np.ones((2, 2))
+    for prior in ("model", "true_model", "none")[: 2 if learner == "observer" else 3]:
+        hierarchy = build(robot, 2, prior=prior, learner=learner)
+        assert type(hierarchy.learner) is kind
+        known = Prior([robot] * 2, rigid=False).output(motion, motion)
+        expected = 0.0 * known if prior == "none" else known
+        np.testing.assert_array_equal(hierarchy.feedforward(motion, motion), expected)
 
 
-@pytest.mark.parametrize("name", ["model", "oracle"])
+def test_names():
+    """Each name of a pair is that of its scenario; an observer without a model is refused in one line."""
+    for name, pair in FEEDFORWARDS.items():
+        assert Scenario(**pair).feedforward == name
+    with pytest.raises(InputError, match="^prior: the learner observer compares the robot with a model; set model$"):
+        Scenario.from_dict({"learner": "observer"})
+
+
+@pytest.mark.parametrize("name", ["model", "true_model"])
 def test_nothing_wrong(robot, name):
     """Where posture and twist are the reference's, the voltages are the inverse dynamics and the feedback is silent."""
     _, _, motion, slip = signals(1, 300)
     reference, twist, acceleration = np.split(motion, [3, 5], axis=-1)
-    hierarchy = build(robot, feedforward=name)
+    hierarchy = build(robot, **FEEDFORWARDS[name])
     log = drive(hierarchy, (reference, twist, motion, slip))[:, 0]
     expected = inverse_dynamics(twist[:, 0], acceleration[:, 0], robot, sign_speed=0.05)
     np.testing.assert_allclose(log[:, :2], expected, atol=1e-9)
@@ -98,7 +110,7 @@ def test_nothing_wrong(robot, name):
 def test_slow_motion_controller(robot):
     """A motion controller of 50 ms answers every fifth tick; between, its correction rides on the live reference."""
     hierarchy = build(
-        robot, 2, feedforward="none", motion_period=0.05, prefilter=0.01, kanayama=Kanayama(k_x=3, k_y=25, k_theta=10)
+        robot, 2, learner="none", motion_period=0.05, prefilter=0.01, kanayama=Kanayama(k_x=3, k_y=25, k_theta=10)
     )
     inputs = pose, _, motion, _ = signals(2, 43)
     reference, twist = motion[..., :3], motion[..., 3:5]
@@ -123,7 +135,7 @@ def test_slow_motion_controller(robot):
 @pytest.mark.parametrize("every", [1, 5])
 def test_motion_rate(robot, every):
     """The motion controller looks at the posture at its own rate alone."""
-    hierarchy = build(robot, feedforward="none", motion_period=0.01 * every)
+    hierarchy = build(robot, learner="none", motion_period=0.01 * every)
     inputs = signals(1, 21)
     log = drive(hierarchy, inputs)
     changed = np.flatnonzero((np.diff(log[:, 0, 4:7], axis=0) != 0).any(axis=1)) + 1
@@ -136,7 +148,7 @@ def test_rows(robot, name, steering):
     """Through the whole hierarchy robots keep to themselves: each has the same bits alone and among others."""
     body = robot.model_copy(update={"trail": 0.0}) if steering == "rigid" else robot
     inputs = signals(3, 120)
-    scenarios = [Scenario(**IDEAL, feedforward=name, steering=steering, seed=seed) for seed in range(3)]
+    scenarios = [Scenario(**IDEAL, **FEEDFORWARDS[name], steering=steering, seed=seed) for seed in range(3)]
 
     def answer(rows):
         chosen = scenarios[rows]
@@ -148,18 +160,18 @@ def test_rows(robot, name, steering):
     for i in range(3):
         alone, _ = answer(slice(i, i + 1))
         assert together[:, i].tobytes() == alone[:, 0].tobytes()
-    stage = hierarchy.feedforward
+    stage = hierarchy.learner
     for array in (hierarchy.state, *(getattr(stage, name) for name in ("rows", "weights") if hasattr(stage, name))):
         assert array.shape[0] == 3  # what is remembered has a leading B
     for array in (hierarchy.output, hierarchy.weight_norm, hierarchy.saturated):
         assert array.shape[0] == 3
-    assert (hierarchy.weight_norm > 0).all() == (name in ("fel", "rls", "composite"))
+    assert (hierarchy.weight_norm > 0).all() == (FEEDFORWARDS[name]["learner"] in ("fel", "rls", "composite"))
 
 
-@pytest.mark.parametrize("name", ["fel", "rls", "composite"])
+@pytest.mark.parametrize("name", ["fel", "rls", "model+fel", "model+rls", "model+composite"])
 def test_learning_switch(robot, name):
     """Switched off, a robot keeps its weights while its neighbour learns; switched on again, it goes on."""
-    hierarchy = build(robot, 2, feedforward=name)
+    hierarchy = build(robot, 2, **FEEDFORWARDS[name])
     inputs = signals(2, 360)
     early, middle, late = ([signal[part] for signal in inputs] for part in np.split(np.arange(360), 3))
     drive(hierarchy, early)
@@ -175,10 +187,10 @@ def test_learning_switch(robot, name):
     assert (weights(hierarchy)[0] != learned[0]).any()
 
 
-@pytest.mark.parametrize("name", ["fel", "rls", "composite"])
+@pytest.mark.parametrize("name", ["fel", "rls", "model+fel", "model+rls", "model+composite"])
 def test_slip_freezes(robot, name):
     """The voltage of a wheel that slips says nothing about the motion: nobody learns from it, the neighbour goes on."""
-    hierarchy = build(robot, 2, feedforward=name)
+    hierarchy = build(robot, 2, **FEEDFORWARDS[name])
     early, late = ([signal[part] for signal in signals(2, 240)] for part in np.split(np.arange(240), 2))
     drive(hierarchy, early)
     learned = weights(hierarchy).copy()
@@ -191,7 +203,7 @@ def test_slip_freezes(robot, name):
 def test_saturation_freezes(robot):
     """A voltage that cannot act teaches nothing, and does not wind the integral up."""
     weak = robot.model_copy(update={"supply": 0.5})
-    hierarchy = build(weak, 1, feedforward="fel")
+    hierarchy = build(weak, 1, learner="fel")
     still, pose, ahead, wanted = np.zeros((1, 2)), np.zeros((1, 3)), np.array([[0.5, 0, 0]]), np.array([[0.5, 0]])
     for _ in range(10):  # until the command has risen beyond reach
         tick(hierarchy, pose, still, np.hstack([ahead, wanted, still]))
@@ -208,13 +220,13 @@ def test_saturation_freezes(robot):
 def test_switching_one_robot(robot):
     """New gains reach one robot, and both kinds of gains reach it."""
     inputs = signals(2, 10)
-    plain = drive(build(robot, 2, feedforward="none"), inputs)
-    hierarchy = build(robot, 2, feedforward="none")
+    plain = drive(build(robot, 2, learner="none"), inputs)
+    hierarchy = build(robot, 2, learner="none")
     hierarchy.set_kanayama(0, Kanayama(k_x=1.0))
     moved = drive(hierarchy, inputs)
     np.testing.assert_array_equal(moved[:, 1], plain[:, 1])
     assert (moved[:, 0, 7] != plain[:, 0, 7]).any()
-    hierarchy = build(robot, 2, feedforward="none")
+    hierarchy = build(robot, 2, learner="none")
     hierarchy.set_pid(1, Pid(time_constant=0.4))
     slower = drive(hierarchy, inputs)
     np.testing.assert_array_equal(slower[:, 0], plain[:, 0])
@@ -226,7 +238,7 @@ def test_switching_one_robot(robot):
 def test_rolling_start(robot, name):
     """Reset to a motion that goes on, the first command is that motion and the voltage what the model takes for it."""
     twist, acceleration = np.array([[0.8, 0.5]]), np.array([[0.2, -0.3]])
-    hierarchy = build(robot, feedforward=name)
+    hierarchy = build(robot, **FEEDFORWARDS[name])
     hierarchy.reset(twist, acceleration, np.array([0.2]))
     pose = np.array([[1.0, 2.0, 0.5]])
     output = tick(hierarchy, pose, twist, np.hstack([pose, twist, acceleration]))
@@ -254,7 +266,7 @@ def test_take_over(robot):
     integrals = []
     for added in (taken, None):
         stage = UserStage("feedforward", lambda robot, size, added=added: Learner(added), robot, 1)
-        hierarchy = UserHierarchy([Scenario(feedforward="none")], robot, {"feedforward": stage})
+        hierarchy = UserHierarchy([Scenario(learner="none")], robot, {"feedforward": stage})
         tick(hierarchy, np.zeros((1, 3)), np.zeros((1, 2)), np.array([[0, 0, 0, 1.0, 1.0, 0, 0]]))
         integrals.append(hierarchy.state["pid"]["integral"].copy())
     np.testing.assert_allclose(integrals[1] - integrals[0], TAKE_OVER * taken, atol=1e-14)
@@ -262,7 +274,7 @@ def test_take_over(robot):
 
 def test_lag_of_the_fork(robot):
     """The fork starts from the angle it has and does not jump to another."""
-    hierarchy = build(robot, feedforward="none")
+    hierarchy = build(robot, learner="none")
     twist, still, pose = np.array([[0.8, 0.5]]), np.zeros((1, 2)), np.zeros((1, 3))
     hierarchy.reset(twist, still, np.array([0.4]))
     first = tick(hierarchy, pose, twist, np.hstack([pose, twist, still]))[0, 2]

@@ -16,7 +16,7 @@ from mrctl.kernel import kernel, over_rows
 from mrctl.physics.files import models_folder
 
 PACKAGE = Path(mrctl.__file__).parent
-FEEDFORWARDS = ("model", "observer", "composite", "rls", "fel")
+FEEDFORWARDS = ("model", "observer", "composite", "rls", "fel")  # the prior `model`, and learners
 VOLTAGES = """
 import gc
 import sys
@@ -26,7 +26,7 @@ import numpy as np
 import mrctl
 from mrctl import Scenario
 from mrctl.kernel import Kernel
-from mrctl.loop.hierarchy import feedforward_of
+from mrctl.loop.hierarchy import Hierarchy
 from mrctl.physics import mjcf
 
 file, *names = sys.argv[1:]
@@ -34,7 +34,8 @@ robot = mjcf.build()[1]
 twist, rate = np.array([[0.5, 0.8]]), np.array([[0.3, -0.2]])
 voltages = {}
 for name in names:
-    stage = feedforward_of([Scenario(feedforward=name)], robot)
+    hierarchy = Hierarchy([Scenario(prior="model", learner="none" if name == "model" else name)], robot)
+    stage = hierarchy.learner
     if name == "fel":
         stage.weights[:] = 0.1
     elif name != "model":
@@ -44,7 +45,7 @@ for name in names:
             stage.learn(rate, np.zeros(1), twist, rate)
         voltages[name] = stage.rows["disturbance"].copy()
     else:
-        voltages[name] = stage.output(twist, rate).copy()
+        voltages[name] = (hierarchy.prior if name == "model" else stage).output(twist, rate).copy()
 np.savez(file, **voltages)
 kernels = [k for k in gc.get_objects() if type(k) is Kernel and "compiled" in vars(k)]
 hits, misses = (

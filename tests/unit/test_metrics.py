@@ -284,3 +284,20 @@ def test_bad_input(call, field):
     with pytest.raises(InputError, match=rf"^{field}: .+") as caught:
         call(make())
     assert "\n" not in str(caught.value)
+
+
+def test_over_laps_and_excess():
+    """The RMS over all laps is that of all samples; the excess is the area above the error that settles."""
+    error = np.array([[3.0, 2.0, 1.0, 4.0, 2.0, 1.0], [2.0, 2.0, 2.0, np.nan, np.nan, np.nan], [1.0] * 6])
+    laps = xr.Dataset(
+        {"position_rmse": (("run", "lap"), error), "laps": ("run", [6, 6, 3])},
+        {"run": [0, 1, 2], "lap": np.arange(1, 7), "lap_time": ("run", [12.0, 12.0, 10.0])},
+    )
+    found = metrics.over_laps(laps, "position_rmse").values
+    assert found[0] == pytest.approx(np.sqrt(np.mean(error[0] ** 2))) and found[2] == 1.0 and np.isnan(found[1])
+    after = metrics.excess(laps, "position_rmse", 4, 6).values
+    assert after[0] == pytest.approx(12 * ((4 - 1) + (2 - 1))) and np.isnan(after[1]) and after[2] == 0.0
+    with pytest.raises(InputError, match="^metric: 'energy' is not a root mean square"):
+        metrics.over_laps(laps, "energy")
+    with pytest.raises(InputError, match="^change: lap 5 and lap 4"):
+        metrics.excess(laps, "position_rmse", 5, 4)

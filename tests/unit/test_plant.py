@@ -273,7 +273,7 @@ def test_inductance(inductive):
 def test_inductance_in_the_loop(inductive):
     """It runs, alone and in a batch with the same bits, and hardly differs from a winding without."""
     scenarios = [
-        Scenario(world=world, reference=Circle(period=4, radius=0.5), laps=1, feedforward="model", seed=seed)
+        Scenario(world=world, reference=Circle(period=4, radius=0.5), laps=1, prior="model", learner="none", seed=seed)
         for seed, world in ((0, inductive), (1, inductive), (0, "flat"))
     ]
     with_winding, _, without = (simulate(scenarios).isel(run=run) for run in range(3))

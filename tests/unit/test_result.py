@@ -21,19 +21,19 @@ from mrctl.viewer.recording import Library
 CIRCLE = Circle(period=4, radius=0.5)
 SCENARIOS = [
     Scenario(
-        reference=CIRCLE, laps=1, feedforward="fel", fel=Fel(hidden=4), name="gelernt ✓", sensing=Sensing(tier="ideal")
+        reference=CIRCLE, laps=1, learner="fel", fel=Fel(hidden=4), name="gelernt ✓", sensing=Sensing(tier="ideal")
     ),
     Scenario(
         reference=Circle(period=5, radius=0.5),
         laps=1,
-        feedforward="none",
+        learner="none",
         seed=3,
         sensing=Sensing(estimator="odometry"),
     ),
     Scenario(
         reference=CIRCLE,
         laps=1,
-        feedforward="rls",
+        learner="rls",
         steering="rigid",
         perturbation=Perturbation(payload=2, dead_zone=0.1, control_delay=0.01),
         events=(Event(time=1, push=(1e4, 1e4, 0)),),

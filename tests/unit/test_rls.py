@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mrctl.control.features import feature_matrix, feature_scale
-from mrctl.control.feedforward import InverseDynamics
+from mrctl.control.feedforward import Prior
 from mrctl.control.rls import RLS, RecursiveLeastSquares, Rls, update
 from mrctl.theory.dynamics import inverse_coefficients
 
@@ -62,8 +62,8 @@ def test_kalman(x, root, coefficients, feedback, drift, step_size):
 
 
 def test_learns_physics(robot):
-    """Taught by what an oracle has and it lacks, it finds the oracle's coefficients."""
-    teacher = InverseDynamics([robot] * 2, rigid=False)
+    """Taught by what a model has and it lacks, it finds the model's coefficients."""
+    teacher = Prior([robot] * 2, rigid=False)
     eager = Rls(step=1, initial_covariance=1000, drift=0, covariance_bound=1e-9, dead_zone=0)
     pupil = RecursiveLeastSquares(robot, [eager] * 2, rigid=False, period=PERIOD)
     first = None

@@ -9,11 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mrctl import Composite, Event, Fel, Kanayama, Observer, Perturbation, Pid, Rls, Scenario
-from mrctl.control.feedforward import NoFeedforward
+from mrctl.control.feedforward import NoLearner
 from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
-from mrctl.scenario import LONGEST, whole
+from mrctl.scenario import LONGEST, replicates, whole
 from mrctl.sensing.tiers import Sensing
+from mrctl.theory.perturbation import UNKNOWN
 from mrctl.theory.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
 
 values = (
@@ -153,7 +154,7 @@ FULL = Scenario(
     steering="rigid",
     reference=Waypoints(points=((0, 0), (1, 0), (1, 1))),
     laps=3,
-    feedforward="rls",
+    learner="rls",
     sensing=Sensing(tier="field", estimator="odometry", gyro_noise=1e-3),
     kanayama=Kanayama(k_x=2.5),
     pid=Pid(time_constant=0.3),
@@ -269,7 +270,7 @@ def test_order():
             name=f"run {seed}",
             reference=Circle(period=period, radius=0.5),
             laps=1,
-            feedforward=kind,
+            learner=kind,
             steering=steering,
             seed=seed,
         )
@@ -298,10 +299,10 @@ def test_networks_of_different_sizes():
 
 def test_label():
     """A run's label is its name, or that of the feedforward, which for a user's stage is that of its function."""
-    scenario = Scenario(reference=Circle(period=4, radius=0.5), laps=1, feedforward="none")
+    scenario = Scenario(reference=Circle(period=4, radius=0.5), laps=1, learner="none")
 
     def mine(robot, size):
-        return NoFeedforward(robot, size, rigid=False, period=scenario.control_period)
+        return NoLearner(robot, size, rigid=False, period=scenario.control_period)
 
     assert str(simulate(scenario).label.item()) == "none"
     assert (
@@ -310,3 +311,25 @@ def test_label():
         == "mine"
     )
     assert str(simulate(scenario.model_copy(update={"name": "x"})).label.item()) == "x"
+
+
+def test_replicates():
+    """Draws of what nobody knows are uniform, paired over scenarios, and those of a run's start in its events."""
+    heavy = Scenario(perturbation=Perturbation(mass_factor=1.5), events=(Event(time=1, perturbation=Perturbation()),))
+    runs, plain = replicates(heavy, 400), replicates(Scenario(learner="none"), 400)
+    for name, width in UNKNOWN.items():
+        start, later, other = (
+            np.array([getattr(p, name) for p in found])
+            for found in (
+                [r.perturbation for r in runs],
+                [r.events[0].perturbation for r in runs],
+                [r.perturbation for r in plain],
+            )
+        )
+        np.testing.assert_array_equal(later, other)
+        np.testing.assert_allclose(start, other * getattr(heavy.perturbation, name), rtol=1e-12)
+        assert np.abs(other - 1).max() <= width
+        assert other.std() == pytest.approx(width / np.sqrt(3), rel=0.1) and abs(other.mean() - 1) < 0.2 * width
+    assert [r.seed for r in runs] == list(range(400)) and replicates(heavy, 3, first=7) == runs[7:10]
+    factors = np.array([[getattr(r.perturbation, name) for name in UNKNOWN] for r in plain])
+    assert np.abs(np.corrcoef(factors.T) - np.eye(len(UNKNOWN))).max() < 0.15

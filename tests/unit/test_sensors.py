@@ -268,7 +268,7 @@ def test_fixes():
 
 def test_rates_and_latencies():
     """Every sensor has its own rate and latency: a slow run shows the signals of a quick one, later and held."""
-    base = Scenario(reference=Circle(period=4, radius=0.6), laps=1, feedforward="none", seed=2)
+    base = Scenario(reference=Circle(period=4, radius=0.6), laps=1, learner="none", seed=2)
     own = {"encoder": (50, 0.03), "gyro": (25, 0.01), "accelerometer": (20, 0.02), "fix": (10, 0.05)}
     values = {f"{name}_rate": rate for name, (rate, _) in own.items()}
     values |= {f"{name}_latency": latency for name, (_, latency) in own.items()}

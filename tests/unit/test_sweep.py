@@ -14,9 +14,9 @@ from mrctl import Circle, Event, InputError, Perturbation, RobotFile, Scenario, 
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import store as folder
 
-BASE = {"laps": 1, "feedforward": "none", "reference": {"kind": "line", "length": 0.4}}
+BASE = {"laps": 1, "prior": "none", "learner": "none", "reference": {"kind": "line", "length": 0.4}}
 MASS = {"field": "perturbation.mass_factor", "uniform": [0.8, 1.5]}
-LAWS = {"field": "feedforward", "values": ["none", "model", "fel"]}
+LAWS = {"field": "learner", "values": ["none", "rls", "fel"]}
 
 
 def sweep(*axes, **changes):
@@ -35,7 +35,7 @@ def test_product_in_the_order_of_the_file():
     slopes = {"field": "perturbation.slope", "grid": {"start": -0.1, "stop": 0.1, "count": 3}}
     one = sweep(LAWS, slopes, runs=2)
     expected = itertools.product(LAWS["values"], [-0.1, 0.0, 0.1], range(2))
-    found = [(v["feedforward"], v["perturbation.slope"]) for v in drawn(one)]
+    found = [(v["learner"], v["perturbation.slope"]) for v in drawn(one)]
     assert found == [(law, slope) for law, slope, _ in expected] and one.size == 18
 
 
@@ -104,8 +104,8 @@ def test_paired(paired):
     """Paired values see the same seeds and draws; others see their own; combinations of other axes see their own."""
     slopes = {"field": "perturbation.slope", "values": [0.0, 0.1]}
     rows = drawn(sweep({**LAWS, "paired": paired}, slopes, MASS, runs=4))
-    seen = {law: [(v["seed"], v[MASS["field"]]) for v in rows if v["feedforward"] == law] for law in LAWS["values"]}
-    assert (seen["none"] == seen["fel"] == seen["model"]) is paired
+    seen = {law: [(v["seed"], v[MASS["field"]]) for v in rows if v["learner"] == law] for law in LAWS["values"]}
+    assert (seen["none"] == seen["fel"] == seen["rls"]) is paired
     assert len(set(itertools.chain(*seen.values()))) == (8 if paired else 24)
 
 
@@ -142,7 +142,7 @@ def grid(start, stop, count):
         ("laps.x: no 'x' in laps", [axis("laps.x", values=[1])], {}),
         ("perturbation.mass_factor: .* greater than", [axis(MASS["field"], uniform=[0, 1])], {}),
         ("perturbation.mass_factor: .* less than", [axis(MASS["field"], grid=grid(1, 99, 3))], {}),
-        ("feedforward: Input should be 'none', 'model'", [axis("feedforward", values=["none", "magic"])], {}),
+        ("learner: Input should be 'none', 'observer'", [axis("learner", values=["none", "magic"])], {}),
         (
             "run 0: perturbation.control_delay: .* whole multiple",
             [axis("perturbation.control_delay", uniform=[0.02, 0.04])],
@@ -154,7 +154,7 @@ def grid(start, stop, count):
         ("axes.0.normal.1: .* greater than 0", [axis(MASS["field"], normal=[1, 0])], {}),
         ("only values and grids can be paired", [{**MASS, "paired": True}], {}),
         ("laps is there twice", [axis("laps", values=[1]), axis("laps", values=[2])], {}),
-        ("feedforward, laps are zipped, but differ", [{**LAWS, "zip": "a"}, axis("laps", values=[1], zip="a")], {}),
+        ("learner, laps are zipped, but differ", [{**LAWS, "zip": "a"}, axis("laps", values=[1], zip="a")], {}),
         ("axes.0.values: .* at least 1", [axis("laps", values=[])], {}),
         ("axes.0.stdev: Extra inputs", [{**MASS, "stdev": 1}], {}),
         ("every: only where record", [], {"every": 5}),
@@ -215,7 +215,7 @@ def test_columns():
         {"field": "laps", "values": [1, 2]}, {"field": "perturbation.slope", "values": [0, 0.1]}, LAWS, MASS,
         {"field": "perturbation", "values": [{"slope": 0.1}]},
     )  # fmt: skip
-    kinds = [one.columns.field(name).type for name in ("laps", "perturbation.slope", "feedforward", MASS["field"])]
+    kinds = [one.columns.field(name).type for name in ("laps", "perturbation.slope", "learner", MASS["field"])]
     assert kinds == [pa.int64(), pa.float64(), pa.string(), pa.float64()]
     assert one.axes[-1].cell({"slope": 0.1}) == '{"slope": 0.1}' and one.axes[2].cell("fel") == "fel"
     assert one.columns.names.count("laps") == 1 and one.columns.field("energy").metadata == {b"units": b"J"}
@@ -225,7 +225,7 @@ def test_list_of_scenarios():
     """Run i of a list is its i-th scenario, whatever it changes, seed and events included."""
     step = Event(time=0.2, perturbation=Perturbation(payload=3), reference=Circle(period=9))
     scenarios = [
-        Scenario(), Scenario(seed=7, laps=2, name="a", feedforward="rls"), Scenario(reference=Circle(), events=(step,)),
+        Scenario(), Scenario(seed=7, laps=2, name="a", learner="rls"), Scenario(reference=Circle(), events=(step,)),
         Scenario(world="rough", steering="rigid", control_period=0.02, motion_period=0.02, prefilter=0.1),
     ]  # fmt: skip
     one = Sweep.of(scenarios, record="laps", chunk=3)
@@ -240,7 +240,7 @@ def test_scenario_axis_combines_with_others():
     tables = [{"perturbation": {"slope": 0.1}}, {"laps": 3}]
     one = sweep({"field": "scenario", "values": tables}, LAWS, base={**BASE, "perturbation": {"payload": 2.0}})
     found = [one.scenario(run) for run in range(one.size)]
-    assert [s.feedforward for s in found] == ["none", "model", "fel"] * 2
+    assert [s.feedforward for s in found] == ["none", "rls", "fel"] * 2
     assert {(s.perturbation.slope, s.perturbation.payload, s.laps) for s in found} == {(0.1, 0.0, 1), (0.0, 2.0, 3)}
     with pytest.raises(InputError, match="laps"):
         sweep({"field": "scenario", "values": [{"laps": 0}]})

@@ -1,0 +1,69 @@
+"""The best fixed feedforward in hindsight: what a learner would have used that knew the whole run at its start.
+
+    U_ff = cᵀ x_c,    c ← c + argmin_Δ Σ |U_fb − Δᵀ x_c|²,    x_c = the 8 features of equation (3) at the command
+
+The inverse dynamics of the nominal robot is the first guess. A run shows which voltage the feedback had to add; least
+squares finds the coefficients that would have given it, and the run is repeated with them. After one repetition the
+coefficients hardly change any more. The regret of a learner is its error less that of the last repetition
+(Cesa-Bianchi and Lugosi, 2006).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from mrctl.control.features import feature_matrix
+from mrctl.kernel import Array
+from mrctl.loop.simulation import Simulation, uniform
+from mrctl.results import dataset
+from mrctl.scenario import FEEDFORWARDS, Scenario
+
+REPETITIONS = 2
+RIDGE = 1e-6  # share of a feature's mean square; keeps what was never excited at its first guess
+
+
+def best_fixed(scenarios: Sequence[Scenario], *, threads: int = 0) -> xr.Dataset:
+    """Drives every scenario with the nominal model, then twice more; returns the last drives, as `simulate` does.
+
+    Args:
+        scenarios: Scenarios, whose priors and learners are replaced.
+        threads: Number of threads; 0 for all cores.
+
+    Raises:
+        InputError: As `mrctl.simulate`.
+    """
+    scenarios = [s.model_copy(update=FEEDFORWARDS["model"] | {"name": s.name or "hindsight"}) for s in scenarios]
+    parts = []
+    for rows in uniform(scenarios):
+        group = [scenarios[row] for row in rows]
+        result, coefficients = drive(group, None, threads)
+        for _ in range(REPETITIONS):
+            result, coefficients = drive(group, coefficients, threads)
+        parts.append((rows, result))
+    return dataset.combine(parts, scenarios)
+
+
+def drive(scenarios: Sequence[Scenario], coefficients: Array | None, threads: int = 0) -> tuple[xr.Dataset, Array]:
+    """Drives once with fixed coefficients `(B, 8, 2)`, by default the model's; returns the result and the next ones."""
+    simulation = Simulation(scenarios, threads=threads)
+    hierarchy = simulation.hierarchy
+    prior = hierarchy.prior.rows
+    if coefficients is not None:
+        prior["c"] = coefficients
+        motion = hierarchy.command.copy(), hierarchy.derivative.copy()
+        hierarchy.reset(*motion, simulation.plant.reading["steering_angle"])  # the integral holds less now
+    gram, seen = np.zeros((len(scenarios), 8, 8)), np.zeros((len(scenarios), 8, 2))
+    while simulation.running:
+        simulation.step()
+        control = hierarchy.state
+        x = feature_matrix(hierarchy.command, hierarchy.derivative, prior["half_track"], prior["ones"])
+        x = np.where((control["frozen"][:, None] == 0) & np.isfinite(x), x, 0.0)
+        gram += x[:, :, None] * x[:, None, :]
+        seen += x[:, :, None] * np.nan_to_num(hierarchy.feedback)[:, None, :]
+    scale = np.sqrt(np.einsum("bii->bi", gram)).clip(min=1e-12)
+    scaled = gram / (scale[:, :, None] * scale[:, None, :]) + RIDGE * np.eye(8)
+    found = np.linalg.solve(scaled, seen / scale[:, :, None]) / scale[:, :, None]
+    return simulation.result(), prior["c"] + found
