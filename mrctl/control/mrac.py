@@ -328,6 +328,11 @@ class ModelReferenceAdaptive(Learner):
         self._start = rows.copy()
         self.arrays = rows, feature_scale(robot), queues(len(settings), delay)
 
+    @property
+    def parameters(self) -> Array:
+        """Learned coefficients of the scaled features, `(B, 8, 2)` in V."""
+        return self.rows["b"].copy()
+
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to the parameters of the prior and P₀."""
         self.rows[rows], self.weight_norm[rows] = self._start[rows], 0.0

@@ -98,7 +98,8 @@ CASES = [Mrac(), Mrac(tracking=20.0, noise=0.1), Mrac(radius=0.2, leak=5.0, nois
 def test_lyapunov(robot, settings, known):
     """In the case of the theorem V falls; where a sampled step raises it, that is by O(h²): a quarter with h/2.
 
-    With the projection at work (radius 0.2 of the supply) the true parameters must be in the ball, as with a prior.
+    With the default settings no step raises it. With a ball of 0.2 of the supply the true parameters are only in it
+    where the prior is the model; elsewhere the theorem does not hold (`test_outside`).
     """
     if settings.radius < 1 and not known:
         pytest.skip("the true parameters are not in the ball")
@@ -107,9 +108,15 @@ def test_lyapunov(robot, settings, known):
         values, _, _ = drive(robot, settings, period, 3.0, known)
         rises.append(max(np.diff(values).max(), 0.0) / values[0])
         assert values[-1] < 0.5 * values[0]
-    assert rises[0] < 5e-3
+    assert rises[0] < 5e-3 if settings.tracking > 2 else not any(rises)
     for before, after in zip(rises, rises[1:], strict=False):
         assert after <= 0.35 * before + 1e-9
+
+
+def test_outside(robot):
+    """Where the true parameters are not in the ball, V grows: the test above can fail."""
+    values, _, _ = drive(robot, CASES[2], PERIOD, 3.0, known=False)
+    assert values[-1] > 10 * values[0]
 
 
 def test_parameters(robot):
