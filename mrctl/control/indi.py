@@ -10,8 +10,9 @@ acceleration that it made (`match`), so that U_f − M ẋ_f = H f exactly. Ther
 
     ẋ = ν + M⁻¹ (H f e^(−L's) − f),      L' = two periods and the delay of the sensing tier
 
-(one period for the mean acceleration, one because a stage answers before it sees the motion of its tick).
-The response to ν is one, whatever f is, and T does not enter into it; T only says how fast a change of f is followed.
+The mean acceleration takes one of the periods, and the other is that a stage answers before it sees the motion of its
+tick. The response to ν is one, whatever f is, and T does not enter into it; T only says how fast a change of f is
+followed.
 
 Here ν = ẋ_c + M⁻¹ · PID(x_c − x): the prior gives M ẋ_c, the PID gives the rest of M ν, and this stage replaces what
 the prior says about f at the commanded motion by what was measured,
@@ -28,10 +29,10 @@ For P = 1/(M s), a plant without f, and a PID C that acts L later, the loop open
     (C e^(−Ls) + H M s e^(−L's)) P/(1 − H e^(−L's)),      1/(1 + loop) = (1 − H e^(−L's))/(1 + C P e^(−Ls))
 
 so that INDI is stable wherever the PID alone is. That is owed to the matched delay: with 1 − H in the denominator the
-loop would lose phase. `M e^(−L's)` also shows what a wrong M does: it leaves a part of H e^(−L's) in the loop.
+loop would lose phase. A wrong M leaves a part of H e^(−L's) in the loop.
 
-Under `rigid` steering the fork makes θ̇ without a voltage: in the second channel, INDI then
-increments the rotation itself, whose effectiveness is one, U = U_f + (ν − θ̇_f).
+Under `rigid` steering the fork makes θ̇ without a voltage: in the second channel, INDI then increments the rotation
+itself, whose effectiveness is one, U = U_f + (ν − θ̇_f).
 """
 
 from __future__ import annotations

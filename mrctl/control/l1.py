@@ -9,10 +9,9 @@ M and f of the model and an unknown voltage σ. Three parts:
     control      U = model(x_c) + PID − C σ̂,    C = ω/(s + ω)
 
 The predictor is driven by the voltage that acted (`match`), which the delay of the sensing tier has made older, and by
-the measured motion, a straight line between two samples, so that its steps are exact. The law
-cancels what the prediction error would still be after a period, so that a constant σ is found in one period, up to the
-factor e^(−a h), the price of the sampling; the adaptation may be this fast because C alone sets the bandwidth of what
-the motors see.
+the measured motion, a straight line between two samples, so that its steps are exact. The law cancels what the
+prediction error would still be after a period, so that a constant σ is found in one period, up to the factor e^(−a h),
+the price of the sampling. The adaptation may be this fast because C alone sets the bandwidth of what the motors see.
 
 Put together, the law and the predictor say σ̂ = e^(−a h) [M (x_n − x_(n−1))/h − (U − f)]: the predictor has no memory
 of its own, and the whole is a disturbance observer with Q = C e^(−a h), as is known of this law.

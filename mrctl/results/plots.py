@@ -352,8 +352,9 @@ def excitation(result: xr.Dataset, span: float = 4.0, motion: str = "commanded",
         axes[1].plot(found["time"].values, signal, label=PARAMETERS[order], **_line(order))
     axes[1].set(xlabel="time (s)", ylabel="excitation alone (1)")
     for one in axes:
-        one.set_yscale("log", nonpositive="mask")
-    axes[1].legend(ncols=4, fontsize=7)
+        if any((np.asarray(line.get_ydata(), float) > 0).any() for line in one.lines):  # a circle excites nothing
+            one.set_yscale("log", nonpositive="mask")
+    axes[1].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
     _legend(figure, curves)
     return figure
 

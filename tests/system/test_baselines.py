@@ -65,6 +65,25 @@ def test_batch_equals_alone(name, delay):
             assert together[signal].values[k].tobytes() == alone[signal].values.tobytes()
 
 
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("periods", [0, 1, 4])
+def test_matching(name, periods):
+    """The motion that a law compares is the true one of this tick, and the voltage is the one that has just acted."""
+    sensing = Sensing(tier="ideal", delay=0.01 * periods)
+    simulation = Simulation([scenario(name, sensing=sensing, perturbation=PERTURBATIONS["all"])])
+    for _ in range(100):
+        simulation.step()
+    found, log = simulation.hierarchy.learner.arrays[0][0]["matched"], simulation.log
+    now, before = log.at(99)[0], log.at(98)[0]
+    np.testing.assert_allclose(found["twist"], (now["v"], now["omega"]), atol=1e-12)
+    np.testing.assert_allclose(
+        found["rate"], (np.array([now["v"], now["omega"]]) - (before["v"], before["omega"])) / 0.01
+    )
+    sent = log.at(98 - periods)[0]
+    left, right = sent["voltage_left"], sent["voltage_right"]
+    np.testing.assert_allclose(found["acted"], ((left + right) / 2, (right - left) / 2), atol=1e-12)
+
+
 @pytest.mark.parametrize("steering", ["compliant", "caster", "rigid"])
 def test_arrangements(steering):
     """One setting serves all steering arrangements, through rest too, in every tier."""
