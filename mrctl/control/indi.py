@@ -22,8 +22,8 @@ the prior says about f at the commanded motion by what was measured,
 The first bracket is the prior, the last one is this stage. `observer` keeps f̂ of the model and adds the measured
 difference from it; INDI drops f̂, so that a wrong model of back-EMF, friction or coupling has no effect, and pays with a
 lag of about 2 T + L' in f, which is left to the PID: with a slow one (λ = 0.15 s, `lab`, nominal robot) its position
-error is 13 mm and that of the model alone 2.5 mm. The PID stays as it is: for a plant ẋ = ν, PI control gives e a second-order response,
-M ë + K_p ė + K_i e = 0, whose integral holds what a wrong M leaves.
+error is 13 mm and that of the model alone 2.5 mm. The PID stays as it is: for a plant ẋ = ν, PI control gives e a
+second-order response, M ë + K_p ė + K_i e = 0, whose integral holds what a wrong M leaves.
 
 For P = 1/(M s), a plant without f, and a PID C that acts L later, the loop opened at the voltage is
 
