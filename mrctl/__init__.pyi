@@ -1,7 +1,10 @@
 from .control.composite import Composite as Composite
 from .control.fel import Fel as Fel
 from .control.guard import Guard as Guard
+from .control.indi import Indi as Indi
 from .control.kanayama import Kanayama as Kanayama
+from .control.l1 import L1 as L1
+from .control.mrac import Mrac as Mrac
 from .control.observer import Observer as Observer
 from .control.pid import Pid as Pid
 from .control.rls import Rls as Rls

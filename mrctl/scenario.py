@@ -14,7 +14,10 @@ from pydantic import Field, model_validator
 from mrctl.control.composite import Composite
 from mrctl.control.fel import Fel
 from mrctl.control.guard import Guard
+from mrctl.control.indi import Indi
 from mrctl.control.kanayama import Kanayama
+from mrctl.control.l1 import L1
+from mrctl.control.mrac import Mrac
 from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
@@ -25,7 +28,9 @@ from mrctl.theory.references import Lemniscate, Reference
 from mrctl.theory.robot import CAR, RobotFile, Steering
 
 PriorName = Literal["none", "model", "true_model"]
-LearnerName = Literal["none", "observer", "fel", "rls", "composite"]
+LearnerName = Literal["none", "observer", "indi", "l1", "fel", "rls", "mrac", "composite"]
+MODEL_BASED = ("observer", "indi", "l1")
+"""Learners that compare the robot with a model, which the prior must be."""
 
 
 def named(prior: str, learner: str) -> str:
@@ -34,8 +39,8 @@ def named(prior: str, learner: str) -> str:
 
 
 FeedforwardName = Literal[
-    "none", "model", "true_model", "model+observer", "fel", "model+fel", "rls", "model+rls", "composite",
-    "model+composite",
+    "none", "model", "true_model", "model+observer", "model+indi", "model+l1", "fel", "model+fel", "rls", "model+rls",
+    "mrac", "model+mrac", "composite", "model+composite",
 ]  # fmt: skip
 _PAIRS = {named(p, n): {"prior": p, "learner": n} for p in get_args(PriorName) for n in get_args(LearnerName)}
 FEEDFORWARDS: dict[FeedforwardName, dict[str, Any]] = {name: _PAIRS[name] for name in get_args(FeedforwardName)}
@@ -107,6 +112,12 @@ class Scenario(Record):
     """Settings of the learner `rls`."""
     observer: Observer = Observer()
     """Settings of the learner `observer`."""
+    indi: Indi = Indi()
+    """Settings of the learner `indi`."""
+    l1: L1 = L1()
+    """Settings of the learner `l1`."""
+    mrac: Mrac = Mrac()
+    """Settings of the learner `mrac`."""
     composite: Composite = Composite()
     """Settings of the learner `composite`."""
     guard: Guard = Guard()
@@ -139,8 +150,8 @@ class Scenario(Record):
         changes += [(f"events.{i}.perturbation", e.perturbation) for i, e in enumerate(self.events) if e.perturbation]
         for name, perturbation in changes:
             whole(perturbation.control_delay, self.control_period, f"{name}.control_delay", "control_period")
-        if self.learner == "observer" and self.prior == "none":
-            raise ValueError("prior: the learner observer compares the robot with a model; set model")
+        if self.learner in MODEL_BASED and self.prior == "none":
+            raise ValueError(f"prior: the learner {self.learner} compares the robot with a model; set model")
         if not 1 <= self.duration / self.control_period <= LONGEST:
             raise ValueError(f"laps: a run of {self.duration:g} s is not between 1 and {LONGEST:,} control periods")
         self.sensing.check(self.control_period, self.duration)

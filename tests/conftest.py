@@ -58,7 +58,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     cache, digest = session.config.cache, kernel_files_digest()
     if hasattr(session.config, "workerinput") or cache is None or cache.get("mrctl/compiled", "") == digest:
         return
-    halves = ("fel", "none"), ("composite", "rls", "observer")
+    halves = ("fel", "none", "rls", "l1"), ("composite", "observer", "indi", "mrac")
     processes = [subprocess.Popen([sys.executable, "-c", COMPILE, *names]) for names in halves]
     if not any(process.wait() for process in processes):
         cache.set("mrctl/compiled", digest)

@@ -415,6 +415,11 @@ class CompositeAdaptation(Learner):
         self.arrays = rows, scale, training.units, self._priors
         self.restore(np.arange(len(settings)))
 
+    @property
+    def parameters(self) -> Array:
+        """Learned coefficients of the scaled features, `(B, 8, 2)` in V."""
+        return self.rows["a"][:, :, :INPUTS].swapaxes(1, 2).copy()
+
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to their initial weights and covariance, without former plants."""
         self.weight_norm[rows] = 0.0

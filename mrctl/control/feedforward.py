@@ -174,6 +174,11 @@ class Learner(ABC):
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets the robots with these indices to their initial memory."""
 
+    @property
+    def parameters(self) -> Array | None:
+        """Learned coefficients of the 8 scaled features, beside the prior's, `(B, 8, 2)` in V, or None."""
+        return None
+
     def take(self, row: int, other: Learner) -> None:
         """Copies the memory of the same stage for one robot into a row of this stage."""
         size = len(self.weight_norm)
@@ -260,6 +265,11 @@ class NoLearner(Learner):
 
     respond, learn_one, guarded = nothing, learn_nothing, False
     arrays = ()
+
+    @property
+    def parameters(self) -> Array:
+        """Zeros."""
+        return np.zeros((len(self.weight_norm), 8, 2))
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Does nothing, since nothing is learned."""

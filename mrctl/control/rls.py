@@ -131,6 +131,11 @@ class RecursiveLeastSquares(Learner):
         rows["P"] = self._covariance
         self.arrays = rows, feature_scale(robot)
 
+    @property
+    def parameters(self) -> Array:
+        """Learned coefficients of the scaled features, `(B, 8, 2)` in V."""
+        return self.rows["theta"].copy()
+
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to zero coefficients and the initial covariance."""
         self.rows["theta"][rows], self.rows["norm"][rows], self.weight_norm[rows] = 0.0, 0.0, 0.0

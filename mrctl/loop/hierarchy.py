@@ -28,8 +28,11 @@ from mrctl.control.feedforward import (
 )
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.guard import GUARD, UNSURE, guard
+from mrctl.control.indi import IncrementalInversion
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
+from mrctl.control.l1 import L1Adaptive
 from mrctl.control.limiter import LIMITER, limit
+from mrctl.control.mrac import ModelReferenceAdaptive
 from mrctl.control.nominal import nominal
 from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import PID, Pid, pid
@@ -170,11 +173,18 @@ def learner_of(scenarios: Sequence[Scenario], robot: Robot) -> Learner:
     """Returns the learner that a uniform group of scenarios names."""
     first = scenarios[0]
     rigid, period = first.steering == "rigid", first.control_period
+    delay = first.sensing.periods("delay", period)
     match first.learner:
         case "none":
             return NoLearner(robot, len(scenarios), rigid, period)
         case "observer":
             return DisturbanceObserver(robot, [s.observer for s in scenarios], rigid, period)
+        case "indi":
+            return IncrementalInversion(robot, [s.indi for s in scenarios], rigid, period, delay)
+        case "l1":
+            return L1Adaptive(robot, [s.l1 for s in scenarios], rigid, period, delay)
+        case "mrac":
+            return ModelReferenceAdaptive(robot, [s.mrac for s in scenarios], rigid, period, delay)
         case "composite":
             settings = [s.composite for s in scenarios]
             return CompositeAdaptation(robot, settings, rigid, period, prior=first.prior != "none")

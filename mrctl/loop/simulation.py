@@ -14,6 +14,7 @@ import xarray as xr
 from tqdm import tqdm
 
 from mrctl.control.features import feature_scale
+from mrctl.control.feedforward import Learner
 from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.stages import Stages
 from mrctl.kernel import Array, Rows
@@ -29,6 +30,7 @@ from mrctl.results import dataset
 from mrctl.scenario import Event, Scenario, named
 from mrctl.sensing.estimators import Estimator
 from mrctl.sensing.sensors import Sensors
+from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.references import check
 
 LEAST = 8  # robots in a thread, for fewer do not pay for it
@@ -317,8 +319,24 @@ class Simulation:
         names = [self._label] * size, [self._feedforward] * size
         log, failure = self.log.ticks[:length], self.plant.failure
         found = dataset.dataset(self.scenarios, *names, log, failure, self._failure_time, weights)
+        found = found.assign(self._parameters())
         return found.assign(  # the constants that turn the commanded motion into features
             half_track=("run", np.full(size, robot.half_track), {"units": "m"}),
             estimator_fault=("run", np.array(getattr(self.estimator, "faults", [""] * size), object)),
             feature_scale=(("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         )
+
+    def _parameters(self) -> dict[str, Any]:
+        """Coefficients of the scaled features at the end, those of prior and learner and the true ones, in V."""
+        learner, hierarchy = self.hierarchy.learner, self.hierarchy
+        learned = learner.parameters if isinstance(learner, Learner) else None
+        if learned is None:
+            return {}
+        scale = feature_scale(self.plant.robot)[:, None]
+        known = scale * hierarchy.prior.rows["c"] + learned
+        true = scale * np.stack([inverse_coefficients(robot) for robot in self.plant.truth])
+        known[self.plant.failed] = np.nan
+        if self.scenarios[0].steering == "rigid":  # the second channel is steering
+            known[:, :, 1] = true[:, :, 1] = np.nan
+        axes, units = ("run", "feature", "channel"), {"units": "V"}
+        return {"parameters": (axes, known, units), "true_parameters": (axes, true, units)}

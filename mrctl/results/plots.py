@@ -23,6 +23,7 @@ from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Pol
 from matplotlib.rcsetup import cycler
 
 from mrctl.record import InputError
+from mrctl.results import excitation as exciting
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap
 
 COLUMN, PAGE = 88 / 25.4, 180 / 25.4  # inches
@@ -330,6 +331,39 @@ def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
     handles = [Line2D([], [], **_line(k)) for k in range(len(samples))]
     figure.legend(handles, list(samples), loc="outside upper center", ncols=4)
     return figure
+
+
+@styled
+def excitation(result: xr.Dataset, span: float = 4.0, motion: str = "commanded", run: int = 0) -> Figure:
+    """Persistency of excitation over time on log axes: the least eigenvalue of every run, and the features of one.
+
+    Args:
+        result: What `simulate` returns, or one run of it.
+        span: Length of the sliding window in s.
+        motion: As for `mrctl.results.excitation.excitation`.
+        run: Index of the run whose features have a line each.
+    """
+    found = exciting.excitation(result, span, motion)
+    figure, axes = _figure(COLUMN, 1.2 * COLUMN, rows=2)
+    curves = _curves(found, None, None)
+    _signals(axes[0], curves, "least", r"$\lambda_{\min}$ (1)")
+    for order, name in enumerate(found["feature"].values):
+        signal = found["alone"].isel(run=run).sel(feature=name).values
+        axes[1].plot(found["time"].values, signal, label=PARAMETERS[order], **_line(order))
+    axes[1].set(xlabel="time (s)", ylabel="excitation alone (1)")
+    for one in axes:
+        if any((np.asarray(line.get_ydata(), float) > 0).any() for line in one.lines):  # a circle excites nothing
+            one.set_yscale("log", nonpositive="mask")
+    axes[1].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
+    _legend(figure, curves)
+    return figure
+
+
+PARAMETERS = (
+    "$V$", r"$\dot\theta$", r"$\dot V$", r"$\ddot\theta$", r"$V\dot\theta$", r"$\dot\theta^2$", r"sgn $V_l$",
+    r"sgn $V_r$",
+)  # fmt: skip
+"""The 8 physical features in figures."""
 
 
 class InverseMap(NamedTuple):

@@ -175,7 +175,7 @@ def test_scenarios_differ(scenarios, alone):
     events = [e for s in scenarios for e in s.events]
     for field in ("perturbation", "push", "kanayama", "pid", "learning"):
         assert any(getattr(e, field) is not None for e in events)
-    for field, kinds in {"world": 4, "steering": 3, "feedforward": 10, "motion_period": 2}.items():
+    for field, kinds in {"world": 4, "steering": 3, "feedforward": len(FEEDFORWARDS), "motion_period": 2}.items():
         assert len({getattr(s, field) for s in scenarios}) == kinds
     assert {s.sensing.tier for s in scenarios} == set(TIERS)
     assert {s.sensing.source for s in scenarios} == {"truth", "odometry", "ekf"}

@@ -1,0 +1,79 @@
+"""The voltage and the motion that belong together: laws that compare the two must know which voltage made which motion.
+
+A voltage acts d control periods after it was computed, d being the delay of the sensing tier, and it is held for one
+period. The controllers receive the motion predicted to the moment when the coming voltage acts (`mrctl.sensing`):
+
+    x̂_n = x_n + h Σ ẋ_c,p,   p = n − d … n − 1,      h = control period, ẋ_c,p = acceleration that was commanded then
+
+`match` takes the commanded accelerations out again. The rest, x_n, was measured at tick n, and its mean acceleration in
+the period before, (x_n − x_(n−1))/h, is exactly what the voltage u_(n−1−d) made, together with all other forces. The
+latencies of the sensors, which an estimator bridges in the same way, are not matched, nor is the `control_delay` of a
+perturbation, which nobody knows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrctl.kernel import Array, Row, kernel
+
+MATCHED = np.dtype(
+    [
+        ("tick", "i8"),  # number of control ticks so far
+        ("twist", "f8", 2),  # measured V and θ̇, not predicted, m/s and rad/s
+        ("last", "f8", 2),  # the same one period ago
+        ("rate", "f8", 2),  # mean acceleration in the period between, m/s² and rad/s²
+        ("acted", "f8", 2),  # voltage that acted in that period, V (rad/s on a steering channel)
+    ],
+    align=True,
+)
+
+
+def queues(size: int, delay: int) -> Array:
+    """Returns room for what `match` keeps of each robot, `(B, delay + 1, 4)`; the delay is in control periods."""
+    return np.zeros((size, delay + 1, 4))
+
+
+@kernel
+def match(twist: Array, derivative: Array, sent: Array, period: float, queue: Array, s: Row) -> bool:
+    """Finds the voltage that acted in the period that ends now, and the motion that it made.
+
+    Args:
+        twist: Predicted V in m/s and θ̇ in rad/s, on which `sent` has not acted yet, `(2,)`.
+        derivative: Commanded V̇ in m/s² and θ̈ in rad/s² of this tick, `(2,)`.
+        sent: Voltage that is computed in this tick, after the limits, `(2,)`.
+        period: Control period in s.
+        queue: In and out: voltages and commanded accelerations of the last d + 1 ticks, `(d + 1, 4)`.
+        s: In and out: a record of `MATCHED`, whose `twist`, `last`, `rate` and `acted` are the result.
+
+    Returns:
+        Whether a voltage is known that acted in that period; it is not in the first d + 1 ticks.
+    """
+    size = len(queue)
+    oldest = s.tick % size
+    for k in range(2):
+        now = twist[k]
+        for p in range(size):
+            if p != oldest:
+                now -= period * queue[p, 2 + k]
+        s.last[k] = s.twist[k] if s.tick > 0 else now
+        s.twist[k], s.rate[k] = now, (now - s.last[k]) / period
+        s.acted[k] = queue[oldest, k]
+        queue[oldest, k], queue[oldest, 2 + k] = sent[k], derivative[k]
+    s.tick += 1
+    return s.tick > size
+
+
+@kernel
+def low_pass(signal: float, k: int, share: float, once: Array, twice: Array) -> None:
+    """One step of H = 1/(T s + 1)², two equal filters by implicit Euler with share = h/(T + h).
+
+    Args:
+        signal: Input.
+        k: Index of the signal in `once` and `twice`.
+        share: Weight of a new sample.
+        once: In and out: outputs of the first filter.
+        twice: In and out: outputs of the second filter, which are H of the inputs.
+    """
+    once[k] += share * (signal - once[k])
+    twice[k] += share * (once[k] - twice[k])

@@ -1,0 +1,309 @@
+"""The composite law of Slotine and Li: its theorem where it holds, each of its steps in matrices, and its fences."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mrctl.control.features import feature_matrix, feature_scale
+from mrctl.control.feedforward import Prior
+from mrctl.control.mrac import MRAC, SETTLED, ModelReferenceAdaptive, Mrac, confine, predict, track
+from mrctl.theory.dynamics import accelerations, inverse_coefficients, left_right
+
+PERIOD = 0.01
+RNG = np.random.default_rng(6)
+SIGN_SPEED = 0.05
+K_P, K_I = np.array([40.0, 8.0]), np.array([200.0, 60.0])
+
+
+def truth(robot):
+    """A robot that differs from the model in mass, friction and resistance, and never saturates."""
+    other = {"mass": 30.0, "yaw_inertia": 0.9, "gear_loss": 0.3, "resistance": 1.3 * robot.resistance, "supply": 1e4}
+    return robot.model_copy(update=other)
+
+
+def command(t, turns=False):
+    """A motion, twist and its derivative: forward, or with turns in which the inner wheel goes backward."""
+    mean, swing, side = (0.5, 2.4, 0.5) if turns else (0.8, 1.2, 0.4)
+    v = mean + 0.3 * np.sin(1.3 * t) + 0.1 * np.sin(3.1 * t)
+    omega = swing * np.sin(0.9 * t) + side * np.cos(2.3 * t)
+    v_dot = 0.39 * np.cos(1.3 * t) + 0.31 * np.cos(3.1 * t)
+    omega_dot = 0.9 * swing * np.cos(0.9 * t) - 2.3 * side * np.sin(2.3 * t)
+    return np.array([v, omega]), np.array([v_dot, omega_dot])
+
+
+def move(x, voltage, c, half_track, duration, steps):
+    """The motion after a time under held voltages by equation (3), in its parameters, by the midpoint rule."""
+
+    def rate(v, omega):
+        left, right = (math.tanh((v + side * half_track * omega) / SIGN_SPEED) for side in (-1, 1))
+        found = []
+        for k in range(2):
+            f = c[0][k] * v + c[1][k] * omega + c[4][k] * v * omega + c[5][k] * omega**2
+            found.append((voltage[k] - f - c[6][k] * left - c[7][k] * right) / c[2 + k][k])
+        return found
+
+    v, omega = x
+    h = duration / steps
+    for _ in range(steps):
+        a = rate(v, omega)
+        a = rate(v + h / 2 * a[0], omega + h / 2 * a[1])
+        v, omega = v + h * a[0], omega + h * a[1]
+    return np.array([v, omega])
+
+
+def test_plant(robot):
+    """The plant of these tests is equation (3)."""
+    x, voltage, true = np.array([0.4, 1.0]), np.array([7.0, -1.0]), truth(robot)
+    moved = (move(x, voltage, inverse_coefficients(true).tolist(), robot.half_track, 1e-6, 1) - x) / 1e-6
+    np.testing.assert_allclose(moved, accelerations(x, left_right(voltage), true, sign_speed=SIGN_SPEED), rtol=1e-4)
+
+
+def lyapunov(stage, prior, true, error, integral, period):
+    """V = ½ Σ [η (m e² + K_i z²) + ãᵀ P⁻¹ ã] as in the docstring, with the true parameters."""
+    row, scale = stage.rows[0], stage.arrays[1]
+    c = inverse_coefficients(true)
+    eta = row["tracking"] / period
+    wrong = scale[:, None] * prior.rows["c"][0] + row["b"] - scale[:, None] * c
+    states = eta * (np.diag(c[2:4]) * error**2 + K_I * integral**2)
+    return 0.5 * (states.sum() + np.einsum("ik,ij,jk", wrong, np.linalg.inv(row["P"]), wrong))
+
+
+def drive(robot, settings, period, seconds, known=True, turns=False):
+    """The law with PI control: V at each tick since learning began, and the errors of parameters and motion."""
+    true, stage = truth(robot), ModelReferenceAdaptive(robot, [settings], False, period)
+    prior = Prior([robot if known else None], False)
+    c, scale = inverse_coefficients(true), stage.arrays[1][:, None]
+    x, integral, log, wrong = command(0.0, turns)[0] + [0.05, -0.1], np.zeros(2), [], []
+    for tick in range(round(seconds / period)):
+        wanted, rate = command(period * tick, turns)
+        error = wanted - x
+        voltage = K_P * error + K_I * integral
+        voltage = voltage + prior.output(wanted[None], rate[None])[0] + stage.output(wanted[None], rate[None])[0]
+        if stage.rows["age"][0] > SETTLED:
+            log.append(lyapunov(stage, prior, true, error, integral, period))
+        added = stage.learn(np.zeros((1, 2)), np.zeros(1), x[None], voltage[None], prior.rows)
+        assert not added.any()
+        integral = integral + period * error
+        x = move(x, voltage, c.tolist(), robot.half_track, period, round(period / 0.00125))
+        wrong.append(scale * (prior.rows["c"][0] - c) + stage.rows["b"][0])
+    return np.array(log), np.array(wrong), error
+
+
+CASES = [Mrac(), Mrac(tracking=20.0, noise=0.1), Mrac(radius=0.2, leak=5.0, noise=0.05), Mrac(memory=2.0)]
+
+
+@pytest.mark.parametrize("settings", CASES)
+@pytest.mark.parametrize("known", [True, False])
+def test_lyapunov(robot, settings, known):
+    """In the case of the theorem V falls; where a sampled step raises it, that is by O(h²): a quarter with h/2.
+
+    With the default settings no step raises it. With a ball of 0.2 of the supply the true parameters are only in it
+    where the prior is the model; elsewhere the theorem does not hold (`test_outside`).
+    """
+    if settings.radius < 1 and not known:
+        pytest.skip("the true parameters are not in the ball")
+    rises = []
+    for period in (0.01, 0.005, 0.0025):
+        values, _, _ = drive(robot, settings, period, 3.0, known)
+        rises.append(max(np.diff(values).max(), 0.0) / values[0])
+        assert values[-1] < 0.5 * values[0]
+    assert rises[0] < 5e-3 if settings.tracking > 2 else not any(rises)
+    for before, after in zip(rises, rises[1:], strict=False):
+        assert after <= 0.35 * before + 1e-9
+
+
+def test_outside(robot):
+    """Where the true parameters are not in the ball, V grows: the test above can fail."""
+    values, _, _ = drive(robot, CASES[2], PERIOD, 3.0, known=False)
+    assert values[-1] > 10 * values[0]
+
+
+def test_parameters(robot):
+    """With a motion that excites every feature, the parameters of an unknown robot are found; the error vanishes."""
+    values, wrong, error = drive(robot, Mrac(), PERIOD, 25.0, known=False, turns=True)
+    size = np.linalg.norm(wrong, axis=(1, 2))
+    assert size[-1] < 0.05 * size[0]
+    assert np.abs(error).max() < 2e-3
+
+
+def test_assumption(robot):
+    """(A): Σ η e (f(x_c) − f(x)) ≥ −Σ η K e² with the gains of the PID, over the speeds of the robot."""
+    c = inverse_coefficients(robot)
+    eta = np.diag(c[:2])
+    at = RNG.uniform([0, -3], [1.5, 3], (20000, 2))
+    x = RNG.uniform([-0.5, -3.5], [2, 3.5], (20000, 2))
+    ones = np.ones(8)
+
+    def force(motion):
+        return feature_matrix(motion, np.zeros_like(motion), robot.half_track, ones) @ c
+
+    error = at - x
+    work = (eta * error * (force(at) - force(x))).sum(1)
+    assert (work >= -(eta * K_P * error**2).sum(1)).all()
+    lever = c[4, 1] * robot.half_track
+    assert lever == pytest.approx(-c[5, 0])
+    assert eta[1] == pytest.approx(robot.half_track * eta[0])
+    assert lever * 3 < 0.03 * 2 * np.sqrt(72.9 * robot.half_track * 15.7)
+
+
+def record(**values):
+    s = np.zeros(1, MRAC)[0]
+    for name, value in values.items():
+        s[name] = value
+    return s
+
+
+def covariance():
+    root = RNG.uniform(-1, 1, (8, 8))
+    return root @ root.T + 0.1 * np.eye(8)
+
+
+def test_prediction_step():
+    """P⁻¹ ← (1 − λ h) P⁻¹ + w wᵀ h/ρ², and the parameters move along the new P w by the prediction error."""
+    P, w, b, residual = covariance(), RNG.uniform(-1, 1, 8), RNG.uniform(-1, 1, (8, 2)), RNG.uniform(-1, 1, 2)
+    s = record(P=P, w=w, b=b, residual=residual, r=0.3, forgetting=0.02, trace=2 * np.trace(P))
+    predict(s)
+    inverse = (1 - 0.02 * 0.5) * np.linalg.inv(P) + np.outer(w, w) / 0.3
+    np.testing.assert_allclose(np.linalg.inv(s["P"]), inverse, rtol=1e-8, atol=1e-8)
+    expected = b + np.outer(np.linalg.solve(inverse, w), residual - w @ b) / 0.3
+    np.testing.assert_allclose(s["b"], expected, rtol=1e-8, atol=1e-10)
+
+
+def test_prediction_lyapunov():
+    """ãᵀ P⁻¹ ã falls with each prediction step, exactly: to (1 − λ h) ãᵀ P⁻¹ ã − e²/(ρ²/h + wᵀ P w)."""
+    for _ in range(50):
+        P, w, b, true = covariance(), RNG.uniform(-1, 1, 8), RNG.uniform(-1, 1, (8, 2)), RNG.uniform(-1, 1, (8, 2))
+        s = record(P=P, w=w, b=b, residual=w @ true, r=0.3, forgetting=0.02, trace=np.trace(P) / 0.75)
+        before = (1 - 0.02 * 0.25) * np.einsum("ik,ij,jk", b - true, np.linalg.inv(P), b - true)
+        grown = P / (1 - 0.02 * 0.25)
+        predict(s)
+        after = np.einsum("ik,ij,jk", s["b"] - true, np.linalg.inv(s["P"]), s["b"] - true)
+        fall = (np.square(w @ (b - true)) / (0.3 + w @ grown @ w)).sum()
+        assert after == pytest.approx(before - fall, rel=1e-8)
+
+
+def test_gain_is_bounded():
+    """Without excitation P grows to tr P₀ and no further."""
+    s = record(P=0.01 * np.eye(8), r=1.0, forgetting=0.05, trace=8.0)
+    traces = []
+    for _ in range(2000):
+        predict(s)
+        traces.append(np.trace(s["P"]))
+    assert (np.diff(traces) >= 0).all() and traces[-1] == pytest.approx(8.0, rel=1e-6)
+
+
+def test_tracking_step():
+    P, phi = covariance(), RNG.uniform(-1, 1, 8)
+    s = record(P=P, phi_c=phi, tracking=[0.2, 0.5], error=[0.3, -0.4])
+    for k in range(2):
+        track(k, s)
+    np.testing.assert_allclose(s["b"], np.outer(P @ phi, [0.06, -0.2]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", [0.5, 1.5, 2.5, 5.0])
+def test_fence(size):
+    """Leak and projection bring the parameters no farther from any point of the inner ball, in the metric P⁻¹."""
+    for _ in range(200):
+        P, direction, point = covariance(), RNG.standard_normal(8), RNG.standard_normal(8)
+        b = size * direction / np.linalg.norm(direction)
+        point *= RNG.uniform(0, 1) / np.linalg.norm(point)
+        s = record(P=P, radius=[1.0, 1.0], leak=RNG.uniform(0, 1))
+        s["b"][:, 0] = b
+        confine(0, s)
+        after = s["b"][:, 0]
+        if size <= 1:
+            assert (after == b).all()
+            continue
+        inverse = np.linalg.inv(P)
+        assert (after - point) @ inverse @ (after - point) <= (b - point) @ inverse @ (b - point) + 1e-12
+        if size > 2:  # on the half-space that touches the ball of radius 2, or deeper
+            assert b @ after / size <= 2 + 1e-9
+
+
+def test_projection_holds():
+    """The parameters stay in the ball, however hard a wrong regression pulls at them."""
+    s = record(P=9 * np.eye(8), radius=[1.0, 1.0], leak=0.0, r=0.01, trace=72.0, forgetting=1e-3)
+    for _ in range(3000):
+        s["w"], s["residual"] = RNG.uniform(-1, 1, 8), (50.0, -50.0)
+        predict(s)
+        for k in range(2):
+            confine(k, s)
+    assert np.linalg.norm(s["b"], axis=0).max() < 2.2
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+@pytest.mark.parametrize("delay", [0, 2])
+def test_regression(robot, rigid, delay):
+    """On data that obey the law exactly the filtered voltage is wᵀ a, whatever the delay, and a is found."""
+    n, scale = 4000, feature_scale(robot)
+    true = inverse_coefficients(truth(robot))
+    if rigid:
+        true[:, 1] = 0.1 * RNG.uniform(-1, 1, 8)
+    prior, stage = Prior([robot], rigid), ModelReferenceAdaptive(robot, [Mrac(tracking=0)], rigid, PERIOD, delay)
+    t = PERIOD * np.arange(n + 1)
+    x = np.array([command(one, turns=True)[0] for one in t])
+    rate = np.diff(x, axis=0) / PERIOD
+    half = [feature_matrix(x[i : n + i], 0 * rate, robot.half_track, np.ones(8)) for i in (0, 1)]
+    phi = (half[0] + half[1]) / 2
+    phi[:, 2:4] = rate
+    made = phi @ true  # voltage that acts in each period
+    if rigid:
+        made[:, 1] += phi[:, 1]
+    zero = np.zeros((1, 2))
+    for tick in range(delay, n - delay):
+        sent = made[tick : tick + 1].copy()
+        stage.output(zero, zero)
+        stage.learn(zero, np.zeros(1), x[tick - delay][None], sent, prior.rows)
+    found = stage.rows["b"][0] / scale[:, None] + prior.rows["c"][0]
+    np.testing.assert_allclose(scale[:, None] * found, scale[:, None] * true, atol=0.02)
+
+
+def test_frozen(robot):
+    """While it must not learn, the parameters stay; near rest too; `restore` brings back the start."""
+    stage, prior = ModelReferenceAdaptive(robot, [Mrac()], False, PERIOD), Prior([robot], False)
+    start = stage.rows.copy()
+
+    def go(frozen, speed):
+        before = stage.rows["b"].copy()
+        for tick in range(100):
+            twist = np.array([[speed * (1 + 0.3 * np.sin(tick)), 0.0]])
+            stage.output(twist, np.zeros((1, 2)))
+            assert not stage.learn(np.ones((1, 2)), np.full(1, frozen), twist, np.ones((1, 2)), prior.rows).any()
+        return (stage.rows["b"] != before).any()
+
+    assert not go(1.0, 0.8) and not go(0.0, 0.05) and go(0.0, 0.8) and not go(1.0, 0.8)
+    assert stage.weight_norm[0] == pytest.approx(np.linalg.norm(stage.rows["b"]))
+    stage.restore(np.array([0]))
+    assert stage.rows.tobytes() == start.tobytes() and not stage.weight_norm.any()
+
+
+def test_hand_over(robot):
+    """What is handed over to the PID's integral is the change of the output for the same command."""
+    stage, prior = ModelReferenceAdaptive(robot, [Mrac(hand_over=True)], False, PERIOD), Prior([robot], False)
+    for tick in range(60):
+        twist = np.array([[0.8 + 0.1 * np.sin(tick), 0.3]])
+        before = stage.output(twist, twist).copy()
+        added = stage.learn(np.ones((1, 2)), np.zeros(1), twist, np.full((1, 2), 3.0), prior.rows).copy()
+        np.testing.assert_allclose(stage.output(twist, twist) - before, added, atol=1e-12)
+    assert added.any()
+
+
+def test_rows(robot):
+    """Robots do not mix: a row has the same bits alone and beside one that is lost."""
+    inputs = RNG.uniform(-1, 1, (60, 3, 3, 2))
+
+    def answer(rows, lost=()):
+        size = len(inputs[0, 0, rows])
+        stage, log = ModelReferenceAdaptive(robot, [Mrac()] * size, False, PERIOD, 2), []
+        prior = Prior([robot] * size, False)
+        for command, twist, voltage in inputs[:, :, rows].copy():
+            twist[list(lost)] = np.nan
+            log.append(stage.output(command, command).copy())
+            stage.learn(command, np.zeros(size), twist, voltage, prior.rows)
+        return np.array(log)
+
+    together = answer(slice(None), lost=[1])
+    for i in (0, 2):
+        assert together[:, i].tobytes() == answer(slice(i, i + 1))[:, 0].tobytes()
+        assert together[-1, i].any()
