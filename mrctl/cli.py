@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from mrctl import __version__
 from mrctl.record import InputError, Record, describe
-from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
+from mrctl.scenario import COMPARED, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, RobotFile
@@ -263,7 +263,7 @@ def reproduce(out: Path = Path("reproduction")) -> None:
 
 def suite(
     feedforward: Annotated[tuple[FeedforwardName | Literal["hindsight"], ...], tyro.conf.arg(metavar="NAME ...")] = (
-        *FEEDFORWARDS,
+        *COMPARED,
         "hindsight",
     ),
     controller: tuple[str, ...] = (),

@@ -21,14 +21,17 @@ from mrctl.experiments.tables import machine, markdown, number, output_folder, w
 from mrctl.loop.simulation import simulate
 from mrctl.results import metrics, plots
 from mrctl.results.dataset import versions
-from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
+from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.sensing.tiers import TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS
 from mrctl.theory.references import Lemniscate
 
 CASE = "all"  # the plant of the figures, which differs from the model in everything
+PAPER: tuple[FeedforwardName, ...] = (
+    "none", "model", "true_model", "model+observer", "fel", "model+fel", "model+rls", "model+composite",
+)  # fmt: skip
 FAST, SLOW = 12.0, 20.0  # s a lap
-DRAWS = 4  # of noise and biases, for the runs with real sensors; without noise, one run says all
+DRAWS = 4  # replicates in each sensing tier
 LONG = 60  # laps that show whether learning stays stable
 IDEAL: dict[str, Any] = {
     "sensing": Sensing(tier="ideal"),
@@ -50,32 +53,24 @@ def scenario(feedforward: FeedforwardName, case: str, period: float = FAST, **ch
 def real(tier: Tier) -> list[Scenario]:
     """The runs of eight laps with sensors and motors of a tier, and with the controllers that are designed for it.
 
-    Each feedforward has the same draws of noise, biases and initial offset.
+    Each feedforward has the same replicates.
     """
-    return [
-        Scenario(
-            name=f"{f}, {case}, {tier}",
-            **FEEDFORWARDS[f],
-            perturbation=PERTURBATIONS[case],
-            sensing=Sensing(tier=tier),
-            seed=seed,
-        )
-        for case in ("nominal", CASE)
-        for f in FEEDFORWARDS
-        for seed in range(1 if tier == "ideal" else DRAWS)
-    ]
+    found = []
+    for case in ("nominal", CASE):
+        for f in COMPARED:
+            fields = {"sensing": Sensing(tier=tier), "perturbation": PERTURBATIONS[case], **FEEDFORWARDS[f]}
+            found += replicates(Scenario(name=f"{f}, {case}, {tier}", **fields), DRAWS)
+    return found
 
 
 def benchmark() -> list[Scenario]:
     """The runs of eight laps: every feedforward, fast and slow, and under the other steering arrangements."""
-    compliant = [
-        scenario(f, case, period) for period in (FAST, SLOW) for case in ("nominal", CASE) for f in FEEDFORWARDS
-    ]
+    compliant = [scenario(f, case, period) for period in (FAST, SLOW) for case in ("nominal", CASE) for f in PAPER]
     others = [
         scenario(f, case, steering=steering)
         for steering in ("caster", "rigid")
         for case in ("nominal", CASE)
-        for f in FEEDFORWARDS
+        for f in PAPER
     ]
     return [*compliant, *others]
 
@@ -159,7 +154,7 @@ def compare(table: pd.DataFrame, scenarios: Sequence[Scenario]) -> list[dict[str
         bare = scenarios.index(one.model_copy(update=FEEDFORWARDS["none"] | {"name": _bare(one)}))
         row: dict[str, Any] = {
             "steering": one.steering,
-            "plant": next(name for name, p in PERTURBATIONS.items() if p == one.perturbation),
+            "plant": one.name.split(", ")[1],
             "sensing": one.sensing.tier,
             "estimator": one.sensing.source,
             "lap_time": one.reference.period,
@@ -232,7 +227,7 @@ def tiers_text(rows: Sequence[dict[str, Any]]) -> str:
         ratio = means[key]["position_rmse"] / means[*key[:2], "none"]["position_rmse"]
         told = f"{ratio:.2f}" if math.isfinite(ratio) else "PID fails"
         cells.append([*key, *(number(1e3 * means[key][m]) for m in METRICS), told])
-    title = f"The 12 s lap with the sensors, motors and controllers of each tier, mean of {DRAWS} draws (ideal: one):"
+    title = f"The 12 s lap with the sensors, motors and controllers of each tier, mean of {DRAWS} replicates:"
     return f"{title}\n\n{markdown(header, cells)}"
 
 
