@@ -45,7 +45,9 @@ FeedforwardName = Literal[
 _PAIRS = {named(p, n): {"prior": p, "learner": n} for p in get_args(PriorName) for n in get_args(LearnerName)}
 FEEDFORWARDS: dict[FeedforwardName, dict[str, Any]] = {name: _PAIRS[name] for name in get_args(FeedforwardName)}
 """Pairs of a prior and a learner, as fields of a scenario, by their names."""
-COMPARED = tuple(name for name, pair in FEEDFORWARDS.items() if pair["prior"] != "none" or name in ("none", "fel"))
+COMPARED: tuple[FeedforwardName, ...] = tuple(
+    name for name, pair in FEEDFORWARDS.items() if pair["prior"] != "none" or name in ("none", "fel")
+)
 """Those that the tables compare: every learner from the model, and the paper's from nothing."""
 LONGEST = 10_000_000
 """Largest number of control periods in a run; the record of one takes 432 bytes."""
