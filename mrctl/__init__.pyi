@@ -9,6 +9,7 @@ from .control.observer import Observer as Observer
 from .control.pid import Pid as Pid
 from .control.rls import Rls as Rls
 from .control.weights import save_weights as save_weights
+from .loop.learned import save_learned as save_learned
 from .loop.simulation import Simulation as Simulation
 from .loop.simulation import simulate as simulate
 from .physics.mjcf import load_robot as load_robot

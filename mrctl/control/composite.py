@@ -375,7 +375,7 @@ class CompositeAdaptation(Learner):
         weight_volts: Unit of the weights: 1 V.
     """
 
-    respond, learn_one = respond, learn
+    respond, learn_one, learned = respond, learn, ("a", "P")
     weight_volts = 1.0
 
     def __init__(self, robot: Robot, settings: list[Composite], rigid: bool, period: float, prior: bool = True) -> None:
@@ -419,6 +419,16 @@ class CompositeAdaptation(Learner):
     def parameters(self) -> Array:
         """Learned coefficients of the scaled features, `(B, 8, 2)` in V."""
         return self.rows["a"][:, :, :INPUTS].swapaxes(1, 2).copy()
+
+    def adopt(self, row: int, learned: Array) -> None:
+        """As `Learner.adopt`, without the slope and the disturbance: they belong to another place and moment."""
+        super().adopt(row, learned)
+        s = self.rows[row]
+        local = [*range(INPUTS, PHYSICAL), FEATURES]
+        s["a"][:, local] = 0.0
+        s["P"][:, local, :] = s["P"][:, :, local] = 0.0
+        s["P"][:, local, local] = self._priors[:, local, local]
+        s["P"][:, FEATURES, FEATURES] = s["disturbance"] ** 2
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to their initial weights and covariance, without former plants."""

@@ -153,6 +153,7 @@ class Learner(ABC):
         arrays: Memory and constants of the kernels, a tuple of arrays.
         prior: What is added to its output; at first nothing.
         guarded: Whether the guard watches it.
+        learned: Fields of `rows` that hold what it has adapted, from which another run can start.
         weight_norm: Norm of the weights, `(B,)`.
         weight_volts: Voltage in V that weights of norm one give for features of size one; 0 if there are no weights.
     """
@@ -160,6 +161,8 @@ class Learner(ABC):
     respond: ClassVar[Kernel]
     learn_one: ClassVar[Kernel]
     guarded: ClassVar[bool] = True
+    learned: ClassVar[tuple[str, ...]] = ()
+    rows: Rows
     arrays: tuple[Any, ...]
     weight_volts: Array | float = 0.0
 
@@ -178,6 +181,19 @@ class Learner(ABC):
     def parameters(self) -> Array | None:
         """Learned coefficients of the 8 scaled features, beside the prior's, `(B, 8, 2)` in V, or None."""
         return None
+
+    def adapted(self) -> Array:
+        """What each robot has learned, flat, `(B, n)`; n is 0 if it keeps nothing."""
+        size = len(self.weight_norm)
+        return np.concatenate([np.zeros((size, 0)), *(self.rows[name].reshape(size, -1) for name in self.learned)], 1)
+
+    def adopt(self, row: int, learned: Array) -> None:
+        """Lets one robot start from what another has learned, a row of `adapted`."""
+        start = 0
+        for name in self.learned:
+            place = self.rows[name][row]
+            place[...] = learned[start : start + place.size].reshape(place.shape)
+            start += place.size
 
     def take(self, row: int, other: Learner) -> None:
         """Copies the memory of the same stage for one robot into a row of this stage."""

@@ -268,6 +268,14 @@ class FeedbackErrorLearning(Learner):
         hidden, gradient = np.zeros((len(settings), settings[0].hidden)), np.zeros(self.initial.shape[1])
         self.arrays = self.rows, feature_scale(robot), self.weights, self.initial, hidden, gradient
 
+    def adapted(self) -> Array:
+        """The weights, `(B, n)`."""
+        return self.weights.copy()
+
+    def adopt(self, row: int, learned: Array) -> None:
+        """Starts one robot from other weights, to which leak and projection then refer."""
+        self.weights[row] = self.initial[row] = learned
+
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to their initial weights."""
         self.weights[rows] = self.initial[rows]

@@ -141,6 +141,7 @@ class L1Adaptive(Learner):
     """
 
     respond, learn_one, guarded = respond, learn, False
+    learned = "sigma", "filtered"
 
     def __init__(self, robot: Robot, settings: list[L1], rigid: bool, period: float, delay: int = 0) -> None:
         """Makes the stages.

@@ -117,6 +117,7 @@ class DisturbanceObserver(Learner):
     """
 
     respond, learn_one, guarded = respond, learn, False
+    learned = "voltage", "disturbance"
 
     def __init__(self, robot: Robot, settings: list[Observer], rigid: bool, period: float) -> None:
         """Takes the nominal robot, the settings of each robot, whether channel two is steering, and the period in s."""

@@ -117,7 +117,7 @@ class RecursiveLeastSquares(Learner):
         weight_volts: Unit of the coefficients: 1 V.
     """
 
-    respond, learn_one = respond, learn
+    respond, learn_one, learned = respond, learn, ("theta", "P")
     weight_volts = 1.0
 
     def __init__(self, robot: Robot, settings: list[Rls], rigid: bool, period: float) -> None:

@@ -62,7 +62,7 @@ def save_weights(path: str | Path, weights: Array) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    _write(path, unflatten(weights))
+    write_arrays(path, unflatten(weights))
 
 
 def load_weights(path: str | Path, hidden: int) -> Array:
@@ -78,7 +78,7 @@ def load_weights(path: str | Path, hidden: int) -> Array:
     Raises:
         InputError: The file is missing, broken, of another shape, or holds non-finite numbers.
     """
-    return flatten(_read(path, "fel.weights", shapes(hidden)))
+    return flatten(read_arrays(path, "fel.weights", shapes(hidden)))
 
 
 class Training(NamedTuple):
@@ -100,7 +100,7 @@ def save_training(path: str | Path, training: Training, recipe: dict[str, str]) 
     Raises:
         InputError: The file cannot be written.
     """
-    _write(path, training._asdict(), recipe)
+    write_arrays(path, training._asdict(), recipe)
 
 
 def load_training(path: str | Path = SHIPPED) -> Training:
@@ -110,10 +110,15 @@ def load_training(path: str | Path = SHIPPED) -> Training:
         InputError: The file is missing, broken, of another shape, or holds non-finite numbers.
     """
     expected = {"units": (UNITS, INPUTS + 1), "priors": (3, FEATURES, FEATURES)}
-    return Training(**_read(path, "composite.weights", expected))
+    return Training(**read_arrays(path, "composite.weights", expected))
 
 
-def _write(path: str | Path, arrays: Mapping[str, Array], metadata: dict[str, str] | None = None) -> None:
+def write_arrays(path: str | Path, arrays: Mapping[str, Array], metadata: dict[str, str] | None = None) -> None:
+    """Writes named arrays as a safetensors file, with the version of mrctl and `metadata`.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
     from safetensors.numpy import save
 
     contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
@@ -124,8 +129,17 @@ def _write(path: str | Path, arrays: Mapping[str, Array], metadata: dict[str, st
         raise InputError(f"{path}: cannot write weights: {error.strerror}") from None
 
 
-def _read(path: str | Path, field: str, expected: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
-    """Arrays of these names and shapes, as float64; errors name the field, the path and the version that wrote it."""
+def read_arrays(path: str | Path, field: str, expected: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
+    """Reads arrays of these names and shapes, as float64.
+
+    Args:
+        path: A safetensors file, or one of `torch.save`.
+        field: Field of the scenario that names the file, for messages.
+        expected: Names and shapes.
+
+    Raises:
+        InputError: The file is missing, broken, of other shapes, or holds non-finite numbers.
+    """
     if not Path(path).is_file():
         raise InputError(f"{field}: no file {path}")
     writer = ""

@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 
 from mrctl.control.stages import Stages
-from mrctl.control.weights import save_weights
 from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.loop import user_files
+from mrctl.loop.learned import save_learned
 from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
 from mrctl.results import metrics, plots
@@ -51,8 +51,8 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     laps = metrics.per_lap(result)
     if out is not None:
         save(result, out / "result.zarr")
-        if "weights" in result:
-            save_weights(out / "weights.safetensors", result["weights"].values[0])
+        if "weights" in result and not result["failed"].any():
+            save_learned(out / "learned.safetensors", result)
         figures = {
             "path": plots.path(result),
             "velocities": plots.velocities(result),

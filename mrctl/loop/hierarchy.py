@@ -7,7 +7,7 @@ With built-in stages a control tick of all robots is one compiled call.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import Any
 
@@ -39,6 +39,8 @@ from mrctl.control.pid import PID, Pid, pid
 from mrctl.control.rls import RecursiveLeastSquares
 from mrctl.control.steering import ALLOCATION, allocate, take_loss
 from mrctl.kernel import Array, Kernel, Row, Rows, kernel
+from mrctl.loop.learned import load_learned
+from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import Robot
 
@@ -224,8 +226,12 @@ class Hierarchy:
         self.learner: Learner | Feedforward = learner_of(scenarios, robot) if feedforward is None else feedforward
         self.prior = Prior([None if first.prior == "none" else robot] * size, self._rigid)  # events tell the truth
         self._told = first.prior == "true_model"
+        self._learned = {row: load_learned(s) for row, s in enumerate(scenarios) if s.learned}
         if isinstance(self.learner, Learner):
             self.learner.prior = self.prior
+            self._adopt(range(size))
+        elif self._learned:
+            raise InputError("learned: a feedforward of one's own keeps what it learned itself")
         self._period = first.control_period
         self._every = round(first.motion_period / first.control_period)
         self._tick = 0
@@ -350,5 +356,13 @@ class Hierarchy:
         """Resets the learners of these robots; returns whether the stage can be reset."""
         assert isinstance(self.learner, Learner)
         self.learner.restore(rows)
+        self._adopt(rows)
         self.weight_norm[rows] = 0.0
         return True
+
+    def _adopt(self, rows: Iterable[int]) -> None:
+        """Lets the learners of these robots start from the files that their scenarios name."""
+        assert isinstance(self.learner, Learner)
+        for row in rows:
+            if row in self._learned:
+                self.learner.adopt(row, self._learned[row])

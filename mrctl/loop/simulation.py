@@ -15,7 +15,6 @@ from tqdm import tqdm
 
 from mrctl.control.features import feature_scale
 from mrctl.control.feedforward import Learner
-from mrctl.control.fel import FeedbackErrorLearning
 from mrctl.control.stages import Stages
 from mrctl.kernel import Array, Rows
 from mrctl.loop.courses import Courses, start_pose
@@ -56,7 +55,8 @@ def simulate(
 
     Returns:
         The signals of `results.dataset.SIGNALS` with dimensions run and time (time alone for one scenario), with units;
-        `failed`, `failure` and `failure_time` of each run; `weights` where a network learned.
+        `failed`, `failure` and `failure_time` of each run; `weights`, flat, where
+        something was learned.
 
     Raises:
         InputError: A scenario asks for something that does not exist or that the robot cannot do, and the message names
@@ -311,7 +311,8 @@ class Simulation:
     def result(self) -> xr.Dataset:
         """Returns the signals so far; if every robot has failed, of the whole run, with NaN at the end."""
         stage = self.hierarchy.learner
-        weights = stage.weights.copy() if isinstance(stage, FeedbackErrorLearning) else None
+        learned = stage.adapted() if isinstance(stage, Learner) else np.zeros((0, 0))
+        weights = learned if learned.size else None
         size, robot = len(self.scenarios), self.plant.robot
         length = self.tick if self.running else self.ticks
         for tick in range(self.tick, length):

@@ -124,7 +124,7 @@ def dataset(
         log: One record of `TICK` for each tick and run, `(ticks, B)`.
         failure: For each run why it stopped early, or "".
         failure_time: For each run when it stopped in s, or NaN, `(B,)`.
-        weights: Final weights of the network of each run, `(B, n)`, or None.
+        weights: What the learner of each run has adapted, flat, `(B, n)`, or None.
 
     Returns:
         Variables (run, time) by signal, `failed`, `failure`, `failure_time` and `weights`; coordinates label,
@@ -148,7 +148,7 @@ def dataset(
         "lap_time": ("run", np.array([s.reference.period for s in scenarios]), {"units": "s"}),
     }
     if weights is not None:
-        variables["weights"] = (("run", "weight"), weights, {"long_name": "weights at the end, flat"})
+        variables["weights"] = (("run", "weight"), weights, {"long_name": "what was learned, flat"})
         coords["weight"] = np.arange(weights.shape[1])  # networks of different sizes align on it
     return xr.Dataset(variables, coords)
 

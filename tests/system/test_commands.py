@@ -97,7 +97,8 @@ def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.Cap
         laps=1,
         reference=circle,
         **ideal,
-        fel=mrctl.Fel(weights=str(out / "weights.safetensors"), frozen=True),
+        learned=str(out / "learned.safetensors"),
+        events=(mrctl.Event(time=0.0, learning=False),),
     )
     assert float(mrctl.per_lap(mrctl.simulate([carried]))["v_rmse"].values[0, 0]) < first
 

@@ -165,7 +165,7 @@ def test_rows(robot, name, steering):
         assert array.shape[0] == 3  # what is remembered has a leading B
     for array in (hierarchy.output, hierarchy.weight_norm, hierarchy.saturated):
         assert array.shape[0] == 3
-    assert (hierarchy.weight_norm > 0).all() == (FEEDFORWARDS[name]["learner"] in ("fel", "rls", "composite"))
+    assert (hierarchy.weight_norm > 0).all() == (FEEDFORWARDS[name]["learner"] in ("fel", "rls", "mrac", "composite"))
 
 
 @pytest.mark.parametrize("name", ["fel", "rls", "model+fel", "model+rls", "model+composite"])

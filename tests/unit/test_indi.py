@@ -29,7 +29,8 @@ def drive(stage, prior, inputs):
     log = []
     for command, derivative, twist, voltage in inputs[:, :, None]:
         log.append(stage.output(command, derivative)[0].copy())
-        stage.learn(np.zeros((1, 2)), np.zeros(1), twist, voltage, prior.rows)
+        stage.prior = prior
+        stage.learn(np.zeros((1, 2)), np.zeros(1), twist, voltage)
     return np.array(log)
 
 
@@ -73,7 +74,8 @@ def test_inversion(robot, delay):
         wanted = np.array([0.6 * np.cos(3 * PERIOD * tick), -0.4 * np.sin(5 * PERIOD * tick)])
         seen = x + PERIOD * np.sum(ahead, axis=0)
         voltage = prior.output(seen[None], wanted[None])[0] + stage.output(seen[None], wanted[None])[0]
-        stage.learn(np.zeros((1, 2)), np.zeros(1), seen[None], voltage[None], prior.rows)
+        stage.prior = prior
+        stage.learn(np.zeros((1, 2)), np.zeros(1), seen[None], voltage[None])
         force = np.array([9 * x[0] + 3 * x[0] ** 3 + np.sin(7 * PERIOD * tick), 2 * x[1] - x[0] * x[1] + 0.5])
         waiting.append(voltage)
         ahead = (ahead + [wanted])[1:]
@@ -98,7 +100,8 @@ def test_constant_force(robot):
     for tick in range(300):
         wanted = np.array([0.5 * np.cos(0.1 * tick), 0.3 * np.sin(0.2 * tick)])
         voltage = prior.output(x[None], wanted[None])[0] + stage.output(x[None], wanted[None])[0]
-        stage.learn(np.zeros((1, 2)), np.zeros(1), x[None], voltage[None], prior.rows)
+        stage.prior = prior
+        stage.learn(np.zeros((1, 2)), np.zeros(1), x[None], voltage[None])
         rate = (voltage - [4.0, -3.0]) / mass
         x = x + PERIOD * rate
     np.testing.assert_allclose(rate, wanted, atol=1e-12)
@@ -146,7 +149,8 @@ def test_steering(robot):
     command = np.array([[0.8, 0.5]])
     for _ in range(300):
         found = stage.output(command, np.zeros((1, 2))).copy()
-        stage.learn(np.zeros((1, 2)), np.zeros(1), np.array([[0.8, 0.45]]), np.array([[9.0, 0.02]]), prior.rows)
+        stage.prior = prior
+        stage.learn(np.zeros((1, 2)), np.zeros(1), np.array([[0.8, 0.45]]), np.array([[9.0, 0.02]]))
     assert found[0, 1] == pytest.approx(0.5 + 0.02 - 0.45, rel=1e-6)
 
 
@@ -155,7 +159,8 @@ def test_frozen(robot):
     stage, prior = IncrementalInversion(robot, [Indi()], False, PERIOD), Prior([robot], False)
     for _ in range(20):
         stage.output(np.ones((1, 2)), np.ones((1, 2)))
-        added = stage.learn(np.ones((1, 2)), np.ones(1), np.ones((1, 2)), np.full((1, 2), 3.0), prior.rows)
+        stage.prior = prior
+        added = stage.learn(np.ones((1, 2)), np.ones(1), np.ones((1, 2)), np.full((1, 2), 3.0))
         assert not added.any()
     assert stage.output(np.ones((1, 2)), np.ones((1, 2))).any()
     assert not stage.guarded and not stage.weight_norm.any()
@@ -177,7 +182,8 @@ def test_rows(robot):
         for command, twist, voltage in inputs[:, :, rows].copy():
             twist[list(lost)] = np.nan
             log.append(stage.output(command, command).copy())
-            stage.learn(command, np.zeros(size), twist, voltage, prior.rows)
+            stage.prior = prior
+            stage.learn(command, np.zeros(size), twist, voltage)
         return np.array(log)
 
     together = answer(slice(None), lost=[1])

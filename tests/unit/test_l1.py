@@ -35,7 +35,8 @@ def test_independent(robot, rigid, delay):
     for tick in range(n):
         command, derivative, twist, voltage = inputs[tick]
         np.testing.assert_allclose(stage.output(command[None], derivative[None])[0], -filtered, atol=1e-9)
-        stage.learn(np.zeros((1, 2)), np.zeros(1), twist[None], voltage[None], prior.rows)
+        stage.prior = prior
+        stage.learn(np.zeros((1, 2)), np.zeros(1), twist[None], voltage[None])
         x = twist - PERIOD * inputs[max(0, tick - delay) : tick, 1].sum(0)
         if tick > delay:
             before = inputs[tick - 1 - delay]
@@ -68,7 +69,8 @@ def test_closed_form(robot):
     decay, left = np.exp(-A * PERIOD), []
     for tick in range(200):
         voltage = stage.output(np.zeros((1, 2)), np.zeros((1, 2)))[0].copy()
-        stage.learn(np.zeros((1, 2)), np.zeros(1), x[None], voltage[None], prior.rows)
+        stage.prior = prior
+        stage.learn(np.zeros((1, 2)), np.zeros(1), x[None], voltage[None])
         if tick:
             np.testing.assert_allclose(stage.rows["sigma"][0], decay * lost, rtol=1e-9)
         left.append(voltage + lost)
@@ -112,7 +114,8 @@ def test_steering(robot):
     command = np.array([[0.8, 0.5]])
     for _ in range(500):
         found = stage.output(command, np.zeros((1, 2))).copy()
-        stage.learn(np.zeros((1, 2)), np.zeros(1), np.array([[0.8, 0.45]]), np.array([[9.0, 0.02]]), prior.rows)
+        stage.prior = prior
+        stage.learn(np.zeros((1, 2)), np.zeros(1), np.array([[0.8, 0.45]]), np.array([[9.0, 0.02]]))
     assert found[0, 1] == pytest.approx(np.exp(-A * PERIOD) * (0.5 + 0.02 - 0.45), rel=1e-6)
 
 
@@ -121,7 +124,8 @@ def test_frozen(robot):
     stage, prior = L1Adaptive(robot, [L1()], False, PERIOD), Prior([robot], False)
     for _ in range(20):
         stage.output(np.ones((1, 2)), np.ones((1, 2)))
-        assert not stage.learn(np.ones((1, 2)), np.ones(1), np.ones((1, 2)), np.full((1, 2), 3.0), prior.rows).any()
+        stage.prior = prior
+        assert not stage.learn(np.ones((1, 2)), np.ones(1), np.ones((1, 2)), np.full((1, 2), 3.0)).any()
     assert stage.output(np.ones((1, 2)), np.ones((1, 2))).any()
     assert not stage.guarded and not stage.weight_norm.any()
     stage.restore(np.array([0]))
@@ -138,7 +142,8 @@ def test_rows(robot):
         for command, twist, voltage in inputs[:, :, rows].copy():
             twist[list(lost)] = np.nan
             log.append(stage.output(command, command).copy())
-            stage.learn(command, np.zeros(size), twist, voltage, prior.rows)
+            stage.prior = prior
+            stage.learn(command, np.zeros(size), twist, voltage)
         return np.array(log)
 
     together = answer(slice(None), lost=[1])

@@ -82,7 +82,8 @@ def drive(robot, settings, period, seconds, known=True, turns=False):
         voltage = voltage + prior.output(wanted[None], rate[None])[0] + stage.output(wanted[None], rate[None])[0]
         if stage.rows["age"][0] > SETTLED:
             log.append(lyapunov(stage, prior, true, error, integral, period))
-        added = stage.learn(np.zeros((1, 2)), np.zeros(1), x[None], voltage[None], prior.rows)
+        stage.prior = prior
+        added = stage.learn(np.zeros((1, 2)), np.zeros(1), x[None], voltage[None])
         assert not added.any()
         integral = integral + period * error
         x = move(x, voltage, c.tolist(), robot.half_track, period, round(period / 0.00125))
@@ -254,7 +255,8 @@ def test_regression(robot, rigid, delay):
     for tick in range(delay, n - delay):
         sent = made[tick : tick + 1].copy()
         stage.output(zero, zero)
-        stage.learn(zero, np.zeros(1), x[tick - delay][None], sent, prior.rows)
+        stage.prior = prior
+        stage.learn(zero, np.zeros(1), x[tick - delay][None], sent)
     found = stage.rows["b"][0] / scale[:, None] + prior.rows["c"][0]
     np.testing.assert_allclose(scale[:, None] * found, scale[:, None] * true, atol=0.02)
 
@@ -269,7 +271,8 @@ def test_frozen(robot):
         for tick in range(100):
             twist = np.array([[speed * (1 + 0.3 * np.sin(tick)), 0.0]])
             stage.output(twist, np.zeros((1, 2)))
-            assert not stage.learn(np.ones((1, 2)), np.full(1, frozen), twist, np.ones((1, 2)), prior.rows).any()
+            stage.prior = prior
+            assert not stage.learn(np.ones((1, 2)), np.full(1, frozen), twist, np.ones((1, 2))).any()
         return (stage.rows["b"] != before).any()
 
     assert not go(1.0, 0.8) and not go(0.0, 0.05) and go(0.0, 0.8) and not go(1.0, 0.8)
@@ -284,7 +287,8 @@ def test_hand_over(robot):
     for tick in range(60):
         twist = np.array([[0.8 + 0.1 * np.sin(tick), 0.3]])
         before = stage.output(twist, twist).copy()
-        added = stage.learn(np.ones((1, 2)), np.zeros(1), twist, np.full((1, 2), 3.0), prior.rows).copy()
+        stage.prior = prior
+        added = stage.learn(np.ones((1, 2)), np.zeros(1), twist, np.full((1, 2), 3.0)).copy()
         np.testing.assert_allclose(stage.output(twist, twist) - before, added, atol=1e-12)
     assert added.any()
 
@@ -300,7 +304,8 @@ def test_rows(robot):
         for command, twist, voltage in inputs[:, :, rows].copy():
             twist[list(lost)] = np.nan
             log.append(stage.output(command, command).copy())
-            stage.learn(command, np.zeros(size), twist, voltage, prior.rows)
+            stage.prior = prior
+            stage.learn(command, np.zeros(size), twist, voltage)
         return np.array(log)
 
     together = answer(slice(None), lost=[1])

@@ -277,7 +277,7 @@ def test_order():
         for seed, (kind, steering, period) in enumerate(kinds)
     ]
     whole_result = simulate(scenarios)
-    assert whole_result.sizes == {"run": 5, "time": 500, "weight": 282, "feature": 8}
+    assert whole_result.sizes == {"run": 5, "time": 500, "weight": 282, "feature": 8, "channel": 2}
     assert list(whole_result.seed) == list(range(5)) == list(whole_result.run)
     assert list(whole_result.label.values) == [s.name for s in scenarios]
     assert list(whole_result.feedforward.values) == [s.feedforward for s in scenarios]

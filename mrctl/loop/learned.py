@@ -1,0 +1,77 @@
+"""Files of what a learner has adapted, from which another run can start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from mrctl.control.composite import COMPOSITE, CompositeAdaptation
+from mrctl.control.l1 import PREDICTOR, L1Adaptive
+from mrctl.control.mrac import MRAC, ModelReferenceAdaptive
+from mrctl.control.observer import OBSERVER, DisturbanceObserver
+from mrctl.control.rls import RLS, RecursiveLeastSquares
+from mrctl.control.weights import read_arrays, shapes, write_arrays
+from mrctl.kernel import Array
+from mrctl.record import InputError
+from mrctl.results.dataset import scenarios_of
+from mrctl.scenario import Scenario
+
+KEPT = {
+    "observer": {name: OBSERVER[name].shape for name in DisturbanceObserver.learned},
+    "l1": {name: PREDICTOR[name].shape for name in L1Adaptive.learned},
+    "rls": {name: RLS[name].shape for name in RecursiveLeastSquares.learned},
+    "mrac": {name: MRAC[name].shape for name in ModelReferenceAdaptive.learned},
+    "composite": {name: COMPOSITE[name].shape for name in CompositeAdaptation.learned},
+}
+"""Names and shapes of what each learner keeps, but for `fel`, whose network has the size that its settings say."""
+
+
+def kept(scenario: Scenario) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of what the learner of a scenario keeps, in the order of `weights` of a result.
+
+    Raises:
+        InputError: It keeps nothing.
+    """
+    if scenario.learner == "fel":
+        return shapes(scenario.fel.hidden)
+    if scenario.learner not in KEPT:
+        raise InputError(f"learned: the learner {scenario.learner} has nothing that a run could keep")
+    return KEPT[scenario.learner]
+
+
+def save_learned(path: str | Path, run: xr.Dataset) -> None:
+    """Writes what the learner of one run has adapted as a safetensors file, for the field `learned` of a scenario.
+
+    Args:
+        path: File to write.
+        run: One run of a result, such as `result.isel(run=0)`.
+
+    Raises:
+        InputError: There are several runs, the learner keeps nothing, the run failed, or the file cannot be written.
+    """
+    if run.sizes.get("run", 1) != 1:
+        raise InputError(f"run: {run.sizes['run']} runs; choose one with isel(run=…)")
+    one = run.squeeze("run") if "run" in run.dims else run
+    if bool(one.failed):
+        raise InputError(f"learned: the run failed ({one.failure.item()}), and what it learned is not to be trusted")
+    if "weights" not in one:
+        raise InputError("learned: the run has no learner of mrctl that keeps anything")
+    (scenario,) = scenarios_of(one)
+    flat, arrays, start = one.weights.values, {}, 0
+    for name, shape in kept(scenario).items():
+        stop = start + int(np.prod(shape))
+        arrays[name], start = flat[start:stop].reshape(shape), stop
+    write_arrays(path, arrays, {"learner": scenario.learner, "robot": scenario.robot.path})
+
+
+def load_learned(scenario: Scenario) -> Array:
+    """Reads what the learner of a scenario starts from, flat, `(n,)`.
+
+    Raises:
+        InputError: The file is missing, broken, or of another learner.
+    """
+    expected = kept(scenario)
+    arrays = read_arrays(str(scenario.learned), "learned", expected)
+    return np.concatenate([arrays[name].ravel() for name in expected])

@@ -1,0 +1,71 @@
+"""What a learner has adapted, kept in a file: the next run starts from it, on another course and frozen or not."""
+
+import numpy as np
+import pytest
+
+import mrctl
+from mrctl import FEEDFORWARDS, PERTURBATIONS, Circle, Event, InputError, Lemniscate, Scenario, Sensing
+from mrctl.loop.learned import KEPT, load_learned
+from mrctl.loop.simulation import Simulation
+
+COURSE, OTHER = Lemniscate(size=1.2, period=10), Circle(radius=0.8, period=8)
+BASE = Scenario(
+    sensing=Sensing(tier="ideal"), perturbation=PERTURBATIONS["all"], reference=COURSE, laps=2, initial_spread=(0, 0, 0)
+)
+FROZEN = (Event(time=0.0, learning=False),)
+LEARNERS = ("fel", "model+fel", "model+rls", "model+mrac", "model+composite", "model+observer", "model+l1")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A file of what each learner has adapted in two laps."""
+    folder = tmp_path_factory.mktemp("learned")
+    runs = mrctl.simulate([BASE.model_copy(update=FEEDFORWARDS[name]) for name in LEARNERS])
+    for k, name in enumerate(LEARNERS):
+        mrctl.save_learned(folder / f"{name}.safetensors", runs.isel(run=k))
+    return {name: (str(folder / f"{name}.safetensors"), runs.isel(run=k)) for k, name in enumerate(LEARNERS)}
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+def test_starts_where_it_ended(name, files):
+    """Before the first tick the learner of the next run has what was saved, to the bit, and in a batch its own."""
+    file, run = files[name]
+    pair = [BASE.model_copy(update=FEEDFORWARDS[name] | {"learned": path}) for path in (file, None)]
+    learner = Simulation(pair).hierarchy.learner
+    found, fresh = learner.adapted()
+    kept = found == load_learned(pair[0])
+    if name == "model+composite":  # but for the slope and the disturbance, which belong to another place and moment
+        assert 0.7 < kept.mean() < 1 and np.array_equal(found[:8], run.weights.values[:8])
+    else:
+        assert kept.all()
+    assert (found != fresh).any()
+
+
+@pytest.mark.parametrize("name", LEARNERS[:5])
+def test_transfer(name, files):
+    """Learned on one course, frozen on another: it tracks the robot that the model does not know from its first lap on.
+
+    Not frozen, it begins as well and goes on learning.
+    """
+    pair = FEEDFORWARDS[name]
+    elsewhere = BASE.model_copy(update={**pair, "reference": OTHER, "laps": 1})
+    alone = elsewhere.model_copy(update={"learner": "none"})
+    kept = elsewhere.model_copy(update={"learned": files[name][0]})
+    frozen = kept.model_copy(update={"events": FROZEN})
+    runs = mrctl.simulate([alone, frozen, kept])
+    without, still, onward = mrctl.per_lap(runs).feedback_share.values[:, 0]
+    assert still < 0.6 * without and onward < 0.6 * without
+    assert runs.feedforward_left.values[1, 0] == runs.feedforward_left.values[2, 0] != 0
+
+
+def test_refused(files, tmp_path):
+    """A learner that keeps nothing, another learner's file, several runs, a user's stage: one line that says which."""
+    with pytest.raises(InputError, match="^learned: the learner indi has nothing that a run could keep$"):
+        Scenario.from_dict({"prior": "model", "learner": "indi", "learned": "x.safetensors"})
+    with pytest.raises(InputError, match=r"^learned: .*fel\.safetensors: theta is missing, it must have"):
+        Simulation([BASE.model_copy(update={"learner": "rls", "learned": files["fel"][0]})])
+    with pytest.raises(InputError, match="^run: 2 runs; choose one"):
+        mrctl.save_learned(tmp_path / "x", mrctl.simulate([BASE.model_copy(update={"laps": 1})] * 2))
+    with pytest.raises(InputError, match="^learned: the run has no learner of mrctl"):
+        mrctl.save_learned(tmp_path / "x", mrctl.simulate(BASE.model_copy(update={"learner": "none", "laps": 1})))
+    assert set(KEPT) == {"observer", "l1", "rls", "mrac", "composite"}
