@@ -142,3 +142,9 @@ def test_laws_without_physics() -> None:
     """The laws, the hierarchy and the results are usable where no engine is."""
     block = "import sys; sys.modules['mujoco'] = sys.modules['dm_control'] = None\n"
     loaded(block + "import mrctl.loop.hierarchy, mrctl.results.metrics, mrctl.results.dataset", ())
+
+
+def test_public_module() -> None:
+    """`mrctl.plots` is a module, which is there before anything else has imported it."""
+    script = "import mrctl; assert callable(mrctl.plots.save)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
