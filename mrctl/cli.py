@@ -276,12 +276,12 @@ def suite(
     """Compares feedforwards under every uncertainty, with the same draws; the same command resumes after an interrupt.
 
     Args:
-        feedforward: Feedforwards to compare, such as fel or model+composite; hindsight is the best fixed one, which is
-            found for each run by repeating it.
+        feedforward: Feedforwards to compare, such as fel or model+composite; hindsight has fixed coefficients, which
+            are fitted to each run itself.
         controller: Controllers of your own to compare, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion.
         seeds: Number of replicates of each case; by default 20, or 3 with --quick.
         random: Number of random scenarios; by default 300, or 20 with --quick.
-        quick: Run a selection of cases with fewer laps, in two minutes instead of half an hour.
+        quick: Run a selection of cases with fewer laps, in a few minutes instead of an hour.
         workers: Number of processes on this machine; by default one for each core.
         out: Folder for report.html, the tables in Markdown and JSON, the figures and the runs.
     """

@@ -103,7 +103,7 @@ class Scenario(Record):
     prior: PriorName = "none"
     """What the feedforward knows at the start: nothing, the nominal model, or, for reference, the true one."""
     learner: LearnerName = "fel"
-    """What the feedforward learns with, beyond the prior; with `none` and prior `none` the PID is alone."""
+    """Law that adapts the feedforward, added to the prior; with `none` and prior `none` the PID is alone."""
     sensing: Sensing = Sensing()
     """Sensors, estimator, motor driver, battery, steering servo and delay, by a tier."""
     kanayama: Kanayama = Kanayama()
@@ -193,9 +193,9 @@ class Scenario(Record):
 def replicates(scenario: Scenario, count: int, first: int = 0) -> list[Scenario]:
     """Returns independent repetitions of a run: each is another robot of the kind, on another day.
 
-    Two runs that differ in their noise alone are nearly copies, and say little about robots. A replicate draws its
-    seed, and what nobody knows about a robot: see `Perturbation.drawn`. Replicate k has the same draws whatever the
-    scenario is, so that replicates of two scenarios are pairs; an event's perturbation has those of the start.
+    Two runs that differ in their noise alone are nearly copies, and say little about robots. Replicate k
+    has the seed first + k, and perturbations drawn with that seed (`Perturbation.drawn`), those of its events with the
+    same draw. The draw does not depend on the scenario, so that replicates of two scenarios are pairs.
 
     Args:
         scenario: The run; its seed is replaced.

@@ -16,9 +16,9 @@ the price of the sampling. The adaptation may be this fast because C alone sets 
 Put together, the law and the predictor say σ̂ = e^(−a h) [M (x_n − x_(n−1))/h − (U − f)]: the predictor has no memory
 of its own, and the whole is a disturbance observer with Q = C e^(−a h), as is known of this law.
 
-The loop opened at the voltage, with a PID C_p that acts L later, the nominal plant P = 1/(M s + B), and L' = L and one
-period, is (C_p P e^(−Ls) + Q e^(−L's))/(1 − Q e^(−L's)), and 1/(1 + loop) = (1 − Q e^(−L's))/(1 + C_p P e^(−Ls)): the
-adaptation cannot make the nominal loop unstable.
+The loop opened at the voltage, with a PID C_p that acts L later, the nominal plant P = 1/(M s + B), and L' of two
+periods and the delay of the sensing tier, as in `indi`, is (C_p P e^(−Ls) + Q e^(−L's))/(1 − Q e^(−L's)), and 1/(1 +
+loop) = (1 − Q e^(−L's))/(1 + C_p P e^(−Ls)): the adaptation cannot make the nominal loop unstable.
 
 Under `rigid` steering the second channel is the rotation: f is θ̇ itself, σ is in rad/s, and M is the lag of the servo.
 """

@@ -38,8 +38,9 @@ bracket is negative. The half-space contains the ball, so also a_k, and a projec
 farther from any of its points. ∎
 
 About (A): with η_k in proportion to the back-EMF, as here, Σ η_k e_k U_k is a power. Back-EMF and friction dissipate,
-and of the products V θ̇ and θ̇² remains l (V_c e_ω² − ω_c e_V e_ω), where l is m c in volts. Forward, the feedback is
-stronger where l |ω_c| < 2 √(K_V D K_ω); for the default robot in `lab` this is 0.7 < 29 V s/m at the most.
+and of the products V θ̇ and θ̇² remains l (V_c e_ω² − ω_c e_V e_ω), where l, in V s², is minus the coefficient of ω²
+in U_Σ. Forward, the feedback is stronger where l |ω_c| < 2 √(K_V D K_ω); for the default robot in `lab` this is 0.7 V
+s < 29 V s at the most.
 
 The law is sampled; one period changes V by O(h²) beyond the theorem, which the test measures. As the theorem demands,
 learning hands nothing over to the PID's integral. `hand_over` does so as in the other learners: then the first lap from
@@ -48,7 +49,7 @@ the prior `none` is better, and V may grow.
 Beyond the theorem there are noise, delay, the fork and slip. `match` gives the prediction error the voltage that acted.
 Nothing is learned while a limit acts or a wheel slips (`frozen`), or near rest, where stiction is no function of the
 motion; the filters go on. Under `rigid` steering the second channel is the correction of the commanded rotation, as in
-`composite`: its plant is U = θ̇ + φᵀ a, e is counted in rad/s, and learning is slower by the same factor.
+`composite`: its plant is U = θ̇ + φᵀ a, in rad/s, and η_k is smaller by the factor `STEERING_SHARE`.
 """
 
 from __future__ import annotations
@@ -192,8 +193,10 @@ def track(k: int, s: Row) -> None:
 def confine(k: int, s: Row) -> None:
     """Switching σ-modification and projection of the parameters of channel k.
 
-        b ← b − h σ P b,    σ = σ_0 min(‖b‖/R − 1, 1) where ‖b‖ > R
-        b ← b − P g (gᵀ b − 2 R)/(gᵀ P g),    g = b/‖b‖, where ‖b‖ > 2 R
+        b ← b − s P b,    s = min(max(h σ, s_2R), s_R),    s_r = ‖b‖ (‖b‖ − r)/(bᵀ P b)
+        σ = σ_0 min(‖b‖/R − 1, 1) where ‖b‖ > R;    s_2R, the projection, only where ‖b‖ > 2 R
+
+    s_R ends a very fast leak where gᵀ b = R, with g = b/‖b‖ before the step.
 
     Args:
         k: Channel.
@@ -211,7 +214,7 @@ def confine(k: int, s: Row) -> None:
     share = s.leak * min(size / radius - 1, 1.0)
     if size > 2 * radius:
         share = max(share, (size - 2 * radius) * size / power)
-    share = min(share, (size - radius) * size / power)  # a very fast leak ends where gᵀ b = R
+    share = min(share, (size - radius) * size / power)
     for i in range(INPUTS):
         b[i] -= share * s.direction[i]
 

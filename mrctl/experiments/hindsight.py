@@ -1,11 +1,12 @@
-"""The best fixed feedforward in hindsight: what a learner would have used that knew the whole run at its start.
+"""A fixed feedforward in hindsight: what a learner would have used that knew the whole run at its start.
 
-    U_ff = cᵀ x_c,    c ← c + argmin_Δ Σ |U_fb − Δᵀ x_c|²,    x_c = the 8 features of equation (3) at the command
+    U_ff = cᵀ φ_c,    c ← c + argmin_Δ Σ |U_fb − Δᵀ φ_c|²,    φ_c = the 8 features of equation (3) at the command
 
 The inverse dynamics of the nominal robot is the first guess. A run shows which voltage the feedback had to add; least
-squares finds the coefficients that would have given it, and the run is repeated with them. After one repetition the
-coefficients hardly change any more. The regret of a learner is its error less that of the last repetition
-(Cesa-Bianchi and Lugosi, 2006).
+squares finds the coefficients that would have given it, and the run is repeated with them. Ticks in which nothing
+may be learned do not count. After one repetition the coefficients hardly change any more. By analogy with the regret of
+on-line learning (Cesa-Bianchi and Lugosi, 2006), that of a learner is its RMS error over all laps less that of the last
+repetition. It can be negative, since the feedback voltage is minimised, not the error.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ def reproduce(out: Path) -> str:
             "last_lap": rows,
             "tiers": tier_rows,
             "endurance": long_rows,
-            "scenarios": [s.model_dump(mode="json") for s in (*scenarios, *endurance, *tiers)],
+            "scenarios": [s.model_dump(mode="json") for s in (*scenarios, *endurance, *tiers, *bound)],
         },
     )
     parts = [text(rows), endurance_text(long_rows), tiers_text(tier_rows), kanayama_text(lateral)]

@@ -97,10 +97,10 @@ class Perturbation(Record):
     """Delay of voltages and steering commands in s beyond that of `sensing`, a multiple of the control period."""
 
     def drawn(self, random: np.random.Generator) -> Perturbation:
-        """Returns the perturbation of one robot on one day: what nobody knows of a robot is drawn and added.
+        """Returns the perturbation of one robot on one day, with what nobody knows of it drawn at random.
 
-        Factors of `UNKNOWN` are uniform about those of the perturbation, with these half widths; so is the slope, with
-        `UNKNOWN_SLOPE`.
+        Each factor in `UNKNOWN` is multiplied by a uniform draw from 1 ± w; to the slope a uniform draw from
+        ± `UNKNOWN_SLOPE` is added.
 
         Args:
             random: Source of the draw, which always takes the same number of values from it.
