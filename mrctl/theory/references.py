@@ -442,8 +442,9 @@ Reference = Annotated[
 ]
 
 
+@lru_cache(1024)
 def check(reference: Reference, robot: Robot, reverse: bool) -> None:
-    """Refuses a reference that the robot cannot follow.
+    """Refuses a reference that the robot cannot follow; a reference that was fine is not sampled again.
 
     Args:
         reference: The reference.
