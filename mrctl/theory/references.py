@@ -442,7 +442,6 @@ Reference = Annotated[
 ]
 
 
-@lru_cache(1024)
 def check(reference: Reference, robot: Robot, reverse: bool) -> None:
     """Refuses a reference that the robot cannot follow; a reference that was fine is not sampled again.
 
@@ -455,6 +454,11 @@ def check(reference: Reference, robot: Robot, reverse: bool) -> None:
         InputError: The reference reverses or exceeds a limit; the message has the quantity, its peak, the time of the
             peak and the limit.
     """
+    _check(reference, robot, reverse)  # pyright: ignore[reportArgumentType] (frozen records are hashable)
+
+
+@lru_cache(1024)
+def _check(reference: Reference, robot: Robot, reverse: bool) -> None:
     # Samples are at most 10 ms apart up to a period of 5000 s, so that short moves between long rests are seen.
     t = np.linspace(0, reference.period, int(np.clip(100 * reference.period, 2000, 500_000)) + 1)
     _, (v, omega), (v_dot, omega_dot) = (part.T for part in reference.sample(t))
