@@ -95,10 +95,10 @@ def reproduce(out: Path) -> str:
     endured = simulate(endurance, progress=True)
     figures(result, scenarios, out)
     lateral = kanayama.table()
-    rows, long_rows = compare(metrics.summary(result), scenarios), endure(endured, endurance)
+    rows, long_rows = compare(summary(result), scenarios), endure(endured, endurance)
     tiers = [one for tier in TIERS for one in real(tier)]
     bound = [one for one in tiers if one.feedforward == "none"]
-    found = pd.concat([metrics.summary(simulate(tiers, progress=True)), metrics.summary(best_fixed(bound))])
+    found = pd.concat([summary(simulate(tiers, progress=True)), summary(best_fixed(bound))])
     tier_rows = compare(found, [*tiers, *bound])
     for row in tier_rows[len(tiers) :]:
         row["feedforward"] = "hindsight"
@@ -142,11 +142,16 @@ def figures(result: xr.Dataset, scenarios: Sequence[Scenario], out: Path) -> Non
         plots.save(figure, out, name)
 
 
+def summary(result: xr.Dataset) -> pd.DataFrame:
+    """The metrics of the last lap of every run, and why it failed, or ""."""
+    return metrics.summary(result).assign(failure=result["failure"].values)
+
+
 def compare(table: pd.DataFrame, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
     """RMSE in the last lap of every run, and its ratio to PID alone on the same plant, reference and seed.
 
     Args:
-        table: What `metrics.summary` returns, a row for each scenario.
+        table: What `summary` returns, a row for each scenario.
         scenarios: The runs, PID alone among them.
     """
     rows = []
@@ -160,7 +165,7 @@ def compare(table: pd.DataFrame, scenarios: Sequence[Scenario]) -> list[dict[str
             "lap_time": one.reference.period,
             "feedforward": one.feedforward,
             "seed": one.seed,
-            "failed": bool(table["failed"].iloc[k]),
+            "failure": str(table["failure"].iloc[k]),
         }
         for metric in METRICS:
             row[metric] = float(table[metric].iloc[k])
@@ -201,8 +206,8 @@ def text(rows: Sequence[dict[str, Any]]) -> str:
     header += ["to PID: V", "θ̇", "position"]
     cells = []
     for row in rows:
-        if row["failed"]:
-            values = ["failed", *[""] * 5]
+        if row["failure"]:
+            values = [row["failure"], *[""] * 5]
         else:
             ratios = [row[f"{m}_to_pid"] for m in METRICS]
             values = [number(1e3 * row[m]) for m in METRICS]
@@ -221,7 +226,7 @@ def tiers_text(rows: Sequence[dict[str, Any]]) -> str:
     means = {key: {m: fmean(row[m] for row in group) for m in METRICS} for key, group in groups.items()}
     cells = []
     for key, group in groups.items():
-        if lost := sum(row["failed"] for row in group):
+        if lost := sum(bool(row["failure"]) for row in group):
             cells.append([*key, f"{lost} of {len(group)} fail", *[""] * 3])
             continue
         ratio = means[key]["position_rmse"] / means[*key[:2], "none"]["position_rmse"]

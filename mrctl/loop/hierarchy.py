@@ -290,6 +290,9 @@ class Hierarchy:
         renewed = Hierarchy([scenario], self._robot)
         self.state[row] = renewed.state[0]
         self.prior.rows[row] = renewed.prior.rows[0]
+        self._learned.pop(row, None)
+        if 0 in renewed._learned:
+            self._learned[row] = renewed._learned[0]
         mine, other = self.learner, renewed.learner
         assert isinstance(mine, Learner) and isinstance(other, Learner)
         mine.take(row, other)

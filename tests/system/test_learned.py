@@ -69,3 +69,16 @@ def test_refused(files, tmp_path):
     with pytest.raises(InputError, match="^learned: the run has no learner of mrctl"):
         mrctl.save_learned(tmp_path / "x", mrctl.simulate(BASE.model_copy(update={"learner": "none", "laps": 1})))
     assert set(KEPT) == {"observer", "l1", "rls", "mrac", "composite"}
+
+
+def test_renewed(files):
+    """A robot that begins anew with another file is reset to that one, and to nothing where it has none."""
+    first, second = (files[name][0] for name in ("model+rls", "model+fel"))
+    start = BASE.model_copy(update=FEEDFORWARDS["model+rls"] | {"learned": first})
+    hierarchy = Simulation([start, start]).hierarchy
+    hierarchy.renew(1, start.model_copy(update={"learned": None}))
+    hierarchy._restore(np.arange(2))
+    kept, fresh = hierarchy.learner.adapted()
+    assert np.array_equal(kept, load_learned(start)) and not fresh[:16].any()
+    with pytest.raises(InputError, match="theta is missing"):
+        hierarchy.renew(0, start.model_copy(update={"learned": second}))

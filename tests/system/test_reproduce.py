@@ -60,8 +60,8 @@ def test_network_beats_pid_in_other_arrangements(table: dict, steering: str, pla
     """At most PID on V, below it on θ̇ and position; PID that fails is beaten by not failing."""
     found = row(table, steering=steering, plant=plant, feedforward="fel")
     bare = row(table, steering=steering, plant=plant, feedforward="none")
-    assert not found["failed"]
-    if not bare["failed"]:
+    assert not found["failure"]
+    if not bare["failure"]:
         assert found["v_rmse"] <= bare["v_rmse"]
         assert found["omega_rmse"] < bare["omega_rmse"]
         assert found["position_rmse"] < bare["position_rmse"]

@@ -34,7 +34,7 @@ def suite(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def reproduction(tmp_path: Path) -> Path:
-    row = {"steering": "rigid", "plant": "all", "lap_time": 12.0, "feedforward": "fel", "failed": False}
+    row = {"steering": "rigid", "plant": "all", "lap_time": 12.0, "feedforward": "fel", "failure": ""}
     row |= {m: 0.00321 for m in paper.METRICS} | {f"{m}_to_pid": float("nan") for m in paper.METRICS}
     long = {"run": "fel, all", "laps": 60} | {m: {"lap_8": 0.002, "last": 0.001} for m in paper.METRICS}
     case = {"case": "an offset", "unit": "%", "target": 9.1, "value": 9.06, "value_10ms": 8.95}
