@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"mrctl {__version__}")
         return 0
     try:
-        _parse(arguments)()
+        _parse(_written_out(arguments))()
     except InputError as error:
         print(f"mrctl: {error}", file=sys.stderr)
         return 2
@@ -65,6 +65,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 class _Incomplete(Exception):
     """A command has ended, but a part of its work failed; the message says which part."""
+
+
+def _written_out(arguments: list[str]) -> list[str]:
+    """Replaces `--perturbation NAME` by the flags of that perturbation, which later flags override.
+
+    Raises:
+        InputError: There is no perturbation of that name.
+    """
+    found: list[str] = []
+    rest = iter(arguments)
+    for argument in rest:
+        flag, given, name = argument.partition("=")
+        if flag != "--perturbation":
+            found.append(argument)
+            continue
+        perturbation = Perturbation.from_dict(name if given else next(rest, ""), "perturbation")
+        for field, value in perturbation.model_dump(exclude_defaults=True).items():
+            found += [f"--perturbation.{field.replace('_', '-')}", str(value)]
+    return found
 
 
 def _parse(arguments: list[str]) -> Callable[[], Any]:
@@ -87,6 +106,8 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
         "view": view,
         "export": export,
     }
+    if not arguments[0].startswith("-") and arguments[0] not in commands:
+        raise InputError(f"no command is called {arguments[0]!r}; there are {', '.join(commands)}")
     complaints = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaints):
@@ -101,6 +122,9 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
         raise InputError(describe(error)) from None
     except SystemExit as stop:
         if stop.code:
+            for name in Scenario.moved:  # whose successors are known
+                if arguments[0] == "run" and f"--{name}" in arguments:
+                    Scenario.from_dict({name: ""})
             raise InputError(_one_line(complaints.getvalue())) from None
         if _is_short_help(arguments):
             print(_further_flags())
@@ -166,8 +190,8 @@ def _further_flags() -> str:
 
 def _run_with(arguments: list[str]) -> Callable[..., None]:
     """Returns the `run` command, whose flags take their defaults from the scenario file where one is given."""
-    file = next((a for a in arguments[1:] if a.endswith(".toml")), None) if arguments[0] == "run" else None
-    default = Scenario.from_toml(file) if file else Scenario()
+    scenario_file = _scenario_file(arguments) if arguments[0] == "run" else None
+    default = Scenario.from_toml(scenario_file) if scenario_file else Scenario()
 
     def run(
         file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml|STORE")] = None,
@@ -194,6 +218,8 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             return _repeat(file, number, out, json)
         if file is not None and file.is_dir():
             raise InputError(f"run: {file} is a store; give the number of one of its runs with --run")
+        if file is not None and str(file) != scenario_file:
+            raise InputError(f"run: {file} is not a scenario file, whose name ends in .toml; see mrctl run --help")
         from mrctl.experiments import single
 
         text, failure = single.run(scenario, out, json, controller)
@@ -206,6 +232,14 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         run.__annotations__["scenario"] = Annotated[type(short), tyro.conf.arg(name="")]
         run.__defaults__ = (None, short, *(run.__defaults__ or ())[2:])
     return run
+
+
+def _scenario_file(arguments: Sequence[str]) -> str | None:
+    """Returns the argument of `run` that is a scenario file: it ends in .toml and is not the value of a flag."""
+    for before, argument in zip(arguments, arguments[1:], strict=False):
+        if argument.endswith(".toml") and not argument.startswith("-") and not re.match("--(?!json$)", before):
+            return str(Path(argument))
+    return None
 
 
 def _repeat(store: Path | None, number: int, out: Path | None, json: bool) -> None:

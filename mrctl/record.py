@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from typing_extensions import override
 
 from mrctl import __version__
 
@@ -34,6 +36,25 @@ class Record(BaseModel):
         for name in cls.moved.keys() & values.keys() if isinstance(values, dict) else ():
             raise ValueError(f"{name}: this field of an earlier version is gone; {cls.moved[name]}")
         return values
+
+    def replace(self, **changes: Any) -> Self:  # noqa: ANN401
+        """Returns the record with other values in these fields, validated as a whole.
+
+        Raises:
+            InputError: A field is unknown or a value is invalid; the message names the field.
+        """
+        return self.from_dict({name: getattr(self, name) for name in type(self).model_fields} | changes)
+
+    @override
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """As pydantic's, which does not validate the values; but it refuses unknown fields, as `replace` does.
+
+        Raises:
+            InputError: A field is unknown.
+        """
+        for name in (update or {}).keys() - type(self).model_fields.keys():
+            self.replace(**{name: (update or {})[name]})
+        return super().model_copy(update=update, deep=deep)
 
     @classmethod
     def from_dict(cls, values: object, source: str = "") -> Self:

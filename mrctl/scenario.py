@@ -129,7 +129,8 @@ class Scenario(Record):
     guard: Guard = Guard()
     """Settings of the guard, which limits or stops a learner that makes the loop worse."""
     perturbation: Perturbation = Perturbation()
-    """Differences of the plant from its model from the start, such as a mass factor or a payload."""
+    """Differences of the plant from its model from the start, such as a mass factor or a payload; or the name of one of
+    `PERTURBATIONS`, such as `all`."""
     events: tuple[Event, ...] = ()
     """Changes during the run."""
     initial_pose: tuple[float, float, float] | None = None
@@ -171,8 +172,7 @@ class Scenario(Record):
         Raises:
             InputError: The event does not fit the run.
         """
-        values = {name: getattr(self, name) for name in Scenario.model_fields}
-        return Scenario.from_dict(values | {"events": (*self.events, event)})
+        return self.replace(events=(*self.events, event))
 
     @property
     def feedforward(self) -> str:

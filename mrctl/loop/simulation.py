@@ -62,7 +62,7 @@ def simulate(
         InputError: A scenario asks for something that does not exist or that the robot cannot do, and the message names
             the field; or a stage of the user cannot be made.
     """
-    several = [scenarios] if isinstance(scenarios, Scenario) else list(scenarios)
+    several = [s.replace() for s in ([scenarios] if isinstance(scenarios, Scenario) else scenarios)]  # validated
     if not several:
         raise InputError("scenarios: none given")
     if len({s.control_period for s in several}) > 1:

@@ -5,10 +5,10 @@ A `Perturbation` is data; `mrctl.physics.perturb` writes it into a compiled mode
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from mrctl.record import Record
 from mrctl.theory.drive import (
@@ -95,6 +95,16 @@ class Perturbation(Record):
     """Inclination of the ground in rad, uphill along the world's +x; gravity is turned, not the floor."""
     control_delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] = 0.0
     """Delay of voltages and steering commands in s beyond that of `sensing`, a multiple of the control period."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named(cls, values: Any) -> Any:  # noqa: ANN401
+        """A name stands for one of `PERTURBATIONS`."""
+        if not isinstance(values, str):
+            return values
+        if values not in PERTURBATIONS:
+            raise ValueError(f"no perturbation is called {values!r}; there are {', '.join(PERTURBATIONS)}")
+        return PERTURBATIONS[values].model_dump()
 
     def drawn(self, random: np.random.Generator) -> Perturbation:
         """Returns the perturbation of one robot on one day, with what nobody knows of it drawn at random.

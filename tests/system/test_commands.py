@@ -178,6 +178,10 @@ def test_bad_scenario_is_one_line(
     ("arguments", "says"),
     [
         (["run", "missing.toml"], "missing.toml"),
+        (["run", "turtlebot"], "turtlebot is not a scenario file"),
+        (["run", "scenario.tml", "--laps", "1"], "scenario.tml is not a scenario file"),
+        (["run", "--perturbation", "al"], "perturbation: no perturbation is called 'al'; there are nominal, mass"),
+        (["identify", "--perturbation"], "perturbation: no perturbation is called ''"),
         (["run", "--fel.step", "7"], "fel.step"),
         (["run", "--fel.stride", "1"], "--fel.stride"),
         (["run", "--learner", "magic"], "--learner"),
@@ -189,12 +193,24 @@ def test_bad_scenario_is_one_line(
         (["tune", "--delay", "0.013"], "control_delay"),
         (["tune", "--delay", "0.6"], "delay: "),
         (["suite", "--seeds", "0"], "seeds"),
-        (["dance"], "dance"),
+        (["dance"], "no command is called 'dance'; there are run, reproduce"),
+        (["run", "--feedforward", "rls"], "feedforward: this field of an earlier version is gone"),
     ],
 )
 def test_bad_flags_are_one_line(arguments: list[str], says: str, capsys: pytest.CaptureFixture) -> None:
     """Every kind of bad flag ends with one line that names it."""
     assert says in refused(capsys, *arguments)
+
+
+def test_perturbation_by_name(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """On the command line and in a file; later flags override it. The value of a flag is no scenario file."""
+    flags = ["--perturbation", "all", "--perturbation.mass-factor", "1", "--name", "x.toml", "--json"]
+    assert cli.main(["run", *flags, *SHORT]) == 0
+    scenario = mrctl.Scenario.from_dict(json.loads(capsys.readouterr().out)["scenario"])
+    assert scenario.perturbation == mrctl.PERTURBATIONS["all"].replace(mass_factor=1.0)
+    assert scenario.name == "x.toml"
+    (tmp_path / "all.toml").write_text('perturbation = "all"')
+    assert mrctl.Scenario.from_toml(tmp_path / "all.toml").perturbation == mrctl.PERTURBATIONS["all"]
 
 
 COMMANDS = ("run", "reproduce", "sweep", "suite", "tune", "identify", "train", "check", "bench", "view", "export")

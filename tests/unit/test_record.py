@@ -112,6 +112,17 @@ def test_frozen():
         Outer().name = "y"  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def test_copies():
+    """`replace` validates everything; `model_copy` trusts values, but not names."""
+    outer = Outer.from_dict({"inner": {"rate": 2.0}, "name": "a"})
+    assert outer.replace(name="b") == outer.model_copy(update={"name": "b"}) == Outer(inner=Inner(rate=2.0), name="b")
+    for copy in (outer.replace, lambda **fields: outer.model_copy(update=fields)):
+        with pytest.raises(InputError, match="^nme: "):
+            copy(nme="b")
+    with pytest.raises(InputError, match="^name: "):
+        outer.replace(name=3)
+
+
 def test_field_docs():
     """The docstring under a field is its description, for help texts and sliders."""
 

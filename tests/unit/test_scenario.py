@@ -244,6 +244,12 @@ def test_simulation_refuses(words, changes):
         assert "\n" not in str(error.value)
 
 
+def test_simulation_validates():
+    """A copy that was not validated is refused before anything runs."""
+    with pytest.raises(InputError, match="^learner: "):
+        simulate(Scenario().model_copy(update={"learner": "pid"}))
+
+
 def test_mixed_rates():
     """Runs of one result need the same control period."""
     with pytest.raises(InputError, match="^control_period"):
