@@ -18,6 +18,8 @@ from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Lemniscate, Waypoints, random_spline
 from mrctl.theory.robot import STEERINGS, Robot
 
+SUITE_SEEDS, TUNING_SEEDS, HELD_OUT_SEEDS = range(100_000), range(100_000, 200_000), range(200_000, 300_000)
+"""Seeds of the suite's draws, of those that settings are chosen on, and of those that nothing is ever chosen on."""
 HINDSIGHT = "hindsight"  # the best fixed feedforward, which is found by repeating the run
 REFERENCES = ("true_model", HINDSIGHT)  # feedforwards that know the plant, and compete with nobody
 LADDER = ("nominal", "mass +50 %", "supply -20 %", "all")  # plants of every steering arrangement
