@@ -2,19 +2,38 @@
 
 A setting that was chosen on some runs looks better on them than it is (selection bias). These cells were written down
 before any tuning; no course, no plant and no seed of theirs is used anywhere else. A learner is named, with its
-settings, before it is driven through them.
+settings, before it is driven through them, and every time that one is driven is kept.
 """
 
 from __future__ import annotations
 
-from mrctl.experiments.cases import HELD_OUT_SEEDS, Case
-from mrctl.scenario import Scenario, replicates
+import json
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from mrctl.experiments import suite
+from mrctl.experiments.cases import HALF, HELD_OUT_SEEDS, NO_SPREAD, Case, Laps
+from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, Table, interval
+from mrctl.experiments.tables import machine, number, output_folder, write_json
+from mrctl.record import InputError
+from mrctl.results.comparison import bootstrap_interval
+from mrctl.results.dataset import versions
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Circle, Reference, RoundedSquare, StopAndGo, Waypoints
 from mrctl.theory.timing import Limits
 
 LAPS = 6
-NO_SPREAD = (0.0, 0.0, 0.0)  # an initial offset, the same for all, would hide what learning costs in lap 1
+RIVALS: tuple[FeedforwardName, ...] = ("model", "true_model", "model+observer")
+RESOLVED = 5  # replicates of each cell that are also driven with half the physics step
+LOG = "held_out.jsonl"
+"""File with a line for each time that the cells were begun, and for each time that they were finished."""
 
 COURSES: dict[str, Reference] = {
     "circle": Circle(radius=1.3, period=9.0, clockwise=True),
@@ -72,3 +91,130 @@ def cells(count: int) -> list[Case]:
         for course, reference in COURSES.items()
         for plant, perturbation in PLANTS.items()
     ]  # fmt: skip
+
+
+def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
+    """Drives one feedforward and its rivals through the cells; writes `table.md` and `table.json`, and logs it.
+
+    Args:
+        entry: Name of the feedforward, or one of the user's as `my_file.py:MyController`.
+        count: Number of replicates of each cell.
+        workers: Number of processes; by default one for each core.
+        out: Folder for the results.
+
+    Returns:
+        A sentence on the runs that could not be done, or "".
+
+    Raises:
+        InputError: There is no such feedforward, it is a rival, or the folder cannot be written or holds other runs.
+    """
+    if entry in RIVALS or (entry not in FEEDFORWARDS and ".py:" not in entry):
+        names = ", ".join(name for name in FEEDFORWARDS if name not in RIVALS)
+        raise InputError(f"held_out: {entry!r} is neither one of {names} nor of the form my_file.py:MyController")
+    if not 1 <= count <= len(HELD_OUT_SEEDS):
+        raise InputError(f"seeds: {count} is not between 1 and {len(HELD_OUT_SEEDS):,}")
+    known = entry in FEEDFORWARDS
+    choices = suite.by_name((entry, *RIVALS) if known else RIVALS, () if known else (entry,))
+    (name,) = (name for name in choices if name not in RIVALS)
+    output_folder(out)
+    chosen = [one for cell in cells(count) for one in (cell, _half(cell))]
+    told = {"entry": entry, "mrctl": versions()["mrctl"]}
+    fresh = any(suite.left(out / "runs" / one) for one in choices)
+    if fresh:
+        _log(out, told | {"replicates": count, "settings": _settings(name) if known else None})
+    laps, aside = suite.run(chosen, choices, workers, out / "runs")
+    rows = compare(name, suite.runs_of(chosen, laps))
+    table = summarised(name, rows, count)
+    if fresh:
+        _log(out, told | {"says": table.says})
+    (out / "table.md").write_text(table.markdown)
+    source = {"versions": versions(), "machine": machine()}
+    write_json(out / "table.json", source | {"mode": "held-out", "entry": entry, "cells": rows})
+    return aside
+
+
+def _log(out: Path, values: Mapping[str, Any]) -> None:
+    """Adds a line, so that a drive that was begun is known even if its result is not."""
+    with (out / LOG).open("a") as file:
+        file.write(json.dumps({"time": datetime.now(UTC).isoformat(timespec="seconds"), **values}) + "\n")
+
+
+def _half(cell: Case) -> Case:
+    """The first replicates of a cell with half the physics step."""
+    halved = {"physics_step": Scenario().physics_step / 2, "name": cell.name + HALF}
+    return Case(cell.name + HALF, cell.part, tuple(s.model_copy(update=halved) for s in cell.scenarios[:RESOLVED]))
+
+
+def _settings(name: str) -> dict[str, Any]:
+    """The settings of a learner that comes with mrctl."""
+    learner = FEEDFORWARDS[name]["learner"]  # type: ignore[index]
+    return getattr(Scenario(), learner).model_dump(mode="json") if learner != "none" else {}
+
+
+def compare(name: str, found: Mapping[str, Laps]) -> list[dict[str, Any]]:
+    """How a feedforward stands to each rival in each cell, metric and window: a row for each.
+
+    It is at or below a rival if it lost no more runs, and its mean over those that both finished is no more than that
+    of the rival and the floor. The floor is that of the course: the largest change of a difference between two of the
+    means on any of its plants when the physics step is halved.
+    """
+    rows = []
+    for course in COURSES:
+        whole = {plant: found[f"{course}; {plant}"] for plant in PLANTS}
+        pairs = [
+            ({one: laps.isel(run=slice(RESOLVED)) for one, laps in own.items()}, found[f"{course}; {plant}{HALF}"])
+            for plant, own in whole.items()
+        ]
+        for metric in COLUMNS:
+            floors = suite.floors(pairs, metric)
+            for plant, own in whole.items():
+                errors = {one: suite.windows(laps, metric) for one, laps in own.items()}
+                for window in WINDOWS:
+                    for rival in RIVALS:
+                        mine, theirs = errors[name][window], errors[rival][window]
+                        row = {"course": course, "plant": plant, "metric": metric, "window": window, "rival": rival}
+                        rows.append(row | _standing(mine, theirs, floors[window]))
+    return rows
+
+
+def _standing(mine: NDArray[np.float64], theirs: NDArray[np.float64], floor: suite.Floor) -> dict[str, Any]:
+    lost, lost_by_rival = (int((~np.isfinite(one)).sum()) for one in (mine, theirs))
+    both = np.isfinite(mine) & np.isfinite(theirs)
+    apart = bootstrap_interval((mine - theirs)[both])._asdict()
+    close = not both.any() or apart["value"] <= floor.difference
+    means = {"mine": float(mine[both].mean()), "theirs": float(theirs[both].mean())} if both.any() else {}
+    return {
+        **means, "apart": apart, "floor": floor._asdict(), "failed": lost, "rival_failed": lost_by_rival,
+        "at_or_below": bool(lost < lost_by_rival or (lost == lost_by_rival and close)),
+        "tie": bool(lost == lost_by_rival and both.any() and abs(apart["value"]) <= floor.difference),
+    }  # fmt: skip
+
+
+def summarised(name: str, rows: Sequence[dict[str, Any]], count: int) -> Table:
+    """In how many cells a feedforward is at or below each rival, and the cells where its position is not."""
+    size = len(COURSES) * len(PLANTS)
+    cells, least = [], size
+    for metric, title in COLUMNS.items():
+        for window, called in WINDOWS.items():
+            line = [title.split(",")[0], called]
+            for rival in RIVALS:
+                asked = {"metric": metric, "window": window, "rival": rival}
+                own = [row for row in rows if asked.items() <= row.items()]
+                fine, ties = sum(row["at_or_below"] for row in own), sum(row["tie"] for row in own)
+                least = min(least, fine) if metric == "position_rmse" else least
+                line.append(f"{fine}/{len(own)}, {ties} of them ties")
+            cells.append(line)
+    above = [row for row in rows if row["metric"] == "position_rmse" and not row["at_or_below"]]
+    listed = "; ".join(
+        f"{row['course']}, {row['plant']}, {WINDOWS[row['window']]}: above {row['rival']} by "
+        f"{interval(row['apart'])} mm (floor {number(1e3 * row['floor']['difference'])} mm)"
+        + (f", {row['failed']} runs failed against {row['rival_failed']}" if row["failed"] else "")
+        for row in above
+    )
+    says = (
+        f"Position of `{name}` with {count} replicates is at or below `model`, `true_model` and `model+observer` in at "
+        f"least {least} of {size} cells in lap 1, over all laps and in the last lap. "
+        + (f"It is above in: {listed}." if above else "It is above in none.")
+    )
+    header = ["error", "window", *(f"at or below {rival}" for rival in RIVALS)]
+    return Table("Held-out cells (held-out)", says, pd.DataFrame(cells, columns=header))

@@ -20,7 +20,7 @@ def test_apart() -> None:
     runs = [run for case in found for run in case.scenarios]
     assert {run.seed for run in runs} == {200_000, 200_001}
     assert {run.sensing.tier for run in runs} == {"lab"}
-    others = [run for case in cases.cases(1, 3, False) for run in case.scenarios]
+    others = [run for case in cases.cases("full", 1, 3) for run in case.scenarios]
     assert not {run.reference for run in runs} & {run.reference for run in others}
     assert not set(held_out.PLANTS.values()) & set(PERTURBATIONS.values())
 
