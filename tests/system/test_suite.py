@@ -23,7 +23,7 @@ from scipy import stats
 
 import mrctl
 from mrctl import cli
-from mrctl.experiments import report, suite, suite_tables, tuning
+from mrctl.experiments import held_out, report, suite, suite_tables, tuning
 from mrctl.experiments.cases import Case
 from mrctl.experiments.hindsight import best_fixed
 from mrctl.results import metrics, plots
@@ -346,6 +346,37 @@ def test_controller_joins(whole: Path, tmp_path: Path) -> None:
     assert row["v_rmse"]["value"] == pytest.approx(alone["v_rmse"].mean(), rel=1e-12)
     assert "Gain" in (out / "report.html").read_text()
     assert content(whole)["runs/rls/runs.parquet"] == content(out)["runs/rls/runs.parquet"]
+
+
+def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """A cell counts where the mean is no more than the rival's and the floor; each time it is driven is kept."""
+    monkeypatch.setattr(held_out, "COURSES", {"circle": mrctl.Circle(radius=0.5, period=LAP)})
+    plants = {"heavy": mrctl.Perturbation(mass_factor=2.0), "light": mrctl.Perturbation(mass_factor=0.6)}
+    monkeypatch.setattr(held_out, "PLANTS", plants)
+    monkeypatch.setattr(held_out, "LAPS", 2)
+    words = ["suite", "--held-out", "none", "--seeds", "2", "--workers", "1", "--out", str(tmp_path)]
+    for _ in range(2):
+        assert cli.main(words) == 0
+    begun, ended = map(json.loads, (tmp_path / held_out.LOG).read_text().splitlines())
+    assert (begun["entry"], begun["replicates"], ended["says"] in capsys.readouterr().out) == ("none", 2, True)
+    table = json.loads((tmp_path / "table.json").read_text())
+    assert table["mode"] == "held-out" and len(table["cells"]) == 2 * 3 * 3 * 3
+    errors = {}
+    for name in ("none", "model"):
+        for half in (1, 2):
+            for cell in held_out.cells(2):
+                changes = {**mrctl.FEEDFORWARDS[name], "physics_step": 0.002 / half}
+                runs = mrctl.simulate([s.model_copy(update=changes) for s in cell.scenarios])
+                errors[name, half, cell.name.split("; ")[1]] = mrctl.per_lap(runs).position_rmse.values[:, 0].mean()
+    asked = {"metric": "position_rmse", "window": "first", "rival": "model"}
+    for row in (row for row in table["cells"] if asked.items() <= row.items()):
+        apart = {(half, p): errors["none", half, p] - errors["model", half, p] for half in (1, 2) for p in plants}
+        assert row["apart"]["value"] == pytest.approx(apart[1, row["plant"]], rel=1e-9)
+        assert row["floor"]["difference"] >= max(abs(apart[2, p] - apart[1, p]) for p in plants) * (1 - 1e-9)
+        assert row["at_or_below"] == (apart[1, row["plant"]] <= row["floor"]["difference"])
+    assert "is neither one of none, model+indi" in refused(capsys, ["suite", "--held-out", "model"])
+    assert "one of --quick" in refused(capsys, ["suite", "--held-out", "fel", "--quick"])
+    assert "names the one feedforward" in refused(capsys, ["suite", "--held-out", "fel", "--feedforward", "rls"])
 
 
 @pytest.mark.parametrize(
