@@ -91,11 +91,13 @@ SLOW = Pid(time_constant=0.15)
 """A PID that leaves more for a feedforward to gain than the default."""
 
 LOOP = Waypoints(
-    points=((0.0, 0.0), (0.75, 1.0), (2.0, 1.3), (2.5, 0.2), (1.4, -0.5), (0.7, -1.5), (-0.8, -1.4), (-0.9, -0.5)),
+    points=(
+        (0, 0), (0.46, 1.16), (1.59, 1.77), (2.36, 0.84), (1.48, -0.12), (1.07, -1.27), (-0.41, -1.56), (-0.74, -0.72),
+    ),
     speed=1.2,
     timing="limits",
     limits=Limits(acceleration=0.7, rotation=1.8, rotation_acceleration=3.5, lateral_acceleration=0.8),
-)
+)  # fmt: skip
 """A course at changing speed, which begins where the lemniscate does and in its direction."""
 
 Mode = Literal["quick", "core", "full"]

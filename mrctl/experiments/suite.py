@@ -47,7 +47,7 @@ from mrctl.theory.references import Circle
 
 Entry = FeedforwardName | Literal["hindsight"]
 CHUNK = 40  # runs in a job: enough for a fast batch, and few enough that no worker idles for long at the end
-STARTING, STATISTICS = 3.0, 0.3  # s, to start workers for a feedforward, and for a row of the tables; measured
+STARTING, STATISTICS = 3.0, 0.15  # s, to start workers for a feedforward, and for a row of the tables; measured
 
 
 def suite(

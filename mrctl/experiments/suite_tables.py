@@ -23,7 +23,8 @@ LEADING = {
     "position in lap 1": ("position_rmse", "first"),
     "position in all laps": ("position_rmse", "all"),
 }
-NO_CLAIM = "A table of --quick supports no claim: so few draws tell nothing apart."
+NO_CLAIM = "So few draws tell nothing apart: this table supports no claim."
+LEAST = 4  # pairs without which even a feedforward that always wins does so with less than 95 % confidence
 
 Row = dict[str, Any]
 
@@ -51,9 +52,10 @@ def tables(rows: Sequence[Row], mode: str) -> list[Table]:
         mode: Which suite made them.
     """
     found = []
+    few = mode == "quick" or all(row["runs"] < LEAST for row in rows)
 
     def add(title: str, says: str, cells: pd.DataFrame) -> None:
-        found.append(Table(f"{title} ({mode})", NO_CLAIM if mode == "quick" else says, cells))
+        found.append(Table(f"{title} ({mode})", NO_CLAIM if few else says, cells))
 
     for part, title in PARTS.items():
         if own := [row for row in rows if row["part"] == part]:

@@ -70,8 +70,7 @@ def test_other_course_begins_where_the_lap_ends():
                 assert 2 * first.period / event.reference.period % 1 == pytest.approx(0, abs=1e-9)
                 ends, begins = (one.sample(np.array([t])).pose[0] for one, t in
                                 ((first, first.period), (event.reference, 0.0)))  # fmt: skip
-                np.testing.assert_allclose(begins, ends, atol=0.3)
-                np.testing.assert_allclose(begins[:2], ends[:2], atol=1e-9)
+                np.testing.assert_allclose(begins, ends, atol=0.01)
 
 
 def test_random_scenario_is_a_function_of_its_seed(robot):
