@@ -231,10 +231,10 @@ def recovered(rows: Sequence[Row]) -> str:
         whole = row["position_rmse"]["recovered_within_one_lap"] == 1
         counts[row["feedforward"]] = counts.get(row["feedforward"], 0) + whole
     steps = len({row["case"] for row in rows})
-    listed = _counted(counts) or "nobody"
+    listed = _counted(counts)
     return (
-        f"One lap after the step the position error of every run is back within {BAND:g} times that before it: "
-        f"{listed} of {steps} step{'s' * (steps > 1)}."
+        f"Of {steps} step{'s' * (steps > 1)}, one lap later the position error of every run is back within {BAND:g} "
+        f"times that before it {'with ' + listed if listed else 'with no feedforward in any'}."
     )
 
 
