@@ -23,7 +23,7 @@ from pydantic import ValidationError
 
 from mrctl import __version__
 from mrctl.record import InputError, Record, describe
-from mrctl.scenario import COMPARED, FeedforwardName, Scenario
+from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, RobotFile
@@ -296,38 +296,58 @@ def reproduce(out: Path = Path("reproduction")) -> None:
 
 
 def suite(
-    feedforward: Annotated[tuple[FeedforwardName | Literal["hindsight"], ...], tyro.conf.arg(metavar="NAME ...")] = (
-        *COMPARED,
-        "hindsight",
-    ),
+    feedforward: Annotated[
+        tuple[FeedforwardName | Literal["hindsight"], ...] | None, tyro.conf.arg(metavar="NAME ...")
+    ] = None,
     controller: tuple[str, ...] = (),
     seeds: int | None = None,
     random: int | None = None,
     quick: bool = False,
+    full: bool = False,
+    held_out: str | None = None,
     workers: int | None = None,
-    out: Path = Path("suite"),
+    out: Path | None = None,
 ) -> None:
-    """Compares feedforwards under every uncertainty, with the same draws; the same command resumes after an interrupt.
+    """Compares feedforwards under uncertainty, with the same draws; the same command resumes after an interrupt.
+
+    It prints how long it will take before it starts: by default less than half an hour on two cores.
 
     Args:
         feedforward: Feedforwards to compare, such as fel or model+composite; hindsight has fixed coefficients, which
-            are fitted to each run itself.
+            are fitted to each run itself. By default those of the tables, with --full all.
         controller: Controllers of your own to compare, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion.
         seeds: Number of replicates of each case; by default 20, or 3 with --quick.
-        random: Number of random scenarios; by default 300, or 20 with --quick.
-        quick: Run a selection of cases with fewer laps, in a few minutes instead of an hour.
+        random: Number of random scenarios; by default 30, with --quick 6, with --full 1,000.
+        quick: Run a few cases with few laps, in two minutes; the tables support no claim.
+        full: Run all cases, in every tier, in hours.
+        held_out: Instead of all that, drive this one feedforward, or my_file.py:MyFeedforward, through 40 cells on
+            which nothing was ever chosen, beside model, true_model and model+observer.
         workers: Number of processes on this machine; by default one for each core.
-        out: Folder for report.html, the tables in Markdown and JSON, the figures and the runs.
+        out: Folder for report.html, the tables in Markdown and JSON, the figures and the runs; by default suite,
+            suite_quick, suite_full or held_out.
     """
+    from mrctl.experiments import held_out as unseen
     from mrctl.experiments import suite as uncertainty
+    from mrctl.experiments.cases import HINDSIGHT, RANDOM, REPLICATES, Mode
 
-    default_seeds, default_random = (3, 20) if quick else (20, 300)
-    seeds = default_seeds if seeds is None else seeds
-    random = default_random if random is None else random
-    report = uncertainty.suite(feedforward, controller, seeds, random, quick, workers, out)
-    print(f"{(out / 'table.md').read_text()}\nReport: {out / 'report.html'}")
-    if report.aside:
-        raise _Incomplete(f"{report.aside}; the same command tries them again")
+    if quick + full + (held_out is not None) > 1:
+        raise InputError("quick: give one of --quick, --full and --held-out")
+    if held_out is not None:
+        if feedforward or controller or random is not None:
+            raise InputError("held_out: names the one feedforward to judge; give no other, and no random scenarios")
+        folder = out or Path("held_out")
+        aside = unseen.judge(held_out, REPLICATES["core"] if seeds is None else seeds, workers, folder)
+    else:
+        mode: Mode = "quick" if quick else "full" if full else "core"
+        folder = out or Path("suite" if mode == "core" else f"suite_{mode}")
+        every = (*(FEEDFORWARDS if full else COMPARED), HINDSIGHT)
+        counts = (REPLICATES[mode] if seeds is None else seeds), (RANDOM[mode] if random is None else random)
+        compared = every if feedforward is None else feedforward
+        aside = uncertainty.suite(mode, compared, controller, *counts, workers, folder).aside
+    report = "" if held_out is not None else f"\nReport: {folder / 'report.html'}"
+    print((folder / "table.md").read_text() + report)
+    if aside:
+        raise _Incomplete(f"{aside}; the same command tries them again")
 
 
 def tune(

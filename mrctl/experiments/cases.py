@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -15,19 +15,35 @@ from mrctl.physics.parameters import read_robot
 from mrctl.scenario import Event, Scenario, replicates
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
-from mrctl.theory.references import Lemniscate, Waypoints, random_spline
+from mrctl.theory.references import Lemniscate, StopAndGo, Waypoints, random_spline
 from mrctl.theory.robot import STEERINGS, Robot
+from mrctl.theory.timing import Limits
 
+SUITE_SEEDS, TUNING_SEEDS, HELD_OUT_SEEDS = range(100_000), range(100_000, 200_000), range(200_000, 300_000)
+"""Seeds of the suite's draws, of those that settings are chosen on, and of those that nothing is ever chosen on."""
 HINDSIGHT = "hindsight"  # the best fixed feedforward, which is found by repeating the run
 REFERENCES = ("true_model", HINDSIGHT)  # feedforwards that know the plant, and compete with nobody
 LADDER = ("nominal", "mass +50 %", "supply -20 %", "all")  # plants of every steering arrangement
-STEPS = (
-    "mass +50 %", "payload ahead", "payload aside", "left wheel +5 %", "drive friction x3", "resistance +30 %",
-    "motor constant -15 %", "supply -20 %", "delay 20 ms", "tyre friction 0.2", "left tyre on ice", "slope 10°", "all",
+UNCERTAIN = (
+    "mass +50 %", "mass -50 %", "payload ahead", "payload aside", "left wheel +5 %", "drive friction x3",
+    "resistance +30 %", "motor constant -15 %", "supply -20 %", "delay 20 ms", "left tyre on ice", "slope 10°",
 )  # fmt: skip
+FAULTS = {
+    "left motor -20 %": Perturbation(left_motor_constant_factor=0.8),
+    "left drive friction x3": Perturbation(left_drive_friction_factor=3.0),
+}
+HARD = {
+    "nominal": Perturbation(),
+    "tyre friction 0.33": Perturbation(tyre_friction_factor=0.33 / 0.9),
+    "current limit 1.5 A": Perturbation(current_limit=1.5),
+    "sagging battery": Perturbation(supply_factor=0.8, battery_resistance=1.0),
+}
+"""Plants that a lap of 12 s, with at most 0.17 g to the side and 1 A a motor, does not tell from the nominal one."""
+STEPS = (*(name for name in UNCERTAIN if name != "mass -50 %"), "all")
 LASTING = ("left_radius_factor", "right_radius_factor", "slope")  # what does not change while a robot drives
-FLOOR = ("nominal", "all")  # plants that are also driven with half the physics step
-SHORT, LONG = 12.0, 18.0  # s, lap times of the benchmark, and of slower laps to learn on
+FLOOR, HALF = ("nominal", "all"), ", half the step"  # plants that are also driven with half the physics step
+NO_SPREAD = (0.0, 0.0, 0.0)  # an initial offset, the same for all, would hide what learning costs in lap 1
+FAST, SHORT, LONG = 9.0, 12.0, 18.0  # s, lap times: near the robot's limits, of the benchmark, slow to learn on
 LAP_TIMES = (8.0, 10.0, 12.0, 16.0, 20.0, 24.0, 30.0)  # s, of random splines; few, so that runs share a batch
 RANDOM_LAPS = 4
 MARGIN = 0.8  # share of the robot's limits that a random spline may ask for
@@ -59,8 +75,8 @@ Laps = Mapping[str, xr.Dataset]
 class Outcome(NamedTuple):
     """The results of a suite."""
 
-    quick: bool
-    """Whether it was the selection with fewer laps."""
+    mode: Mode
+    """Which of the suites it was."""
     cases: Sequence[Case]
     laps: Laps
     runs: Mapping[str, Laps]
@@ -74,68 +90,107 @@ class Outcome(NamedTuple):
 SLOW = Pid(time_constant=0.15)
 """A PID that leaves more for a feedforward to gain than the default."""
 
+LOOP = Waypoints(
+    points=(
+        (0, 0), (0.46, 1.16), (1.59, 1.77), (2.36, 0.84), (1.48, -0.12), (1.07, -1.27), (-0.41, -1.56), (-0.74, -0.72),
+    ),
+    speed=1.2,
+    timing="limits",
+    limits=Limits(acceleration=0.7, rotation=1.8, rotation_acceleration=3.5, lateral_acceleration=0.8),
+)  # fmt: skip
+"""A course at changing speed, which begins where the lemniscate does and in its direction."""
+
+Mode = Literal["quick", "core", "full"]
+REPLICATES: dict[Mode, int] = {"quick": 3, "core": 20, "full": 20}
+RANDOM: dict[Mode, int] = {"quick": 6, "core": 30, "full": 1000}
+
 PARTS = {
-    "steady": "One thing wrong from the start",
+    "steady": "One thing wrong from the start, or four at once",
+    "fault": "One motor, the current limit, the battery, the grip",
+    "course": "Courses at changing speed",
     "step": "A step, and the return",
-    "learning": "Learning switched on, and off",
+    "learning": "Learning carried to another course, switched on, and off",
+    "tier": "Other sensors",
     "steering": "Other steering arrangements",
     "random": "Random robots, splines and perturbations",
     "floor": "Half the physics step: what the integrator resolves",
 }
+UNCHANGED = ("steady", "fault", "course", "tier", "steering")  # parts in whose runs nothing changes between the laps
 
 
-def cases(seeds: int, random: int, quick: bool) -> list[Case]:
+def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
     """The cases of the suite, the longest runs first.
 
     Args:
+        mode: What to take: `core`, the cases of the default; `quick`, a few of them with fewer laps; or `full`, which
+            adds the other uncertainties, tiers and steering arrangements, and drives 8 laps.
         seeds: Number of replicates of each case; all cases have the same draws. After a step and its return the robot
             is not quite the one before, but another draw.
         random: Number of random scenarios.
-        quick: Whether to take a selection of the cases with fewer laps.
     """
-    laps, third = (4, 2) if quick else (8, 4)
-    base = Scenario(laps=laps)
+    quick, full = mode == "quick", mode == "full"
+    leading, laps, third = {"quick": (3, 3, 2), "core": (5, 4, 3), "full": (8, 8, 4)}[mode]
+    plants = PERTURBATIONS | FAULTS
     found: list[Case] = []
 
     def add(part: str, name: str, change: int = 0, back: int = 0, **fields: Any) -> None:  # noqa: ANN401
-        changed = base.model_copy(update=fields)
+        changed = Scenario(laps=laps, initial_spread=NO_SPREAD).model_copy(update=fields)
         runs = [run.model_copy(update={"name": name}) for run in replicates(changed, seeds)]
         if back:
             runs = [_another_on_return(run) for run in runs]
         found.append(Case(name, part, tuple(runs), change, back))
 
-    for name in ("supply -20 %", "payload ahead") if quick else STEPS:
+    steps = {"quick": ("supply -20 %",), "core": ("payload ahead", "supply -20 %", "all"), "full": STEPS}[mode]
+    for name in steps:
         events = (
             Event(time=third * SHORT, perturbation=PERTURBATIONS[name]),
             Event(time=2 * third * SHORT, perturbation=Perturbation()),
         )
         add("step", f"{name}, on and off", third + 1, 2 * third + 1, laps=3 * third, events=events)
-    for name in ("nominal", "all"):
-        frozen = Event(time=third * LONG, learning=False, reference=Lemniscate(period=SHORT))
-        slow = Lemniscate(period=LONG)
-        case = {"reference": slow, "laps": third + 2, "events": (frozen,), "perturbation": PERTURBATIONS[name]}
-        add("learning", f"{name}, frozen on laps half as fast again", third + 1, **case)
-        half = laps // 2
-        events = (Event(time=0.0, learning=False), Event(time=half * SHORT, learning=True))
-        add("learning", f"{name}, learning from half time", half + 1, perturbation=PERTURBATIONS[name], events=events)
-    for name in (*LADDER, "delay 20 ms") if quick else PERTURBATIONS:
-        add("steady", name, perturbation=PERTURBATIONS[name])
-    for name in FLOOR:
-        add("floor", f"{name}, half the step", perturbation=PERTURBATIONS[name], physics_step=base.physics_step / 2)
+    carried = Event(time=third * SHORT, learning=False, reference=_slowed(LOOP, SHORT))
+    for name in ("all",) if quick else FLOOR:
+        case = {"laps": third + 2, "events": (carried,), "perturbation": PERTURBATIONS[name]}
+        add("learning", f"{name}, frozen on another course", third + 1, **case)
     if not quick:
+        switched = (Event(time=0.0, learning=False), Event(time=third * SHORT, learning=True))
+        case = {"laps": 2 * third, "events": switched, "perturbation": PERTURBATIONS["all"]}
+        add("learning", "all, learning from half time", third + 1, **case)
+    if full:
+        frozen = Event(time=third * LONG, learning=False, reference=Lemniscate(period=SHORT))
+        for name in FLOOR:
+            case = {"reference": Lemniscate(period=LONG), "laps": third + 2, "perturbation": PERTURBATIONS[name]}
+            add("learning", f"{name}, frozen on laps half as fast again", third + 1, events=(frozen,), **case)
+    for name in FLOOR:
+        case = {"laps": leading, "perturbation": PERTURBATIONS[name]}
+        add("steady", name, **case)
+        add("floor", f"{name}{HALF}", physics_step=Scenario().physics_step / 2, **case)
+    steady = {"quick": ("supply -20 %",), "core": UNCERTAIN, "full": (n for n in PERTURBATIONS if n not in FLOOR)}[mode]
+    for name in steady:
+        add("steady", name, perturbation=PERTURBATIONS[name])
+    for name in list(FAULTS)[: 1 if quick else None]:
+        add("fault", name, perturbation=FAULTS[name])
+    for name in () if quick else HARD:
+        add("fault", f"{name}, 9 s a lap", perturbation=HARD[name], reference=Lemniscate(period=FAST))
+    for name in ("all",) if quick else FLOOR:
+        add("course", f"{name}, spline", perturbation=PERTURBATIONS[name], reference=LOOP)
+    if not quick:
+        back = {"reference": StopAndGo(), "steering": "rigid"}
+        add("course", "all, forth and back, rigid", perturbation=PERTURBATIONS["all"], **back)
         for tier in ("ideal", "field"):
-            add("steady", f"sensing {tier}", sensing=Sensing(tier=tier))
-        add("steady", "odometry", sensing=Sensing(estimator="odometry"))
-        for name in ("nominal", "all"):
+            for name in PERTURBATIONS | FAULTS if full else FLOOR:
+                add("tier", f"{name}, {tier}", perturbation=plants[name], sensing=Sensing(tier=tier))
+    if full:
+        add("tier", "odometry", sensing=Sensing(estimator="odometry"))
+        for name in FLOOR:
             add("steady", f"{name}, slow PID", perturbation=PERTURBATIONS[name], pid=SLOW)
-        add("steady", "patch of ice", world="patch")
-        add("steady", "rough ground", world="rough")
+        add("fault", "patch of ice", world="patch")
+        add("fault", "rough ground", world="rough")
         for steering in STEERINGS[1:]:
             for name in LADDER:
                 add("steering", f"{steering}, {name}", steering=steering, perturbation=PERTURBATIONS[name])
     if random:
         found.append(Case("random", "random", tuple(random_scenarios(random))))
-    return found
+    return sorted(found, key=lambda case: -case.scenarios[-1].ticks)
 
 
 def _another_on_return(run: Scenario) -> Scenario:

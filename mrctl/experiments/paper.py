@@ -44,22 +44,24 @@ METRICS = ("v_rmse", "omega_rmse", "position_rmse")
 
 
 def scenario(feedforward: FeedforwardName, case: str, period: float = FAST, **changes: Any) -> Scenario:  # noqa: ANN401
-    """A run of the benchmark in the world of the paper: the lemniscate, on the plant of a named perturbation."""
-    name = f"{feedforward}, {case}, {period:g} s"
+    """A run of the benchmark in the world of the paper: the lemniscate, on the plant of a named perturbation.
+
+    The name of the run is that of its plant.
+    """
     fields: dict[str, Any] = FEEDFORWARDS[feedforward] | {"perturbation": PERTURBATIONS[case]}
-    return Scenario(name=name, reference=Lemniscate(period=period), **fields | IDEAL | changes)
+    return Scenario(name=case, reference=Lemniscate(period=period), **fields | IDEAL | changes)
 
 
 def real(tier: Tier) -> list[Scenario]:
     """The runs of eight laps with sensors and motors of a tier, and with the controllers that are designed for it.
 
-    Each feedforward has the same replicates.
+    Each feedforward has the same replicates. The name of a run is that of its plant.
     """
     found = []
     for case in ("nominal", CASE):
         for f in COMPARED:
             fields = {"sensing": Sensing(tier=tier), "perturbation": PERTURBATIONS[case], **FEEDFORWARDS[f]}
-            found += replicates(Scenario(name=f"{f}, {case}, {tier}", **fields), DRAWS)
+            found += replicates(Scenario(name=case, **fields), DRAWS)
     return found
 
 
@@ -156,10 +158,10 @@ def compare(table: pd.DataFrame, scenarios: Sequence[Scenario]) -> list[dict[str
     """
     rows = []
     for k, one in enumerate(scenarios):
-        bare = scenarios.index(one.model_copy(update=FEEDFORWARDS["none"] | {"name": _bare(one)}))
+        bare = scenarios.index(one.model_copy(update=FEEDFORWARDS["none"]))
         row: dict[str, Any] = {
             "steering": one.steering,
-            "plant": one.name.split(", ")[1],
+            "plant": one.name,
             "sensing": one.sensing.tier,
             "estimator": one.sensing.source,
             "lap_time": one.reference.period,
@@ -174,16 +176,12 @@ def compare(table: pd.DataFrame, scenarios: Sequence[Scenario]) -> list[dict[str
     return rows
 
 
-def _bare(one: Scenario) -> str:
-    return one.name.replace(one.feedforward, "none", 1)
-
-
 def endure(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
     """RMSE in lap 8 and in the last lap of the long runs, which agree if learning stays stable."""
     laps = metrics.per_lap(result)
     rows = []
     for k, one in enumerate(scenarios):
-        row: dict[str, Any] = {"run": one.name, "laps": one.laps}
+        row: dict[str, Any] = {"run": f"{one.feedforward}, {one.name}, {one.reference.period:g} s", "laps": one.laps}
         for metric in METRICS:
             values = laps[metric].values[k]
             row[metric] = {"lap_8": float(values[7]), "last": float(values[-1])}

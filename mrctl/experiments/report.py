@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,27 +19,28 @@ from mrctl.control.pid import Pid
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
 from mrctl.experiments.cases import BAND, REFERENCES, SLOW, Choices, Outcome
+from mrctl.experiments.suite_tables import NO_CLAIM, TITLES, Table, verdict
 from mrctl.experiments.tables import number
 from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation
 from mrctl.results import metrics, plots
-from mrctl.results.comparison import superiority
 from mrctl.results.dataset import versions
 from mrctl.results.plots import InverseMap
-from mrctl.scenario import FEEDFORWARDS, Scenario
+from mrctl.scenario import FEEDFORWARDS, MODEL_BASED, Scenario
 
-STATIC = ("none", "model", *REFERENCES)  # feedforwards that do not learn
+MAPLESS = ("none", "model", *REFERENCES, *(f"model+{name}" for name in MODEL_BASED))
+"""Feedforwards that learn no map from motion to voltage."""
 GRID = 41  # points along each side of a heat map
 TEMPLATE = Path(__file__).with_name("report.html")
 
 
-def write(outcome: Outcome, choices: Choices, tables: Mapping[str, pd.DataFrame], out: Path) -> None:
+def write(outcome: Outcome, choices: Choices, tables: Sequence[Table], out: Path) -> None:
     """Writes the figures, as PNG and PDF, and `report.html`.
 
     Args:
         outcome: Results of the suite.
         choices: The feedforwards, by name.
-        tables: The tables of all numbers, by title.
+        tables: The tables of all numbers.
         out: Folder to write to.
 
     Raises:
@@ -79,8 +80,8 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
     panels = {case.name: _labelled(found[case.name]) for case in switched}
     drawn["learning"] = (
         plots.laps_by_case(panels, "position_rmse", (switched[0].change,)),
-        "Learning off until the dotted line and on from there; or on until there, then frozen on laps half as fast "
-        f"again, of which three count as two. {mean}",
+        "Learning off until the dotted line and on from there; or on until there, then frozen on another course. "
+        f"{mean}",
     )
     if "random" in found and "none" in found["random"]:
         ends = {name: metrics.summary(own)["position_rmse"].to_numpy() for name, own in found["random"].items()}
@@ -90,13 +91,13 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
             "Random scenarios: the share of runs whose error is below a multiple of that of PID alone. A curve that "
             "does not reach 1 belongs to a feedforward with failed runs.",
         )
-    learners = [name for name in choices if name not in STATIC]
+    learners = [name for name in choices if name not in MAPLESS]
     if learners:
         drawn["inverse_dynamics"] = (
             plots.inverse_dynamics({name: learned(choices[name], runs["all"].scenarios[0]) for name in learners}),
-            "What each feedforward learned with everything wrong at once, beside the true inverse dynamics, in steady "
-            "motion: the voltage that the motors share and the one in which they differ, over V and θ̇. The line shows "
-            "where the robot drove.",
+            "What the feedforwards that learn a map learned with everything wrong at once, beside the true inverse "
+            "dynamics, in steady motion: the voltage that the motors share and the one in which they differ, over V "
+            "and θ̇. The line shows where the robot drove.",
         )
     return drawn
 
@@ -128,7 +129,7 @@ def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
 def page(
     outcome: Outcome,
     choices: Choices,
-    tables: Mapping[str, pd.DataFrame],
+    tables: Sequence[Table],
     images: Mapping[str, tuple[str, str]],
 ) -> str:
     """The report as HTML.
@@ -136,7 +137,7 @@ def page(
     Args:
         outcome: Results of the suite.
         choices: The feedforwards, by name.
-        tables: The tables of all numbers, by title.
+        tables: The tables of all numbers.
         images: Each figure as base64 of a PNG, and its caption, by file name.
     """
     fixed = [case for case in outcome.cases if case.part != "random"]
@@ -150,11 +151,14 @@ def page(
         feedforwards=list(choices),
         aside=outcome.aside,
         band=f"{BAND:g}",
+        mode=outcome.mode,
+        says={table.title: table.says for table in tables},
+        no_claim=NO_CLAIM.replace("this table", "this page") if {NO_CLAIM} == {one.says for one in tables} else "",
         scorecard=scorecard(outcome),
         recoveries=recoveries(outcome),
         duels=duels(outcome) if random else "",
         figures=[{"data": data, "caption": caption} for data, caption in images.values()],
-        tables={title: _plain(table) for title, table in tables.items()},
+        tables={table.title: _plain(table.cells) for table in tables},
         command=command(outcome, choices),
         versions=versions(),
         pids=[tuning.statement(tuning.design("flat", pid, (0.0,))) for pid in (Pid(), SLOW)],
@@ -163,11 +167,11 @@ def page(
 
 def command(outcome: Outcome, choices: Choices) -> str:
     """The command that repeats the suite."""
-    words = ["mrctl", "suite", *(["--quick"] if outcome.quick else [])]
+    words = ["mrctl", "suite", *([f"--{outcome.mode}"] if outcome.mode != "core" else [])]
     words += ["--feedforward", *(name for name, one in choices.items() if "feedforward" in one)]
     own = [one["controller"] for one in choices.values() if "controller" in one]
     words += ["--controller", *own] if own else []
-    words += ["--seeds", str(len(outcome.cases[0].scenarios))]
+    words += ["--seeds", str(len(next(case for case in outcome.cases if case.part != "random").scenarios))]
     words += ["--random", str(sum(len(case.scenarios) for case in outcome.cases if case.part == "random"))]
     return shlex.join(words)
 
@@ -176,12 +180,13 @@ def scorecard(outcome: Outcome) -> str:
     """The position error of every case under every feedforward, coloured by its ratio to that of PID alone."""
     cells: dict[str, dict[str, Cell]] = {}
     for case, rows in _by_case(outcome, steps=False).items():
-        best = min((_mean(row) for row in rows if row["feedforward"] not in REFERENCES), default=np.inf)
+        rivals = [row for row in rows if row["feedforward"] not in REFERENCES]
         for row in rows:
             error = row["position_rmse"]
             text = number(1e3 * error["value"]) if error["samples"] else ""
             lost = f"{row['failed']} failed" if row["failed"] else ""
-            bold = _mean(row) <= best < np.inf and row["feedforward"] not in REFERENCES
+            bold = row in rivals and not row["failed"]
+            bold &= all(verdict(one, row["feedforward"]) >= 0 for one in rivals if one is not row)
             ratio = error.get("to_PID", {"value": 1.0})["value"]
             cells.setdefault(case, {})[row["feedforward"]] = Cell(", ".join(filter(None, (text, lost))), ratio, bold)
     return _coloured("scorecard", cells)
@@ -204,17 +209,19 @@ def recoveries(outcome: Outcome) -> str:
 
 def duels(outcome: Outcome) -> str:
     """Probabilities that one feedforward beats another in the random scenarios."""
-    errors = {n: metrics.summary(own)["position_rmse"].to_numpy() for n, own in outcome.runs["random"].items()}
     rows = {row["feedforward"]: row for row in outcome.rows if row["part"] == "random"}
     cells: dict[str, dict[str, Cell]] = {}
-    for name, own in errors.items():
+    for name, row in rows.items():
         cells[name] = {}
-        for other, theirs in errors.items():
-            won = superiority(own, theirs)
-            text = f"{won.value:.2f} [{won.low:.2f}, {won.high:.2f}]"
-            cells[name][other] = Cell("–") if other == name else Cell(text, np.exp(3 * (1 - 2 * won.value)))
-        cells[name]["failed"] = Cell(f"{rows[name]['failed']}/{rows[name]['runs']}")
-        cells[name]["where PID did not"] = Cell(str(rows[name].get("failed_where_pid_did_not", "")))
+        for other in rows:
+            if other == name:
+                cells[name][other] = Cell("–")
+                continue
+            won = row["position_rmse"][f"beats_{TITLES.get(other, other)}"]
+            text = f"{won['value']:.2f} [{won['low']:.2f}, {won['high']:.2f}]"
+            cells[name][other] = Cell(text, np.exp(3 * (1 - 2 * won["value"])))
+        cells[name]["failed"] = Cell(f"{row['failed']}/{row['runs']}")
+        cells[name]["where PID did not"] = Cell(str(row.get("failed_where_pid_did_not", "")))
     return _coloured("duels", cells, corner="")
 
 
@@ -256,11 +263,6 @@ def _by_case(outcome: Outcome, steps: bool) -> dict[str, list[dict[str, Any]]]:
         if (row["part"] == "step") == steps:
             found.setdefault(row["case"], []).append(row)
     return found
-
-
-def _mean(row: Mapping[str, Any]) -> float:
-    """The mean position error, infinite where a run failed."""
-    return np.inf if row["failed"] else row["position_rmse"]["value"]
 
 
 def _shade(ratio: float) -> str:

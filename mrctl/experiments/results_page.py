@@ -20,14 +20,15 @@ import tyro
 from mrctl.experiments import bench as benchmark
 from mrctl.experiments import identify as identification
 from mrctl.experiments import paper, tuning
-from mrctl.experiments.suite import COLUMNS, TITLES
-from mrctl.experiments.tables import markdown, number
+from mrctl.experiments.held_out import LOG
+from mrctl.experiments.suite_tables import COLUMNS, TITLES, interval
+from mrctl.experiments.tables import markdown
 from mrctl.record import InputError
 
 BEGINNING = """# Results
 
 `python -m mrctl.experiments.results_page` writes the tables of this page from what the commands leave behind."""
-BENCHMARK = ("nominal", "all", "rigid, all")
+BENCHMARK = ("nominal", "all")
 """Cases of the suite in the short table at the head of its section."""
 
 Table = Mapping[str, Any]
@@ -36,6 +37,7 @@ Table = Mapping[str, Any]
 def main(
     reproduce: Path | None = None,
     suite: Path | None = None,
+    held_out: Path | None = None,
     tune: Path | None = None,
     identify: tuple[Path, ...] = (),
     bench: Path | None = None,
@@ -46,6 +48,7 @@ def main(
     Args:
         reproduce: Folder that `mrctl reproduce --out` wrote.
         suite: Folder that `mrctl suite --out` wrote.
+        held_out: Folder that `mrctl suite --held-out` wrote.
         tune: Folder that `mrctl tune --out` wrote.
         identify: Files with the output of `mrctl identify --json`, one for each robot.
         bench: File with the output of `mrctl bench --json`.
@@ -59,8 +62,14 @@ def main(
         table = _read(reproduce / "table.json", "last_lap", "endurance", "tiers", "kanayama")
         written["The paper"] = _section("mrctl reproduce", table, paper_text(table))
     if suite is not None:
-        table = _read(suite / "table.json", "rows")
-        written["The uncertainty suite"] = _section("mrctl suite", table, suite_text(table, _text(suite / "table.md")))
+        table = _read(suite / "table.json", "rows", "mode")
+        flag = "" if table["mode"] == "core" else f" --{table['mode']}"
+        text = suite_text(table, _text(suite / "table.md"))
+        written["The uncertainty suite"] = _section(f"mrctl suite{flag}", table, text)
+    if held_out is not None:
+        table = _read(held_out / "table.json", "cells", "entry")
+        text = held_out_text(_text(held_out / "table.md"), _text(held_out / LOG))
+        written["The held-out cells"] = _section(f"mrctl suite --held-out {table['entry']}", table, text)
     if tune is not None:
         table = _read(tune / "table.json", "loops", "motion")
         written["Where learning is safe"] = _section("mrctl tune", table, tune_text(table))
@@ -96,7 +105,7 @@ def paper_text(table: Table) -> str:
 
 
 def suite_text(table: Table, everything: str) -> str:
-    """The tables of `mrctl suite`: a short one with the benchmark's cases, and all of them folded away.
+    """What the tables of `mrctl suite` say, a short one with the benchmark's cases, and all of them folded away.
 
     Args:
         table: The content of `table.json`.
@@ -104,18 +113,33 @@ def suite_text(table: Table, everything: str) -> str:
     """
     cells = [
         [row["case"], TITLES.get(row["feedforward"], row["feedforward"]), f"{row['failed']}/{row['runs']}"]
-        + [_mean(row[metric]) for metric in COLUMNS]
+        + [interval(row[metric]) for metric in COLUMNS]
         for case in BENCHMARK
         for row in table["rows"]
         if row["case"] == case
     ]
     short = markdown(["case", "feedforward", "failed", *COLUMNS.values()], cells)
+    told = {title: text.partition("\n\n") for title, text in sections(everything).items() if title}
+    says = "\n".join(f"- {title}. {says}" for title, (says, _, _) in told.items())
     folded = [
-        f"<details><summary>{title}</summary>\n\n{text}\n\n</details>"
-        for title, text in sections(everything).items()
-        if title
+        f"<details><summary>{title}</summary>\n\n{says}\n\n{text}\n\n</details>"
+        for title, (says, _, text) in told.items()
     ]
-    return "\n\n".join(["RMSE of the last lap, mean [95 % bootstrap interval]:", short, *folded])
+    title = f"RMSE of the last lap ({table['mode']}), mean [95 % bootstrap interval]:"
+    return "\n\n".join([says, title, short, *folded])
+
+
+def held_out_text(table: str, log: str) -> str:
+    """The table of `mrctl suite --held-out`, and every time that the cells were driven.
+
+    Args:
+        table: The content of `table.md`.
+        log: The content of `held_out.jsonl`.
+    """
+    (text,) = (text for title, text in sections(table).items() if title)
+    lines = [json.loads(line) for line in log.splitlines()]
+    driven = [f"- {one['time']}, {one['entry']}: {one.get('says') or 'begun'}" for one in lines]
+    return "\n\n".join([text, "Every time that the cells were driven:", "\n".join(driven)])
 
 
 def tune_text(table: Table) -> str:
@@ -128,13 +152,6 @@ def identify_text(table: Table) -> str:
     """The table of `mrctl identify`."""
     fields = identification.Constant._fields
     return identification.text([identification.Constant(*(row[f] for f in fields)) for row in table["constants"]])
-
-
-def _mean(error: Table) -> str:
-    if not error["samples"]:
-        return "–"
-    value, low, high = (number(1e3 * error[key]) for key in ("value", "low", "high"))
-    return f"{value} [{low}, {high}]"
 
 
 def _section(command: str, table: Table, text: str) -> str:

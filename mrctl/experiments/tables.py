@@ -20,9 +20,9 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def number(value: float) -> str:
-    """A number as text with three significant digits."""
-    return f"{value:#.3g}".rstrip(".")
+def number(value: float, digits: int = 3) -> str:
+    """A number as text with so many significant digits."""
+    return f"{value:#.{digits}g}".rstrip(".")
 
 
 def output_folder(path: Path) -> Path:

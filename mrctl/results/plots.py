@@ -310,7 +310,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
     for unused in axes[len(cases) :]:
         unused.remove()
     handles = [Line2D([], [], **_line(k)) for k in range(len(order))]
-    figure.legend(handles, order, loc="outside upper center", ncols=min(8, len(order)))
+    figure.legend(handles, order, loc="outside upper center", ncols=min(4, len(order)))
     return figure
 
 
@@ -329,7 +329,7 @@ def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
     axes.axvline(1, color="0.4", lw=0.8, ls=":")
     axes.set(xlabel=label, ylabel="share of runs", xscale="log", ylim=(0, 1.02))
     handles = [Line2D([], [], **_line(k)) for k in range(len(samples))]
-    figure.legend(handles, list(samples), loc="outside upper center", ncols=4)
+    figure.legend(handles, list(samples), loc="outside upper center", ncols=2)
     return figure
 
 

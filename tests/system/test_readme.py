@@ -46,6 +46,7 @@ ELSEWHERE = {
     r"mrctl sweep .* --scheduler .*": ("tests/system/test_sweep_dask.py::test_killed_worker", "mrctl.sweep.jobs.run"),
     r"mrctl reproduce": ("tests/system/test_reproduce.py::test_network_beats_pid", "mrctl.experiments.paper.reproduce"),
     r"mrctl suite( --\w+( \d+)?)*": ("tests/system/test_suite.py::test_table", "mrctl.experiments.suite.suite"),
+    r"mrctl suite --held-out \S*": ("tests/system/test_suite.py::test_held_out", "mrctl.experiments.held_out.judge"),
     r"mrctl suite --controller \S*": (
         "tests/system/test_suite.py::test_controller_joins", "mrctl.experiments.suite.suite",
     ),
@@ -227,7 +228,8 @@ def test_elsewhere(
     else:
         assert command in text
     if "results_page" in command:
-        assert set(re.findall(r"--(\w+)", command)) <= set(inspect.signature(results_page.main).parameters)
+        flags = {flag.replace("-", "_") for flag in re.findall(r"--([\w-]+)", command)}
+        assert flags <= set(inspect.signature(results_page.main).parameters)
     if function:
 
         def reached(*_: object, **__: object) -> None:

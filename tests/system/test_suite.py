@@ -17,12 +17,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from numpy.typing import ArrayLike
 from PIL import Image
 from scipy import stats
 
 import mrctl
 from mrctl import cli
-from mrctl.experiments import report, suite, tuning
+from mrctl.experiments import held_out, report, suite, suite_tables, tuning
 from mrctl.experiments.cases import Case
 from mrctl.experiments.hindsight import best_fixed
 from mrctl.results import metrics, plots
@@ -47,7 +48,7 @@ class Gain:
 WINDOWS = {"first": lambda e: e[:, 0], "all": lambda e: np.sqrt(np.mean(e**2, axis=1))}
 
 
-def tiny(seeds: int, random: int, quick: bool) -> list[Case]:
+def tiny(mode: str, seeds: int, random: int) -> list[Case]:
     """A case of each part, on a small circle."""
     base = mrctl.Scenario(laps=2, reference=mrctl.Circle(radius=0.5, period=LAP))
     payload = mrctl.Event(time=2 * LAP, perturbation=mrctl.PERTURBATIONS["payload ahead"])
@@ -106,6 +107,7 @@ def refused(capsys: pytest.CaptureFixture, words: list[str], status: int = 2) ->
     lines = capsys.readouterr().err.replace("\r", "\n").splitlines()
     lines = [line for line in lines if line.strip() and "run/s" not in line and not re.match(r".* \(\d of \d\)$", line)]
     lines = [line for line in lines if "it/s" not in line and "?" not in line and "s/run" not in line]
+    lines = [line for line in lines if not re.fullmatch(r"[\d,]+ runs, \d+% of them done; about \d+ min .*", line)]
     assert len(lines) == 1 and "Traceback" not in lines[0], lines
     return lines[0]
 
@@ -114,7 +116,7 @@ def test_table(whole: Path) -> None:
     """Every combination is there, equal to the same scenarios run directly, and comparisons pair the runs."""
     table = json.loads((whole / "table.json").read_text())
     assert len(table["rows"]) == 6 * 3 and len(table["runs"]) == (5 * 2 + 3) * 3
-    cases = {case.name: case.scenarios for case in tiny(2, 3, False)}
+    cases = {case.name: case.scenarios for case in tiny("core", 2, 3)}
     found = {(row["case"], row["feedforward"]): row for row in table["rows"]}
     for case in ("all", "caster", "random"):
         alone = {
@@ -167,17 +169,17 @@ def test_leaders() -> None:
     rows = []
     for name, own in errors.items():
         row = {"case": "a", "feedforward": name, "failed": int(np.isnan(own).sum())}
-        for metric in suite.COLUMNS:
+        for metric in suite_tables.COLUMNS:
             row[metric] = {"value": np.nanmean(own), "first": {"value": 0.0}, "all": {"value": 0.0}}
             for rival, theirs in errors.items():
                 wins = int((np.nan_to_num(own, nan=np.inf) < np.nan_to_num(theirs, nan=np.inf)).sum())
-                low = stats.binomtest(wins, 10).proportion_ci(method="wilson").low
+                low, high = stats.binomtest(wins, 10).proportion_ci(method="wilson")
                 for window in (row[metric], row[metric]["first"], row[metric]["all"]):
-                    window[f"beats_{'PID' if rival == 'none' else rival}"] = {"low": low}
+                    window[f"beats_{'PID' if rival == 'none' else rival}"] = {"low": low, "high": high}
                 row[metric]["first"]["value"] = row[metric]["all"]["value"] = np.nanmean(own)
         rows.append(row)
     assert 0.2 < np.mean(errors["model"] < errors["rls"]) < 0.9
-    assert suite.leaders(rows) == [["a", *["model, rls"] * 5]]
+    assert suite_tables.leaders(rows) == [["a", *["model, rls"] * 5]]
 
 
 def test_hindsight(tmp_path: Path) -> None:
@@ -186,29 +188,77 @@ def test_hindsight(tmp_path: Path) -> None:
     assert cli.main([*words, "--out", str(tmp_path)]) == 0
     rows = json.loads((tmp_path / "table.json").read_text())["rows"]
     all_laps = {r["feedforward"]: r["position_rmse"]["all"]["value"] for r in rows if r["case"] == "all"}
-    (scenario,) = next(case.scenarios for case in tiny(1, 0, False) if case.name == "all")
+    (scenario,) = next(case.scenarios for case in tiny("core", 1, 0) if case.name == "all")
     laps = mrctl.per_lap(best_fixed([scenario])).position_rmse.values
     assert all_laps["hindsight"] == pytest.approx(np.sqrt(np.mean(laps**2)), rel=1e-9)
-    lines = (tmp_path / "table.md").read_text().partition("Position error in mm")[2].splitlines()
-    (line,) = (one for one in lines if re.match(r"\| all +\| model ", one) and one.count("|") == 8)
+    (line,) = (
+        one for one in (tmp_path / "table.md").read_text().partition("Position error in mm")[2].splitlines()
+        if re.match(r"\| all +\| model ", one) and one.count("|") == 9
+    )  # fmt: skip
     regret = 1e3 * (all_laps["model"] - all_laps["hindsight"])
-    assert line.split("|")[6].strip() == f"{regret:.2f}"
+    assert float(line.split("|")[7]) == pytest.approx(regret, rel=0.06)  # two digits
+
+
+def laps_of(*laps: ArrayLike) -> xr.Dataset:
+    """The laps of some runs."""
+    error = (("run", "lap"), np.array(laps).T)
+    names = {name: error for name in metrics.METRICS}
+    count = error[1].shape[0]
+    lost = np.isnan(laps).any(axis=0)
+    per_run = {"laps": ("run", [len(laps)] * count), "failed": ("run", lost)}
+    per_run |= {"failure_time": ("run", [np.nan] * count), "lap_time": ("run", [LAP] * count)}
+    return xr.Dataset(names | per_run, {"run": np.arange(count), "lap": np.arange(1, len(laps) + 1)})
 
 
 def test_floors() -> None:
-    """The largest change of a mean when the step is halved; a feedforward that lost a run says nothing."""
+    """The largest change of a mean, and of a difference of two; a feedforward that lost a run says nothing."""
+    whole = {"model": laps_of([1.0, 1.0], [1.0, 3.0]), "rls": laps_of([1.0, 1.0], [2.0, 2.0])}
+    half = {"model": laps_of([1.4, 1.6], [1.5, 2.9]), "rls": laps_of([1.4, 1.4], [2.3, 2.3])}
+    lost = laps_of([9.0, 9.0], [1.1, np.nan])
+    for more in ({}, {"fel": lost}):
+        found = suite.floors([(whole | more, half | more)], "v_rmse")
+        assert found["last"] == pytest.approx((0.3, 0.1)) and found["first"] == pytest.approx((0.5, 0.1))
+    assert set(suite.floors([], "v_rmse").values()) == {(0.0, 0.0)}
 
-    def laps(last: list[float]) -> xr.Dataset:
-        error = (("run", "lap"), np.stack([np.ones(2), last], axis=1))
-        names = {name: error for name in metrics.METRICS}
-        per_run = {"laps": ("run", [2, 2]), "failed": ("run", [False, False]), "failure_time": ("run", [np.nan] * 2)}
-        return xr.Dataset(names | per_run, {"run": [0, 1], "lap": [1, 2]})
 
-    whole = {"model": laps([1.0, 3.0]), "fel": laps([1.0, 1.0])}
-    half = {"model": laps([1.5, 2.9]), "fel": laps([1.1, np.nan])}
-    found = suite.floors({"nominal": whole, "nominal, half the step": half})
-    assert found == dict.fromkeys(suite.COLUMNS, pytest.approx(0.2))
-    assert suite.floors({"nominal": whole}) == dict.fromkeys(suite.COLUMNS, 0.0)
+def test_sentences() -> None:
+    """They count what the paired test decides: twenty of twenty is, two of three is not, and the floor makes ties."""
+    random = np.random.default_rng(0)
+
+    def rows(count: int, floor: float) -> list[dict]:
+        case = Case("nominal", "steady", (mrctl.Scenario(laps=2),) * count)
+        half = case._replace(name="nominal, half the step", part="floor")
+        noise = 0.01 * random.random(count)
+
+        def drives(more: float) -> dict[str, xr.Dataset]:
+            """The model's error stays; those of the others grow by so much."""
+            first, last = {"none": 5, "rls": 1.2}, {"none": 5, "rls": 1.5}
+            others = {name: laps_of(first[name] + more + noise, last[name] + more - noise) for name in first}
+            return others | {"model": laps_of(1 + noise, 2 - noise)}
+
+        found, moved = drives(0.0), drives(floor)
+        return suite.compare([case, half], {case.name: found, half.name: moved})
+
+    says = [table.says for table in suite_tables.tables(rows(20, 0.1), "core")]
+    assert "below it `rls` in 1; above it `PID` in 1; the others are level" in says[0]
+    assert "in lap 1 against `model` in 1 case" in says[2] and "above it `PID` in 1, `rls` in 1" in says[2]
+    assert "all tie in 0 of 1 cases; in the others, best or level with the best are `rls` in 1." in says[3]
+    assert "reverses 0." in says[1]
+    (few,) = {suite_tables.against([r for r in rows(3, 0.1) if r["part"] == "steady"], "last")}
+    assert "all are level with it" in few
+    tied = suite_tables.tables(rows(20, 0.6), "core")[0].says
+    assert "below it" not in tied and "above it `PID` in 1" in tied
+    assert {one.says for one in suite_tables.tables(rows(20, 0.1), "quick")} == {suite_tables.NO_CLAIM}
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "text"),
+    [(6.5e-4, 6.4e-4, 6.6e-4, "0.650 [0.640, 0.660]"), (6.5e-4, 6.5e-4, 6.5e-4, "0.650"),
+     (6.5e-4, 6.49996e-4, 6.50004e-4, "0.650000 [0.649996, 0.650004]"), (1e-3, np.nan, np.nan, "1.00")],
+)  # fmt: skip
+def test_interval(value: float, low: float, high: float, text: str) -> None:
+    """No interval is printed with equal ends."""
+    assert suite_tables.interval({"value": value, "low": low, "high": high, "samples": 2}) == text
 
 
 def test_goes_on_where_it_stopped(whole: Path, tmp_path: Path) -> None:
@@ -291,11 +341,42 @@ def test_controller_joins(whole: Path, tmp_path: Path) -> None:
     row = next(r for r in table["rows"] if (r["case"], r["feedforward"]) == ("all", "Gain"))
     namespace: dict = {}
     exec(GAIN, namespace)
-    scenarios = next(case.scenarios for case in tiny(2, 3, False) if case.name == "all")
+    scenarios = next(case.scenarios for case in tiny("core", 2, 3) if case.name == "all")
     alone = mrctl.summary(mrctl.simulate(list(scenarios), feedforward=namespace["Gain"]))
     assert row["v_rmse"]["value"] == pytest.approx(alone["v_rmse"].mean(), rel=1e-12)
     assert "Gain" in (out / "report.html").read_text()
     assert content(whole)["runs/rls/runs.parquet"] == content(out)["runs/rls/runs.parquet"]
+
+
+def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """A cell counts where the mean is no more than the rival's and the floor; each time it is driven is kept."""
+    monkeypatch.setattr(held_out, "COURSES", {"circle": mrctl.Circle(radius=0.5, period=LAP)})
+    plants = {"heavy": mrctl.Perturbation(mass_factor=2.0), "light": mrctl.Perturbation(mass_factor=0.6)}
+    monkeypatch.setattr(held_out, "PLANTS", plants)
+    monkeypatch.setattr(held_out, "LAPS", 2)
+    words = ["suite", "--held-out", "none", "--seeds", "2", "--workers", "1", "--out", str(tmp_path)]
+    for _ in range(2):
+        assert cli.main(words) == 0
+    begun, ended = map(json.loads, (tmp_path / held_out.LOG).read_text().splitlines())
+    assert (begun["entry"], begun["replicates"], ended["says"] in capsys.readouterr().out) == ("none", 2, True)
+    table = json.loads((tmp_path / "table.json").read_text())
+    assert table["mode"] == "held-out" and len(table["cells"]) == 2 * 3 * 3 * 3
+    errors = {}
+    for name in ("none", "model"):
+        for half in (1, 2):
+            for cell in held_out.cells(2):
+                changes = {**mrctl.FEEDFORWARDS[name], "physics_step": 0.002 / half}
+                runs = mrctl.simulate([s.model_copy(update=changes) for s in cell.scenarios])
+                errors[name, half, cell.name.split("; ")[1]] = mrctl.per_lap(runs).position_rmse.values[:, 0].mean()
+    asked = {"metric": "position_rmse", "window": "first", "rival": "model"}
+    for row in (row for row in table["cells"] if asked.items() <= row.items()):
+        apart = {(half, p): errors["none", half, p] - errors["model", half, p] for half in (1, 2) for p in plants}
+        assert row["apart"]["value"] == pytest.approx(apart[1, row["plant"]], rel=1e-9)
+        assert row["floor"]["difference"] >= max(abs(apart[2, p] - apart[1, p]) for p in plants) * (1 - 1e-9)
+        assert row["at_or_below"] == (apart[1, row["plant"]] <= row["floor"]["difference"])
+    assert "is neither one of none, model+indi" in refused(capsys, ["suite", "--held-out", "model"])
+    assert "one of --quick" in refused(capsys, ["suite", "--held-out", "fel", "--quick"])
+    assert "names the one feedforward" in refused(capsys, ["suite", "--held-out", "fel", "--feedforward", "rls"])
 
 
 @pytest.mark.parametrize(

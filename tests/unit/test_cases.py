@@ -19,11 +19,13 @@ def robot():
     return read_robot(mjcf.load())
 
 
-@pytest.mark.parametrize("quick", [False, True])
-def test_complete_and_paired(quick):
+@pytest.mark.parametrize("mode", cases.REPLICATES)
+def test_complete_and_paired(mode):
     """Every part is there under names of their own; each case has the same seeds, and runs of one length."""
-    found = cases.cases(3, 2, quick)
-    assert {case.part for case in found} == set(cases.PARTS) - ({"steering"} if quick else set())
+    found = cases.cases(mode, 3, 2)
+    assert {case.part for case in found} == set(cases.PARTS) - {
+        "quick": {"steering", "tier"}, "core": {"steering"}, "full": set(),
+    }[mode]  # fmt: skip
     assert len({case.name for case in found}) == len(found)
     for case in found:
         if case.part != "random":
@@ -32,17 +34,21 @@ def test_complete_and_paired(quick):
             same = {s.model_copy(update={"seed": 0, "perturbation": PLAIN, "events": ()}) for s in case.scenarios}
             assert len(same) == 1
         assert len({s.laps for s in case.scenarios}) == 1
-    if not quick:
-        drawn = {name: p.drawn(np.random.default_rng([0, 5])) for name, p in PERTURBATIONS.items()}
-        steady = {case.scenarios[0].perturbation for case in found if case.part == "steady"}
-        assert steady >= set(drawn.values())
+    drawn = {name: p.drawn(np.random.default_rng([0, 5])) for name, p in PERTURBATIONS.items()}
+    if mode == "full":
+        for tier in ("ideal", "lab", "field"):
+            driven = [s for case in found if case.part in ("steady", "tier") for s in case.scenarios]
+            assert {s.perturbation for s in driven if s.sensing.tier == tier} >= set(drawn.values())
         ladder = {(s.steering, s.perturbation) for case in found if not case.change for s in case.scenarios}
         assert ladder >= {(steering, drawn[p]) for steering in cases.STEERINGS for p in cases.LADDER}
+    if mode == "core":
+        lab = {s.perturbation for case in found if case.part == "steady" for s in case.scenarios}
+        assert lab >= {drawn[name] for name in (*cases.UNCERTAIN, "nominal", "all")}
 
 
 def test_steps_are_where_the_laps_say():
     """The perturbation comes in the beginning of lap `change`, and goes in that of lap `back`."""
-    for case in cases.cases(1, 0, False):
+    for case in cases.cases("full", 1, 0):
         events = case.scenarios[0].events
         if case.part == "step":
             laps = [1 + event.time / case.scenarios[0].reference.period for event in events]
@@ -55,12 +61,16 @@ def test_steps_are_where_the_laps_say():
             assert back.slope == start.slope
 
 
-def test_frozen_laps_count_whole():
-    """The faster reference fits three half laps of its symmetric figure into a lap, so that every lap says the same."""
-    for case in cases.cases(1, 0, False):
+def test_other_course_begins_where_the_lap_ends():
+    """In position and direction, and its laps count whole: one to a lap, or three half laps of a symmetric figure."""
+    for case in cases.cases("full", 1, 0):
         for event in case.scenarios[0].events:
             if event.reference is not None:
-                assert case.scenarios[0].reference.period / event.reference.period == pytest.approx(1.5)
+                first = case.scenarios[0].reference
+                assert 2 * first.period / event.reference.period % 1 == pytest.approx(0, abs=1e-9)
+                ends, begins = (one.sample(np.array([t])).pose[0] for one, t in
+                                ((first, first.period), (event.reference, 0.0)))  # fmt: skip
+                np.testing.assert_allclose(begins, ends, atol=0.01)
 
 
 def test_random_scenario_is_a_function_of_its_seed(robot):

@@ -12,6 +12,8 @@ from mrctl.results.dataset import versions
 SOURCE = {"versions": versions() | {"mujoco": "9.9.9"}, "machine": {"processor": "Abacus", "cores": 3}}
 MADE = "with mrctl {mrctl}, mujoco 9.9.9, dm-control".format(**SOURCE["versions"])
 
+TABLES = "## Steady\n\nAll tie.\n\n| case |\n| --- |\n\n## A step\n\n`rls` is back.\n\n| step |\n"
+
 
 def written(folder: Path, values: dict, table: str = "") -> Path:
     folder.mkdir()
@@ -22,14 +24,14 @@ def written(folder: Path, values: dict, table: str = "") -> Path:
 
 @pytest.fixture
 def suite(tmp_path: Path) -> Path:
-    error = {"value": 0.0123, "low": 0.0121, "high": float("inf"), "samples": 2}
+    error = {"value": 0.0123, "low": 0.0121, "high": 0.0125, "samples": 2}
     lost = error | {"value": float("nan"), "samples": 0}
     rows = [
         {"case": case, "feedforward": name, "failed": 2 * (e is lost), "runs": 2, "v_rmse": e, "omega_rmse": e,
          "position_rmse": e}
         for case, name, e in (("nominal", "none", error), ("slope 10°", "fel", error), ("all", "fel", lost))
     ]  # fmt: skip
-    return written(tmp_path / "suite", {"rows": rows}, "## Steady\n\n| case |\n| --- |\n\n## A step\n\n| step |\n")
+    return written(tmp_path / "suite", {"rows": rows, "mode": "full"}, TABLES)
 
 
 @pytest.fixture
@@ -91,8 +93,9 @@ def test_sections(suite: Path, reproduction: Path, tune: Path, identified: Path,
     assert list(page) == ["", *titles]
     assert all(MADE in page[title] and "on Abacus with 3 cores." in page[title] for title in titles)
     short, *folded = page["The uncertainty suite"].split("<details>")
-    assert "| nominal | PID         | 0/2    | 12.3 [12.1, nan] |" in short and "slope" not in short
+    assert "| nominal | PID         | 0/2    | 12.3 [12.1, 12.5] |" in short and "slope" not in short
     assert "| all     | fel         | 2/2    | –  " in short
+    assert "`mrctl suite --full` made this" in short and "- Steady. All tie.\n- A step. `rls` is back." in short
     assert [text.split("</summary>")[0] for text in folded] == ["<summary>Steady", "<summary>A step"]
     assert "| fel         | 3.21    | 3.21       | 3.21         | PID fails |" in page["The paper"]
     assert "| lab     | " in page["The paper"] and "| 1.00         | 0.25 " in page["The paper"]

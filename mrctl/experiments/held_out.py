@@ -1,0 +1,220 @@
+"""The held-out cells: courses and plants on which one learner is judged, and on which nothing is ever chosen.
+
+A setting that was chosen on some runs looks better on them than it is (selection bias). These cells were written down
+before any tuning; no course, no plant and no seed of theirs is used anywhere else. A learner is named, with its
+settings, before it is driven through them, and every time that one is driven is kept.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from mrctl.experiments import suite
+from mrctl.experiments.cases import HALF, HELD_OUT_SEEDS, NO_SPREAD, Case, Laps
+from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, Table, interval
+from mrctl.experiments.tables import machine, number, output_folder, write_json
+from mrctl.record import InputError
+from mrctl.results.comparison import bootstrap_interval
+from mrctl.results.dataset import versions
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
+from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.references import Circle, Reference, RoundedSquare, StopAndGo, Waypoints
+from mrctl.theory.timing import Limits
+
+LAPS = 6
+RIVALS: tuple[FeedforwardName, ...] = ("model", "true_model", "model+observer")
+RESOLVED = 5  # replicates of each cell that are also driven with half the physics step
+LOG = "held_out.jsonl"
+"""File with a line for each time that the cells were begun, and for each time that they were finished."""
+
+COURSES: dict[str, Reference] = {
+    "circle": Circle(radius=1.3, period=9.0, clockwise=True),
+    "square": RoundedSquare(side=2.6, radius=0.6, speed=0.6),
+    "stop and go": StopAndGo(distance=3.0, move_time=4.5, pause=0.7, reverse=False),
+    "fast spline": Waypoints(
+        points=((0, 0), (1.4, -0.3), (2.6, 0.5), (1.9, 1.7), (0.7, 1.1), (-0.9, 1.8), (-1.5, 0.6)),
+        speed=1.1,
+        timing="limits",
+        limits=Limits(acceleration=0.8, rotation=1.8, rotation_acceleration=3.5, lateral_acceleration=0.9),
+    ),
+    "winding spline": Waypoints(
+        points=((0, 0), (-0.6, 1.0), (0.4, 1.9), (2.0, 1.5), (3.2, 1.9), (3.6, 0.6), (2.6, -0.6), (1.2, 0.1)),
+        speed=0.9,
+        timing="limits",
+        limits=Limits(acceleration=0.5, rotation=1.5, rotation_acceleration=3.0, lateral_acceleration=0.6),
+    ),
+}
+"""Five courses; the speed changes along the last three."""
+
+PLANTS: dict[str, Perturbation] = {
+    "light, weak supply": Perturbation(mass_factor=0.7, supply_factor=0.95),
+    "payload 3 kg aside": Perturbation(payload=3.0, payload_x=0.25, payload_y=-0.12),
+    "left motor -8 %, friction x2": Perturbation(left_motor_constant_factor=0.92, drive_friction_factor=2.0),
+    "supply -10 %, resistance +20 %": Perturbation(supply_factor=0.9, resistance_factor=1.2),
+    "slope 4°, mass +20 %": Perturbation(slope=0.07, mass_factor=1.2),
+    "sagging battery, dead zone": Perturbation(battery_resistance=0.2, dead_zone=0.5),
+    "delay 10 ms, inertia +40 %": Perturbation(control_delay=0.01, inertia_factor=1.4),
+    "right wheel -3 %, right friction x3": Perturbation(right_radius_factor=0.97, right_drive_friction_factor=3.0),
+}
+"""Eight robots that differ from the model in more than one way, none of them in `PERTURBATIONS`."""
+
+
+def cells(count: int) -> list[Case]:
+    """The 40 cells, each course with each plant, course by course.
+
+    Args:
+        count: Number of replicates of each cell; all cells have the same draws.
+    """
+    return [
+        Case(
+            f"{course}; {plant}",
+            "held-out",
+            tuple(
+                replicates(
+                    Scenario(
+                        name=f"{course}; {plant}", laps=LAPS, reference=reference, perturbation=perturbation,
+                        initial_spread=NO_SPREAD,
+                    ),
+                    count,
+                    HELD_OUT_SEEDS.start,
+                )
+            ),
+        )
+        for course, reference in COURSES.items()
+        for plant, perturbation in PLANTS.items()
+    ]  # fmt: skip
+
+
+def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
+    """Drives one feedforward and its rivals through the cells; writes `table.md` and `table.json`, and logs it.
+
+    Args:
+        entry: Name of the feedforward, or one of the user's as `my_file.py:MyController`.
+        count: Number of replicates of each cell.
+        workers: Number of processes; by default one for each core.
+        out: Folder for the results.
+
+    Returns:
+        A sentence on the runs that could not be done, or "".
+
+    Raises:
+        InputError: There is no such feedforward, it is a rival, or the folder cannot be written or holds other runs.
+    """
+    if entry in RIVALS or (entry not in FEEDFORWARDS and ".py:" not in entry):
+        names = ", ".join(name for name in FEEDFORWARDS if name not in RIVALS)
+        raise InputError(f"held_out: {entry!r} is neither one of {names} nor of the form my_file.py:MyController")
+    if not 1 <= count <= len(HELD_OUT_SEEDS):
+        raise InputError(f"seeds: {count} is not between 1 and {len(HELD_OUT_SEEDS):,}")
+    known = entry in FEEDFORWARDS
+    choices = suite.by_name((entry, *RIVALS) if known else RIVALS, () if known else (entry,))
+    (name,) = (name for name in choices if name not in RIVALS)
+    output_folder(out)
+    chosen = [one for cell in cells(count) for one in (cell, _half(cell))]
+    told = {"entry": entry, "mrctl": versions()["mrctl"]}
+    fresh = any(suite.left(out / "runs" / one) for one in choices)
+    if fresh:
+        _log(out, told | {"replicates": count, "settings": _settings(name) if known else None})
+    laps, aside = suite.run(chosen, choices, workers, out / "runs")
+    rows = compare(name, suite.runs_of(chosen, laps))
+    table = summarised(name, rows, count)
+    if fresh:
+        _log(out, told | {"says": table.says})
+    (out / "table.md").write_text(table.markdown)
+    source = {"versions": versions(), "machine": machine()}
+    write_json(out / "table.json", source | {"mode": "held-out", "entry": entry, "cells": rows})
+    return aside
+
+
+def _log(out: Path, values: Mapping[str, Any]) -> None:
+    """Adds a line, so that a drive that was begun is known even if its result is not."""
+    with (out / LOG).open("a") as file:
+        file.write(json.dumps({"time": datetime.now(UTC).isoformat(timespec="seconds"), **values}) + "\n")
+
+
+def _half(cell: Case) -> Case:
+    """The first replicates of a cell with half the physics step."""
+    halved = {"physics_step": Scenario().physics_step / 2, "name": cell.name + HALF}
+    return Case(cell.name + HALF, cell.part, tuple(s.model_copy(update=halved) for s in cell.scenarios[:RESOLVED]))
+
+
+def _settings(name: str) -> dict[str, Any]:
+    """The settings of a learner that comes with mrctl."""
+    learner = FEEDFORWARDS[name]["learner"]  # type: ignore[index]
+    return getattr(Scenario(), learner).model_dump(mode="json") if learner != "none" else {}
+
+
+def compare(name: str, found: Mapping[str, Laps]) -> list[dict[str, Any]]:
+    """How a feedforward stands to each rival in each cell, metric and window: a row for each.
+
+    It is at or below a rival if it lost no more runs, and its mean over those that both finished is no more than that
+    of the rival and the floor. The floor is that of the course: the largest change of a difference between two of the
+    means on any of its plants when the physics step is halved.
+    """
+    rows = []
+    for course in COURSES:
+        whole = {plant: found[f"{course}; {plant}"] for plant in PLANTS}
+        pairs = [
+            ({one: laps.isel(run=slice(RESOLVED)) for one, laps in own.items()}, found[f"{course}; {plant}{HALF}"])
+            for plant, own in whole.items()
+        ]
+        for metric in COLUMNS:
+            floors = suite.floors(pairs, metric)
+            for plant, own in whole.items():
+                errors = {one: suite.windows(laps, metric) for one, laps in own.items()}
+                for window in WINDOWS:
+                    for rival in RIVALS:
+                        mine, theirs = errors[name][window], errors[rival][window]
+                        row = {"course": course, "plant": plant, "metric": metric, "window": window, "rival": rival}
+                        rows.append(row | _standing(mine, theirs, floors[window]))
+    return rows
+
+
+def _standing(mine: NDArray[np.float64], theirs: NDArray[np.float64], floor: suite.Floor) -> dict[str, Any]:
+    lost, lost_by_rival = (int((~np.isfinite(one)).sum()) for one in (mine, theirs))
+    both = np.isfinite(mine) & np.isfinite(theirs)
+    apart = bootstrap_interval((mine - theirs)[both])._asdict()
+    close = not both.any() or apart["value"] <= floor.difference
+    means = {"mine": float(mine[both].mean()), "theirs": float(theirs[both].mean())} if both.any() else {}
+    return {
+        **means, "apart": apart, "floor": floor._asdict(), "failed": lost, "rival_failed": lost_by_rival,
+        "at_or_below": bool(lost < lost_by_rival or (lost == lost_by_rival and close)),
+        "tie": bool(lost == lost_by_rival and both.any() and abs(apart["value"]) <= floor.difference),
+    }  # fmt: skip
+
+
+def summarised(name: str, rows: Sequence[dict[str, Any]], count: int) -> Table:
+    """In how many cells a feedforward is at or below each rival, and the cells where its position is not."""
+    size = len(COURSES) * len(PLANTS)
+    cells, least = [], size
+    for metric, title in COLUMNS.items():
+        for window, called in WINDOWS.items():
+            line = [title.split(",")[0], called]
+            for rival in RIVALS:
+                asked = {"metric": metric, "window": window, "rival": rival}
+                own = [row for row in rows if asked.items() <= row.items()]
+                fine, ties = sum(row["at_or_below"] for row in own), sum(row["tie"] for row in own)
+                least = min(least, fine) if metric == "position_rmse" else least
+                line.append(f"{fine}/{len(own)}, {ties} of them ties")
+            cells.append(line)
+    above = [row for row in rows if row["metric"] == "position_rmse" and not row["at_or_below"]]
+    listed = "; ".join(
+        f"{row['course']}, {row['plant']}, {WINDOWS[row['window']]}: above {row['rival']} by "
+        f"{interval(row['apart'])} mm (floor {number(1e3 * row['floor']['difference'])} mm)"
+        + (f", {row['failed']} runs failed against {row['rival_failed']}" if row["failed"] else "")
+        for row in above
+    )
+    says = (
+        f"Position of `{name}` with {count} replicates is at or below `model`, `true_model` and `model+observer` in at "
+        f"least {least} of {size} cells in lap 1, over all laps and in the last lap. "
+        + (f"It is above in: {listed}." if above else "It is above in none.")
+    )
+    header = ["error", "window", *(f"at or below {rival}" for rival in RIVALS)]
+    return Table("Held-out cells (held-out)", says, pd.DataFrame(cells, columns=header))

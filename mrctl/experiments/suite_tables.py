@@ -1,0 +1,280 @@
+"""The tables of the suite, each with the sentence that it supports."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from mrctl.experiments.cases import BAND, FLOOR, HALF, HINDSIGHT, PARTS, REFERENCES, UNCHANGED
+from mrctl.experiments.tables import markdown, number
+
+COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
+TITLES = {"none": "PID"}  # names of feedforwards in the tables, where they differ
+YARDSTICKS = ("none", "model")  # feedforwards that the tables compare all others with
+WINDOWS = {"first": "lap 1", "all": "all laps", "last": "the last lap"}
+LEADING = {
+    "V": ("v_rmse", "last"),
+    "θ̇": ("omega_rmse", "last"),
+    "position": ("position_rmse", "last"),
+    "position in lap 1": ("position_rmse", "first"),
+    "position in all laps": ("position_rmse", "all"),
+}
+NO_CLAIM = "So few draws tell nothing apart: this table supports no claim."
+LEAST = 4  # pairs without which even a feedforward that always wins does so with less than 95 % confidence
+
+Row = dict[str, Any]
+
+
+class Table(NamedTuple):
+    """A table of text."""
+
+    title: str
+    """What it shows, and which suite made it."""
+    says: str
+    """The sentence that it supports, which follows from paired tests."""
+    cells: pd.DataFrame
+
+    @property
+    def markdown(self) -> str:
+        """Title, sentence and table."""
+        return f"## {self.title}\n\n{self.says}\n\n{markdown(list(self.cells), self.cells.to_numpy().tolist())}\n"
+
+
+def tables(rows: Sequence[Row], mode: str) -> list[Table]:
+    """The last lap of each part, then lap 1 and all laps, who is best, and the recovery after the steps.
+
+    Args:
+        rows: What `suite.compare` returns.
+        mode: Which suite made them.
+    """
+    found = []
+    few = mode == "quick" or all(row["runs"] < LEAST for row in rows)
+
+    def add(title: str, says: str, cells: pd.DataFrame) -> None:
+        found.append(Table(f"{title} ({mode})", NO_CLAIM if few else says, cells))
+
+    for part, title in PARTS.items():
+        if own := [row for row in rows if row["part"] == part]:
+            add(title, resolution(rows) if part == "floor" else against(own, "last"), last_laps(own))
+    every = [row for row in rows if row["part"] != "floor"]
+    add("Position error in mm", " ".join(against(every, window) for window in WINDOWS), positions(every))
+    if any(row["feedforward"] not in REFERENCES for row in rows):
+        best = pd.DataFrame(leaders(every), columns=["case", *LEADING])
+        add("Best in each case, and who is level with it", leading(best), best)
+    if steps := [row for row in rows if row["part"] == "step"]:
+        add("Recovery and forgetting: position error over that before the step", recovered(steps), recovery(steps))
+    return found
+
+
+def verdict(row: Row, rival: str, metric: str = "position_rmse", window: str = "last") -> int:
+    """How a feedforward stands to another in one case: −1 below it with 95 % confidence, 1 above it, 0 level.
+
+    The test pairs the runs (sign test with Wilson's interval); what the integrator does not resolve is a tie.
+    """
+    stated = row[metric] if window == "last" else row[metric][window]
+    beats = stated[f"beats_{TITLES.get(rival, rival)}"]
+    return int(beats["high"] < 0.5) - int(beats["low"] > 0.5)
+
+
+def against(rows: Sequence[Row], window: str) -> str:
+    """A sentence on who is below and above `model`, or PID where there is no model, in how many cases."""
+    names = list(dict.fromkeys(row["feedforward"] for row in rows))
+    rival = next((name for name in reversed(YARDSTICKS) if name in names and len(names) > 1), None)
+    if rival is None:
+        return "There is nothing to compare with."
+    cases, runs = len({row["case"] for row in rows}), sorted({row["runs"] for row in rows})
+    stands = {n: [verdict(r, rival, window=window) for r in rows if r["feedforward"] == n] for n in names if n != rival}
+    tie = number(1e3 * _window(rows[0]["position_rmse"], window)["floor"]["difference"])
+    parts = [
+        f"{word} it {listed}"
+        for word, sign in (("below", -1), ("above", 1))
+        if (listed := _counted({name: own.count(sign) for name, own in stands.items()}))
+    ]
+    rest = "the others are level with it" if parts else "all are level with it"
+    return (
+        f"Position in {WINDOWS[window]} against `{TITLES.get(rival, rival)}` in {cases} case{'s' * (cases > 1)} "
+        f"({' or '.join(map(str, runs))} runs each, paired, 95 %, differences up to {tie} mm are ties): "
+        f"{'; '.join([*parts, rest])}."
+    )
+
+
+def _counted(counts: dict[str, int]) -> str:
+    """Names with their counts, the largest first, without those that have none."""
+    ordered = sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
+    return ", ".join(f"`{TITLES.get(name, name)}` in {counts[name]}" for name in ordered)
+
+
+def resolution(rows: Sequence[Row]) -> str:
+    """A sentence on what half the physics step moves, and on the ranks that it reverses."""
+    stated = rows[0]
+    floor = {metric: [_window(stated[metric], w)["floor"] for w in WINDOWS] for metric in COLUMNS}
+    moved = ", ".join(
+        f"{title.split(',')[0]} {number(1e3 * max(one['mean'] for one in floor[metric]))} {title.split(', ')[1]} "
+        f"(a difference of two {number(1e3 * max(one['difference'] for one in floor[metric]))})"
+        for metric, title in COLUMNS.items()
+    )
+    pairs = list(_both_steps(rows))
+    claimed, turned = sum(one != 0 for one, _ in pairs), sum(one * other < 0 for one, other in pairs)
+    return (
+        f"Half the step moves no mean by more than: {moved}. Of {claimed} ranks between two feedforwards on these "
+        f"plants, in lap 1, all laps and the last lap, it reverses {turned}."
+    )
+
+
+def _both_steps(rows: Sequence[Row]) -> Iterator[tuple[int, int]]:
+    """Every verdict on the plants of `FLOOR`, with the physics step and with half of it."""
+    by = {(row["case"], row["feedforward"]): row for row in rows}
+    names = list(dict.fromkeys(row["feedforward"] for row in rows))
+    for plant in FLOOR:
+        for name, rival in combinations(names, 2):
+            if (plant, name) in by and (plant + HALF, name) in by:
+                for metric in COLUMNS:
+                    for window in WINDOWS:
+                        whole, half = (by[case, name] for case in (plant, plant + HALF))
+                        yield verdict(whole, rival, metric, window), verdict(half, rival, metric, window)
+
+
+def last_laps(rows: Sequence[Row]) -> pd.DataFrame:
+    """The errors of the last lap, and how often each feedforward beats PID and `model`."""
+    header = ["case", "feedforward", "failed", *(f"{title}; worst 5 %" for title in COLUMNS.values())]
+    header += ["beats PID in V / θ̇ / position", "beats model", "guard acted"]
+    unchanged = rows[0]["part"] in UNCHANGED
+    header += [f"laps to {BAND:g}× the final V / θ̇ / position"] if unchanged else []
+    cells = [
+        [
+            row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", *(_mean(row[m]) for m in COLUMNS),
+            *(_wins(row, TITLES.get(one, one)) for one in YARDSTICKS), number(row["guard_events"]),
+            *([_converged(row)] if unchanged else []),
+        ]
+        for row in rows
+    ]  # fmt: skip
+    return pd.DataFrame(cells, columns=header)
+
+
+def positions(rows: Sequence[Row]) -> pd.DataFrame:
+    """The position error in lap 1, all laps and the last lap, less that of the model, and what it costs to learn.
+
+    Regret is the error over all laps less that of `hindsight`.
+    """
+    header = ["case", "feedforward", *WINDOWS.values(), "less `model`: lap 1 / all laps / last lap", "regret"]
+    known = {row["case"]: row["position_rmse"]["all"]["value"] for row in rows if row["feedforward"] == HINDSIGHT}
+    cells = []
+    for row in rows:
+        error = row["position_rmse"]
+        regret = 1e3 * (error["all"]["value"] - known.get(row["case"], np.nan))
+        tie = abs(regret) <= 1e3 * error["all"]["floor"]["difference"]
+        excess = error.get("excess", {"samples": 0})
+        cells.append([row["case"], row["feedforward"], *(interval(_window(error, window)) for window in WINDOWS)])
+        cells[-1].append(" / ".join(_less(row, window) for window in WINDOWS) if "less_model" in error else "")
+        cells[-1].append(("tie" if tie else _signed(regret)) if np.isfinite(regret) else "")
+        cells[-1].append(number(1e3 * excess["value"]) if excess["samples"] else "–")
+    floor = max(_window(row["position_rmse"], window)["floor"]["mean"] for row in rows for window in WINDOWS)
+    return pd.DataFrame(cells, columns=[*header, f"excess, mm s (floor of the means: {number(1e3 * floor)} mm)"])
+
+
+def leaders(rows: Sequence[Row]) -> list[list[str]]:
+    """For each case and column of `LEADING` the feedforward with the least mean, and those that are level with it.
+
+    A feedforward is level if the best does not beat it with 95 % confidence in the same runs. One with a failed run is
+    left out, and so are `REFERENCES`, which know the plant. Where all are level, none is the best: it is a tie.
+    """
+    lines = []
+    for case in dict.fromkeys(row["case"] for row in rows):
+        own = {str(r["feedforward"]): r for r in rows if r["case"] == case and r["feedforward"] not in REFERENCES}
+        fine = [name for name, row in own.items() if not row["failed"]] or list(own)
+        cells = []
+        for metric, window in LEADING.values():
+            best, *others = sorted(fine, key=lambda name: float(_window(own[name][metric], window)["value"]))
+            level = [one for one in others if verdict(own[best], one, metric, window) >= 0]
+            names = (TITLES.get(name, name) for name in (best, *level))
+            cells.append("tie" if others and len(level) == len(others) else ", ".join(names))
+        lines.append([case, *cells])
+    return lines
+
+
+def leading(best: pd.DataFrame) -> str:
+    """A sentence on who is best, or level with the best, in how many cases."""
+    column = best["position"]
+    told = [cell.split(", ") for cell in column if cell != "tie"]
+    counts = {name: sum(name in names for names in told) for name in dict.fromkeys(sum(told, []))}
+    ties = len(column) - len(told)
+    shared = f"In position in the last lap all tie in {ties} of {len(column)} cases"
+    return f"{shared}; in the others, best or level with the best are {_counted(counts)}." if told else f"{shared}."
+
+
+def recovery(rows: Sequence[Row]) -> pd.DataFrame:
+    """The position error after a step and after the return, over that before the step."""
+    header = ["case", "feedforward", "failed", "first lap", "one lap later; worst 5 %", "recovered in V / θ̇ / position"]
+    header += ["one lap later over settled", "return: first lap", "one lap later; worst 5 %"]
+    cells = []
+    for row in rows:
+        error = row["position_rmse"]
+        names = ("in_first_lap", "after_one_lap", "return_first_lap", "return_after_one_lap")
+        first, later, back, settled = (f"{number(error[name]['value'])}×" for name in names)
+        within = " / ".join(f"{100 * row[m]['recovered_within_one_lap']:.0f} %" for m in COLUMNS)
+        later, settled = (
+            f"{text}; {number(error[f'{name}_worst'])}×" for text, name in ((later, names[1]), (settled, names[3]))
+        )
+        cells.append([row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", first, later, within])
+        cells[-1] += [f"{number(error['after_one_lap_to_settled']['value'])}×", back, settled]
+    return pd.DataFrame(cells, columns=header)
+
+
+def recovered(rows: Sequence[Row]) -> str:
+    """A sentence on whose position error is back one lap after the change, in every run."""
+    counts: dict[str, int] = {}
+    for row in rows:
+        whole = row["position_rmse"]["recovered_within_one_lap"] == 1
+        counts[row["feedforward"]] = counts.get(row["feedforward"], 0) + whole
+    steps = len({row["case"] for row in rows})
+    listed = _counted(counts)
+    return (
+        f"Of {steps} step{'s' * (steps > 1)}, one lap later the position error of every run is back within {BAND:g} "
+        f"times that before it {'with ' + listed if listed else 'with no feedforward in any'}."
+    )
+
+
+def interval(error: Row) -> str:
+    """A mean in thousandths with its interval, in as many digits as tell the ends of the interval apart."""
+    if not error["samples"]:
+        return "–"
+    value, low, high = (1e3 * error[key] for key in ("value", "low", "high"))
+    if not high > low:
+        return number(value)
+    digits = next((n for n in range(3, 9) if number(low, n) != number(high, n)), 9)
+    return f"{number(value, digits)} [{number(low, digits)}, {number(high, digits)}]"
+
+
+def _window(error: Row, window: str) -> Row:
+    return error if window == "last" else error[window]
+
+
+def _less(row: Row, window: str) -> str:
+    """The difference from the model in mm, or `tie`."""
+    tied = verdict(row, "model", window=window) == 0
+    return "tie" if tied else _signed(1e3 * _window(row["position_rmse"], window)["less_model"])
+
+
+def _signed(value: float) -> str:
+    return ("+" if value > 0 else "") + number(value, 3 if abs(value) >= 10 else 2)
+
+
+def _mean(error: Row) -> str:
+    return f"{interval(error)}; {number(1e3 * error['worst'])}" if error["samples"] else "–"
+
+
+def _converged(row: Row) -> str:
+    laps = [row[metric]["laps_to_converge"] for metric in COLUMNS]
+    return " / ".join(f"{one['value']:.1f}" if one["samples"] else "–" for one in laps)
+
+
+def _wins(row: Row, rival: str) -> str:
+    if f"beats_{rival}" not in row["position_rmse"]:
+        return ""
+    values = [row[metric][f"beats_{rival}"] for metric in COLUMNS]
+    last = values[-1]
+    return " / ".join(f"{one['value']:.2f}" for one in values) + f" [{last['low']:.2f}, {last['high']:.2f}]"
