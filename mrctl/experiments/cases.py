@@ -18,6 +18,8 @@ from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Lemniscate, Waypoints, random_spline
 from mrctl.theory.robot import STEERINGS, Robot
 
+TUNING, HELD_OUT = 100_000, 200_000
+"""First seeds of what tuning sees, and of the held-out set; the suite has those below. No two of them share a draw."""
 HINDSIGHT = "hindsight"  # the best fixed feedforward, which is found by repeating the run
 REFERENCES = ("true_model", HINDSIGHT)  # feedforwards that know the plant, and compete with nobody
 LADDER = ("nominal", "mass +50 %", "supply -20 %", "all")  # plants of every steering arrangement
@@ -198,10 +200,10 @@ def _spline(random: np.random.Generator, robot: Robot) -> Waypoints:
         course = random_spline(random, careful, MARGIN, MARGIN)
         slower = int(random.integers(2))
         if times := [time for time in LAP_TIMES if time >= course.period]:
-            return _slowed(course, times[min(slower, len(times) - 1)])
+            return slowed(course, times[min(slower, len(times) - 1)])
 
 
-def _slowed(course: Waypoints, period: float) -> Waypoints:
+def slowed(course: Waypoints, period: float) -> Waypoints:
     """The same course in a longer lap time in s, with velocities in one proportion, accelerations in its square."""
 
     def at(share: float) -> Waypoints:

@@ -72,7 +72,7 @@ def suite(
         raise InputError("seeds: the suite needs at least one run of at least one feedforward")
     choices: dict[str, dict[str, Any]] = {name: {"feedforward": name} for name in feedforwards}
     for stages in controllers:
-        name = "+".join(part.attribute for part in user_files.parts(stages))
+        name = "+".join(part.title for part in user_files.parts(stages))
         if name in choices:
             raise InputError(f"controller: the name {name} is taken")
         choices[name] = {"controller": user_files.absolute(stages)}
