@@ -13,8 +13,11 @@ exp J is a weighted geometric mean of ratios. A mean of logarithms gives every w
 whatever its size; in a mean of errors the hardest world would decide alone. Position counts as much as both velocities:
 it is what a user sees, and the velocities are what a learner acts on. All laps count, so that a setting pays for
 learning slowly. To each error the floor of the integrator is added, below which a difference means nothing. A run that
-fails counts as `LOST` times the error of `model`, and none counts as more. In the worlds `delay` the motors lag by one
-or two periods more than the controller knows, which keeps settings off the edge of stability.
+fails counts as `LOST` times the error of `model`, and none counts as more: one loss among 16 worlds costs as much as
+15 % of the error in all of them. In two of the eight kinds of worlds the motors lag by one period more than the
+controller knows, in one of them with a light robot; that keeps settings off the edge of stability. With two periods
+more the shipped `rls` oscillates without a guard in `lab`, and a search does nothing but slow it down: that is the
+guard's task.
 
 **Search.** CMA-ES (Hansen 2016, arXiv:1604.00772) in the logarithm of the settings, from those that mrctl ships, on the
 same worlds in each generation. The shipped settings are a candidate too, so that what is found is never worse on these
@@ -28,7 +31,7 @@ import inspect
 import json as jsonlib
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,9 +59,11 @@ Bounds = dict[str, tuple[float, float]]
 SEARCHED: dict[str, Bounds] = {
     # The PID's design keeps its margins for the plant that these two assume.
     "none": {"pid.lag": (1e-3, 0.1), "pid.derivative_time": (1e-3, 0.1)},
+    # The bandwidth of what is measured of the disturbance, against noise and delay.
     "observer": {"observer.time_constant": (0.02, 1.0)},
     "indi": {"indi.time_constant": (0.005, 0.5)},
     "l1": {"l1.bandwidth": (1.0, 100.0), "l1.predictor": (0.5, 100.0)},
+    # How fast it learns, forgets, and from which feedback on.
     "fel": {"fel.step": (0.005, 0.5), "fel.leak": (1e-7, 1e-2), "fel.dead_zone": (0.003, 0.3)},
     # The share that moves at once, what is known at the start, and what is forgotten.
     "rls": {
@@ -75,10 +80,11 @@ SEARCHED: dict[str, Bounds] = {
         "composite.step": (1e-3, 0.3),
     },
 }  # fmt: skip
-"""Settings to search, with their bounds, by learner: those with which the answer to an error changes most."""
+"""Settings to search, with their bounds, by learner: those that set how fast and how far it follows an error. Sizes
+that change no dynamics (units, scales, bounds of weights) and filters that several laws share stay as they are."""
 METRICS = {"position_rmse": 0.5, "v_rmse": 0.25, "omega_rmse": 0.25}  # with their weights in the objective
 FLOORS = 1e-4, 5e-5, 1e-4  # m, m/s, rad/s: changes of the errors in these worlds when the physics step is halved
-LOST = 100.0
+LOST = 10.0
 PERIOD, LAPS = 12.0, 2  # s; of the splines, which all robots of a batch share
 SPREAD = 0.2  # standard deviation of the first generation, as a share of the logarithmic range
 FRESH = TUNING + 50_000  # first seed of the worlds that the search does not see
@@ -86,7 +92,7 @@ NOISY = {"encoder_counts": 0.5, "gyro_noise": 4.0, "fix_position_noise": 2.0, "f
 KINDS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
     "as built": lambda r: {},
     "heavy": lambda r: {"perturbation": {"mass_factor": r.uniform(1.25, 1.75)}},
-    "light": lambda r: {"perturbation": {"mass_factor": r.uniform(0.5, 0.8)}},
+    "light, late": lambda r: {"perturbation": {"mass_factor": r.uniform(0.5, 0.8), "control_delay": 0.01}},
     "weak supply": lambda r: {"perturbation": {"supply_factor": r.uniform(0.75, 0.95)}},
     "several things": lambda r: {
         "perturbation": {
@@ -100,7 +106,7 @@ KINDS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
         }}],
     },
     "noise": lambda r: {"sensing": NOISY},
-    "delay": lambda r: {"perturbation": {"control_delay": 0.01 * int(r.integers(1, 3))}},
+    "late": lambda r: {"perturbation": {"control_delay": 0.01}},
 }  # fmt: skip
 """What is wrong with a plant, as fields of a scenario; the values of `sensing` are factors on those of the tier."""
 
@@ -229,7 +235,7 @@ def world(tier: Tier, seed: int) -> Scenario:
     base = {
         "name": kind,
         "laps": LAPS,
-        "reference": _course(random),
+        "reference": _course(seed),
         "initial_spread": (0, 0, 0),
         "guard": {"on": False},
     }
@@ -237,9 +243,10 @@ def world(tier: Tier, seed: int) -> Scenario:
     return replicates(scenario, 1, seed)[0]
 
 
-def _course(random: np.random.Generator) -> Waypoints:
+@cache
+def _course(seed: int) -> Waypoints:
     """A random spline with the margins of the suite's, slowed down to the lap time."""
-    robot = read_robot(mjcf.load())
+    random, robot = np.random.default_rng([seed, 8]), read_robot(mjcf.load())
     careful = robot.model_copy(update={"tyre_friction": GRIP / MARGIN})
     while (course := random_spline(random, careful, MARGIN, MARGIN)).period > PERIOD:
         pass

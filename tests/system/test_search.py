@@ -88,17 +88,17 @@ def test_worlds():
         assert search.world(tier, seeds[3]) == seen[3]
     lab = {s.name: s for s in search.worlds("lab", Budget(8, 1, 4, 0)).seen}
     assert lab["noise"].sensing["gyro_noise"] == pytest.approx(4 * lab["as built"].sensing["gyro_noise"])
-    assert lab["delay"].perturbation.control_delay in (0.01, 0.02)
+    assert [lab[kind].perturbation.control_delay for kind in ("light, late", "late")] == [0.01, 0.01]
     (payload,) = lab["payload at half time"].events
-    assert payload.time == pytest.approx(lab["delay"].duration / 2) and payload.perturbation.payload > 1
+    assert payload.time == pytest.approx(lab["late"].duration / 2) and payload.perturbation.payload > 1
 
 
 def test_score_by_hand():
-    """The weighted logarithm of the ratios with their floors; a run that failed, or nearly, counts as a hundred."""
+    """The weighted logarithm of the ratios with their floors; a run that failed, or nearly, counts as ten."""
     errors = np.array([[2e-3, 3e-3, 4e-3], [1e-3, 1e-3, 1e-3], [np.nan] * 3, [1e3, 1e-3, 1e-3]])
     yardstick = np.array([[1e-3, 6e-3, 4e-3], [1e-3, 1e-3, 1e-3], [1e-3] * 3, [1e-3] * 3])
     first = 0.5 * log(2.1e-3 / 1.1e-3) + 0.25 * log(3.05e-3 / 6.05e-3)
-    expected = [first, 0.0, log(100), 0.5 * log(100)]
+    expected = [first, 0.0, log(10), 0.5 * log(10)]
     assert search.score(errors, yardstick) == pytest.approx(expected)
 
 
