@@ -128,7 +128,7 @@ def test_same_twice_and_resumed(tmp_path, brief):
 def test_known_optimum_of_a_user(monkeypatch, tmp_path, brief, file):
     """The best gain on the inverse dynamics of a robot as built is one; a slow PID shows it."""
     monkeypatch.setattr(search, "KINDS", {"as built": lambda r: {"pid": {"time_constant": 0.3}}})
-    search.search(f"{file}:Scaled", ("ideal",), tmp_path / "out", True, Budget(2, 6, 4, 1))
+    search.search(f"{file}:Scaled", ("ideal",), tmp_path / "out", True, Budget(1, 5, 4, 1))
     tier = json.loads((tmp_path / "out" / "table.json").read_text())["tiers"]["ideal"]
     assert tier["found"]["Scaled.gain"] == pytest.approx(1.0, abs=0.06)
     assert exp(tier["objective"]["found"]) < 0.5 * exp(tier["objective"]["shipped"])
