@@ -60,11 +60,11 @@ SEARCHED: dict[str, Bounds] = {
     # The PID's design keeps its margins for the plant that these two assume.
     "none": {"pid.lag": (1e-3, 0.1), "pid.derivative_time": (1e-3, 0.1)},
     # The bandwidth of what is measured of the disturbance, against noise and delay.
-    "observer": {"observer.time_constant": (0.02, 1.0)},
+    "observer": {"observer.time_constant": (0.02, 5.0)},
     "indi": {"indi.time_constant": (0.005, 0.5)},
     "l1": {"l1.bandwidth": (1.0, 100.0), "l1.predictor": (0.5, 100.0)},
     # How fast it learns, forgets, and from which feedback on.
-    "fel": {"fel.step": (0.005, 0.5), "fel.leak": (1e-7, 1e-2), "fel.dead_zone": (0.003, 0.3)},
+    "fel": {"fel.step": (0.001, 0.5), "fel.leak": (1e-7, 1e-2), "fel.dead_zone": (0.003, 0.3)},
     # The share that moves at once, what is known at the start, and what is forgotten.
     "rls": {
         "rls.step": (0.001, 0.2), "rls.initial_covariance": (2e-3, 20.0), "rls.drift": (1e-7, 1e-2),
