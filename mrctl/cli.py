@@ -24,7 +24,7 @@ from pydantic import ValidationError
 from mrctl import __version__
 from mrctl.record import InputError, Record, describe
 from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario
-from mrctl.sensing.tiers import Sensing
+from mrctl.sensing.tiers import TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, RobotFile
 
@@ -32,6 +32,7 @@ FIRST = ("name", "world", "steering", "reference", "laps", "prior", "learner", "
 """Fields of `Scenario` that `mrctl run --help` explains; it lists the others, which `mrctl run --help-all` explains."""
 
 LAB = Sensing(tier="lab")
+DELAYS = 0.0, 0.01, 0.02  # s
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -357,13 +358,17 @@ def tune(
     steering: tuple[str, ...] = (),
     chassis: str = "",
     world: str = "flat",
-    delay: tuple[float, ...] = (0.0, 0.01, 0.02),
+    delay: tuple[float, ...] = DELAYS,
     lag: float = 0.0,
     time_constant: float | None = None,
+    search: str | None = None,
+    tier: tuple[Tier, ...] = TIERS,
     out: Path | None = None,
     json: bool = False,
 ) -> None:
     """Designs the velocity PID and the motion controller, measures the loops, and says where learning is safe.
+
+    With --search, finds settings of a feedforward instead, by driving; the same command resumes after an interrupt.
 
     Args:
         robot: Robot to design for: `car`, `turtlebot`, `racecar`, or an MJCF file; by default the world's own.
@@ -374,12 +379,24 @@ def tune(
         delay: Delays of the loop in s beside the sample and hold, each a multiple of the control period.
         lag: Time constant in s of the measured velocities behind the true ones that the design assumes.
         time_constant: Time constant of the closed loop in s, for the IMC rule in place of the design.
-        out: Folder for the table, the measured responses and a figure of them.
+        search: Feedforward whose settings to search, such as model+rls, or none for the PID, or one of your own, such
+            as my_file.py:MyController, whose class says search = {"gain": (0.01, 1.0)}.
+        tier: Sensing tiers to search in, each for itself.
+        out: Folder for the table, and the measured responses and their figure or, by default under search, the runs.
         json: Print JSON instead of a table.
     """
     from mrctl.experiments import tuning
+    from mrctl.experiments.search import search as find
     from mrctl.physics.mjcf import load_robot
 
+    if search is not None:
+        given = robot, wheels, steering, chassis, world, delay, lag, time_constant
+        if given != (CAR.path, (), (), "", "flat", DELAYS, 0.0, None):
+            raise InputError(
+                "search: it drives the default car in worlds of its own; the flags of the design do not apply"
+            )
+        print(find(search, tier, out, json))
+        return
     file = (
         CAR
         if (robot, wheels, steering, chassis) == (CAR.path, (), (), "")

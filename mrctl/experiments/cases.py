@@ -147,7 +147,7 @@ def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
             Event(time=2 * third * SHORT, perturbation=Perturbation()),
         )
         add("step", f"{name}, on and off", third + 1, 2 * third + 1, laps=3 * third, events=events)
-    carried = Event(time=third * SHORT, learning=False, reference=_slowed(LOOP, SHORT))
+    carried = Event(time=third * SHORT, learning=False, reference=slowed(LOOP, SHORT))
     for name in ("all",) if quick else FLOOR:
         case = {"laps": third + 2, "events": (carried,), "perturbation": PERTURBATIONS[name]}
         add("learning", f"{name}, frozen on another course", third + 1, **case)
@@ -253,10 +253,10 @@ def _spline(random: np.random.Generator, robot: Robot) -> Waypoints:
         course = random_spline(random, careful, MARGIN, MARGIN)
         slower = int(random.integers(2))
         if times := [time for time in LAP_TIMES if time >= course.period]:
-            return _slowed(course, times[min(slower, len(times) - 1)])
+            return slowed(course, times[min(slower, len(times) - 1)])
 
 
-def _slowed(course: Waypoints, period: float) -> Waypoints:
+def slowed(course: Waypoints, period: float) -> Waypoints:
     """The same course in a longer lap time in s, with velocities in one proportion, accelerations in its square."""
 
     def at(share: float) -> Waypoints:

@@ -104,7 +104,7 @@ def by_name(feedforwards: Sequence[str], controllers: Sequence[str]) -> dict[str
     """
     choices: dict[str, dict[str, Any]] = {name: {"feedforward": name} for name in feedforwards}
     for stages in controllers:
-        name = "+".join(part.attribute for part in user_files.parts(stages))
+        name = "+".join(part.title for part in user_files.parts(stages))
         if name in choices:
             raise InputError(f"controller: the name {name} is taken")
         choices[name] = {"controller": user_files.absolute(stages)}

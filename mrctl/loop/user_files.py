@@ -1,15 +1,18 @@
 """A user's own stages, named by their files: `my_file.py:MyController`, `motion=my_file.py:PurePursuit`.
 
-A name stands for a factory as `simulate` takes it; a name without a stage in front is a feedforward. Several names are
-joined by commas. Loading runs the files.
+A name stands for a factory as `simulate` takes it; a name without a stage in front is a feedforward. Keyword arguments
+of the factory may follow, as in `my_file.py:MyController(gain=0.3)`. Several names are joined by commas. Loading a name
+runs its files.
 """
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib.util
+import re
 import sys
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +28,14 @@ class Part(NamedTuple):
     stage: str
     path: Path
     attribute: str
+    settings: dict[str, Any]
+    """Keyword arguments of the factory."""
+
+    @property
+    def title(self) -> str:
+        """The attribute, with its settings as in a call."""
+        settings = ", ".join(f"{name}={value!r}" for name, value in self.settings.items())
+        return f"{self.attribute}({settings})" if settings else self.attribute
 
 
 def parts(name: str) -> list[Part]:
@@ -34,11 +45,12 @@ def parts(name: str) -> list[Part]:
         InputError: The name is not of the form above, names an unknown stage or one twice, or a file is missing.
     """
     found: list[Part] = []
-    for part in name.split(","):
-        before, separator, place = part.partition("=")
-        stage, place = (before, place) if separator else ("feedforward", part)
-        file, _, attribute = place.rpartition(":")
-        if not file.endswith(".py") or not attribute.isidentifier():
+    for part in re.split(r",(?![^(]*\))", name):
+        place, _, call = part.rpartition(":")
+        before, separator, file = place.partition("=")
+        stage, file = (before, file) if separator else ("feedforward", place)
+        attribute, settings = _called(call)
+        if not file.endswith(".py") or not attribute:
             raise InputError(f"controller: {part!r} is not of the form my_file.py:MyController")
         if stage not in METHODS:
             raise InputError(f"controller: {stage!r} is no stage; there are {', '.join(METHODS)}")
@@ -46,13 +58,26 @@ def parts(name: str) -> list[Part]:
             raise InputError(f"controller: {stage} is there twice")
         if not Path(file).is_file():
             raise InputError(f"controller: no file {file}")
-        found.append(Part(stage, Path(file).absolute(), attribute))
+        found.append(Part(stage, Path(file).absolute(), attribute, settings))
     return found
+
+
+def _called(call: str) -> tuple[str, dict[str, Any]]:
+    """Splits `MyController(gain=0.3)` into name and keyword arguments; the name is "" where it is something else."""
+    try:
+        tree = ast.parse(call.strip(), mode="eval").body
+        if isinstance(tree, ast.Name):
+            return tree.id, {}
+        if isinstance(tree, ast.Call) and isinstance(tree.func, ast.Name) and not tree.args:
+            return tree.func.id, {word.arg or "**": ast.literal_eval(word.value) for word in tree.keywords}
+    except (SyntaxError, ValueError):
+        pass
+    return "", {}
 
 
 def absolute(name: str) -> str:
     """Returns the name with absolute paths; it is the same for every spelling of the same controller."""
-    return ",".join(f"{part.stage}={part.path}:{part.attribute}" for part in parts(name)).removeprefix("feedforward=")
+    return ",".join(f"{part.stage}={part.path}:{part.title}" for part in parts(name)).removeprefix("feedforward=")
 
 
 def digest(name: str) -> str:
@@ -90,7 +115,11 @@ def _factory(part: Part) -> Any:  # noqa: ANN401
         sys.path.remove(str(path.parent))
     if not callable(getattr(module, attribute, None)):
         raise InputError(f"controller: {path.name} has no {attribute} that can be called with a robot and a size")
-    return getattr(module, attribute)
+    factory = getattr(module, attribute)
+    if part.settings:
+        factory = partial(factory, **part.settings)
+        factory.__name__ = part.title  # type: ignore[attr-defined] (the name in labels and messages)
+    return factory
 
 
 def trial(name: str, scenario: Scenario) -> None:

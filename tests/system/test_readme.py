@@ -50,6 +50,7 @@ ELSEWHERE = {
     r"mrctl suite --controller \S*": (
         "tests/system/test_suite.py::test_controller_joins", "mrctl.experiments.suite.suite",
     ),
+    r"mrctl tune --search .*": ("tests/system/test_search.py::test_command", "mrctl.experiments.search.search"),
     r"mrctl train .*": ("tests/system/test_train.py::test_command", "mrctl.experiments.train.train"),
     r"mrctl bench": ("tests/benchmarks/test_bench.py::test_command", "mrctl.experiments.bench.run"),
     r"mrctl view( (?!--export)\S+)*": ("tests/system/test_viewer_server.py::test_command", "mrctl.viewer.view.view"),

@@ -1,0 +1,445 @@
+"""`mrctl tune --search`: settings of any controller, found with the same budget, worlds and objective for all.
+
+**Worlds.** A world is a random spline, driven twice, and a plant with one thing wrong: see `KINDS`. Its draws, like
+those of `replicates`, have seeds from `cases.TUNING_SEEDS`, which neither the suite nor the held-out set has. The robot
+starts on the reference, as a random offset would hide the first seconds of learning. The guard is off: it would hide
+that a setting makes the loop oscillate, and settings must do without it.
+
+**Objective.** With the errors e of a run over all its laps, and those of the feedforward `model` in the same world,
+
+    J = mean over worlds of ½ log(e/e_model of position) + ¼ log(… of V) + ¼ log(… of θ̇)
+
+exp J is a weighted geometric mean of ratios. A mean of logarithms gives every world and every metric its weight,
+whatever its size; in a mean of errors the hardest world would decide alone. Position counts as much as both velocities:
+it is what a user sees, and the velocities are what a learner acts on. All laps count, so that a setting pays for
+learning slowly. To each error the floor of the integrator is added, below which a difference means nothing. A run that
+fails counts as `LOST` times the error of `model`, and none counts as more: one loss among 16 worlds costs as much as
+15 % of the error in all of them. In two of the eight kinds of worlds the motors lag by one period more than the
+controller knows, in one of them with a light robot, which keeps settings off the edge of stability. More would tell
+nothing about settings: with half the mass and one period, `model` itself nearly oscillates in `lab`, and with two
+periods nothing is left to a search but to slow the learner down. That is the guard's task.
+
+**Search.** CMA-ES (Hansen 2016, arXiv:1604.00772) in the logarithm of the settings, from those that mrctl ships, on the
+same worlds in each generation. The shipped settings are a candidate too, so that what is found is never worse on these
+worlds. Whether it is better elsewhere is measured in fresh ones.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json as jsonlib
+import sys
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from cmaes import CMA
+from tqdm import tqdm
+
+from mrctl.control.stages import Stages
+from mrctl.experiments.cases import GRIP, MARGIN, TUNING_SEEDS, slowed
+from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder
+from mrctl.kernel import Array
+from mrctl.loop import user_files
+from mrctl.loop.simulation import Simulation, run
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
+from mrctl.record import InputError
+from mrctl.results import metrics
+from mrctl.results.comparison import paired_ratio
+from mrctl.results.dataset import versions
+from mrctl.scenario import FEEDFORWARDS, Scenario, replicates
+from mrctl.sensing.tiers import Sensing, Tier
+from mrctl.theory.references import Waypoints, random_spline
+
+Bounds = dict[str, tuple[float, float]]
+SEARCHED: dict[str, Bounds] = {
+    # The PID's design keeps its margins for the plant that these two assume.
+    "none": {"pid.lag": (1e-3, 0.1), "pid.derivative_time": (1e-3, 0.1)},
+    # The bandwidth of what is measured of the disturbance, against noise and delay.
+    "observer": {"observer.time_constant": (0.02, 5.0)},
+    "indi": {"indi.time_constant": (0.005, 0.5)},
+    "l1": {"l1.bandwidth": (1.0, 100.0), "l1.predictor": (0.5, 100.0)},
+    # How fast it learns, forgets, and from which feedback on.
+    "fel": {"fel.step": (0.001, 0.5), "fel.leak": (1e-7, 1e-2), "fel.dead_zone": (0.003, 0.3)},
+    # The share that moves at once, what is known at the start, and what is forgotten.
+    "rls": {
+        "rls.step": (0.001, 0.2), "rls.initial_covariance": (2e-3, 20.0), "rls.drift": (1e-7, 1e-2),
+        "rls.covariance_bound": (2e-3, 20.0),
+    },
+    # Trust in the prediction error, memory, spread of plants, and weight of the tracking error.
+    "mrac": {
+        "mrac.noise": (1e-3, 0.5), "mrac.memory": (1.0, 1000.0), "mrac.spread": (0.1, 30.0),
+        "mrac.tracking": (0.05, 100.0),
+    },
+    "composite": {
+        "composite.noise": (0.02, 2.0), "composite.memory": (10.0, 1e5), "composite.disturbance": (0.01, 2.0),
+        "composite.step": (1e-3, 0.3),
+    },
+}  # fmt: skip
+"""Settings to search, with their bounds, by learner: those that set how fast and how far it follows an error. Sizes
+that change no dynamics (units, scales, bounds of weights) and filters that several laws share stay as they are."""
+METRICS = {"position_rmse": 0.5, "v_rmse": 0.25, "omega_rmse": 0.25}  # with their weights in the objective
+FLOORS = 1e-4, 5e-5, 1e-4  # m, m/s, rad/s: changes of the errors in these worlds when the physics step is halved
+LOST = 10.0
+PERIOD, LAPS = 12.0, 2  # s; of the splines, which all robots of a batch share
+SPREAD = 0.2  # standard deviation of the first generation, as a share of the logarithmic range
+TUNING = TUNING_SEEDS.start  # first seed of the worlds that the search sees
+FRESH = TUNING + 50_000  # and of those that the search does not see
+NOISY = {"encoder_counts": 0.5, "gyro_noise": 4.0, "fix_position_noise": 2.0, "fix_heading_noise": 2.0}  # factors
+KINDS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
+    "as built": lambda r: {},
+    "heavy": lambda r: {"perturbation": {"mass_factor": r.uniform(1.25, 1.75)}},
+    "light, late": lambda r: {"perturbation": {"mass_factor": r.uniform(0.7, 0.9), "control_delay": 0.01}},
+    "weak supply": lambda r: {"perturbation": {"supply_factor": r.uniform(0.75, 0.95)}},
+    "several things": lambda r: {
+        "perturbation": {
+            "mass_factor": r.uniform(1.2, 1.6), "drive_friction_factor": r.uniform(2, 4),
+            "resistance_factor": r.uniform(1.1, 1.4), "supply_factor": r.uniform(0.75, 0.95),
+        },
+    },
+    "payload at half time": lambda r: {
+        "events": [{"time": PERIOD * LAPS / 2, "perturbation": {
+            "payload": r.uniform(2, 6), "payload_x": r.uniform(-0.1, 0.3), "payload_y": r.uniform(-0.1, 0.1),
+        }}],
+    },
+    "noise": lambda r: {"sensing": NOISY},
+    "late": lambda r: {"perturbation": {"control_delay": 0.01}},
+}  # fmt: skip
+"""What is wrong with a plant, as fields of a scenario; the values of `sensing` are factors on those of the tier."""
+
+
+class Budget(NamedTuple):
+    """Effort of a search."""
+
+    worlds: int = 2 * len(KINDS)
+    generations: int = 15
+    population: int = 8
+    fresh: int = 4 * len(KINDS)
+    """Number of worlds that the search does not see."""
+
+
+BUDGET = Budget()
+"""The same for every controller: 2 to 3 minutes for a tier on two cores."""
+
+
+class Entry(NamedTuple):
+    """A controller with settings to search."""
+
+    name: str
+    """One of `FEEDFORWARDS`, or the absolute name of the user's; see `mrctl.loop.user_files`."""
+    bounds: Bounds
+    shipped: dict[str, float]
+    """Values that the search begins with."""
+
+    def tried(self, settings: dict[str, float], worlds: Sequence[Scenario]) -> tuple[list[Scenario], Stages]:
+        """Returns the worlds with these settings, and the factories of the user's stages."""
+        if self.name in FEEDFORWARDS:
+            update: dict[str, Any] = dict(FEEDFORWARDS[self.name])
+            for field, value in settings.items():
+                record, name = field.split(".")
+                update[record] = update.get(record, getattr(Scenario(), record)).model_copy(update={name: value})
+            return [world.model_copy(update=update) for world in worlds], {}
+        stages: Any = dict(user_files.load(self.name))
+        for part in user_files.parts(self.name):
+            own = {name: settings[f"{part.attribute}.{name}"] for name in _declared(stages[part.stage])}
+            stages[part.stage] = partial(stages[part.stage], **own)
+        return [world.model_copy(update=FEEDFORWARDS["none"]) for world in worlds], stages
+
+    def flags(self, settings: dict[str, float]) -> str:
+        """The flags of `mrctl run` with these settings, to four digits."""
+        if self.name in FEEDFORWARDS:
+            chosen = [f"{name} {value}" for name, value in FEEDFORWARDS[self.name].items()]
+            chosen += [f"{field.replace('_', '-')} {value:.4g}" for field, value in settings.items()]
+            return " ".join(f"--{flag}" for flag in chosen)
+        parts = []
+        for part in user_files.parts(self.name):
+            own = {f.split(".")[1]: float(f"{v:.4g}") for f, v in settings.items() if f.split(".")[0] == part.attribute}
+            parts.append(f"{part.stage}={part.path}:{part._replace(settings=part.settings | own).title}")
+        return f"--controller '{','.join(parts)}'"
+
+    @property
+    def title(self) -> str:
+        """Name for tables and folders."""
+        return self.name if self.name in FEEDFORWARDS else "+".join(p.title for p in user_files.parts(self.name))
+
+
+def entry(name: str) -> Entry:
+    """The controller of a name: one of `FEEDFORWARDS`, or the user's as `my_file.py:MyController`.
+
+    A user's class says what may be searched, `search = {"gain": (0.01, 1.0)}`: names of keyword arguments of its
+    constructor, whose defaults are the start, with their bounds.
+
+    Raises:
+        InputError: There is no such controller, or it says nothing, or nothing sensible, about what may be searched.
+    """
+    if name in FEEDFORWARDS and (name == "none" or FEEDFORWARDS[name]["learner"] != "none"):
+        bounds = SEARCHED[FEEDFORWARDS[name]["learner"]]
+        fields = (field.split(".") for field in bounds)
+        return Entry(name, bounds, {f"{r}.{n}": getattr(getattr(Scenario(), r), n) for r, n in fields})
+    if ":" not in name:
+        known = ", ".join(n for n, pair in FEEDFORWARDS.items() if n == "none" or pair["learner"] != "none")
+        raise InputError(f"search: {name!r} has no settings; there are {known}, and my_file.py:MyController")
+    name = user_files.absolute(name)
+    user_files.trial(name, Scenario(laps=1, **FEEDFORWARDS["none"]))
+    stages: Any = user_files.load(name)
+    bounds: Bounds = {}
+    shipped: dict[str, float] = {}
+    for part in user_files.parts(name):
+        arguments = inspect.signature(stages[part.stage]).parameters
+        for setting, limits in _declared(stages[part.stage]).items():
+            field = f"{part.attribute}.{setting}"
+            try:
+                low, start, high = (float(value) for value in (limits[0], arguments[setting].default, limits[1]))
+            except (KeyError, IndexError, TypeError, ValueError):
+                low = start = high = np.nan
+            if not 0 < low <= start <= high < np.inf or low == high:
+                raise InputError(
+                    f"search: {field}: needs bounds 0 < low < high, and a keyword argument with a default between them"
+                )
+            bounds[field], shipped[field] = (low, high), start
+    if not bounds:
+        raise InputError('search: no class says what may be searched, as in search = {"gain": (0.01, 1.0)}')
+    return Entry(name, bounds, shipped)
+
+
+def _declared(factory: Any) -> dict[str, Any]:  # noqa: ANN401
+    """What a user's class says may be searched."""
+    return dict(getattr(getattr(factory, "func", factory), "search", {}))
+
+
+class Worlds(NamedTuple):
+    """The worlds of a tier."""
+
+    seen: Sequence[Scenario]
+    """Those of the search."""
+    fresh: Sequence[Scenario]
+    """Those in which its result is measured."""
+
+
+def worlds(tier: Tier, budget: Budget) -> Worlds:
+    """The worlds of a tier; each is a pure function of tier and seed."""
+    first = {TUNING: budget.worlds, FRESH: budget.fresh}
+    return Worlds(*([world(tier, seed) for seed in range(start, start + count)] for start, count in first.items()))
+
+
+def world(tier: Tier, seed: int) -> Scenario:
+    """The world of a seed: its kind follows from the seed, everything else is drawn with it."""
+    random = np.random.default_rng([seed, 7])
+    kind = list(KINDS)[seed % len(KINDS)]
+    fields = KINDS[kind](random)
+    own = Sensing(tier=tier)
+    sensing = {name: own[name] * factor for name, factor in fields.get("sensing", {}).items()}
+    base = {
+        "name": kind,
+        "laps": LAPS,
+        "reference": _course(seed),
+        "initial_spread": (0, 0, 0),
+        "guard": {"on": False},
+    }
+    scenario = Scenario.from_dict(base | fields | {"sensing": {"tier": tier} | sensing}, kind)
+    return replicates(scenario, 1, seed)[0]
+
+
+@cache
+def _course(seed: int) -> Waypoints:
+    """A random spline with the margins of the suite's, slowed down to the lap time."""
+    random, robot = np.random.default_rng([seed, 8]), read_robot(mjcf.load())
+    careful = robot.model_copy(update={"tyre_friction": GRIP / MARGIN})
+    while (course := random_spline(random, careful, MARGIN, MARGIN)).period > PERIOD:
+        pass
+    return slowed(course, PERIOD)
+
+
+def score(errors: Array, yardstick: Array) -> Array:
+    """Weighted logarithm of the ratio to `model` in each world, `(worlds,)`, whose mean is the objective.
+
+    Args:
+        errors: Errors by world and metric of `METRICS`, `(worlds, 3)`; NaN where the run failed.
+        yardstick: Those of `model`, `(worlds, 3)`.
+    """
+    ratio = np.nan_to_num((errors + FLOORS) / (yardstick + np.array(FLOORS)), nan=LOST, posinf=LOST)
+    return np.log(np.minimum(ratio, LOST)) @ np.array(list(METRICS.values()))
+
+
+class Memory:
+    """What has been driven already: a file with a line for each setting in each set of worlds."""
+
+    def __init__(self, file: Path, head: dict[str, Any], threads: int = 0) -> None:
+        """Opens the file of a search or begins it.
+
+        Args:
+            file: The file; a line that was not finished is dropped.
+            head: What the search depends on, its first line.
+            threads: Number of threads; 0 for all cores.
+
+        Raises:
+            InputError: The file belongs to another search.
+        """
+        self._file, self._threads = file, threads
+        begun = file.read_text() if file.exists() else ""
+        lines = [jsonlib.loads(line) for line in begun[: begun.rfind("\n") + 1].splitlines()]
+        head = jsonlib.loads(jsonlib.dumps(head))
+        if lines and lines[0] != head:
+            other = next((name for name in head if lines[0].get(name) != head[name]), "it")
+            raise InputError(f"out: {file} holds another search ({other} differs); choose another folder")
+        lines = lines or [head]
+        file.write_text("".join(jsonlib.dumps(line) + "\n" for line in lines))
+        self._known = {_key(line): np.array(line["errors"]) for line in lines[1:]}
+
+    def drive(self, entry: Entry, settings: Sequence[dict[str, float]], among: Sequence[Scenario]) -> list[Array]:
+        """Returns the errors of each of the settings in the worlds, `(worlds, 3)`, which are driven if need be."""
+        lines = [{"entry": entry.title, "settings": one, "first": among[0].seed} for one in settings]
+        missing = {_key(line): line for line in lines if _key(line) not in self._known}
+        simulations = []
+        for line in missing.values():
+            runs, stages = entry.tried(line["settings"], among)
+            simulations.append(Simulation(runs, threads=1, **stages))
+        if simulations:
+            run(simulations, threads=self._threads)
+        for (key, line), simulation in zip(missing.items(), simulations, strict=True):
+            laps = metrics.per_lap(simulation.result())
+            self._known[key] = np.stack([metrics.over_laps(laps, name).values for name in METRICS], axis=-1)
+            with self._file.open("a") as file:
+                file.write(jsonlib.dumps(line | {"errors": self._known[key].tolist()}) + "\n")
+        return [self._known[_key(line)] for line in lines]
+
+
+def _key(line: dict[str, Any]) -> str:
+    return jsonlib.dumps([line["entry"], line["settings"], line["first"]])
+
+
+def search(
+    name: str, tiers: Sequence[Tier], out: Path | None, json: bool, budget: Budget = BUDGET, threads: int = 0
+) -> str:
+    """The command: searches settings for each tier, and drives all that were found in fresh worlds of each tier.
+
+    Args:
+        name: The controller, as for `entry`.
+        tiers: Sensing tiers.
+        out: Folder for `table.json` and what was driven; by default `search/NAME`. The same command continues there.
+        json: Whether to return JSON instead of a table.
+        budget: Effort of the search.
+        threads: Number of threads, which changes no bit; 0 for all cores.
+
+    Raises:
+        InputError: The controller is bad, or the folder cannot be written or holds another search.
+    """
+    searched = entry(name)
+    out = output_folder(out or Path("search") / searched.title)
+    table: dict[str, Any] = {"versions": versions(), "machine": machine(), "entry": searched.title}
+    table |= {"bounds": searched.bounds, "shipped": searched.shipped, "budget": budget._asdict(), "tiers": {}}
+    drawn = {tier: worlds(tier, budget) for tier in tiers}
+    heads = {tier: _head(searched, drawn[tier], budget) for tier in tiers}
+    memories = {tier: Memory(out / f"{tier}.jsonl", heads[tier], threads) for tier in tiers}
+    found = {tier: find(searched, tier, memories[tier], drawn[tier].seen, budget) for tier in tiers}
+    candidates = {"shipped": searched.shipped} | {tier: one["found"] for tier, one in found.items()}
+    for tier, one in found.items():
+        fresh = compare(searched, candidates, memories[tier], drawn[tier].fresh)
+        table["tiers"][tier] = one | {"fresh": fresh, "flags": searched.flags(one["found"])}
+    (out / "table.json").write_text(json_text(table) + "\n")
+    return json_text(table) if json else text(table)
+
+
+def _head(searched: Entry, drawn: Worlds, budget: Budget) -> dict[str, Any]:
+    """What the errors depend on beside the settings, and the proposals on beside the errors."""
+    own = {} if searched.name in FEEDFORWARDS else {"file": user_files.digest(searched.name)}
+    written = "".join(world.model_dump_json() for world in (*drawn.seen, *drawn.fresh))
+    digest = hashlib.sha256(written.encode()).hexdigest()
+    settings = {"bounds": searched.bounds, "shipped": searched.shipped}
+    return {"entry": searched.name, **own, "versions": versions(), **settings, "drawn": digest, **budget._asdict()}
+
+
+def find(searched: Entry, tier: Tier, memory: Memory, among: Sequence[Scenario], budget: Budget) -> dict[str, Any]:
+    """Searches in the worlds of one tier.
+
+    Returns:
+        The settings `found`, the `objective` of these and of the `shipped` ones, and the `origin` in words.
+    """
+    (yardstick,) = memory.drive(Entry("model", {}, {}), [{}], among)
+    limits = np.array(list(searched.bounds.values()))
+    low, span = limits[:, 0], np.log(limits[:, 1] / limits[:, 0])
+    start = np.log(np.clip(list(searched.shipped.values()), limits[:, 0], limits[:, 1]) / low) / span
+    unit = np.tile([0.0, 1.0], (len(low), 1))
+    optimiser = CMA(start, SPREAD, unit, seed=TUNING, population_size=budget.population)
+    tried: list[tuple[float, dict[str, float]]] = []
+
+    def judge(settings: list[dict[str, float]]) -> list[float]:
+        found = [float(score(errors, yardstick).mean()) for errors in memory.drive(searched, settings, among)]
+        tried.extend(zip(found, settings, strict=True))
+        return found
+
+    with tqdm(total=1 + budget.generations * budget.population, unit="setting", desc=tier, file=sys.stderr) as bar:
+        judge([searched.shipped])
+        bar.update()
+        for _ in range(budget.generations):
+            points = [optimiser.ask() for _ in range(budget.population)]
+            values = [np.clip(low * np.exp(span * x), *limits.T).tolist() for x in points]
+            values = judge([dict(zip(searched.bounds, one, strict=True)) for one in values])
+            optimiser.tell(list(zip(points, values, strict=True)))
+            bar.update(budget.population)
+            bar.set_postfix(error=f"{np.exp(min(tried, key=_value)[0]):.4f} of model's")
+    best, found = min(tried, key=_value)  # the first one of several
+    origin = f"mrctl {versions()['mrctl']}, tune --search {searched.title}, {tier}: best of {len(tried)} settings "
+    origin += f"in {budget.worlds} worlds with seeds from {TUNING}"
+    return {"found": found, "objective": {"shipped": tried[0][0], "found": best}, "origin": origin}
+
+
+def _value(tried: tuple[float, dict[str, float]]) -> float:
+    return tried[0]
+
+
+def compare(
+    searched: Entry, candidates: dict[str, dict[str, float]], memory: Memory, among: Sequence[Scenario]
+) -> dict[str, Any]:
+    """Drives settings in fresh worlds.
+
+    Returns:
+        For each of the settings `to_model`, exp J; `to_shipped`, the same relative to the shipped settings, with its
+        95 % interval; and the number of runs that `failed`.
+    """
+    (yardstick,) = memory.drive(Entry("model", {}, {}), [{}], among)
+    errors = dict(zip(candidates, memory.drive(searched, list(candidates.values()), among), strict=True))
+    scores = {name: np.exp(score(one, yardstick)) for name, one in errors.items()}
+    return {
+        name: {
+            "to_model": float(np.exp(np.log(one).mean())),
+            "to_shipped": paired_ratio(one, scores["shipped"])._asdict(),
+            "failed": int(np.isnan(errors[name]).any(axis=1).sum()),
+        }
+        for name, one in scores.items()
+    }
+
+
+def text(table: dict[str, Any]) -> str:
+    """The settings and what they are worth, as text."""
+    tiers = table["tiers"]
+    settings = [
+        [name, number(shipped), *(number(tiers[tier]["found"][name]) for tier in tiers)]
+        for name, shipped in table["shipped"].items()
+    ]
+    trained = [
+        [tier, *(number(np.exp(found["objective"][which])) for which in ("shipped", "found"))]
+        for tier, found in tiers.items()
+    ]
+    fresh = []
+    for tier, found in tiers.items():
+        for name, one in found["fresh"].items():
+            ratio = one["to_shipped"]
+            fresh.append([tier, name if name == "shipped" else f"found in {name}", number(one["to_model"])])
+            fresh[-1].append(f"{number(ratio['value'])} [{number(ratio['low'])}, {number(ratio['high'])}]")
+            fresh[-1].append(f"{one['failed']}/{table['budget']['fresh']}")
+    found = [f"found in {tier}" for tier in tiers]
+    parts = [
+        f"{table['entry']}: {1 + table['budget']['generations'] * table['budget']['population']} settings a tier.",
+        markdown(["setting", "shipped", *found], settings),
+        f"Error over that of `model`, in the {table['budget']['worlds']} worlds of the search:",
+        markdown(["tier", "shipped", "found"], trained),
+        f"The same in {table['budget']['fresh']} fresh worlds, with 95 % intervals:",
+        markdown(["tier", "settings", "over model", "over shipped", "failed"], fresh),
+        "\n".join(f"mrctl run --sensing.tier {tier} {found['flags']}" for tier, found in tiers.items()),
+    ]
+    return "\n\n".join(parts)

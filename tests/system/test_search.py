@@ -1,0 +1,192 @@
+"""`mrctl tune --search`: the same result twice, whatever interrupts it, and the optimum where it is known."""
+
+import json
+from math import exp, log
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mrctl
+from mrctl import cli
+from mrctl.experiments import cases, search
+from mrctl.experiments.search import Budget
+from mrctl.loop import user_files
+from mrctl.scenario import FEEDFORWARDS, Scenario
+from mrctl.sensing.tiers import TIERS
+
+TINY = Budget(worlds=1, generations=2, population=4, fresh=1)
+SCALED = """
+from mrctl.control.feedforward import Prior
+
+class Scaled:
+    '''The nominal inverse dynamics times a gain.'''
+
+    search = {"gain": (0.3, 10.0)}
+
+    def __init__(self, robot, size, gain=0.4):
+        self.gain, self.model = gain, Prior([robot] * size, False)
+
+    def output(self, command, derivative):
+        return self.gain * self.model.output(command, derivative)
+
+    def learn(self, feedback, saturated, twist, voltage):
+        pass
+
+class Plain(Scaled):
+    search = {}
+
+class Wrong(Scaled):
+    search = {"gain": (0.5, 5.0)}
+
+class Missing(Scaled):
+    search = {"bias": (0.5, 5.0)}
+"""
+
+
+@pytest.fixture
+def brief(monkeypatch):
+    """Worlds of one lap."""
+    monkeypatch.setattr(search, "LAPS", 1)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    file = tmp_path / "mine.py"
+    file.write_text(SCALED)
+    return file
+
+
+def test_fields():
+    """Every learner has 1 to 4 settings that its record has; the bounds are valid there and hold what is shipped."""
+    assert set(search.SEARCHED) == {pair["learner"] for pair in FEEDFORWARDS.values()}
+    for name, pair in FEEDFORWARDS.items():
+        if name in ("model", "true_model"):
+            continue
+        entry = search.entry(name)
+        assert 1 <= len(entry.bounds) <= 4
+        for field, (low, high) in entry.bounds.items():
+            record, setting = field.split(".")
+            assert record == ("pid" if name == "none" else pair["learner"])
+            # Zero has no logarithm, so that the search begins at the lower bound.
+            assert low <= entry.shipped[field] <= high or entry.shipped[field] == 0 < low < high
+            for value in (low, high):
+                tried = Scenario.from_dict({**pair, record: {setting: value}})
+                (made,), stages = entry.tried(entry.shipped | {field: value}, [Scenario()])
+                assert made == tried and not stages
+
+
+def test_worlds():
+    """The draws are of the seeds of tuning, the same again, different from each other, and in the tier."""
+    for tier in TIERS:
+        seen, fresh = search.worlds(tier, Budget(8, 1, 4, 8))
+        seeds = [s.seed for s in (*seen, *fresh)]
+        assert len(set(seeds)) == 16 and set(seeds) <= set(cases.TUNING_SEEDS)
+        assert [s.name for s in seen] == [s.name for s in fresh] == list(search.KINDS)
+        assert len({s.reference for s in (*seen, *fresh)}) == 16
+        assert {s.sensing.tier for s in seen} == {tier} and not any(s.guard.on for s in seen)
+        assert search.world(tier, seeds[3]) == seen[3]
+    lab = {s.name: s for s in search.worlds("lab", Budget(8, 1, 4, 0)).seen}
+    assert lab["noise"].sensing["gyro_noise"] == pytest.approx(4 * lab["as built"].sensing["gyro_noise"])
+    assert [lab[kind].perturbation.control_delay for kind in ("light, late", "late")] == [0.01, 0.01]
+    (payload,) = lab["payload at half time"].events
+    assert payload.time == pytest.approx(lab["late"].duration / 2) and payload.perturbation.payload > 1
+
+
+def test_score_by_hand():
+    """The weighted logarithm of the ratios with their floors; a run that failed, or nearly, counts as ten."""
+    errors = np.array([[2e-3, 3e-3, 4e-3], [1e-3, 1e-3, 1e-3], [np.nan] * 3, [1e3, 1e-3, 1e-3]])
+    yardstick = np.array([[1e-3, 6e-3, 4e-3], [1e-3, 1e-3, 1e-3], [1e-3] * 3, [1e-3] * 3])
+    first = 0.5 * log(2.1e-3 / 1.1e-3) + 0.25 * log(3.05e-3 / 6.05e-3)
+    expected = [first, 0.0, log(10), 0.5 * log(10)]
+    assert search.score(errors, yardstick) == pytest.approx(expected)
+
+
+def test_same_twice_and_resumed(tmp_path, brief):
+    """The same table and the same bytes on other threads, and after an interrupt in the middle of a line."""
+    once, twice, torn = (tmp_path / name for name in ("once", "twice", "torn"))
+    first = search.search("model+rls", ("lab",), once, True, TINY, threads=1)
+    assert search.search("model+rls", ("lab",), twice, True, TINY, threads=2) == first
+    driven = (once / "lab.jsonl").read_bytes()
+    assert (twice / "lab.jsonl").read_bytes() == driven
+    lines = driven.decode().splitlines(keepends=True)
+    torn.mkdir()
+    (torn / "lab.jsonl").write_text("".join(lines[:6]) + lines[6][:40])
+    assert search.search("model+rls", ("lab",), torn, True, TINY) == first
+    assert (torn / "lab.jsonl").read_bytes() == driven
+    # The shipped setting is among those tried, and the best of them is what was found.
+    table = json.loads(first)
+    objective = table["tiers"]["lab"]["objective"]
+    assert len(lines) == 1 + (1 + 1 + 8) + (1 + 2)  # head; model and 9 settings; three in fresh worlds
+    assert objective["found"] <= objective["shipped"]
+    found = table["tiers"]["lab"]["fresh"]
+    assert found["lab"]["to_shipped"]["value"] == pytest.approx(found["lab"]["to_model"] / found["shipped"]["to_model"])
+    with pytest.raises(mrctl.InputError, match="holds another search .entry differs"):
+        search.search("model+fel", ("lab",), once, True, TINY)
+
+
+def test_known_optimum_of_a_user(monkeypatch, tmp_path, brief, file):
+    """The best gain on the inverse dynamics of a robot as built is one; a slow PID shows it."""
+    monkeypatch.setattr(search, "KINDS", {"as built": lambda r: {"pid": {"time_constant": 0.3}}})
+    search.search(f"{file}:Scaled", ("ideal",), tmp_path / "out", True, Budget(1, 5, 4, 1))
+    tier = json.loads((tmp_path / "out" / "table.json").read_text())["tiers"]["ideal"]
+    assert tier["found"]["Scaled.gain"] == pytest.approx(1.0, abs=0.06)
+    assert exp(tier["objective"]["found"]) < 0.5 * exp(tier["objective"]["shipped"])
+
+
+def test_settings_of_a_user(file, tmp_path):
+    """A name with settings is the class with these arguments, in labels, digests and every spelling."""
+    name = f"{file}:Scaled(gain=0.5)"
+    (part,) = user_files.parts(name)
+    assert part.settings == {"gain": 0.5} and part.title == "Scaled(gain=0.5)"
+    assert user_files.absolute(f"feedforward={file}:Scaled( gain = 0.5 )") == name
+    both = user_files.parts(f"{file}:Scaled(gain=0.5, more=2),steering={file}:Plain")
+    assert [(p.stage, p.attribute, p.settings) for p in both] == [
+        ("feedforward", "Scaled", {"gain": 0.5, "more": 2}), ("steering", "Plain", {}),
+    ]  # fmt: skip
+    circle = mrctl.Circle(radius=0.5, period=5.0)
+    one = mrctl.Scenario(laps=1, reference=circle, prior="none", learner="none")
+    runs = [mrctl.simulate([one], **user_files.load(f"{file}:Scaled{text}")) for text in ("(gain=0.4)", "", "(gain=1)")]
+    voltage = [run["feedforward_left"].values[0, 5:9] for run in runs]
+    assert np.array_equal(voltage[0], voltage[1]) and voltage[2] == pytest.approx(voltage[1] / 0.4, rel=0.2)
+    assert runs[0]["label"].values[0] == "Scaled(gain=0.4)"
+    for text in ("Scaled(0.4)", "Scaled(gain=)", "Scaled(gain=open)", "Scaled[0]"):
+        with pytest.raises(mrctl.InputError, match="is not of the form"):
+            user_files.parts(f"{file}:{text}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["model"], "search: 'model' has no settings; there are none, model+observer"),
+        (["magic"], "search: 'magic' has no settings"),
+        (["mine.py:Plain"], "search: no class says what may be searched"),
+        (["mine.py:Wrong"], "search: Wrong.gain: needs bounds"),
+        (["mine.py:Missing"], "search: Missing.bias: needs bounds"),
+        (["mine.py:Other"], "controller: mine.py has no Other"),
+        (["mine.py:Scaled(gian=1)"], "gian"),
+        (["fel", "--delay", "0.01"], "flags of the design"),
+        (["fel", "--tier", "moon"], "--tier"),
+        (["fel", "--out", "mine.py"], "mine.py"),
+    ],
+)
+def test_refused(arguments, says, monkeypatch, capsys, file, tmp_path):
+    """Bad input is one line that says what is wrong, before anything is driven."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(search.Memory, "drive", None)
+    assert cli.main(["tune", "--search", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and says in error, error
+
+
+def test_command(monkeypatch, capsys, brief, file, tmp_path):
+    """The command prints the settings, what they are worth on fresh draws, and how to use those of a user."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(search, "search", lambda *a, given=search.search: given(*a, Budget(1, 1, 4, 1)))
+    assert cli.main(["tune", "--search", "mine.py:Scaled", "--tier", "lab", "ideal"]) == 0
+    out = capsys.readouterr().out
+    assert "| Scaled.gain | 0.400 " in out and "found in ideal" in out
+    table = json.loads(Path("search/Scaled/table.json").read_text())
+    assert list(table["tiers"]) == ["lab", "ideal"] and "seeds from 100000" in table["tiers"]["lab"]["origin"]
+    best = table["tiers"]["lab"]["found"]["Scaled.gain"]
+    assert f"mine.py:Scaled(gain={best:.4g})" in out
