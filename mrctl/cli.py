@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json as jsonlib
+import os
 import re
 import sys
 import textwrap
@@ -51,7 +52,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"mrctl {__version__}")
         return 0
     try:
-        _parse(_written_out(arguments))()
+        try:
+            _parse(_written_out(arguments))()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # the reader of a pipe, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except InputError as error:
         print(f"mrctl: {error}", file=sys.stderr)
         return 2

@@ -108,7 +108,7 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
     offered = mjcf.steerings(mjcf.load(world, mjcf.arrangement(robot), robot=robot))
     for steering in offered:
         _, nominal = mjcf.build(world, steering, robot=robot)
-        pids = [Pid.from_dict(pid.model_dump() | {"delay": delay}) for delay in delays]
+        pids = [pid.replace(delay=delay) for delay in delays]
         common = {"world": world, "robot": robot.model_dump(), "steering": steering, "sensing": {"tier": "ideal"}}
         scenarios = [
             Scenario.from_dict(

@@ -117,7 +117,7 @@ class Perturbation(Record):
         """
         changed = {name: getattr(self, name) * (1 + random.uniform(-w, w)) for name, w in UNKNOWN.items()}
         changed["slope"] = self.slope + random.uniform(-UNKNOWN_SLOPE, UNKNOWN_SLOPE)
-        return Perturbation.from_dict(self.model_dump() | changed)
+        return self.replace(**changed)
 
     def of_driver(self, driver: Driver) -> Driver:
         """Returns the perturbed driver: dead zones and resistances add; the lower limit and number of steps hold."""

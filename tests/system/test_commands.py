@@ -202,6 +202,20 @@ def test_bad_flags_are_one_line(arguments: list[str], says: str, capsys: pytest.
     assert says in refused(capsys, *arguments)
 
 
+@pytest.mark.parametrize("arguments", [["run", "--help"], ["tune", "--search", "nothing"]])
+def test_reader_of_a_pipe_that_leaves(arguments: list[str]) -> None:
+    """A pipe that nobody reads any more, as after `mrctl run --help | head`, is no error, and hides none."""
+    command = [sys.executable, "-m", "mrctl.cli", *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout and process.stderr
+    process.stdout.close()
+    said = process.stderr.read()
+    if "--help" in arguments:
+        assert (process.wait(), said) == (0, "")
+    else:
+        assert process.wait() == 2 and said.startswith("mrctl: search: 'nothing' has no settings")
+
+
 def test_perturbation_by_name(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """On the command line and in a file; later flags override it. The value of a flag is no scenario file."""
     flags = ["--perturbation", "all", "--perturbation.mass-factor", "1", "--name", "x.toml", "--json"]
