@@ -107,7 +107,6 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
         "suite": suite,
         "tune": tune,
         "identify": identify,
-        "train": train,
         "check": check,
         "bench": bench,
         "view": view,
@@ -432,21 +431,6 @@ def identify(
     from mrctl.experiments import identify as identification
 
     print(identification.run(world, robot, perturbation, sensing, seed, json))
-
-
-def train(out: Path = Path("composite.safetensors"), plants: int = 120, seed: int = 0) -> None:
-    """Trains the features of the learner `composite` on randomised plants, in less than five minutes.
-
-    `mrctl run --composite.weights FILE` uses them; by default a run uses the features that come with mrctl.
-
-    Args:
-        out: File for the trained features and their prior.
-        plants: Number of randomised plants to train on; a third as many more are held out for validation.
-        seed: Seed of the plants, the references and the initial network.
-    """
-    from mrctl.experiments import train as training
-
-    print(training.train(out, plants, seed))
 
 
 def check(

@@ -1,6 +1,6 @@
-"""Composite adaptation: features whose weights follow prediction errors and tracking errors.
+"""Composite adaptation: weights of physical features follow prediction errors and tracking errors.
 
-    U = φ(x)ᵀ a + d,      φ = 8 physical features, gravity on a slope, 16 tanh units,      a(0) = 0, d(0) = 0
+    U = φ(x)ᵀ a + d,      φ = 8 features of the inverse dynamics, cosine and sine of the heading,    a(0) = 0, d(0) = 0
 
 A Kalman filter (`predict`) estimates the weights a and the disturbance d from the voltage that acted and the motion
 that followed, both low-passed; the tracking term (`track`) moves a by a share of the feedback voltage e:
@@ -8,24 +8,20 @@ that followed, both low-passed; the tracking term (`track`) moves a by a share o
     U_f = prior(x_f) + φ(x_f)ᵀ a + d + noise,      x_f = (V_f, V̇_f)
     a ← a + P φ(x_c) · step · e / (φ(x_c)ᵀ P φ(x_c)),      x_c = commanded motion
 
-Slotine and Li (1989) combine the two errors; Neural-Fly (O'Connell et al. 2022) and MAGIC-VFM (Lupu et al. 2024) use
-them to adapt only the last layer of a network that was trained off-line on many plants.
+Slotine and Li (1989) combine the two errors; Neural-Fly (O'Connell et al. 2022) and MAGIC-VFM (Lupu et al. 2024) do so
+with a Kalman filter. The weights of cosine and sine of the heading are gravity on a slope of any direction.
 
 Voltage and motion pass the same two first-order filters. V̇_f is the input of the second filter less its output, over
 its time constant, so that nothing is differentiated. With only one filter, V̇_f would contain the noise of V unfiltered,
 and noise on a regressor biases its weight toward zero.
 
-The weights are modelled as an Ornstein-Uhlenbeck process whose stationary covariance P₀ is the scatter of the weights
-over the plants of the training. P₀ tells the filter in what plants differ, and without excitation P returns to P₀ and
-does not grow further. d is modelled in the same way with a short memory; it takes up what is no function of the motion,
-such as a push. The noise of the measured motion is estimated from its second differences, which inertia keeps small;
-the larger the noise, the less a sample counts. The heading in the slope features is dead reckoning; its origin does not
-matter.
+The weights are modelled as an Ornstein-Uhlenbeck process, whose stationary covariance P₀ (`stationary`) says by how
+much plants differ; without excitation P returns to P₀ and does not grow further. d is modelled in the same way with a
+short memory; it takes up what is no function of the motion, such as a push, and what the weights have not explained
+yet. The noise of the measured motion is estimated from its second differences, which inertia keeps small; the larger
+the noise, the less a sample counts. The heading is dead reckoning; its origin does not matter.
 
-When the innovations of one channel grow suddenly, the plant has changed. The weights of the former plant are stored,
-and P of both channels is reset. Two former plants are stored and go on predicting (multiple models, Narendra and
-Balakrishnan, 1997): when one of them predicts well again within seconds, its weights and covariance are restored. If
-the measurement is noisy, a former plant cannot be told from the noise, and the plant is learned anew.
+When the innovations of one channel grow suddenly, the plant has changed, and P of both channels is reset.
 
 Under `rigid` steering the second channel works in the same way: the rotation that is commanded to the steering takes
 the place of the voltage, its nominal inverse is the rotation itself, and U is the correction of the command.
@@ -39,14 +35,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import FEATURES, INPUTS, PHYSICAL, feature_scale, features
+from mrctl.control.features import INPUTS, feature_scale, features
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, explained
-from mrctl.control.weights import SHIPPED, load_training
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
+from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
 CHANNELS = 2
+FEATURES = INPUTS + 2  # the eight of the inverse dynamics, and gravity on a slope
 STEERING_DISTURBANCE = 0.03  # rad/s of disturbance per volt; it is smaller, since the geometry needs no motor
 OUTLIER = 3.0  # standard deviations at which an innovation is clipped: a tyre slips, or a wheel lost its load
 SLOW = 0.1  # m/s of the faster wheel; below it the voltage depends on stiction, not on the motion
@@ -56,21 +53,23 @@ NOTHING = 1e-9  # V² or (rad/s)²; features whose φᵀ P φ is smaller explain
 # V of noise in a sample for each m/s of noise in the measured wheel speed; tuned with sensor noise of 10 mm/s and
 # 20 mrad/s behind filters of 0.03 s, at a control period of 10 ms.
 SCATTER = 300.0
-UNKNOWN = 6.0  # V, standard deviation of the weight of a physical feature without a model
+UNKNOWN = 6.0  # V, standard deviation of the weights of the eight features without a model
 SETTLED = 6.0  # time constants until the two filters have forgotten their initial state
-LEARNED = 12.0  # s of learning after which a plant is stored, and during which a former one is sought
-LOOK = 2.0  # s over which the prediction error of former plants is averaged, and the least time of averaging
-BACK = 0.2  # mean square prediction error, in variances of a sample, below which a former plant is back
-FORMER = 2  # number of former plants that are stored
 SIGNALS = 6  # filtered signals: voltage of the two channels, twist, cosine and sine of the heading
 
 
 class Composite(Record):
     """Settings of the learner `composite`; one setting serves every robot, steering and perturbation."""
 
+    moved = {"weights": "features are no longer trained; save_learned and `learned` keep what a run has adapted"}
+
     noise: Annotated[float, Field(gt=0, le=100)] = 0.2
     """Standard deviation of one sample of the regression in V, if the motion is measured without noise; the noise that
     the measured motion shows is added. On a steering channel it is a tenth of this number in rad/s."""
+    gain: Annotated[float, Field(ge=0, le=100)] = 0.3
+    """Standard deviation over plants of a factor on the whole model, as from supply, motor constant or resistance."""
+    spread: Annotated[float, Field(ge=0, le=1e3)] = 1.0
+    """Standard deviation of each weight over plants in V; on a steering channel a tenth of this number in rad/s."""
     memory: Annotated[float, Field(ge=1, le=1e6)] = 1000.0
     """Correlation time of the weights in s, in which they wander by as much as plants differ."""
     disturbance: Annotated[float, Field(ge=0, le=100)] = 0.15
@@ -83,22 +82,19 @@ class Composite(Record):
     """Share of the feedback that the tracking term moves into the feedforward in each control period."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
     """Feedback in V below which the tracking term is zero; on a steering channel, a tenth of this number in rad/s."""
-    weights: str | None = None
-    """File that `mrctl train` wrote; by default the one that comes with the package."""
 
 
 COMPOSITE = np.dtype(
     [
         # Settings, for the two channels; the second is in rad/s where it is steering.
         ("f", "f8", (CHANNELS, FEATURES + 1)),  # diagonal of F: decay of a and, last, of d in a period
-        ("drift", "f8", CHANNELS),  # variance that d gains in a period, V²
-        ("disturbance", "f8", CHANNELS),  # standard deviation of d, V
+        ("prior", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)),  # P₀, V²
         ("step", "f8", CHANNELS),  # share of the feedback that the tracking term moves into the feedforward
         ("dead_zone", "f8", CHANNELS),  # feedback below which the tracking term is zero, V
         ("noise", "f8", CHANNELS),  # standard deviation of a sample, V
         ("scatter", "f8", CHANNELS),  # further noise of a sample for each m/s or rad/s of noise in the twist, V
         ("brief", "f8"),  # weight of a new sample in the brief mean square of the innovations
-        ("lasting", "f8"),  # weight of a new sample in the lasting mean square
+        ("lasting", "f8"),  # weight of a new sample in the lasting mean square, and in the variance of the twist
         ("filter", "f8"),  # weight of a new sample in the two filters
         # Motion
         ("age", "f8"),  # time since the start in time constants of the filters
@@ -109,7 +105,6 @@ COMPOSITE = np.dtype(
         ("last", "f8", (2, CHANNELS)),  # the last two measured twists, m/s and rad/s
         ("variance", "f8", CHANNELS),  # variance of the noise of the measured twist, (m/s)² and (rad/s)²
         ("rate", "f8", CHANNELS),  # filtered acceleration, m/s² and rad/s²
-        ("x", "f8", PHYSICAL),  # physical features at the filtered motion, or at the command
         ("phi", "f8", FEATURES + 1),  # (φ, 1) at the filtered motion
         ("phi_c", "f8", FEATURES + 1),  # (φ, 1) at the command
         ("residual", "f8", CHANNELS),  # filtered voltage less the prior's, V
@@ -118,39 +113,27 @@ COMPOSITE = np.dtype(
         ("P", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)),  # their covariance, V²
         ("Pphi", "f8", FEATURES + 1),  # P φ
         ("power", "f8", (CHANNELS, 2)),  # brief and lasting mean square of the innovations, V²
+        ("since", "f8"),  # time since the plant was found to have changed, s
         ("norm", "f8"),  # ‖a‖ of both channels, V
-        # Former plants
-        ("learned", "f8"),  # how long the present plant has been learned, s
-        ("place", "i8"),  # where it will be stored
-        ("restored", "?"),  # whether the present plant is a former one
-        ("stored", "i8", FORMER),  # 1 where a place holds a plant
-        ("former_a", "f8", (FORMER, CHANNELS, FEATURES + 1)),  # a and d of the stored plants, V
-        ("former_P", "f8", (FORMER, CHANNELS, FEATURES + 1, FEATURES + 1)),  # their covariance, V²
-        ("misfit", "f8", FORMER),  # mean square prediction error of a stored plant, in variances of a sample
     ],
     align=True,
 )
 
 
 @kernel
-def basis(x: Array, units: Array, phi: Array) -> None:
-    """The features φ = (x, tanh(W x₁…₈ + b)), followed by a one for the disturbance.
+def regressor(twist: Array, rate: Array, heading: Array, half_track: float, scale: Array, phi: Array) -> None:
+    """The ten features φ of a motion, followed by a one for the disturbance.
 
     Args:
-        x: The 8 scaled features, and cosine and sine of the heading, `(10,)`.
-        units: W and b side by side, `(16, 9)`.
-        phi: Out: φ and 1, `(27,)`.
+        twist: V in m/s and θ̇ in rad/s, `(2,)`.
+        rate: V̇ in m/s² and θ̈ in rad/s², `(2,)`.
+        heading: Cosine and sine of the heading, `(2,)`.
+        half_track: D in m.
+        scale: Scales of the first eight features, as from `feature_scale`, `(8,)`.
+        phi: Out: φ and 1, `(11,)`.
     """
-    for i in range(PHYSICAL):
-        phi[i] = x[i]
-    for j in range(units.shape[0]):
-        z = units[j, INPUTS]
-        for i in range(INPUTS):
-            z += units[j, i] * x[i]
-        phi[PHYSICAL + j] = z
-    for j in range(PHYSICAL, FEATURES):
-        phi[j] = 1 - 2 / (np.exp(2 * phi[j]) + 1)  # tanh, in half the time of the library's
-    phi[FEATURES] = 1.0
+    features(twist, rate, half_track, scale, phi[:INPUTS])
+    phi[INPUTS], phi[INPUTS + 1], phi[FEATURES] = heading[0], heading[1], 1.0
 
 
 @kernel
@@ -165,7 +148,7 @@ def times(P: Array, phi: Array, out: Array) -> None:
 
 
 @kernel
-def predict(k: int, prior: Array, s: Row) -> None:
+def predict(k: int, s: Row) -> None:
     """One Kalman step of channel k for residual = φᵀ a + d + noise; below, a stands for (a, d) and φ for (φ, 1).
 
         S = φᵀ P φ + r,    e = residual − φᵀ a,    K = P φ / S
@@ -176,7 +159,6 @@ def predict(k: int, prior: Array, s: Row) -> None:
 
     Args:
         k: Channel.
-        prior: P₀ of a, with a row and a column of zeros for d, whose Q is `s.drift`, `(27, 27)`.
         s: In and out: a record of `COMPOSITE`.
     """
     a, P, f, Pphi = s.a[k], s.P[k], s.f[k], s.Pphi
@@ -193,8 +175,7 @@ def predict(k: int, prior: Array, s: Row) -> None:
     for i in range(FEATURES + 1):
         a[i] = f[i] * (a[i] + Pphi[i] * e)
         for j in range(FEATURES + 1):
-            P[i, j] = f[i] * f[j] * (P[i, j] - Pphi[i] * Pphi[j] / S) + (1 - f[i] * f[j]) * prior[i, j]
-    P[FEATURES, FEATURES] += s.drift[k]
+            P[i, j] = f[i] * f[j] * (P[i, j] - Pphi[i] * Pphi[j] / S) + (1 - f[i] * f[j]) * s.prior[k, i, j]
 
 
 @kernel
@@ -225,18 +206,30 @@ def track(k: int, feedback: float, s: Row) -> None:
 
 
 @kernel
-def reset_covariance(k: int, prior: Array, s: Row) -> None:
+def reset_covariance(k: int, s: Row) -> None:
     """P ← P₀ + a aᵀ after a change of the plant; the weights stay.
 
     This is covariance resetting (Goodwin and Sin, 1984). The second term is the step of the weights back to zero, in
     case the plant returns to the nominal one.
     """
-    a, P = s.a[k], s.P[k]
+    s.P[k] = s.prior[k]
     for i in range(FEATURES):
-        P[i, FEATURES] = P[FEATURES, i] = 0.0
         for j in range(FEATURES):
-            P[i, j] = prior[i, j] + a[i] * a[j]
-    P[FEATURES, FEATURES] = s.disturbance[k] * s.disturbance[k]
+            s.P[k, i, j] += s.a[k, i] * s.a[k, j]
+
+
+@kernel
+def detect_change(period: float, s: Row) -> None:
+    """Resets the covariance where the plant has changed, and again when the filters have forgotten the former plant."""
+    settled, before = SETTLED * period * (1 / s.filter - 1), s.since
+    s.since += period
+    if s.power[0, 0] > CHANGE * s.power[0, 1] or s.power[1, 0] > CHANGE * s.power[1, 1]:
+        for k in range(CHANNELS):
+            s.power[k, 1] = max(s.power[k, 0], s.power[k, 1])
+        before = s.since = 0.0
+    if s.since == 0.0 or before < settled <= s.since:
+        for k in range(CHANNELS):
+            reset_covariance(k, s)
 
 
 @kernel
@@ -246,49 +239,6 @@ def learned_voltage(a: Array, phi: Array) -> float:
     for i in range(FEATURES):
         total += a[i] * phi[i]
     return total
-
-
-@kernel
-def detect_change(period: float, priors: Array, s: Row) -> None:
-    """Resets the covariance where the plant has changed, and restores what was learned of a former plant."""
-    settled, before = SETTLED * period * (1 / s.filter - 1), s.learned
-    s.learned += period
-    changed = s.power[0, 0] > CHANGE * s.power[0, 1] or s.power[1, 0] > CHANGE * s.power[1, 1]
-    if changed:
-        for k in range(CHANNELS):
-            s.power[k, 1] = max(s.power[k, 0], s.power[k, 1])
-        if s.learned > LEARNED:
-            s.former_a[s.place], s.former_P[s.place], s.stored[s.place] = s.a, s.P, 1
-        if s.learned > LEARNED or s.restored:
-            s.place = 1 - s.place
-        s.learned, s.restored = 0.0, False
-    if changed or before < settled <= s.learned:  # once more, when the filters have forgotten the former plant
-        for k in range(CHANNELS):
-            reset_covariance(k, priors[k], s)
-        for j in range(FORMER):
-            s.misfit[j] = 0.0
-    elif not s.restored and s.stored[0] + s.stored[1] > 0 and settled < s.learned < settled + LEARNED:
-        seek_former(period, settled, s)
-
-
-@kernel
-def seek_former(period: float, settled: float, s: Row) -> None:
-    """Predicts with the former plants, and restores one whose prediction error is within the noise of a sample."""
-    for j in range(FORMER):
-        misfit = 0.0
-        for k in range(CHANNELS):
-            misfit += ((s.residual[k] - learned_voltage(s.former_a[j, k], s.phi)) / s.noise[k]) ** 2
-        s.misfit[j] += period / (period + LOOK) * (misfit - s.misfit[j])
-    j = 1 if s.stored[1] > 0 and (s.stored[0] == 0 or s.misfit[1] < s.misfit[0]) else 0
-    if not (s.stored[j] > 0 and s.misfit[j] < BACK and s.learned > settled + LOOK):
-        return
-    s.place, s.restored = j, True
-    s.a[:], s.P[:] = s.former_a[j], s.former_P[j]
-    for k in range(CHANNELS):
-        s.a[k, FEATURES] = 0.0
-        for i in range(FEATURES):
-            s.P[k, FEATURES, i] = s.P[k, i, FEATURES] = 0.0
-        s.P[k, FEATURES, FEATURES] = s.disturbance[k] ** 2
 
 
 @kernel
@@ -323,11 +273,9 @@ def filter_motion(command: Array, twist: Array, voltage: Array, period: float, r
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
     """U = φ(x_c)ᵀ a + d at the commanded motion x_c."""
-    rows, scale, units, _ = arrays
+    rows, scale = arrays
     s = rows[i]
-    features(command, derivative, robot.half_track, scale, s.x)
-    s.x[8], s.x[9] = np.cos(s.heading), np.sin(s.heading)
-    basis(s.x, units, s.phi_c)
+    regressor(command, derivative, s.signals[4:], robot.half_track, scale, s.phi_c)
     for k in range(CHANNELS):
         voltage[k] = learned_voltage(s.a[k], s.phi_c) + s.a[k, FEATURES]
 
@@ -341,22 +289,20 @@ def learn(
 
     `added` leaves the disturbance out, so that the PID's integral keeps its part of it, as with `observer`.
     """
-    rows, scale, units, priors = arrays
+    rows, scale = arrays
     s = rows[i]
     filter_motion(command, twist, voltage, period, robot, s)
     added[0] = added[1] = 0.0
     moves = abs(s.twice[2]) + robot.half_track * abs(s.twice[3]) > SLOW
     if moves and s.age > SETTLED and frozen == 0:
-        features(s.twice[2:4], s.rate, robot.half_track, scale, s.x)
-        s.x[8], s.x[9] = s.twice[4], s.twice[5]
-        basis(s.x, units, s.phi)
+        regressor(s.twice[2:4], s.rate, s.twice[4:], robot.half_track, scale, s.phi)
         explained(s.twice[2:4], s.rate, robot.rigid, prior, s.residual)
         for k in range(CHANNELS):
             s.residual[k] = s.twice[k] - s.residual[k]
             added[k] = learned_voltage(s.a[k], s.phi_c)
-            predict(k, priors[k], s)
+            predict(k, s)
             track(k, feedback[k], s)
-        detect_change(period, priors, s)
+        detect_change(period, s)
         for k in range(CHANNELS):
             added[k] = learned_voltage(s.a[k], s.phi_c) - added[k]
     else:
@@ -364,6 +310,34 @@ def learn(
             s.a[k, FEATURES] *= s.f[k, FEATURES]
     s.norm = np.sqrt((s.a[:, :FEATURES] ** 2).sum())
     return s.norm
+
+
+def stationary(settings: Composite, robot: Robot, rigid: bool, prior: bool) -> Array:
+    """P₀ of weights and disturbance, `(2, 11, 11)` in V²; c are the coefficients of the nominal inverse dynamics.
+
+        P₀ = gain² c cᵀ + spread² I
+
+    A supply, a motor constant or a resistance that is not as modelled changes all coefficients in one proportion, so
+    that a few samples tell much about all of them; the second term is for all else.
+
+    Args:
+        settings: The settings.
+        robot: The nominal robot.
+        rigid: Whether channel two is steering.
+        prior: Whether a model is the prior; otherwise the weights are as large as those of a model.
+    """
+    c, scale = np.zeros((CHANNELS, FEATURES)), feature_scale(robot)
+    c[:, :INPUTS] = inverse_coefficients(robot).T * scale
+    if rigid:
+        c[1], c[1, 1] = 0.0, scale[1]  # the rotation itself
+    P = np.zeros((CHANNELS, FEATURES + 1, FEATURES + 1))
+    unit = np.array([1.0, STEERING_SCALE if rigid else 1.0])
+    P[:, :FEATURES, :FEATURES] = settings.gain**2 * c[:, :, None] * c[:, None, :]
+    P[:, range(FEATURES), range(FEATURES)] += (settings.spread * unit[:, None]) ** 2
+    if not prior:  # the geometry of a steering channel is known in any case
+        P[: 1 if rigid else 2, range(INPUTS), range(INPUTS)] += UNKNOWN**2
+    P[:, FEATURES, FEATURES] = (settings.disturbance * np.array([1.0, STEERING_DISTURBANCE if rigid else 1.0])) ** 2
+    return P
 
 
 class CompositeAdaptation(Learner):
@@ -379,7 +353,7 @@ class CompositeAdaptation(Learner):
     weight_volts = 1.0
 
     def __init__(self, robot: Robot, settings: list[Composite], rigid: bool, period: float, prior: bool = True) -> None:
-        """Makes the learners; all robots use the weights file of the first.
+        """Makes the learners.
 
         Args:
             robot: The nominal robot.
@@ -387,32 +361,22 @@ class CompositeAdaptation(Learner):
             rigid: Whether channel two is steering.
             period: Control period in s.
             prior: Whether a model is the prior; otherwise P₀ allows weights as large as those of a model.
-
-        Raises:
-            InputError: The weights file is missing, broken or of another shape.
         """
         super().__init__(robot, len(settings), rigid, period)
-        training = load_training(settings[0].weights or SHIPPED)
-        self._priors = np.zeros((CHANNELS, FEATURES + 1, FEATURES + 1))
-        self._priors[:, :FEATURES, :FEATURES] = training.priors[[0, 2 if rigid else 1]]
-        if not prior:  # the geometry of a steering channel is known in any case
-            for P in self._priors[: 1 if rigid else 2]:
-                P[range(INPUTS), range(INPUTS)] += UNKNOWN**2
         scale = feature_scale(robot)
         self.rows = rows = np.zeros(len(settings), COMPOSITE)
         unit = np.array([1.0, STEERING_SCALE if rigid else 1.0])
         for row, s in zip(rows, settings, strict=True):
             memory, brief_memory = np.exp(-period / np.array([s.memory, s.disturbance_memory]))
             row["f"][:, :FEATURES], row["f"][:, FEATURES] = memory, brief_memory
-            row["disturbance"] = s.disturbance * np.array([1.0, STEERING_DISTURBANCE if rigid else 1.0])
-            row["drift"] = (1 - brief_memory * brief_memory) * row["disturbance"] * row["disturbance"]
+            row["prior"] = stationary(s, robot, rigid, prior)
             row["step"] = s.step * np.array([1.0, STEERING_SHARE if rigid else 1.0])
             row["dead_zone"] = s.dead_zone * unit
             row["noise"] = s.noise * unit
             row["scatter"] = SCATTER * unit * (1.0, robot.half_track)
             row["brief"], row["lasting"] = period / (period + BRIEF), period / (period + LASTING)
             row["filter"] = period / (period + s.filter)
-        self.arrays = rows, scale, training.units, self._priors
+        self.arrays = rows, scale
         self.restore(np.arange(len(settings)))
 
     @property
@@ -424,19 +388,16 @@ class CompositeAdaptation(Learner):
         """As `Learner.adopt`, without the slope and the disturbance: they belong to another place and moment."""
         super().adopt(row, learned)
         s = self.rows[row]
-        local = [*range(INPUTS, PHYSICAL), FEATURES]
+        local = [*range(INPUTS, FEATURES + 1)]
         s["a"][:, local] = 0.0
         s["P"][:, local, :] = s["P"][:, :, local] = 0.0
-        s["P"][:, local, local] = self._priors[:, local, local]
-        s["P"][:, FEATURES, FEATURES] = s["disturbance"] ** 2
+        s["P"][:, local, local] = s["prior"][:, local, local]
 
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Resets robots to their initial weights and covariance, without former plants."""
+        """Resets robots to their initial weights and covariance."""
         self.weight_norm[rows] = 0.0
         for i in rows:
             s = self.rows[i]
-            s["a"], s["norm"], s["stored"], s["restored"] = 0.0, 0.0, 0, False
-            s["P"] = self._priors
-            s["P"][:, FEATURES, FEATURES] = s["disturbance"] ** 2
+            s["a"], s["norm"], s["P"] = 0.0, 0.0, s["prior"]
             s["power"] = (s["noise"] ** 2 + s["scatter"] ** 2 * s["variance"])[:, None]
-            s["learned"] = SETTLED * self.period * (1 / s["filter"] - 1)
+            s["since"] = SETTLED * self.period * (1 / s["filter"] - 1)

@@ -11,9 +11,6 @@ from mrctl.theory.robot import Robot
 NAMES = ("V", "ω", "V̇", "ω̇", "Vω", "ω²", "sgn V_l", "sgn V_r")
 # Kernels are compiled with these sizes, so they stand in a file that holds one; see `mrctl.kernel`.
 INPUTS, OUTPUTS = 8, 2  # of the network of `fel`: the physical features, and channels
-UNITS = 16  # tanh units of `composite`
-PHYSICAL = INPUTS + 2  # its physical features: the eight, and gravity on a slope
-FEATURES = PHYSICAL + UNITS
 SIGN_SPEED = 0.05  # m/s over which the smooth sign function of the friction turns
 
 

@@ -1,19 +1,16 @@
-"""Files that learners start from: the weights of `fel`, and the training of `composite` by `mrctl train`."""
+"""Files of arrays that learners start from, such as the weights of `fel`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from mrctl import __version__
-from mrctl.control.features import FEATURES, INPUTS, OUTPUTS, UNITS
+from mrctl.control.features import INPUTS, OUTPUTS
 from mrctl.kernel import Array
 from mrctl.record import InputError
-
-SHIPPED = Path(__file__).with_name("composite.safetensors")
 
 
 def shapes(hidden: int) -> dict[str, tuple[int, ...]]:
@@ -79,38 +76,6 @@ def load_weights(path: str | Path, hidden: int) -> Array:
         InputError: The file is missing, broken, of another shape, or holds non-finite numbers.
     """
     return flatten(read_arrays(path, "fel.weights", shapes(hidden)))
-
-
-class Training(NamedTuple):
-    """The result of `mrctl train`.
-
-    Attributes:
-        units: Weights of the tanh units for the scaled features, and their bias in the last column, `(16, 9)`.
-        priors: Covariance P₀ of the weights of φ, in V² for the common and the differential channel and in (rad/s)² for
-            a steering channel, `(3, 26, 26)`.
-    """
-
-    units: Array
-    priors: Array
-
-
-def save_training(path: str | Path, training: Training, recipe: dict[str, str]) -> None:
-    """Writes a training as a safetensors file with its recipe as metadata.
-
-    Raises:
-        InputError: The file cannot be written.
-    """
-    write_arrays(path, training._asdict(), recipe)
-
-
-def load_training(path: str | Path = SHIPPED) -> Training:
-    """Reads a file that `mrctl train` wrote.
-
-    Raises:
-        InputError: The file is missing, broken, of another shape, or holds non-finite numbers.
-    """
-    expected = {"units": (UNITS, INPUTS + 1), "priors": (3, FEATURES, FEATURES)}
-    return Training(**read_arrays(path, "composite.weights", expected))
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, Array], metadata: dict[str, str] | None = None) -> None:

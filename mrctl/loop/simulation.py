@@ -154,10 +154,9 @@ def run(
 
 def group_of(s: Scenario) -> Hashable:
     """Returns what the runs of one simulation must share."""
-    net = s.fel.hidden, s.composite.weights
     rates = s.ticks, s.physics_step, s.control_period, s.motion_period
     chain = s.sensing.source, s.sensing.periods("delay", s.control_period)
-    return s.world, s.robot, s.steering, s.prior, s.learner, *rates, *net, *chain
+    return s.world, s.robot, s.steering, s.prior, s.learner, s.fel.hidden, *rates, *chain
 
 
 class Simulation:

@@ -10,7 +10,6 @@ import inspect
 import io
 import re
 import shlex
-import shutil
 import tomllib
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -51,12 +50,9 @@ ELSEWHERE = {
         "tests/system/test_suite.py::test_controller_joins", "mrctl.experiments.suite.suite",
     ),
     r"mrctl tune --search .*": ("tests/system/test_search.py::test_command", "mrctl.experiments.search.search"),
-    r"mrctl train .*": ("tests/system/test_train.py::test_command", "mrctl.experiments.train.train"),
     r"mrctl bench": ("tests/benchmarks/test_bench.py::test_command", "mrctl.experiments.bench.run"),
     r"mrctl view( (?!--export)\S+)*": ("tests/system/test_viewer_server.py::test_command", "mrctl.viewer.view.view"),
 }  # fmt: skip
-# What is the same as the output of a command above, and is there already.
-READY = {"features.safetensors": ROOT / "mrctl" / "control" / "composite.safetensors"}
 # One draw of each combination in place of hundreds.
 SMALLER = {"sweep.toml": ("runs = 500", "runs = 1")}
 
@@ -127,9 +123,7 @@ class Folder:
     def prepare(self, mentioned: list[str]) -> None:
         """Makes those of some paths that a command makes."""
         for made in dict.fromkeys(path.partition("/")[0] for path in mentioned):
-            if made in READY:
-                shutil.copy(READY[made], self.path / made)
-            elif made in self.makers:
+            if made in self.makers:
                 self.run(self.makers[made])
 
     def run(self, command: str) -> None:

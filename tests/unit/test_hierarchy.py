@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrctl.control.composite import CompositeAdaptation
+from mrctl.control.composite import FEATURES, CompositeAdaptation
 from mrctl.control.feedforward import NoLearner, Prior
 from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
@@ -64,7 +64,7 @@ def weights(hierarchy):
     """What a learner knows of its robots, `(B, …)`; a disturbance, which fades while nothing is learned, is no part."""
     stage = hierarchy.learner
     if isinstance(stage, CompositeAdaptation):
-        return stage.rows["a"][..., :26]
+        return stage.rows["a"][..., :FEATURES]
     return stage.rows["theta"] if isinstance(stage, RecursiveLeastSquares) else stage.weights
 
 
