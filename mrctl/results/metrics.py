@@ -244,7 +244,7 @@ def guard_events(result: xr.Dataset) -> pd.DataFrame:
         result: What `simulate` returns, or one run of it.
 
     Returns:
-        A row for each action: run, time in s, action (limit, freeze, fallback, or resume after the last two), and the
+        A row for each action: run, time in s, action (limit, fallback, or resume after a fallback), and the
         reason in words.
 
     Raises:
