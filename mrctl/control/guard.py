@@ -39,31 +39,19 @@ from pydantic import Field
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 
-GUARD_ACTIONS = ("none", "limit", "fallback")
-NONE, LIMIT, FALLBACK = range(3)
-REASONS = (
-    "",
-    "output beyond its share of the supply",
-    "output beyond its share of the supply for most of a second",
-    "weights beyond what the supply can mean",
-    "growing oscillation",
-    "far from the reference",
-    "velocity far from the command",
-    "output not finite",
-)
-_, CLIPPED, OVERDONE, WEIGHTS, OSCILLATION, FAR, FAST, BROKEN = range(8)
+GUARD_ACTIONS = ("none", "fallback")
+NONE, FALLBACK = range(2)
+REASONS = ("", "sustained oscillation", "far from the reference", "velocity far from the command", "output not finite")
+_, OSCILLATION, FAR, FAST, BROKEN = range(5)
 
-# An oscillation of the loop changes its sign at least once a second about its own slow mean. A step or a push is over
-# after one or two half-waves, and the motion of a lap is slower.
-SMOOTH, DRIFT = 0.01, 0.3  # s, time constants of the filters that remove noise and slow motion from a signal
+# The loops are designed with damping ratios of at least 0.5: after a push a half-wave has at most a sixth of the
+# amplitude of the one before it. Eight in a row are fed by something, and what a lap asks for is slower.
+SMOOTH, DRIFT = 0.01, 0.3  # s, time constants of the filters that remove noise and slow motion from the PID's output
 SLOWEST = 1.0  # s, longest half-wave
-SUSTAINED = 3  # half-waves above the threshold, the last not below the first
-LARGEST = 0.1  # share of the supply at which the baseline of an oscillation is clipped
-MEMORY = 10.0  # s over which the baselines are averaged
+SUSTAINED = 8  # half-waves in a row
 
 RECENT = 1.0  # s for which a deviation may be to blame for an error
 MEAN = 0.5  # s over which voltages are averaged before the integral takes them over; a few periods of an oscillation
-BUSY = 1.0  # s over which the limit is averaged
 RETURN = 5.0  # s in which a learner that resumes at full gain gets its authority back
 APART = 0.15  # m of posture error that are always tolerated; a run fails at 1 m
 ARM = 0.75  # m ahead of the robot at which a heading error counts as a position error
@@ -75,19 +63,13 @@ class Guard(Record):
     """Settings of the guard, the watchdog on every learner."""
 
     on: bool = True
-    """Whether the guard watches the learner, and may limit or replace it."""
-    share: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Largest share of the supply voltage by which the learner may deviate from the fallback on a wheel; on a steering
-    channel, of the largest rotation velocity."""
-    weights: Annotated[float, Field(gt=0, le=1e3)] = 2.5
-    """Largest norm of the weights, as a ratio: the voltage that they give for features of size one, over the supply."""
+    """Whether the guard watches the learner, and may replace it."""
     velocity: Annotated[float, Field(gt=0, le=10)] = 0.28
     """Largest errors of V and θ̇, as a share of the robot's largest ones, with which a learner may go on."""
-    oscillation: Annotated[float, Field(gt=0, le=1)] = 0.05
-    """Amplitude a₀, as a share of the supply, below which an oscillation is ignored."""
+    oscillation: Annotated[float, Field(gt=0, le=1)] = 0.25
+    """Amplitude of the PID's output, as a share of D, below which an oscillation is ignored."""
     growth: Annotated[float, Field(ge=1, le=100)] = 3.0
-    """Factor by which the posture error may exceed the smallest one so far, if that is more than 0.15 m, and an
-    oscillation the mean one."""
+    """Factor by which the posture error may exceed the smallest one so far, if that is more than 0.15 m."""
     hold: Annotated[float, Field(gt=0, le=100)] = 1.0
     """Shortest duration of the first fallback in s; each later one lasts three times as long as the last."""
     retries: Annotated[int, Field(ge=0, le=20)] = 4
@@ -102,8 +84,6 @@ GUARD = np.dtype(
     [
         # Settings, as in `Guard`
         ("on", "?"),
-        ("share", "f8"),
-        ("weights", "f8"),  # largest norm of the weights
         ("oscillation", "f8"),
         ("growth", "f8"),
         ("hold", "f8"),  # s
@@ -113,21 +93,16 @@ GUARD = np.dtype(
         ("range", "f8", 2),  # largest command of a channel: the supply in V, or the largest θ̇ in rad/s
         ("region", "f8", 2),  # ē: largest errors of V and θ̇ with which a learner may go on, m/s and rad/s
         ("harmless", "f8", 2),  # D: deviation of a channel that cannot leave that region, V (rad/s)
-        # Oscillation of four signals, deviation and feedback of the two channels, as shares of `range`
-        ("low_pass", "f8", 4),  # the signal without noise
-        ("slow_mean", "f8", 4),  # its slow mean
-        ("sign", "f8", 4),  # of the present half-wave
-        ("peak", "f8", 4),  # its amplitude
-        ("last", "f8", 4),  # amplitude of the last one
-        ("half_wave_time", "f8", 4),  # its duration so far, s
-        ("baseline", "f8", 4),  # mean amplitude of earlier half-waves
-        ("baseline_time", "f8", 4),  # time over which that was averaged, s
-        ("waves", "f8", 4),  # consecutive half-waves above the threshold
-        ("first", "f8", 4),  # amplitude of the first of them
+        # Oscillation of the PID's output in the two channels
+        ("low_pass", "f8", 2),  # the signal without noise, V (rad/s)
+        ("slow_mean", "f8", 2),  # its slow mean, V (rad/s)
+        ("sign", "f8", 2),  # of the present half-wave
+        ("peak", "f8", 2),  # its amplitude, V (rad/s)
+        ("half_wave_time", "f8", 2),  # its duration so far, s
+        ("waves", "f8", 2),  # consecutive half-waves above the threshold
         # What is compared with a bound
         ("deviation", "f8", 2),  # largest deviation from the fallback in the recent past, V
         ("nearest", "f8"),  # smallest posture error so far, m
-        ("limited_share", "f8"),  # recent share of time in which the output was limited
         ("model_error", "f8", 2),  # mean of the voltage sent less that of the nominal model, V
         # Decisions
         ("action", "f8"),  # index into `GUARD_ACTIONS`
@@ -140,7 +115,7 @@ GUARD = np.dtype(
         ("broken", "?"),  # whether the learner itself is not finite, as its caller found
         ("forget", "?"),  # whether the learner is to be reset to its initial weights
         ("frozen", "?"),  # whether the learner must not learn now
-        ("limited", "f8", 2),  # output of the learner after the limit, V
+        ("limited", "f8", 2),  # output of the learner, limited to the supply, V
         ("output", "f8", 2),  # the feedforward to apply, V
         ("teaching", "f8", 2),  # the feedback to learn from, V
     ],
@@ -148,21 +123,18 @@ GUARD = np.dtype(
 )
 
 
-def fresh(settings: list[Guard], robot: Rows, volts: Array, gains: Array) -> Rows:
+def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
     """Returns records of `GUARD` at the start of a run, `(B,)`.
 
     Args:
         settings: Settings of each robot.
         robot: The nominal robot, as from `nominal`.
-        volts: Voltage in V that weights of norm one give for features of size one; 0 if unknown, `(B,)`.
         gains: Peak-to-peak gains from a voltage of each channel to its velocity error and to the position, `(B, 2, 2)`.
     """
     rows = np.zeros(len(settings), GUARD)
-    for name in ("on", "share", "oscillation", "growth", "hold", "retries", "fade"):
+    for name in ("on", "oscillation", "growth", "hold", "retries", "fade"):
         rows[name] = [getattr(s, name) for s in settings]
     supply, rotation = float(robot["supply"][0]), float(robot["max_twist"][0, 1])
-    with np.errstate(divide="ignore"):
-        rows["weights"] = np.array([s.weights for s in settings]) * supply / volts
     rows["model"] = [s.fallback == "model" for s in settings]
     rows["range"] = supply, rotation if robot["rigid"][0] else supply
     rows["region"] = np.array([[s.velocity] for s in settings]) * robot["max_twist"]
@@ -184,12 +156,11 @@ def harmless(region: Array, gains: Array) -> Array:
 
 @kernel
 def guard(
-    g: Row, feedforward: Array, nominal: Array, error: Array, command: Array, twist: Array, norm: float,
-    voltage: Array, period: float, rigid: bool, integral: Array, feedback: Array,
+    g: Row, feedforward: Array, nominal: Array, error: Array, command: Array, twist: Array, voltage: Array,
+    period: float, rigid: bool, integral: Array, feedback: Array,
 ) -> None:  # fmt: skip
     """One tick of the guard of one robot, between the feedforward stage and the allocation.
 
-    - limit: the deviation from the fallback is scaled to its share of the supply; meanwhile nothing is learned.
     - fallback: the nominal inverse dynamics replaces the learner. The integral starts from the mean error of the model,
       so that the step in voltage is small; what is left of it fades. The learner is reset to its initial weights.
     - resume: the learner returns after the hold, once nothing is wrong, each time with less gain and after a longer
@@ -205,7 +176,6 @@ def guard(
         error: Posture error in m, m, rad, `(3,)`.
         command: Commanded V and θ̇ in m/s and rad/s, `(2,)`.
         twist: Estimated V and θ̇ in the same units, `(2,)`.
-        norm: Norm of the learner's weights.
         voltage: Voltage of the last tick in the two channels, after the limits, `(2,)`.
         period: Control period in s.
         rigid: Whether the second channel is steering.
@@ -220,23 +190,21 @@ def guard(
     broken, g.broken = g.broken, False
     for k in range(2):
         broken |= not np.isfinite(feedforward[k])
-    clipped = False
     if not broken:  # otherwise the last output remains, from which the fallback starts
-        clipped = limit_output(g, feedforward, nominal, rigid)
-    growing = False
+        for k in range(2):  # as the voltage is limited; U_r,l = U_Σ ± U_Δ
+            demand = abs(feedforward[k]) if rigid else abs(feedforward[0]) + abs(feedforward[1])
+            g.limited[k] = feedforward[k] * (g.range[k] / max(g.range[k], demand))
     for k in range(2):
         fallback = nominal[k] if g.model else 0.0
         deviation = g.authority * (g.limited[k] - fallback)
-        growing |= grows(g, k, deviation / g.range[k], period)
-        growing |= grows(g, 2 + k, feedback[k] / g.range[k], period) and g.last[k] > g.oscillation  # its blame
+        count_half_waves(g, k, feedback[k], period)
         g.output[k] = g.limited[k]
         if g.authority < 1.0:
             g.bump[k] *= g.fade / (g.fade + period)
             g.output[k] = fallback + deviation + g.bump[k]
         g.deviation[k] = max(abs(deviation), RECENT / (RECENT + period) * g.deviation[k])
         g.model_error[k] += period / (MEAN + period) * (voltage[k] - nominal[k] - g.model_error[k])
-    g.limited_share += period / (BUSY + period) * ((1.0 if clipped else 0.0) - g.limited_share)
-    trouble = worst_trouble(g, broken, growing, error, command, twist, norm)
+    trouble = worst_trouble(g, broken, error, command, twist)
 
     g.hold_left -= period
     if g.action != FALLBACK and trouble > 0:
@@ -245,88 +213,48 @@ def guard(
         g.hold_left = max(g.hold_left, g.hold)
     elif g.hold_left <= 0:
         g.action, g.reason = NONE, 0.0
-    if clipped and g.action != FALLBACK:
-        g.action, g.reason, g.hold_left = LIMIT, CLIPPED, BUSY
 
     if g.action != FALLBACK:
         g.authority = min(1.0, g.authority + period * g.gain / RETURN)
-    g.frozen = clipped or g.action == FALLBACK
+    g.frozen = g.action == FALLBACK
     for k in range(2):
         g.teaching[k] = g.gain * feedback[k]
 
 
 @kernel
-def limit_output(g: Row, feedforward: Array, nominal: Array, rigid: bool) -> bool:
-    """Limits the output, as the voltage is limited, to its share of the supply on each wheel, or of the rotation.
-
-    Returns:
-        Whether the learner is further than that from the fallback.
-    """
-    demand = apart = 0.0
-    for k in range(2):
-        bound = g.share * g.range[k]
-        output, deviation = abs(feedforward[k]), abs(feedforward[k] - (nominal[k] if g.model else 0.0))
-        if rigid:
-            g.limited[k] = feedforward[k] if output <= bound else np.copysign(bound, feedforward[k])
-            apart = max(apart, deviation / bound)
-        else:  # U_r,l = U_Σ ± U_Δ
-            demand, apart = demand + output / bound, apart + deviation / bound
-    if not rigid:
-        for k in range(2):
-            g.limited[k] = feedforward[k] if demand <= 1.0 else feedforward[k] / demand
-    return apart > 1.0
-
-
-@kernel
-def grows(g: Row, k: int, value: float, period: float) -> bool:
-    """Returns whether signal k, a share of its range, is an oscillation that grows, with half-waves up to `SLOWEST`."""
+def count_half_waves(g: Row, k: int, value: float, period: float) -> None:
+    """Counts the half-waves of a signal of channel k in a row that are large enough, and shorter than `SLOWEST`."""
     g.low_pass[k] += period / (SMOOTH + period) * (value - g.low_pass[k])
     g.slow_mean[k] += period / (DRIFT + period) * (g.low_pass[k] - g.slow_mean[k])
     wave = g.low_pass[k] - g.slow_mean[k]
     sign = 1.0 if wave >= 0 else -1.0
-    grown = False
     if sign != g.sign[k] or g.half_wave_time[k] > SLOWEST:
-        peak, lasted = g.peak[k], g.half_wave_time[k]
-        if lasted <= SLOWEST and peak > max(g.oscillation, g.growth * g.baseline[k]):
-            g.waves[k] += 1.0
-            if g.waves[k] == 1.0:
-                g.first[k] = peak
-            grown = g.waves[k] >= SUSTAINED and peak >= g.first[k]
-            if grown:
-                g.waves[k] = 0.0
-        else:
-            g.waves[k] = 0.0
-        if lasted > 0:  # a mean over the whole past, and later over `MEMORY`
-            g.baseline_time[k] = min(g.baseline_time[k] + lasted, MEMORY)
-            g.baseline[k] += min(1.0, lasted / g.baseline_time[k]) * (min(peak, LARGEST) - g.baseline[k])
-        g.sign[k], g.last[k], g.peak[k], g.half_wave_time[k] = sign, peak, 0.0, 0.0
+        counts = g.half_wave_time[k] <= SLOWEST and g.peak[k] > g.oscillation * g.harmless[k]
+        g.waves[k] = g.waves[k] + 1.0 if counts else 0.0
+        g.sign[k], g.peak[k], g.half_wave_time[k] = sign, 0.0, 0.0
     g.peak[k] = max(g.peak[k], abs(wave))
     g.half_wave_time[k] += period
-    return grown
 
 
 @kernel
-def worst_trouble(g: Row, broken: bool, growing: bool, error: Array, command: Array, twist: Array, norm: float) -> int:
+def worst_trouble(g: Row, broken: bool, error: Array, command: Array, twist: Array) -> int:
     """Returns the reason of the worst trouble now, an index into `REASONS`; 0 if nothing is wrong.
 
-    Errors are the learner's only if it has deviated so much that it can have caused them, |d| > D.
+    It is the learner's only if the learner has deviated so much that it can have caused it.
     """
     posture = np.hypot(np.hypot(error[0], error[1]), ARM * error[2])
     g.nearest = min(g.nearest, posture)
     if broken:
         return BROKEN
-    if not norm <= g.weights:
-        return WEIGHTS
     for k in range(2):
-        if g.action == FALLBACK or g.deviation[k] > g.harmless[k]:
+        deviation = np.inf if g.action == FALLBACK else g.deviation[k]
+        if deviation > g.harmless[k]:
             if posture > max(APART, g.growth * g.nearest):
                 return FAR
             if abs(command[k] - twist[k]) > g.region[k]:
                 return FAST
-    if growing:
-        return OSCILLATION
-    if g.limited_share > 0.5:
-        return OVERDONE
+        if deviation > g.oscillation * g.harmless[k] and g.waves[k] >= SUSTAINED:
+            return OSCILLATION
     return 0
 
 
@@ -336,7 +264,7 @@ def fall_back(g: Row, trouble: int, nominal: Array, integral: Array, feedback: A
     g.strikes += 1.0
     g.gain /= BACK_OFF
     g.hold_left = np.inf if g.strikes > g.retries else g.hold * BACK_OFF ** (g.strikes - 1.0)
-    g.action, g.reason, g.authority, g.forget, g.limited_share = FALLBACK, trouble, 0.0, True, 0.0
+    g.action, g.reason, g.authority, g.forget = FALLBACK, trouble, 0.0, True
     for k in range(2):
         fallback = nominal[k] if g.model else 0.0
         lacked = max(-g.harmless[k], min(g.harmless[k], g.model_error[k]))

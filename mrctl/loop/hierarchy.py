@@ -102,8 +102,8 @@ def apply_voltages(seen: Row, model: Row, robot: Row, period: float, s: Row) -> 
     if s.guard.on:
         inverse_dynamics(command, derivative, model, s.nominal)
     guard(
-        s.guard, s.feedforward, s.nominal, s.error, command, seen.twist, s.weight_norm, s.voltage, period, robot.rigid,
-        s.pid.integral, s.feedback,
+        s.guard, s.feedforward, s.nominal, s.error, command, seen.twist, s.voltage, period, robot.rigid, s.pid.integral,
+        s.feedback,
     )  # fmt: skip
     allocate(command, derivative, s.feedback, s.guard.output, period, robot, a)
     take_loss(seen.lost, robot.rigid, a)
@@ -249,9 +249,8 @@ class Hierarchy:
             state["limiter"]["time_constant"][row] = max(prefilter, self._period)
             self.set_kanayama(row, scenario.kanayama)
             self.set_pid(row, scenario.pid)
-        volts = np.broadcast_to(getattr(self.learner, "weight_volts", 0.0), size)
         rejected = np.array([self._rejection(row, scenario.pid) for row, scenario in enumerate(scenarios)])
-        state["guard"] = guarding.fresh([s.guard for s in scenarios], self._record, volts, rejected)
+        state["guard"] = guarding.fresh([s.guard for s in scenarios], self._record, rejected)
         if not getattr(self.learner, "guarded", True):
             state["guard"]["on"] = False
         self.command, self.derivative = state["limiter"]["command"], state["limiter"]["derivative"]
