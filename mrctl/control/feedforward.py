@@ -35,8 +35,8 @@ class Feedforward(Protocol):
     The voltage of the prior is added to its output.
 
     A stage serves B robots; its memory belongs in arrays with a leading axis B, so that robots cannot mix. It may have
-    two further members: `weight_norm`, a float64 array `(B,)` for the results; and `restore(rows)`, with which the guard
-    (`mrctl.control.guard`) resets the robots with these indices to their initial weights.
+    two further members: `weight_norm`, a float64 array `(B,)` for the results; and `restore(rows)`, with which the
+    guard (`mrctl.control.guard`) resets the robots with these indices to their initial weights.
     """
 
     def output(self, command: Array, derivative: Array) -> Array:

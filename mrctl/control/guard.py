@@ -1,32 +1,35 @@
-"""A watchdog on a learning feedforward: it limits the learner, replaces it by the nominal model, lets it try again.
+"""A watchdog on a learning feedforward: it replaces the learner by the nominal model, and lets it try again.
 
-| action   | cause                                                       | effect                                     |
-| -------- | ----------------------------------------------------------- | ------------------------------------------ |
-| limit    | further from the fallback than its share of the supply      | deviation scaled to that, no learning      |
-| fallback | a large error or a growing oscillation for which the        | nominal model or PID alone in place of the |
-|          | learner may be to blame, weights beyond the supply, limited | learner, which is reset to its initial     |
-|          | for most of 1 s, output not finite                          | weights                                    |
+This is the simplex architecture (Seto, Krogh, Sha and Chutinan 1998): a controller that may be wrong has full authority
+as long as the state is one from which a trusted one, here PID and nominal model, recovers. Let d be the deviation of a
+channel, d = authority · (learner − model), e the error of its velocity, and ρ the posture error. The region of recovery
+is |e| ≤ ē, ρ ≤ ρ̄ = 0.15 m. A learner is to blame for an error if its |d| exceeded D in the last second, and for an
+oscillation if it exceeded a quarter of D:
 
-This is the simplex architecture (Seto, Krogh, Sha and Chutinan 1998): a controller that may be wrong acts as long as
-the state is one from which a trusted one, here PID and nominal model, recovers. After a hold the learner resumes, each
-time with a third of the gain; the next hold, and the time in which it gets its authority back, are three times as long.
+    D = min(ē/‖G_e‖₁, ρ̄/‖G_ρ‖₁)        ‖G‖₁: peak-to-peak gains of the designed loops from a voltage (`rejection`)
 
-**What it guarantees.** Let d = authority · (learner − fallback) be the deviation of a channel, e the error of its
-velocity, ρ the posture error, and let |e| ≤ ē, ρ ≤ ρ̄ be the region of recovery.
+| cause of a fallback   | condition                                                                         |
+| --------------------- | --------------------------------------------------------------------------------- |
+| error                 | |e| > ē or ρ > ρ̄ while the learner is to blame                                    |
+| sustained oscillation | eight half-waves of the PID's output in a row beyond D/4 while it is to blame     |
+| not finite            | NaN or ∞ from the learner                                                         |
 
-1. ‖G‖₁ is the peak-to-peak gain of the closed loops from a voltage to an error (`rejection`). With |d| ≤ D,
-   D = min(ē/‖G_e‖₁, ρ̄/‖G_ρ‖₁), no d, however it oscillates or grows, takes e (for the same command) or the position out
-   of the region. The guard leaves such a learner alone, unless it oscillates.
-2. A larger |d| ends in the tick in which an error leaves the region. Until then the errors are inside.
+After a hold the learner, reset to its initial weights, resumes with a third of the gain; its authority grows from 0
+again. Each further hold, and the time in which it gets its authority back, are three times as long.
+
+**What it guarantees.**
+
+1. |d| ≤ D: no d, however it oscillates or grows, takes e (for the same command) or the position out of the region.
+   The guard leaves such a learner alone, unless the loop oscillates.
+2. |d| > D: it ends in the tick in which an error leaves the region. Until then the errors are inside.
 3. From then on PID and model act alone, and the PID's integral starts within D of the model. From any such state the
    position error stays below a bound that the loops give (`recovery`): 0.16 to 0.19 m for the default robot.
 
 The bounds are those of the linear loops that the PID was designed for; the limits of voltage and acceleration, and what
 happens within the loop's delay, add to them. `tests/system/test_adversaries.py` drives against the worst learners.
 
-**Oscillation.** A loop with more delay than designed for oscillates long before it leaves the region. In d and in
-the feedback a half-wave counts if its amplitude exceeds max(a₀, growth · ā), ā the mean of earlier ones. Three in a
-row, the last not below the first, grow. They are the learner's if the last half-wave of d itself exceeds a₀.
+The oscillation is no part of the guarantee. A loop with more delay than it was designed for may oscillate within the
+region for ever, and tracks better without the learner.
 """
 
 from __future__ import annotations
@@ -65,7 +68,7 @@ class Guard(Record):
     on: bool = True
     """Whether the guard watches the learner, and may replace it."""
     velocity: Annotated[float, Field(gt=0, le=10)] = 0.28
-    """Largest errors of V and θ̇, as a share of the robot's largest ones, with which a learner may go on."""
+    """Largest errors of V and θ̇, as a share ē of the robot's largest ones, with which a learner may go on."""
     oscillation: Annotated[float, Field(gt=0, le=1)] = 0.25
     """Amplitude of the PID's output, as a share of D, below which an oscillation is ignored."""
     growth: Annotated[float, Field(ge=1, le=100)] = 3.0

@@ -54,7 +54,7 @@ class Bench:
         return REASONS[int(self.g["reason"])]
 
     def play(self, wave, channel=0, deviation=1.0):
-        """Feeds a wave as feedback, beside a learner that deviates by a multiple of D: seconds to a fallback, or None."""
+        """Feeds a wave as feedback, beside a learner that deviates by a multiple of D: s to a fallback, or None."""
         feedforward, pair = deviation * self.g["harmless"], np.zeros(2)
         for k, pair[channel] in enumerate(wave):
             if self.tick(feedforward, feedback=pair) == "fallback":
@@ -99,7 +99,7 @@ def test_off():
 
 @pytest.mark.parametrize(("rigid", "output"), [(False, (16.0, -8.0)), (True, (24.0, -3.0))])
 def test_limit(rigid, output):
-    """U_r,l = 32 ∓ 16 V shrinks to the supply, as the voltage does, a steering channel by itself; nothing else happens."""
+    """U_r,l = 32 ∓ 16 V shrinks to the supply, as the voltage does, a steering channel by itself; that is all."""
     bench = Bench(rigid=rigid)
     for _ in range(1000):
         assert bench.tick(feedforward=(32, -16)) == "none" and not bench.g["frozen"]
