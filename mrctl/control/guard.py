@@ -11,7 +11,7 @@ oscillation if it exceeded a quarter of D:
 | cause of a fallback   | condition                                                                         |
 | --------------------- | --------------------------------------------------------------------------------- |
 | error                 | |e| > ē or ρ > ρ̄ while the learner is to blame                                    |
-| sustained oscillation | eight half-waves of the PID's output in a row beyond D/4 while it is to blame     |
+| sustained oscillation | 16 half-waves of the PID's output in a row beyond D/4 while it is to blame     |
 | not finite            | NaN or ∞ from the learner                                                         |
 
 After a hold the learner, reset to its initial weights, resumes with a third of the gain; its authority grows from 0
@@ -48,10 +48,10 @@ REASONS = ("", "sustained oscillation", "far from the reference", "velocity far 
 _, OSCILLATION, FAR, FAST, BROKEN = range(5)
 
 # The loops are designed with damping ratios of at least 0.5: after a push a half-wave has at most a sixth of the
-# amplitude of the one before it. Eight in a row are fed by something, and what a lap asks for is slower.
+# amplitude of the one before it. Many in a row are fed by something, and what a lap asks for is slower.
 SMOOTH, DRIFT = 0.01, 0.3  # s, time constants of the filters that remove noise and slow motion from the PID's output
 SLOWEST = 1.0  # s, longest half-wave
-SUSTAINED = 8  # half-waves in a row
+SUSTAINED = 16  # half-waves in a row
 
 RECENT = 1.0  # s for which a deviation may be to blame for an error
 MEAN = 0.5  # s over which voltages are averaged before the integral takes them over; a few periods of an oscillation
