@@ -22,8 +22,9 @@ again. Each further hold, and the time in which it gets its authority back, are 
 1. |d| ≤ D: no d, however it oscillates or grows, takes e (for the same command) or the position out of the region.
    The guard leaves such a learner alone, unless the loop oscillates.
 2. |d| > D: it ends in the tick in which an error leaves the region. Until then the errors are inside.
-3. From then on PID and model act alone, and the PID's integral starts within D of the model. From any such state the
-   position error stays below a bound that the loops give (`recovery`): 0.16 to 0.19 m for the default robot.
+3. From then on PID and model act alone; the PID's integral starts within D of the model, and the rest of the step in
+   voltage, which fades, is within D too. From any such state the position error stays below a bound that the loops
+   give (`recovery`): 0.16 to 0.19 m for the default robot.
 
 The bounds are those of the linear loops that the PID was designed for; the limits of voltage and acceleration, and what
 happens within the loop's delay, add to them. `tests/system/test_adversaries.py` drives against the worst learners.
@@ -78,7 +79,7 @@ class Guard(Record):
     retries: Annotated[int, Field(ge=0, le=20)] = 4
     """Number of times that the learner may resume, each time with a third of the gain; then the fallback stays."""
     fade: Annotated[float, Field(gt=0, le=2)] = 0.1
-    """Time constant in s with which the step in voltage at the beginning of a fallback fades."""
+    """Time constant in s with which the step in voltage at the beginning of a fallback fades, as far as it is below D."""
     fallback: Literal["model", "none"] = "model"
     """Feedforward during a fallback: the nominal inverse dynamics (`model`), or PID alone (`none`)."""
 
@@ -263,16 +264,20 @@ def worst_trouble(g: Row, broken: bool, error: Array, command: Array, twist: Arr
 
 @kernel
 def fall_back(g: Row, trouble: int, nominal: Array, integral: Array, feedback: Array) -> None:
-    """Replaces the learner by the fallback; the integral of the PID takes over what the model lacked, up to D."""
+    """Replaces the learner by the fallback; the integral of the PID takes over what the model lacked, up to D.
+
+    What is left of the step in voltage fades; beyond D it would be one more disturbance that leaves the region.
+    """
     g.strikes += 1.0
     g.gain /= BACK_OFF
     g.hold_left = np.inf if g.strikes > g.retries else g.hold * BACK_OFF ** (g.strikes - 1.0)
     g.action, g.reason, g.authority, g.forget = FALLBACK, trouble, 0.0, True
     for k in range(2):
         fallback = nominal[k] if g.model else 0.0
-        lacked = max(-g.harmless[k], min(g.harmless[k], g.model_error[k]))
+        bound = g.harmless[k]
+        lacked = max(-bound, min(bound, g.model_error[k]))
         target = lacked + nominal[k] - fallback
-        g.bump[k] = g.output[k] + integral[k] - target - fallback
+        g.bump[k] = max(-bound, min(bound, g.output[k] + integral[k] - target - fallback))
         g.output[k] = fallback + g.bump[k]
         feedback[k] += target - integral[k]  # the feedback contains the old integral
         integral[k] = target

@@ -193,9 +193,9 @@ def test_fallback(fallback):
         bench.tick(feedforward=(7, 1), nominal=(5, 1), sent=(7, 1))
     bench.integral[:] = 0.5, -0.5
     feedback = np.array([0.6, -0.4])  # of which the integral is all but 0.1 V
-    assert bench.tick(feedforward=(9, 4), nominal=(5, 1), feedback=feedback, sent=(7, 1), slower=(0, 2)) == "fallback"
+    assert bench.tick(feedforward=(10, 2), nominal=(5, 1), feedback=feedback, sent=(7, 1), slower=(2, 0)) == "fallback"
     assert bench.g["forget"]
-    np.testing.assert_allclose(bench.g["output"] + bench.feedback, (9.6, 3.6))  # 9 + 0.6, 4 − 0.4: no jump
+    np.testing.assert_allclose(bench.g["output"] + bench.feedback, (10.6, 1.6))  # 10 + 0.6, 2 − 0.4: no jump
     given = np.array([5.0, 1.0]) if fallback == "model" else np.zeros(2)
     np.testing.assert_allclose(bench.integral, np.array([7.0, 1.0]) - given, atol=1e-3)
     np.testing.assert_allclose(bench.feedback, bench.integral + 0.1)
@@ -206,6 +206,14 @@ def test_fallback(fallback):
         np.testing.assert_allclose(bench.g["output"], given + bump * (0.1 / 0.11) ** k)
         np.testing.assert_array_equal(bench.integral, integral)
         assert not bench.g["forget"] and bench.g["frozen"]
+
+
+def test_large_step():
+    """Of a step in voltage beyond D, D fades; the rest is gone at once, as it would be one more disturbance."""
+    bench = Bench()
+    bounds = bench.g["harmless"].copy()
+    assert bench.tick(feedforward=(12, -12), slower=(2, 0)) == "fallback"
+    np.testing.assert_allclose(bench.g["output"], bounds * (1, -1))
 
 
 def test_return():
