@@ -79,7 +79,7 @@ class Guard(Record):
     retries: Annotated[int, Field(ge=0, le=20)] = 4
     """Number of times that the learner may resume, each time with a third of the gain; then the fallback stays."""
     fade: Annotated[float, Field(gt=0, le=2)] = 0.1
-    """Time constant in s with which the step in voltage at the beginning of a fallback fades, as far as it is below D."""
+    """Time constant in s with which the step in voltage at the beginning of a fallback, up to D, fades."""
     fallback: Literal["model", "none"] = "model"
     """Feedforward during a fallback: the nominal inverse dynamics (`model`), or PID alone (`none`)."""
 
