@@ -58,6 +58,7 @@ RECENT = 1.0  # s for which a deviation may be to blame for an error
 MEAN = 0.5  # s over which voltages are averaged before the integral takes them over; a few periods of an oscillation
 RETURN = 5.0  # s in which a learner that resumes at full gain gets its authority back
 APART = 0.15  # m of posture error that are always tolerated; a run fails at 1 m
+MOVED = 0.55  # s in which an error of V that is always tolerated, 0.27 m/s, moves the robot by `APART`
 ARM = 0.75  # m ahead of the robot at which a heading error counts as a position error
 BACK_OFF = 3.0  # factor by which each attempt learns more slowly, and waits longer
 UNSURE = 0.1  # further factor on the learning gain of a stage that cannot be reset to its initial weights
@@ -69,7 +70,8 @@ class Guard(Record):
     on: bool = True
     """Whether the guard watches the learner, and may replace it."""
     velocity: Annotated[float, Field(gt=0, le=10)] = 0.28
-    """Largest errors of V and θ̇, as a share ē of the robot's largest ones, with which a learner may go on."""
+    """Largest errors of V and θ̇, as a share of the robot's largest ones, with which a learner may go on; that of V is
+    at least 0.27 m/s."""
     oscillation: Annotated[float, Field(gt=0, le=1)] = 0.25
     """Amplitude of the PID's output, as a share of D, below which an oscillation is ignored."""
     growth: Annotated[float, Field(ge=1, le=100)] = 3.0
@@ -141,7 +143,7 @@ def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
     supply, rotation = float(robot["supply"][0]), float(robot["max_twist"][0, 1])
     rows["model"] = [s.fallback == "model" for s in settings]
     rows["range"] = supply, rotation if robot["rigid"][0] else supply
-    rows["region"] = np.array([[s.velocity] for s in settings]) * robot["max_twist"]
+    rows["region"] = np.maximum(np.array([[s.velocity] for s in settings]) * robot["max_twist"], (APART / MOVED, 0.0))
     rows["harmless"] = harmless(rows["region"], gains)
     rows["nearest"] = np.inf
     rows["gain"] = rows["authority"] = 1.0
