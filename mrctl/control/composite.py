@@ -346,11 +346,9 @@ class CompositeAdaptation(Learner):
     Attributes:
         rows: One record of `COMPOSITE` a robot.
         weight_norm: Euclidean norm of a, `(B,)`.
-        weight_volts: Unit of the weights: 1 V.
     """
 
     respond, learn_one, learned = respond, learn, ("a", "P")
-    weight_volts = 1.0
 
     def __init__(self, robot: Robot, settings: list[Composite], rigid: bool, period: float, prior: bool = True) -> None:
         """Makes the learners.

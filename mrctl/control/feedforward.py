@@ -35,9 +35,8 @@ class Feedforward(Protocol):
     The voltage of the prior is added to its output.
 
     A stage serves B robots; its memory belongs in arrays with a leading axis B, so that robots cannot mix. It may have
-    three further members for the guard (`mrctl.control.guard`): `weight_norm`, a float64 array `(B,)`; `weight_volts`,
-    the voltage in V that weights of norm one give for features of size one, a number or `(B,)`; and `restore(rows)`,
-    which resets the robots with these indices to their initial weights.
+    two further members: `weight_norm`, a float64 array `(B,)` for the results; and `restore(rows)`, with which the
+    guard (`mrctl.control.guard`) resets the robots with these indices to their initial weights.
     """
 
     def output(self, command: Array, derivative: Array) -> Array:
@@ -155,7 +154,6 @@ class Learner(ABC):
         guarded: Whether the guard watches it.
         learned: Fields of `rows` that hold what it has adapted, from which another run can start.
         weight_norm: Norm of the weights, `(B,)`.
-        weight_volts: Voltage in V that weights of norm one give for features of size one; 0 if there are no weights.
     """
 
     respond: ClassVar[Kernel]
@@ -164,7 +162,6 @@ class Learner(ABC):
     learned: ClassVar[tuple[str, ...]] = ()
     rows: Rows
     arrays: tuple[Any, ...]
-    weight_volts: Array | float = 0.0
 
     def __init__(self, robot: Robot, size: int, rigid: bool, period: float) -> None:
         """Takes the nominal robot, the number of robots, whether channel two is steering, and the period in s."""

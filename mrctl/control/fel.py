@@ -237,7 +237,6 @@ class FeedbackErrorLearning(Learner):
         weights: Flat weights W, `(B, n)`.
         initial: Initial weights W₀, to which leak and projection refer, `(B, n)`.
         weight_norm: ‖W − W₀‖, `(B,)`.
-        weight_volts: Output scale in V, `(B,)`.
     """
 
     respond, learn_one = respond, learn
@@ -263,7 +262,6 @@ class FeedbackErrorLearning(Learner):
             ]
         )
         self.weights = self.initial.copy()
-        self.weight_volts = np.array([s.output_scale for s in settings])
         self.rows = fresh(settings, rigid)
         hidden, gradient = np.zeros((len(settings), settings[0].hidden)), np.zeros(self.initial.shape[1])
         self.arrays = self.rows, feature_scale(robot), self.weights, self.initial, hidden, gradient

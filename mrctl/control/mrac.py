@@ -306,11 +306,9 @@ class ModelReferenceAdaptive(Learner):
 
     Attributes:
         rows: One record of `MRAC` a robot.
-        weight_volts: Unit of the parameters: 1 V.
     """
 
     respond, learn_one, learned = respond, learn, ("b", "P")
-    weight_volts = 1.0
 
     def __init__(self, robot: Robot, settings: list[Mrac], rigid: bool, period: float, delay: int = 0) -> None:
         """Makes the learners.

@@ -114,11 +114,9 @@ class RecursiveLeastSquares(Learner):
 
     Attributes:
         rows: One record of `RLS` a robot.
-        weight_volts: Unit of the coefficients: 1 V.
     """
 
     respond, learn_one, learned = respond, learn, ("theta", "P")
-    weight_volts = 1.0
 
     def __init__(self, robot: Robot, settings: list[Rls], rigid: bool, period: float) -> None:
         """Takes the nominal robot, the settings of each robot, whether channel two is steering, and the period in s."""

@@ -36,6 +36,7 @@ from mrctl.control.mrac import ModelReferenceAdaptive
 from mrctl.control.nominal import nominal
 from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import PID, Pid, pid
+from mrctl.control.rejection import Peaks, rejection
 from mrctl.control.rls import RecursiveLeastSquares
 from mrctl.control.steering import ALLOCATION, allocate, take_loss
 from mrctl.kernel import Array, Kernel, Row, Rows, kernel
@@ -101,8 +102,8 @@ def apply_voltages(seen: Row, model: Row, robot: Row, period: float, s: Row) -> 
     if s.guard.on:
         inverse_dynamics(command, derivative, model, s.nominal)
     guard(
-        s.guard, s.feedforward, s.nominal, s.error, s.weight_norm, a.saturated, s.voltage, period, robot.rigid,
-        s.pid.integral, s.feedback,
+        s.guard, s.feedforward, s.nominal, s.error, command, seen.twist, s.voltage, period, robot.rigid, s.pid.integral,
+        s.feedback,
     )  # fmt: skip
     allocate(command, derivative, s.feedback, s.guard.output, period, robot, a)
     take_loss(seen.lost, robot.rigid, a)
@@ -248,8 +249,8 @@ class Hierarchy:
             state["limiter"]["time_constant"][row] = max(prefilter, self._period)
             self.set_kanayama(row, scenario.kanayama)
             self.set_pid(row, scenario.pid)
-        volts = np.broadcast_to(getattr(self.learner, "weight_volts", 0.0), size)
-        state["guard"] = guarding.fresh([s.guard for s in scenarios], self._record, volts)
+        rejected = np.array([self._rejection(row, scenario.pid) for row, scenario in enumerate(scenarios)])
+        state["guard"] = guarding.fresh([s.guard for s in scenarios], self._record, rejected)
         if not getattr(self.learner, "guarded", True):
             state["guard"]["on"] = False
         self.command, self.derivative = state["limiter"]["command"], state["limiter"]["derivative"]
@@ -270,6 +271,17 @@ class Hierarchy:
         """Changes the velocity feedback of one robot."""
         for name, value in design.gains(self._robot, self._rigid, self._delays[row], self._period).items():
             self.state["pid"][name][row] = value
+        guard = self.state["guard"]
+        guard["harmless"][row] = guarding.harmless(guard["region"][row], np.array(self._rejection(row, design)))
+
+    def _rejection(self, row: int, design: Pid) -> tuple[Peaks, Peaks]:
+        """Peak-to-peak gains from a voltage to the errors of one robot under this feedback."""
+        delay, k = self._delays[row], self.state["kanayama"][row]
+        kanayama = Kanayama(k_x=k["k_x"], k_y=k["k_y"], k_theta=k["k_theta"])
+        prefilter = float(self.state["limiter"]["time_constant"][row])
+        around = Motion(kanayama, prefilter, self._motions[row].lag)
+        gains = design.channels(self._robot, self._rigid, delay, self._period)
+        return rejection(self._robot, self._rigid, gains, around, delay, self._period)
 
     def set_learning(self, row: int, on: bool) -> None:
         """Switches learning of one robot on or off."""

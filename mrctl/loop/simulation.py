@@ -51,7 +51,7 @@ def simulate(
             scenario's: a factory, called with the nominal robot and the number of robots, which returns an object with
             the two methods of that stage in `mrctl.control.stages`. One that raises, or returns an array of the wrong
             shape, fails all runs that are computed together; one that returns NaN for a robot fails that run, except
-            for an estimator, which odometry then replaces.
+            for an estimator, which odometry then replaces, and for a feedforward, which the guard replaces if it is on.
 
     Returns:
         The signals of `results.dataset.SIGNALS` with dimensions run and time (time alone for one scenario), with units;
@@ -323,6 +323,7 @@ class Simulation:
         return found.assign(  # the constants that turn the commanded motion into features
             half_track=("run", np.full(size, robot.half_track), {"units": "m"}),
             estimator_fault=("run", np.array(getattr(self.estimator, "faults", [""] * size), object)),
+            feedforward_fault=("run", np.array(getattr(self.hierarchy, "feedforward_faults", [""] * size), object)),
             feature_scale=(("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         )
 

@@ -137,7 +137,9 @@ class UserHierarchy(Hierarchy):
     """The hierarchy with some of a user's stages; a tick calls them between compiled loops over the built-in laws.
 
     Attributes:
-        faults: Robots for which a stage returned a number that is not finite in the last tick, with the message.
+        faults: Robots for which a stage returned a number that is not finite in the last tick, with the message; not
+            those whose guard takes the place of a feedforward.
+        feedforward_faults: For each robot the message of the first tick at which the guard did that, or "".
     """
 
     def __init__(self, scenarios: Sequence[Scenario], robot: Robot, stages: dict[str, UserStage]) -> None:
@@ -146,6 +148,7 @@ class UserHierarchy(Hierarchy):
         self._feedforward_stage = stages.get("feedforward")
         super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
         self.faults: dict[int, str] = {}
+        self.feedforward_faults = [""] * len(scenarios)
 
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
         """Bumpless start; see `Hierarchy.reset`."""
@@ -210,8 +213,20 @@ class UserHierarchy(Hierarchy):
         stage = self._feedforward_stage
         if not stage:
             return super().feedforward(command, derivative)
-        learned = self._finite_rows(stage, stage.output(command, derivative))
+        learned = self._finite_rows(stage, self._left_to_guard(stage, stage.output(command, derivative)))
         return self.prior.output(command, derivative) + learned
+
+    def _left_to_guard(self, stage: UserStage, answer: Array) -> Array:
+        """Returns an answer of the feedforward, and tells each guard that is on if its row is not finite."""
+        guard = self.state["guard"]
+        broken = ~np.isfinite(answer).all(axis=1) & guard["on"]
+        if not broken.any():
+            return answer
+        guard["broken"] |= broken
+        for row in np.flatnonzero(broken):
+            fault = f"{stage.title}: not finite, tick {max(self._tick - 1, 0)}"
+            self.feedforward_faults[row] = self.feedforward_faults[row] or fault
+        return np.where(broken[:, None], 0.0, answer)
 
     def _steer(self, stage: UserStage, lost: NDArray[np.bool]) -> None:
         """Calls the user's steering, and limits it as `allocate` does; `lost` are the robots with a limited current."""
@@ -243,7 +258,8 @@ class UserHierarchy(Hierarchy):
         added = stage.call("learn", *values)
         if added is None:
             return None
-        return self._finite_rows(stage, stage.checked(added, self.feedback.shape, "what `learn` returns"))
+        added = self._left_to_guard(stage, stage.checked(added, self.feedback.shape, "what `learn` returns"))
+        return self._finite_rows(stage, added)
 
     def _read_weight_norm(self) -> None:
         """Reads the norm of the learner's weights, if the feedforward has it."""

@@ -71,7 +71,7 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "current_left": ("A", "left motor current"),
     "current_right": ("A", "right motor current"),
     "power": ("W", "electrical power"),
-    "guard": ("1", "what the guard does: 0 nothing, 1 limit, 2 freeze, 3 fallback"),
+    "guard": ("1", "what the guard does: 0 nothing, 1 fallback"),
     "guard_reason": ("1", "why, as an index into `mrctl.control.guard.REASONS`"),
 }
 

@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from mrctl.control.features import feature_matrix
-from mrctl.control.guard import GUARD_ACTIONS, LIMIT, NONE, REASONS
+from mrctl.control.guard import GUARD_ACTIONS, NONE, REASONS
 from mrctl.record import InputError
 from mrctl.results.dataset import require
 
@@ -244,8 +244,7 @@ def guard_events(result: xr.Dataset) -> pd.DataFrame:
         result: What `simulate` returns, or one run of it.
 
     Returns:
-        A row for each action: run, time in s, action (limit, freeze, fallback, or resume after the last two), and the
-        reason in words.
+        A row for each action: run, time in s, action (fallback or resume), and the reason in words.
 
     Raises:
         InputError: The result has no record of the guard.
@@ -256,9 +255,8 @@ def guard_events(result: xr.Dataset) -> pd.DataFrame:
     for row, number in enumerate(runs["run"].values):
         action, reason = (np.nan_to_num(runs[name].values[row]).astype(int) for name in ("guard", "guard_reason"))
         for k in np.flatnonzero(np.diff(action, prepend=0)):
-            before = action[k - 1] if k else 0
-            if action[k] == NONE and before == LIMIT or np.isnan(runs["guard"].values[row, k]):
-                continue  # a limit ends by itself, a run that failed has no guard
+            if np.isnan(runs["guard"].values[row, k]):
+                continue  # a run that failed has no guard
             name = GUARD_ACTIONS[action[k]] if action[k] != NONE else "resume"
             rows.append((number, float(runs["time"][k]), name, REASONS[reason[k]]))
     return pd.DataFrame(rows, columns=["run", "time", "action", "reason"])

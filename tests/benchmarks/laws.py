@@ -70,8 +70,8 @@ def laws(simulation: Simulation) -> dict[str, tuple[Kernel, tuple[Any, ...]]]:
         "PID": (pid, (command, seen["twist"], allocation["excess"], period, state["pid"], feedback)),
         "guard": (
             guard,
-            (state["guard"], feedforward, state["nominal"], state["error"], float(state["weight_norm"]),
-             bool(allocation["saturated"]), voltage, period, bool(robot["rigid"]), state["pid"]["integral"], feedback),
+            (state["guard"], feedforward, state["nominal"], state["error"], command, seen["twist"], voltage, period,
+             bool(robot["rigid"]), state["pid"]["integral"], feedback),
         ),
         "allocation": (allocate, (command, derivative, feedback, feedforward, period, robot, allocation)),
         "feedforward": (stage.respond, (0, command, derivative, robot, arrays, feedforward)),

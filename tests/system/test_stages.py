@@ -231,8 +231,9 @@ def test_fault(stage, fault):
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_not_finite(stage):
-    """A number that is not finite stops the run of its row, whose failure names stage and tick, and no other run."""
-    whole, sound = simulate(THREE, **breaking(stage, spoilt)), simulate(THREE)
+    """Not finite, with no guard: it stops the run of its row, whose failure names stage and tick, and no other run."""
+    bare = [scenario.model_copy(update={"guard": mrctl.Guard(on=False)}) for scenario in THREE]
+    whole, sound = simulate(bare, **breaking(stage, spoilt)), simulate(bare)
     tick = 99 if stage == "feedforward" else 100
     assert str(whole.failure[1].item()) == f"{stage} Breaks: not finite, tick {tick}"
     assert whole.failed.values.tolist() == [False, True, False]
