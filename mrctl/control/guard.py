@@ -11,11 +11,12 @@ oscillation if it exceeded a quarter of D:
 | cause of a fallback   | condition                                                                         |
 | --------------------- | --------------------------------------------------------------------------------- |
 | error                 | |e| > ē or ρ > ρ̄ while the learner is to blame                                    |
-| sustained oscillation | 16 half-waves of the PID's output in a row beyond D/4 while it is to blame     |
+| sustained oscillation | 16 half-waves of the PID's output in a row beyond D/4 while it is to blame        |
 | not finite            | NaN or ∞ from the learner                                                         |
 
-After a hold the learner, reset to its initial weights, resumes with a third of the gain; its authority grows from 0
-again. Each further hold, and the time in which it gets its authority back, are three times as long.
+After a hold of 1 s the learner, reset to its initial weights, resumes, and its authority grows from 0 again in 5 s.
+Each further time the hold is three times as long. After an oscillation, and from the second time on, the gain of
+learning is a third and that growth three times as long.
 
 **What it guarantees.**
 
@@ -24,7 +25,7 @@ again. Each further hold, and the time in which it gets its authority back, are 
 2. |d| > D: it ends in the tick in which an error leaves the region. Until then the errors are inside.
 3. From then on PID and model act alone; the PID's integral starts within D of the model, and the rest of the step in
    voltage, which fades, is within D too. From any such state the position error stays below a bound that the loops
-   give (`recovery`): 0.16 to 0.19 m for the default robot.
+   give (`recovery`, which takes that rest for a part of the integral): 0.16 to 0.19 m for the default robot.
 
 The bounds are those of the linear loops that the PID was designed for; the limits of voltage and acceleration, and what
 happens within the loop's delay, add to them. `tests/system/test_adversaries.py` drives against the worst learners.
@@ -58,7 +59,7 @@ RECENT = 1.0  # s for which a deviation may be to blame for an error
 MEAN = 0.5  # s over which voltages are averaged before the integral takes them over; a few periods of an oscillation
 RETURN = 5.0  # s in which a learner that resumes at full gain gets its authority back
 APART = 0.15  # m of posture error that are always tolerated; a run fails at 1 m
-MOVED = 0.55  # s in which an error of V that is always tolerated, 0.27 m/s, moves the robot by `APART`
+LEAST = 0.27, 0.75  # m/s, rad/s, errors of the velocities that are always tolerated; slow robots start with them
 ARM = 0.75  # m ahead of the robot at which a heading error counts as a position error
 BACK_OFF = 3.0  # factor by which each attempt learns more slowly, and waits longer
 UNSURE = 0.1  # further factor on the learning gain of a stage that cannot be reset to its initial weights
@@ -67,11 +68,16 @@ UNSURE = 0.1  # further factor on the learning gain of a stage that cannot be re
 class Guard(Record):
     """Settings of the guard, the watchdog on every learner."""
 
+    moved = {
+        "share": "the learner's output is limited to the supply alone",
+        "weights": "the bound on the errors limits the learner; norms of weights are no longer looked at",
+    }
+
     on: bool = True
     """Whether the guard watches the learner, and may replace it."""
     velocity: Annotated[float, Field(gt=0, le=10)] = 0.28
-    """Largest errors of V and θ̇, as a share of the robot's largest ones, with which a learner may go on; that of V is
-    at least 0.27 m/s."""
+    """Largest errors of V and θ̇, as a share of the robot's largest ones, with which a learner may go on; at least
+    0.27 m/s and 0.75 rad/s."""
     oscillation: Annotated[float, Field(gt=0, le=1)] = 0.25
     """Amplitude of the PID's output, as a share of D, below which an oscillation is ignored."""
     growth: Annotated[float, Field(ge=1, le=100)] = 3.0
@@ -79,7 +85,8 @@ class Guard(Record):
     hold: Annotated[float, Field(gt=0, le=100)] = 1.0
     """Shortest duration of the first fallback in s; each later one lasts three times as long as the last."""
     retries: Annotated[int, Field(ge=0, le=20)] = 4
-    """Number of times that the learner may resume, each time with a third of the gain; then the fallback stays."""
+    """Number of times that the learner may resume, from the second on with a third of the gain each time; then the
+    fallback stays."""
     fade: Annotated[float, Field(gt=0, le=2)] = 0.1
     """Time constant in s with which the step in voltage at the beginning of a fallback, up to D, fades."""
     fallback: Literal["model", "none"] = "model"
@@ -143,7 +150,7 @@ def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
     supply, rotation = float(robot["supply"][0]), float(robot["max_twist"][0, 1])
     rows["model"] = [s.fallback == "model" for s in settings]
     rows["range"] = supply, rotation if robot["rigid"][0] else supply
-    rows["region"] = np.maximum(np.array([[s.velocity] for s in settings]) * robot["max_twist"], (APART / MOVED, 0.0))
+    rows["region"] = np.maximum(np.array([[s.velocity] for s in settings]) * robot["max_twist"], LEAST)
     rows["harmless"] = harmless(rows["region"], gains)
     rows["nearest"] = np.inf
     rows["gain"] = rows["authority"] = 1.0
@@ -271,7 +278,8 @@ def fall_back(g: Row, trouble: int, nominal: Array, integral: Array, feedback: A
     What is left of the step in voltage fades; beyond D it would be one more disturbance that leaves the region.
     """
     g.strikes += 1.0
-    g.gain /= BACK_OFF
+    if g.strikes > 1 or trouble == OSCILLATION:  # the first error may be no more than a bad start
+        g.gain /= BACK_OFF
     g.hold_left = np.inf if g.strikes > g.retries else g.hold * BACK_OFF ** (g.strikes - 1.0)
     g.action, g.reason, g.authority, g.forget = FALLBACK, trouble, 0.0, True
     for k in range(2):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from mrctl.control.feedforward import STEERING_SCALE
+from mrctl.control.guard import Guard
 from mrctl.loop.hierarchy import TAKE_OVER
 from mrctl.loop.simulation import Simulation
 from mrctl.record import InputError
@@ -110,7 +111,8 @@ def measure(scenarios: Sequence[Scenario], channel: int, speed: float = Line().s
     signal[:, channel] = AMPLITUDE * scale * multisine(SAMPLES, harmonics)
     duration = 2 * SAMPLES * first.control_period  # one period to settle, one to measure
     line = Line(length=speed * duration, speed=speed)
-    steady = {"reference": line, "laps": 1, "events": (), "initial_spread": (0.0, 0.0, 0.0)} | FEEDFORWARDS["none"]
+    steady = {"reference": line, "laps": 1, "events": (), "initial_spread": (0.0, 0.0, 0.0), "guard": Guard(on=False)}
+    steady |= FEEDFORWARDS["none"]
     runs = [s.model_copy(update=steady) for s in scenarios]
     shaker = Shaker(signal, 2 * SAMPLES, len(runs))
     simulation = Simulation(runs, feedforward=lambda robot, size: shaker)

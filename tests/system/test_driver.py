@@ -61,10 +61,10 @@ def test_hard_limit(feedforward):
 
 
 def test_hard_limit_with_predictions():
-    """`composite` is no better for being told: it learns from the motion it predicts, and told it must wait."""
+    """`composite` need not be told: its error is the same within a tenth, and the guard leaves it alone."""
     untold, _ = limited("model+composite", 1.3, 12.0, 6, [0], told=False)
     told, guarded = limited("model+composite", 1.3, 12.0, 6, [0], told=True, guard=True)
-    assert untold < told < 3.5
+    assert told == pytest.approx(untold, rel=0.1) and told < 3.5
     assert guarded == 0
 
 

@@ -106,11 +106,14 @@ def test_start(tier):
 
 
 # What a robot meets: changes of the scenario, and the least share of time in which each of posture and twist is within
-# three standard deviations. With one wheel on ice, the heading and V of the tier `field` are in about half of the time.
+# three standard deviations. With one wheel on ice, the heading and V of the tier `field` are in about half of the time;
+# a lifted wheel, whose encoder still counts, turns the heading by up to 3 mrad where the filter believes in 0.5 mrad.
 MEETS = {
     "lost fixes": ({"fix_lost": 0.5}, {}, (0.98,) * 5),
     "outlying fixes": ({"fix_outliers": 0.2}, {}, (0.98,) * 5),
-    "lifted wheel": ({}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.8)}, (0.93,) * 5),
+    "lifted wheel": (
+        {}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.8)}, (0.93, 0.93, 0.88, 0.9, 0.93)
+    ),
     "slipping wheel": (
         {}, {"perturbation": Perturbation(left_tyre_friction_factor=0.1 / 0.9)}, (0.9, 0.9, 0.5, 0.5, 0.95)
     ),
@@ -125,7 +128,7 @@ def test_within_three_deviations(tier, name):
     scenario = Scenario(
         sensing=Sensing(tier=tier, estimator="ekf", **sensing), prior="model", learner="composite", laps=1, **changes
     )
-    errors, covariances, innovations, failed = watched([scenario.model_copy(update={"seed": k}) for k in range(6)])
+    errors, covariances, innovations, failed = watched([scenario.model_copy(update={"seed": k}) for k in range(12)])
     assert not failed.any()
     for k, share in enumerate(least):
         within = normalised(errors, covariances, [k])[SETTLED:] < 9
