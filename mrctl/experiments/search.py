@@ -70,13 +70,13 @@ SEARCHED: dict[str, Bounds] = {
         "rls.step": (0.001, 0.2), "rls.initial_covariance": (2e-3, 20.0), "rls.drift": (1e-7, 1e-2),
         "rls.covariance_bound": (2e-3, 20.0),
     },
-    # Trust in the prediction error, memory, spread of plants, and weight of the tracking error.
+    # Trust in the prediction error, memory or spread of plants, and weight of the tracking error.
     "mrac": {
         "mrac.noise": (1e-3, 0.5), "mrac.memory": (1.0, 1000.0), "mrac.spread": (0.1, 30.0),
         "mrac.tracking": (0.05, 100.0),
     },
     "composite": {
-        "composite.noise": (0.02, 2.0), "composite.memory": (10.0, 1e5), "composite.disturbance": (0.01, 2.0),
+        "composite.noise": (0.02, 2.0), "composite.gain": (0.03, 3.0), "composite.disturbance": (0.01, 2.0),
         "composite.step": (1e-3, 0.3),
     },
 }  # fmt: skip
