@@ -12,7 +12,7 @@ that a setting makes the loop oscillate, and settings must do without it.
 exp J is a weighted geometric mean of ratios. A mean of logarithms gives every world and every metric its weight,
 whatever its size; in a mean of errors the hardest world would decide alone. Position counts as much as both velocities:
 it is what a user sees, and the velocities are what a learner acts on. All laps count, so that a setting pays for
-learning slowly. To each error the floor of the integrator is added, below which a difference means nothing. A run that
+learning slowly. To each error a floor is added, below which a difference means nothing to a user (`FLOORS`). A run that
 fails counts as `LOST` times the error of `model`, and none counts as more: one loss among 16 worlds costs as much as
 15 % of the error in all of them. In two of the eight kinds of worlds the motors lag by one period more than the
 controller knows, in one of them with a light robot, which keeps settings off the edge of stability. More would tell
@@ -83,7 +83,7 @@ SEARCHED: dict[str, Bounds] = {
 """Settings to search, with their bounds, by learner: those that set how fast and how far it follows an error. Sizes
 that change no dynamics (units, scales, bounds of weights) and filters that several laws share stay as they are."""
 METRICS = {"position_rmse": 0.5, "v_rmse": 0.25, "omega_rmse": 0.25}  # with their weights in the objective
-FLOORS = 1e-4, 5e-5, 1e-4  # m, m/s, rad/s: changes of the errors in these worlds when the physics step is halved
+FLOORS = 1e-4, 5e-5, 1e-4  # m, m/s, rad/s; half the physics step changes the errors by less
 LOST = 10.0
 PERIOD, LAPS = 12.0, 2  # s; of the splines, which all robots of a batch share
 SPREAD = 0.2  # standard deviation of the first generation, as a share of the logarithmic range
