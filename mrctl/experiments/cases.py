@@ -112,7 +112,7 @@ PARTS = {
     "learning": "Learning carried to another course, switched on, and off",
     "tier": "Other sensors",
     "steering": "Other steering arrangements",
-    "random": "Random robots, splines and perturbations",
+    "random": "Random robots, splines and perturbations: medians",
     "floor": "Half the physics step: what the integrator resolves",
 }
 UNCHANGED = ("steady", "fault", "course", "tier", "steering")  # parts in whose runs nothing changes between the laps

@@ -188,11 +188,12 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
 
     A row holds for lap 1, all laps and the last lap: the mean with its 95 % bootstrap interval; the floor; the mean
     difference from PID and from `model` in the same run; and the probability of beating each of the others in the same
-    run, where two errors that differ by no more than the floor of differences are a tie. For the last lap it also holds
-    the mean of the worst 5 % (infinite where a run failed) and the ratios to PID and to `model`. `excess` is the error
-    beyond that of the last lap (after a step: of the lap before the return), integrated from the start or the step on;
-    it has no meaning where the course changes. Where nothing changes on the way, a row holds the laps until the error
-    stays within `BAND` times its final value; for a step it holds what `_step` returns.
+    run, where two errors that differ by no more than the floor of differences are a tie. In `random`, where one world
+    would rule the means, they are medians. For the last lap a row also holds the mean of the worst 5 % (infinite where
+    a run failed) and the ratios to PID and to `model`. `excess` is the error beyond that of the last lap (after a step:
+    of the lap before the return), integrated from the start or the step on; it has no meaning where the course changes.
+    Where nothing changes on the way, a row holds the laps until the error stays within `BAND` times its final value;
+    for a step it holds what `_step` returns.
     """
     pairs = [(found[plant], found[plant + HALF]) for plant in FLOOR if {plant, plant + HALF} <= found.keys()]
     limits = {metric: floors(pairs, metric) for metric in COLUMNS}
@@ -209,7 +210,9 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
                 row["failed_where_pid_did_not"] = int((lost[name] & ~lost["none"]).sum())
             for metric in COLUMNS:
                 row[metric] = {
-                    window: standing(name, {one: e[window] for one, e in errors[metric].items()}, floor)
+                    window: standing(
+                        name, {one: e[window] for one, e in errors[metric].items()}, floor, case.part == "random"
+                    )
                     for window, floor in limits[metric].items()
                 }
                 row[metric] |= row[metric].pop("last")
@@ -237,16 +240,17 @@ def windows(laps: xr.Dataset, metric: str) -> dict[str, NDArray[np.float64]]:
     return {"first": error[:, 0], "all": np.sqrt(np.mean(error**2, axis=1)), "last": error[:, -1]}
 
 
-def standing(name: str, errors: Mapping[str, NDArray[np.float64]], floor: Floor) -> dict[str, Any]:
-    """The mean of one feedforward in a case, with its interval, and how it stands to the others in the same runs."""
-    found: dict[str, Any] = bootstrap_interval(errors[name])._asdict() | {"floor": floor._asdict()}
+def standing(name: str, errors: Mapping[str, NDArray[np.float64]], floor: Floor, median: bool) -> dict[str, Any]:
+    """The mean or median of one feedforward in a case, and how it stands to the others in the same runs."""
+    found: dict[str, Any] = bootstrap_interval(errors[name], median=median)._asdict() | {"floor": floor._asdict()}
     for rival, theirs in errors.items():
         if rival != name:
             beaten = superiority(errors[name], theirs, floor=floor.difference)
             found[f"beats_{titled(rival)}"] = beaten._asdict()
             if rival in YARDSTICKS:
                 apart = (errors[name] - theirs)[np.isfinite(errors[name] - theirs)]
-                found[f"less_{titled(rival)}"] = float(apart.mean()) if len(apart) else np.nan
+                centre = np.median if median else np.mean
+                found[f"less_{titled(rival)}"] = float(centre(apart)) if len(apart) else np.nan
     return found
 
 

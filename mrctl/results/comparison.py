@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 class Interval(NamedTuple):
-    """A mean with its confidence interval, over the `samples` that are finite."""
+    """A mean or median with its confidence interval, over the `samples` that are finite."""
 
     value: float
     low: float
@@ -52,7 +52,9 @@ class Superiority(NamedTuple):
     losses: int
 
 
-def bootstrap_interval(samples: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0) -> Interval:
+def bootstrap_interval(
+    samples: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0, *, median: bool = False
+) -> Interval:
     """Mean of the finite samples with its bias-corrected, accelerated bootstrap interval (Efron, 1987).
 
     Args:
@@ -60,15 +62,17 @@ def bootstrap_interval(samples: ArrayLike, level: float = 0.95, n: int = 10_000,
         level: Confidence level, between 0 and 1.
         n: Number of resamples.
         seed: Seed of the resampling.
+        median: Takes the median instead, over which no single sample rules.
 
     Returns:
         The interval; its ends are NaN where fewer than two samples are finite, for one run does not show the spread.
     """
     values = np.asarray(samples, float).ravel()
     finite = values[np.isfinite(values)]
-    low, high = _interval((finite,), np.mean, level, n, seed)
-    mean = float(finite.mean()) if len(finite) else np.nan
-    return Interval(mean, low, high, len(finite), len(values) - len(finite))
+    statistic = np.median if median else np.mean
+    low, high = _interval((finite,), statistic, level, n, seed)
+    value = float(statistic(finite)) if len(finite) else np.nan
+    return Interval(value, low, high, len(finite), len(values) - len(finite))
 
 
 def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0) -> Ratio:

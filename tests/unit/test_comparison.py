@@ -18,6 +18,12 @@ def test_bootstrap_normal():
     assert (found.low, found.high) == pytest.approx((samples.mean() - half, samples.mean() + half), abs=0.1 * half)
 
 
+def test_median():
+    """One run that went far wrong moves the mean and not the median, nor its interval."""
+    found = comparison.bootstrap_interval([1, 2, 3, 4, 5, 6, 700], median=True)
+    assert found.value == 4 and 1 <= found.low < 4 < found.high <= 6
+
+
 def test_bootstrap_coverage():
     """About 95 % of the intervals of 30 samples hold the true mean."""
     draws = np.random.default_rng(2).normal(3, 1, (200, 30))
