@@ -1,6 +1,7 @@
 """`mrctl reproduce` from end to end, its numbers held against the targets."""
 
 import json
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from matplotlib.image import imread
 
 from mrctl import cli
-from mrctl.experiments import kanayama
+from mrctl.experiments import kanayama, paper
+from mrctl.scenario import COMPARED
 
 pytestmark = pytest.mark.xdist_group("reproduce")  # what its tests share is made once
 
@@ -22,7 +24,9 @@ FIGURES = (
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("reproduction")
-    assert cli.main(["reproduce", "--out", str(out)]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper, "DRAWS", 1)  # replicates in the table of the tiers; one shows what its test asks for
+        assert cli.main(["reproduce", "--out", str(out)]) == 0
     return out
 
 
@@ -65,6 +69,15 @@ def test_network_beats_pid_in_other_arrangements(table: dict, steering: str, pla
         assert found["v_rmse"] <= bare["v_rmse"]
         assert found["omega_rmse"] < bare["omega_rmse"]
         assert found["position_rmse"] < bare["position_rmse"]
+
+
+def test_tiers(table: dict) -> None:
+    """Everything is driven in each tier, and with all four constants wrong every learner is ahead of PID alone."""
+    rows = {(r["sensing"], r["plant"], r["feedforward"]): r for r in table["tiers"]}
+    assert set(rows) == set(product(("ideal", "lab", "field"), ("nominal", "all"), (*COMPARED, "hindsight")))
+    for tier, name in product(("ideal", "lab", "field"), COMPARED):
+        if name != "none":
+            assert rows[tier, "all", name]["position_rmse"] < rows[tier, "all", "none"]["position_rmse"], (tier, name)
 
 
 def test_learning_stays_stable(table: dict) -> None:
