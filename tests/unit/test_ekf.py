@@ -28,7 +28,7 @@ def motion(x, acceleration, theta_dot_dot):
     """Returns the state a period later, from the equations in the filter's documentation, by the midpoint rule."""
     v, omega = x[V] + acceleration * MIDDLE, x[OMEGA] + theta_dot_dot * MIDDLE
     # The rear axle moves along θ − c θ̇.
-    heading = x[THETA] + omega * T / 2 - (laws.SIDE - SKEW) * omega
+    heading = x[THETA] + omega * T / 2 - laws.SIDE * omega
     new = np.array(x)
     new[X] += T * v * np.cos(heading)
     new[Y] += T * v * np.sin(heading)
@@ -49,7 +49,7 @@ def jacobian(f, x):
 def process_noise(x, grip, s, acceleration, theta_dot_dot, jolt):
     """Returns the covariance that a period adds."""
     v, omega = x[V] + acceleration * MIDDLE, x[OMEGA] + theta_dot_dot * MIDDLE
-    heading = x[THETA] + omega * T / 2 - (laws.SIDE - SKEW) * omega
+    heading = x[THETA] + omega * T / 2 - laws.SIDE * omega
     across = np.array([-np.sin(heading), np.cos(heading)])
     Q = np.zeros((N, N))
     Q[:2, :2] = T * (laws.SIDE_SLIP if grip.all() else laws.SKID) ** 2 * np.outer(across, across)
