@@ -34,8 +34,9 @@ class Fel(Record):
 
     hidden: Annotated[int, Field(ge=1, le=256)] = 24
     """Number of hidden tanh units."""
-    step: Annotated[float, Field(ge=0, le=1)] = 0.1
-    """Normalised step μ: share of the feedback voltage that one control period moves into the feedforward."""
+    step: Annotated[float, Field(ge=0, le=1)] = 0.01
+    """Normalised step μ: share of the feedback voltage that one control period moves into the feedforward. The default
+    is what `mrctl tune --search` found in `lab`, with and without the model as prior."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.03
     """Feedback in V below which nothing is learned; on a steering channel, a tenth of this number in rad/s."""
     leak: Annotated[float, Field(ge=0, le=0.1)] = 1e-6

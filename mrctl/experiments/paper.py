@@ -13,7 +13,9 @@ from typing import Any
 import pandas as pd
 import xarray as xr
 
+from mrctl.control.fel import Fel
 from mrctl.control.kanayama import Kanayama
+from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.experiments import kanayama
 from mrctl.experiments.hindsight import best_fixed
@@ -38,8 +40,13 @@ IDEAL: dict[str, Any] = {
     "pid": Pid(time_constant=0.15),
     "kanayama": Kanayama(k_x=3.0, k_y=25.0, k_theta=10.0),
     "prefilter": 0.05,
+    "fel": Fel(step=0.1),
+    "observer": Observer(time_constant=0.055),
 }
-"""The world of the paper: exact measurements without delay, ideal motors, and a PID that is not tuned to its limit."""
+"""The world of the paper: exact measurements without delay, ideal motors, and a PID that is not tuned to its limit.
+
+Learner and observer have the settings for that PID; their defaults are for a PID ten times as fast.
+"""
 METRICS = ("v_rmse", "omega_rmse", "position_rmse")
 
 
