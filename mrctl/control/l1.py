@@ -42,9 +42,9 @@ from mrctl.theory.robot import Robot
 class L1(Record):
     """Settings of the learner `l1`."""
 
-    bandwidth: Annotated[float, Field(gt=0, le=200)] = 12.0
-    """Bandwidth ω of the low-pass C in rad/s. With the default PID the sensitivity at the voltage is at most 1.9 in
-    `lab`, where 50 rad/s give 2.4; with 30 rad/s a robot of half the mass nearly oscillates."""
+    bandwidth: Annotated[float, Field(gt=0, le=200)] = 4.0
+    """Bandwidth of the low-pass C in rad/s. `mrctl tune --search` found that in `lab` all up to 4 rad/s are equal
+    within 1 %; the default is the fastest of them."""
     predictor: Annotated[float, Field(gt=0, le=200)] = 5.0
     """Rate a in 1/s with which the predictor's error decays by itself."""
 

@@ -115,14 +115,14 @@ def test_torch_module(runs):
     start = unflatten(initial_weights(24, BASE.seed))
     twin.load_state_dict({name: torch.tensor(layer) for name, layer in start.items()})
     short = variant(laps=1)
-    same = simulate(short, feedforward=lambda robot, size: ModuleLearning(twin, robot, size))
+    same = simulate(short, feedforward=lambda robot, size: ModuleLearning(twin, robot, size, BASE.fel))
     for name in ("x", "omega", "feedforward_left"):
         assert np.allclose(same[name], lap(runs.isel(run=0), 0)[name], atol=1e-6), name
 
     torch.manual_seed(0)
     own = torch.nn.Sequential(torch.nn.Linear(8, 16), torch.nn.Tanh(), torch.nn.Linear(16, 2))
     learned = simulate(
-        [short, variant(laps=1, seed=1)], feedforward=lambda robot, size: ModuleLearning(own, robot, size)
+        [short, variant(laps=1, seed=1)], feedforward=lambda robot, size: ModuleLearning(own, robot, size, BASE.fel)
     )
     assert not learned.failed.any() and float(learned.weight_norm[0, -1]) > 0
     assert rms(learned.feedback_left[0, TICKS // 2 :]) < rms(lap(runs.isel(run=1), 0).feedback_left[TICKS // 2 :])
@@ -130,7 +130,8 @@ def test_torch_module(runs):
 
 def test_too_small_a_bound():
     """A network at the bound of its weights helps less, but does not talk the PID out of what it holds."""
-    small = Scenario(**IDEAL, laps=2, fel=Fel(weight_bound=7.0, output_scale=0.76), initial_spread=(0, 0, 0))
+    fel = Fel(step=0.1, weight_bound=7.0, output_scale=0.76)
+    small = Scenario(**IDEAL | {"fel": fel}, laps=2, initial_spread=(0, 0, 0))
     bound, alone = per_lap(
         simulate([small, small.model_copy(update={"prior": "none", "learner": "none"})])
     ).position_rmse[:, 1]

@@ -5,6 +5,7 @@ import pytest
 
 from mrctl.control.feedforward import Prior
 from mrctl.control.observer import DisturbanceObserver, Observer
+from mrctl.experiments.paper import IDEAL
 from mrctl.theory.dynamics import accelerations, left_right
 
 PERIOD = 0.01
@@ -73,10 +74,12 @@ def stable(time_constant, delay, pid_time_constant=0.15):
 
 
 def test_margin():
-    """With 20 ms of delay and the hold the sensitivity stays below 2, 5 ms faster it does not; stable behind 40 ms."""
-    assert sensitivity(T, 0.025) < 2 < sensitivity(T - 0.005, 0.025)
-    assert sensitivity(T, 0.005) < 1.2
-    assert stable(T, 0.045) and not stable(T - 0.02, 0.045)
+    """In the world of the paper 20 ms of delay leave a sensitivity of 2, 5 ms faster does not; it is stable with 40."""
+    fast = IDEAL["observer"].time_constant
+    assert sensitivity(fast, 0.025) < 2 < sensitivity(fast - 0.005, 0.025)
+    assert sensitivity(fast, 0.005) < 1.2
+    assert stable(fast, 0.045) and not stable(fast - 0.02, 0.045)
+    assert sensitivity(T, 0.025) < 1.3
 
 
 @pytest.mark.parametrize("rigid", [False, True])
@@ -95,7 +98,7 @@ def test_steering(robot):
     """Under rigid steering the disturbance is the rotation that is asked for and does not come."""
     stage = observer(robot, rigid=True)
     command = np.array([[0.8, 0.5]])
-    for _ in range(300):
+    for _ in range(round(20 * T / PERIOD)):
         stage.output(command, np.zeros((1, 2)))
         stage.learn(np.zeros((1, 2)), np.zeros(1), np.array([[0.8, 0.45]]), np.array([[9.0, 0.02]]))
     assert stage.rows["disturbance"][0, 1] == pytest.approx(0.5 + 0.02 - 0.45, rel=1e-6)
