@@ -73,7 +73,12 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "power": ("W", "electrical power"),
     "guard": ("1", "what the guard does: 0 nothing, 1 limit, 2 freeze, 3 fallback"),
     "guard_reason": ("1", "why, as an index into `mrctl.control.guard.REASONS`"),
+    "z": ("m", "height of the middle between the driven wheels"),
+    "roll": ("rad", "roll, positive to the right; heading, pitch and roll are angles about z, y and x in this order"),
+    "pitch": ("rad", "pitch, positive nose down"),
 }
+
+SINCE_0_4_2 = ("z", "roll", "pitch")  # signals that older results lack
 
 TICK = np.dtype([(name, "f8") for name in SIGNALS])  # the signals of one robot at one control tick
 

@@ -31,6 +31,7 @@ from mrctl.viewer.session import state
 
 Array = NDArray[np.float64]
 MAX_SHOWN = 4  # largest number of runs in a result that are all shown at the beginning
+ABOVE = 0.01  # m, height of a path above the ground
 WHEELS = {"wheel_left": "wheel_rate_left", "wheel_right": "wheel_rate_right"}
 
 
@@ -74,6 +75,11 @@ class Recording:
         """The compiled world with the nominal robot."""
         return mjcf.load(self.scenario.world, self.scenario.steering, robot=self.scenario.robot)
 
+    @property
+    def _radius(self) -> float:
+        """Radius of the driven wheels in m."""
+        return float(self.model.geom("wheel_left").size[0])
+
     @cached_property
     def _wheel_angles(self) -> dict[str, Array]:
         """Angle of each wheel at the samples in rad, `(T,)`."""
@@ -87,20 +93,36 @@ class Recording:
         return state(self.scenario, self.start + time)["perturbation"]
 
     def path(self, points: int = 600) -> Array:
-        """Returns points of the path of P, a little above the ground, in m, `(points, 3)`."""
-        rows = self.log[np.linspace(0, len(self.log) - 1, points).astype(int)]
-        height = self.qpos(0)[2] - self.model.geom("wheel_left").size[0] + 0.01
-        return np.column_stack([rows["x"], rows["y"], np.full(points, height)])
+        """Returns points of the path of P as from `path`, at equal times, `(points, 3)`."""
+        return path(self.log[np.linspace(0, len(self.log) - 1, points).astype(int)], self._radius, self.qpos(0)[2])
 
     def qpos(self, index: int) -> Array:
-        """Returns the generalised position at a sample, `(nq,)`: the recorded plane motion, placed on the ground."""
+        """Returns the generalised position at a sample, `(nq,)`; a result without height and tilt stands upright."""
         now = self.log[index]
         pose, twist = (np.array([now[name] for name in names]) for names in (("x", "y", "theta"), ("v", "omega")))
-        qpos = stand(self.model, pose, twist).qpos
+        if np.isfinite(now["z"]):
+            qpos = self.model.qpos0.copy()
+            chassis = qpos[self.model.joint("chassis").qposadr[0] :]
+            chassis[:3] = now["x"], now["y"], now["z"]
+            mujoco.mju_euler2Quat(chassis[3:7], np.array([now["theta"], now["pitch"], now["roll"]]), "zyx")
+        else:
+            qpos = stand(self.model, pose, twist).qpos
         steer(self.model, qpos, now["steering_angle"])
         for wheel, angle in self._wheel_angles.items():
             qpos[self.model.joint(wheel).qposadr[0]] = angle[index]
         return qpos
+
+
+def path(rows: Rows, radius: float, height: float) -> Array:
+    """Returns the path of P, a little above the ground, in m, with the shape of `rows` and 3.
+
+    Args:
+        rows: Records of `TICK`.
+        radius: Radius of the driven wheels in m.
+        height: Height of the middle between them in m, where none was recorded.
+    """
+    z = np.where(np.isfinite(rows["z"]), rows["z"], height)
+    return np.stack([rows["x"], rows["y"], z - radius + ABOVE], axis=-1)
 
 
 def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows]:
