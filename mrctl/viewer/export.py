@@ -68,7 +68,7 @@ def _scene(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
         for time in np.arange(0, duration, 1 / PICTURE_RATE):
             for row, recording in enumerate(recordings):
                 scene.show(row, recording.qpos(recording.index(time)))
-            scene.show_payload(recordings[0].perturbation(time))
+                scene.show_payload(row, recording.perturbation(time))
             scene.flush(follow=False)
             serializer.insert_sleep(1 / PICTURE_RATE)
         return serializer.as_html()
@@ -83,12 +83,12 @@ def _curves(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
     drawn = []
     for chart in charts(log, labels, recordings[0].period):
         values = [curve.values[::step] for curve in chart.curves]
-        known = np.concatenate(values)
+        known = np.concatenate([*values, chart.least])
         known = known[np.isfinite(known)]
         drawn.append(
             {
                 "title": chart.title,
-                "range": [float(known.min()), float(known.max())] if known.size else [0.0, 1.0],
+                "range": [float(known.min()), float(known.max())],
                 "curves": [
                     {
                         "colour": f"rgb{curve.colour}",

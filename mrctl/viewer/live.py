@@ -25,12 +25,13 @@ from mrctl.viewer.plots import Plots
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import CHANGEABLE, Session, changed
+from mrctl.viewer.session import CHANGEABLE, Session, changed, state
 
 WINDOW = 12.0  # s, time span of the plots
 SAMPLES = 300  # about the largest number of samples in a curve
 TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each of which may take half a second
-PLOTS_PER_MARK = 3  # updates of the plots for each point of the trails
+PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
+REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
 MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
 # Label of each group of buttons, its buttons, and the change of the perturbation or the push that a button makes.
 BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
@@ -75,11 +76,12 @@ class Live(Page):
         self.late = self.ticks = 0  # ticks that began more than a period too late, and all ticks, at a finite speed
         self._due = 0.0  # number of ticks that are due
         self._changed_inputs: dict[tuple[str, ...], Any] = {}
+        self._rested = 0.0  # monotonic time in s at which the changed inputs are applied
         self._shown_setup: tuple[object, ...] | None = None  # world, robot, steering and labels of the present scene
         self._shown_sensing: list[Sensing] | None = None
         self._drawn: tuple[object, ...] | None = None
         self._plotted: int | None = None
-        self._plots_since_mark = 0
+        self._plots_since_trail = 0
         self._tidied = time.monotonic()
         self._build()
         self._show_session()
@@ -187,8 +189,9 @@ class Live(Page):
         self._describe()
 
     def _note_input(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
-        """Notes the value of an input; while a slider is dragged, only the last value counts."""
+        """Notes the value of an input; while a slider is dragged, only the value counts at which it rests."""
         self._changed_inputs[path] = value
+        self._rested = time.monotonic() + (REST if isinstance(value, float) else 0.0)
 
     def _apply_inputs(self) -> None:
         """Applies the noted inputs: as an event if the field can change during a run, otherwise in a new run."""
@@ -224,13 +227,16 @@ class Live(Page):
 
     def _present(self, scenario: Scenario) -> Scenario:
         """Returns the scenario with the present values of the fields that events have changed."""
-        state = self.session.state()
-        return scenario.model_copy(update={name: state[name] for name in CHANGEABLE})
+        now = self.session.state()
+        return scenario.model_copy(update={name: now[name] for name in CHANGEABLE})
 
     def _compare(self, name: FeedforwardName, wanted: bool) -> None:
         first, *ghosts = map(self._present, self.session.start)
+        if wanted and name == first.feedforward:
+            self._ghosts[name].value = False
+            raise InputError(f"compare with: {name} drives already, as the first robot")
         ghosts = [s for s in ghosts if s.feedforward != name]
-        if wanted and name != first.feedforward:
+        if wanted:
             ghosts.append(first.model_copy(update=FEEDFORWARDS[name] | {"name": ""}))
         self._restart([first, *ghosts])
 
@@ -293,36 +299,45 @@ class Live(Page):
 
     @override
     def refresh(self) -> None:
-        self._apply_inputs()
         session, now = self.session, time.monotonic()
+        if self._changed_inputs and now >= self._rested:
+            self._apply_inputs()
+            session = self.session
         since, tick = self._counted
         if now - since >= 1:
             self.factor = (session.tick - tick) * session.period / (now - since)
             self._counted = now, session.tick
-        state = "playing" if self.playing else "paused" if session.running else "finished; reset starts again"
+        doing = "playing" if self.playing else "paused" if session.running else "finished; reset starts again"
         lap = 1 + int(session.time / session.start[0].reference.period)
         factor = f" · {self.factor:.2f}× real time" if self.playing else ""
-        lines = [f"<b>{session.time:.2f} s</b> · lap {lap} · {state}{factor}"]
+        lines = [f"<b>{session.time:.2f} s</b> · lap {lap} · {doing}{factor}"]
         for row, scenario in enumerate(session.start):
             if reason := session.failure(row):
                 lines.append(warning(f"{scenario.name or scenario.feedforward} stopped: {reason}"))
-        if self.message:
-            lines.append(warning(self.message))
         write(self._status, block("status", *lines))
-        if session.tick != self._plotted and session.tick > 1:
+        if session.tick != self._plotted:
             self._plotted = session.tick
-            self._plots_since_mark += 1
-            if self.playing and self._plots_since_mark >= PLOTS_PER_MARK:
-                self._plots_since_mark = 0
-                self._scene.mark_trails()
-            ticks = round(WINDOW / session.period)
-            step = max(1, ticks // SAMPLES)
-            first = max(0, session.tick - ticks) // step * step
-            log = session.log(first)
-            times = np.arange(first, first + len(log), dtype=float) * session.period
-            self._plots.show(times, log, step)
+            self._show_past()
         if session.tick:
             self.describe_estimates(self._labels, session.log(session.tick - 1)[-1])
+
+    def _show_past(self) -> None:
+        """Draws the last seconds: their curves, and the trails of the robots, which change less often."""
+        session = self.session
+        ticks = round(WINDOW / session.period)
+        step = max(1, ticks // SAMPLES)
+        first = max(0, session.tick - ticks) // step * step
+        log = session.log(first)
+        if len(log) < 2:
+            return self._plots.clear(WINDOW)
+        self._plots.show(np.arange(first, first + len(log), dtype=float) * session.period, log, step)
+        self._plots_since_trail += 1
+        if self._plots_since_trail >= PLOTS_PER_TRAIL or not self.playing:
+            self._plots_since_trail = 0
+            every = -(-ticks // (self._scene.trail_points - 2))
+            marked = session.tick // every * every - every * np.arange(self._scene.trail_points - 1)[::-1]
+            rows = np.append(marked, session.tick - 1) - first  # the same moments of the run in every picture
+            self._scene.show_trails(log[np.clip(rows, 0, len(log) - 1)])
 
     def _describe(self) -> None:
         """Writes the timeline, and sets the inputs to the present values."""
@@ -334,7 +349,8 @@ class Live(Page):
             before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
         write(self._timeline, block("timeline", *(reversed(lines[-50:]) if lines else ["no events yet"])))
         present = self._present(self.session.start[0])
-        self._scene.show_payload(present.perturbation)
+        for row, saved in enumerate(self.session.saved()):
+            self._scene.show_payload(row, state(saved, self.session.time)["perturbation"])
         self._controls.designed = self.session.designed()
         self._controls.show(present)
         units = ("V/(m/s)", "V/m"), RIGID_UNITS if present.steering == "rigid" else ("V/(rad/s)", "V/rad")

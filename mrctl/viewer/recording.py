@@ -75,11 +75,6 @@ class Recording:
         """The compiled world with the nominal robot."""
         return mjcf.load(self.scenario.world, self.scenario.steering, robot=self.scenario.robot)
 
-    @property
-    def _radius(self) -> float:
-        """Radius of the driven wheels in m."""
-        return float(self.model.geom("wheel_left").size[0])
-
     @cached_property
     def _wheel_angles(self) -> dict[str, Array]:
         """Angle of each wheel at the samples in rad, `(T,)`."""
@@ -91,10 +86,6 @@ class Recording:
     def perturbation(self, time: float) -> Perturbation:
         """Returns the perturbation of the plant at a time in s."""
         return state(self.scenario, self.start + time)["perturbation"]
-
-    def path(self, points: int = 600) -> Array:
-        """Returns points of the path of P as from `path`, at equal times, `(points, 3)`."""
-        return path(self.log[np.linspace(0, len(self.log) - 1, points).astype(int)], self._radius, self.qpos(0)[2])
 
     def qpos(self, index: int) -> Array:
         """Returns the generalised position at a sample, `(nq,)`; a result without height and tilt stands upright."""
