@@ -74,11 +74,11 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "guard": ("1", "what the guard does: 0 nothing, 1 limit, 2 freeze, 3 fallback"),
     "guard_reason": ("1", "why, as an index into `mrctl.control.guard.REASONS`"),
     "z": ("m", "height of the middle between the driven wheels"),
-    "roll": ("rad", "roll, positive to the right; heading, pitch and roll are angles about z, y and x in this order"),
-    "pitch": ("rad", "pitch, positive nose down"),
+    "roll_angle": ("rad", "roll, positive to the right; after heading and pitch, about the robot's own axis"),
+    "pitch_angle": ("rad", "pitch, positive nose down; after the heading"),
 }
 
-SINCE_0_4_2 = ("z", "roll", "pitch")  # signals that older results lack
+SINCE_0_4_2 = ("z", "roll_angle", "pitch_angle")  # signals that older results lack
 
 TICK = np.dtype([(name, "f8") for name in SIGNALS])  # the signals of one robot at one control tick
 

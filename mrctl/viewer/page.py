@@ -43,6 +43,7 @@ class Page(ABC):
         """Takes the server; a subclass builds the rest of the page."""
         self.server = server
         self._notice = server.gui.add_html("")  # above the tabs, so that it is seen on each of them
+        self.message = ""
         self.playing = True
         self.speed = 1.0
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()

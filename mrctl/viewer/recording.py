@@ -95,7 +95,7 @@ class Recording:
             qpos = self.model.qpos0.copy()
             chassis = qpos[self.model.joint("chassis").qposadr[0] :]
             chassis[:3] = now["x"], now["y"], now["z"]
-            mujoco.mju_euler2Quat(chassis[3:7], np.array([now["theta"], now["pitch"], now["roll"]]), "zyx")
+            mujoco.mju_euler2Quat(chassis[3:7], np.array([now["theta"], now["pitch_angle"], now["roll_angle"]]), "zyx")
         else:
             qpos = stand(self.model, pose, twist).qpos
         steer(self.model, qpos, now["steering_angle"])

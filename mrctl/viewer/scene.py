@@ -265,7 +265,9 @@ class Scene:
         self._root.position = -self._positions[0, self._chassis] * [1, 1, 0] if follow else np.zeros(3)
         for row, frames in enumerate(self._frames):
             for k, frame in enumerate(frames):
-                frame.position, frame.wxyz = self._positions[row, k], self._quaternions[row, k]
+                frame.wxyz = self._quaternions[row, k]
+                if abs(frame.position - self._positions[row, k]).max() > 1e-6:  # wheels stay, but for rounding
+                    frame.position = self._positions[row, k]
         self._show_labels()
 
     def _show_labels(self) -> None:
