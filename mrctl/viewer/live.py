@@ -16,10 +16,12 @@ import viser
 from typing_extensions import override
 
 from mrctl.record import InputError
+from mrctl.results.controllers import title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.controls import Controls
+from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.scene import Scene
@@ -118,7 +120,7 @@ class Live(Page):
             self._controls.add(first, only=DRIVER)
             with gui.add_folder("compare with"):
                 self._ghosts: dict[FeedforwardName, viser.GuiCheckboxHandle] = {
-                    name: gui.add_checkbox(name, False) for name in FEEDFORWARDS
+                    name: gui.add_checkbox(title_of(name), False) for name in FEEDFORWARDS
                 }
                 for name, ghost in self._ghosts.items():
                     self.on(ghost, partial(self._compare, name))
@@ -132,14 +134,15 @@ class Live(Page):
     def _show_session(self) -> None:
         """Shows the robots of a new session in the scene and in the plots."""
         session, first = self.session, self.session.start[0]
-        self._labels = labels = [s.name or s.feedforward for s in session.start]
-        setup = (first.world, first.robot, first.steering, labels)
+        self._labels = [s.name or title_of(s.feedforward) for s in session.start]
+        robots = looks(self._labels, [s.feedforward for s in session.start])
+        setup = (first.world, first.robot, first.steering, robots)
         if self._shown_setup != setup:
             if self._shown_setup is not None:
                 self._scene.remove()
             self._shown_setup = setup
-            self._scene = Scene(self.server, session.simulations[0][1].model, labels)
-            self._plots.set_robots(labels, session.period)
+            self._scene = Scene(self.server, session.simulations[0][1].model, robots)
+            self._plots.set_robots(robots, session.period)
         sensing = [s.sensing for s in session.start]
         if self._shown_sensing != sensing:
             self._shown_sensing = sensing
@@ -234,7 +237,7 @@ class Live(Page):
         first, *ghosts = map(self._present, self.session.start)
         if wanted and name == first.feedforward:
             self._ghosts[name].value = False
-            raise InputError(f"compare with: {name} drives already, as the first robot")
+            raise InputError(f"compare with: {title_of(name)} drives already, as the first robot")
         ghosts = [s for s in ghosts if s.feedforward != name]
         if wanted:
             ghosts.append(first.model_copy(update=FEEDFORWARDS[name] | {"name": ""}))
@@ -311,9 +314,9 @@ class Live(Page):
         lap = 1 + int(session.time / session.start[0].reference.period)
         factor = f" · {self.factor:.2f}× real time" if self.playing else ""
         lines = [f"<b>{session.time:.2f} s</b> · lap {lap} · {doing}{factor}"]
-        for row, scenario in enumerate(session.start):
+        for row, label in enumerate(self._labels):
             if reason := session.failure(row):
-                lines.append(warning(f"{scenario.name or scenario.feedforward} stopped: {reason}"))
+                lines.append(warning(f"{label} stopped: {reason}"))
         write(self._status, block("status", *lines))
         if session.tick != self._plotted:
             self._plotted = session.tick

@@ -13,7 +13,8 @@ from viser import uplot
 
 from mrctl.kernel import Rows
 from mrctl.results.dataset import blank
-from mrctl.viewer.scene import REFERENCE_COLOUR, Colour, colour_of
+from mrctl.viewer.looks import Colour, Look
+from mrctl.viewer.scene import REFERENCE_COLOUR
 
 Array = NDArray[np.float64]
 
@@ -40,26 +41,32 @@ class Chart(NamedTuple):
     least: tuple[float, float]
 
 
-def charts(log: Rows, labels: Sequence[str], period: float) -> list[Chart]:
+def charts(log: Rows, robots: Sequence[Look], period: float) -> list[Chart]:
     """Returns the charts of a log.
 
     Args:
         log: Record of `results.dataset.TICK` for each sample and robot, `(T, B)`.
-        labels: Label of each robot.
+        robots: Look of each robot.
         period: Time between samples in s.
     """
-    shown = range(min(len(labels), MAX_ROBOTS))
+    shown = range(min(len(robots), MAX_ROBOTS))
 
     def signal(name: str, row: int) -> Array:
         return log[name][:, row]
 
     def each(quantity: str, values: Sequence[Array], dashed: bool = False) -> list[Curve]:
-        return [Curve(f"{labels[r]} {quantity}", colour_of(r), dashed, values[r]) for r in shown]
+        return [Curve(f"{robots[r].label} {quantity}", robots[r].colour, dashed, values[r]) for r in shown]
 
     def tracked(title: str, name: str, least: tuple[float, float]) -> Chart:
         reference = Curve("reference", REFERENCE_COLOUR, False, signal(f"{name}_ref", 0))
         estimated = [
-            Curve(f"{labels[r]} {name} estimated", pale(colour_of(r)), False, signal(f"{name}_measured", r), 4.5)
+            Curve(
+                f"{robots[r].label} {name} estimated",
+                pale(robots[r].colour),
+                False,
+                signal(f"{name}_measured", r),
+                4.5,
+            )
             for r in shown
         ]
         return Chart(title, [reference, *estimated, *each(name, [signal(name, r) for r in shown])], least)
@@ -129,24 +136,27 @@ class Plots:
             self._legend = gui.add_html("")
             self._cursor = gui.add_html("")
 
-    def set_robots(self, labels: Sequence[str], period: float) -> None:
+    def set_robots(self, robots: Sequence[Look], period: float) -> None:
         """Sets the robots whose curves `show` will draw.
 
         Args:
-            labels: Label of each robot.
+            robots: Look of each robot.
             period: Time between samples in s.
         """
-        self._labels, self._period = labels, period
-        self._legend.content = legend(labels)
-        size = min(len(labels), MAX_ROBOTS)
+        self._robots, self._period = robots, period
+        self._legend.content = legend(robots)
+        size = min(len(robots), MAX_ROBOTS)
+        drawn = charts(blank(2, size), robots[:size], period)
         if size not in self._sets:
-            empty = charts(blank(2, size), labels[:size], period)
             with self._tab:
-                self._sets[size] = [_add(self._gui, chart, self._zoom) for chart in empty]
+                self._sets[size] = [_add(self._gui, chart, self._zoom) for chart in drawn]
         for count, handles in self._sets.items():
             for handle in handles:
                 handle.visible = count == size
         self._handles = self._sets[size]
+        for handle, chart in zip(self._handles, drawn, strict=True):
+            if handle.series != (series := _series(chart)):
+                handle.series = series
 
     def show(self, time: Array, log: Rows, step: int) -> None:
         """Draws a log.
@@ -156,12 +166,12 @@ class Plots:
             log: Record of `TICK` for each sample and robot, `(T, B)`.
             step: Number of samples from one drawn sample to the next.
         """
-        for handle, chart in zip(self._handles, charts(log, self._labels, self._period), strict=True):
+        for handle, chart in zip(self._handles, charts(log, self._robots, self._period), strict=True):
             handle.data = tuple(np.ascontiguousarray(v[::step]) for v in (time, *(c.values for c in chart.curves)))
 
     def clear(self, span: float) -> None:
         """Draws empty charts of `span` s."""
-        self.show(np.array([0.0, span]), blank(2, len(self._labels)), 1)
+        self.show(np.array([0.0, span]), blank(2, len(self._robots)), 1)
 
     def point(self, share: float) -> None:
         """Draws a vertical line in all charts at a share of their time; their data need not be sent again."""
@@ -170,27 +180,32 @@ class Plots:
         self._cursor.content = f"<style>.u-over::after{{{line}}}</style>"
 
 
-def legend(labels: Sequence[str]) -> str:
+def legend(robots: Sequence[Look]) -> str:
     """Returns the legend of robots and their colours in HTML."""
-    keys = [f'<span style="color:rgb{colour_of(k)}">■ {html.escape(name)}</span>' for k, name in enumerate(labels)]
+    keys = [f'<span style="color:rgb{colour}">■ {html.escape(label)}</span>' for label, colour in robots]
     keys += [f'<span style="color:rgb{REFERENCE_COLOUR}">■ reference</span>']
-    keys += [f'<span style="color:rgb{pale(colour_of(0))}">■ pale: estimated V, θ̇</span>']
-    if len(labels) > MAX_ROBOTS:
-        keys += [f"Curves are of the first {MAX_ROBOTS} of {len(labels)} robots."]
+    keys += [f'<span style="color:rgb{pale(robots[0].colour)}">■ pale: estimated V, θ̇</span>']
+    if len(robots) > MAX_ROBOTS:
+        keys += [f"Curves are of the first {MAX_ROBOTS} of {len(robots)} robots."]
     return f'<p style="margin:0.3em 1em;max-height:6em;overflow:auto">{" &nbsp; ".join(keys)}</p>'
 
 
-def _add(gui: viser.GuiApi, chart: Chart, zoom: bool) -> viser.GuiUplotHandle:
-    series = [
+def _series(chart: Chart) -> tuple[uplot.Series, ...]:
+    """Returns the series of a chart: the time, and its curves."""
+    return uplot.Series(label="s"), *(
         uplot.Series(
             label="", stroke=f"rgb{c.colour}", width=c.width, dash=(5, 4) if c.dashed else (), points={"show": False}
         )
         for c in chart.curves
-    ]
+    )
+
+
+def _add(gui: viser.GuiApi, chart: Chart, zoom: bool) -> viser.GuiUplotHandle:
+    series = _series(chart)
     low, high = ({"pad": 0.1, "soft": soft, "mode": 1} for soft in chart.least)
     return gui.add_uplot(
-        tuple(np.zeros(2) for _ in range(1 + len(series))),
-        (uplot.Series(label="s"), *series),
+        tuple(np.zeros(2) for _ in series),
+        series,
         title=chart.title,
         scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}},
         legend={"show": False},

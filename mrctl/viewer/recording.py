@@ -21,12 +21,14 @@ from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.stand import front_rates, stand, steer
 from mrctl.record import InputError
+from mrctl.results.controllers import title_of
 from mrctl.results.dataset import SIGNALS, blank, scenarios_of
 from mrctl.results.metrics import as_runs, summary
 from mrctl.scenario import Scenario
 from mrctl.sweep import store
 from mrctl.sweep.store import Store
 from mrctl.theory.perturbation import Perturbation
+from mrctl.viewer.looks import Look, looks
 from mrctl.viewer.session import state
 
 Array = NDArray[np.float64]
@@ -40,7 +42,8 @@ class Recording:
 
     Attributes:
         scenario: Scenario of the run.
-        label: Name of the run.
+        controller: Name of the controller in tables.
+        label: Name of the run for people.
         period: Time between samples in s.
         start: Time of the first sample since the start of the run in s; all methods count time from this sample.
         log: Record of `TICK` for each sample until the end or the failure, `(T,)`.
@@ -50,7 +53,9 @@ class Recording:
     def __init__(self, run: xr.Dataset) -> None:
         """Takes a single run of a result, or an interval of one."""
         self.scenario: Scenario = scenarios_of(run)[0]
-        self.label = str(run["label"].values)
+        self.controller = str(run["feedforward"].values) if "feedforward" in run.coords else self.scenario.feedforward
+        label = str(run["label"].values)
+        self.label = title_of(label) if label == self.controller else label
         self.period = float(run.attrs["control_period"])
         self.start = float(run["time"][0])
         log = blank(run.sizes["time"])
@@ -124,8 +129,8 @@ def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows]:
     return recordings[0].period * np.arange(len(log), dtype=float), log
 
 
-def labels_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[str]:
-    """Returns a label for each run, with its number if labels would be equal.
+def looks_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[Look]:
+    """Returns the look of each run, with its number in the label if labels would be equal.
 
     Raises:
         InputError: Runs differ in world, robot or control period, so they cannot share a scene.
@@ -136,8 +141,9 @@ def labels_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[str]
             if getattr(r.scenario, field) != getattr(first.scenario, field):
                 raise InputError(f"run: {r.label} drove with another {field} than {first.label}")
     labels = [r.label for r in recordings]
-    unique = len(set(labels)) == len(labels)
-    return labels if unique else [f"{label} {run}" for label, run in zip(labels, runs, strict=True)]
+    if len(set(labels)) < len(labels):
+        labels = [f"{label} {run}" for label, run in zip(labels, runs, strict=True)]
+    return looks(labels, [r.controller for r in recordings])
 
 
 class Library:

@@ -13,15 +13,15 @@ from typing_extensions import override
 from mrctl.record import InputError
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
-from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, labels_of
-from mrctl.viewer.scene import Scene, colour_of
+from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of
+from mrctl.viewer.scene import Scene
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
 
 SAMPLES = 800  # about the largest number of samples in a curve
 BOARD_SIZE = np.array([4.0, 0.0, 2.2])  # m, extent of the scatter plot in the scene along x, y and z
 BOARD_CORNER = np.array([-2.0, 3.2, 0.3])  # m, its lower left corner
-FAILED = (185, 28, 28)
+DROVE, FAILED = (71, 85, 105), (185, 28, 28)
 
 
 class Replay(Page):
@@ -103,7 +103,7 @@ class Replay(Page):
         sphere = _sphere()
         points = scene.add_batched_meshes_simple(
             "/board/runs", *sphere, np.tile([1.0, 0, 0, 0], (len(where), 1)), where,
-            batched_colors=np.where(failed[:, None], FAILED, colour_of(0)).astype(np.uint8),
+            batched_colors=np.where(failed[:, None], FAILED, DROVE).astype(np.uint8),
             lod="off", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
         runs = table.index.to_numpy()[known]
@@ -147,16 +147,16 @@ class Replay(Page):
     def _show(self, runs: Sequence[int]) -> None:
         """Shows runs in the scene and in the plots."""
         recordings = [self.library.recording(run) for run in runs]
-        labels = labels_of(recordings, runs)
+        robots = looks_of(recordings, runs)
         if self.recordings:
             self._scene.remove()
         self.runs, self.recordings = list(runs), recordings
-        self._scene = Scene(self.server, recordings[0].model, labels)
+        self._scene = Scene(self.server, recordings[0].model, robots)
         self._scene.show_recordings(recordings)
-        self._plots.set_robots(labels, recordings[0].period)
+        self._plots.set_robots(robots, recordings[0].period)
         times, self._log = joint_log(recordings)
         self._plots.show(times, self._log, max(1, len(self._log) // SAMPLES))
-        self._labels, sensing = labels, [r.scenario.sensing for r in recordings]
+        self._labels, sensing = [robot.label for robot in robots], [r.scenario.sensing for r in recordings]
         self._latencies = [s.periods("fix_latency", r.period) for s, r in zip(sensing, recordings, strict=True)]
         off = np.nan_to_num(np.hypot(*np.moveaxis(error(self._log), -1, 0)))
         estimated = np.isfinite(self._log["x_measured"][0])

@@ -22,17 +22,12 @@ from mrctl.physics.stand import ground
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.perturbation import Perturbation
+from mrctl.viewer.looks import Colour, Look
 from mrctl.viewer.recording import ABOVE, Recording, joint_log, path
 from mrctl.viewer.sensors import Marks
 from mrctl.viewer.shapes import ribbons
 
 Array = NDArray[np.float64]
-Colour = tuple[int, int, int]
-
-# The first robot is solid, the others are translucent; the curves of a robot have its colour.
-COLOURS: list[Colour] = [
-    (37, 99, 235), (234, 88, 12), (22, 163, 74), (147, 51, 234), (8, 145, 178), (202, 138, 4), (219, 39, 119),
-]  # fmt: skip
 REFERENCE_COLOUR: Colour = (110, 115, 122)
 GLASS: Colour = (150, 155, 160)  # of the first robot while marks are drawn, which have its colour
 TRAIL_POINTS = 240  # number of points in the trail of a robot
@@ -57,26 +52,21 @@ def name_of(row: int) -> str:
     return f"/world/ghosts/{row}" if row else "/world/robot"
 
 
-def colour_of(row: int) -> Colour:
-    """Returns the colour of a robot."""
-    return COLOURS[row % len(COLOURS)]
-
-
 class Scene:
     """One world with one solid robot and any number of translucent ones.
 
     Everything is below the node `/world`: to follow a robot, that node moves instead of the cameras.
     """
 
-    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel, labels: Sequence[str]) -> None:
+    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel, robots: Sequence[Look]) -> None:
         """Draws the world and its robots.
 
         Args:
             server: Server of the page.
             model: Compiled world; it is not changed.
-            labels: Label of each robot.
+            robots: Look of each robot.
         """
-        self.size = len(labels)
+        self.size, self._robots = len(robots), list(robots)
         self._scene, self._number = server.scene, next(_NUMBERS)
         self._server = server
         self._model, self._data = mjcf.clone(model), mujoco.MjData(model)
@@ -95,10 +85,9 @@ class Scene:
         self._footprint = np.array([[np.inf, np.inf], [-np.inf, -np.inf]])
         self._parts = self._draw_bodies()
         self._frames = [self._draw_robot(row) for row in range(self.size)]
-        self._names = list(labels)
         self._labels = [
-            self._scene.add_label(f"/world/label{row}", label, font_screen_scale=0.8)
-            for row, label in enumerate(labels)
+            self._scene.add_label(f"/world/label{row}", robot.label, font_screen_scale=0.8)
+            for row, robot in enumerate(robots)
             if self.size > 1
         ]
         self._payloads = [
@@ -110,7 +99,7 @@ class Scene:
         ]  # fmt: skip
         self._sensors = self._scene.add_frame("/world/sensors", show_axes=False, visible=False)
         self._marks = [
-            Marks(self._scene, row, self._footprint, colour_of(row)) for row in range(min(self.size, MAX_MARKED))
+            Marks(self._scene, row, self._footprint, robot.colour) for row, robot in enumerate(robots[:MAX_MARKED])
         ]
         self._perturbations: list[Perturbation | None] = [None] * self.size  # as drawn
         self._ribbons: list[viser.MeshHandle] = []
@@ -180,7 +169,7 @@ class Scene:
             name = self._node(row, body)
             frames.append(self._scene.add_frame(name, show_axes=False))
             if row and part is not None:
-                self._draw_glass(f"{name}/mesh", part, colour_of(row), GHOST_OPACITY)
+                self._draw_glass(f"{name}/mesh", part, self._robots[row].colour, GHOST_OPACITY)
         return frames
 
     def _node(self, row: int, body: int) -> str:
@@ -275,7 +264,7 @@ class Scene:
         here, near = self._positions[:, self._chassis], {}
         for row in range(len(self._labels)):
             first = next((r for r in near if np.hypot(*(here[r] - here[row])[:2]) < TOGETHER), row)
-            near.setdefault(first, []).append(self._names[row])
+            near.setdefault(first, []).append(self._robots[row].label)
         for row, label in enumerate(self._labels):
             label.visible = row in near
             if row in near:
@@ -329,10 +318,11 @@ class Scene:
         here = self._positions[:, self._chassis]
         paths = path(rows, self._radius, here[0, 2])
         paths = np.where(np.isfinite(paths), paths, here - [0, 0, self._radius - ABOVE]).swapaxes(0, 1)
-        groups = [paths[k :: len(COLOURS)] for k in range(min(self.size, len(COLOURS)))]
+        colours = list(dict.fromkeys(robot.colour for robot in self._robots))
+        groups = [paths[[robot.colour == colour for robot in self._robots]] for colour in colours]
         if not self._ribbons:
             self._ribbons = [
-                self._draw_lines(f"/world/trail/{k}", group, 0.012, COLOURS[k]) for k, group in enumerate(groups)
+                self._draw_lines(f"/world/trail/{k}", group, 0.012, colours[k]) for k, group in enumerate(groups)
             ]
             return
         for ribbon, group in zip(self._ribbons, groups, strict=True):

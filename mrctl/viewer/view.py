@@ -34,7 +34,7 @@ def view(
     """
     from mrctl.viewer.export import export as write
     from mrctl.viewer.live import Live
-    from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, labels_of
+    from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, looks_of
     from mrctl.viewer.replay import Replay
 
     if file is not None and file.is_dir():
@@ -47,7 +47,7 @@ def view(
             shown = [int(k) for k in table.index]
         if export is not None:
             recordings = [library.recording(k) for k in shown]
-            return write(recordings, labels_of(recordings, shown), export)
+            return write(recordings, looks_of(recordings, shown), export)
         return _serve(lambda server: Replay(library, shown, server), host, port)
     if run is not None:
         raise InputError("run: only a result or a sweep has several")
@@ -56,7 +56,7 @@ def view(
     if export is not None:
         result = simulate([scenario, *ghosts], progress=True)
         recordings = [Recording(result.isel(run=k)) for k in range(result.sizes["run"])]
-        return write(recordings, labels_of(recordings, range(len(recordings))), export)
+        return write(recordings, looks_of(recordings, range(len(recordings))), export)
     return _serve(lambda server: Live([scenario, *ghosts], server), host, port)
 
 

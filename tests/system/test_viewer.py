@@ -228,11 +228,11 @@ def test_inputs(browser, tmp_path):
         until(lambda: "reverses" in page.inner_text("#mrctl-message"), "the refusal, on whatever tab")
         page.get_by_role("tab", name="Controllers").click()
         session = live.session
-        page.get_by_label("fel", exact=True).first.click()
+        page.get_by_label("PID + network (paper)", exact=True).first.click()
         until(lambda: "drives already" in page.inner_text("#mrctl-message"), "the refusal of a second one")
-        until(lambda: not page.get_by_label("fel", exact=True).first.is_checked(), "the tick to go")
+        until(lambda: not page.get_by_label("PID + network (paper)", exact=True).first.is_checked(), "the tick to go")
         assert live.session is session and session.saved()[0].events == events
-        page.get_by_label("rls", exact=True).first.click()
+        page.get_by_label("PID + RLS", exact=True).first.click()
         until(lambda: [s.feedforward for s in live.session.start] == ["fel", "rls"], "the ghost")
         assert live.session.start[1].perturbation.mass_factor == factor  # goes on as things were
         until(lambda: node(page, GHOST) is not None, "the ghost in the scene")
