@@ -25,6 +25,7 @@ from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.scene import Scene
+from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import CHANGEABLE, Session, changed, state
@@ -154,6 +155,7 @@ class Live(Page):
         for name, ghost in self._ghosts.items():
             ghost.value = any(s.feedforward == name for s in session.start[1:])
         self._drawn = self._plotted = None
+        self._laps: list[dict[str, Any]] = []  # metrics of the whole laps until now
         self._counted = (time.monotonic(), session.tick)
         self._describe()
 
@@ -322,7 +324,12 @@ class Live(Page):
             self._plotted = session.tick
             self._show_past()
         if session.tick:
-            self.describe_estimates(self._labels, session.log(session.tick - 1)[-1])
+            now = session.log(session.tick - 1)[-1]
+            self.describe_estimates(self._labels, now)
+            ticks = round(session.start[0].reference.period / session.period)
+            if session.tick >= (len(self._laps) + 1) * ticks:
+                self._laps += whole_laps(session.log(len(self._laps) * ticks), ticks, session.period)
+            self._plots.score(now, self._laps)
 
     def _show_past(self) -> None:
         """Draws the last seconds: their curves, and the trails of the robots, which change less often."""

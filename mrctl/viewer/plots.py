@@ -15,6 +15,7 @@ from mrctl.kernel import Rows
 from mrctl.results.dataset import blank
 from mrctl.viewer.looks import Colour, Look
 from mrctl.viewer.scene import REFERENCE_COLOUR
+from mrctl.viewer.score import table
 
 Array = NDArray[np.float64]
 
@@ -134,6 +135,7 @@ class Plots:
         self._sets: dict[int, list[viser.GuiUplotHandle]] = {}
         with tab:
             self._legend = gui.add_html("")
+            self._score = gui.add_html("")
             self._cursor = gui.add_html("")
 
     def set_robots(self, robots: Sequence[Look], period: float) -> None:
@@ -168,6 +170,10 @@ class Plots:
         """
         for handle, chart in zip(self._handles, charts(log, self._robots, self._period), strict=True):
             handle.data = tuple(np.ascontiguousarray(v[::step]) for v in (time, *(c.values for c in chart.curves)))
+
+    def score(self, now: Rows, laps: Sequence[dict[str, Array]]) -> None:
+        """Writes the score, as `score.table` does."""
+        self._score.content = table(self._robots, now, laps)
 
     def clear(self, span: float) -> None:
         """Draws empty charts of `span` s."""

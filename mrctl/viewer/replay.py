@@ -15,6 +15,7 @@ from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of
 from mrctl.viewer.scene import Scene
+from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
 
@@ -156,6 +157,8 @@ class Replay(Page):
         self._plots.set_robots(robots, recordings[0].period)
         times, self._log = joint_log(recordings)
         self._plots.show(times, self._log, max(1, len(self._log) // SAMPLES))
+        self._lap = round(recordings[0].scenario.reference.period / recordings[0].period)
+        self._laps = whole_laps(self._log, self._lap, recordings[0].period)
         self._labels, sensing = [robot.label for robot in robots], [r.scenario.sensing for r in recordings]
         self._latencies = [s.periods("fix_latency", r.period) for s, r in zip(sensing, recordings, strict=True)]
         off = np.nan_to_num(np.hypot(*np.moveaxis(error(self._log), -1, 0)))
@@ -226,6 +229,8 @@ class Replay(Page):
         if self.time != self._plotted:
             self._plotted = self.time
             self.scrubber.value = self.time
+            tick = min(round(self.time / self.recordings[0].period), len(self._log) - 1)
+            self._plots.score(self._log[tick], self._laps[: (tick + 1) // self._lap])
             self._plots.point(self.time / self.duration if self.duration else 0.0)
 
 

@@ -13,6 +13,7 @@ from PIL import Image
 from mrctl import Circle, Event, Perturbation, Scenario, Sweep, save
 from mrctl.cli import main
 from mrctl.loop.simulation import simulate
+from mrctl.results.metrics import per_lap
 from mrctl.sensing.tiers import Sensing
 from mrctl.sweep import jobs
 from mrctl.viewer.live import Live
@@ -312,6 +313,9 @@ def test_replay(browser, tmp_path):
         tilt = np.arccos(np.cos(last.pitch_angle) * np.cos(last.roll_angle))
         assert tilt > 0.4
         replay.ask(replay._scrub, 12.0)
+        laps = per_lap(result)
+        score = [f"{1e3 * laps.position_rmse.values[0].min():.3g}", f"{100 * laps.feedback_share.values[0, 1]:.3g}"]
+        until(lambda: {*score, "–"} <= set(page.inner_text("#mrctl-score").split()), "the score of the tables")
         pose = f"window.__viserMutable.nodePoseData[{GHOST!r}].wxyz"
         until(lambda: abs(2 * np.arcsin(np.hypot(*page.evaluate(pose)[1:3])) - tilt) < 1e-3, "the ghost to be tipped")
         replay.ask(replay._choose, 1)
