@@ -10,6 +10,8 @@ from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
+BEST: FeedforwardName = "model+composite"  # that tracks best in the suite; shown with PID alone by default
+
 if TYPE_CHECKING:
     from mrctl.viewer.page import Page
     from mrctl.viewer.server import Server
@@ -22,7 +24,7 @@ def view(
 
     Args:
         file: Scenario file, or folder of a result or a sweep; None for the default scenario.
-        compare: Feedforwards of the ghosts beside a scenario.
+        compare: Feedforwards of the ghosts beside a scenario; with neither, the best learner and PID alone are shown.
         run: Number of the run of a result or a sweep that is shown first.
         export: File to write instead of serving a page.
         host: Address to listen on.
@@ -52,6 +54,8 @@ def view(
     if run is not None:
         raise InputError("run: only a result or a sweep has several")
     scenario = Scenario() if file is None else Scenario.from_toml(file)
+    if file is None and not compare:
+        scenario, compare = scenario.replace(**FEEDFORWARDS[BEST]), ("none",)
     ghosts = [scenario.model_copy(update=FEEDFORWARDS[name] | {"name": ""}) for name in compare]
     if export is not None:
         result = simulate([scenario, *ghosts], progress=True)
