@@ -10,7 +10,7 @@ from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
-BEST: FeedforwardName = "model+composite"  # that tracks best in the suite; shown with PID alone by default
+BEST: FeedforwardName = "model+composite"  # with the least errors in the README; shown beside PID alone by default
 
 if TYPE_CHECKING:
     from mrctl.viewer.page import Page
@@ -55,7 +55,8 @@ def view(
         raise InputError("run: only a result or a sweep has several")
     scenario = Scenario() if file is None else Scenario.from_toml(file)
     if file is None and not compare:
-        scenario, compare = scenario.replace(**FEEDFORWARDS[BEST]), ("none",)
+        scenario = scenario.replace(**FEEDFORWARDS[BEST])
+        compare = ["none"]
     ghosts = [scenario.model_copy(update=FEEDFORWARDS[name] | {"name": ""}) for name in compare]
     if export is not None:
         result = simulate([scenario, *ghosts], progress=True)
