@@ -484,7 +484,8 @@ def view(
     """Shows robots in the browser: a live session of a scenario, or the replay of a result or sweep.
 
     Args:
-        file: Scenario file, or result of `mrctl run --out` or `mrctl sweep`; by default a live default scenario.
+        file: Scenario file, or result of `mrctl run --out` or `mrctl sweep`; by default the best learner and PID alone,
+            live.
         compare: Feedforwards of further robots, such as none or model+composite, which are shown as ghosts with the
             same seed and events.
         number: Number of the run to show first, in a result or sweep.

@@ -57,6 +57,7 @@ def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, error: Array, tic
         t.current_left, t.current_right = p.current[0], p.current[1]
         t.power = p.applied[0] * p.current[0] + p.applied[1] * p.current[1]
         t.guard, t.guard_reason = c.guard.action, c.guard.reason
+        t.z, t.roll_angle, t.pitch_angle = state.z, state.roll, state.pitch
         near &= not abs(t.lateral_error) > DIVERGED or p.failed
     return near
 

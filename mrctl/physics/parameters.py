@@ -25,7 +25,7 @@ from mrctl.record import InputError
 from mrctl.theory.robot import ANY_ANGLE, GRAVITY, Robot
 
 
-def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
+def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.MjData | None = None) -> Robot:
     """Reads the parameters of equations (1) to (3) out of a compiled model, by element name; it takes a millisecond.
 
     The front wheel's frictionloss is rolling loss alone and gives the rolling coefficient, which is 0 for a caster that
@@ -35,12 +35,13 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
     Args:
         model: Compiled model.
         drive_gain: Applied volt per commanded volt, which no model holds.
+        scratch: As for `at_rest`.
 
     Raises:
         InputError: A parameter is out of range, the centre of mass lies outside the wheels, or a rear wheel's
             frictionloss is smaller than its rolling and no-load losses.
     """
-    data, com = at_rest(model)
+    data, com = at_rest(model, scratch)
     bodies = bodies_of(model)
     masses, positions = model.body_mass[bodies], data.xipos[bodies, :2]
     inertia = np.sum(masses[:, None] * (positions - np.average(positions, axis=0, weights=masses)) ** 2)
@@ -54,7 +55,7 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
     resistance, constant = model.actuator_gainprm[[model.actuator(name).id for name in MOTORS], :2].mean(axis=0)
     gear = motor.gear[0]
     no_load = model.numeric("no_load_current").data[0]
-    load = load_torques(model)
+    load = load_torques(model, data)
     if min(load.values()) <= 0:
         raise InputError("com_offset: the centre of mass must lie over the triangle of the wheels")
     rolling = 0.0
@@ -101,13 +102,18 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0) -> Robot:
     )
 
 
-def at_rest(model: mujoco.MjModel) -> tuple[mujoco.MjData, NDArray[np.float64]]:
+def at_rest(model: mujoco.MjModel, scratch: mujoco.MjData | None = None) -> tuple[mujoco.MjData, NDArray[np.float64]]:
     """Computes the kinematics of the robot as its file places it.
+
+    Args:
+        model: Compiled model.
+        scratch: Data of a model of this size, which is overwritten; to make new data takes longer than all the rest.
 
     Returns:
         The model's data at that state, and the robot's centre of mass from P in the chassis' frame, `(3,)` in m.
     """
-    data = mujoco.MjData(model)
+    data = scratch or mujoco.MjData(model)
+    data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     bodies, chassis = bodies_of(model), data.body("chassis")
@@ -152,12 +158,16 @@ def _steering(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, float]:
     }
 
 
-def load_torques(model: mujoco.MjModel) -> dict[str, float]:
+def load_torques(model: mujoco.MjModel, scratch: mujoco.MjData | None = None) -> dict[str, float]:
     """Returns the static load on each wheel times its radius in N·m, by geom name.
 
     The load follows from the lever rule on level ground. It is not positive where the robot would tip over.
+
+    Args:
+        model: Compiled model.
+        scratch: As for `at_rest`.
     """
-    data, com = at_rest(model)
+    data, com = at_rest(model, scratch)
     half_track, wheelbase, trail = _layout(model, data)
     front, side = com[0] / (wheelbase - trail), com[1] / (2 * half_track)
     shares = {"wheel_left": (1 - front) / 2 + side, "wheel_right": (1 - front) / 2 - side}

@@ -41,7 +41,11 @@ PERTURBED = (
 
 
 def perturb(
-    nominal: mujoco.MjModel, model: mujoco.MjModel, perturbation: Perturbation, robot: Robot | None = None
+    nominal: mujoco.MjModel,
+    model: mujoco.MjModel,
+    perturbation: Perturbation,
+    robot: Robot | None = None,
+    scratch: mujoco.MjData | None = None,
 ) -> None:
     """Writes the nominal model, changed by a perturbation, into another model, and recomputes its constants.
 
@@ -54,12 +58,14 @@ def perturb(
         model: A copy of it, which is written.
         perturbation: The complete perturbation.
         robot: The parameters of the nominal model, where they are known; by default they are read from it.
+        scratch: As for `at_rest`.
 
     Raises:
         InputError: The perturbed robot could not stand: its centre of mass lies outside its wheels or below the ground.
     """
     p = perturbation
-    robot = robot or read_robot(nominal)
+    scratch = scratch or mujoco.MjData(nominal)
+    robot = robot or read_robot(nominal, scratch=scratch)
     chassis, bodies = nominal.body("chassis").id, bodies_of(nominal)
     model.body_mass[:] = nominal.body_mass
     model.body_inertia[:] = nominal.body_inertia
@@ -98,10 +104,10 @@ def perturb(
     gx, gy, gz = nominal.opt.gravity
     c, s = np.cos(p.slope), np.sin(p.slope)
     model.opt.gravity[:] = c * gx + s * gz, gy, c * gz - s * gx
-    before, after = load_torques(nominal), load_torques(model)
+    before, after = load_torques(nominal, scratch), load_torques(model, scratch)
     if min(after.values()) <= 0:
         raise InputError("perturbation.payload: the centre of mass lies outside the wheels, the robot would tip over")
-    height = at_rest(model)[1][2] + np.mean([model.geom(wheel).size[0] for wheel in REAR])
+    height = at_rest(model, scratch)[1][2] + np.mean([model.geom(wheel).size[0] for wheel in REAR])
     if height < 0:
         raise InputError("perturbation.payload_z: the centre of mass lies below the ground")
     factors = dict(zip(REAR, friction, strict=True))
@@ -110,7 +116,7 @@ def perturb(
         drive = robot.drive_loss * (factors[wheel] - 1) if wheel in factors else 0.0
         rolling = robot.rolling_coefficient * (after[wheel] - before[wheel])
         model.dof_frictionloss[dof] = nominal.dof_frictionloss[dof] + drive + rolling
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    mujoco.mj_setConst(model, scratch)
 
 
 def limit_current(nominal: mujoco.MjModel, model: mujoco.MjModel, limit: float) -> None:
@@ -172,8 +178,14 @@ def _get(model: mujoco.MjModel, name: str) -> NDArray:
     return getattr(model.opt, name[4:]) if name.startswith("opt.") else getattr(model, name)
 
 
-def write(model: mujoco.MjModel, values: Mapping[str, NDArray]) -> None:
-    """Writes fields, as `fields` returns them, into a model and recomputes the constants that follow from them."""
+def write(model: mujoco.MjModel, values: Mapping[str, NDArray], scratch: mujoco.MjData) -> None:
+    """Writes fields, as `fields` returns them, into a model and recomputes the constants that follow from them.
+
+    Args:
+        model: The model.
+        values: The fields by name.
+        scratch: As for `at_rest`.
+    """
     for name, value in values.items():
         _get(model, name)[...] = value
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    mujoco.mj_setConst(model, scratch)

@@ -151,7 +151,7 @@ class Plant(ABC):
         self.failure = [""] * size
         self.running = size
         self._nominal = model
-        self._scratch = mjcf.clone(model)
+        self._scratch, self._scratch_data = mjcf.clone(model), mujoco.MjData(model)
         self._nominal_robots = np.ones(size, bool)
         self._address = addresses(model)
         self._inputs = np.array(inputs(model), int)
@@ -201,10 +201,10 @@ class Plant(ABC):
         if self._nominal_robots[robot] and ideal and perturbation == Perturbation():
             return
         self._nominal_robots[robot] = False
-        perturb(self._nominal, self._scratch, perturbation, self.robot)
+        perturb(self._nominal, self._scratch, perturbation, self.robot, self._scratch_data)
         limit_current(self._nominal, self._scratch, driver.current_limit)
         self._write(robot, self._scratch)
-        self.truth[robot] = read_robot(self._scratch, perturbation.supply_factor)
+        self.truth[robot] = read_robot(self._scratch, perturbation.supply_factor, self._scratch_data)
         resistance, back_emf, _ = motor_parameters(self._scratch)
         self.state["resistance"][robot], self.state["back_emf"][robot] = resistance[0], back_emf[0]
         self.state["delay"][robot] = delay
@@ -222,7 +222,7 @@ class Plant(ABC):
         Raises:
             InputError: Why.
         """
-        perturb(self._nominal, self._scratch, perturbation, self.robot)
+        perturb(self._nominal, self._scratch, perturbation, self.robot, self._scratch_data)
 
     def reset(self, pose: Array, twist: Array) -> None:
         """Stands every robot on the ground, rolling.
@@ -363,7 +363,7 @@ class PhysicsPlant(Plant):
         return self.physics.model.ptr
 
     def _write(self, robot: int, model: mujoco.MjModel) -> None:
-        write(self.physics.model.ptr, fields(model))
+        write(self.physics.model.ptr, fields(model), self._scratch_data)
 
     def _clear(self, robot: int) -> None:
         mujoco.mj_resetData(self.physics.model.ptr, self.physics.data.ptr)

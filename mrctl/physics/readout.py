@@ -23,6 +23,9 @@ READING = np.dtype(
         ("wheel_rates", "f8", 2),  # of the rear wheels, left and right, rad/s
         ("steering_angle", "f8"),  # rad, positive to the left; 0 where nothing is steered
         ("steering_rate", "f8"),  # rad/s
+        ("z", "f8"),  # height of the middle between the driven wheels, m
+        ("roll", "f8"),  # rad, positive to the right; heading, pitch and roll are angles about z, y and x in this order
+        ("pitch", "f8"),  # rad, positive nose down
         ("upright", "f8"),  # cosine of the tilt from the vertical; NaN once the state has blown up
     ]
 )
@@ -52,6 +55,7 @@ def read(qpos: Array, qvel: Array, address: NDArray[np.int64], r: Row) -> None:
     if address.shape[0] > 6:
         r.steering_angle, r.steering_rate = qpos[address[6]], qvel[address[7]]
     r.upright = 1 - 2 * (i * i + j * j)
+    r.z, r.roll, r.pitch = qpos[q + 2], np.arctan2(yz, r.upright), np.arctan2(-xz, np.hypot(xx, xy))
     for value in qpos:
         if not abs(value) < HUGE:
             r.upright = np.nan

@@ -73,7 +73,12 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "power": ("W", "electrical power"),
     "guard": ("1", "what the guard does: 0 nothing, 1 fallback"),
     "guard_reason": ("1", "why, as an index into `mrctl.control.guard.REASONS`"),
+    "z": ("m", "height of the middle between the driven wheels"),
+    "roll_angle": ("rad", "roll, positive to the right; after heading and pitch, about the robot's own axis"),
+    "pitch_angle": ("rad", "pitch, positive nose down; after the heading"),
 }
+
+SINCE_0_4_2 = ("z", "roll_angle", "pitch_angle")  # signals that older results lack
 
 TICK = np.dtype([(name, "f8") for name in SIGNALS])  # the signals of one robot at one control tick
 

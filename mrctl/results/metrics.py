@@ -157,7 +157,7 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
             # The step into a lap belongs to it, so that the variation of all laps adds up to that of the run.
             stepping = ("voltage_left", "voltage_right", "guard")
             steps = {name: data[name][rows, max(start - 1, 0) : end] for name in stepping}
-            for name, value in _lap_metrics(rates, steps, period).items():
+            for name, value in lap_metrics(rates, steps, period).items():
                 values[name][rows, lap] = value
             if scaled and end - start > 1:
                 command = np.stack([rates["v_command"], rates["omega_command"]], axis=-1)
@@ -179,8 +179,17 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(variables, {**coords, "lap": np.arange(1, max(counts, default=0) + 1)}, dict(result.attrs))
 
 
-def _lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float) -> dict[str, Array]:
-    """The metrics (rows,) of one lap, from its samples (rows, n)."""
+def lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float) -> dict[str, Array]:
+    """Computes the metrics of one lap of several robots, all but the excitation.
+
+    Args:
+        data: Signals of the lap by name, `(rows, n)`.
+        steps: The voltages and `guard`, with the sample before the lap if there is one.
+        period: Seconds between the samples.
+
+    Returns:
+        The metrics of `METRICS` by name, `(rows,)`.
+    """
     found: dict[str, Array] = {}
     for name in ("longitudinal", "lateral", "heading"):
         error = data[f"{name}_error"]

@@ -24,6 +24,7 @@ from matplotlib.rcsetup import cycler
 
 from mrctl.record import InputError
 from mrctl.results import excitation as exciting
+from mrctl.results.controllers import colours_of
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap
 
 COLUMN, PAGE = 88 / 25.4, 180 / 25.4  # inches
@@ -171,13 +172,14 @@ def compare_errors(
         lap: Lap to show instead of a window.
     """
     curves = []
-    for result, label, colour in zip((result_pid, result_nn), labels, COLOURS, strict=False):
+    colours = colours_of(("none", "fel"))
+    for result, label, colour in zip((result_pid, result_nn), labels, colours, strict=True):
         for data, _, style in _curves(result, window, lap):
             curves.append(Curve(data, label, {**style, "color": colour}))
     figure = _errors(curves)
     for axes, name in zip(figure.axes, ERRORS, strict=True):
         for row, label in enumerate(labels):
-            colour = COLOURS[row]
+            colour = colours[row]
             squares = np.concatenate([np.square(data[name].values) for data, other, _ in curves if other == label])
             text = f"RMS {np.sqrt(squares.mean()):.2g}" if np.isfinite(squares).all() else "failed"
             axes.text(1 - 0.26 * (1 - row), 1.0, text, color=colour, fontsize=8, ha="right", va="bottom",
@@ -249,9 +251,9 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
         unused.remove()
     for one, name in zip(axes, names, strict=False):
         ends: list[tuple[float, float, str, str]] = []
-        for order, label in enumerate(dict.fromkeys(labels)):
+        for label, colour in _colours(laps).items():
             rows = [row for row, other in enumerate(labels) if other == label]
-            values, colour = laps[name].values[rows], COLOURS[order % len(COLOURS)]
+            values = laps[name].values[rows]
             finite = np.isfinite(values)
             some = finite.any(0)
             mean = np.where(finite, values, 0).sum(0)[some] / finite.sum(0)[some]
@@ -437,17 +439,25 @@ def _curves(result: xr.Dataset, window: tuple[float, float] | None, lap: int | N
         raise InputError("window: give a window or a lap, not both")
     runs = as_runs(result)
     labels = [str(label) for label in runs["label"].values]
-    order = list(dict.fromkeys(labels))
-    curves = []
+    colours, curves = _colours(runs), []
     for row, label in enumerate(labels):
         many = labels.count(label) > 1
-        style: dict[str, Any] = {"color": COLOURS[order.index(label) % len(COLOURS)], "lw": 0.7 if many else 1.0}
+        style: dict[str, Any] = {"color": colours[label], "lw": 0.7 if many else 1.0}
         if many:
             style["alpha"] = 0.7
         curves.append(Curve(_cut(runs.isel(run=row), window, lap), label, style))
     if not any(curve.data.sizes["time"] for curve in curves):
         raise InputError(f"window: no samples in {window}" if window else "result: no samples")
     return curves
+
+
+def _colours(runs: xr.Dataset) -> dict[str, str]:
+    """Colour of each label, that of the controller of its first run where no other label has it."""
+    labels = [str(label) for label in runs["label"].values]
+    controllers = runs["feedforward"].values if "feedforward" in runs.coords else labels
+    first = dict(zip(reversed(labels), reversed([str(name) for name in controllers]), strict=True))
+    order = list(dict.fromkeys(labels))
+    return dict(zip(order, colours_of(first[label] for label in order), strict=True))
 
 
 def _cut(run: xr.Dataset, window: tuple[float, float] | None, lap: int | None) -> xr.Dataset:

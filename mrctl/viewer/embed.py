@@ -44,7 +44,7 @@ def replay(*results: xr.Dataset) -> Replay:
         InputError: There is no run, a run is longer than a minute, or runs differ in world or control period.
     """
     from mrctl.viewer.export import page
-    from mrctl.viewer.recording import Recording, labels_of
+    from mrctl.viewer.recording import Recording, looks_of
 
     runs = [result.isel(run=k) for result in map(as_runs, results) for k in range(result.sizes["run"])]
     if not runs:
@@ -57,4 +57,4 @@ def replay(*results: xr.Dataset) -> Replay:
             raise InputError(
                 f"results: {recording.duration:g} s are too long for a page; select some with .sel(time=…)"
             )
-    return Replay(page(recordings, labels_of(recordings, range(len(recordings)))))
+    return Replay(page(recordings, looks_of(recordings, range(len(recordings)))))

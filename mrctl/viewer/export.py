@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.record import InputError
+from mrctl.viewer.looks import Look
 from mrctl.viewer.plots import charts, legend
 from mrctl.viewer.recording import Recording, joint_log
 from mrctl.viewer.scene import Scene
@@ -23,12 +24,12 @@ SAMPLES = 1200  # about the largest number of samples in a curve
 PLAYER = Path(__file__).parent / "player.html"
 
 
-def export(recordings: Sequence[Recording], labels: Sequence[str], path: Path) -> None:
+def export(recordings: Sequence[Recording], robots: Sequence[Look], path: Path) -> None:
     """Writes recordings as one HTML file.
 
     Args:
         recordings: Runs in one world; the first one is solid, the others are ghosts.
-        labels: Label of each run.
+        robots: Look of each run.
         path: File to write.
 
     Raises:
@@ -37,38 +38,38 @@ def export(recordings: Sequence[Recording], labels: Sequence[str], path: Path) -
     if path.exists():
         raise InputError(f"export: {path} exists already; nothing was overwritten")
     try:
-        path.write_text(page(recordings, labels))
+        path.write_text(page(recordings, robots))
     except OSError as error:
         raise InputError(f"export: {path}: {error.strerror or error}") from None
 
 
-def page(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
+def page(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
     """Returns a page in HTML with the 3-D scene and the curves of recordings, and one scrubber for both.
 
     Args:
         recordings: Runs in one world; the first one is solid, the others are ghosts.
-        labels: Label of each run.
+        robots: Look of each run.
     """
     parts = {
-        "legend": legend(labels),
-        "scene": html.escape(_scene(recordings, labels)),
-        "data": _curves(recordings, labels),
+        "legend": legend(robots),
+        "scene": html.escape(_scene(recordings, robots)),
+        "data": _curves(recordings, robots),
     }
     return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], PLAYER.read_text())
 
 
-def _scene(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
+def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
     """Returns the scene with its player, as a complete page in HTML."""
     server = Server(port=0)
     try:
-        scene = Scene(server, recordings[0].model, labels)
+        scene = Scene(server, recordings[0].model, robots)
         scene.show_recordings(recordings)
         duration = max(r.duration for r in recordings)
         serializer = server.get_scene_serializer()
         for time in np.arange(0, duration, 1 / PICTURE_RATE):
             for row, recording in enumerate(recordings):
                 scene.show(row, recording.qpos(recording.index(time)))
-            scene.show_payload(recordings[0].perturbation(time))
+                scene.show_payload(row, recording.perturbation(time))
             scene.flush(follow=False)
             serializer.insert_sleep(1 / PICTURE_RATE)
         return serializer.as_html()
@@ -76,19 +77,19 @@ def _scene(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
         server.stop()
 
 
-def _curves(recordings: Sequence[Recording], labels: Sequence[str]) -> str:
+def _curves(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
     """Returns the curves as JSON that is safe inside a script element."""
     times, log = joint_log(recordings)
     step = max(1, len(log) // SAMPLES)
     drawn = []
-    for chart in charts(log, labels, recordings[0].period):
+    for chart in charts(log, robots, recordings[0].period):
         values = [curve.values[::step] for curve in chart.curves]
-        known = np.concatenate(values)
+        known = np.concatenate([*values, chart.least])
         known = known[np.isfinite(known)]
         drawn.append(
             {
                 "title": chart.title,
-                "range": [float(known.min()), float(known.max())] if known.size else [0.0, 1.0],
+                "range": [float(known.min()), float(known.max())],
                 "curves": [
                     {
                         "colour": f"rgb{curve.colour}",

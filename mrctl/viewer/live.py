@@ -16,21 +16,25 @@ import viser
 from typing_extensions import override
 
 from mrctl.record import InputError
+from mrctl.results.controllers import title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.controls import Controls
+from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.scene import Scene
+from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import CHANGEABLE, Session, changed
+from mrctl.viewer.session import CHANGEABLE, Session, changed, state
 
 WINDOW = 12.0  # s, time span of the plots
 SAMPLES = 300  # about the largest number of samples in a curve
 TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each of which may take half a second
-PLOTS_PER_MARK = 3  # updates of the plots for each point of the trails
+PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
+REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
 MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
 # Label of each group of buttons, its buttons, and the change of the perturbation or the push that a button makes.
 BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
@@ -75,11 +79,12 @@ class Live(Page):
         self.late = self.ticks = 0  # ticks that began more than a period too late, and all ticks, at a finite speed
         self._due = 0.0  # number of ticks that are due
         self._changed_inputs: dict[tuple[str, ...], Any] = {}
+        self._rested = 0.0  # monotonic time in s at which the changed inputs are applied
         self._shown_setup: tuple[object, ...] | None = None  # world, robot, steering and labels of the present scene
         self._shown_sensing: list[Sensing] | None = None
         self._drawn: tuple[object, ...] | None = None
         self._plotted: int | None = None
-        self._plots_since_mark = 0
+        self._plots_since_trail = 0
         self._tidied = time.monotonic()
         self._build()
         self._show_session()
@@ -116,7 +121,7 @@ class Live(Page):
             self._controls.add(first, only=DRIVER)
             with gui.add_folder("compare with"):
                 self._ghosts: dict[FeedforwardName, viser.GuiCheckboxHandle] = {
-                    name: gui.add_checkbox(name, False) for name in FEEDFORWARDS
+                    name: gui.add_checkbox(title_of(name), False) for name in FEEDFORWARDS
                 }
                 for name, ghost in self._ghosts.items():
                     self.on(ghost, partial(self._compare, name))
@@ -130,14 +135,15 @@ class Live(Page):
     def _show_session(self) -> None:
         """Shows the robots of a new session in the scene and in the plots."""
         session, first = self.session, self.session.start[0]
-        self._labels = labels = [s.name or s.feedforward for s in session.start]
-        setup = (first.world, first.robot, first.steering, labels)
+        self._labels = [s.name or title_of(s.feedforward) for s in session.start]
+        robots = looks(self._labels, [s.feedforward for s in session.start])
+        setup = (first.world, first.robot, first.steering, robots)
         if self._shown_setup != setup:
             if self._shown_setup is not None:
                 self._scene.remove()
             self._shown_setup = setup
-            self._scene = Scene(self.server, session.simulations[0][1].model, labels)
-            self._plots.set_robots(labels, session.period)
+            self._scene = Scene(self.server, session.simulations[0][1].model, robots)
+            self._plots.set_robots(robots, session.period)
         sensing = [s.sensing for s in session.start]
         if self._shown_sensing != sensing:
             self._shown_sensing = sensing
@@ -149,6 +155,7 @@ class Live(Page):
         for name, ghost in self._ghosts.items():
             ghost.value = any(s.feedforward == name for s in session.start[1:])
         self._drawn = self._plotted = None
+        self._laps: list[dict[str, Any]] = []  # metrics of the whole laps until now
         self._counted = (time.monotonic(), session.tick)
         self._describe()
 
@@ -187,8 +194,9 @@ class Live(Page):
         self._describe()
 
     def _note_input(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
-        """Notes the value of an input; while a slider is dragged, only the last value counts."""
+        """Notes the value of an input; while a slider is dragged, only the value counts at which it rests."""
         self._changed_inputs[path] = value
+        self._rested = time.monotonic() + (REST if isinstance(value, float) else 0.0)
 
     def _apply_inputs(self) -> None:
         """Applies the noted inputs: as an event if the field can change during a run, otherwise in a new run."""
@@ -224,13 +232,16 @@ class Live(Page):
 
     def _present(self, scenario: Scenario) -> Scenario:
         """Returns the scenario with the present values of the fields that events have changed."""
-        state = self.session.state()
-        return scenario.model_copy(update={name: state[name] for name in CHANGEABLE})
+        now = self.session.state()
+        return scenario.model_copy(update={name: now[name] for name in CHANGEABLE})
 
     def _compare(self, name: FeedforwardName, wanted: bool) -> None:
         first, *ghosts = map(self._present, self.session.start)
+        if wanted and name == first.feedforward:
+            self._ghosts[name].value = False
+            raise InputError(f"compare with: {title_of(name)} drives already, as the first robot")
         ghosts = [s for s in ghosts if s.feedforward != name]
-        if wanted and name != first.feedforward:
+        if wanted:
             ghosts.append(first.model_copy(update=FEEDFORWARDS[name] | {"name": ""}))
         self._restart([first, *ghosts])
 
@@ -293,36 +304,50 @@ class Live(Page):
 
     @override
     def refresh(self) -> None:
-        self._apply_inputs()
         session, now = self.session, time.monotonic()
+        if self._changed_inputs and now >= self._rested:
+            self._apply_inputs()
+            session = self.session
         since, tick = self._counted
         if now - since >= 1:
             self.factor = (session.tick - tick) * session.period / (now - since)
             self._counted = now, session.tick
-        state = "playing" if self.playing else "paused" if session.running else "finished; reset starts again"
+        doing = "playing" if self.playing else "paused" if session.running else "finished; reset starts again"
         lap = 1 + int(session.time / session.start[0].reference.period)
         factor = f" · {self.factor:.2f}× real time" if self.playing else ""
-        lines = [f"<b>{session.time:.2f} s</b> · lap {lap} · {state}{factor}"]
-        for row, scenario in enumerate(session.start):
+        lines = [f"<b>{session.time:.2f} s</b> · lap {lap} · {doing}{factor}"]
+        for row, label in enumerate(self._labels):
             if reason := session.failure(row):
-                lines.append(warning(f"{scenario.name or scenario.feedforward} stopped: {reason}"))
-        if self.message:
-            lines.append(warning(self.message))
+                lines.append(warning(f"{label} stopped: {reason}"))
         write(self._status, block("status", *lines))
-        if session.tick != self._plotted and session.tick > 1:
+        if session.tick != self._plotted:
             self._plotted = session.tick
-            self._plots_since_mark += 1
-            if self.playing and self._plots_since_mark >= PLOTS_PER_MARK:
-                self._plots_since_mark = 0
-                self._scene.mark_trails()
-            ticks = round(WINDOW / session.period)
-            step = max(1, ticks // SAMPLES)
-            first = max(0, session.tick - ticks) // step * step
-            log = session.log(first)
-            times = np.arange(first, first + len(log), dtype=float) * session.period
-            self._plots.show(times, log, step)
+            self._show_past()
         if session.tick:
-            self.describe_estimates(self._labels, session.log(session.tick - 1)[-1])
+            now = session.log(session.tick - 1)[-1]
+            self.describe_estimates(self._labels, now)
+            ticks = round(session.start[0].reference.period / session.period)
+            if session.tick >= (len(self._laps) + 1) * ticks:
+                self._laps += whole_laps(session.log(len(self._laps) * ticks), ticks, session.period)
+            self._plots.score(now, self._laps)
+
+    def _show_past(self) -> None:
+        """Draws the last seconds: their curves, and the trails of the robots, which change less often."""
+        session = self.session
+        ticks = round(WINDOW / session.period)
+        step = max(1, ticks // SAMPLES)
+        first = max(0, session.tick - ticks) // step * step
+        log = session.log(first)
+        if len(log) < 2:
+            return self._plots.clear(WINDOW)
+        self._plots.show(np.arange(first, first + len(log), dtype=float) * session.period, log, step)
+        self._plots_since_trail += 1
+        if self._plots_since_trail >= PLOTS_PER_TRAIL or not self.playing:
+            self._plots_since_trail = 0
+            every = -(-ticks // (self._scene.trail_points - 2))
+            marked = session.tick // every * every - every * np.arange(self._scene.trail_points - 1)[::-1]
+            rows = np.append(marked, session.tick - 1) - first  # the same moments of the run in every picture
+            self._scene.show_trails(log[np.clip(rows, 0, len(log) - 1)])
 
     def _describe(self) -> None:
         """Writes the timeline, and sets the inputs to the present values."""
@@ -334,7 +359,8 @@ class Live(Page):
             before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
         write(self._timeline, block("timeline", *(reversed(lines[-50:]) if lines else ["no events yet"])))
         present = self._present(self.session.start[0])
-        self._scene.show_payload(present.perturbation)
+        for row, saved in enumerate(self.session.saved()):
+            self._scene.show_payload(row, state(saved, self.session.time)["perturbation"])
         self._controls.designed = self.session.designed()
         self._controls.show(present)
         units = ("V/(m/s)", "V/m"), RIGID_UNITS if present.steering == "rigid" else ("V/(rad/s)", "V/rad")

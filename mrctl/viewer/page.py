@@ -18,7 +18,7 @@ import viser
 from mrctl.kernel import Rows
 from mrctl.record import InputError
 from mrctl.viewer import sensors
-from mrctl.viewer.scene import MAX_MARKED
+from mrctl.viewer.scene import MAX_MARKED, Scene
 from mrctl.viewer.server import Server
 
 FRAME, REFRESH = 1 / 25, 1 / 15  # s of wall time between two pictures, and between two updates of the plots
@@ -34,16 +34,18 @@ class Page(ABC):
         server: Server of the page.
         playing: Whether time goes on.
         speed: Requested ratio of simulated to wall time.
-        message: Last error, or "".
         curves: Tab for the plots.
     """
+
+    _scene: Scene
 
     def __init__(self, server: Server) -> None:
         """Takes the server; a subclass builds the rest of the page."""
         self.server = server
+        self._notice = server.gui.add_html("")  # above the tabs, so that it is seen on each of them
+        self.message = ""
         self.playing = True
         self.speed = 1.0
-        self.message = ""
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._closing = False
         panel = server.gui.add_panel()
@@ -51,6 +53,27 @@ class Page(ABC):
         panel.dock_left()
         panel.set_width(430)
         server.gui.main_panel.dock_right()
+
+        @server.on_client_connect
+        async def _(client: viser.ClientHandle) -> None:
+            client.camera.on_update(self._keep_above)
+
+    async def _keep_above(self, camera: viser.CameraHandle) -> None:
+        """Keeps a visitor's camera above the floor."""
+        here, target = np.array(camera.position), np.array(camera.look_at)
+        above = self._scene.above_floor(here)
+        if not np.array_equal(above, here):
+            camera.position, camera.look_at = above, target
+
+    @property
+    def message(self) -> str:
+        """Last error, or ""; it stands on every tab."""
+        return self._message
+
+    @message.setter
+    def message(self, text: str) -> None:
+        self._message = text
+        write(self._notice, block("message", warning(text)) if text else "")
 
     def add_sensors(self) -> None:
         """Adds the inputs that say whether and how estimates and fixes are drawn, in the present context of the GUI."""

@@ -13,12 +13,14 @@ from viser import uplot
 
 from mrctl.kernel import Rows
 from mrctl.results.dataset import blank
-from mrctl.viewer.scene import REFERENCE_COLOUR, Colour, colour_of
+from mrctl.viewer.looks import Colour, Look
+from mrctl.viewer.scene import REFERENCE_COLOUR
+from mrctl.viewer.score import table
 
 Array = NDArray[np.float64]
 
 SHARE_WINDOW = 1.0  # s over which the share of the feedback is averaged
-CURSOR_COLOUR: Colour = (150, 155, 160)
+CURSOR_COLOUR: Colour = (17, 24, 39)
 MAX_ROBOTS = 4  # number of robots whose curves are drawn
 
 
@@ -33,64 +35,75 @@ class Curve(NamedTuple):
 
 
 class Chart(NamedTuple):
-    """Curves with one axis."""
+    """Curves with one axis, which shows at least an interval: a curve of zeros is flat, at any scale."""
 
     title: str
     curves: list[Curve]
+    least: tuple[float, float]
 
 
-def charts(log: Rows, labels: Sequence[str], period: float) -> list[Chart]:
+def charts(log: Rows, robots: Sequence[Look], period: float) -> list[Chart]:
     """Returns the charts of a log.
 
     Args:
         log: Record of `results.dataset.TICK` for each sample and robot, `(T, B)`.
-        labels: Label of each robot.
+        robots: Look of each robot.
         period: Time between samples in s.
     """
-    shown = range(min(len(labels), MAX_ROBOTS))
+    shown = range(min(len(robots), MAX_ROBOTS))
 
     def signal(name: str, row: int) -> Array:
         return log[name][:, row]
 
     def each(quantity: str, values: Sequence[Array], dashed: bool = False) -> list[Curve]:
-        return [Curve(f"{labels[r]} {quantity}", colour_of(r), dashed, values[r]) for r in shown]
+        return [Curve(f"{robots[r].label} {quantity}", robots[r].colour, dashed, values[r]) for r in shown]
 
-    def tracked(title: str, name: str) -> Chart:
+    def tracked(title: str, name: str, least: tuple[float, float]) -> Chart:
         reference = Curve("reference", REFERENCE_COLOUR, False, signal(f"{name}_ref", 0))
         estimated = [
-            Curve(f"{labels[r]} {name} estimated", pale(colour_of(r)), False, signal(f"{name}_measured", r), 4.5)
+            Curve(
+                f"{robots[r].label} {name} estimated",
+                pale(robots[r].colour),
+                False,
+                signal(f"{name}_measured", r),
+                4.5,
+            )
             for r in shown
         ]
-        return Chart(title, [reference, *estimated, *each(name, [signal(name, r) for r in shown])])
+        return Chart(title, [reference, *estimated, *each(name, [signal(name, r) for r in shown])], least)
 
     def voltages(title: str, sign: float) -> Chart:
         parts = {
             part: [(signal(f"{part}_right", r) + sign * signal(f"{part}_left", r)) / 2 for r in shown]
             for part in ("feedback", "feedforward")
         }
-        return Chart(
-            title, each("feedback", parts["feedback"]) + each("feedforward", parts["feedforward"], dashed=True)
-        )
+        curves = each("feedback", parts["feedback"]) + each("feedforward", parts["feedforward"], dashed=True)
+        return Chart(title, curves, (-1.0, 1.0))
 
     def squares(part: str, row: int) -> Array:
         both = signal(f"{part}_left", row) ** 2 + signal(f"{part}_right", row) ** 2
-        return _moving_mean(both, round(SHARE_WINDOW / period))
+        return np.where(np.isfinite(both), _moving_mean(both, round(SHARE_WINDOW / period)), np.nan)
 
     with np.errstate(invalid="ignore", divide="ignore"):
         shares = [np.sqrt(squares("feedback", r) / squares("voltage", r)) for r in shown]
     position = [1e3 * np.hypot(signal("longitudinal_error", r), signal("lateral_error", r)) for r in shown]
     return [
-        tracked("V, m/s", "v"),
-        tracked("θ̇, rad/s", "omega"),
-        Chart("position error, mm", each("position error", position)),
-        Chart("share of the voltage that is feedback, last second", each("share", shares)),
+        tracked("V, m/s", "v", (0.0, 0.1)),
+        tracked("θ̇, rad/s", "omega", (-0.1, 0.1)),
+        Chart("position error, mm", each("position error", position), (0.0, 1.0)),
+        Chart("share of the voltage that is feedback, last second", each("share", shares), (0.0, 1.0)),
         voltages("Σ: feedback (solid), feedforward (dashed), V", 1.0),
         voltages("Δ: feedback (solid), feedforward (dashed), V", -1.0),
-        Chart("norm of the learned weights, ‖W‖", each("weight norm", [signal("weight_norm", r) for r in shown])),
+        Chart(
+            "norm of the learned weights, ‖W‖",
+            each("weight norm", [signal("weight_norm", r) for r in shown]),
+            (0.0, 0.1),
+        ),
         Chart(
             "saturated, guard (dashed)",
             each("saturated", [signal("saturated", r) for r in shown])
             + each("guard", [signal("guard", r) for r in shown], dashed=True),
+            (0.0, 1.0),
         ),
     ]
 
@@ -116,80 +129,94 @@ class Plots:
     removed.
     """
 
-    def __init__(self, gui: viser.GuiApi, tab: viser.GuiTabHandle, cursor: bool = False) -> None:
-        """Takes the GUI of the page and the tab for the charts; with `cursor`, `show` needs the time of a cursor."""
-        self._gui, self._tab, self._cursor = gui, tab, cursor
+    def __init__(self, gui: viser.GuiApi, tab: viser.GuiTabHandle, zoom: bool = True) -> None:
+        """Takes the GUI of the page and the tab for the charts; `zoom` lets a visitor zoom in along the time."""
+        self._gui, self._tab, self._zoom = gui, tab, zoom
         self._sets: dict[int, list[viser.GuiUplotHandle]] = {}
         with tab:
             self._legend = gui.add_html("")
+            self._score = gui.add_html("")
+            self._cursor = gui.add_html("")
 
-    def set_robots(self, labels: Sequence[str], period: float) -> None:
+    def set_robots(self, robots: Sequence[Look], period: float) -> None:
         """Sets the robots whose curves `show` will draw.
 
         Args:
-            labels: Label of each robot.
+            robots: Look of each robot.
             period: Time between samples in s.
         """
-        self._labels, self._period = labels, period
-        self._legend.content = legend(labels)
-        size = min(len(labels), MAX_ROBOTS)
+        self._robots, self._period = robots, period
+        self._legend.content = legend(robots)
+        size = min(len(robots), MAX_ROBOTS)
+        drawn = charts(blank(2, size), robots[:size], period)
         if size not in self._sets:
-            empty = charts(blank(2, size), labels[:size], period)
             with self._tab:
-                self._sets[size] = [_add(self._gui, chart, self._cursor) for chart in empty]
+                self._sets[size] = [_add(self._gui, chart, self._zoom) for chart in drawn]
         for count, handles in self._sets.items():
             for handle in handles:
                 handle.visible = count == size
         self._handles = self._sets[size]
+        for handle, chart in zip(self._handles, drawn, strict=True):
+            if handle.series != (series := _series(chart)):
+                handle.series = series
 
-    def show(self, time: Array, log: Rows, step: int, cursor: float | None = None) -> None:
+    def show(self, time: Array, log: Rows, step: int) -> None:
         """Draws a log.
 
         Args:
             time: Times of the samples in s, `(T,)`.
             log: Record of `TICK` for each sample and robot, `(T, B)`.
             step: Number of samples from one drawn sample to the next.
-            cursor: Time of a vertical line in s.
         """
-        for handle, chart in zip(self._handles, charts(log, self._labels, self._period), strict=True):
-            curves = [np.ascontiguousarray(curve.values[::step]) for curve in chart.curves]
-            at = np.ascontiguousarray(time[::step])
-            handle.data = (at, *curves) if cursor is None else _with_cursor(at, curves, cursor)
+        for handle, chart in zip(self._handles, charts(log, self._robots, self._period), strict=True):
+            handle.data = tuple(np.ascontiguousarray(v[::step]) for v in (time, *(c.values for c in chart.curves)))
+
+    def score(self, now: Rows, laps: Sequence[dict[str, Array]]) -> None:
+        """Writes the score, as `score.table` does."""
+        self._score.content = table(self._robots, now, laps)
+
+    def clear(self, span: float) -> None:
+        """Draws empty charts of `span` s."""
+        self.show(np.array([0.0, span]), blank(2, len(self._robots)), 1)
+
+    def point(self, share: float) -> None:
+        """Draws a vertical line in all charts at a share of their time; their data need not be sent again."""
+        left = f"{100 * share:.3f}%"
+        line = f"content:'';position:absolute;top:0;bottom:0;left:{left};border-left:1px solid rgb{CURSOR_COLOUR}"
+        self._cursor.content = f"<style>.u-over::after{{{line}}}</style>"
 
 
-def legend(labels: Sequence[str]) -> str:
+def legend(robots: Sequence[Look]) -> str:
     """Returns the legend of robots and their colours in HTML."""
-    keys = [f'<span style="color:rgb{colour_of(k)}">■ {html.escape(name)}</span>' for k, name in enumerate(labels)]
-    keys = [*keys[:MAX_ROBOTS], f'<span style="color:rgb{REFERENCE_COLOUR}">■ reference</span>']
-    keys += [f'<span style="color:rgb{pale(colour_of(0))}">■ pale: estimated V, θ̇</span>']
-    return f'<p style="margin:0.3em 1em">{" &nbsp; ".join(keys)}</p>'
+    keys = [f'<span style="color:rgb{colour}">■ {html.escape(label)}</span>' for label, colour in robots]
+    keys += [f'<span style="color:rgb{REFERENCE_COLOUR}">■ reference</span>']
+    keys += [f'<span style="color:rgb{pale(robots[0].colour)}">■ pale: estimated V, θ̇</span>']
+    if len(robots) > MAX_ROBOTS:
+        keys += [f"Curves are of the first {MAX_ROBOTS} of {len(robots)} robots."]
+    return f'<p style="margin:0.3em 1em;max-height:6em;overflow:auto">{" &nbsp; ".join(keys)}</p>'
 
 
-def _add(gui: viser.GuiApi, chart: Chart, cursor: bool) -> viser.GuiUplotHandle:
-    colours = [curve.colour for curve in chart.curves] + [CURSOR_COLOUR] * cursor
-    dashes = [curve.dashed for curve in chart.curves] + [False] * cursor
-    widths = [curve.width for curve in chart.curves] + [1.5] * cursor
-    series = [
-        uplot.Series(label="", stroke=f"rgb{colour}", width=w, dash=(5, 4) if dashed else (), points={"show": False})
-        for colour, dashed, w in zip(colours, dashes, widths, strict=True)
-    ]
-    return gui.add_uplot(
-        tuple(np.zeros(2) for _ in range(1 + len(series))),
-        (uplot.Series(label="s"), *series),
-        title=chart.title,
-        scales={"x": {"time": False}},
-        legend={"show": False},
-        axes=({"size": 24, "ticks": {"size": 4}}, {"size": 42, "ticks": {"size": 4}}),
-        height=112,
-        padding=(0, 8, 0, 0),
+def _series(chart: Chart) -> tuple[uplot.Series, ...]:
+    """Returns the series of a chart: the time, and its curves."""
+    return uplot.Series(label="s"), *(
+        uplot.Series(
+            label="", stroke=f"rgb{c.colour}", width=c.width, dash=(5, 4) if c.dashed else (), points={"show": False}
+        )
+        for c in chart.curves
     )
 
 
-def _with_cursor(time: Array, curves: Sequence[Array], cursor: float) -> tuple[Array, ...]:
-    """Returns data for uPlot with one more series: a vertical line at the cursor, and a base line elsewhere."""
-    at = min(int(np.searchsorted(time, cursor)), len(time) - 1)
-    known = np.concatenate(curves)
-    low, high = (np.nanmin(known), np.nanmax(known)) if np.isfinite(known).any() else (0.0, 0.0)
-    line = np.full(len(time) + 3, low)
-    line[at + 1] = high
-    return np.insert(time, at, [cursor] * 3), *(np.insert(c, at, [c[at]] * 3) for c in curves), line
+def _add(gui: viser.GuiApi, chart: Chart, zoom: bool) -> viser.GuiUplotHandle:
+    series = _series(chart)
+    low, high = ({"pad": 0.1, "soft": soft, "mode": 1} for soft in chart.least)
+    return gui.add_uplot(
+        tuple(np.zeros(2) for _ in series),
+        series,
+        title=chart.title,
+        scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}},
+        legend={"show": False},
+        axes=({"size": 24, "ticks": {"size": 4}}, {"size": 56, "ticks": {"size": 4}}),
+        height=112,
+        padding=(8, 8, 0, 0),
+        cursor=None if zoom else {"drag": {"x": False, "y": False}},
+    )

@@ -21,16 +21,19 @@ from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.stand import front_rates, stand, steer
 from mrctl.record import InputError
+from mrctl.results.controllers import title_of
 from mrctl.results.dataset import SIGNALS, blank, scenarios_of
 from mrctl.results.metrics import as_runs, summary
 from mrctl.scenario import Scenario
 from mrctl.sweep import store
 from mrctl.sweep.store import Store
 from mrctl.theory.perturbation import Perturbation
+from mrctl.viewer.looks import Look, looks
 from mrctl.viewer.session import state
 
 Array = NDArray[np.float64]
 MAX_SHOWN = 4  # largest number of runs in a result that are all shown at the beginning
+ABOVE = 0.01  # m, height of a path above the ground
 WHEELS = {"wheel_left": "wheel_rate_left", "wheel_right": "wheel_rate_right"}
 
 
@@ -39,7 +42,8 @@ class Recording:
 
     Attributes:
         scenario: Scenario of the run.
-        label: Name of the run.
+        controller: Name of the controller in tables.
+        label: Name of the run for people.
         period: Time between samples in s.
         start: Time of the first sample since the start of the run in s; all methods count time from this sample.
         log: Record of `TICK` for each sample until the end or the failure, `(T,)`.
@@ -49,7 +53,9 @@ class Recording:
     def __init__(self, run: xr.Dataset) -> None:
         """Takes a single run of a result, or an interval of one."""
         self.scenario: Scenario = scenarios_of(run)[0]
-        self.label = str(run["label"].values)
+        self.controller = str(run["feedforward"].values) if "feedforward" in run.coords else self.scenario.feedforward
+        label = str(run["label"].values)
+        self.label = title_of(label) if label == self.controller else label
         self.period = float(run.attrs["control_period"])
         self.start = float(run["time"][0])
         log = blank(run.sizes["time"])
@@ -86,21 +92,33 @@ class Recording:
         """Returns the perturbation of the plant at a time in s."""
         return state(self.scenario, self.start + time)["perturbation"]
 
-    def path(self, points: int = 600) -> Array:
-        """Returns points of the path of P, a little above the ground, in m, `(points, 3)`."""
-        rows = self.log[np.linspace(0, len(self.log) - 1, points).astype(int)]
-        height = self.qpos(0)[2] - self.model.geom("wheel_left").size[0] + 0.01
-        return np.column_stack([rows["x"], rows["y"], np.full(points, height)])
-
     def qpos(self, index: int) -> Array:
-        """Returns the generalised position at a sample, `(nq,)`: the recorded plane motion, placed on the ground."""
+        """Returns the generalised position at a sample, `(nq,)`; a result without height and tilt stands upright."""
         now = self.log[index]
         pose, twist = (np.array([now[name] for name in names]) for names in (("x", "y", "theta"), ("v", "omega")))
-        qpos = stand(self.model, pose, twist).qpos
+        if np.isfinite(now["z"]):
+            qpos = self.model.qpos0.copy()
+            chassis = qpos[self.model.joint("chassis").qposadr[0] :]
+            chassis[:3] = now["x"], now["y"], now["z"]
+            mujoco.mju_euler2Quat(chassis[3:7], np.array([now["theta"], now["pitch_angle"], now["roll_angle"]]), "zyx")
+        else:
+            qpos = stand(self.model, pose, twist).qpos
         steer(self.model, qpos, now["steering_angle"])
         for wheel, angle in self._wheel_angles.items():
             qpos[self.model.joint(wheel).qposadr[0]] = angle[index]
         return qpos
+
+
+def path(rows: Rows, radius: float, height: float) -> Array:
+    """Returns the path of P, a little above the ground, in m, with the shape of `rows` and 3.
+
+    Args:
+        rows: Records of `TICK`.
+        radius: Radius of the driven wheels in m.
+        height: Height of the middle between them in m, where none was recorded.
+    """
+    z = np.where(np.isfinite(rows["z"]), rows["z"], height)
+    return np.stack([rows["x"], rows["y"], z - radius + ABOVE], axis=-1)
 
 
 def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows]:
@@ -111,8 +129,8 @@ def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows]:
     return recordings[0].period * np.arange(len(log), dtype=float), log
 
 
-def labels_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[str]:
-    """Returns a label for each run, with its number if labels would be equal.
+def looks_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[Look]:
+    """Returns the look of each run, with its number in the label if labels would be equal.
 
     Raises:
         InputError: Runs differ in world, robot or control period, so they cannot share a scene.
@@ -123,8 +141,9 @@ def labels_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[str]
             if getattr(r.scenario, field) != getattr(first.scenario, field):
                 raise InputError(f"run: {r.label} drove with another {field} than {first.label}")
     labels = [r.label for r in recordings]
-    unique = len(set(labels)) == len(labels)
-    return labels if unique else [f"{label} {run}" for label, run in zip(labels, runs, strict=True)]
+    if len(set(labels)) < len(labels):
+        labels = [f"{label} {run}" for label, run in zip(labels, runs, strict=True)]
+    return looks(labels, [r.controller for r in recordings])
 
 
 class Library:

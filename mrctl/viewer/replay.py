@@ -13,15 +13,16 @@ from typing_extensions import override
 from mrctl.record import InputError
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
-from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, labels_of
-from mrctl.viewer.scene import Scene, colour_of
+from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of
+from mrctl.viewer.scene import Scene
+from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
 
 SAMPLES = 800  # about the largest number of samples in a curve
 BOARD_SIZE = np.array([4.0, 0.0, 2.2])  # m, extent of the scatter plot in the scene along x, y and z
 BOARD_CORNER = np.array([-2.0, 3.2, 0.3])  # m, its lower left corner
-FAILED = (185, 28, 28)
+DROVE, FAILED = (71, 85, 105), (185, 28, 28)
 
 
 class Replay(Page):
@@ -44,12 +45,13 @@ class Replay(Page):
         self.recordings: list[Recording] = []
         self._drawn: tuple[object, ...] | None = None
         self._plotted: float | None = None
+        self._kept = list(runs[1:])  # the ghosts
         self._build(runs[0])
         self._show(runs)
 
     def _build(self, run: int) -> None:
         gui, table = self.server.gui, self.library.table
-        self._plots = Plots(gui, self.curves, cursor=True)
+        self._plots = Plots(gui, self.curves, zoom=False)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Replay"):
             self._status = gui.add_html("")
@@ -66,9 +68,9 @@ class Replay(Page):
             self._chosen = gui.add_number(
                 "Run", float(run), min=float(table.index[0]), max=float(table.index[-1]), step=1.0
             )
-            self.on(self._chosen, lambda run: self._show([int(run), *self.runs[1:]]))
-            self.on(gui.add_button("Keep this run as a ghost"), lambda _: self._show([*self.runs, self.runs[0]]))
-            self.on(gui.add_button("Only this run"), lambda _: self._show(self.runs[:1]))
+            self.on(self._chosen, lambda run: self._choose(int(run)))
+            self.on(gui.add_button("Keep this run as a ghost"), lambda _: self._keep())
+            self.on(gui.add_button("Only this run"), lambda _: self._only())
         numbers = [str(name) for name, values in table.select_dtypes("number").nunique().items() if values > 1]
         self._board: list[Any] = []
         if len(table) > MAX_SHOWN and numbers:
@@ -102,7 +104,7 @@ class Replay(Page):
         sphere = _sphere()
         points = scene.add_batched_meshes_simple(
             "/board/runs", *sphere, np.tile([1.0, 0, 0, 0], (len(where), 1)), where,
-            batched_colors=np.where(failed[:, None], FAILED, colour_of(0)).astype(np.uint8),
+            batched_colors=np.where(failed[:, None], FAILED, DROVE).astype(np.uint8),
             lod="off", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
         runs = table.index.to_numpy()[known]
@@ -128,21 +130,36 @@ class Replay(Page):
         ]
 
     def _open(self, run: int) -> None:
-        self._show([run, *self.runs[1:]])
+        self._choose(run)
         self._chosen.value = float(run)
+
+    def _choose(self, run: int) -> None:
+        """Shows a run beside the kept ones, each once."""
+        self._show(list(dict.fromkeys([run, *self._kept])))
+
+    def _keep(self) -> None:
+        if self.runs[0] not in self._kept:
+            self._kept.append(self.runs[0])
+
+    def _only(self) -> None:
+        self._kept = []
+        self._show(self.runs[:1])
 
     def _show(self, runs: Sequence[int]) -> None:
         """Shows runs in the scene and in the plots."""
         recordings = [self.library.recording(run) for run in runs]
-        labels = labels_of(recordings, runs)
+        robots = looks_of(recordings, runs)
         if self.recordings:
             self._scene.remove()
         self.runs, self.recordings = list(runs), recordings
-        self._scene = Scene(self.server, recordings[0].model, labels)
+        self._scene = Scene(self.server, recordings[0].model, robots)
         self._scene.show_recordings(recordings)
-        self._plots.set_robots(labels, recordings[0].period)
-        self._times, self._log = joint_log(recordings)
-        self._labels, sensing = labels, [r.scenario.sensing for r in recordings]
+        self._plots.set_robots(robots, recordings[0].period)
+        times, self._log = joint_log(recordings)
+        self._plots.show(times, self._log, max(1, len(self._log) // SAMPLES))
+        self._lap = round(recordings[0].scenario.reference.period / recordings[0].period)
+        self._laps = whole_laps(self._log, self._lap, recordings[0].period)
+        self._labels, sensing = [robot.label for robot in robots], [r.scenario.sensing for r in recordings]
         self._latencies = [s.periods("fix_latency", r.period) for s, r in zip(sensing, recordings, strict=True)]
         off = np.nan_to_num(np.hypot(*np.moveaxis(error(self._log), -1, 0)))
         estimated = np.isfinite(self._log["x_measured"][0])
@@ -150,7 +167,7 @@ class Replay(Page):
             any(estimated & [s.source != "truth" for s in sensing]),
             max(np.sqrt(np.mean(off**2, axis=0)).max(), *(s["fix_position_noise"] for s in sensing)),
         )
-        self.duration = float(self._times[-1])
+        self.duration = float(times[-1])
         self.scrubber.max = self.duration
         self._scrub(self.time, pause=False)
 
@@ -183,7 +200,7 @@ class Replay(Page):
         self._drawn = now
         for row, recording in enumerate(self.recordings):
             self._scene.show(row, recording.qpos(recording.index(self.time)))
-        self._scene.show_payload(self.recordings[0].perturbation(self.time))
+            self._scene.show_payload(row, recording.perturbation(self.time))
         period, logs = self.recordings[0].period, []
         if marked:
             ticks = round(FIX_AGE / period)
@@ -204,15 +221,17 @@ class Replay(Page):
         row = self.library.table.loc[self.runs[0]]
         known = [f"{html.escape(str(k))} {v:.4g}" for k, v in row.items() if isinstance(v, int | float) and v == v]
         lines += known
-        if self.message:
-            lines.append(warning(self.message))
+        if self._kept:
+            lines.append(f"kept as ghosts: runs {', '.join(map(str, sorted(self._kept)))}")
         write(self._status, block("status", *lines))
         last = np.stack([r.log[r.index(self.time)] for r in self.recordings])
         self.describe_estimates(self._labels, last)
         if self.time != self._plotted:
             self._plotted = self.time
             self.scrubber.value = self.time
-            self._plots.show(self._times, self._log, max(1, len(self._log) // SAMPLES), self.time)
+            tick = min(round(self.time / self.recordings[0].period), len(self._log) - 1)
+            self._plots.score(self._log[tick], self._laps[: (tick + 1) // self._lap])
+            self._plots.point(self.time / self.duration if self.duration else 0.0)
 
 
 def _sphere() -> tuple[np.ndarray, np.ndarray]:

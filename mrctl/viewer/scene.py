@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import mujoco
@@ -21,21 +22,20 @@ from mrctl.physics.stand import ground
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.perturbation import Perturbation
-from mrctl.viewer.recording import Recording
+from mrctl.viewer.looks import Colour, Look
+from mrctl.viewer.recording import ABOVE, Recording, joint_log, path
 from mrctl.viewer.sensors import Marks
 from mrctl.viewer.shapes import ribbons
 
 Array = NDArray[np.float64]
-Colour = tuple[int, int, int]
-
-# The first robot is solid, the others are translucent; the curves of a robot have its colour.
-COLOURS: list[Colour] = [
-    (37, 99, 235), (234, 88, 12), (22, 163, 74), (147, 51, 234), (8, 145, 178), (202, 138, 4), (219, 39, 119),
-]  # fmt: skip
 REFERENCE_COLOUR: Colour = (110, 115, 122)
 GLASS: Colour = (150, 155, 160)  # of the first robot while marks are drawn, which have its colour
 TRAIL_POINTS = 240  # number of points in the trail of a robot
 TRAIL_POINTS_OF_ALL = 1600  # largest number of points in the trails of all robots
+PATH_POINTS = 600  # number of points in the path of a finished run
+TOGETHER = 0.5  # m, distance of robots that have one label
+LABEL_HEIGHT = 0.4  # m
+CLEARANCE = 0.05  # m, least height of a camera above the floor
 # Initial camera, relative to the middle of the reference and in units of its size.
 CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])
 GHOST_OPACITY, GLASS_OPACITY = 0.4, 0.55
@@ -44,9 +44,12 @@ LEAST_VIEW = 1.2  # m, least width of the view
 SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
 
 
-def colour_of(row: int) -> Colour:
-    """Returns the colour of a robot."""
-    return COLOURS[row % len(COLOURS)]
+_NUMBERS = itertools.count()  # of scenes
+
+
+def name_of(row: int) -> str:
+    """Returns the name of the node of a robot."""
+    return f"/world/ghosts/{row}" if row else "/world/robot"
 
 
 class Scene:
@@ -55,21 +58,22 @@ class Scene:
     Everything is below the node `/world`: to follow a robot, that node moves instead of the cameras.
     """
 
-    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel, labels: Sequence[str]) -> None:
+    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel, robots: Sequence[Look]) -> None:
         """Draws the world and its robots.
 
         Args:
             server: Server of the page.
             model: Compiled world; it is not changed.
-            labels: Label of each robot.
+            robots: Look of each robot.
         """
-        self.size = len(labels)
-        self._scene = server.scene
-        self._camera = server.initial_camera
+        self.size, self._robots = len(robots), list(robots)
+        self._scene, self._number = server.scene, next(_NUMBERS)
+        self._server = server
         self._model, self._data = mjcf.clone(model), mujoco.MjData(model)
         round_ends = self._model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
         self._model.geom_type[round_ends] = mujoco.mjtGeom.mjGEOM_CYLINDER  # a capsule takes thousands of triangles
         self._radius = read_robot(model).wheel_radius
+        self._back = np.zeros(4)  # scratch
         self._root = self._scene.add_frame("/world", show_axes=False)
         chassis = model.body("chassis").id
         self._bodies = [b for b in range(model.nbody) if model.body_rootid[b] == chassis]
@@ -79,32 +83,39 @@ class Scene:
         self._draw_world()
         self._looks: list[tuple[viser.GlbHandle, viser.MeshHandle]] = []  # of each body, solid and translucent
         self._footprint = np.array([[np.inf, np.inf], [-np.inf, -np.inf]])
-        self._solid, self._ghosts = self._draw_robots()
+        self._parts = self._draw_bodies()
+        self._frames = [self._draw_robot(row) for row in range(self.size)]
         self._labels = [
-            self._scene.add_label(f"/world/label{row}", label, font_screen_scale=0.8)
-            for row, label in enumerate(labels)
-            if 1 < self.size <= len(COLOURS)
+            self._scene.add_label(f"/world/label{row}", robot.label, font_screen_scale=0.8)
+            for row, robot in enumerate(robots)
+            if self.size > 1
         ]
-        self._payload = self._scene.add_box(
-            "/world/robot/chassis/payload", (120, 72, 40), (0.1, 0.1, 0.1), cast_shadow=False, visible=False
-        )
+        self._payloads = [
+            self._scene.add_box(
+                f"{name_of(row)}/chassis/payload", (120, 72, 40), (0.1, 0.1, 0.1), cast_shadow=False, visible=False,
+                opacity=GHOST_OPACITY if row else None,
+            )
+            for row in range(self.size)
+        ]  # fmt: skip
         self._sensors = self._scene.add_frame("/world/sensors", show_axes=False, visible=False)
         self._marks = [
-            Marks(self._scene, row, self._footprint, colour_of(row)) for row in range(min(self.size, MAX_MARKED))
+            Marks(self._scene, row, self._footprint, robot.colour) for row, robot in enumerate(robots[:MAX_MARKED])
         ]
-        self._shown = None
-        self._trails: Array | None = None
+        self._perturbations: list[Perturbation | None] = [None] * self.size  # as drawn
         self._ribbons: list[viser.MeshHandle] = []
 
     def _draw_world(self) -> None:
         model, data = self._model, self._data
         mujoco.mj_kinematics(model, data)
+        self._floor = np.array([0.0, 0.0, 1.0]), np.zeros(3)  # its normal and a point of it
         for geom in range(model.ngeom):
             if model.body_weldid[model.geom_bodyid[geom]] or model.geom_group[geom] > SEEN:
                 continue
-            name, turn = f"/world/fixed/{geom}", np.zeros(4)
+            # A page gives a node the pose of the one that it replaces, if both have the same name.
+            name, turn = f"/world/fixed/{self._number}/{geom}", np.zeros(4)
             mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
             if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+                self._floor = data.geom_xmat[geom].reshape(3, 3)[:, 2].copy(), data.geom_xpos[geom].copy()
                 self._scene.add_grid(
                     name, 24, 24, cell_size=0.5, section_size=1, cell_color=(214, 217, 221),
                     section_color=(190, 194, 200), plane_color=(238, 240, 242), plane_opacity=1.0, shadow_opacity=0.0,
@@ -118,45 +129,57 @@ class Scene:
                     flat_shading=True, cast_shadow=False, receive_shadow=False,
                 )  # fmt: skip
 
-    def _draw_robots(self) -> tuple[list[viser.FrameHandle], list[tuple[int, viser.BatchedMeshHandle]]]:
-        model, solid = self._model, []
-        ghosts: list[tuple[int, viser.BatchedMeshHandle]] = []
-        others = self.size - 1
-        for k, body in enumerate(self._bodies):
-            name = model.body(body).name
-            solid.append(self._scene.add_frame(f"/world/robot/{name}", show_axes=False))
+    def _draw_bodies(self) -> list[trimesh.Trimesh | None]:
+        """Draws the bodies of the solid robot; returns the rough shape of each, which ghosts have."""
+        model, parts = self._model, []
+        for body in self._bodies:
             geoms = [
                 g for g in range(model.ngeom)
                 if model.geom_bodyid[g] == body and model.geom_group[g] <= SEEN and model.geom_rgba[g, 3] > 0
             ]  # fmt: skip
-            if not geoms:
-                continue
-            mesh = merge_geoms(model, geoms)
-            solid_mesh = self._scene.add_mesh_trimesh(
-                f"/world/robot/{name}/mesh", mesh, cast_shadow=False, receive_shadow=False
-            )
-            rough = _rough(model, geoms)
-            glass = self._scene.add_mesh_simple(
-                f"/world/robot/{name}/glass", rough.vertices, rough.faces, color=GLASS, opacity=GLASS_OPACITY,
-                flat_shading=True, cast_shadow=False, receive_shadow=False, visible=False,
-            )  # fmt: skip
-            self._looks.append((solid_mesh, glass))
-            corners = mesh.vertices @ self._data.xmat[body].reshape(3, 3).T
-            corners = (corners + self._data.xpos[body] - self._data.xpos[self._bodies[self._chassis]])[:, :2]
-            low, high = self._footprint
-            self._footprint = np.array([np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))])
-            if others:
-                handle = self._scene.add_batched_meshes_simple(
-                    f"/world/ghosts/{name}", rough.vertices, rough.faces, self._quaternions[1:, k],
-                    self._positions[1:, k],
-                    batched_colors=np.array([colour_of(row + 1) for row in range(others)], np.uint8),
-                    opacity=GHOST_OPACITY, lod="off", cast_shadow=False, receive_shadow=False,
-                )  # fmt: skip
-                ghosts.append((k, handle))
-        return solid, ghosts
+            parts.append(_rough(model, geoms) if geoms else None)
+            if geoms:
+                mesh, name = merge_geoms(model, geoms), self._node(0, body)
+                solid = self._scene.add_mesh_trimesh(f"{name}/mesh", mesh, cast_shadow=False, receive_shadow=False)
+                glass = self._draw_glass(f"{name}/glass", parts[-1], GLASS, GLASS_OPACITY, visible=False)
+                self._looks.append((solid, glass))
+                corners = mesh.vertices @ self._data.xmat[body].reshape(3, 3).T
+                corners = (corners + self._data.xpos[body] - self._data.xpos[self._bodies[self._chassis]])[:, :2]
+                low, high = self._footprint
+                self._footprint = np.array(
+                    [np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))]
+                )
+        return parts
+
+    def _draw_glass(
+        self, name: str, part: trimesh.Trimesh, colour: Colour, opacity: float, visible: bool = True
+    ) -> viser.MeshHandle:
+        return self._scene.add_mesh_simple(
+            name, part.vertices, part.faces, color=colour, opacity=opacity,
+            flat_shading=True, cast_shadow=False, receive_shadow=False, visible=visible,
+        )  # fmt: skip
+
+    def _draw_robot(self, row: int) -> list[viser.FrameHandle]:
+        """Draws a robot, with a frame for each body.
+
+        Each frame is a node of its own: the poses of viser's batched meshes reach the picture a frame late.
+        """
+        frames = []
+        for body, part in zip(self._bodies, self._parts, strict=True):
+            name = self._node(row, body)
+            frames.append(self._scene.add_frame(name, show_axes=False))
+            if row and part is not None:
+                self._draw_glass(f"{name}/mesh", part, self._robots[row].colour, GHOST_OPACITY)
+        return frames
+
+    def _node(self, row: int, body: int) -> str:
+        """Returns the name of the node of a body, below that of its parent."""
+        parent = int(self._model.body_parentid[body])
+        before = self._node(row, parent) if parent in self._bodies else name_of(row)
+        return f"{before}/{self._model.body(body).name}"
 
     def show_reference(self, scenario: Scenario) -> None:
-        """Draws a lap of each reference of a scenario on the ground, and sets the initial camera to show them."""
+        """Draws a lap of each reference of a scenario on the ground, and turns the cameras to show them."""
         lines = []
         for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
             pose = reference.sample(np.linspace(0, reference.period, 401)).pose
@@ -165,7 +188,22 @@ class Scene:
         self._draw_lines("/world/reference", np.stack(lines), 0.025, REFERENCE_COLOUR)
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
         middle, size = (low + high) / 2, max(LEAST_VIEW, *(high - low))
-        self._camera.position, self._camera.look_at = middle + size * CAMERA_POSITION, middle + size * CAMERA_TARGET
+        self._look(middle + size * CAMERA_POSITION, middle + size * CAMERA_TARGET)
+
+    def _look(self, position: Array, target: Array) -> None:
+        """Sets the camera of pages to come, and of open ones if it is another than before."""
+        initial = self._server.initial_camera
+        if np.allclose(initial.position, position):
+            return
+        initial.position, initial.look_at = position, target
+        for client in self._server.get_clients().values():
+            client.camera.position = position
+            client.camera.look_at = target
+
+    def above_floor(self, position: Array) -> Array:
+        """Returns the nearest position to one in m, `(3,)`, from which a camera sees the floor from above."""
+        normal, point = self._floor
+        return position + normal * max(0.0, CLEARANCE - normal @ (position - point - self._root.position))
 
     def _draw_lines(self, name: str, lines: Array, width: float, colour: Colour) -> viser.MeshHandle:
         """Draws lines `(B, n, 3)` as one mesh; each segment of a thick line of viser's costs about as much."""
@@ -177,7 +215,10 @@ class Scene:
     def show_recordings(self, recordings: Sequence[Recording]) -> None:
         """Draws the references and the paths of finished runs."""
         self.show_reference(recordings[0].scenario)
-        self.show_trails(np.stack([recording.path() for recording in recordings]))
+        for row, recording in enumerate(recordings):
+            self.show(row, recording.qpos(len(recording.log) - 1))
+        _, log = joint_log(recordings)
+        self.show_trails(log[np.linspace(0, len(log) - 1, PATH_POINTS).astype(int)])
 
     def _height(self, x: float, y: float) -> float:
         try:
@@ -192,9 +233,17 @@ class Scene:
             row: Index of the robot.
             qpos: Generalised position of the robot, `(nq,)`.
         """
-        self._data.qpos[:] = qpos
-        mujoco.mj_kinematics(self._model, self._data)
-        self._positions[row], self._quaternions[row] = self._data.xpos[self._bodies], self._data.xquat[self._bodies]
+        model, data = self._model, self._data
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        for k, body in enumerate(self._bodies):
+            parent = model.body_parentid[body]
+            if parent not in self._bodies:
+                self._positions[row, k], self._quaternions[row, k] = data.xpos[body], data.xquat[body]
+                continue
+            mujoco.mju_negQuat(self._back, data.xquat[parent])
+            mujoco.mju_rotVecQuat(self._positions[row, k], data.xpos[body] - data.xpos[parent], self._back)
+            mujoco.mju_mulQuat(self._quaternions[row, k], self._back, data.xquat[body])
 
     def flush(self, follow: bool) -> None:
         """Sends the positions of all robots to the browsers.
@@ -203,20 +252,35 @@ class Scene:
             follow: Whether the first robot stays in the middle of the screen, and the world moves.
         """
         self._root.position = -self._positions[0, self._chassis] * [1, 1, 0] if follow else np.zeros(3)
-        for k, frame in enumerate(self._solid):
-            frame.position, frame.wxyz = self._positions[0, k], self._quaternions[0, k]
-        for k, handle in self._ghosts:
-            handle.batched_positions = self._positions[1:, k].astype(np.float32)
-            handle.batched_wxyzs = self._quaternions[1:, k].astype(np.float32)
-        for row, label in enumerate(self._labels):
-            label.position = self._positions[row, self._chassis] + [0, 0, 0.4 + 0.12 * row]
+        for row, frames in enumerate(self._frames):
+            for k, frame in enumerate(frames):
+                frame.wxyz = self._quaternions[row, k]
+                if abs(frame.position - self._positions[row, k]).max() > 1e-6:  # wheels stay, but for rounding
+                    frame.position = self._positions[row, k]
+        self._show_labels()
 
-    def show_payload(self, perturbation: Perturbation) -> None:
-        """Draws the payload as a cube with the density of water at its place; without a payload, it draws nothing."""
-        p, box = perturbation, self._payload
-        if p == self._shown:
+    def _show_labels(self) -> None:
+        """Moves the labels; robots that are close together have one label, which names at most three of them."""
+        here, near = self._positions[:, self._chassis], {}
+        for row in range(len(self._labels)):
+            first = next((r for r in near if np.hypot(*(here[r] - here[row])[:2]) < TOGETHER), row)
+            near.setdefault(first, []).append(self._robots[row].label)
+        for row, label in enumerate(self._labels):
+            label.visible = row in near
+            if row in near:
+                names = near[row]
+                more = f" + {len(names) - 2}" if len(names) > 3 else ""
+                text = ", ".join(names[: 2 if more else 3]) + more
+                if label.text != text:
+                    label.text = text
+                label.position = here[row] + [0, 0, LABEL_HEIGHT]
+
+    def show_payload(self, row: int, perturbation: Perturbation) -> None:
+        """Draws the payload of a robot as a cube with the density of water at its place; if there is none, nothing."""
+        p, box = perturbation, self._payloads[row]
+        if p == self._perturbations[row]:
             return
-        self._shown = p
+        self._perturbations[row] = p
         box.visible = p.payload > 0
         if box.visible:
             side = (p.payload / 1000) ** (1 / 3)
@@ -239,30 +303,36 @@ class Scene:
         for marks, here, log, latency in zip(self._marks, ground, logs, latencies, strict=False):
             marks.show(here, log, period, latency, magnified)
 
-    def mark_trails(self) -> None:
-        """Adds the present positions of the robots to their trails."""
-        here = self._positions[:, self._chassis] - [0, 0, self._radius - 0.01]
-        if self._trails is None:
-            self._trails = np.repeat(here[:, None], min(TRAIL_POINTS, TRAIL_POINTS_OF_ALL // self.size), axis=1)
-        self._trails = np.concatenate([self._trails[:, 1:], here[:, None]], axis=1)
-        self.show_trails(self._trails)
+    @property
+    def trail_points(self) -> int:
+        """Number of points in the trail of a robot."""
+        return min(TRAIL_POINTS, TRAIL_POINTS_OF_ALL // self.size)
 
-    def show_trails(self, paths: Array) -> None:
-        """Draws the paths of the robots in m, `(B, n, 3)`."""
-        groups = [paths[k :: len(COLOURS)] for k in range(min(self.size, len(COLOURS)))]
+    def show_trails(self, rows: Rows) -> None:
+        """Draws where the robots were.
+
+        Args:
+            rows: Record of `TICK` at any number of times, always the same number, `(n, B)`. A robot that has stopped
+                remains where it is.
+        """
+        here = self._positions[:, self._chassis]
+        paths = path(rows, self._radius, here[0, 2])
+        paths = np.where(np.isfinite(paths), paths, here - [0, 0, self._radius - ABOVE]).swapaxes(0, 1)
+        colours = list(dict.fromkeys(robot.colour for robot in self._robots))
+        groups = [paths[[robot.colour == colour for robot in self._robots]] for colour in colours]
         if not self._ribbons:
             self._ribbons = [
-                self._draw_lines(f"/world/trail/{k}", group, 0.012, COLOURS[k]) for k, group in enumerate(groups)
+                self._draw_lines(f"/world/trail/{k}", group, 0.012, colours[k]) for k, group in enumerate(groups)
             ]
             return
         for ribbon, group in zip(self._ribbons, groups, strict=True):
             ribbon.vertices = ribbons(group, 0.012)[0]
 
     def forget_trails(self) -> None:
-        """Removes the trails; new ones begin at the next mark."""
+        """Removes the trails."""
         for ribbon in self._ribbons:
             ribbon.remove()
-        self._trails, self._ribbons = None, []
+        self._ribbons = []
 
     def remove(self) -> None:
         """Removes the world with everything in it."""

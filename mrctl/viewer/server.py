@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import http
+import ipaddress
 import socket
 import sys
 from collections.abc import Iterator
@@ -16,6 +17,8 @@ from urllib.parse import urlsplit
 import rich
 import viser
 import websockets.asyncio.server
+from viser._messages import GuiUpdateMessage
+from viser.infra import ClientId
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
@@ -46,6 +49,9 @@ class Server(viser.ViserServer):
             port = taken.getsockname()[1]
         with _guarded(host), _quiet():
             super().__init__(host, port, label="mrctl", verbose=False)
+        interface = self.gui._websock_interface
+        interface.unregister_handler(GuiUpdateMessage, self.gui._handle_gui_updates)
+        interface.register_handler(GuiUpdateMessage, self._update_value)
         if self.get_port() != port:  # another program took it in the meantime
             self.stop()
             raise InputError(f"port: {port} is in use; choose another with --port")
@@ -53,6 +59,11 @@ class Server(viser.ViserServer):
         self.scene.configure_environment_map(None)
         self.scene.configure_default_lights(cast_shadow=False)
         self.scene.add_light_ambient("/light", intensity=1.2)
+
+    async def _update_value(self, client: ClientId, message: GuiUpdateMessage) -> None:
+        """Sets the value of an input for a client; viser would set whatever attribute of it a client names."""
+        if set(message.updates) == {"value"}:
+            await self.gui._handle_gui_updates(client, message)
 
     def request_share_url(self, verbose: bool = True) -> None:
         """Refuses to open a tunnel to a public server, which any client may ask for."""
@@ -128,10 +139,25 @@ def _admit(host: str, answer: Any, connection: ServerConnection, request: Reques
     """Refuses requests that pages of another origin make through a visitor's browser.
 
     The host of the request must be a name of this machine, since a foreign name may point here (DNS rebinding), and the
-    origin must be a page of that host. Programs other than browsers send no origin, and could send any.
+    origin must be a page of that host. Programs other than browsers send no origin, and could send any. No page may
+    show this one in a frame, where a visitor would click without knowing on what.
     """
     names, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-    known = host in ANYWHERE or all(urlsplit(f"//{name}").hostname in (*LOCAL, host) for name in names)
+    known = all(_is_own(urlsplit(f"//{name}").hostname or "", host) for name in names)
     if len(names) != 1 or not known or any(origin.partition("://")[2] != names[0] for origin in origins):
         return connection.respond(http.HTTPStatus.FORBIDDEN, "mrctl: a foreign origin\n")
-    return answer(connection, request)
+    response = answer(connection, request)
+    if response is not None:
+        response.headers["X-Frame-Options"] = "DENY"
+    return response
+
+
+def _is_own(name: str, host: str) -> bool:
+    """Returns whether a name is this machine's, which listens on `host`; no address can be rebound, as a name can."""
+    if name in (*LOCAL, host):
+        return True
+    if host not in ANYWHERE:
+        return False
+    with contextlib.suppress(ValueError):
+        return bool(ipaddress.ip_address(name))
+    return name in (socket.gethostname().lower(), socket.getfqdn().lower())

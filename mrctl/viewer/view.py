@@ -10,6 +10,8 @@ from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
+BEST: FeedforwardName = "model+composite"  # with the least errors in the README; shown beside PID alone by default
+
 if TYPE_CHECKING:
     from mrctl.viewer.page import Page
     from mrctl.viewer.server import Server
@@ -22,7 +24,7 @@ def view(
 
     Args:
         file: Scenario file, or folder of a result or a sweep; None for the default scenario.
-        compare: Feedforwards of the ghosts beside a scenario.
+        compare: Feedforwards of the ghosts beside a scenario; with neither, the best learner and PID alone are shown.
         run: Number of the run of a result or a sweep that is shown first.
         export: File to write instead of serving a page.
         host: Address to listen on.
@@ -34,7 +36,7 @@ def view(
     """
     from mrctl.viewer.export import export as write
     from mrctl.viewer.live import Live
-    from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, labels_of
+    from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, looks_of
     from mrctl.viewer.replay import Replay
 
     if file is not None and file.is_dir():
@@ -47,16 +49,19 @@ def view(
             shown = [int(k) for k in table.index]
         if export is not None:
             recordings = [library.recording(k) for k in shown]
-            return write(recordings, labels_of(recordings, shown), export)
+            return write(recordings, looks_of(recordings, shown), export)
         return _serve(lambda server: Replay(library, shown, server), host, port)
     if run is not None:
         raise InputError("run: only a result or a sweep has several")
     scenario = Scenario() if file is None else Scenario.from_toml(file)
+    if file is None and not compare:
+        scenario = scenario.replace(**FEEDFORWARDS[BEST])
+        compare = ["none"]
     ghosts = [scenario.model_copy(update=FEEDFORWARDS[name] | {"name": ""}) for name in compare]
     if export is not None:
         result = simulate([scenario, *ghosts], progress=True)
         recordings = [Recording(result.isel(run=k)) for k in range(result.sizes["run"])]
-        return write(recordings, labels_of(recordings, range(len(recordings))), export)
+        return write(recordings, looks_of(recordings, range(len(recordings))), export)
     return _serve(lambda server: Live([scenario, *ghosts], server), host, port)
 
 

@@ -13,6 +13,7 @@ from PIL import Image
 from mrctl import Circle, Event, Perturbation, Scenario, Sweep, save
 from mrctl.cli import main
 from mrctl.loop.simulation import simulate
+from mrctl.results.metrics import per_lap
 from mrctl.sensing.tiers import Sensing
 from mrctl.sweep import jobs
 from mrctl.viewer.live import Live
@@ -25,7 +26,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
 SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 BASE = Scenario(reference=Circle(radius=0.8, period=6.0), laps=2)
 PATIENCE = 60_000  # ms, on a machine that does other things too
-ROBOT, GHOSTS, PAYLOAD = "/world/robot/chassis", "/world/ghosts/chassis", "/world/robot/chassis/payload"
+ROBOT, GHOST = "/world/robot/chassis", "/world/ghosts/1/chassis"
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +97,33 @@ def moved(before, after):
     return int((np.abs(before - after).max(axis=-1) > 60).sum())
 
 
+DRAWN = """(names) => new Promise((done) => {
+    const m = window.__viserMutable, seen = [], at = (name) => {
+        const node = m.nodeRefFromName[name], place = node.position.clone();
+        return m.nodeRefFromName['/world'].worldToLocal(node.getWorldPosition(place)).toArray();
+    };
+    m.nodeRefFromName[names[0]].traverse((part) => {
+        part.onBeforeRender = () => { if (seen.push(names.map(at)) === 30) done(seen); };
+    });
+})"""
+AXES = """() => Object.fromEntries(Object.values(window.__viserTestpoints.uplots).map(({chart}) => {
+    const line = getComputedStyle(chart.over, '::after');
+    const { x, y } = chart.scales;
+    const title = chart.root.querySelector('.u-title').textContent;
+    const cursor = line.content === 'none' ? null : chart.posToVal(parseFloat(line.left), 'x');
+    return [title, { times: chart.axes[0]._values, x: [x.min, x.max], y: [y.min, y.max], cursor }];
+}))"""
+UP = """() => {
+    const m = window.__viserMutable, fixed = Object.entries(m.nodeRefFromName);
+    const floor = fixed.find(([name, node]) => node && /^.world.fixed.[0-9]+.[0-9]+$/.test(name));
+    return floor ? m.camera.position.clone().set(0, 0, 1).applyQuaternion(floor[1].quaternion).toArray() : null;
+}"""
+CAMERA = """() => {
+    const m = window.__viserMutable;
+    return m.nodeRefFromName['/world'].worldToLocal(m.camera.position.clone()).toArray();
+}"""
+
+
 def curves(page, title):
     """Data of a chart, as the browser draws it."""
     charts = page.evaluate(
@@ -114,6 +142,7 @@ def test_live(browser, tmp_path):
         start = node(page, ROBOT)
         until(lambda: np.linalg.norm(node(page, ROBOT) - start) > 0.3, "the robot to move")
         until(lambda: live.session.time > 3.0, "the offset at the start to be gone")
+        drawn = np.array(page.evaluate(DRAWN, [ROBOT, GHOST]))
         page.get_by_text("pause", exact=True).click()
         until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
         page.mouse.move(640, 700)
@@ -126,7 +155,10 @@ def test_live(browser, tmp_path):
         time.sleep(0.5)
         assert live.session.tick == tick and (node(page, ROBOT) == held).all()
         names = page.evaluate("Object.keys(window.__viserSceneTree.getState())")
-        assert {ROBOT, GHOSTS, "/world/reference", "/world/trail"} <= set(names)
+        assert {ROBOT, GHOST, "/world/reference", "/world/trail"} <= set(names)
+        place = np.stack([live.session.log()[name] for name in ("x", "y", "z")], axis=-1)  # (T, B, 3)
+        apart = np.linalg.norm(place[None] - drawn[:, None], axis=-1)  # (30, T, B)
+        assert len(np.unique(drawn[:, 0], axis=0)) > 1 and apart.max(axis=2).min(axis=1).max() < 1e-3  # of one tick
 
         page.get_by_text("drop payload").click()
         until(lambda: "payload 0 → 10" in page.inner_text("#mrctl-timeline"), "the payload in the timeline")
@@ -150,6 +182,29 @@ def test_live(browser, tmp_path):
         page.get_by_label("Camera follows").click()
         until(lambda: np.allclose(node(page, "/world"), 0), "the world to be back")
         assert live.session.tick == tick + 1
+        assert all(page.evaluate(VISIBLE, f"{robot}/payload") for robot in (ROBOT, GHOST))
+
+        live.ask(live._set_speed, float("inf"))
+        live.ask(live._command, "play")
+        until(lambda: live.session.time > 9.0, "some seconds within a few pictures")
+        live.ask(live._command, "pause")
+        until(lambda: "paused" in page.inner_text("#mrctl-status"), "the third pause")
+        until(lambda: curves(page, "V, m/s")[0][0][-1] > live.session.time - 0.1, "the last curves")
+        flat = page.evaluate(AXES)["saturated, guard (dashed)"]
+        assert flat["y"] == pytest.approx([0, 1], abs=0.2) and flat["cursor"] is None
+        trail = places(page, "/world/trail/0").reshape(-1, 2, 3).mean(axis=1)  # the middle of the ribbon
+        assert np.linalg.norm(np.diff(trail, axis=0), axis=-1).max() < 0.12  # m, in 1/8 s
+        assert np.abs(np.hypot(*(trail[:, :2] - [0, 0.8]).T) - 0.8).max() < 0.1
+
+        page.get_by_text("reset", exact=True).click()
+        until(lambda: np.isnan(curves(page, "V, m/s")[0][1:]).all(), "the old curves to go")
+        until(
+            lambda: (
+                "/world/trail" not in page.evaluate("Object.keys(window.__viserSceneTree.getState())")
+                or not len(places(page, "/world/trail/0"))
+            ),
+            "the old trails to go",
+        )
 
 
 def test_inputs(browser, tmp_path):
@@ -158,15 +213,43 @@ def test_inputs(browser, tmp_path):
         until(lambda: node(page, ROBOT) is not None, "the scene")
         page.get_by_role("tab", name="Robot").click()
         slider = page.get_by_role("slider").first
-        slider.focus()
-        for _ in range(3):
-            page.keyboard.press("ArrowRight")
-        until(lambda: live.session.state()["perturbation"].mass_factor == pytest.approx(1.03), "the slider's event")
+        thumb = slider.bounding_box()
+        page.mouse.move(thumb["x"] + 4, thumb["y"] + 4)
+        page.mouse.down()
+        for k in range(1, 9):
+            page.mouse.move(thumb["x"] + 4 + 4 * k, thumb["y"] + 4)
+            time.sleep(0.05)
+        page.mouse.up()
+        until(lambda: live.session.saved()[0].events, "the slider's event")
+        time.sleep(1.0)
+        events = live.session.saved()[0].events  # one, unless the page takes its time
+        factor = live.session.state()["perturbation"].mass_factor
+        assert factor == pytest.approx(float(slider.get_attribute("aria-valuenow"))) and factor > 1.05
+        live.ask(live._note_input, ("reference",), "stop_and_go")  # it reverses
+        until(lambda: "reverses" in page.inner_text("#mrctl-message"), "the refusal, on whatever tab")
         page.get_by_role("tab", name="Controllers").click()
-        page.get_by_label("rls", exact=True).first.click()
+        session = live.session
+        page.get_by_label("PID + network (paper)", exact=True).first.click()
+        until(lambda: "drives already" in page.inner_text("#mrctl-message"), "the refusal of a second one")
+        until(lambda: not page.get_by_label("PID + network (paper)", exact=True).first.is_checked(), "the tick to go")
+        assert live.session is session and session.saved()[0].events == events
+        page.get_by_label("PID + RLS", exact=True).first.click()
         until(lambda: [s.feedforward for s in live.session.start] == ["fel", "rls"], "the ghost")
-        assert live.session.start[1].perturbation.mass_factor == pytest.approx(1.03)  # goes on as things were
-        until(lambda: node(page, "/world/ghosts/chassis") is not None, "the ghost in the scene")
+        assert live.session.start[1].perturbation.mass_factor == factor  # goes on as things were
+        until(lambda: node(page, GHOST) is not None, "the ghost in the scene")
+
+        live.ask(live._note_input, ("world",), "slope")
+        until(lambda: (up := page.evaluate(UP)) and up[2] < 0.99, "the floor to tilt")
+        live.ask(live._note_input, ("world",), "flat")
+        until(lambda: (up := page.evaluate(UP)) and np.allclose(up, [0, 0, 1]), "the floor to be level again")
+        camera = until(lambda: page.evaluate(CAMERA), "the camera")
+        live.ask(live._note_input, ("reference", "radius"), 1.2)
+        until(lambda: page.evaluate(CAMERA)[2] > 1.3 * camera[2], "a view of the larger reference")
+        page.mouse.move(640, 400)
+        page.mouse.down()
+        page.mouse.move(640, 60, steps=4)
+        page.mouse.up()
+        until(lambda: 0.03 < page.evaluate(CAMERA)[2] < 0.1, "the camera to stop above the floor")
         live.ask(live._compare, "rls", False)  # while the page is busy: it gets all of this at once
         live.ask(live._note_input, ("reference",), "rounded_square")
         page.evaluate("() => { const end = performance.now() + 2000; while (performance.now() < end); }")
@@ -174,7 +257,7 @@ def test_inputs(browser, tmp_path):
 
         genuine, live.session.step = live.session.step, lambda: 1 / 0
         page.get_by_role("tab", name="Drive").click()
-        until(lambda: "ZeroDivisionError" in page.inner_text("#mrctl-status"), "the error in the page")
+        until(lambda: "ZeroDivisionError" in page.inner_text("#mrctl-message"), "the error in the page")
         picture(page, tmp_path / "error.png")
         page.get_by_text("reset", exact=True).click()
         page.get_by_text("play", exact=True).click()
@@ -198,8 +281,10 @@ def test_visitors_come_and_go(browser):
 
 def test_replay(browser, tmp_path):
     """A saved result: the scrubber puts the robots where they were, and the curves have its cursor."""
-    event = Event(time=4.0, perturbation=Perturbation(payload=8))
-    result = simulate([BASE.model_copy(update={"learner": f, "events": (event,)}) for f in ("fel", "none")])
+    high = Event(time=4.0, perturbation=Perturbation(payload=8, payload_z=0.9))
+    tips = high, Event(time=8.0, push=(0.0, 350.0, 0.0), push_duration=0.3)
+    result = simulate([BASE.replace(events=(high,)), BASE.replace(learner="none", events=tips)])
+    assert result.failure.values.tolist() == ["", "tilt over 30°"]
     save(result, tmp_path / "result.zarr")
     library = Library(tmp_path / "result.zarr")
     with serving(lambda server: Replay(library, [0, 1], server)) as (replay, url), visit(browser, url) as page:
@@ -220,8 +305,26 @@ def test_replay(browser, tmp_path):
         until(lambda: np.allclose(node(page, ROBOT)[:2], [expected.x, expected.y], atol=1e-3), "the robot to be there")
         time.sleep(1.0)
         picture(page, tmp_path / "replay.png")
-        t, *_, cursor = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
-        assert t[np.argmax(cursor)] == pytest.approx(7.5) and t[-1] == pytest.approx(11.99)
+        t, *drawn = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
+        assert t[-1] == pytest.approx(11.98, abs=0.02) and len(drawn) == 1 + 2 * 2  # reference, estimates and truths
+        for title, axes in page.evaluate(AXES).items():
+            assert axes["cursor"] == pytest.approx(7.5, abs=0.05) and axes["times"], title
+        last = result.isel(run=1).dropna("time", subset=["x"]).isel(time=-1)
+        tilt = np.arccos(np.cos(last.pitch_angle) * np.cos(last.roll_angle))
+        assert tilt > 0.4
+        replay.ask(replay._scrub, 12.0)
+        laps = per_lap(result)
+        score = [f"{1e3 * laps.position_rmse.values[0].min():.3g}", f"{100 * laps.feedback_share.values[0, 1]:.3g}"]
+        until(lambda: {*score, "–"} <= set(page.inner_text("#mrctl-score").split()), "the score of the tables")
+        pose = f"window.__viserMutable.nodePoseData[{GHOST!r}].wxyz"
+        until(lambda: abs(2 * np.arcsin(np.hypot(*page.evaluate(pose)[1:3])) - tilt) < 1e-3, "the ghost to be tipped")
+        replay.ask(replay._choose, 1)
+        until(lambda: replay.runs == [1], "the other run, once")
+        page.get_by_text("Keep this run as a ghost").click()
+        until(lambda: "ghosts: runs 1" in page.inner_text("#mrctl-status"), "it to be kept")
+        assert replay.runs == [1]
+        replay.ask(replay._choose, 0)
+        until(lambda: replay.runs == [0, 1], "it to be a ghost")
 
 
 PLACES = """(name) => {

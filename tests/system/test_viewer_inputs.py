@@ -1,6 +1,7 @@
 """What an input of the page changes is what the same scenario file would change."""
 
 import asyncio
+import time
 import typing
 
 import pytest
@@ -152,6 +153,30 @@ def test_whole_numbers(live):
             live._apply_inputs()
             assert (live.message == "") == (value == 12.6), live.message
         assert controls._inputs[path].value == 13
+
+
+def test_dragging(live):
+    """A slider that is dragged makes one event, when it rests; a choice counts at once."""
+    live._restart([Scenario()])
+    live.session.step()
+    path = ("perturbation", "mass_factor")
+    with pytest.MonkeyPatch.context() as patch:
+        now = time.monotonic()
+        for k in range(1, 23):
+            patch.setattr(module.time, "monotonic", lambda k=k: now + 0.1 * k)
+            visitor_sets(live, live._controls._inputs[path], 1 + k / 100)
+            live._run_requests()
+            live.refresh()
+        assert live.session.saved()[0].events == ()
+        patch.setattr(module.time, "monotonic", lambda: now + 2.2 + 0.31)
+        live.refresh()
+        (event,) = live.session.saved()[0].events
+        assert event.perturbation.mass_factor == 1.22
+        visitor_sets(live, live._controls._inputs["perturbation", "payload"], 3.0)
+        visitor_sets(live, live._controls._inputs["world",], "slope")
+        live._run_requests()
+        live.refresh()
+        assert live.session.start[0].world == "slope" and live.session.start[0].perturbation.payload == 3.0
 
 
 def test_order(live):

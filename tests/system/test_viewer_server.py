@@ -45,6 +45,7 @@ def packed(message):
 def fetch(server, host):
     request = urllib.request.Request(f"http://127.0.0.1:{server.get_port()}/", headers={"Host": host})
     with urllib.request.urlopen(request, timeout=10) as answer:
+        assert answer.headers["X-Frame-Options"] == "DENY"
         return answer.status
 
 
@@ -65,6 +66,16 @@ def test_origins(server):
     for host in ("evil.example", f"evil.example:{port}", ""):  # DNS rebinding: their name, our address
         with pytest.raises(urllib.error.HTTPError, match="403"):
             fetch(server, host)
+
+
+def test_values_alone(server):
+    """A client sets the value of an input, and nothing else of it."""
+    number = server.gui.add_number("number", 1.0)
+    with client(server) as visitor:
+        for updates in ({"removed": True}, {"update_cb": []}, {"value": 5.0, "removed": True}, {"value": 2.0}):
+            visitor.send(packed(_messages.GuiUpdateMessage(number._impl.uuid, updates)))
+        until(lambda: number.value == 2.0, 10)  # viser handles messages in order
+    assert not number._impl.removed and number._impl.update_cb is not None
 
 
 def test_sharing(server, monkeypatch, capfd):
@@ -93,7 +104,11 @@ def test_addresses(monkeypatch, capsys):
         assert capsys.readouterr().err.count("\n") == 1
     anywhere = Server("0.0.0.0", 0)
     try:
-        assert "warning" in anywhere.announce() and fetch(anywhere, "robot.example:1") == 200
+        assert "warning" in anywhere.announce()
+        for host in ("203.0.113.7:1", "[2001:db8::7]:1", socket.gethostname()):
+            assert fetch(anywhere, host) == 200
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            fetch(anywhere, "evil.example:1")
         with pytest.raises(InvalidStatus, match="403"):
             client(anywhere, origin="http://evil.example")
     finally:

@@ -56,7 +56,7 @@ def test_every_changed_field_is_listed():
     )  # fmt: skip
     limit_current(NOMINAL, model, 3.0)
     copied = mjcf.clone(NOMINAL)
-    write(copied, fields(model))
+    write(copied, fields(model), mujoco.MjData(copied))
     names = [n for n in dir(model) if not n.startswith("_") and isinstance(getattr(model, n), np.ndarray)]
     assert len(names) > 300
     for name in names:

@@ -10,6 +10,9 @@ from matplotlib.image import imread
 
 from mrctl.record import InputError
 from mrctl.results import metrics, plots
+from mrctl.results.controllers import CONTROLLERS
+from mrctl.scenario import FEEDFORWARDS
+from mrctl.viewer.looks import looks
 
 LAP = 2.0
 
@@ -77,6 +80,19 @@ def test_time_series(plot, cut):
             for run in (0, 1):
                 assert drawn(axes, seen["time"], seen[name].isel(run=run)), name
     assert legend(figure)[-2:] == ["none", "fel"]
+
+
+def test_colours():
+    """A controller has its colour in every figure and in the viewer, whatever it is compared with."""
+    alone = "#D55E00"
+    for labels in (("none", "fel"), ("fel", "none")):
+        lines = plots.learning_curve(make(labels), ["v_rmse"]).axes[0].lines
+        assert lines[labels.index("none")].get_color() == alone
+    both = plots.compare_errors(make().isel(run=[0]), make().isel(run=[1])).axes[0].lines
+    assert alone in {line.get_color() for line in both}
+    (pid, net, own, again) = looks("abcd", ["none", "fel", "mine", "none"])
+    assert pid == ("a", (0xD5, 0x5E, 0x00)) and len({pid.colour, net.colour, own.colour, again.colour}) == 4
+    assert set(CONTROLLERS) == set(FEEDFORWARDS) and len(set(CONTROLLERS.values())) == len(FEEDFORWARDS)
 
 
 def test_path():

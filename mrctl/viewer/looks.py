@@ -1,0 +1,27 @@
+"""How robots are told apart in a page: label and colour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from mrctl.results.controllers import colours_of
+
+Colour = tuple[int, int, int]
+
+
+class Look(NamedTuple):
+    """The label of a robot and its colour in the scene and in the curves."""
+
+    label: str
+    colour: Colour
+
+
+def looks(labels: Sequence[str], controllers: Sequence[str]) -> list[Look]:
+    """Returns the look of each robot, whose colour is that of its controller in figures too."""
+    return [Look(*pair) for pair in zip(labels, map(_rgb, colours_of(controllers)), strict=True)]
+
+
+def _rgb(colour: str) -> Colour:
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+    return red, green, blue
