@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 
 from mrctl.experiments import bench as benchmark
@@ -22,7 +23,7 @@ from mrctl.experiments import identify as identification
 from mrctl.experiments import paper, tuning
 from mrctl.experiments.held_out import LOG
 from mrctl.experiments.suite_tables import COLUMNS, TITLES, interval
-from mrctl.experiments.tables import markdown
+from mrctl.experiments.tables import markdown, number
 from mrctl.record import InputError
 
 BEGINNING = """# Results
@@ -39,6 +40,7 @@ def main(
     suite: Path | None = None,
     held_out: Path | None = None,
     tune: Path | None = None,
+    search: tuple[Path, ...] = (),
     identify: tuple[Path, ...] = (),
     bench: Path | None = None,
     out: Path = Path("RESULTS.md"),
@@ -50,6 +52,7 @@ def main(
         suite: Folder that `mrctl suite --out` wrote.
         held_out: Folder that `mrctl suite --held-out` wrote.
         tune: Folder that `mrctl tune --out` wrote.
+        search: Folders that `mrctl tune --search` wrote, one for each entry.
         identify: Files with the output of `mrctl identify --json`, one for each robot.
         bench: File with the output of `mrctl bench --json`.
         out: The page to write.
@@ -73,6 +76,9 @@ def main(
     if tune is not None:
         table = _read(tune / "table.json", "loops", "motion")
         written["Where learning is safe"] = _section("mrctl tune", table, tune_text(table))
+    if search:
+        tables = [_read(folder / "table.json", "entry", "shipped", "tiers") for folder in search]
+        written["The search of settings"] = _section("mrctl tune --search NAME", tables[0], search_text(tables))
     if identify:
         tables = [_read(file, "constants", "robot") for file in identify]
         parts = [_section(f"mrctl identify --robot.path {t['robot']['path']}", t, identify_text(t)) for t in tables]
@@ -146,6 +152,36 @@ def tune_text(table: Table) -> str:
     """The design, the table and the advice of `mrctl tune`."""
     design, _, rest = tuning.text(dict(table)).partition("\n\n")
     return f"```text\n{design}\n```\n\n{rest}"
+
+
+def search_text(tables: Sequence[Table]) -> str:
+    """What each search began with and found, in its own worlds and in fresh ones: a row for each entry and tier."""
+    header = [
+        "entry",
+        "tier",
+        "settings: before, found",
+        "over `model`: before, found",
+        "in fresh worlds",
+        "found / before",
+    ]
+    cells = []
+    for table in tables:
+        for tier, found in table["tiers"].items():
+            before, after = table["shipped"], found["found"]
+            settings = "; ".join(f"`{name}` {number(before[name])}, {number(after[name])}" for name in before)
+            seen = ", ".join(number(np.exp(found["objective"][which])) for which in ("shipped", "found"))
+            fresh, ratio = found["fresh"], found["fresh"][tier]["to_shipped"]
+            unseen = ", ".join(number(fresh[which]["to_model"]) for which in ("shipped", tier))
+            gain = f"{number(ratio['value'])} [{number(ratio['low'])}, {number(ratio['high'])}]"
+            gain = "the same" if before == found["found"] else gain
+            cells.append([f"`{TITLES.get(table['entry'], table['entry'])}`", tier, settings, seen, unseen, gain])
+    budget = tables[0]["budget"]
+    tried = 1 + budget["generations"] * budget["population"]
+    says = (
+        f"Each row is the best of {tried} settings in {budget['worlds']} worlds, and what it is worth in "
+        f"{budget['fresh']} others, with 95 % intervals. Errors are geometric means of ratios to `model`."
+    )
+    return f"{says}\n\n{markdown(header, cells)}"
 
 
 def identify_text(table: Table) -> str:

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mrctl.experiments import bench, identify, paper, results_page, tuning
@@ -58,6 +59,18 @@ def tune(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
+def searched(tmp_path: Path) -> Path:
+    def fresh(ratio: float) -> dict:
+        return {"to_model": 0.9 * ratio, "to_shipped": {"value": ratio, "low": ratio - 0.01, "high": ratio + 0.01}}
+
+    lab = {"found": {"fel.step": 0.02}, "objective": {"shipped": np.log(1.5), "found": np.log(0.75)}}
+    lab |= {"fresh": {"shipped": fresh(1.0), "lab": fresh(0.5)}}
+    budget = {"worlds": 16, "generations": 15, "population": 8, "fresh": 32}
+    values = {"entry": "model+fel", "shipped": {"fel.step": 0.1}, "tiers": {"lab": lab}, "budget": budget}
+    return written(tmp_path / "search", values)
+
+
+@pytest.fixture
 def identified(tmp_path: Path) -> Path:
     constant = identify.Constant("M_e", "kg", 21.32, 21.0, 21.64, 21.28)
     values = {"robot": {"path": "racecar"}, "constants": [constant._asdict() | {"error": constant.error}]}
@@ -82,14 +95,18 @@ def figures(tmp_path: Path) -> Path:
     return tmp_path / "bench.json"
 
 
-def test_sections(suite: Path, reproduction: Path, tune: Path, identified: Path, figures: Path, tmp_path: Path) -> None:
+def test_sections(
+    suite: Path, reproduction: Path, tune: Path, searched: Path, identified: Path, figures: Path, tmp_path: Path
+) -> None:
     """Every input becomes a section with its numbers, and with the versions and the machine that it names."""
     out = tmp_path / "RESULTS.md"
-    inputs = {"suite": suite, "reproduce": reproduction, "tune": tune, "identify": identified, "bench": figures}
+    inputs = {"suite": suite, "reproduce": reproduction, "tune": tune, "search": searched}
+    inputs |= {"identify": identified, "bench": figures}
     words = [word for name, path in inputs.items() for word in (f"--{name}", str(path))]
     assert results_page.command([*words, "--out", str(out)]) == 0
     page = results_page.sections(out.read_text())
-    titles = ["The paper", "The uncertainty suite", "Where learning is safe", "Identification", "Speed"]
+    titles = ["The paper", "The uncertainty suite", "Where learning is safe", "The search of settings"]
+    titles += ["Identification", "Speed"]
     assert list(page) == ["", *titles]
     assert all(MADE in page[title] and "on Abacus with 3 cores." in page[title] for title in titles)
     short, *folded = page["The uncertainty suite"].split("<details>")
@@ -101,6 +118,18 @@ def test_sections(suite: Path, reproduction: Path, tune: Path, identified: Path,
     assert "| lab     | " in page["The paper"] and "| 1.00         | 0.25 " in page["The paper"]
     assert "2.00 → 1.00" in page["The paper"] and "| an offset | 9.1 %" in page["The paper"]
     assert "| caster, second | 20 " in page["Where learning is safe"] and "88.5" in page["Where learning is safe"]
+    (row,) = (line for line in page["The search of settings"].splitlines() if "model+fel" in line)
+    cells = [
+        "",
+        "`model+fel`",
+        "lab",
+        "`fel.step` 0.100, 0.0200",
+        "1.50, 0.750",
+        "0.900, 0.450",
+        "0.500 [0.490, 0.510]",
+        "",
+    ]
+    assert [cell.strip() for cell in row.split("|")] == cells and "best of 121" in page["The search of settings"]
     assert "`mrctl identify --robot.path racecar`" in page["Identification"]
     assert "| 21.32    | 21 to 21.64   | 21.28 | +0.19 % |" in page["Identification"]
     assert "| 0.912 |" in page["Speed"] and bench.text(json.loads(figures.read_text())) in page["Speed"]
