@@ -47,6 +47,7 @@ HIDDEN = (
     "name",
     "laps",
     "events",
+    "obstacles",
     "initial_pose",
     "initial_spread",
     "robot",
