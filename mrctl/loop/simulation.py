@@ -214,7 +214,7 @@ class Simulation:
         sensing = [s.sensing for s in scenarios]
         self.sensors = Sensors(sensing, [s.seed for s in scenarios], self.period)
         # The engine integrates positions with the velocities at the end of a step: velocities are half a step behind.
-        parts = sensing, robot, self.sensors, self.plant.imu, first.physics_step / 2
+        parts = sensing, robot, self.sensors, self.plant.imu, first.physics_step / 2, first.obstacles
         self.estimator = UserEstimator(own, *parts) if own else Estimator(first.sensing.source, *parts)
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period)
         self.log = Log(self.ticks, size)

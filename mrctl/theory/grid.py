@@ -62,13 +62,18 @@ def occupancy(outlines: Outlines, low: Array, high: Array, resolution: float) ->
     Raises:
         InputError: The rectangle is empty, or has too many cells.
     """
+    grid = _empty(low, high, resolution)
+    occupy.compiled(*outlines, *grid)
+    return grid
+
+
+def _empty(low: Array, high: Array, resolution: float) -> Grid:
+    """Returns a grid with nothing in it; the arguments and errors are those of `occupancy`."""
     columns, rows = (int(n) for n in np.ceil((np.asarray(high) - low) / resolution - 1e-9))
     if rows < 1 or columns < 1:
         raise InputError("grid: the rectangle is empty")
     check_size(rows, columns, "grid")
-    grid = Grid(np.zeros((rows, columns), bool), np.array(low, float), float(resolution))
-    occupy.compiled(*outlines, *grid)
-    return grid
+    return Grid(np.zeros((rows, columns), bool), np.array(low, float), float(resolution))
 
 
 @kernel
@@ -109,6 +114,36 @@ def distance_field(grid: Grid) -> Field:
         if not occupied.all():
             distance = np.where(occupied, 0.5 - _transform(occupied), distance)
     return Field(np.ascontiguousarray(distance * grid.resolution), grid.origin, grid.resolution)
+
+
+def field_of(outlines: Outlines, low: Array, high: Array, resolution: float) -> Field:
+    """Returns the distance of each cell's centre from the obstacles themselves, without cells in between.
+
+    The arguments and errors are those of `occupancy`.
+    """
+    grid = _empty(low, high, resolution)
+    distance = np.empty(grid.occupied.shape)
+    measure.compiled(*outlines, distance, grid.origin, grid.resolution)
+    return Field(distance, grid.origin, grid.resolution)
+
+
+@kernel
+def measure(
+    discs: Array, edges: Array, first: NDArray[np.int64], rings: Array, distance: Array, origin: Array,
+    resolution: float,
+) -> None:  # fmt: skip
+    """Writes the distances of `field_of`; the arguments are those of `Outlines` and `Field`."""
+    rows, columns = distance.shape
+    for i in range(rows):
+        for k in range(columns):
+            x, y = origin[0] + (k + 0.5) * resolution, origin[1] + (i + 0.5) * resolution
+            nearest = resolution * np.hypot(rows, columns)
+            for n in range(len(discs)):
+                nearest = min(nearest, np.hypot(discs[n, 0] - x, discs[n, 1] - y) - discs[n, 2])
+            for p in range(len(rings)):
+                if np.hypot(rings[p, 0] - x, rings[p, 1] - y) - rings[p, 2] < nearest:
+                    nearest = min(nearest, point_to_polygon(x, y, edges[first[p] : first[p + 1]]))
+            distance[i, k] = nearest
 
 
 def _transform(cells: NDArray[np.bool]) -> Array:

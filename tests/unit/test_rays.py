@@ -38,7 +38,9 @@ def test_wall_and_disc():
 
 def test_around():
     """In a closed room no beam is lost, wherever the sensor looks and however few or many beams there are."""
-    walls = [Box(x=x, y=y, length=1 + 4 * (x == 0), width=1 + 4 * (y == 0)) for x, y in ((3, 0), (-3, 0), (0, 3), (0, -3))]
+    walls = [
+        Box(x=x, y=y, length=1 + 4 * (x == 0), width=1 + 4 * (y == 0)) for x, y in ((3, 0), (-3, 0), (0, 3), (0, -3))
+    ]
     corners = [Disc(x=2.5 * i, y=2.5 * k, radius=0.1) for i in (-1, 1) for k in (-1, 1)]
     random = np.random.default_rng(0)
     for beams in (1, 7, 360, 1081):
