@@ -2,8 +2,8 @@
 
 Forward only: Dubins, American Journal of Mathematics 79, 1957, by the formulas of Shkel and Lumelsky, Robotics and
 Autonomous Systems 34, 2001. With reversing: Reeds and Shepp, Pacific Journal of Mathematics 145, 1990, whose numbers
-the formulas here have. A path is a word of up to five pieces, each a left turn (1), a line (0) or a right turn (−1) with
-a signed length, which is negative in reverse. Of equally short paths the one with the first word is returned.
+the formulas here have. A path is a word of up to five pieces, each a left turn (1), a line (0) or a right turn (−1)
+with a signed length, which is negative in reverse. Of equally short paths the one with the first word is returned.
 """
 
 from __future__ import annotations

@@ -208,7 +208,7 @@ def _kind(field: FieldInfo) -> FieldInfo:
 
 def _scale(path: tuple[str, ...], value: float) -> float:
     """Returns the number on which the step of an input depends: its present value, or the least one of any tier."""
-    if path[0] != "sensing":
+    if path[0] != "sensing" or path[-1] not in VALUES:
         return value
     return min((v for v in VALUES[path[-1]] if v > 0), default=1.0)
 
