@@ -96,6 +96,8 @@ class Plan(NamedTuple):
             raise InputError("plan: reverses; plan with reverse = False for a reference")
         way = np.append(0, np.cumsum(np.hypot(*np.diff(self.poses[:, :2], axis=0).T)))
         places = np.linspace(0, way[-1], max(2, round(way[-1] / spacing) + 1))
+        if places[1] > 2 * CHECK:  # one more point near either end holds the heading there
+            places = np.concatenate([places[:1], [CHECK], places[1:-1], [way[-1] - CHECK], places[-1:]])
         points = np.column_stack([np.interp(places, way, self.poses[:, k]) for k in range(2)])
         return Waypoints(
             points=tuple(map(tuple, points.tolist())), closed=False, timing="limits", speed=speed, limits=limits

@@ -127,6 +127,10 @@ def test_reference():
     motion = reference.sample(np.linspace(0, reference.period, 500))
     assert np.allclose(motion.pose[[0, -1], :2], found.poses[[0, -1], :2], atol=1e-6)
     assert np.abs(motion.twist).max(axis=0)[0] <= 0.8 + 1e-6
+    turns = motion.pose[[0, -1], 2] - found.poses[[0, -1], 2]
+    assert np.abs(turns - 2 * np.pi * np.round(turns / (2 * np.pi))).max() < 0.06
+    curvature = np.abs(motion.twist[:, 1]) / np.maximum(motion.twist[:, 0], 0.05)
+    assert curvature.max() < 1.5 / RADIUS
     walls = shapely.union_all([judged(shape) for shape in task.obstacles.shapes])
     assert min(shapely.Polygon(turned(FOOTPRINT, pose)).distance(walls) for pose in motion.pose) > 0.02
     where = prepared(Obstacles(shapes=(Disc(x=3.9, y=3.9),)))
