@@ -245,19 +245,18 @@ def is_free(pose: Array, where: Space, sides: Array) -> bool:
         where: Obstacles and footprint.
         sides: Scratch, `(n, 4)`.
     """
-    field, outlines = where.field, where.outlines
+    field = where.field
     c, s = np.cos(pose[2]), np.sin(pose[2])
     clear = True
     for k in range(len(where.discs)):
         ahead, aside, radius = where.discs[k]
         x, y = pose[0] + c * ahead - s * aside, pose[1] + s * ahead + c * aside
         # A field that is interpolated may be too large by half a cell at most.
-        free = at(field.distance, field.origin, field.resolution, x, y)[0] - field.resolution / 2
+        free = at(field, x, y)[0] - field.resolution / 2
         clear &= free > radius + where.margin
     if clear:
         return True
-    gap_now = gap(where.footprint, pose, sides, outlines.discs, outlines.edges, outlines.first, outlines.rings)
-    return gap_now > where.margin
+    return gap(where.footprint, pose, sides, where.outlines) > where.margin
 
 
 @kernel

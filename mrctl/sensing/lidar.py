@@ -54,7 +54,7 @@ class Lidar(Record):
         """
         ranges = np.empty(self.beams)
         sensor = np.append(turned(np.array([[self.x, 0.0]]), pose)[0], pose[2])
-        cast.compiled(sensor, self.first, self.step, self.range, *outlines, ranges)
+        cast.compiled(sensor, self.first, self.step, self.range, outlines, ranges)
         noise, chance = random.standard_normal(self.beams), random.uniform(size=self.beams)
         ranges[(ranges >= self.range) | (chance < self.lost)] = np.inf
         return np.maximum(ranges + self.noise * noise, 0.0)

@@ -75,9 +75,9 @@ class Particles:
         random, n = self._random, len(self.particles)
         move.compiled(self.particles, way, turn, random.standard_normal((n, 3)))
         weights = np.empty(n)
-        weigh.compiled(self.particles, points, *self._field, weights)
+        weigh.compiled(self.particles, points, self._field, weights)
         average.compiled(self.particles, weights, self.pose, self.spread)
-        lost = len(points) > 0 and agreement.compiled(points, self.pose, *self._field) < AGREE
+        lost = len(points) > 0 and agreement.compiled(points, self.pose, self._field) < AGREE
         fresh = self._seeds(points) if lost else np.zeros((1, 3))
         found = np.empty((MOST, 3))
         count = resample.compiled(
@@ -90,9 +90,9 @@ class Particles:
     def _seeds(self, points: Array) -> Array:
         """Returns the poses that agree best with a scan, of many random ones, `(KEPT, 3)`."""
         poses, weights = self._anywhere(TRIALS), np.empty(TRIALS)
-        weigh.compiled(poses, points[:: max(1, len(points) // 20)], *self._field, weights)
+        weigh.compiled(poses, points[:: max(1, len(points) // 20)], self._field, weights)
         best = poses[np.argsort(-weights, kind="stable")[:SEEDS]]
-        shares = np.array([fit.compiled(points, pose, *self._field) for pose in best])
+        shares = np.array([fit.compiled(points, pose, self._field) for pose in best])
         return best[np.argsort(-shares, kind="stable")[:KEPT]]
 
 
@@ -111,18 +111,17 @@ def move(particles: Array, way: float, turn: float, noise: Array) -> None:
 
 
 @kernel
-def weigh(particles: Array, points: Array, distance: Array, origin: Array, resolution: float, weights: Array) -> None:
+def weigh(particles: Array, points: Array, field: Field, weights: Array) -> None:
     """Weighs particles by the likelihood field, p = exp(−d²/2σ²) + `RANDOM` for each point of the scan.
 
     Args:
         particles: Poses in m, m, rad, `(n, 3)`.
         points: Points of the scan in the robot's frame in m, `(k, 2)`.
-        distance: As in `Field`, and so are `origin` and `resolution`.
-        origin: See above.
-        resolution: See above.
+        field: Distance field of the map.
         weights: Out: weights, whose sum is 1, `(n,)`.
     """
     n, most = len(particles), -np.inf
+    distance, origin, resolution = field
     rows, columns = distance.shape
     for i in range(n):
         c, s = np.cos(particles[i, 2]), np.sin(particles[i, 2])

@@ -39,7 +39,7 @@ def match(points: Array, guess: Array, field: Field) -> tuple[Array, float]:
     best, share = np.array(guess, float), -1.0
     for offset in AROUND:
         pose = guess + offset
-        found = fit.compiled(points, pose, *field)
+        found = fit.compiled(points, pose, field)
         if found > share:
             best, share = pose, found
         if share > AGREE:
@@ -48,7 +48,7 @@ def match(points: Array, guess: Array, field: Field) -> tuple[Array, float]:
 
 
 @kernel
-def fit(points: Array, pose: Array, distance: Array, origin: Array, resolution: float) -> float:
+def fit(points: Array, pose: Array, field: Field) -> float:
     """Does what `match` says: improves the pose, and returns the share."""
     guess = pose.copy()
     H, g = np.empty((3, 3)), np.empty(3)
@@ -61,7 +61,7 @@ def fit(points: Array, pose: Array, distance: Array, origin: Array, resolution: 
         for n in range(len(points)):
             px, py = points[n, 0], points[n, 1]
             x, y = c * px - s * py, s * px + c * py
-            d, jx, jy = at(distance, origin, resolution, pose[0] + x, pose[1] + y)
+            d, jx, jy = at(field, pose[0] + x, pose[1] + y)
             jt = jy * x - jx * y
             weight = 1.0 / (1.0 + (d / width) ** 2) ** 2
             H[0, 0] += weight * jx * jx
@@ -80,14 +80,14 @@ def fit(points: Array, pose: Array, distance: Array, origin: Array, resolution: 
         if width == NARROW and abs(step[0]) + abs(step[1]) + abs(step[2]) < 1e-6:
             break
         width = max(NARROW, SHRINK * width)
-    return agreement(points, pose, distance, origin, resolution)
+    return agreement(points, pose, field)
 
 
 @kernel
-def agreement(points: Array, pose: Array, distance: Array, origin: Array, resolution: float) -> float:
+def agreement(points: Array, pose: Array, field: Field) -> float:
     """Returns the share of the points of a scan that lie within 10 cm of the map from a pose; arguments as in `fit`."""
     c, s, count = np.cos(pose[2]), np.sin(pose[2]), 0
     for n in range(len(points)):
         x, y = pose[0] + c * points[n, 0] - s * points[n, 1], pose[1] + s * points[n, 0] + c * points[n, 1]
-        count += abs(at(distance, origin, resolution, x, y)[0]) < INLIER
+        count += abs(at(field, x, y)[0]) < INLIER
     return count / max(len(points), 1)

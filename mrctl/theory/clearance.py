@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
 from mrctl.theory.obstacles import Outlines, Surroundings, moved
@@ -38,7 +37,7 @@ def clearance(footprint: Array, pose: Array, outlines: Outlines) -> float:
         pose: x and y of P in m and θ in rad, `(3,)`.
         outlines: The obstacles.
     """
-    return gap.compiled(footprint, np.asarray(pose, float), np.empty((len(footprint), 4)), *outlines)
+    return gap.compiled(footprint, np.asarray(pose, float), np.empty((len(footprint), 4)), outlines)
 
 
 def clearances(footprint: Array, poses: Array, times: Array, surroundings: Surroundings) -> Array:
@@ -58,15 +57,14 @@ def clearances(footprint: Array, poses: Array, times: Array, surroundings: Surro
     for k in np.flatnonzero(np.isfinite(poses).all(axis=1)):
         if surroundings.courses:
             outlines = surroundings.placed(courses[k])
-        found[k] = gap.compiled(footprint, poses[k], scratch, *outlines)
+        found[k] = gap.compiled(footprint, poses[k], scratch, outlines)
     return found
 
 
 @kernel
-def gap(
-    footprint: Array, pose: Array, sides: Array, discs: Array, edges: Array, first: NDArray[np.int64], rings: Array
-) -> float:
-    """Returns what `clearance` does; `sides` is scratch, `(n, 4)`, and the last four are a record of `Outlines`."""
+def gap(footprint: Array, pose: Array, sides: Array, outlines: Outlines) -> float:
+    """Returns what `clearance` does; `sides` is scratch, `(n, 4)`."""
+    discs, edges, first, rings = outlines
     n, nearest, reach = len(footprint), np.inf, 0.0
     for k in range(n):
         following = (k + 1) % n

@@ -63,7 +63,7 @@ def occupancy(outlines: Outlines, low: Array, high: Array, resolution: float) ->
         InputError: The rectangle is empty, or has too many cells.
     """
     grid = _empty(low, high, resolution)
-    occupy.compiled(*outlines, *grid)
+    occupy.compiled(outlines, grid)
     return grid
 
 
@@ -77,11 +77,10 @@ def _empty(low: Array, high: Array, resolution: float) -> Grid:
 
 
 @kernel
-def occupy(
-    discs: Array, edges: Array, first: NDArray[np.int64], rings: Array, occupied: NDArray[np.bool], origin: Array,
-    resolution: float,
-) -> None:  # fmt: skip
-    """Marks the cells that obstacles touch; the arguments are those of `Outlines` and `Grid`."""
+def occupy(outlines: Outlines, grid: Grid) -> None:
+    """Marks the cells of a grid that obstacles touch."""
+    discs, edges, first, rings = outlines
+    occupied, origin, resolution = grid
     rows, columns = occupied.shape
     reach = resolution / np.sqrt(2.0)
     for shape in range(len(discs) + len(rings)):
@@ -122,17 +121,16 @@ def field_of(outlines: Outlines, low: Array, high: Array, resolution: float) -> 
     The arguments and errors are those of `occupancy`.
     """
     grid = _empty(low, high, resolution)
-    distance = np.empty(grid.occupied.shape)
-    measure.compiled(*outlines, distance, grid.origin, grid.resolution)
-    return Field(distance, grid.origin, grid.resolution)
+    field = Field(np.empty(grid.occupied.shape), grid.origin, grid.resolution)
+    measure.compiled(outlines, field)
+    return field
 
 
 @kernel
-def measure(
-    discs: Array, edges: Array, first: NDArray[np.int64], rings: Array, distance: Array, origin: Array,
-    resolution: float,
-) -> None:  # fmt: skip
-    """Writes the distances of `field_of`; the arguments are those of `Outlines` and `Field`."""
+def measure(outlines: Outlines, field: Field) -> None:
+    """Writes the distances of `field_of` into the field."""
+    discs, edges, first, rings = outlines
+    distance, origin, resolution = field
     rows, columns = distance.shape
     for i in range(rows):
         for k in range(columns):
@@ -152,18 +150,17 @@ def _transform(cells: NDArray[np.bool]) -> Array:
 
 
 @kernel
-def at(distance: Array, origin: Array, resolution: float, x: float, y: float) -> tuple[float, float, float]:
+def at(field: Field, x: float, y: float) -> tuple[float, float, float]:
     """Returns the distance in m at a point and its gradient, interpolated between the centres of four cells.
 
     Outside the grid it is that of the nearest cell, and the gradient is 0.
 
     Args:
-        distance: As in `Field`; `origin` and `resolution` likewise.
-        origin: See above.
-        resolution: See above.
+        field: The field.
         x: x of the point in m.
         y: y of the point in m.
     """
+    distance, origin, resolution = field
     rows, columns = distance.shape
     column, row = (x - origin[0]) / resolution - 0.5, (y - origin[1]) / resolution - 0.5
     inside = 0.0 <= column <= columns - 1 and 0.0 <= row <= rows - 1

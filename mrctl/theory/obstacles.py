@@ -163,6 +163,17 @@ class Outlines(NamedTuple):
     """A circle around each polygon: x and y of its centre and its radius in m, `(P, 3)`."""
 
 
+class Movers(NamedTuple):
+    """The course on which each part of some outlines moves; below 0 where it stands still."""
+
+    discs: NDArray[np.int64]
+    """Course of each disc, `(C,)`."""
+    edges: NDArray[np.int64]
+    """Course of each side, `(E,)`."""
+    rings: NDArray[np.int64]
+    """Course of each polygon, `(P,)`."""
+
+
 class Surroundings:
     """Obstacles as arrays, those that move last.
 
@@ -188,7 +199,7 @@ class Surroundings:
         still = len(shapes) - len(self.courses)  # the index of an obstacle less this is that of its course
         of_discs = np.array([k - still for k, _ in discs], int)
         of_rings = np.array([k - still for k, _ in corners], int)
-        self._movers = of_discs, np.repeat(of_rings, np.diff(self._own.first)), of_rings
+        self._movers = Movers(of_discs, np.repeat(of_rings, np.diff(self._own.first)), of_rings)
 
     def poses(self, times: Array) -> Array:
         """Returns the poses of the courses at times in s, `(T,)`, as `(T, M, 3)` in m, m, rad."""
@@ -206,32 +217,23 @@ class Surroundings:
         """Returns the outlines where the courses have these poses, `(M, 3)` in m, m, rad."""
         own = self._own
         found = Outlines(own.discs.copy(), own.edges.copy(), own.first, own.rings.copy())
-        place.compiled(*own, *self._movers, poses, *found)
+        place.compiled(own, self._movers, poses, found)
         return found
 
 
 @kernel
-def place(
-    own_discs: Array, own_edges: Array, own_first: NDArray[np.int64], own_rings: Array, of_discs: NDArray[np.int64],
-    of_edges: NDArray[np.int64], of_rings: NDArray[np.int64], poses: Array, discs: Array, edges: Array,
-    first: NDArray[np.int64], rings: Array,
-) -> None:  # fmt: skip
+def place(own: Outlines, movers: Movers, poses: Array, found: Outlines) -> None:
     """Places the outlines of moving obstacles; those of others, whose mover is below 0, stay.
 
     Args:
-        own_discs: As in `Outlines`, relative to the courses; `own_edges`, `own_first` and `own_rings` likewise.
-        own_edges: See above.
-        own_first: See above.
-        own_rings: See above.
-        of_discs: Course of each disc, `(C,)`; below 0 where it stands still.
-        of_edges: Course of each edge, `(E,)`.
-        of_rings: Course of each polygon, `(P,)`.
+        own: Outlines relative to the courses.
+        movers: Course of each of them.
         poses: Pose of each course in m, m, rad, `(M, 3)`.
-        discs: Out, as in `Outlines`; `edges` and `rings` likewise.
-        edges: Out.
-        first: Not used.
-        rings: Out.
+        found: In and out: the outlines in the world.
     """
+    own_discs, own_edges, _, own_rings = own
+    of_discs, of_edges, of_rings = movers
+    discs, edges, _, rings = found
     for k in range(len(discs)):
         if of_discs[k] >= 0:
             discs[k, 0], discs[k, 1] = moved(poses[of_discs[k]], own_discs[k, 0], own_discs[k, 1])

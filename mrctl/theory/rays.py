@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
+from mrctl.theory.obstacles import Outlines
 
 SLACK = 1e-9  # rad, by which a beam may miss the end of an edge and still meet it; two edges meet there
 
 
 @kernel
-def cast(
-    pose: Array, first: float, step: float, reach: float, discs: Array, edges: Array, firsts: NDArray[np.int64],
-    rings: Array, ranges: Array,
-) -> None:  # fmt: skip
+def cast(pose: Array, first: float, step: float, reach: float, outlines: Outlines, ranges: Array) -> None:
     """Casts the beams of a planar lidar at obstacles.
 
     Beam k leaves in the direction θ + first + k step. Each obstacle is cut only with the beams within the angle that it
@@ -25,12 +22,10 @@ def cast(
         first: Direction of the first beam from θ in rad.
         step: Angle from one beam to the next in rad, positive.
         reach: Largest range in m.
-        discs: As in `Outlines`, and so are `edges`, `firsts` (its `first`) and `rings`.
-        edges: See above.
-        firsts: See above.
-        rings: See above.
+        outlines: The obstacles.
         ranges: Out: ranges in m, `(n,)`; `reach` where nothing is met.
     """
+    discs, edges, firsts, rings = outlines
     n = len(ranges)
     ranges[:] = reach
     x, y, turn = pose[0], pose[1], pose[2] + first

@@ -77,7 +77,7 @@ def test_field():
     room = Room(0)
     for x, y in room.random.uniform(-3.9, 3.9, (100, 2)):
         speck = np.array([[-1e-6, -1e-6], [1e-6, -1e-6], [0, 1e-6]])
-        found = at(*room.field, x, y)[0]
+        found = at(room.field, x, y)[0]
         assert found == pytest.approx(clearance(speck, np.array([x, y, 0]), room.outlines), abs=0.02)
 
 

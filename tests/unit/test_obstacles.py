@@ -115,10 +115,10 @@ def test_distance_field():
     wall = Surroundings(Obstacles(shapes=(Box(x=-0.5, y=1, length=1, width=10),))).at(0.0)
     field = distance_field(occupancy(wall, np.array([-0.5, -1.0]), np.array([3.0, 3.0]), 0.05))
     for x, y in ((0.3, 0.4), (1.02, -0.3), (2.5, 2.1), (-0.2, 1.0)):
-        value, dx, dy = at(field.distance, field.origin, field.resolution, x, y)
+        value, dx, dy = at(field, x, y)
         assert value == pytest.approx(x - 0.05, abs=0.051)  # the border is on that of a cell
         assert (dx, dy) == pytest.approx((1, 0), abs=1e-9)
-    far = at(field.distance, field.origin, field.resolution, 50.0, 1.0)
+    far = at(field, 50.0, 1.0)
     assert far == (pytest.approx(2.95, abs=0.05), 0, 0)
     empty = distance_field(occupancy(wall, np.array([5.0, 5.0]), np.array([6.0, 6.0]), 0.1))
     assert empty.distance.min() > 1.4

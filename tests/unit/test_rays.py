@@ -16,7 +16,7 @@ REACH = 12.0
 def scan(obstacles, pose, beams=360, view=2 * np.pi, time=0.0):
     ranges = np.empty(beams)
     outlines = Surroundings(obstacles).at(time)
-    cast(np.array(pose, float), -view / 2, view / beams, REACH, *outlines, ranges)
+    cast(np.array(pose, float), -view / 2, view / beams, REACH, outlines, ranges)
     return ranges
 
 
@@ -74,7 +74,7 @@ def judged(count, kinds=("disc", "box")):
         outlines = Surroundings(obstacles).at(0.0)
         for pose in random.uniform([-4, -4, -4], [4, 4, 4], (50, 3)):
             ranges, expected = np.empty(72), np.empty(72)
-            cast(pose, -np.pi, np.pi / 36, REACH, *outlines, ranges)
+            cast(pose, -np.pi, np.pi / 36, REACH, outlines, ranges)
             angles = pose[2] - np.pi + np.pi / 36 * np.arange(72)
             beams = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(72)])
             mujoco.mj_multiRay(
