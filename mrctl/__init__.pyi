@@ -28,6 +28,10 @@ from .sensing.tiers import Sensing as Sensing
 from .sweep.plan import Axis as Axis
 from .sweep.plan import Sweep as Sweep
 from .sweep.store import open as open
+from .theory.obstacles import Box as Box
+from .theory.obstacles import Disc as Disc
+from .theory.obstacles import Obstacles as Obstacles
+from .theory.obstacles import Polygon as Polygon
 from .theory.perturbation import PERTURBATIONS as PERTURBATIONS
 from .theory.perturbation import Perturbation as Perturbation
 from .theory.references import Circle as Circle

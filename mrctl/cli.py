@@ -183,8 +183,8 @@ def _short(scenario: Scenario) -> Record:
 
 def _further_flags() -> str:
     """Lists the flags of `run` that its short help leaves out: each field or group of fields with its description."""
-    # Perturbations are what people change most. Events have no flags: they come from a scenario file.
-    left_out = [name for name in Scenario.model_fields if name not in (*FIRST, "events")]
+    # Perturbations are what people change most. Events and obstacles have no flags: they come from a scenario file.
+    left_out = [name for name in Scenario.model_fields if name not in (*FIRST, "events", "obstacles")]
     names = sorted(left_out, key=lambda name: name != "perturbation")
     lines = ["Further flags, which `mrctl run --help-all` explains one by one:"]
     for name in names:

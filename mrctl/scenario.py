@@ -23,6 +23,7 @@ from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
 from mrctl.record import Record
 from mrctl.sensing.tiers import Sensing
+from mrctl.theory.obstacles import Obstacles
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Lemniscate, Reference
 from mrctl.theory.robot import CAR, RobotFile, Steering
@@ -92,6 +93,9 @@ class Scenario(Record):
     """Label of the run in tables and figures; by default that of the feedforward."""
     world: str = "flat"
     """World to drive in: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file."""
+    obstacles: Obstacles = Obstacles()
+    """Obstacles that stand in the world or move in it, or the path of a TOML file of them; a run ends where the robot
+    touches one."""
     robot: RobotFile = CAR
     """Robot that drives; by default the world's own."""
     steering: Steering = "compliant"

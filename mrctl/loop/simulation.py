@@ -22,14 +22,16 @@ from mrctl.loop.events import Events
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.log import DIVERGED, Log
 from mrctl.loop.user_stages import StageError, UserEstimator, UserHierarchy, UserStage
-from mrctl.physics import mjcf
+from mrctl.physics import hull, mjcf
 from mrctl.physics.plant import Plant, build
 from mrctl.record import InputError
 from mrctl.results import dataset
 from mrctl.scenario import Event, Scenario, named
 from mrctl.sensing.estimators import Estimator
 from mrctl.sensing.sensors import Sensors
+from mrctl.theory.clearance import clearances
 from mrctl.theory.dynamics import inverse_coefficients
+from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.references import check
 
 LEAST = 8  # robots in a thread, for fewer do not pay for it
@@ -43,7 +45,7 @@ def simulate(
     One scenario runs through dm_control, several run together on MuJoCo's batch engine, with the same bits.
 
     Args:
-        scenarios: One scenario, or several; those that differ in world, laws, steering, length or
+        scenarios: One scenario, or several; those that differ in world, obstacles, laws, steering, length or
             rates run in batches of their own.
         progress: Whether to show a progress bar.
         threads: Number of threads that control and physics run on, which changes no bit; 0 for all cores.
@@ -156,7 +158,7 @@ def group_of(s: Scenario) -> Hashable:
     """Returns what the runs of one simulation must share."""
     rates = s.ticks, s.physics_step, s.control_period, s.motion_period
     chain = s.sensing.source, s.sensing.periods("delay", s.control_period)
-    return s.world, s.robot, s.steering, s.prior, s.learner, s.fel.hidden, *rates, *chain
+    return s.world, s.obstacles, s.robot, s.steering, s.prior, s.learner, s.fel.hidden, *rates, *chain
 
 
 class Simulation:
@@ -190,7 +192,7 @@ class Simulation:
         first, size = scenarios[0], len(scenarios)
         self.scenarios = list(scenarios)
         self.ticks, self.tick, self.period = first.ticks, 0, first.control_period
-        self.model, robot = mjcf.build(first.world, first.steering, first.physics_step, first.robot)
+        self.model, robot = mjcf.build(first.world, first.steering, first.physics_step, first.robot, first.obstacles)
         self._reverses = mjcf.reverses(self.model, first.steering)
         for scenario in scenarios:
             for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
@@ -203,13 +205,15 @@ class Simulation:
 
         self._lead = first.sensing.periods("delay", self.period)
         self.courses = Courses(scenarios, self._lead)
-        self.plant: Plant = build(self.model, robot, size, round(self.period / first.physics_step), threads)
+        self.plant: Plant = build(
+            self.model, robot, size, round(self.period / first.physics_step), threads, first.obstacles
+        )
         own = users.pop("estimator", None)
         self.hierarchy = UserHierarchy(scenarios, robot, users) if users else Hierarchy(scenarios, robot)
         sensing = [s.sensing for s in scenarios]
         self.sensors = Sensors(sensing, [s.seed for s in scenarios], self.period)
         # The engine integrates positions with the velocities at the end of a step: velocities are half a step behind.
-        parts = sensing, robot, self.sensors, self.plant.imu, first.physics_step / 2
+        parts = sensing, robot, self.sensors, self.plant.imu, first.physics_step / 2, first.obstacles
         self.estimator = UserEstimator(own, *parts) if own else Estimator(first.sensing.source, *parts)
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period)
         self.log = Log(self.ticks, size)
@@ -319,13 +323,27 @@ class Simulation:
         names = [self._label] * size, [self._feedforward] * size
         log, failure = self.log.ticks[:length], self.plant.failure
         found = dataset.dataset(self.scenarios, *names, log, failure, self._failure_time, weights)
-        found = found.assign(self._parameters())
+        found = found.assign(self._parameters()).assign(self._clearance(length))
         return found.assign(  # the constants that turn the commanded motion into features
             half_track=("run", np.full(size, robot.half_track), {"units": "m"}),
             estimator_fault=("run", np.array(getattr(self.estimator, "faults", [""] * size), object)),
             feedforward_fault=("run", np.array(getattr(self.hierarchy, "feedforward_faults", [""] * size), object)),
             feature_scale=(("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         )
+
+    def _clearance(self, length: int) -> dict[str, Any]:
+        """Distance of each robot from the nearest obstacle at each tick, where there are some, and its footprint."""
+        obstacles = self.scenarios[0].obstacles
+        if not obstacles.shapes:
+            return {}
+        footprint, ticks, around = hull.footprint(self.model), self.log.ticks[:length], Surroundings(obstacles)
+        poses, times = (
+            np.stack([ticks[name].T for name in ("x", "y", "theta")], -1),
+            self.period * np.arange(length, dtype=float),
+        )
+        found = np.stack([clearances(footprint, poses[row], times, around) for row in range(len(poses))])
+        attributes = {"units": "m", "long_name": "distance of the footprint from the nearest obstacle"}
+        return {"clearance": (("run", "time"), found, attributes)}
 
     def _parameters(self) -> dict[str, Any]:
         """Coefficients of the scaled features at the end, those of prior and learner and the true ones, in V."""

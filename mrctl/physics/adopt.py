@@ -48,8 +48,8 @@ class Wheel(NamedTuple):
     """Coulomb coefficient of its geom."""
 
 
-def compiled(robot: RobotFile, world: Path) -> mujoco.MjModel:
-    """Compiles a world with the robot of another file in place of its own.
+def adopted(robot: RobotFile, world: Path) -> mujoco.MjSpec:
+    """Brings the robot of another file into a world in place of its own.
 
     Args:
         robot: The robot's file, and the names of those parts that are ambiguous in it.
@@ -280,8 +280,8 @@ class _Adoption:
 
     # -- changes -------------------------------------------------------------------------------------------------------
 
-    def into(self, world: Path) -> mujoco.MjModel:
-        """Compiles a world with this robot in place of its own."""
+    def into(self, world: Path) -> mujoco.MjSpec:
+        """Returns a world with this robot in place of its own, which compiles."""
         spec = mujoco.MjSpec.from_file(str(world))
         if (own := spec.body("chassis")) is None:
             raise InputError(f"world: {world} has no body 'chassis', which another robot could replace")
@@ -316,7 +316,7 @@ class _Adoption:
         spec.option.disableflags &= ~int(flags.mjDSBL_EQUALITY | flags.mjDSBL_SPRING)
         if not spec.equalities:
             spec.option.disableflags |= int(flags.mjDSBL_EQUALITY)
-        return spec.compile()
+        return spec
 
     def _strip(self) -> None:
         """Removes what the robot does not need: sensors, key frames, contacts, and its own steering actuators.

@@ -24,6 +24,9 @@ NUMERICS = {"no_load_current": 1, "limits": 4}
 """Numerics that every model holds, with their lengths: the no-load current in A, and the robot's limits on V in m/s, on
 θ̇ in rad/s, on V̇ in m/s² and on θ̈ in rad/s²."""
 
+COLLISION = "collision"
+"""Name of the sensor that counts the contacts of a robot's hull with obstacles, where a world has some."""
+
 RIGID = "servo_steering"
 """Name of the text element in an adopted model whose steered wheels are held by servos."""
 

@@ -19,11 +19,16 @@ import mujoco
 import numpy as np
 
 from mrctl.physics import adopt
+from mrctl.physics import obstacles as walls
 from mrctl.physics.elements import MOTORS, NUMERICS, RIGID, fronts, has, left_tyre_pairs
 from mrctl.physics.files import robot_path, world_path
+from mrctl.physics.hull import footprint
 from mrctl.physics.parameters import load_torques, read_robot
 from mrctl.record import InputError
+from mrctl.theory.obstacles import Obstacles
 from mrctl.theory.robot import ANY_ANGLE, CAR, GRAVITY, STEERINGS, Robot, RobotFile, Steering
+
+NONE = Obstacles()
 
 REQUIRED = {
     "body": ("chassis", "wheel_left", "wheel_right", "fork", "front_wheel"),
@@ -39,6 +44,7 @@ def build(
     steering: Steering = "compliant",
     timestep: float | None = None,
     robot: RobotFile = CAR,
+    obstacles: Obstacles = NONE,
 ) -> tuple[mujoco.MjModel, Robot]:
     """Compiles a world with a robot in one of its steering arrangements.
 
@@ -49,6 +55,7 @@ def build(
             numerics `steering_caster` and `steering_rigid`.
         timestep: Time step of the physics in s; by default the file's own.
         robot: The robot that drives there; by default the world's own.
+        obstacles: What stands in the robot's way. Where there is something, the robot has a massless hull.
 
     Returns:
         The compiled model, and the parameters of its robot.
@@ -58,20 +65,15 @@ def build(
             steering, or a parameter of the robot is out of range.
     """
     path = world_path(world)
-    adopted = None if robot == CAR else adopt.compiled(robot, path)
-    source = path if adopted is None else robot_path(robot)
+    source = path if robot == CAR else robot_path(robot)
     try:
-        model = adopted or mujoco.MjModel.from_xml_path(str(path))
-        offered = steerings(model)
-        if adopted and steering not in offered:
-            raise InputError(f"steering: {robot.path} is driven with {' or '.join(offered)}, not {steering}")
-        _check_elements(model, steering)
-        if adopted and not np.any(model.numeric("limits").data):
-            _derive_limits(model)
-        nominal = read_robot(model)
-        if steering != "compliant" and len(offered) > 1:
-            _rearrange(model, nominal, steering)
-            nominal = read_robot(model)
+        model = mujoco.MjModel.from_xml_path(str(path)) if robot == CAR else adopt.adopted(robot, path).compile()
+        nominal = _arranged(model, steering, robot)
+        if obstacles.shapes:
+            spec = mujoco.MjSpec.from_file(str(path)) if robot == CAR else adopt.adopted(robot, path)
+            walls.add(spec, obstacles, footprint(model))
+            model = spec.compile()
+            nominal = _arranged(model, steering, robot)
     except ValueError as error:
         raise InputError(f"{source}: {' '.join(str(error).split())}") from None
     if timestep is not None:
@@ -79,14 +81,34 @@ def build(
     return model, nominal
 
 
+def _arranged(model: mujoco.MjModel, steering: Steering, robot: RobotFile) -> Robot:
+    """Checks a compiled model, gives it its steering arrangement, and returns the parameters of its robot.
+
+    Raises:
+        InputError: An element is missing, or the robot is not driven with this steering.
+    """
+    offered = steerings(model)
+    if robot != CAR and steering not in offered:
+        raise InputError(f"steering: {robot.path} is driven with {' or '.join(offered)}, not {steering}")
+    _check_elements(model, steering)
+    if robot != CAR and not np.any(model.numeric("limits").data):
+        _derive_limits(model)
+    nominal = read_robot(model)
+    if steering != "compliant" and len(offered) > 1:
+        _rearrange(model, nominal, steering)
+        nominal = read_robot(model)
+    return nominal
+
+
 def load(
     world: str = "flat",
     steering: Steering = "compliant",
     timestep: float | None = None,
     robot: RobotFile = CAR,
+    obstacles: Obstacles = NONE,
 ) -> mujoco.MjModel:
     """The compiled model alone; see `build` for the arguments and errors."""
-    return build(world, steering, timestep, robot)[0]
+    return build(world, steering, timestep, robot, obstacles)[0]
 
 
 def load_robot(
@@ -121,7 +143,7 @@ def arrangement(robot: RobotFile) -> Steering:
     Raises:
         InputError: The file has no robot that can be driven.
     """
-    return "compliant" if robot == CAR else steerings(adopt.compiled(robot, world_path("flat")))[0]
+    return "compliant" if robot == CAR else steerings(adopt.adopted(robot, world_path("flat")).compile())[0]
 
 
 def steerings(model: mujoco.MjModel) -> tuple[Steering, ...]:

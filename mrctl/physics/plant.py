@@ -21,17 +21,19 @@ from numpy.typing import NDArray
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.physics import mjcf
 from mrctl.physics.car import CarPhysics
-from mrctl.physics.elements import has
+from mrctl.physics.elements import COLLISION, has
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import fields, limit_current, perturb, write
 from mrctl.physics.readout import READING, addresses, current_limits, imu_motion, inputs, motor_parameters, read
 from mrctl.physics.stand import stand
 from mrctl.theory.drive import DRIVER, SERVO, Driver, SteeringServo, chop, drive, turn
+from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.theory.perturbation import LONGEST_DELAY, Perturbation
 from mrctl.theory.robot import Robot
 
 TILT = float(np.cos(np.radians(30)))
 IDEAL_DRIVER, IDEAL_SERVO = Driver(), SteeringServo()
+NONE = Obstacles()
 
 PLANT = np.dtype(
     [
@@ -140,9 +142,13 @@ class Plant(ABC):
     act: Array
     ctrl: Array
     wrench: Array
+    sensors: Array
+    mocap: tuple[Array, Array]
 
-    def __init__(self, model: mujoco.MjModel, robot: Robot, size: int, substeps: int) -> None:
-        """Takes the compiled nominal model and its robot, the number of robots, and physics steps in a period."""
+    def __init__(
+        self, model: mujoco.MjModel, robot: Robot, size: int, substeps: int, obstacles: Obstacles = NONE
+    ) -> None:
+        """Takes the compiled nominal model, its robot and obstacles, the number of robots, and steps in a period."""
         self.size, self.substeps = size, substeps
         self.robot = robot
         self.truth = [robot] * size
@@ -167,6 +173,10 @@ class Plant(ABC):
         self._tick = 0
         self._pushes: dict[int, int] = {}
         self._chassis = model.body("chassis").id
+        self._collision = model.sensor(COLLISION).adr[0] if has(model, "sensor", COLLISION) else -1
+        self._surroundings = Surroundings(obstacles)
+        self._began = np.zeros(size, int)  # tick at which each robot was stood on the ground
+        self._poses = self._surroundings.poses(np.zeros(0))  # of the moving obstacles, by ticks since then
 
     @abstractmethod
     def _write(self, robot: int, model: mujoco.MjModel) -> None:
@@ -254,6 +264,7 @@ class Plant(ABC):
             self.running += 1
         self._pushes.pop(robot, None)
         self._clear(robot)
+        self._began[robot] = self._tick
         self.qpos[robot], self.qvel[robot] = stand(self._model_of(robot), pose, twist, self.truth[robot])
         self.state["sent"][robot] = 0.0
         self._begin(slice(robot, robot + 1))
@@ -298,10 +309,25 @@ class Plant(ABC):
                 self.fail(int(robot), "non-finite command")
 
     def advance(self) -> None:
-        """The physics of one control period."""
+        """The physics of one control period; moving obstacles are where they are at its end."""
         if self.running:
+            self._move(1)
             for robot, reason in self._advance().items():
                 self.fail(robot, reason)
+            if self._collision >= 0:
+                for robot in np.flatnonzero(self.sensors[:, self._collision]):
+                    self.fail(int(robot), "collision")
+
+    def _move(self, ahead: int) -> None:
+        """Moves the obstacles that move to where they are this number of ticks from now."""
+        if not self._surroundings.courses:
+            return
+        since = self._tick + ahead - self._began
+        if since.max() >= len(self._poses):
+            self._poses = self._surroundings.poses(self._period * np.arange(2.0 * since.max() + 100))
+        now, (position, turn) = self._poses[since], self.mocap
+        position[..., :2] = now[..., :2]
+        turn[..., 0], turn[..., 3] = np.cos(now[..., 2] / 2), np.sin(now[..., 2] / 2)
 
     def look(self) -> None:
         """Readouts after the physics; fails robots that have tilted or whose state is not finite."""
@@ -331,6 +357,7 @@ class Plant(ABC):
         Until the first command of a delayed robot arrives, its motors get their nominal back-EMF, and the robot coasts.
         At 0 V they would brake it hard.
         """
+        self._move(0)
         self._look(rows)
         self._look(rows)
         state, queue = self.state[rows], self._queue[:, rows]
@@ -350,14 +377,15 @@ class PhysicsPlant(Plant):
         physics: The `CarPhysics`, for rendering and inspection.
     """
 
-    def __init__(self, model: mujoco.MjModel, robot: Robot, substeps: int) -> None:
-        """Takes a compiled world, its robot, and the physics steps in a control period."""
-        super().__init__(model, robot, 1, substeps)
+    def __init__(self, model: mujoco.MjModel, robot: Robot, substeps: int, obstacles: Obstacles = NONE) -> None:
+        """Takes a compiled world, its robot and obstacles, and the physics steps in a control period."""
+        super().__init__(model, robot, 1, substeps, obstacles)
         self.physics = CarPhysics.from_compiled(mjcf.clone(model))
         data = self.physics.data
         # Views of the engine's own memory, with the batch dimension in front.
         self.qpos, self.qvel, self.act, self.ctrl = data.qpos[None], data.qvel[None], data.act[None], data.ctrl[None]
-        self.wrench = data.xfrc_applied[None]
+        self.wrench, self.sensors = data.xfrc_applied[None], data.sensordata[None]
+        self.mocap = data.mocap_pos[None], data.mocap_quat[None]
 
     def _model_of(self, robot: int) -> mujoco.MjModel:
         return self.physics.model.ptr
@@ -381,16 +409,26 @@ class PhysicsPlant(Plant):
 class BatchPlant(Plant):
     """Many robots on MuJoCo's own batch engine; parameters differ per robot through `expand` and `set_const`."""
 
-    def __init__(self, model: mujoco.MjModel, robot: Robot, size: int, substeps: int, threads: int = 0) -> None:
-        """Takes a world and its robot, the number of robots, physics steps in a period, and threads (0: all cores)."""
-        super().__init__(model, robot, size, substeps)
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        robot: Robot,
+        size: int,
+        substeps: int,
+        threads: int = 0,
+        obstacles: Obstacles = NONE,
+    ) -> None:
+        """Takes what `build` takes."""
+        super().__init__(model, robot, size, substeps, obstacles)
         quiet = mjcf.clone(model)
-        quiet.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nobody reads them here
+        if self._collision < 0:
+            quiet.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nobody reads them here
         self.batch = mujoco_batch.Batch(quiet, size, threads)
         self._held = mjcf.clone(quiet)  # for `_model_of` to write into
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.act, self.ctrl = self.batch.bind("act"), self.batch.bind("ctrl")
-        self.wrench = self.batch.bind("xfrc_applied")
+        self.wrench, self.sensors = self.batch.bind("xfrc_applied"), self.batch.bind("sensordata")
+        self.mocap = self.batch.bind("mocap_pos"), self.batch.bind("mocap_quat")
         self._fields = fields(model)
         self._expanded: set[str] = set()
 
@@ -416,6 +454,19 @@ class BatchPlant(Plant):
         return {}
 
 
-def build(model: mujoco.MjModel, robot: Robot, size: int, substeps: int, threads: int = 0) -> Plant:
-    """The plant for a number of robots: dm_control for one, the batch engine for more."""
-    return PhysicsPlant(model, robot, substeps) if size == 1 else BatchPlant(model, robot, size, substeps, threads)
+def build(
+    model: mujoco.MjModel, robot: Robot, size: int, substeps: int, threads: int = 0, obstacles: Obstacles = NONE
+) -> Plant:
+    """The plant for a number of robots: dm_control for one, the batch engine for more.
+
+    Args:
+        model: Compiled world with the nominal robot.
+        robot: The nominal robot.
+        size: Number of robots.
+        substeps: Physics steps in a control period.
+        threads: Number of threads of the batch engine; 0 for all cores.
+        obstacles: The obstacles that the model was compiled with.
+    """
+    if size == 1:
+        return PhysicsPlant(model, robot, substeps, obstacles)
+    return BatchPlant(model, robot, size, substeps, threads, obstacles)

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.physics.elements import centres, fronts, has, knuckles
+from mrctl.physics.elements import COLLISION, centres, fronts, has, knuckles
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
 from mrctl.theory.kinematics import scrub_free_angle
@@ -44,7 +44,7 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | N
         The state, in which no wheel is below the ground.
 
     Raises:
-        InputError: There is no ground below the pose.
+        InputError: There is no ground below the pose, or an obstacle is in the way.
     """
     robot = robot or read_robot(model)
     data = mujoco.MjData(model)
@@ -90,6 +90,8 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | N
     for wheel, rate in (rates | front_rates(model, robot, v, omega, np.array(steering))).items():
         data.qvel[model.joint(wheel).dofadr[0]] = rate
     mujoco.mj_forward(model, data)
+    if has(model, "sensor", COLLISION) and data.sensor(COLLISION).data[0]:
+        raise InputError(f"initial_pose: the robot would stand in an obstacle at ({x:.2f}, {y:.2f})")
     if data.ncon:
         data.qpos[2] -= min(0.0, data.contact.dist.min())  # lifts it off bumps between the three points
     return State(data.qpos.copy(), data.qvel.copy())

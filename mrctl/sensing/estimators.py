@@ -14,10 +14,12 @@ import numpy as np
 
 from mrctl.kernel import Array, Kernel, Row, Rows, kernel
 from mrctl.sensing.ekf import EKF, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
+from mrctl.sensing.localisation import Localiser
 from mrctl.sensing.prediction import SEEN, front, predict, wrapped
 from mrctl.sensing.sensors import Sensors
 from mrctl.sensing.slip import slip_ratio
 from mrctl.sensing.tiers import Sensing
+from mrctl.theory.obstacles import Obstacles
 from mrctl.theory.robot import Robot
 
 MOTION = np.dtype(
@@ -128,6 +130,7 @@ def estimate(
             s.fix[k] = taken.fix[k] if arrives else np.nan
 
 
+NONE = Obstacles()
 ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
     "truth": (truth, MOTION),
     "odometry": (odometry, MOTION),
@@ -149,10 +152,18 @@ class Estimator:
     Attributes:
         seen: What the controllers are told, a record of `SEEN` of each robot, `(B,)`.
         memory: State of the estimator, a record of each robot, `(B,)`.
+        localiser: What makes posture fixes from a lidar, or None.
     """
 
     def __init__(
-        self, name: str, sensing: Sequence[Sensing], robot: Robot, sensors: Sensors, imu: Array, skew: float
+        self,
+        name: str,
+        sensing: Sequence[Sensing],
+        robot: Robot,
+        sensors: Sensors,
+        imu: Array,
+        skew: float,
+        obstacles: Obstacles = NONE,
     ) -> None:
         """Builds the estimator.
 
@@ -164,12 +175,18 @@ class Estimator:
             imu: Position of the accelerometer in the frame of the chassis in m, `(3,)`.
             skew: Time in s by which velocities lag behind positions: half a physics step, because the engine integrates
                 positions with the velocities at the end of the step.
+            obstacles: What a lidar sees; those that stand still are on the map.
+
+        Raises:
+            InputError: There is nothing on the map that localisation needs.
         """
         self._law, memory = estimate_with(name), ESTIMATORS[name][1]
         self._name, self._sensing, self._sensors = name, list(sensing), sensors
         self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew])
         self.seen = np.zeros(len(sensing), SEEN)
         self.memory = np.zeros(len(sensing), memory)
+        scans = any(s.localisation != "fixes" for s in sensing)
+        self.localiser = Localiser(sensing, sensors, robot.wheel_radius, obstacles) if scans else None
 
     def start(self, row: int, reading: Row, seed: int, tick: int) -> None:
         """Starts the estimate of one robot from a first fix and an uncertain twist.
@@ -191,6 +208,8 @@ class Estimator:
             deviation[4] = START_TWIST[1] if sensor["gyro_sigma"] else 0.0
         memory, size = self.memory[row], 5
         memory["mean"][:size] = np.append(reading["pose"], reading["twist"]) + deviation * random.standard_normal(size)
+        if self.localiser:
+            self.localiser.start(row, memory["mean"][:3], seed)
         if self._name == "ekf":
             offset = sensing["accelerometer_bias"] ** 2 + START_OFFSET**2
             count = sensor["quantum"] ** 2 / 12
@@ -214,6 +233,8 @@ class Estimator:
             `seen`, `(B,)`.
         """
         sensors = self._sensors
+        if self.localiser:
+            self.localiser.locate(tick, plant, self.seen["estimate"])
         self._law.compiled(
             tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen
         )

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from mrctl.record import Record
 from mrctl.sensing.ekf import KEPT
+from mrctl.sensing.lidar import Lidar
 from mrctl.theory.drive import (
     NO_LIMIT,
     Backlash,
@@ -24,6 +25,7 @@ from mrctl.theory.perturbation import LONGEST_DELAY
 Tier = Literal["ideal", "lab", "field"]
 TIERS: tuple[Tier, ...] = ("ideal", "lab", "field")
 EstimatorName = Literal["truth", "odometry", "ekf"]
+Localisation = Literal["fixes", "scan", "particles"]
 IN_FLIGHT = KEPT - 1
 """Largest number of fixes that have been taken and have not arrived."""
 
@@ -62,6 +64,12 @@ VALUES: dict[str, tuple[float, float, float]] = {
 }
 """Values of the three tiers in the units of the fields of `Sensing`; a rate of 0 is that of the control loop."""
 
+LOCALISED: dict[str, dict[str, float]] = {
+    "scan": {"fix_position_noise": 0.01, "fix_heading_noise": 0.005, "fix_lost": 0, "fix_outliers": 0},
+    "particles": {"fix_position_noise": 0.02, "fix_heading_noise": 0.01, "fix_lost": 0, "fix_outliers": 0},
+}
+"""Values in place of the tier's where fixes come from a lidar: about twice the errors that the tests find."""
+
 Rate = Annotated[float, Field(ge=0, le=10_000)]
 Latency = Annotated[float, Field(ge=0, le=LONGEST_DELAY)]
 
@@ -74,6 +82,11 @@ class Sensing(Record):
     estimator: EstimatorName | None = None
     """Source of posture and twist: the `truth`, `odometry` from encoders and gyro, or an extended Kalman filter, `ekf`;
     by default the truth in the ideal tier and the filter in the others."""
+    localisation: Localisation = "fixes"
+    """Source of posture fixes: the `fixes` below, or a lidar on the map of the obstacles that stand still, by matching
+    each `scan` with the map or by a filter of `particles`."""
+    lidar: Lidar = Lidar()
+    """Lidar, which is used where `localisation` asks for it."""
     encoder_counts: Annotated[int, Field(ge=0, le=10**9)] | None = None
     """Counts of a wheel's encoder in one turn; 0 reads exact angles and rates."""
     encoder_rate: Rate | None = None
@@ -130,6 +143,10 @@ class Sensing(Record):
     def __getitem__(self, name: str) -> float:
         """Returns the value that a field has, its own or the tier's, in the unit of the field."""
         own = getattr(self, name)
+        if self.localisation != "fixes" and own is None:
+            if name == "fix_rate":
+                return self.lidar.rate
+            own = LOCALISED[self.localisation].get(name)
         return VALUES[name][TIERS.index(self.tier)] if own is None else own
 
     @property
@@ -183,6 +200,11 @@ class Sensing(Record):
             ValueError: A time is no whole number of control periods, more than four fixes are on their way at the same
                 time, or fixes are older than the run.
         """
+        if self.localisation != "fixes":
+            if self.fix_rate is not None:
+                raise ValueError("sensing.fix_rate: with a lidar the rate of fixes is that of its scans, lidar.rate")
+            if abs(1 / (self.lidar.rate * control_period) % 1 - 0.5) < 0.5 - 1e-6:
+                raise ValueError(f"sensing.lidar.rate: {self.lidar.rate:g} Hz is no whole fraction of the control rate")
         for name in VALUES:
             if name.endswith(("_rate", "_latency")) or name == "delay":
                 self.periods(name, control_period)

@@ -18,6 +18,7 @@ OnChange = Callable[[tuple[str, ...], Any], None]
 WORLDS = ("flat", "slope", "rough", "patch")
 SENSORS = {"encoders": "encoder", "gyro": "gyro", "accelerometer": "accelerometer", "posture fixes": "fix"}
 DRIVER = ("dead_zone", "pwm_steps", "current_limit", "battery_resistance")
+MAPPED = ("localisation", "lidar")  # fields without an input, as they need obstacles, which a scenario file has
 WIDEST = 1e3  # ratio of the limits of a number, beyond which a slider would show only the largest ones
 STEERING = ("steering_offset", "steering_backlash")
 # Fields of large records in groups, by the name of the field that holds the record. The first group of a perturbation
@@ -81,7 +82,7 @@ class Controls:
         groups = GROUPS.get(path[-1], {}) if path else {}
         grouped = [name for names in groups.values() for name in names]
         for name, field in type(record).model_fields.items():
-            if name not in grouped and (only is None or name in only):
+            if name not in (*grouped, *MAPPED) and (only is None or name in only):
                 self._add(self._shown(record, (*path, name)), field, (*path, name))
         for group, names in groups.items():
             with self._gui.add_folder(group, expand_by_default=group == "mass and payload"):

@@ -51,6 +51,7 @@ HIDDEN = (
     "name",
     "laps",
     "events",
+    "obstacles",
     "initial_pose",
     "initial_spread",
     "robot",

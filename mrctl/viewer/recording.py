@@ -78,7 +78,8 @@ class Recording:
     @cached_property
     def model(self) -> mujoco.MjModel:
         """The compiled world with the nominal robot."""
-        return mjcf.load(self.scenario.world, self.scenario.steering, robot=self.scenario.robot)
+        s = self.scenario
+        return mjcf.load(s.world, s.steering, robot=s.robot, obstacles=s.obstacles)
 
     @cached_property
     def _wheel_angles(self) -> dict[str, Array]:
@@ -137,7 +138,7 @@ def looks_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[Look]
     """
     first = recordings[0]
     for r in recordings:
-        for field in ("world", "robot", "control_period"):
+        for field in ("world", "obstacles", "robot", "control_period"):
             if getattr(r.scenario, field) != getattr(first.scenario, field):
                 raise InputError(f"run: {r.label} drove with another {field} than {first.label}")
     labels = [r.label for r in recordings]

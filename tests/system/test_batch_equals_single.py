@@ -207,8 +207,8 @@ def test_all_equal():
 def test_threads(scenarios, alone, threads, monkeypatch):
     """The number of threads changes nothing; a batch of one is no special case either."""
 
-    def build(model, robot, size, substeps, _):
-        return BatchPlant(model, robot, size, substeps, threads)
+    def build(model, robot, size, substeps, _, obstacles):
+        return BatchPlant(model, robot, size, substeps, threads, obstacles)
 
     monkeypatch.setattr(import_module("mrctl.loop.simulation"), "build", build)
     rows = range(0, COUNT, 3)

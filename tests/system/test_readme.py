@@ -23,6 +23,7 @@ from mrctl import cli
 from mrctl.experiments import results_page
 from mrctl.scenario import Scenario
 from mrctl.sweep.plan import Sweep
+from mrctl.theory.obstacles import Obstacles
 
 pytestmark = pytest.mark.xdist_group("readme")  # what its tests share is made once
 
@@ -183,11 +184,13 @@ def test_python(block: Block, folder: Folder) -> None:
 
 @pytest.mark.parametrize("block", blocks("toml"), ids=place)
 def test_toml(block: Block, tmp_path: Path) -> None:
-    """TOML snippets are valid scenarios, or valid sweeps."""
+    """TOML snippets are valid scenarios, obstacles or sweeps."""
     file = tmp_path / "snippet.toml"
     file.write_text(block.text)
     if tomllib.loads(block.text).keys() <= Scenario.model_fields.keys():
         assert Scenario.from_toml(file) != Scenario()
+    elif block.file == "yard.toml":
+        assert Obstacles.from_toml(file).moving
     else:
         assert Sweep.from_toml(file).size > 1
 

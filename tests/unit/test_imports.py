@@ -95,7 +95,7 @@ def test_no_circles() -> None:
 def test_rooms() -> None:
     """`ls mrctl` stays short, and every room says at its door what lives there."""
     boxes = {path.name for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
-    assert len(boxes) <= 16
+    assert len(boxes) <= 17
     for path in PACKAGE.glob("*/__init__.py"):
         assert len((ast.get_docstring(ast.parse(path.read_text())) or "").splitlines()) >= 3, path
 

@@ -1,0 +1,204 @@
+"""Worlds with a start and a goal, made by rule from a seed; the same arguments give the same world."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrctl.record import InputError, Record
+from mrctl.theory.obstacles import Box, Disc, Obstacle, Obstacles, Polygon, Pose
+
+THICK = 0.1  # m, thickness of walls
+
+
+class Task(Record):
+    """A world, and where a robot has to go in it."""
+
+    obstacles: Obstacles
+    """Obstacles of the world."""
+    start: Pose
+    """Pose at the start: x and y in m, θ in rad."""
+    goal: Pose
+    """Pose at which the robot has to arrive: x and y in m, θ in rad."""
+
+
+def cellular(seed: int, fill: float = 0.2, steps: int = 3, cell: float = 0.15, cells: int = 30) -> Task:
+    """Makes a field of cylinders with a cellular automaton, as BARN does, between two walls along y.
+
+    Each cell is filled at random. In each step a cell is filled if at least 5 of its 8 neighbours are, and emptied if
+    at most 1 is (Perille, Truong, Xiao and Stone, "Benchmarking metric ground navigation", IEEE SSRR 2020). Each filled
+    cell is a cylinder as wide as the cell. Nothing ensures that there is a way through.
+
+    Args:
+        seed: Seed of the field.
+        fill: Share of the cells that are filled at first, between 0 and 1.
+        steps: Number of steps.
+        cell: Side of a cell in m.
+        cells: Number of cells along each side of the field.
+    """
+    _positive(cell=cell, cells=cells)
+    filled = np.random.default_rng(seed).random((cells, cells)) < fill
+    for _ in range(steps):
+        neighbours = _neighbours(filled)
+        filled = (filled | (neighbours >= 5)) & (neighbours > 1)
+    filled &= _neighbours(filled) < 8  # what is inside nobody touches
+    half = cells * cell / 2
+    rows, columns = np.nonzero(filled)
+    at = (np.column_stack([columns, rows]) + 0.5) * cell - half
+    discs = [Disc(x=x, y=y, radius=cell / 2) for x, y in at.tolist()]
+    ahead = half + 8 * cell  # free space before and behind the field
+    walls = [Box(x=side * (half + THICK / 2), length=THICK, width=2 * ahead + 8 * cell) for side in (-1, 1)]
+    return _task([*discs, *walls], (0.0, -ahead, np.pi / 2), (0.0, ahead, np.pi / 2))
+
+
+def _neighbours(filled: NDArray[np.bool]) -> NDArray[np.int64]:
+    """Counts the filled cells among the 8 neighbours of each cell; beyond the border there are none."""
+    padded = np.pad(filled.astype(int), 1)
+    rows, columns = filled.shape
+    return sum(padded[1 + i : 1 + i + rows, 1 + k : 1 + k + columns] for i in (-1, 0, 1) for k in (-1, 0, 1)) - filled
+
+
+def corridor(width: float, seed: int = 0, pieces: int = 4, length: float = 3.0, turn: float = np.pi / 4) -> Task:
+    """Makes a corridor of a width that bends at random.
+
+    Args:
+        width: Width between its walls in m.
+        seed: Seed of the bends.
+        pieces: Number of straight pieces.
+        length: Length of the middle line of a piece in m.
+        turn: Largest bend between two pieces in rad, below π/2.
+
+    Raises:
+        InputError: A wall would fold over itself.
+    """
+    _positive(width=width, pieces=pieces, length=length)
+    if not 0 <= turn < np.pi / 2 or (width / 2 + THICK) * np.tan(turn / 2) >= length / 2:
+        raise InputError(f"turn: pieces of {length:g} m that are {width:g} m wide cannot bend by {turn:g} rad")
+    bends = np.random.default_rng(seed).uniform(-turn, turn, pieces - 1)
+    headings = np.clip(np.concatenate([[0.0], np.cumsum(bends)]), -np.pi / 2, np.pi / 2)  # it never comes back
+    half = np.concatenate([[0.0], np.diff(headings) / 2, [0.0]])
+    middle = np.concatenate([[0], np.cumsum(length * np.exp(1j * headings))])
+    # At a bend the walls meet on the bisector, farther from the middle line by 1/cos of half the bend.
+    mitre = 1j * np.exp(1j * (np.append(headings, headings[-1]) - half)) / np.cos(half)
+    walls = []
+    for side in (-1, 1):
+        near, far = (middle + side * offset * mitre for offset in (width / 2, width / 2 + THICK))
+        for k in range(pieces):
+            corners = [complex(corner) for corner in (near[k], near[k + 1], far[k + 1], far[k])]
+            walls.append(Polygon(points=tuple((corner.real, corner.imag) for corner in corners)))
+    inward = min(0.5, length / 4)
+    first, last = middle[0] + inward, middle[-1] - inward * np.exp(1j * headings[-1])
+    return _task(walls, (first.real, first.imag, 0.0), (last.real, last.imag, headings[-1]))
+
+
+def slalom(gap: float, seed: int = 0, gates: int = 5, spacing: float = 2.0, radius: float = 0.15) -> Task:
+    """Makes a row of pairs of cylinders along x, whose gaps are shifted to either side in turn.
+
+    Args:
+        gap: Free width between the two cylinders of a pair in m.
+        seed: Seed of the shifts.
+        gates: Number of pairs.
+        spacing: Distance of two pairs in m.
+        radius: Radius of a cylinder in m.
+    """
+    _positive(gap=gap, gates=gates, spacing=spacing, radius=radius)
+    shifts = np.random.default_rng(seed).uniform(0.1, 0.3, gates) * spacing * (-1.0) ** np.arange(gates)
+    discs = [
+        Disc(x=spacing * (k + 1), y=shift + side * (gap / 2 + radius), radius=radius)
+        for k, shift in enumerate(shifts.tolist())
+        for side in (-1, 1)
+    ]
+    return _task(discs, (0.0, 0.0, 0.0), (spacing * (gates + 1), 0.0, 0.0))
+
+
+def doorway(width: float, seed: int = 0, room: float = 4.0) -> Task:
+    """Makes two square rooms with a door in the wall between them.
+
+    Args:
+        width: Width of the door in m.
+        seed: Seed of the door's place and of the start and the goal.
+        room: Side of a room in m.
+
+    Raises:
+        InputError: The door is wider than half a room.
+    """
+    _positive(width=width, room=room)
+    if width > room / 2:
+        raise InputError(f"width: a door of {width:g} m is wider than half a room of {room:g} m")
+    door, first, last = (float(y) for y in np.random.default_rng(seed).uniform(-room / 4, room / 4, 3))
+    half = room / 2
+    corners = [(-room, -half), (room, -half), (room, half), (-room, half), (-room, -half)]
+    points = [complex(*corner) for corner in corners]
+    walls = [_wall(a, b) for a, b in zip(points[:-1], points[1:], strict=True)]
+    jamb = (width + THICK) / 2
+    walls += [_wall(complex(0, -half), complex(0, door - jamb)), _wall(complex(0, door + jamb), complex(0, half))]
+    return _task(walls, (-half, first, 0.0), (half, last, 0.0))
+
+
+def parking_bay(length: float, width: float, seed: int = 0, lane: float = 1.5) -> Task:
+    """Makes a bay along a lane, between two parked cars and a kerb, into which a robot parks in parallel.
+
+    Args:
+        length: Free length of the bay in m.
+        width: Width of the bay, from the lane to the kerb, in m.
+        seed: Seed of the start.
+        lane: Width of the lane in m; beyond it is a wall.
+    """
+    _positive(length=length, width=width, lane=lane)
+    along, offset = np.random.default_rng(seed).uniform(-0.1, 0.1, 2) * (length, lane)
+    cars = [Box(x=side * length, y=-width / 2, length=length, width=width) for side in (-1, 1)]
+    ends = 2 * length
+    walls = [_wall(complex(-ends, y), complex(ends, y)) for y in (-width - THICK / 2, lane + THICK / 2)]
+    return _task([*cars, *walls], (float(-length + along), float(lane / 2 + offset), 0.0), (0.0, -width / 2, 0.0))
+
+
+def warehouse(
+    aisle: float, seed: int = 0, rows: int = 4, columns: int = 3, shelf: tuple[float, float] = (2.0, 0.5)
+) -> Task:
+    """Makes rows of shelves with aisles all around them, in a hall with walls; a tenth of the shelves is missing.
+
+    Args:
+        aisle: Width of the aisles in m.
+        seed: Seed of the missing shelves, and of the aisles of start and goal.
+        rows: Number of rows of shelves, across y.
+        columns: Number of shelves in a row.
+        shelf: Length along x and width of a shelf in m.
+    """
+    _positive(aisle=aisle, rows=rows, columns=columns, length=shelf[0], width=shelf[1])
+    random = np.random.default_rng(seed)
+    dx, dy = shelf[0] + aisle, shelf[1] + aisle
+    kept = random.random((rows, columns)) >= 0.1
+    shelves = [
+        Box(x=float((k + 0.5) * dx), y=float((i + 0.5) * dy), length=shelf[0], width=shelf[1])
+        for i, k in zip(*np.nonzero(kept), strict=True)
+    ]
+    low, high = complex(-aisle / 2, -aisle / 2), complex(columns * dx + aisle / 2, rows * dy + aisle / 2)
+    points = [low, complex(high.real, low.imag), high, complex(low.real, high.imag), low]
+    walls = [_wall(a, b) for a, b in zip(points[:-1], points[1:], strict=True)]
+    first, last = random.integers(rows + 1, size=2) * dy
+    return _task([*shelves, *walls], (0.0, float(first), 0.0), (float(columns * dx), float(last), 0.0))
+
+
+def _wall(start: complex, end: complex) -> Box:
+    """Returns a wall along a line from x + i y to x + i y in m, which reaches half its thickness beyond either end."""
+    middle, along = (start + end) / 2, end - start
+    angle = float(np.angle(along))
+    return Box(x=middle.real, y=middle.imag, angle=angle, length=abs(along) + THICK, width=THICK)
+
+
+def _task(shapes: Sequence[Obstacle], start: Sequence[float], goal: Sequence[float]) -> Task:
+    """Returns a task; poses are in m, m, rad."""
+    return Task.from_dict({"obstacles": {"shapes": tuple(shapes)}, "start": tuple(start), "goal": tuple(goal)})
+
+
+def _positive(**values: float) -> None:
+    """Refuses values that are not positive.
+
+    Raises:
+        InputError: One is not; the message names it.
+    """
+    for name, value in values.items():
+        if not value > 0:
+            raise InputError(f"{name}: must be positive, not {value}")

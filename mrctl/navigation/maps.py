@@ -1,0 +1,127 @@
+"""Maps of ROS: the yaml file of `map_server` with its image, and the obstacles that it shows.
+
+The format is that of the package `map_server` (wiki.ros.org/map_server), which Nav2 kept.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from PIL import Image
+from pydantic import Field
+
+from mrctl.kernel import Array
+from mrctl.record import InputError, Record
+from mrctl.theory.grid import check_size, rectangles
+from mrctl.theory.obstacles import MOST, Box, Obstacles, Pose, turned
+
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class MapFile(Record):
+    """The yaml file of a map."""
+
+    image: str
+    """Path of the image, relative to the yaml file."""
+    resolution: Annotated[float, Field(ge=1e-4, le=10)]
+    """Side of a pixel in m."""
+    origin: Pose
+    """Pose of the lower left corner of the image: x and y in m, and its rotation in rad."""
+    negate: bool = False
+    """Whether white means occupied."""
+    occupied_thresh: Share
+    """Probability, a dimensionless share of black, above which a pixel is occupied."""
+    free_thresh: Share
+    """Probability, a dimensionless share of black, below which a pixel is free."""
+    mode: Literal["trinary", "scale"] = "trinary"
+    """What is between the thresholds: unknown (`trinary`), or a probability (`scale`)."""
+
+
+class Map(NamedTuple):
+    """An occupancy grid."""
+
+    occupancy: NDArray[np.int8]
+    """Occupancy of each cell in per cent, −1 where unknown, `(rows, columns)`: rows go up, columns to the right."""
+    resolution: float
+    """Side of a cell in m."""
+    origin: Array
+    """Pose of the lower left corner in m, m, rad, `(3,)`."""
+
+    def obstacles(self) -> Obstacles:
+        """Merges the occupied cells into maximal rectangles, which may overlap.
+
+        Raises:
+            InputError: There are more than 20,000.
+        """
+        found = rectangles(self.occupancy == 100)
+        if len(found) > MOST:
+            raise InputError(f"map: {len(found):,} rectangles are more than {MOST:,}; take a coarser or a cleaner map")
+        size = (found[:, 2:] - found[:, :2]) * self.resolution
+        middles = turned((found[:, 2:] + found[:, :2]) / 2 * self.resolution, self.origin)
+        angle = float(self.origin[2])
+        return Obstacles(
+            shapes=tuple(
+                Box(x=x, y=y, angle=angle, length=length, width=width)
+                for (x, y), (length, width) in zip(middles.tolist(), size.tolist(), strict=True)
+            )
+        )
+
+
+def read_map(path: str | Path) -> Map:
+    """Reads a map of `map_server`.
+
+    Args:
+        path: The yaml file; its image is a png, a pgm, or whatever else Pillow reads.
+
+    Raises:
+        InputError: The file is no map, or its image is missing, no image, or larger than 20 million pixels.
+    """
+    try:
+        values = yaml.safe_load(Path(path).read_bytes())
+    except (OSError, yaml.YAMLError, ValueError) as error:
+        raise InputError(f"{path}: {' '.join(str(getattr(error, 'strerror', None) or error).split())}") from None
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: no map: not a yaml file of fields such as image and resolution")
+    values = {name: value for name, value in values.items() if name in MapFile.model_fields}  # tools add others
+    file = MapFile.from_dict(values, str(path))
+    if file.free_thresh >= file.occupied_thresh:
+        raise InputError(f"{path}: free_thresh: must be below occupied_thresh")
+    pixels = _pixels(Path(path).parent / file.image)
+    # As map_server: `trinary` averages transparency as one more channel, `scale` takes it for unknown.
+    opaque = np.ones(pixels.shape[:2], bool)
+    if file.mode == "scale" and pixels.shape[2] in (2, 4):
+        opaque, pixels = pixels[..., -1] > 0, pixels[..., :-1]
+    black = pixels.mean(axis=2) / 255
+    black = black if file.negate else 1 - black
+    between = 1 + 98 * (black - file.free_thresh) / (file.occupied_thresh - file.free_thresh)
+    unknown = np.full(black.shape, -1) if file.mode == "trinary" else np.where(opaque, np.floor(between), -1)
+    known = [black > file.occupied_thresh, black < file.free_thresh]
+    occupancy = np.select(known, [100, 0], unknown).astype(np.int8)
+    return Map(np.ascontiguousarray(occupancy[::-1]), file.resolution, np.array(file.origin))
+
+
+def _pixels(path: Path) -> Array:
+    """Reads an image as `(height, width, channels)` from 0 to 255, the upper row first.
+
+    Raises:
+        InputError: It is no image, or too large.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                check_size(image.height, image.width, f"{path}: image")
+                if image.mode.startswith("I"):
+                    return np.asarray(image, float)[..., None] / 257  # 16 bits
+                plain = image.mode if image.mode in ("L", "LA", "RGB", "RGBA") else None
+                image = image if plain else image.convert("L" if image.mode == "1" else "RGBA")
+                return np.asarray(image, float).reshape(image.height, image.width, -1)
+    except InputError:
+        raise
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: no image that can be read: {' '.join(str(error).split())}") from None

@@ -1,0 +1,102 @@
+"""Worlds of Gazebo in SDF, such as those of the BARN challenge, from the user's own copy.
+
+BARN: Perille, Truong, Xiao and Stone, "Benchmarking metric ground navigation", IEEE SSRR 2020.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from mrctl.kernel import Array
+from mrctl.record import InputError
+from mrctl.theory.obstacles import Obstacles, turned
+
+FLAT = 0.02  # m, height up to which a collision shape is ground
+
+
+def read_sdf(path: str | Path) -> Obstacles:
+    """Reads the cylinders, boxes and spheres that the models of an SDF world collide with.
+
+    Models that the world includes from other files, such as ground and sun, are left out. A pose in the world's
+    `<state>` is used in place of that of the model.
+
+    Args:
+        path: The `.world` or `.sdf` file.
+
+    Raises:
+        InputError: The file is no SDF world, or one of its shapes is a mesh or not upright.
+    """
+    try:
+        world = ElementTree.parse(path).getroot().find("world")
+    except (OSError, ElementTree.ParseError) as error:
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+    if world is None:
+        raise InputError(f"{path}: no SDF file with a <world>")
+    shapes = []
+    try:
+        placed = {
+            model.get("name"): _pose(model) for model in world.iterfind("state/model") if model.find("pose") is not None
+        }
+        for model in world.iterfind("model"):
+            base = placed.get(model.get("name"), _pose(model))
+            for link in model.iterfind("link"):
+                for collision in link.iterfind("collision"):
+                    name = f"model {model.get('name')}"
+                    shapes += _shape(collision, _after(_after(base, _pose(link)), _pose(collision)), name)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    return Obstacles.from_dict({"shapes": shapes}, str(path))
+
+
+def _pose(element: ElementTree.Element) -> Array:
+    """Returns x, y, z, roll, pitch and yaw of an element in m and rad, `(6,)`; zeros where it has no pose.
+
+    Raises:
+        InputError: The pose is not six numbers.
+    """
+    text = (element.findtext("pose") or "0 0 0 0 0 0").split()
+    try:
+        return np.array([float(number) for number in text]).reshape(6)
+    except ValueError:
+        raise InputError(f"{element.get('name')}: pose: {' '.join(text)!r} is not six numbers") from None
+
+
+def _after(base: Array, pose: Array) -> Array:
+    """Returns a pose that counts from another one; tilts add up, which is right where there is none."""
+    found = base + pose
+    found[:2] = turned(pose[None, :2], base[[0, 1, 5]])[0]
+    return found
+
+
+def _shape(collision: ElementTree.Element, pose: Array, name: str) -> list[dict]:
+    """Returns the obstacle of a collision element at its pose `(6,)`, or nothing for ground.
+
+    Raises:
+        InputError: The shape is not one that is read, or not upright.
+    """
+    geometry = collision.find("geometry")
+    shape = geometry[0] if geometry is not None and len(geometry) else collision
+    if shape.tag in ("plane", "empty"):
+        return []
+    if shape.tag not in ("cylinder", "box", "sphere"):
+        raise InputError(f"{name}: its shape is a {shape.tag}, not a cylinder, box or sphere")
+    field = {"cylinder": "radius", "box": "size", "sphere": "radius"}[shape.tag]
+    try:
+        size = [float(number) for number in (shape.findtext(field) or "").split()]
+        length = float(shape.findtext("length") or 2 * size[0])
+        size = np.array(size).reshape(3 if shape.tag == "box" else 1)
+    except (ValueError, IndexError):
+        raise InputError(f"{name}: {shape.tag} has no valid {field}") from None
+    half = size[2] / 2 if shape.tag == "box" else length / 2
+    if pose[2] + half <= FLAT:
+        return []
+    if shape.tag != "sphere" and np.abs(pose[3:5]).max() > 1e-3:
+        raise InputError(f"{name}: is not upright")
+    x, y, yaw = (float(value) for value in pose[[0, 1, 5]])
+    if shape.tag == "box":
+        yaw = float(np.arctan2(np.sin(yaw), np.cos(yaw)))
+        return [{"kind": "box", "x": x, "y": y, "angle": yaw, "length": size[0], "width": size[1]}]
+    return [{"kind": "disc", "x": x, "y": y, "radius": size[0]}]

@@ -1,0 +1,73 @@
+"""The footprint of a robot: the convex hull of all its parts, as seen from above."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from mrctl.kernel import Array
+from mrctl.physics.elements import REAR, bodies_of, fronts, has
+from mrctl.physics.stand import steer
+from mrctl.record import InputError
+
+DIRECTIONS = np.arange(32) * (2 * np.pi / 32)  # in which round parts are looked at; a disc loses half a per cent
+
+
+def footprint(model: mujoco.MjModel) -> Array:
+    """Finds the footprint of a compiled robot in its frame, with its wheels steered to either side and straight on.
+
+    The spheres on which the wheels roll are left out, because the tyres that one sees are narrower.
+
+    Args:
+        model: Compiled world with the robot.
+
+    Returns:
+        Corners in m from P, counter-clockwise, `(n, 2)`.
+
+    Raises:
+        InputError: The robot has no geom but its wheels.
+    """
+    bodies, contacts = bodies_of(model), [model.geom(name).id for name in (*REAR, *fronts(model))]
+    geoms = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies and g not in contacts]
+    if not geoms:
+        raise InputError("footprint: the robot has no geom beside its wheels")
+    limit = model.joint("steering").range[1] if has(model, "joint", "steering") else 0.0
+    data, points = mujoco.MjData(model), []
+    for angle in {-limit, 0.0, limit}:
+        mujoco.mj_resetData(model, data)
+        steer(model, data.qpos, angle)
+        mujoco.mj_kinematics(model, data)
+        chassis = data.body("chassis")
+        for geom in geoms:
+            points.append((_extremes(model, data, geom) - chassis.xpos) @ chassis.xmat.reshape(3, 3))
+    plane = np.concatenate(points)[:, :2].round(9)
+    return plane[ConvexHull(plane).vertices]
+
+
+def _extremes(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Array:
+    """Returns the farthest points of a geom in level directions of the world in m, or all corners of a mesh, `(n, 3)`.
+
+    The farthest point of a set in a direction is its support (Ericson, Real-Time Collision Detection, 2005).
+    """
+    kind, size, shape = model.geom_type[geom], model.geom_size[geom], mujoco.mjtGeom
+    frame, centre = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
+    level = np.column_stack([np.cos(DIRECTIONS), np.sin(DIRECTIONS), np.zeros(len(DIRECTIONS))])
+    ahead = (level @ frame).round(12)  # the directions in the frame of the geom
+    if kind == shape.mjGEOM_MESH:
+        mesh = model.mesh(model.geom_dataid[geom])
+        own = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]].astype(float)
+    elif kind == shape.mjGEOM_BOX:
+        own = size * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
+    elif kind == shape.mjGEOM_ELLIPSOID:
+        own = size**2 * ahead / np.linalg.norm(size * ahead, axis=1, keepdims=True)
+    else:  # spheres, and the two ends of capsules and cylinders
+        flat = ahead * [1, 1, kind != shape.mjGEOM_CYLINDER]
+        length = np.linalg.norm(flat, axis=1, keepdims=True)
+        round_part = size[0] * np.divide(flat, length, out=np.zeros_like(flat), where=length > 1e-9)
+        end = 0.0 if kind == shape.mjGEOM_SPHERE else size[1]
+        own = np.concatenate([round_part + [0, 0, end], round_part - [0, 0, end]])
+    return centre + own @ frame.T

@@ -1,0 +1,165 @@
+"""Obstacles in MuJoCo: walls that a robot collides with, the hull that collides with them, and the way back.
+
+The hull and the walls have a bit of `contype` and `conaffinity` to themselves, so that a hull meets walls alone: no
+floor, no wheel and no other hull.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from mrctl.kernel import Array
+from mrctl.physics.elements import COLLISION
+from mrctl.record import InputError
+from mrctl.theory.obstacles import Box, Disc, Obstacles
+
+HULL = "hull"  # name of the hull's geom
+BIT = 2  # of contype and conaffinity; MuJoCo's default, which floors have, is 1
+GROUP = 2  # of walls: rays that look for the ground see only group 0
+HEIGHT = 0.5  # m, by which walls rise above the origin and reach below it, for floors that are not level
+TALL = 0.1  # m, height of the hull, which begins at the height of the axle
+
+
+def add(spec: mujoco.MjSpec, obstacles: Obstacles, footprint: Array) -> None:
+    """Puts obstacles into a world, and a massless hull on its robot.
+
+    Args:
+        spec: World with the body `chassis`; it is changed.
+        obstacles: The obstacles.
+        footprint: Corners of the hull in the frame of the chassis in m, `(n, 2)`.
+    """
+    add_walls(spec, obstacles)
+    chassis = spec.body("chassis")
+    _prism(spec, HULL, footprint, 0.0, TALL)
+    chassis.add_geom(
+        name=HULL, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=HULL, mass=0, contype=BIT, conaffinity=0, group=4,
+        rgba=[0.2, 0.5, 1, 0.3],
+    )  # fmt: skip
+    spec.add_sensor(
+        name=COLLISION, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=HULL,
+        intprm=[1, 0, 1],  # the number of contacts, of any kind, in one slot
+    )  # fmt: skip
+
+
+def add_walls(spec: mujoco.MjSpec, obstacles: Obstacles) -> None:
+    """Puts obstacles into a world; those that move are mocap bodies at the start of their courses, in order."""
+    for k, shape in enumerate(obstacles.shapes):
+        body, name = spec.worldbody, f"obstacle {k}"
+        if shape.course is not None:
+            x, y, theta = shape.course.sample(np.zeros(1)).pose[0]
+            body = body.add_body(name=name, mocap=True, pos=[x, y, 0], quat=quaternion(theta))
+            spec.add_text(name=name, data=json.dumps(shape.course.model_dump(mode="json")))
+        common = {"name": name, "contype": 0, "conaffinity": BIT, "group": GROUP, "rgba": [0.45, 0.43, 0.41, 1]}
+        if isinstance(shape, Disc):
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[shape.radius, HEIGHT, 0], pos=[shape.x, shape.y, 0], **common
+            )
+        elif isinstance(shape, Box):
+            size, place = [shape.length / 2, shape.width / 2, HEIGHT], [shape.x, shape.y, 0]
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=place, quat=quaternion(shape.angle), **common)
+        else:
+            _prism(spec, name, shape.vertices, -HEIGHT, HEIGHT)
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **common)
+
+
+def quaternion(angle: float) -> Array:
+    """Returns the quaternion of a rotation by an angle in rad about the vertical, `(4,)`."""
+    return np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
+
+
+def _prism(spec: mujoco.MjSpec, name: str, corners: Array, low: float, high: float) -> None:
+    """Adds the mesh of an upright prism between two heights in m; its corners are in m, `(n, 2)`."""
+    rings = [np.column_stack([corners, np.full(len(corners), z)]) for z in (low, high)]
+    spec.add_mesh(
+        name=name, uservert=np.concatenate(rings).ravel(), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+    )
+
+
+def to_mjcf(obstacles: Obstacles) -> str:
+    """Returns obstacles as the text of an MJCF file without robot and floor."""
+    spec = mujoco.MjSpec()
+    add_walls(spec, obstacles)
+    spec.compile()
+    return spec.to_xml()
+
+
+def read_mjcf(path: str | Path) -> Obstacles:
+    """Reads the obstacles of an MJCF file: fixed upright boxes and cylinders, and the outlines of meshes from above.
+
+    What moves on a course in a file of `to_mjcf` has its course again. Floors, whose tops are at most 2 cm high, are
+    no obstacles; neither are planes, height fields, and geoms that collide with nothing.
+
+    Args:
+        path: The MJCF file.
+
+    Raises:
+        InputError: The file is no MJCF, or one of its obstacles is neither an upright box or cylinder nor a mesh.
+    """
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        model = spec.compile()
+    except ValueError as error:
+        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
+    data, shapes, texts = mujoco.MjData(model), [], {text.name: text.data for text in spec.texts}
+    mujoco.mj_kinematics(model, data)
+    for geom in range(model.ngeom):
+        body = model.geom_bodyid[geom]
+        fixed = model.body_weldid[body] == 0 or model.body_mocapid[body] >= 0
+        if not fixed or not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+            continue
+        values = _outline(model, data, geom)
+        if values is None:
+            continue
+        name = model.body(body).name
+        if model.body_mocapid[body] >= 0 and name in texts:
+            values["course"] = json.loads(texts[name])
+        shapes.append(values)
+    return Obstacles.from_dict({"shapes": shapes}, str(path))
+
+
+def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | None:
+    """Returns the fields of the obstacle that a geom is, in the frame of its body if that moves; None for a floor.
+
+    Raises:
+        InputError: The geom is not upright, or its shape is another one.
+    """
+    kind, size, shape = model.geom_type[geom], model.geom_size[geom], mujoco.mjtGeom
+    if kind == shape.mjGEOM_PLANE or kind == shape.mjGEOM_HFIELD:
+        return None
+    frame, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
+    mesh = model.mesh(model.geom_dataid[geom]) if kind == shape.mjGEOM_MESH else None
+    if mesh is not None:
+        corners = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]].astype(float)
+        points = corners @ frame.T + place
+    else:
+        half = size[[0, 0, 1]] if kind == shape.mjGEOM_CYLINDER else size
+        points = place + np.abs(frame[2]) @ half * np.array([[0, 0, 1.0]])
+    if points[:, 2].max() <= 0.02:
+        return None
+    name = model.geom(geom).name or f"number {geom}"
+    body = model.geom_bodyid[geom]
+    if model.body_mocapid[body] >= 0:  # in the frame of its course
+        turn = data.body(body).xmat.reshape(3, 3)
+        frame, place, points = (
+            turn.T @ frame,
+            turn.T @ (place - data.body(body).xpos),
+            (points - data.body(body).xpos) @ turn,
+        )
+    if mesh is not None:
+        plane = points[:, :2].round(6)
+        return {"kind": "polygon", "points": plane[ConvexHull(plane).vertices].tolist()}
+    if abs(frame[2, 2]) < 1 - 1e-9 or not (kind == shape.mjGEOM_BOX or kind == shape.mjGEOM_CYLINDER):
+        raise InputError(f"geom {name}: is no upright box, cylinder or mesh")
+    values = {"x": float(place[0]), "y": float(place[1])}
+    if kind == shape.mjGEOM_CYLINDER:
+        return {"kind": "disc", "radius": float(size[0]), **values}
+    angle = float(np.arctan2(frame[1, 0], frame[0, 0]))
+    return {"kind": "box", "angle": angle, "length": 2 * float(size[0]), "width": 2 * float(size[1]), **values}

@@ -1,0 +1,75 @@
+"""A planar lidar: beams in a fan about the heading, with noise and beams that are lost."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from mrctl.kernel import Array
+from mrctl.record import Record
+from mrctl.theory.obstacles import Outlines, turned
+from mrctl.theory.rays import cast
+
+
+class Lidar(Record):
+    """A planar lidar; the values are about those of an RPLIDAR A1."""
+
+    rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    """Rate of the scans in Hz; a scan is taken at once."""
+    beams: Annotated[int, Field(ge=1, le=10_000)] = 360
+    """Number of beams of a scan."""
+    view: Annotated[float, Field(ge=0.01, le=2 * np.pi)] = 2 * np.pi
+    """Field of view in rad, half of it to either side of straight ahead."""
+    range: Annotated[float, Field(ge=0.1, le=1000)] = 12.0
+    """Largest range in m, beyond which a beam returns nothing."""
+    noise: Annotated[float, Field(ge=0, le=1)] = 0.02
+    """Standard deviation of a range in m."""
+    lost: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the beams that return nothing though they meet an obstacle."""
+    x: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    """Place of the lidar ahead of P in m."""
+
+    @property
+    def step(self) -> float:
+        """Angle from one beam to the next in rad; the beams are in the middles of equal parts of the view."""
+        return self.view / self.beams
+
+    @property
+    def first(self) -> float:
+        """Direction of the first beam from straight ahead in rad."""
+        return (self.step - self.view) / 2
+
+    def scan(self, pose: Array, outlines: Outlines, random: np.random.Generator) -> Array:
+        """Takes a scan.
+
+        Args:
+            pose: x and y of P in m and θ in rad, `(3,)`.
+            outlines: The obstacles.
+            random: Source of noise and lost beams, which always takes the same number of values from it.
+
+        Returns:
+            Ranges in m, `(beams,)`; infinite where nothing returns, as in ROS (REP 117).
+        """
+        ranges = np.empty(self.beams)
+        sensor = np.append(turned(np.array([[self.x, 0.0]]), pose)[0], pose[2])
+        cast.compiled(sensor, self.first, self.step, self.range, outlines, ranges)
+        noise, chance = random.standard_normal(self.beams), random.uniform(size=self.beams)
+        ranges[(ranges >= self.range) | (chance < self.lost)] = np.inf
+        return np.maximum(ranges + self.noise * noise, 0.0)
+
+    def points(self, ranges: Array, most: int = 10_000) -> Array:
+        """Returns the places that beams of a scan met.
+
+        Args:
+            ranges: Ranges of a scan in m, `(beams,)`.
+            most: Number of beams, evenly spread over the view, that are used at most.
+
+        Returns:
+            x and y in the robot's frame in m, `(n, 2)`; beams that returned nothing are left out.
+        """
+        used = np.arange(0, self.beams, -(-self.beams // most))
+        used = used[np.isfinite(ranges[used])]
+        angles = self.first + self.step * used
+        return ranges[used, None] * np.column_stack([np.cos(angles), np.sin(angles)]) + [self.x, 0.0]

@@ -1,0 +1,102 @@
+"""Localisation on a map: posture fixes from a lidar, by scan matching or by particles, in place of the tier's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mrctl.kernel import Array, Rows
+from mrctl.record import InputError
+from mrctl.sensing.lidar import Lidar
+from mrctl.sensing.particles import Particles
+from mrctl.sensing.scan_matching import match
+from mrctl.sensing.sensors import Sensors
+from mrctl.sensing.tiers import Sensing
+from mrctl.theory.grid import MOST_CELLS, field_of
+from mrctl.theory.obstacles import Obstacles, Surroundings
+
+CELL = 0.05  # m, of the map
+MARGIN = 1.0  # m, of the map around the obstacles
+BEAMS = {"scan": 120, "particles": 60}  # that are used of a scan
+AGREES = 0.5  # share of the points of a scan that must lie on the map for a fix
+
+
+class Localiser:
+    """Lidar and localisation of B robots, which share a map.
+
+    Attributes:
+        scans: Last scan of each robot, ranges in m, `(beams,)`; None for a robot without a lidar.
+        filters: Particle filter of each robot, or None.
+    """
+
+    def __init__(self, sensing: Sequence[Sensing], sensors: Sensors, wheel_radius: float, obstacles: Obstacles) -> None:
+        """Makes the map.
+
+        Args:
+            sensing: Sensing of each robot.
+            sensors: The sensors, whose samples of the odometry are read and whose fixes are replaced.
+            wheel_radius: Nominal radius of the driven wheels in m.
+            obstacles: The obstacles.
+
+        Raises:
+            InputError: Nothing stands still, or the map is too large.
+        """
+        self._sensing, self._sensors, self._radius = list(sensing), sensors, wheel_radius
+        self._surroundings = Surroundings(obstacles)
+        still = Obstacles(shapes=tuple(shape for shape in obstacles.shapes if shape.course is None))
+        if not still.shapes:
+            raise InputError("sensing.localisation: no obstacle stands still, so there is no map to localise on")
+        low, high = (corner + side * MARGIN for corner, side in zip(still.bounds, (-1, 1), strict=True))
+        cell = max(CELL, float(np.sqrt(np.prod(high - low) / MOST_CELLS)) * 1.01)
+        self._map = field_of(Surroundings(still).at(0.0), low, high, cell)
+        self.scans: list[Array | None] = [None] * len(sensing)
+        self.filters: list[Particles | None] = [None] * len(sensing)
+        self._random = [np.random.default_rng()] * len(sensing)
+        self._odometry = np.zeros((len(sensing), 2))  # way in m and turn in rad since the last scan
+
+    def start(self, row: int, pose: Array, seed: int) -> None:
+        """Starts one robot at an estimate of its pose.
+
+        Args:
+            row: Index of the robot.
+            pose: x and y in m and θ in rad, `(3,)`.
+            seed: Seed of its lidar and its particles.
+        """
+        self._random[row], self._odometry[row] = np.random.default_rng([seed, 6]), 0.0
+        if self._sensing[row].localisation == "particles":
+            self.filters[row] = Particles(self._map, seed, pose.copy())
+
+    def locate(self, tick: int, plant: Rows, estimate: Array) -> None:
+        """Adds up the odometry, and takes scans and makes fixes of them in the ticks in which fixes are taken.
+
+        Args:
+            tick: Control tick.
+            plant: Record of `PLANT` of each robot, `(B,)`; its true pose is where the lidar is.
+            estimate: Estimated x, y in m, θ in rad, V in m/s and θ̇ in rad/s of a period ago, `(B, 5)`.
+        """
+        sensors, period = self._sensors, self._sensors.period
+        now, last = sensors.ring[tick % len(sensors.ring)], sensors.ring[(tick - 1) % len(sensors.ring)]
+        begun = tick > sensors.sensors["start"]
+        self._odometry[:, 0] += begun * self._radius * (now["encoder"] - last["encoder"]).mean(axis=1)
+        self._odometry[:, 1] += begun * period * (now["gyro"] + last["gyro"]) / 2
+        for row in np.flatnonzero(now["fix_taken"] & ~plant["failed"]):
+            sensing, since = self._sensing[row], tick - sensors.sensors["start"][row]
+            if sensing.localisation == "fixes":
+                continue
+            lidar: Lidar = sensing.lidar
+            around = self._surroundings.at(since * period)
+            scan = lidar.scan(plant["reading"]["pose"][row], around, self._random[row])
+            self.scans[row], points = scan, lidar.points(scan, BEAMS[sensing.localisation])
+            if particles := self.filters[row]:
+                found = particles.update(float(self._odometry[row, 0]), float(self._odometry[row, 1]), points)
+            elif since == 0:
+                continue  # there is no estimate yet
+            else:
+                x, y, theta, v, omega = estimate[row]
+                guess = np.array(
+                    [x + v * period * np.cos(theta), y + v * period * np.sin(theta), theta + omega * period]
+                )
+                found, share = match(points, guess, self._map)
+                now["fix_arrives"][row] &= share >= AGREES
+            now["fix"][row], self._odometry[row] = found, 0.0

@@ -1,0 +1,136 @@
+"""How far a robot is from what stands in its way: footprints as convex polygons or as discs, and their clearance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrctl.kernel import Array, kernel
+from mrctl.theory.obstacles import Outlines, Surroundings, moved
+
+
+def cover(footprint: Array, count: int = 3) -> Array:
+    """Covers a footprint with equal discs in a row (Ziegler and Stiller, "Fast collision checking for intelligent
+    vehicle motion planning", IEEE Intelligent Vehicles Symposium 2010).
+
+    Args:
+        footprint: Corners in the robot's frame in m, `(n, 2)`.
+        count: Number of discs along the x axis.
+
+    Returns:
+        x and y of the centres in the robot's frame and radius in m, `(count, 3)`.
+    """  # noqa: D205
+    low, high = footprint.min(axis=0), footprint.max(axis=0)
+    slice_length = (high[0] - low[0]) / count
+    x = low[0] + slice_length * (np.arange(count) + 0.5)
+    y, radius = (low[1] + high[1]) / 2, np.hypot(slice_length, high[1] - low[1]) / 2
+    return np.column_stack([x, np.full(count, y), np.full(count, radius)])
+
+
+def clearance(footprint: Array, pose: Array, outlines: Outlines) -> float:
+    """Returns the distance in m between a footprint and the nearest obstacle.
+
+    Where they overlap it is minus the depth, the least translation that separates them; it is infinite where there is
+    no obstacle.
+
+    Args:
+        footprint: Corners in the robot's frame, counter-clockwise, in m, `(n, 2)`.
+        pose: x and y of P in m and θ in rad, `(3,)`.
+        outlines: The obstacles.
+    """
+    return gap.compiled(footprint, np.asarray(pose, float), np.empty((len(footprint), 4)), outlines)
+
+
+def clearances(footprint: Array, poses: Array, times: Array, surroundings: Surroundings) -> Array:
+    """Returns the clearance of a robot at each moment of a run.
+
+    Args:
+        footprint: Corners in the robot's frame, counter-clockwise, in m, `(n, 2)`.
+        poses: x and y of P in m and θ in rad, `(T, 3)`; the clearance of a pose with NaN is NaN.
+        times: Times in s, `(T,)`.
+        surroundings: The obstacles.
+
+    Returns:
+        Clearances in m, as those of `clearance`, `(T,)`.
+    """
+    scratch, courses = np.empty((len(footprint), 4)), surroundings.poses(np.asarray(times, float))
+    outlines, found = surroundings.at(0.0), np.full(len(poses), np.nan)
+    for k in np.flatnonzero(np.isfinite(poses).all(axis=1)):
+        if surroundings.courses:
+            outlines = surroundings.placed(courses[k])
+        found[k] = gap.compiled(footprint, poses[k], scratch, outlines)
+    return found
+
+
+@kernel
+def gap(footprint: Array, pose: Array, sides: Array, outlines: Outlines) -> float:
+    """Returns what `clearance` does; `sides` is scratch, `(n, 4)`."""
+    discs, edges, first, rings = outlines
+    n, nearest, reach = len(footprint), np.inf, 0.0
+    for k in range(n):
+        following = (k + 1) % n
+        sides[k, 0], sides[k, 1] = moved(pose, footprint[k, 0], footprint[k, 1])
+        sides[k, 2], sides[k, 3] = moved(pose, footprint[following, 0], footprint[following, 1])
+        reach = max(reach, np.hypot(footprint[k, 0], footprint[k, 1]))
+    for k in range(len(discs)):
+        x, y, radius = discs[k]
+        if np.hypot(x - pose[0], y - pose[1]) - radius - reach < nearest:
+            nearest = min(nearest, point_to_polygon(x, y, sides) - radius)
+    for k in range(len(rings)):
+        x, y, radius = rings[k]
+        if np.hypot(x - pose[0], y - pose[1]) - radius - reach < nearest:
+            nearest = min(nearest, polygon_to_polygon(sides, edges[first[k] : first[k + 1]]))
+    return nearest
+
+
+@kernel
+def point_to_segment(x: float, y: float, side: Array) -> float:
+    """Returns the distance of a point from a segment, x and y of its start and end, `(4,)`; all in m."""
+    dx, dy = side[2] - side[0], side[3] - side[1]
+    along = ((x - side[0]) * dx + (y - side[1]) * dy) / (dx * dx + dy * dy)
+    along = min(max(along, 0.0), 1.0)
+    return np.hypot(x - side[0] - along * dx, y - side[1] - along * dy)
+
+
+@kernel
+def outside(x: float, y: float, side: Array) -> float:
+    """Returns how far a point is to the right of the line through a side, `(4,)`; all in m."""
+    dx, dy = side[2] - side[0], side[3] - side[1]
+    return ((x - side[0]) * dy - (y - side[1]) * dx) / np.hypot(dx, dy)
+
+
+@kernel
+def point_to_polygon(x: float, y: float, sides: Array) -> float:
+    """Returns the distance of a point from a convex polygon, counter-clockwise sides `(n, 4)`; negative inside."""
+    depth, distance = -np.inf, np.inf
+    for k in range(len(sides)):
+        depth = max(depth, outside(x, y, sides[k]))
+        distance = min(distance, point_to_segment(x, y, sides[k]))
+    return depth if depth <= 0.0 else distance
+
+
+@kernel
+def polygon_to_polygon(a: Array, b: Array) -> float:
+    """Returns the distance of two convex polygons, counter-clockwise sides `(n, 4)` and `(m, 4)`; minus the depth of
+    penetration where they overlap, by the theorem of separating axes (Ericson, Real-Time Collision Detection, 2005).
+    """  # noqa: D205
+    separation = max(_separation(a, b), _separation(b, a))
+    if separation <= 0.0:
+        return separation
+    distance = np.inf
+    for i in range(len(a)):
+        for k in range(len(b)):
+            distance = min(distance, point_to_segment(a[i, 0], a[i, 1], b[k]))
+            distance = min(distance, point_to_segment(b[k, 0], b[k, 1], a[i]))
+    return distance
+
+
+@kernel
+def _separation(a: Array, b: Array) -> float:
+    """Returns the largest gap between two polygons along a normal of the first one; negative where none separates."""
+    largest = -np.inf
+    for i in range(len(a)):
+        least = np.inf
+        for k in range(len(b)):
+            least = min(least, outside(b[k, 0], b[k, 1], a[i]))
+        largest = max(largest, least)
+    return largest

@@ -1,0 +1,214 @@
+"""Space as cells: occupancy, and the distance of every cell from what occupies others."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from mrctl.kernel import Array, kernel
+from mrctl.record import InputError
+from mrctl.theory.clearance import point_to_polygon
+from mrctl.theory.obstacles import Outlines
+
+MOST_CELLS = 20_000_000
+
+
+class Grid(NamedTuple):
+    """Which cells of a rectangle are occupied."""
+
+    occupied: NDArray[np.bool]
+    """Whether an obstacle touches the cell, `(rows, columns)`: rows go up y, columns along x."""
+    origin: Array
+    """Lower left corner of the first cell in m, `(2,)`."""
+    resolution: float
+    """Side of a cell in m."""
+
+
+class Field(NamedTuple):
+    """Distance from the nearest occupied cell; `at` interpolates it."""
+
+    distance: Array
+    """Distance of each cell's centre in m, negative in occupied cells, `(rows, columns)`."""
+    origin: Array
+    """Lower left corner of the first cell in m, `(2,)`."""
+    resolution: float
+    """Side of a cell in m."""
+
+
+def check_size(rows: int, columns: int, name: str) -> None:
+    """Refuses a grid of more than 20 million cells.
+
+    Raises:
+        InputError: It has more; the message begins with the name.
+    """
+    if rows * columns > MOST_CELLS:
+        raise InputError(f"{name}: {columns} by {rows} cells are more than {MOST_CELLS:,}")
+
+
+def occupancy(outlines: Outlines, low: Array, high: Array, resolution: float) -> Grid:
+    """Rasterises obstacles: a cell is occupied if an obstacle comes within half its diagonal of its centre.
+
+    No cell that an obstacle touches is therefore free.
+
+    Args:
+        outlines: The obstacles.
+        low: Lower left corner of the rectangle in m, `(2,)`.
+        high: Its upper right corner in m, `(2,)`.
+        resolution: Side of a cell in m.
+
+    Raises:
+        InputError: The rectangle is empty, or has too many cells.
+    """
+    grid = _empty(low, high, resolution)
+    occupy.compiled(outlines, grid)
+    return grid
+
+
+def _empty(low: Array, high: Array, resolution: float) -> Grid:
+    """Returns a grid with nothing in it; the arguments and errors are those of `occupancy`."""
+    columns, rows = (int(n) for n in np.ceil((np.asarray(high) - low) / resolution - 1e-9))
+    if rows < 1 or columns < 1:
+        raise InputError("grid: the rectangle is empty")
+    check_size(rows, columns, "grid")
+    return Grid(np.zeros((rows, columns), bool), np.array(low, float), float(resolution))
+
+
+@kernel
+def occupy(outlines: Outlines, grid: Grid) -> None:
+    """Marks the cells of a grid that obstacles touch."""
+    discs, edges, first, rings = outlines
+    occupied, origin, resolution = grid
+    rows, columns = occupied.shape
+    reach = resolution / np.sqrt(2.0)
+    for shape in range(len(discs) + len(rings)):
+        ring = shape - len(discs)
+        x, y, radius = discs[shape] if ring < 0 else rings[ring]
+        left, right = (x - radius - reach - origin[0]) / resolution, (x + radius + reach - origin[0]) / resolution
+        low, high = (y - radius - reach - origin[1]) / resolution, (y + radius + reach - origin[1]) / resolution
+        for i in range(max(0, int(np.floor(low))), min(rows - 1, int(np.floor(high))) + 1):
+            for k in range(max(0, int(np.floor(left))), min(columns - 1, int(np.floor(right))) + 1):
+                px, py = origin[0] + (k + 0.5) * resolution, origin[1] + (i + 0.5) * resolution
+                if ring < 0:
+                    distance = np.hypot(px - x, py - y) - radius
+                else:
+                    distance = point_to_polygon(px, py, edges[first[ring] : first[ring + 1]])
+                if distance <= reach:
+                    occupied[i, k] = True
+
+
+def distance_field(grid: Grid) -> Field:
+    """Returns the distance field of a grid; where nothing is occupied it is the diagonal of the grid.
+
+    The border between an occupied and a free cell has distance 0 (Maurer, Qi and Raghavan, IEEE PAMI 25(2), 2003, for
+    the transform, which is that of SciPy).
+    """
+    occupied = grid.occupied
+    if not occupied.any():
+        distance = np.full(occupied.shape, float(np.hypot(*occupied.shape)))
+    else:
+        distance = _transform(~occupied) - 0.5
+        if not occupied.all():
+            distance = np.where(occupied, 0.5 - _transform(occupied), distance)
+    return Field(np.ascontiguousarray(distance * grid.resolution), grid.origin, grid.resolution)
+
+
+def field_of(outlines: Outlines, low: Array, high: Array, resolution: float) -> Field:
+    """Returns the distance of each cell's centre from the obstacles themselves, without cells in between.
+
+    The arguments and errors are those of `occupancy`.
+    """
+    grid = _empty(low, high, resolution)
+    field = Field(np.empty(grid.occupied.shape), grid.origin, grid.resolution)
+    measure.compiled(outlines, field)
+    return field
+
+
+@kernel
+def measure(outlines: Outlines, field: Field) -> None:
+    """Writes the distances of `field_of` into the field."""
+    discs, edges, first, rings = outlines
+    distance, origin, resolution = field
+    rows, columns = distance.shape
+    for i in range(rows):
+        for k in range(columns):
+            x, y = origin[0] + (k + 0.5) * resolution, origin[1] + (i + 0.5) * resolution
+            nearest = resolution * np.hypot(rows, columns)
+            for n in range(len(discs)):
+                nearest = min(nearest, np.hypot(discs[n, 0] - x, discs[n, 1] - y) - discs[n, 2])
+            for p in range(len(rings)):
+                if np.hypot(rings[p, 0] - x, rings[p, 1] - y) - rings[p, 2] < nearest:
+                    nearest = min(nearest, point_to_polygon(x, y, edges[first[p] : first[p + 1]]))
+            distance[i, k] = nearest
+
+
+def _transform(cells: NDArray[np.bool]) -> Array:
+    """Returns the distance of each cell that is set from the nearest one that is not, in cells, and 0 elsewhere."""
+    return np.asarray(distance_transform_edt(cells), float)
+
+
+@kernel
+def at(field: Field, x: float, y: float) -> tuple[float, float, float]:
+    """Returns the distance in m at a point and its gradient, interpolated between the centres of four cells.
+
+    Outside the grid it is that of the nearest cell, and the gradient is 0.
+
+    Args:
+        field: The field.
+        x: x of the point in m.
+        y: y of the point in m.
+    """
+    distance, origin, resolution = field
+    rows, columns = distance.shape
+    column, row = (x - origin[0]) / resolution - 0.5, (y - origin[1]) / resolution - 0.5
+    inside = 0.0 <= column <= columns - 1 and 0.0 <= row <= rows - 1
+    column, row = min(max(column, 0.0), columns - 1.0), min(max(row, 0.0), rows - 1.0)
+    k, i = min(int(column), max(columns - 2, 0)), min(int(row), max(rows - 2, 0))
+    k1, i1 = min(k + 1, columns - 1), min(i + 1, rows - 1)
+    u, v = column - k, row - i
+    a, b, c, d = distance[i, k], distance[i, k1], distance[i1, k], distance[i1, k1]
+    value = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
+    if not inside:
+        return value, 0.0, 0.0
+    return value, ((1 - v) * (b - a) + v * (d - c)) / resolution, ((1 - u) * (c - a) + u * (d - b)) / resolution
+
+
+def rectangles(occupied: NDArray[np.bool]) -> NDArray[np.int64]:
+    """Covers the occupied cells with rectangles, none of which could be larger; they may overlap.
+
+    Each begins at the first cell that none covers yet, row by row, and grows to the right, up, to the left and down.
+
+    Args:
+        occupied: Whether each cell is occupied, `(rows, columns)`.
+
+    Returns:
+        First column, first row, and the column and row after the last ones of each, `(n, 4)`.
+    """
+    found = np.empty((int(np.count_nonzero(occupied)), 4), np.int64)
+    return found[: cover_cells.compiled(occupied, np.zeros(occupied.shape, np.bool_), found)].copy()
+
+
+@kernel
+def cover_cells(occupied: NDArray[np.bool], covered: NDArray[np.bool], found: NDArray[np.int64]) -> int:
+    """Does what `rectangles` says; `covered` is scratch, and `found` has a row for each occupied cell. Returns n."""
+    rows, columns = occupied.shape
+    n = 0
+    for i in range(rows):
+        for k in range(columns):
+            if not occupied[i, k] or covered[i, k]:
+                continue
+            left, low, right, high = k, i, k + 1, i + 1
+            while right < columns and occupied[i, right]:
+                right += 1
+            while high < rows and occupied[high, left:right].all():
+                high += 1
+            while left > 0 and occupied[low:high, left - 1].all():
+                left -= 1
+            while low > 0 and occupied[low - 1, left:right].all():
+                low -= 1
+            covered[low:high, left:right] = True
+            found[n, 0], found[n, 1], found[n, 2], found[n, 3] = left, low, right, high
+            n += 1
+    return n

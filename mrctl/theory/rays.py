@@ -1,0 +1,77 @@
+"""Ray casting on the plane: how far a beam goes until it meets an obstacle."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrctl.kernel import Array, kernel
+from mrctl.theory.obstacles import Outlines
+
+SLACK = 1e-9  # rad, by which a beam may miss the end of an edge and still meet it; two edges meet there
+
+
+@kernel
+def cast(pose: Array, first: float, step: float, reach: float, outlines: Outlines, ranges: Array) -> None:
+    """Casts the beams of a planar lidar at obstacles.
+
+    Beam k leaves in the direction θ + first + k step. Each obstacle is cut only with the beams within the angle that it
+    covers, as seen from the sensor, so that the effort is that of the obstacles plus that of the beams that meet them.
+
+    Args:
+        pose: x and y of the sensor in m and θ in rad, `(3,)`.
+        first: Direction of the first beam from θ in rad.
+        step: Angle from one beam to the next in rad, positive.
+        reach: Largest range in m.
+        outlines: The obstacles.
+        ranges: Out: ranges in m, `(n,)`; `reach` where nothing is met.
+    """
+    discs, edges, firsts, rings = outlines
+    n = len(ranges)
+    ranges[:] = reach
+    x, y, turn = pose[0], pose[1], pose[2] + first
+    for k in range(len(discs)):
+        dx, dy, radius = discs[k, 0] - x, discs[k, 1] - y, discs[k, 2]
+        distance = np.sqrt(dx * dx + dy * dy)
+        if distance - radius >= reach:
+            continue
+        half = np.pi if distance <= radius else np.arcsin(radius / distance)
+        towards = np.arctan2(dy, dx) - half - turn
+        towards -= 2 * np.pi * np.floor(towards / (2 * np.pi))
+        for lap in range(2):  # an angle that crosses the first beam's is also below it
+            start = towards - 2 * np.pi * lap
+            for beam in range(max(0, int(np.ceil((start - SLACK) / step))), n):
+                angle = beam * step
+                if angle > start + 2 * half + SLACK:
+                    break
+                along = dx * np.cos(turn + angle) + dy * np.sin(turn + angle)
+                across = dx * np.sin(turn + angle) - dy * np.cos(turn + angle)
+                root = radius * radius - across * across
+                if root < 0.0:
+                    continue
+                met = along - np.sqrt(root)
+                if met < 0.0:  # the sensor is inside
+                    met = along + np.sqrt(root)
+                if 0.0 <= met < ranges[beam]:
+                    ranges[beam] = met
+    for p in range(len(rings)):
+        if np.hypot(rings[p, 0] - x, rings[p, 1] - y) - rings[p, 2] >= reach:
+            continue
+        for k in range(firsts[p], firsts[p + 1]):
+            ax, ay, bx, by = edges[k, 0] - x, edges[k, 1] - y, edges[k, 2] - x, edges[k, 3] - y
+            ex, ey = bx - ax, by - ay
+            area = ax * by - ay * bx  # twice that of the triangle with the sensor; its sign tells the side
+            begin = np.arctan2(ay, ax) if area >= 0.0 else np.arctan2(by, bx)
+            width = np.arctan2(abs(area), ax * bx + ay * by)
+            towards = begin - turn
+            towards -= 2 * np.pi * np.floor(towards / (2 * np.pi))
+            for lap in range(2):
+                start = towards - 2 * np.pi * lap
+                for beam in range(max(0, int(np.ceil((start - SLACK) / step))), n):
+                    angle = beam * step
+                    if angle > start + width + SLACK:
+                        break
+                    across = np.cos(turn + angle) * ey - np.sin(turn + angle) * ex
+                    if across != 0.0:
+                        met = area / across
+                        if 0.0 <= met < ranges[beam]:
+                            ranges[beam] = met

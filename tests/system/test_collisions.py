@@ -1,0 +1,144 @@
+"""Robots and obstacles in physics: hulls, collisions, and that nothing changes where there are none."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from mrctl import Box, Circle, Disc, InputError, Line, Obstacles, Polygon, Scenario, load_robot, simulate
+from mrctl.navigation.generators import warehouse
+from mrctl.physics import mjcf
+from mrctl.physics.elements import COLLISION
+from mrctl.physics.files import models_folder
+from mrctl.physics.hull import footprint
+from mrctl.physics.obstacles import read_mjcf, to_mjcf
+from mrctl.physics.parameters import read_robot
+from mrctl.theory.clearance import clearance
+from mrctl.theory.obstacles import Surroundings
+
+ROBOTS = {
+    "car": {"steering": "compliant"},
+    "turtlebot": {"steering": "caster", "robot": load_robot("turtlebot")},
+    "racecar": {"steering": "rigid", "robot": load_robot("racecar")},
+}
+MIXED = Obstacles(
+    shapes=(
+        Disc(x=1.0, y=0.9, radius=0.3), Box(x=-0.5, y=-1.0, angle=0.4, length=1.5, width=0.2),
+        Polygon(points=((0.5, -0.5), (1.5, -0.9), (1.2, -0.2))), Disc(x=-1, y=1, radius=0.05),
+        Box(length=0.3, width=0.1, course=Circle(radius=0.7, period=5.0)),
+    )
+)  # fmt: skip
+
+
+def test_footprints():
+    """The footprint is what is known of each robot: the data sheet's circle, or the outermost parts with the wheels."""
+    car, rigid = (footprint(mjcf.load(steering=steering)) for steering in ("compliant", "rigid"))
+    # Rear tyres: radius 98 mm, outer face at 188 + 22.5 mm; front wheel: 400 − 30 + 75 mm, without trail 400 + 75 mm.
+    assert (car.min(axis=0), car.max(axis=0)) == (pytest.approx([-0.098, -0.2105]), pytest.approx([0.445, 0.2105]))
+    assert rigid.max(axis=0)[0] == pytest.approx(0.475)
+    turtlebot = footprint(mjcf.load(**ROBOTS["turtlebot"]))
+    assert np.hypot(*turtlebot.T) == pytest.approx(0.177, rel=0.01)  # the bumper
+    racecar = footprint(mjcf.load(**ROBOTS["racecar"]))
+    straight = 0.12065 + 0.01905  # outer face of a front wheel
+    limit = mjcf.load(**ROBOTS["racecar"]).joint("steering_front_left").range[1]
+    assert racecar.max(axis=0)[1] > straight and limit > 0
+    for corners in (car, rigid, turtlebot, racecar):
+        sides = np.roll(corners, -1, axis=0) - corners
+        assert np.all(sides[:, 0] * np.roll(sides[:, 1], -1) > sides[:, 1] * np.roll(sides[:, 0], -1))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_hull_weighs_nothing(name):
+    """With an obstacle far away a run has the same bits; the robot's parameters are the same."""
+    far = Obstacles(shapes=(Disc(x=40),))
+    assert read_robot(mjcf.load(**ROBOTS[name], obstacles=far)) == read_robot(mjcf.load(**ROBOTS[name]))
+    run = Scenario(**ROBOTS[name], reference=Line(length=0.6, speed=0.3), laps=1)
+    alone, beside = simulate(run), simulate(run.replace(obstacles=far))
+    assert "clearance" not in alone and beside["clearance"].min() > 30
+    for signal in ("x", "y", "theta", "voltage_left", "gyro"):
+        assert np.array_equal(alone[signal], beside[signal])
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_contact_is_overlap(name):
+    """MuJoCo has a contact of the hull where the footprint overlaps an obstacle, at all but 2 mm."""
+    model = mjcf.load(**ROBOTS[name], obstacles=MIXED)
+    data, corners, outlines = mujoco.MjData(model), footprint(model), Surroundings(MIXED).at(0.0)
+    hits = 0
+    for pose in np.random.default_rng(0).uniform([-2, -2, -4], [2, 2, 4], (400, 3)):
+        data.qpos[:7] = *pose[:2], model.body("chassis").pos[2], np.cos(pose[2] / 2), 0, 0, np.sin(pose[2] / 2)
+        mujoco.mj_forward(model, data)
+        touches, gap = data.sensor(COLLISION).data[0] > 0, clearance(corners, pose, outlines)
+        hits += touches
+        assert abs(gap) < 1e-3 or touches == (gap < 0)
+    assert 50 < hits < 350
+    floor = {g for c in data.contact for g in c.geom}
+    assert model.geom("hull").id not in floor or hits  # it is high above the floor in any case
+
+
+def wall(x):
+    """A wall across the line that the robots drive along."""
+    return Obstacles(shapes=(Box(x=x, length=0.1, width=2.0),))
+
+
+def test_collision_ends_the_run():
+    """The run ends in the tick in which the footprint reaches the wall, with the reason."""
+    run = Scenario(reference=Line(length=1.0, speed=0.5), laps=1, obstacles=wall(1.0), initial_spread=(0, 0, 0))
+    result = simulate(run)
+    assert bool(result["failed"]) and str(result["failure"].values) == "collision"
+    before = float(result["clearance"].dropna("time")[-1])
+    assert 0 < before < 0.5 * 0.02  # a tick earlier it was at most two ticks' way off
+    front = 0.95 - footprint(mjcf.load())[:, 0].max()
+    assert float(result["failure_time"]) == pytest.approx(front / 0.5, abs=0.05)
+    assert not simulate(run.replace(obstacles=wall(1.6)))["failed"]
+
+
+def test_start_in_an_obstacle():
+    """A robot that would start in a collision is refused with one line."""
+    with pytest.raises(InputError, match=r"initial_pose: the robot would stand in an obstacle at \("):
+        simulate(Scenario(reference=Line(), laps=1, obstacles=wall(0.3)))
+
+
+def test_batch_equals_single():
+    """Moving obstacles are at the same places for one robot and for many, and robots collide at the same tick."""
+    chaser = Box(x=-0.9, y=-0.4, length=0.3, width=0.3, course=Line(heading=1.5707963, speed=0.5))
+    sides = Disc(x=0.5, y=2, radius=0.2), Disc(x=1.5, radius=0.3, y=0.5)
+    runs = [
+        Scenario(
+            reference=Line(length=1.2, speed=0.4), laps=1, seed=seed, obstacles=Obstacles(shapes=(*sides[:k], chaser)),
+            perturbation={"mass_factor": 1.0 + 0.2 * seed, "payload": 1.0 * k},
+        )
+        for k in (1, 2) for seed in range(3)
+    ]  # fmt: skip
+    together = simulate(runs)
+    assert together["failed"].all()
+    for row in (0, 5):
+        alone = simulate(runs[row])
+        for name in ("x", "voltage_left", "clearance"):
+            size = alone.sizes["time"]
+            assert np.array_equal(alone[name], together[name][row, :size], equal_nan=True)
+        assert alone["failure_time"] == together["failure_time"][row]
+    assert together["failure_time"].values[0] < 2.0  # the box comes from the right, and meets the robot's side
+
+
+def test_mjcf(tmp_path):
+    """Obstacles come back from MJCF as they were, with their courses; a floor is none."""
+    (tmp_path / "a.xml").write_text(to_mjcf(MIXED))
+    found = read_mjcf(tmp_path / "a.xml")
+    assert [shape.kind for shape in found.shapes] == [shape.kind for shape in MIXED.shapes]
+    before, after = (Surroundings(obstacles).at(1.3) for obstacles in (MIXED, found))
+    assert np.allclose(before.discs, after.discs, atol=1e-6)
+    assert np.allclose(sorted(before.edges.tolist()), sorted(after.edges.tolist()), atol=2e-6)
+    assert read_mjcf(models_folder() / "patch.xml").shapes == ()
+    (tmp_path / "b.xml").write_text(
+        '<mujoco><worldbody><geom name="log" type="capsule" size="1 1" zaxis="1 0 0"/></worldbody></mujoco>'
+    )
+    with pytest.raises(InputError, match="geom log: is no upright box, cylinder or mesh"):
+        read_mjcf(tmp_path / "b.xml")
+
+
+def test_world_of_a_generator():
+    """A generated world compiles with every robot."""
+    task = warehouse(1.2)
+    model = mjcf.load(**ROBOTS["turtlebot"], obstacles=task.obstacles)
+    names = [model.geom(k).name for k in range(model.ngeom)]
+    assert sum(name.startswith("obstacle") for name in names) == len(task.obstacles.shapes)

@@ -1,0 +1,49 @@
+"""Runs whose posture fixes come from a lidar on the map."""
+
+import numpy as np
+import pytest
+
+from mrctl import Box, Circle, Disc, InputError, Obstacles, Scenario, simulate
+from mrctl.sensing.tiers import Sensing
+
+WALLS = tuple(
+    Box(x=x, y=y, length=0.2 + 6 * (x == 0), width=0.2 + 5 * (y == 0)) for x, y in ((3, 0), (-3, 0), (0, 3), (0, -3))
+)
+ROOM = Obstacles(shapes=(*WALLS, Disc(x=-2, y=2, radius=0.3), Disc(x=2, y=-1.8, radius=0.2, course=Circle(radius=0.3))))
+RUNS = [
+    Scenario(
+        reference=Circle(radius=0.8, period=8.0), laps=1, learner="none", obstacles=ROOM, seed=seed,
+        sensing=Sensing(tier="field", localisation=("scan", "particles")[seed % 2]),
+    )
+    for seed in range(4)
+]  # fmt: skip
+
+
+def test_estimate_and_bits():
+    """The filter with such fixes errs by less than 20 mm; a run in a batch has the bits of the run alone."""
+    together = simulate(RUNS)
+    assert not together["failed"].any()
+    error = np.hypot(together["x_measured"] - together["x"], together["y_measured"] - together["y"])
+    assert np.sqrt(np.square(error).mean()) < 0.02
+    fixes = np.isfinite(together["fix_x"]).sum("time")
+    assert np.all(fixes >= 75)  # ten in each of eight seconds, but for the first and those on their way
+    for row in (2, 3):
+        alone = simulate(RUNS[row])
+        for name in ("x", "fix_x", "x_measured", "voltage_left"):
+            assert np.array_equal(alone[name], together[name][row], equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"obstacles": Obstacles()}, "sensing.localisation: no obstacle stands still"),
+        ({"sensing": {"localisation": "scan", "lidar": {"rate": 30}}}, "sensing.lidar.rate: 30 Hz is no whole"),
+        ({"sensing": {"localisation": "scan", "fix_rate": 10}}, "sensing.fix_rate: with a lidar"),
+        ({"sensing": {"localisation": "scan", "lidar": {"beams": 0}}}, "sensing.lidar.beams: "),
+    ],
+)
+def test_refused(changes, message):
+    """Localisation without a map, and rates that do not fit, are refused with one line."""
+    with pytest.raises(InputError) as error:
+        simulate(Scenario.from_dict(RUNS[0].model_dump() | changes))
+    assert message in str(error.value) and "\n" not in str(error.value)

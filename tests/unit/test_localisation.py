@@ -1,0 +1,168 @@
+"""The lidar, scan matching and the particle filter, in rooms with obstacles at random places."""
+
+import numpy as np
+import pytest
+from test_obstacles import random_shapes
+
+from mrctl import Box, Disc, Obstacles
+from mrctl.sensing.lidar import Lidar
+from mrctl.sensing.particles import LEAST, MOST, Particles
+from mrctl.sensing.scan_matching import match
+from mrctl.theory.clearance import clearance
+from mrctl.theory.grid import at, field_of
+from mrctl.theory.obstacles import Surroundings, turned
+
+LIDAR = Lidar()
+BODY = 0.2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+
+
+class Room:
+    """A room of 7 m with nine obstacles, its map, and free poses in it."""
+
+    def __init__(self, seed):
+        sides = ((3.5, 0), (-3.5, 0), (0, 3.5), (0, -3.5))
+        walls = [Box(x=x, y=y, length=0.2 + 7 * (x == 0), width=0.2 + 7 * (y == 0)) for x, y in sides]
+        self.random = np.random.default_rng(seed)
+        self.outlines = Surroundings(Obstacles(shapes=(*walls, *random_shapes(self.random, 9).shapes))).at(0.0)
+        self.field = field_of(self.outlines, np.full(2, -4.0), np.full(2, 4.0), 0.05)
+
+    def free(self):
+        while True:
+            pose = self.random.uniform([-3, -3, -3], [3, 3, 3])
+            if clearance(BODY, pose, self.outlines) > 0.1:
+                return pose
+
+    def points(self, pose, most=60):
+        return LIDAR.points(LIDAR.scan(pose, self.outlines, self.random), most)
+
+    def drive(self, steps):
+        """A random drive at 0.5 m/s with 10 scans a second: poses, and odometry that is 2 % wrong."""
+        pose, rate = self.free(), 0.0
+        for _ in range(steps):
+            for trial in range(40):
+                rate = np.clip(rate + self.random.normal(0, 0.5), -1.5, 1.5) if trial < 20 else 1.5
+                way, turn = 0.05 * (trial < 30), 0.1 * rate
+                middle = pose[2] + turn / 2
+                moved = pose + [way * np.cos(middle), way * np.sin(middle), turn]
+                if clearance(BODY, moved, self.outlines) > 0.05:
+                    break
+            pose = moved
+            yield pose, 1.02 * way, 1.02 * turn + self.random.normal(0, 0.002)
+
+
+def errors(found, pose):
+    """Errors of position in m and of heading in rad."""
+    return np.hypot(*(found - pose)[:2]), (found[2] - pose[2] + np.pi) % (2 * np.pi) - np.pi
+
+
+def test_lidar():
+    """Noise and lost beams have the stated sizes, and the points lie where the beams met the wall."""
+    wall = Surroundings(Obstacles(shapes=(Box(x=3, length=1, width=20),))).at(0.0)
+    lidar = Lidar(beams=4000, view=1.0, noise=0.03, lost=0.2, x=0.25)
+    ranges = lidar.scan(np.array([0.5, 0.3, 0.0]), wall, np.random.default_rng(0))
+    met = np.isfinite(ranges)
+    assert met.mean() == pytest.approx(0.8, abs=0.03)
+    angles = lidar.first + lidar.step * np.arange(4000)
+    assert angles[[0, -1]] == pytest.approx([-0.5, 0.5], abs=1e-3)
+    error = ranges[met] - 1.75 / np.cos(angles[met])
+    assert (error.mean(), error.std()) == (pytest.approx(0, abs=2e-3), pytest.approx(0.03, rel=0.05))
+    exact = lidar.replace(noise=0.0)
+    points = exact.points(exact.scan(np.array([0.5, 0.3, 0.0]), wall, np.random.default_rng(0)), 100)
+    assert 60 < len(points) <= 100 and points[:, 0] == pytest.approx(2.0)
+    assert np.isinf(Lidar(range=1.0).scan(np.zeros(3), wall, np.random.default_rng(0))).all()
+
+
+def test_field():
+    """The field of shapes is their distance, up to the interpolation between cells."""
+    room = Room(0)
+    for x, y in room.random.uniform(-3.9, 3.9, (100, 2)):
+        speck = np.array([[-1e-6, -1e-6], [1e-6, -1e-6], [0, 1e-6]])
+        found = at(room.field, x, y)[0]
+        assert found == pytest.approx(clearance(speck, np.array([x, y, 0]), room.outlines), abs=0.02)
+
+
+def test_match():
+    """From 0.3 m and 0.2 rad beside the truth, with a fifth of the beams on things that the map lacks."""
+    found = []
+    for seed in range(40):
+        room = Room(seed)
+        pose = room.free()
+        points = room.points(pose, 120)
+        points[::5] *= room.random.uniform(0.3, 0.9, (len(points[::5]), 1))
+        result, share = match(points, pose + room.random.uniform(-1, 1, 3) * [0.21, 0.21, 0.2], room.field)
+        found.append((*errors(result, pose), share))
+    position, heading, share = np.array(found).T
+    near = position < 0.05
+    print(f"{near.sum()} of 40, {1e3 * np.sqrt(np.mean(position[near] ** 2)):.1f} mm")
+    assert near.sum() >= 38
+    assert np.sqrt(np.mean(position[near] ** 2)) < 0.01 and np.sqrt(np.mean(heading[near] ** 2)) < 0.005
+    assert share[near].min() > 0.7
+
+
+def test_corridor():
+    """In a corridor the scan tells the place across it, and the guess the place along it."""
+    walls = Obstacles(shapes=tuple(Box(y=y, length=100, width=0.2) for y in (-1, 1)))
+    field = field_of(Surroundings(walls).at(0.0), np.array([-8.0, -2.0]), np.array([8.0, 2.0]), 0.05)
+    points = Lidar(range=6, noise=0).points(
+        Lidar(range=6, noise=0).scan(np.array([0.0, 0.2, 0.1]), Surroundings(walls).at(0.0), np.random.default_rng(0))
+    )
+    found, _ = match(points, np.array([1.3, 0.0, 0.0]), field)
+    assert found == pytest.approx([1.3, 0.2, 0.1], abs=0.01)
+
+
+def particles(rooms):
+    """Errors of the particle filter on drives in rooms, from 0.1 m beside the truth, and how often it recovers."""
+    found, recovered = [], 0
+    for seed in range(rooms):
+        room, track = Room(seed), None
+        for part in range(2):  # at the second drive the robot is somewhere else
+            for k, (pose, way, turn) in enumerate(room.drive(40 if part == 0 else 80)):
+                if track is None:
+                    track = Particles(room.field, seed, pose + [0.1, -0.1, 0.1])
+                error = errors(track.update(way, turn, room.points(pose)), pose)
+                if part == 0 and k >= 10:
+                    found.append(error)
+        recovered += error[0] < 0.2
+    position, heading = np.sqrt(np.mean(np.square(found), axis=0))
+    print(f"{1e3 * position:.1f} mm, {np.degrees(heading):.2f}°, recovered {recovered} of {rooms}")
+    return position, np.degrees(heading), recovered / rooms
+
+
+def test_particles():
+    """The filter errs by less than 20 mm and 0.5°, and finds the robot again after it was carried elsewhere."""
+    position, heading, recovered = particles(8)
+    assert position < 0.02 and heading < 0.5 and recovered >= 7 / 8
+
+
+@pytest.mark.full
+def test_particles_full():
+    """So in 200 rooms, with at least 95 % recovered."""
+    position, heading, recovered = particles(200)
+    assert position < 0.02 and heading < 0.5 and recovered >= 0.95
+
+
+def test_unknown_start():
+    """From anywhere in the room, with many particles at first and few when the robot is found; seeds repeat."""
+    room = Room(3)
+    drive = [(pose, way, turn, room.points(pose)) for pose, way, turn in room.drive(25)]
+    filters = [Particles(room.field, seed, None) for seed in (0, 0, 1)]
+    assert len(filters[0].particles) == MOST
+    for _, way, turn, points in drive:
+        same, again, other = (f.update(way, turn, points).copy() for f in filters)
+        assert np.array_equal(same, again)
+    assert not np.array_equal(same, other)
+    assert errors(same, drive[-1][0])[0] < 0.05 and len(filters[0].particles) < 2 * LEAST
+
+
+def test_moving_things():
+    """A passer-by whom the map lacks does not pull the estimate away."""
+    room = Room(5)
+    pose = room.free()
+    track = Particles(room.field, 0, pose)
+    for k in range(20):
+        x, y = turned(np.array([[0.6, 1.0 - 0.1 * k]]), pose)[0]
+        passer = Surroundings(Obstacles(shapes=(Disc(x=x, y=y, radius=0.2),))).at(0.0)
+        ranges = LIDAR.scan(pose, room.outlines, room.random)
+        seen = np.minimum(ranges, LIDAR.scan(pose, passer, room.random))
+        found = track.update(0.0, 0.0, LIDAR.points(seen, 60))
+    assert errors(found, pose)[0] < 0.04

@@ -1,0 +1,169 @@
+"""Hybrid A*: plans are free and can be driven, and cost no more than an exhaustive search of the same lattice finds."""
+
+import numpy as np
+import pytest
+import shapely
+from test_obstacles import judged, random_shapes
+
+from mrctl import Box, Disc, InputError, Limits, Obstacles
+from mrctl.navigation import planning
+from mrctl.navigation.generators import cellular, corridor, parking_bay
+from mrctl.navigation.planning import around, plan, shortcut, space
+from mrctl.theory.clearance import clearance
+from mrctl.theory.obstacles import Surroundings, turned
+
+FOOTPRINT = np.array([[-0.1, -0.2], [0.44, -0.2], [0.44, 0.2], [-0.1, 0.2]])
+RADIUS = 0.5
+
+
+def prepared(obstacles, size=4.0, **options):
+    return space(Surroundings(obstacles).at(0.0), FOOTPRINT, np.full(2, -size), np.full(2, size), **options)
+
+
+def drivable(where, found, start, goal, reverse):
+    """The plan goes from start to goal in arcs, keeps the margin, and reverses only if it may."""
+    assert np.allclose(found.poses[0], start)
+    assert np.allclose(found.poses[-1][:2], goal[:2], atol=1e-6) and np.cos(found.poses[-1][2] - goal[2]) > 1 - 1e-9
+    assert min(clearance(FOOTPRINT, pose, where.outlines) for pose in found.poses) > where.margin - 1e-9
+    assert reverse or found.ways.min() >= 0
+    steps, turns = np.diff(found.poses[:, :2], axis=0), np.diff(found.poses[:, 2])
+    turns -= 2 * np.pi * np.round(turns / (2 * np.pi))
+    length = np.hypot(*steps.T)
+    assert length.max() < planning.CHECK + 1e-9
+    assert np.all(np.abs(turns) <= length / RADIUS * 1.01 + 1e-9)
+    middle = found.poses[:-1, 2] + turns / 2
+    ahead = np.sum(steps * np.column_stack([np.cos(middle), np.sin(middle)]), axis=1)
+    assert np.allclose(ahead, length * found.ways[1:], atol=1e-6)
+    switches = np.sum(np.diff(found.ways[1:]) != 0)
+    cost = np.sum(length * np.where(found.ways[1:] < 0, planning.REVERSE, 1)) + planning.SWITCH * switches
+    assert cost == pytest.approx(found.cost, rel=0.01)
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_random_rooms(reverse):
+    """In rooms with obstacles at random; a shortcut is as good a plan and never costs more."""
+    random, plans = np.random.default_rng(0), 0
+    for _ in range(8):
+        where = prepared(random_shapes(random, 8))
+        free = [
+            p
+            for p in random.uniform([-3.5, -3.5, -3], [3.5, 3.5, 3], (200, 3))
+            if clearance(FOOTPRINT, p, where.outlines) > 0.1
+        ]
+        start, goal = free[:2]
+        try:
+            found = plan(where, start, goal, RADIUS, reverse)
+        except InputError as error:
+            assert "no way" in str(error)
+            continue
+        plans += 1
+        drivable(where, found, start, goal, reverse)
+        shorter = shortcut(where, found, RADIUS, reverse)
+        drivable(where, shorter, start, goal, reverse)
+        assert shorter.cost <= found.cost + 1e-9
+    assert plans >= 6
+
+
+def test_parking():
+    """A car parks backwards into a bay that it cannot enter ahead."""
+    task = parking_bay(1.0, 0.6)
+    low, high = task.obstacles.bounds
+    where = space(Surroundings(task.obstacles).at(0.0), FOOTPRINT, low, high)
+    found = plan(where, task.start, task.goal, RADIUS, True)
+    drivable(where, found, task.start, task.goal, True)
+    assert found.ways.min() == -1
+    with pytest.raises(InputError, match="no way"):
+        plan(where, task.start, task.goal, RADIUS, False)
+
+
+def test_exhaustive(monkeypatch):
+    """Without a heuristic the same lattice gives no plan that is more than 5 % cheaper, with far more poses."""
+    random, effort, compared = np.random.default_rng(3), np.zeros(2), 0
+    while compared < 4:
+        where = prepared(random_shapes(random, 9), 3.0, cell=0.15)
+        free = [
+            p
+            for p in random.uniform([-2.5, -2.5, -3], [2.5, 2.5, 3], (200, 3))
+            if clearance(FOOTPRINT, p, where.outlines) > 0.1
+        ]
+        pair = free[0], max(free, key=lambda pose: np.hypot(*(pose - free[0])[:2]))
+        try:
+            found = plan(where, *pair, RADIUS, False)
+        except InputError:
+            found = None
+        with monkeypatch.context() as patch:
+            patch.setattr(planning, "around", lambda where, _: np.zeros(where.field.distance.shape))
+            try:
+                every = plan(where, *pair, RADIUS, False, 2_000_000)
+            except InputError:
+                every = None
+        assert (found is None) == (every is None)  # it finds a way where there is one
+        if found is not None and found.expanded > 20:
+            assert found.cost <= 1.05 * every.cost
+            effort += found.expanded, every.expanded
+            compared += 1
+    print(f"poses expanded: {effort[0]:.0f} with the heuristic, {effort[1]:.0f} without")
+    assert 3 * effort[0] < effort[1]
+
+
+def test_around():
+    """The way around a wall is at least the straight one, and at most 8 % longer than the shortest."""
+    where = prepared(Obstacles(shapes=(Box(length=0.2, width=4.0),)), 3.0, margin=0.0)
+    found = around(where, np.array([2.0, 0.0, 0.0]))
+    row, column = (np.array([0.0, -2.0]) + 3.0) / 0.1
+    corner = np.array([0.1, 2.0])  # of the wall; P keeps 0.1 m from it
+    shortest = 2 * np.hypot(2.0, 2.0)
+    assert shortest < found[int(row), int(column)] < 1.085 * (shortest + 0.4)
+    assert np.isinf(found[30, 30]) and corner[1] == 2.0
+
+
+def test_reference():
+    """A forward plan becomes a reference of the same course, which keeps the limits and the clearance."""
+    task = corridor(1.2, 2)
+    low, high = task.obstacles.bounds
+    where = space(Surroundings(task.obstacles).at(0.0), FOOTPRINT, low, high)
+    found = shortcut(where, plan(where, task.start, task.goal, RADIUS, False), RADIUS, False)
+    reference = found.reference(0.8, Limits())
+    motion = reference.sample(np.linspace(0, reference.period, 500))
+    assert np.allclose(motion.pose[[0, -1], :2], found.poses[[0, -1], :2], atol=1e-6)
+    assert np.abs(motion.twist).max(axis=0)[0] <= 0.8 + 1e-6
+    turns = motion.pose[[0, -1], 2] - found.poses[[0, -1], 2]
+    assert np.abs(turns - 2 * np.pi * np.round(turns / (2 * np.pi))).max() < 0.06
+    curvature = np.abs(motion.twist[:, 1]) / np.maximum(motion.twist[:, 0], 0.05)
+    assert curvature.max() < 1.5 / RADIUS
+    walls = shapely.union_all([judged(shape) for shape in task.obstacles.shapes])
+    assert min(shapely.Polygon(turned(FOOTPRINT, pose)).distance(walls) for pose in motion.pose) > 0.02
+    where = prepared(Obstacles(shapes=(Disc(x=3.9, y=3.9),)))
+    back = plan(where, (0, 0, 0), (-1, 0, 0), RADIUS, True)
+    with pytest.raises(InputError, match="plan: reverses"):
+        back.reference(0.8, Limits())
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "message"),
+    [
+        ((0, 0, 0), (1.0, 1.0, 0), r"goal: the robot is in an obstacle at \(1.00, 1.00\)"),
+        ((1.0, 1.0, 0), (0, 0, 0), r"start: the robot is in an obstacle at \(1.00, 1.00\)"),
+        ((0, 0, 0), (0.86, 0.57, 0), r"goal: the robot is 0.0.* m from an obstacle, within the margin"),
+        ((0, 0, 0), (9, 0, 0), r"goal: \(9.00, 0.00\) is off the map"),
+        ((0, 0, 0), (-2.9, -2.9, 0), r"goal: no way to \(-2.90, -2.90\) was found; there is none"),
+    ],
+)
+def test_refused(start, goal, message):
+    """Poses in obstacles or off the map, and goals that cannot be reached, are refused with one line."""
+    fence = [Box(x=-2.75, y=-2.0, length=2.7, width=0.1), Box(x=-1.5, y=-3.0, length=0.1, width=2.2)]
+    where = prepared(Obstacles(shapes=(Disc(x=1.3, y=1.0, radius=0.2), *fence)))
+    with pytest.raises(InputError, match=message) as error:
+        plan(where, start, goal, RADIUS, False)
+    assert "\n" not in str(error.value)
+
+
+def test_budget():
+    """A budget that is too small is refused with its size; the same search gives the same plan."""
+    task = cellular(3)
+    low, high = task.obstacles.bounds
+    where = space(Surroundings(task.obstacles).at(0.0), FOOTPRINT, low, high)
+    with pytest.raises(InputError, match="500 poses were not enough"):
+        plan(where, task.start, task.goal, RADIUS, False, 500)
+    one, two = (plan(where, task.start, task.goal, RADIUS, False) for _ in range(2))
+    assert np.array_equal(one.poses, two.poses) and one.expanded == two.expanded
