@@ -302,6 +302,7 @@ class UserEstimator(Estimator):
 
     def estimate(self, tick: int, plant: Rows) -> Rows:
         """Estimates posture and twist of all robots; see `Estimator.estimate`."""
+        self.locate(tick, plant)
         memory, sensors = self.memory, self._sensors
         if not self._started:
             self._stage.call("reset", memory["mean"][:, :3], memory["mean"][:, 3:], sensors.period)

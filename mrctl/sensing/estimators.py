@@ -185,6 +185,7 @@ class Estimator:
         self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew])
         self.seen = np.zeros(len(sensing), SEEN)
         self.memory = np.zeros(len(sensing), memory)
+        self._located = -1
         scans = any(s.localisation != "fixes" for s in sensing)
         self.localiser = Localiser(sensing, sensors, robot.wheel_radius, obstacles) if scans else None
 
@@ -222,6 +223,12 @@ class Estimator:
             memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
             memory["inertial"] = memory["mean"][3]
 
+    def locate(self, tick: int, plant: Rows) -> None:
+        """Makes the fixes of a tick from a lidar, where there is one; further calls in the same tick do nothing."""
+        if self.localiser and tick != self._located:
+            self._located = tick
+            self.localiser.locate(tick, plant, self.seen["estimate"])
+
     def estimate(self, tick: int, plant: Rows) -> Rows:
         """Estimates posture and twist of all robots.
 
@@ -233,8 +240,7 @@ class Estimator:
             `seen`, `(B,)`.
         """
         sensors = self._sensors
-        if self.localiser:
-            self.localiser.locate(tick, plant, self.seen["estimate"])
+        self.locate(tick, plant)
         self._law.compiled(
             tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen
         )

@@ -1,9 +1,12 @@
 """Runs whose posture fixes come from a lidar on the map."""
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 
 from mrctl import Box, Circle, Disc, InputError, Obstacles, Scenario, simulate
+from mrctl.loop.simulation import Simulation
 from mrctl.sensing.tiers import Sensing
 
 WALLS = tuple(
@@ -31,6 +34,35 @@ def test_estimate_and_bits():
         alone = simulate(RUNS[row])
         for name in ("x", "fix_x", "x_measured", "voltage_left"):
             assert np.array_equal(alone[name], together[name][row], equal_nan=True)
+
+
+class Listener:
+    """An estimator that stays at its first estimate and keeps the fixes that it receives."""
+
+    fixes: ClassVar[list] = []
+
+    def __init__(self, robot, size):
+        self.fixes.clear()
+
+    def reset(self, pose, twist, period):
+        self.mean = np.hstack([pose, twist])
+
+    def output(self, encoders, gyro, acceleration, fix, age):
+        self.fixes.extend(fix[age >= 0])
+        return self.mean
+
+
+def test_user_receives_the_same_fixes():
+    """A user's estimator receives the fixes of the lidar in the tick of the scan, and never those of the tier."""
+    sensing = {"tier": "lab", "localisation": "particles", "fix_latency": 0.0}
+    run = RUNS[1].replace(sensing=sensing, reference=Circle(radius=0.8, period=1.0e3), laps=1)
+    simulation = Simulation([run], estimator=Listener)
+    for _ in range(25):
+        simulation.step()
+    logged = simulation.log.ticks[:25, 0]
+    arrived = np.isfinite(logged["fix_x"])
+    assert arrived.sum() == 3
+    assert np.array_equal(np.array(Listener.fixes)[:, 0], logged["fix_x"][arrived])
 
 
 @pytest.mark.parametrize(
