@@ -297,10 +297,16 @@ def test_replay(browser, tmp_path):
 
         until(on_the_way, "it to play")
         page.get_by_text("pause", exact=True).click()
+        until(lambda: not replay.playing, "it to pause")
         field = page.locator("input[inputmode=decimal]").first
-        field.fill("7.5")
-        field.press("Enter")
-        until(lambda: replay.time == pytest.approx(7.5), "the scrubber")
+
+        def scrubbed():
+            field.fill("7.5")  # again, if a time that was still on its way to a slow page has overwritten it
+            field.press("Enter")
+            page.wait_for_timeout(500)
+            return replay.time == pytest.approx(7.5)
+
+        until(scrubbed, "the scrubber")
         expected = result.isel(run=0).sel(time=7.5, method="nearest")
         until(lambda: np.allclose(node(page, ROBOT)[:2], [expected.x, expected.y], atol=1e-3), "the robot to be there")
         time.sleep(1.0)
