@@ -32,7 +32,7 @@ def test_nearest() -> None:
         rows = random.normal(size=(random.integers(1, 12), 3))
         rows[:, 2] = -np.abs(rows[:, 2]) * (random.permutation(len(rows)) >= random.integers(3))
         request = 2 * random.normal(size=2)
-        found = nearest(*request, rows)
+        found = nearest(request[0], request[1], rows)
         np.testing.assert_allclose(found, least_distance(request, rows), atol=1e-6)
         changed += found != tuple(request)
     assert 500 < changed < 1999
@@ -48,6 +48,7 @@ def test_no_collision() -> None:
         pose = random.uniform([-3, -3, -3], [3, 3, 3])
         if min(clearance(_square(disc), pose, outlines) for disc in BARRIER.discs) <= BARRIER.margin:
             continue
+        request = np.zeros(2)
         for step in range(300):
             if step % 50 == 0:
                 request = random.uniform([-1.5, -3], [1.5, 3])
@@ -74,7 +75,7 @@ def test_brakes_before_a_wall(heading: float) -> None:
     way, speeds, gaps = 0.0, [], []
     front = BARRIER.discs[:, 0].max() + BARRIER.discs[0, 2]
     for _ in range(400):
-        v, omega = avoid([1.5, 0.0], [*(way * ahead), heading], wall, BARRIER)
+        v, omega = avoid(np.array([1.5, 0.0]), np.array([*(way * ahead), heading]), wall, BARRIER)
         speeds.append(v)
         gaps.append(2.9 - way - front - BARRIER.margin)
         way += v * BARRIER.period
