@@ -35,13 +35,13 @@ READERS: dict[str, Callable[[str], Obstacles]] = {
     ".sdf": read_sdf,
     ".world": read_sdf,
 }
-# Openings are twice as wide as the robot, and where it turns between shelves, twice as wide as it is long.
+# Openings are twice as wide as the robot; aisles, in which it also turns, are 2.5 times as wide as it is long.
 GENERATORS: dict[str, Callable[[float, float, int], Task]] = {
     "cellular": lambda length, width, seed: generators.cellular(seed),
     "corridor": lambda length, width, seed: generators.corridor(2 * width, seed),
     "slalom": lambda length, width, seed: generators.slalom(2 * width, seed),
     "doorway": lambda length, width, seed: generators.doorway(2 * width, seed),
-    "warehouse": lambda length, width, seed: generators.warehouse(2 * length, seed),
+    "warehouse": lambda length, width, seed: generators.warehouse(2.5 * length, seed),
 }
 ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
 TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
@@ -134,6 +134,8 @@ def planned(task: Task, scenario: Scenario, speed: float | None, margin: float) 
     where = space(outlines, corners, low, high, cell=float(np.ptp(corners[:, 1])) / CELLS, margin=margin)
     found = plan(where, np.array(task.start), np.array(task.goal), radius, reverse=False)
     found = shortcut(where, found, radius, reverse=False)
+    if found.length < NEAR / 2:
+        raise InputError("goal: the robot starts there")
     reference = found.reference(RESERVE * robot.max_speed if speed is None else speed, Limits.of(robot))
     check(reference, robot, reverse=False)
     times = np.linspace(0, reference.period, max(2, round(found.length / 0.01)))

@@ -56,6 +56,7 @@ def test_outcomes() -> None:
         (["yard.toml"], "goal: a world from a file needs one"),
         (["yard.toml", "--goal", "1.5", "0.8", "0"], "goal: the robot is in an obstacle"),
         (["yard.toml", "--goal", "3", "0", "0", "--start", "1.5", "0.8", "0"], "start: the robot is in an obstacle"),
+        (["yard.toml", "--goal", "0", "0", "0"], "goal: the robot starts there"),
         (["yard.toml", "--goal", "10000", "9", "0"], "map: "),
         (["yard.toml", "--goal", "nan", "0", "0"], "goal"),
         (["yard.toml", "--goal", "3", "0", "0", "--speed", "0"], "speed"),
