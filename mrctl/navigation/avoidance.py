@@ -9,13 +9,16 @@ always among the twists that are allowed.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
+from mrctl.control.stages import Motion
 from mrctl.kernel import Array, kernel
 from mrctl.theory.clearance import outside, point_to_segment
-from mrctl.theory.obstacles import Outlines, moved
+from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings, moved
+from mrctl.theory.robot import Robot
 
 
 class Barrier(NamedTuple):
@@ -46,6 +49,40 @@ def avoid(request: Array, pose: Array, outlines: Outlines, barrier: Barrier) -> 
     rows = np.empty((len(barrier.discs) * (len(outlines.discs) + len(outlines.rings)), 3))
     allowed.compiled(np.asarray(request, float), np.asarray(pose, float), outlines, barrier, rows, found)
     return found
+
+
+class Avoiding:
+    """A motion stage whose request passes the filter: `simulate(…, motion=lambda *robots: Avoiding(*robots, …))`."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        size: int,
+        motion: Callable[[Robot, int], Motion],
+        obstacles: Obstacles,
+        barrier: Barrier,
+    ) -> None:
+        """Makes the stage.
+
+        Args:
+            robot: Nominal robot.
+            size: Number of robots.
+            motion: Factory of the motion stage that makes the requests.
+            obstacles: The obstacles; those that move are taken where they are, as if they stood.
+            barrier: Discs, margin and braking of the robot.
+        """
+        self._motion, self._around, self._barrier = motion(robot, size), Surroundings(obstacles), barrier
+
+    def reset(self, pose: Array, reference: Array, period: float) -> None:
+        """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
+        self._motion.reset(pose, reference, period)
+        self._time, self._period = 0.0, period
+
+    def output(self, pose: Array, twist: Array, reference: Array) -> Array:
+        """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
+        requests, outlines = np.asarray(self._motion.output(pose, twist, reference)), self._around.at(self._time)
+        self._time += self._period
+        return np.stack([avoid(r, p, outlines, self._barrier) for r, p in zip(requests, pose, strict=True)])
 
 
 @kernel

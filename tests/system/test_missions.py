@@ -9,8 +9,12 @@ from test_commands import refused
 
 import mrctl
 from mrctl import Box, Disc, Obstacles, Scenario, cli
+from mrctl.navigation.avoidance import Avoiding, Barrier
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import navigate
+from mrctl.physics import mjcf
+from mrctl.physics.hull import footprint
+from mrctl.theory.clearance import cover
 
 PID = Scenario(learner="none")
 
@@ -76,3 +80,29 @@ def test_bad_input_is_one_line(
     monkeypatch.chdir(tmp_path)
     Path("yard.toml").write_text('[[shapes]]\nkind = "disc"\nx = 1.5\ny = 0.8\nradius = 0.2\n')
     assert says in refused(capsys, "navigate", *arguments)
+
+
+class Blind:
+    """A motion stage that asks for the reference's twist."""
+
+    def __init__(self, robot, size):
+        pass
+
+    def reset(self, pose, reference, period):
+        pass
+
+    def output(self, pose, twist, reference):
+        return reference[:, 3:5]
+
+
+def test_filter_in_the_loop() -> None:
+    """The car is asked to drive into a wall: with the filter it does not touch the wall, and without it does."""
+    obstacles = Obstacles(shapes=(Box(x=2.5, length=0.2, width=4.0),))
+    barrier = Barrier(cover(footprint(mjcf.load()), 4), margin=0.05, deceleration=0.6, period=0.01, lever=0.3)
+    scenario = PID.replace(obstacles=obstacles, reference=mrctl.Line(length=2.6), laps=1, initial_spread=(0, 0, 0))
+    hit = mrctl.simulate(scenario, motion=Blind)
+    assert hit["failure"] == "collision"
+    result = mrctl.simulate(scenario, motion=lambda robot, size: Avoiding(robot, size, Blind, obstacles, barrier))
+    assert result["failure"] == "" and 0.02 < float(result["clearance"].min()) < 0.3
+    early = result["clearance"] > 1.0
+    assert np.array_equal(result["v_command"].where(early, drop=True), hit["v_command"][: int(early.sum())])
