@@ -32,6 +32,11 @@ from mrctl.theory.robot import CAR, RobotFile
 FIRST = ("name", "world", "steering", "reference", "laps", "prior", "learner", "seed")
 """Fields of `Scenario` that `mrctl run --help` explains; it lists the others, which `mrctl run --help-all` explains."""
 
+FROM_FILES = ("events", "obstacles")
+"""Fields of `Scenario` that have no flags, because they come from a scenario file."""
+GIVEN = (*FROM_FILES, "reference", "laps", "initial_pose")
+"""Fields of `Scenario` that are no flags of `mrctl navigate`, because the mission gives them."""
+
 LAB = Sensing(tier="lab")
 DELAYS = 0.0, 0.01, 0.02  # s
 
@@ -102,6 +107,7 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
     """
     commands: dict[str, Callable[..., Any]] = {
         "run": _run_with(arguments),
+        "navigate": _navigate_with(arguments),
         "reproduce": reproduce,
         "sweep": sweep,
         "suite": suite,
@@ -133,7 +139,7 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
                     Scenario.from_dict({name: ""})
             raise InputError(_one_line(complaints.getvalue())) from None
         if _is_short_help(arguments):
-            print(_further_flags())
+            print(_further_flags(arguments[0]))
         raise
 
 
@@ -166,27 +172,28 @@ def _one_line(box: str) -> str:
 
 
 def _is_short_help(arguments: Sequence[str]) -> bool:
-    """Tells whether a command line asks for the short help of `run`; that of a reference is short in itself."""
+    """Tells whether a command line asks for the short help of a scenario; that of a reference is short in itself."""
     asked = bool({"-h", "--help"} & set(arguments))
-    return arguments[0] == "run" and asked and not any(a.startswith("reference:") for a in arguments)
+    return arguments[0] in ("run", "navigate") and asked and not any(a.startswith("reference:") for a in arguments)
 
 
-def _short(scenario: Scenario) -> Record:
-    """Returns a record of the fields in `FIRST` alone, from which tyro makes the short help of `run`."""
+def _part(scenario: Scenario, names: Sequence[str]) -> Record:
+    """Returns a record of some fields of a scenario, from which tyro makes flags."""
     types = typing.get_type_hints(Scenario, include_extras=True)
     helps = {name: field.description for name, field in Scenario.model_fields.items()}
     fields: dict[str, Any] = {
-        name: (types[name], pydantic.Field(getattr(scenario, name), description=helps[name])) for name in FIRST
+        name: (types[name], pydantic.Field(getattr(scenario, name), description=helps[name])) for name in names
     }
-    return pydantic.create_model("Short", __base__=Record, **fields)()
+    return pydantic.create_model("Part", __base__=Record, **fields)()
 
 
-def _further_flags() -> str:
-    """Lists the flags of `run` that its short help leaves out: each field or group of fields with its description."""
-    # Perturbations are what people change most. Events and obstacles have no flags: they come from a scenario file.
-    left_out = [name for name in Scenario.model_fields if name not in (*FIRST, "events", "obstacles")]
+def _further_flags(command: str) -> str:
+    """Lists the flags that the short help of a command leaves out, a field or group of fields each, explained."""
+    never = FROM_FILES if command == "run" else GIVEN
+    left_out = [name for name in Scenario.model_fields if name not in (*FIRST, *never)]
+    # Perturbations are what people change most.
     names = sorted(left_out, key=lambda name: name != "perturbation")
-    lines = ["Further flags, which `mrctl run --help-all` explains one by one:"]
+    lines = [f"Further flags, which `mrctl {command} --help-all` explains one by one:"]
     for name in names:
         field = Scenario.model_fields[name]
         flag = f"--{name.replace('_', '-')}" + (".*" if isinstance(field.default, Record) else "")
@@ -234,10 +241,55 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             raise _Incomplete(f"the run failed: {failure}")
 
     if _is_short_help(arguments):
-        short = _short(default)
+        short = _part(default, FIRST)
         run.__annotations__["scenario"] = Annotated[type(short), tyro.conf.arg(name="")]
         run.__defaults__ = (None, short, *(run.__defaults__ or ())[2:])
     return run
+
+
+def _navigate_with(arguments: list[str]) -> Callable[..., None]:
+    """Returns the `navigate` command, whose short help leaves out what that of `run` does."""
+    names = FIRST if _is_short_help(arguments) else Scenario.model_fields
+    part = _part(Scenario(prior="model", learner="composite"), [name for name in names if name not in GIVEN])
+
+    def navigate(
+        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="WORLD|GENERATOR:SEED")],
+        /,
+        scenario: Record = part,
+        goal: tuple[float, float, float] | None = None,
+        start: tuple[float, float, float] | None = None,
+        compare: Annotated[tuple[FeedforwardName, ...], tyro.conf.arg(metavar="NAME ...")] = (),
+        speed: float | None = None,
+        margin: float = 0.05,
+        out: Path | None = None,
+        json: bool = False,
+    ) -> None:
+        """Plans a way among obstacles, drives it, and prints how that ended.
+
+        The exit status is 1 if the robot does not arrive.
+
+        Args:
+            world: TOML file of obstacles, yaml file of a ROS map, world in SDF, or a generator with a seed, such as
+                doorway:3; the others are cellular, corridor, slalom and warehouse.
+            scenario: The scenario.
+            goal: Pose of the goal, as x and y in m and θ in rad; by default that of the generator.
+            start: Pose of the start, as x and y in m and θ in rad; by default that of the generator, or the origin.
+            compare: Feedforwards of further robots, such as none or model, which drive the same plan.
+            speed: Largest speed in m/s; by default 0.9 of what the robot can.
+            margin: Clearance that the plan keeps in m.
+            out: Folder for the result, the table in JSON and the figures.
+            json: Print JSON instead of a table.
+        """
+        from mrctl.experiments import mission
+
+        chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
+        text, outcome = mission.run(world, chosen, goal, start, compare, speed, margin, out, json)
+        print(text)
+        if outcome != "arrived":
+            raise _Incomplete(f"the robot did not arrive: {outcome}")
+
+    navigate.__annotations__["scenario"] = Annotated[type(part), tyro.conf.arg(name="")]
+    return navigate
 
 
 def _scenario_file(arguments: Sequence[str]) -> str | None:

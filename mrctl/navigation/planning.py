@@ -31,6 +31,7 @@ SWITCH = 0.5  # cost of a change of direction, m
 CHECK = 0.05  # m, distance of the poses of an arc that are held against the obstacles
 DISCS = 4  # that cover the footprint; where one of them touches, the footprint itself is looked at
 SHOT = 2.0  # in place of the turn of an arc, a shortest path to the goal
+MOST_CELLS = 1_000_000  # of the plane, for a search takes 288 bytes for each, and three times that with reversing
 STRAIGHT = 0.92  # least ratio of a straight way to the shortest one over the eight neighbours of a cell
 
 
@@ -90,7 +91,7 @@ class Plan(NamedTuple):
             spacing: Distance of the points that the spline goes through in m.
 
         Raises:
-            InputError: The plan reverses, which no spline does.
+            InputError: The plan reverses, which no spline does, or the speed is not positive.
         """
         if self.ways.min() < 0:
             raise InputError("plan: reverses; plan with reverse = False for a reference")
@@ -99,9 +100,8 @@ class Plan(NamedTuple):
         if places[1] > 2 * CHECK:  # one more point near either end holds the heading there
             places = np.concatenate([places[:1], [CHECK], places[1:-1], [way[-1] - CHECK], places[-1:]])
         points = np.column_stack([np.interp(places, way, self.poses[:, k]) for k in range(2)])
-        return Waypoints(
-            points=tuple(map(tuple, points.tolist())), closed=False, timing="limits", speed=speed, limits=limits
-        )
+        values = {"points": points.tolist(), "closed": False, "timing": "limits", "speed": speed, "limits": limits}
+        return Waypoints.from_dict(values, "plan")
 
 
 def space(
@@ -120,6 +120,9 @@ def space(
     Raises:
         InputError: The rectangle is empty, or has too many cells.
     """
+    cells = float(np.prod(np.ceil((np.asarray(high) - low) / cell)))
+    if cells > MOST_CELLS:
+        raise InputError(f"map: {cells:,.0f} cells of {cell:.3g} m are more than {MOST_CELLS:,}, which a search takes")
     return Space(outlines, field_of(outlines, low, high, cell), footprint, cover(footprint, DISCS), margin)
 
 

@@ -25,6 +25,7 @@ from matplotlib.rcsetup import cycler
 from mrctl.record import InputError
 from mrctl.results import excitation as exciting
 from mrctl.results.controllers import colours_of
+from mrctl.results.dataset import scenarios_of
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap
 
 COLUMN, PAGE = 88 / 25.4, 180 / 25.4  # inches
@@ -115,8 +116,13 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
 
 @styled
 def path(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
-    """The path of P over that of the reference; a dot marks the start."""
+    """The path of P over that of the reference; a dot marks the start. Obstacles that stand still are grey."""
     figure, (axes,) = _figure(COLUMN, COLUMN * 0.95)
+    for shape in scenarios_of(as_runs(result))[0].obstacles.shapes if "clearance" in result else ():
+        if shape.course is None:
+            disc = shape.kind == "disc"
+            patch = Circle((shape.x, shape.y), shape.radius) if disc else Polygon(shape.vertices)
+            axes.add_patch(patch).set(color="0.75", lw=0)
     curves = _curves(result, window, lap)
     _references(axes, curves, "x_ref", "y_ref")
     for data, _, style in curves:

@@ -1,0 +1,191 @@
+"""A mission: in a world a robot gets a goal, a plan is made, the robot drives it, and the outcome is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from mrctl.kernel import Array
+from mrctl.loop.simulation import simulate
+from mrctl.navigation import generators
+from mrctl.navigation.generators import Task
+from mrctl.navigation.maps import read_map
+from mrctl.navigation.planning import Plan, plan, shortcut, space
+from mrctl.navigation.sdf import read_sdf
+from mrctl.physics import mjcf
+from mrctl.physics.hull import footprint
+from mrctl.record import InputError
+from mrctl.results.metrics import as_runs, control_period
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
+from mrctl.theory.clearance import clearances
+from mrctl.theory.obstacles import Obstacles, Pose, Surroundings
+from mrctl.theory.references import Waypoints, check
+from mrctl.theory.robot import Robot
+from mrctl.theory.timing import RESERVE, Limits
+
+READERS: dict[str, Callable[[str], Obstacles]] = {
+    ".toml": Obstacles.from_toml,
+    ".yaml": lambda path: read_map(path).obstacles(),
+    ".yml": lambda path: read_map(path).obstacles(),
+    ".sdf": read_sdf,
+    ".world": read_sdf,
+}
+# Openings are twice as wide as the robot; aisles, in which it also turns, are 2.5 times as wide as it is long.
+GENERATORS: dict[str, Callable[[float, float, int], Task]] = {
+    "cellular": lambda length, width, seed: generators.cellular(seed),
+    "corridor": lambda length, width, seed: generators.corridor(2 * width, seed),
+    "slalom": lambda length, width, seed: generators.slalom(2 * width, seed),
+    "doorway": lambda length, width, seed: generators.doorway(2 * width, seed),
+    "warehouse": lambda length, width, seed: generators.warehouse(2.5 * length, seed),
+}
+ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
+TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
+CELLS = 4  # of the search in the width of the robot
+NEAR, TURNED, RESTING = 0.1, 0.2, 0.05  # m, rad and m/s, within which a robot has arrived
+PATIENCE = 2  # time after which a robot is out of time, over that of the plan
+
+
+class Mission(NamedTuple):
+    """A mission that was driven."""
+
+    plan: Plan
+    """Way from start to goal."""
+    result: xr.Dataset
+    """Result of one robot or several, of twice the time of the plan unless one failed before."""
+    table: pd.DataFrame
+    """What `outcomes` returns."""
+
+
+def task_of(world: str, scenario: Scenario, start: Pose | None = None, goal: Pose | None = None) -> Task:
+    """Reads or makes a world.
+
+    Args:
+        world: TOML file of obstacles, yaml file of a ROS map, SDF world, or a generator with its seed, as `doorway:3`.
+        scenario: Scenario with the robot, to whose size a generator makes its openings.
+        start: x and y in m and θ in rad; by default that of the generator, or the origin.
+        goal: x and y in m and θ in rad; by default that of the generator.
+
+    Raises:
+        InputError: The world cannot be read, no generator has that name, or there is no goal.
+    """
+    name, colon, seed = world.partition(":")
+    if colon and name in GENERATORS:
+        if not (seed.isdecimal() and len(seed) < 10):
+            raise InputError(f"world: {world}: the seed must be a number below 10⁹, as in {name}:3")
+        length, width = np.ptp(_robot(scenario)[0], axis=0).tolist()
+        made = GENERATORS[name](length, width, int(seed))
+        return made.replace(start=start or made.start, goal=goal or made.goal)
+    if not (read := READERS.get(Path(world).suffix.lower())):
+        raise InputError(
+            f"world: {world} is neither a file that ends in {', '.join(READERS)} nor a generator with a seed, "
+            f"such as {':3, '.join(GENERATORS)}:3"
+        )
+    obstacles = read(world)
+    if goal is None:
+        raise InputError("goal: a world from a file needs one: x and y in m, θ in rad")
+    return Task.from_dict({"obstacles": obstacles, "start": start or (0.0, 0.0, 0.0), "goal": goal})
+
+
+def navigate(
+    task: Task,
+    scenario: Scenario,
+    compare: Sequence[FeedforwardName] = (),
+    speed: float | None = None,
+    margin: float = 0.05,
+    progress: bool = False,
+) -> Mission:
+    """Plans a way among the obstacles that stand still, and drives it with the hierarchy.
+
+    Args:
+        task: World, start and goal.
+        scenario: The robot and all else; reference, laps and obstacles are those of the mission.
+        compare: Feedforwards of further robots, which drive the same plan, each alone.
+        speed: Largest speed in m/s; by default 0.9 of the robot's.
+        margin: Clearance that the plan keeps in m.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        InputError: Start or goal is in an obstacle, there is no way, or the robot cannot drive the plan.
+    """
+    found, reference = planned(task, scenario, speed, margin)
+    own = scenario.replace(obstacles=task.obstacles, reference=reference, laps=PATIENCE, initial_pose=task.start)
+    others = [own.replace(name="", **FEEDFORWARDS[name]) for name in compare]
+    result = simulate([own, *others], progress=progress)
+    return Mission(found, result, outcomes(result, task.goal, found))
+
+
+def planned(task: Task, scenario: Scenario, speed: float | None, margin: float) -> tuple[Plan, Waypoints]:
+    """Returns the plan and its reference; arguments and errors are those of `navigate`."""
+    if not 0 <= margin <= 10:
+        raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
+    corners, robot = _robot(scenario)
+    still = Obstacles(shapes=tuple(shape for shape in task.obstacles.shapes if shape.course is None))
+    outlines = Surroundings(still).at(0.0)
+    radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit)))
+    ends = np.array([task.start[:2], task.goal[:2]])
+    low, high = ends.min(axis=0) - 3 * radius, ends.max(axis=0) + 3 * radius  # room to turn
+    if still.shapes:
+        low, high = np.minimum(low, still.bounds[0]), np.maximum(high, still.bounds[1])
+    where = space(outlines, corners, low, high, cell=float(np.ptp(corners[:, 1])) / CELLS, margin=margin)
+    found = plan(where, np.array(task.start), np.array(task.goal), radius, reverse=False)
+    found = shortcut(where, found, radius, reverse=False)
+    if found.length < NEAR / 2:
+        raise InputError("goal: the robot starts there")
+    reference = found.reference(RESERVE * robot.max_speed if speed is None else speed, Limits.of(robot))
+    check(reference, robot, reverse=False)
+    times = np.linspace(0, reference.period, max(2, round(found.length / 0.01)))
+    if clearances(corners, reference.sample(times).pose, times, Surroundings(still)).min() <= 0:
+        raise InputError(f"plan: its smooth path comes nearer to an obstacle than the margin of {margin:g} m; set more")
+    return found, reference
+
+
+def _robot(scenario: Scenario) -> tuple[Array, Robot]:
+    """Returns the footprint of a scenario's robot, corners in m, `(n, 2)`, and its parameters."""
+    model, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
+    return footprint(model), robot
+
+
+def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
+    """Returns how each robot of a result fared, until it arrived, failed or was out of time.
+
+    A robot has arrived when it is within 0.1 m and 0.2 rad of the goal and slower than 0.05 m/s.
+
+    Args:
+        result: What `simulate` returns.
+        goal: x and y in m and θ in rad.
+        found: The plan.
+
+    Returns:
+        A row for each robot: `outcome` (arrived, collided, out of time, or why it failed), `time` in s, `length` of its
+        path in m, `spl`, success weighted by path length, ℓ / max(ℓ, length) or 0 unless it arrived, with the length ℓ
+        of the plan (Anderson et al., "On evaluation of embodied navigation agents", 2018), the smallest `clearance` in
+        m, `position_rmse` in m, `energy` in J, and `expanded`, the number of poses that the search expanded.
+    """
+    runs, period, rows = as_runs(result), control_period(result), []
+    for row in range(runs.sizes["run"]):
+        run = runs.isel(run=row)
+        x, y, theta, v = (run[name].values for name in ("x", "y", "theta", "v"))
+        turned = np.abs(np.angle(np.exp(1j * (theta - goal[2]))))
+        near = (np.hypot(x - goal[0], y - goal[1]) < NEAR) & (turned < TURNED) & (np.abs(v) < RESTING)
+        failure = str(run["failure"].values)
+        ended = {"": "out of time", "collision": "collided"}.get(failure, failure)
+        alive = int(np.isfinite(x).sum())
+        last = int(near.argmax()) if near.any() else alive - 1
+        driven = run.isel(time=slice(last + 1))
+        length = float(np.hypot(np.diff(driven["x"]), np.diff(driven["y"])).sum())
+        rows.append({
+            "outcome": "arrived" if near.any() else ended,
+            "time": last * period,
+            "length": length,
+            "spl": near.any() * found.length / max(found.length, length),
+            "clearance": float(driven["clearance"].min()) if "clearance" in driven else np.inf,
+            "position_rmse": float(np.sqrt(np.mean(driven["longitudinal_error"] ** 2 + driven["lateral_error"] ** 2))),
+            "energy": float(driven["power"].sum()) * period,
+            "expanded": found.expanded,
+        })  # fmt: skip
+    return pd.DataFrame(rows, index=pd.Index(runs["label"].values, name="label"))
