@@ -193,7 +193,7 @@ def test_bad_scenario_is_one_line(
         (["tune", "--delay", "0.013"], "control_delay"),
         (["tune", "--delay", "0.6"], "delay: "),
         (["suite", "--seeds", "0"], "seeds"),
-        (["dance"], "no command is called 'dance'; there are run, reproduce"),
+        (["dance"], "no command is called 'dance'; there are run, navigate, reproduce"),
         (["run", "--feedforward", "rls"], "feedforward: this field of an earlier version is gone"),
     ],
 )
