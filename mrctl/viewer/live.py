@@ -158,6 +158,7 @@ class Live(Page):
         self._drawn = self._plotted = None
         self._laps: list[dict[str, Any]] = []  # metrics of the whole laps until now
         self._counted = (time.monotonic(), session.tick)
+        self._happened = 0  # number of the scenarios' own events that have happened
         self._describe()
 
     # -- requests of visitors, carried out by the loop --------------------------------------------------------------
@@ -321,6 +322,10 @@ class Live(Page):
             if reason := session.failure(row):
                 lines.append(warning(f"{label} stopped: {reason}"))
         write(self._status, block("status", *lines))
+        happened = sum(event.time <= session.time for start in session.start for event in start.events)
+        if happened != self._happened:  # events that the scenarios brought along
+            self._happened = happened
+            self._describe()
         if session.tick != self._plotted:
             self._plotted = session.tick
             self._show_past()

@@ -7,7 +7,7 @@ import typing
 import pytest
 import viser
 
-from mrctl import Kanayama, Pid, Scenario
+from mrctl import Event, Kanayama, Perturbation, Pid, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.references import Reference
 from mrctl.viewer import live as module
@@ -177,6 +177,23 @@ def test_dragging(live):
         live._run_requests()
         live.refresh()
         assert live.session.start[0].world == "slope" and live.session.start[0].perturbation.payload == 3.0
+
+
+def test_events_of_the_scenario():
+    """A payload that the scenario brings along is drawn when it drops, and not before."""
+    server = Server(port=0)
+    drop = Event(time=0.05, perturbation=Perturbation(payload=8.0))
+    live = Live([Scenario(events=(drop,))], server)
+    (box,) = live._scene._payloads
+    for _ in range(4):
+        live.session.step()
+    live.refresh()
+    assert not box.visible
+    for _ in range(3):
+        live.session.step()
+    live.refresh()
+    assert box.visible and box.dimensions == pytest.approx((0.2, 0.2, 0.2))
+    server.stop()
 
 
 def test_order(live):
