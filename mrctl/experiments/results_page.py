@@ -21,6 +21,7 @@ import tyro
 from mrctl.experiments import bench as benchmark
 from mrctl.experiments import identify as identification
 from mrctl.experiments import paper, tuning
+from mrctl.experiments.cases import REPLICATES
 from mrctl.experiments.held_out import LOG
 from mrctl.experiments.suite_tables import COLUMNS, TITLES, interval
 from mrctl.experiments.tables import markdown, number
@@ -67,6 +68,8 @@ def main(
     if suite is not None:
         table = _read(suite / "table.json", "rows", "mode")
         flag = "" if table["mode"] == "core" else f" --{table['mode']}"
+        if (count := min(row["runs"] for row in table["rows"])) != REPLICATES[table["mode"]]:
+            flag += f" --seeds {count}"
         text = suite_text(table, _text(suite / "table.md"))
         written["The uncertainty suite"] = _section(f"mrctl suite{flag}", table, text)
     if held_out is not None:

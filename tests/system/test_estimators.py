@@ -114,13 +114,19 @@ MEETS = {
     "lifted wheel": (
         {}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.8)}, (0.93, 0.93, 0.88, 0.9, 0.93)
     ),
+    "lifted wheel, as if on the ground": (
+        {}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.8)}, (0.93,) * 5
+    ),
     "slipping wheel": (
         {}, {"perturbation": Perturbation(left_tyre_friction_factor=0.1 / 0.9)}, (0.9, 0.9, 0.5, 0.5, 0.95)
     ),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", MEETS)
+WANTED = pytest.mark.xfail(strict=True, reason="the encoder of a lifted wheel is believed")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=WANTED) if "as if" in n else n for n in MEETS])
 @pytest.mark.parametrize("tier", TIERS)
 def test_within_three_deviations(tier, name):
     """With lost or outlying fixes or a wheel off the ground, errors stay where the filter says; on ice, less often."""

@@ -112,7 +112,9 @@ def test_sections(
     short, *folded = page["The uncertainty suite"].split("<details>")
     assert "| nominal | PID         | 0/2    | 12.3 [12.1, 12.5] |" in short and "slope" not in short
     assert "| all     | fel         | 2/2    | –  " in short
-    assert "`mrctl suite --full` made this" in short and "- Steady. All tie.\n- A step. `rls` is back." in short
+    assert (
+        "`mrctl suite --full --seeds 2` made this" in short and "- Steady. All tie.\n- A step. `rls` is back." in short
+    )
     assert [text.split("</summary>")[0] for text in folded] == ["<summary>Steady", "<summary>A step"]
     assert "| fel         | 3.21    | 3.21       | 3.21         | PID fails |" in page["The paper"]
     assert "| lab     | " in page["The paper"] and "| 1.00         | 0.25 " in page["The paper"]
