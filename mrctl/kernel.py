@@ -2,7 +2,8 @@
 
 A kernel is written as in a textbook, with arrays for vectors and a NumPy record for what is kept of a robot
 (`s.integral[k]`), and it may call other kernels. Numba compiles it when it is first called, not at import, for the
-types that it is called with; it releases Python's global lock, and the machine code is kept on disk.
+types that it is called with; it releases Python's global lock, and the machine code is kept on disk. Kernels copy
+arrays element by element: with `a[:] = b` Numba also compiles its message about unequal shapes, which takes 3 s.
 
 The code on disk is valid for one state of all files that hold kernels: whoever edits a law gets the new law in every
 kernel that calls it, wherever that is written. Constants that a kernel uses must therefore stand in such a file.

@@ -212,7 +212,9 @@ def reset_covariance(k: int, s: Row) -> None:
     This is covariance resetting (Goodwin and Sin, 1984). The second term is the step of the weights back to zero, in
     case the plant returns to the nominal one.
     """
-    s.P[k] = s.prior[k]
+    for i in range(FEATURES + 1):
+        for j in range(FEATURES + 1):
+            s.P[k, i, j] = s.prior[k, i, j]
     for i in range(FEATURES):
         for j in range(FEATURES):
             s.P[k, i, j] += s.a[k, i] * s.a[k, j]

@@ -44,6 +44,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from mrctl.control.features import INPUTS
 from mrctl.control.feedforward import PRIOR, Learner, Prior, explained, inverse_dynamics
 from mrctl.control.matching import MATCHED, low_pass, match, queues
 from mrctl.kernel import Array, Row, kernel
@@ -119,7 +120,8 @@ def learn(
     """One measurement, which goes on while the robot must not learn: the voltage is the one after the limits."""
     rows, queue = arrays
     s = rows[i]
-    s.prior.c[:, :] = prior.c
+    for j in range(INPUTS):
+        s.prior.c[j, 0], s.prior.c[j, 1] = prior.c[j, 0], prior.c[j, 1]
     s.sent[0], s.sent[1] = voltage[0], voltage[1]
     if robot.rigid:
         s.sent[1] += command[1]  # a steering channel adds a correction to the commanded rotation

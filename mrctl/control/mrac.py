@@ -236,7 +236,8 @@ def filter_motion(command: Array, twist: Array, period: float, queue: Array, sca
         Whether the filters have forgotten how they began.
     """
     known = match(twist, s.derivative, s.sent, period, queue, s.matched)
-    s.before[:] = s.x
+    for j in range(INPUTS):
+        s.before[j] = s.x[j]
     features(s.matched.twist, s.zero, robot.half_track, scale, s.x)
     if not known:
         return False

@@ -67,7 +67,8 @@ def send(command: Array, tick: int, queue: Array, inputs: NDArray[np.int64], pla
     for i in range(len(plant)):
         p = plant[i]
         p.before = p.reading
-        queue[tick % len(queue), i] = command[i]
+        for k in range(command.shape[1]):
+            queue[tick % len(queue), i, k] = command[i, k]
         now = queue[(tick - p.delay) % len(queue), i]
         for k in range(len(inputs)):
             finite &= np.isfinite(now[k]) or p.failed
@@ -107,7 +108,8 @@ def look(
             for n in range(3):
                 axis = (p.imu_axes[k, n] + axes[k, n]) / 2
                 p.specific_force[k] += axis * ((velocity[n] - p.imu_velocity[n]) / period - p.gravity[n])
-        p.imu_velocity[:], p.imu_axes[:, :] = velocity, axes
+        for n in range(3):
+            p.imu_velocity[n], p.imu_axes[0, n], p.imu_axes[1, n] = velocity[n], axes[0, n], axes[1, n]
         back_emf(p)
         for k in range(2):
             limit = p.driver.current_limit[k]

@@ -266,8 +266,19 @@ def keep(t: int, s: Row) -> None:
         if s.kept_tick[k] < s.kept_tick[oldest]:
             oldest = k
     s.kept_tick[oldest] = t
-    s.kept_mean[oldest, :] = s.mean
-    s.kept_P[oldest, :, :] = s.P
+    for i in range(N):
+        s.kept_mean[oldest, i] = s.mean[i]
+        for j in range(N):
+            s.kept_P[oldest, i, j] = s.P[i, j]
+
+
+@kernel
+def go_back(k: int, s: Row) -> None:
+    """Takes up the state that is stored in place k."""
+    for i in range(N):
+        s.mean[i] = s.kept_mean[k, i]
+        for j in range(N):
+            s.P[i, j] = s.kept_P[k, i, j]
 
 
 @kernel
@@ -280,8 +291,7 @@ def ekf(
     if s.start <= taken < now and ring[taken % len(ring), i].fix_arrives:
         for k in range(KEPT):
             if f.kept_tick[k] == taken:
-                f.mean[:] = f.kept_mean[k]
-                f.P[:, :] = f.kept_P[k]
+                go_back(k, f)
                 absorb_fix(ring[taken % len(ring), i].fix, f)
                 for t in range(taken + 1, now):
                     step(t, ring, i, geometry, period, s.delay, s.start, f)

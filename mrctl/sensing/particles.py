@@ -209,7 +209,8 @@ def resample(
                 found[n, k] = own[k] + 0.02 * noise[n, k]
         else:
             chosen = min(np.searchsorted(summed, chance[n, 0] * summed[-1]), len(particles) - 1)
-            found[n, :] = particles[chosen]
+            for k in range(3):
+                found[n, k] = particles[chosen, k]
         heading = found[n, 2] - 2 * np.pi * np.floor(found[n, 2] / (2 * np.pi))
         key = np.int64(np.floor(found[n, 0] / BIN[0])) * 73_856_093
         key = key ^ (np.int64(np.floor(found[n, 1] / BIN[1])) * 19_349_663)
