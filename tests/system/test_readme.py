@@ -55,7 +55,7 @@ ELSEWHERE = {
     r"mrctl view( (?!--export)\S+)*": ("tests/system/test_viewer_server.py::test_command", "mrctl.viewer.view.view"),
 }  # fmt: skip
 # One draw of each combination in place of hundreds.
-SMALLER = {"sweep.toml": ("runs = 500", "runs = 1")}
+SMALLER = {"sweep.toml": ("runs = 500", "runs = 1"), "ablation.toml": ("runs = 20", "runs = 1")}
 
 
 class Block(NamedTuple):
