@@ -11,6 +11,7 @@ A reference starts at the origin along +x unless its docstring says otherwise. A
 from __future__ import annotations
 
 import cmath
+import contextlib
 from functools import cached_property, lru_cache
 from typing import Annotated, Literal, NamedTuple
 
@@ -482,5 +483,16 @@ def _check(reference: Reference, robot: Robot, reverse: bool) -> None:
         if (peak := abs(values[worst])) > bound * (1 + 1e-9):
             raise InputError(
                 f"reference {reference.kind}: {name} {peak:.3g} {unit} at t = {t[worst]:.2f} s "
-                f"exceeds the robot's {limit} {bound:.3g} {unit}"
+                f"exceeds the robot's {limit} {bound:.3g} {unit}{_slower(reference, robot, reverse)}"
             )
+
+
+def _slower(reference: Reference, robot: Robot, reverse: bool) -> str:
+    """Names a period with which a robot can follow a reference that is too fast for it, where there is one."""
+    if isinstance(reference, (Circle, Lemniscate)):
+        for stretch in (1.1, 1.25, 1.5, 2, 3, 4, 6, 10):
+            period = float(f"{stretch * reference.period:.3g}")
+            with contextlib.suppress(InputError):
+                check(reference.replace(period=period), robot, reverse)
+                return f"; a period of {period:g} s would do"
+    return ""
