@@ -98,6 +98,8 @@ class Record(BaseModel):
             return cls.model_validate(values)
         except ValidationError as error:
             raise InputError(describe(error, source)) from None
+        except OSError as error:  # of a field that names a file
+            raise InputError(printable(f"{source}: {error.filename}: {error.strerror}".removeprefix(": "))) from None
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
@@ -151,4 +153,4 @@ def describe(error: ValidationError, source: str = "") -> str:
     field = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
     more = f" (and {len(rest)} more)" if rest else ""
-    return " ".join((": ".join(part for part in (source, field, message) if part) + more).split())
+    return printable(": ".join(part for part in (source, field, message) if part) + more)

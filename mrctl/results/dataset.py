@@ -217,13 +217,17 @@ def open_result(path: str | Path) -> xr.Dataset:
     """
     if not (Path(path) / "zarr.json").is_file():
         raise InputError(f"{path}: not a saved result, nor a sweep's store: no zarr.json")
+    arrays: dict[Path, zarr.Array] = {}
+    for folder in sorted(file.parent for file in Path(path).glob("*/zarr.json")):
+        with reading(folder):
+            arrays[folder] = zarr.open_array(folder, mode="r", zarr_format=3)
     with reading(f"{path}: not a saved result"):
         result = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
+    for folder, array in arrays.items():
+        if WHOLE in result.attrs and (lost := array.nchunks - array.nchunks_initialized):
+            raise InputError(f"{folder}: {lost} chunks are missing")
     for name in result.variables:
         with reading(f"{path}/{name}"):
-            array = zarr.open_array(Path(path) / str(name), mode="r", zarr_format=3)
-            if WHOLE in result.attrs and array.nchunks_initialized < array.nchunks:
-                raise InputError(f"{path}/{name}: {array.nchunks - array.nchunks_initialized} chunks are missing")
             result[name].load()
     result.attrs.pop(WHOLE, None)
     if missing := {"scenarios", "versions", "control_period"} - set(result.attrs):

@@ -80,9 +80,10 @@ def run(
         sweep = sweep.model_copy(update={"controller": user_files.absolute(sweep.controller)})
     work, path = work or compute, Path(out).absolute()
     try:
+        manifest = _manifest(sweep)  # first, so that a sweep that is refused leaves nothing behind
         Store.prepare(path)
         with Store.locked(path):
-            store = Store.begin(path, _manifest(sweep))
+            store = Store.begin(path, manifest)
             pending = sorted(set(range(store.jobs)) - store.done())
             aside = {}
             if pending:

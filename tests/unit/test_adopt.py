@@ -197,14 +197,15 @@ def test_robot_brings_its_steering(name, steering):
     assert simulation.scenarios[0].steering == steering
 
 
-def test_too_fast_a_reference_says_what_would_do():
-    """The refusal names a period with which the robot can follow, and it can."""
-    scenario = mrctl.Scenario(robot=RobotFile(path="turtlebot"))
-    with pytest.raises(InputError, match="max_speed") as refusal:
+@pytest.mark.parametrize(("name", "limit"), [("turtlebot", "max_speed"), ("racecar", "steering_limit")])
+def test_refused_reference_says_what_would_do(name, limit):
+    """The refusal of the default reference names a size and a period with which the robot can follow, and it can."""
+    scenario = mrctl.Scenario(robot=RobotFile(path=name))
+    with pytest.raises(InputError, match=limit) as refusal:
         Simulation([scenario])
-    found = re.search(r"; a period of (\S+) s would do", str(refusal.value))
+    found = re.search(r"; size (\S+) m with period (\S+) s would do", str(refusal.value))
     assert found
-    Simulation([scenario.replace(reference=mrctl.Lemniscate(period=float(found[1])))])
+    Simulation([scenario.replace(reference=mrctl.Lemniscate(size=float(found[1]), period=float(found[2])))])
 
 
 def test_caster_that_swivels_on_a_joint_without_a_name(file):
