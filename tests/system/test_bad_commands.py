@@ -56,7 +56,8 @@ RUN = [
     "list.toml", "event.toml", "pipe.toml", f"{LONG}.toml", "a\x1b[31mb.toml", "\udcff\udcfe.toml", ". --run 1",
     "missing --run 0", "good.toml good.toml", "reference:spiral", "reference:circle --reference.radius -1",
     "reference:circle --reference.radius 0.2 --reference.period 1", "reference:line --reference.speed 9",
-    "reference:lemniscate --reference.period 1", "reference:waypoints --reference.points 1", "--laps 1 --nosuch", "--learner a\x1b[31mb",
+    "reference:lemniscate --reference.period 1", "reference:waypoints --reference.points 1", "--laps 1 --nosuch",
+    "--learner a\x1b[31mb",
 ]  # fmt: skip
 OTHERS = [
     "dance", "Run", "\x1b[31m", "navigate", "navigate nowhere", "navigate doorway:x", "navigate missing.toml",
