@@ -8,11 +8,13 @@ from __future__ import annotations
 import contextlib
 import io
 import json as jsonlib
+import logging
 import os
 import re
 import sys
 import textwrap
 import typing
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
 from pathlib import Path
@@ -23,7 +25,7 @@ import tyro
 from pydantic import ValidationError
 
 from mrctl import __version__
-from mrctl.record import InputError, Record, describe
+from mrctl.record import InputError, Record, describe, printable
 from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.sensing.tiers import TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -56,21 +58,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"mrctl {__version__}")
         return 0
+    warnings.showwarning = lambda message, *_: print(f"mrctl: {printable(str(message))}", file=sys.stderr)
     try:
         try:
-            _parse(_written_out(arguments))()
+            command = _parse(_written_out(arguments))
+            logging.getLogger("absl").addFilter(lambda _: False)  # warnings of failing runs, which say why they failed
+            try:
+                command()
+            except SystemExit as stop:
+                raise _Incomplete(f"the user's code called sys.exit({stop.code})") from None
         finally:
             sys.stdout.flush()
     except BrokenPipeError:  # the reader of a pipe, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except InputError as error:
-        print(f"mrctl: {error}", file=sys.stderr)
+        print(f"mrctl: {printable(str(error))}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        print(f"mrctl: {printable(text)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as stop:
         print(": ".join(["mrctl: interrupted", *map(str, stop.args)]), file=sys.stderr)
         return 130
     except _Incomplete as error:
-        print(f"mrctl: {error}", file=sys.stderr)
+        print(f"mrctl: {printable(str(error))}", file=sys.stderr)
         return 1
     return 0
 
@@ -214,6 +226,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         json: bool = False,
         controller: str | None = None,
         number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
+        code: bool = True,
     ) -> None:
         """Runs one scenario and prints its metrics lap by lap.
 
@@ -226,9 +239,10 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             json: Print JSON instead of a table.
             controller: Stages of your own, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion,feedback=...
             number: Number of a run in the store, which is run again and compared with what is stored.
+            code: Whether a store may run the Python files of the controller that it names.
         """
         if number is not None:
-            return _repeat(file, number, out, json)
+            return _repeat(file, number, out, json, code)
         if file is not None and file.is_dir():
             raise InputError(f"run: {file} is a store; give the number of one of its runs with --run")
         if file is not None and str(file) != scenario_file:
@@ -300,7 +314,7 @@ def _scenario_file(arguments: Sequence[str]) -> str | None:
     return None
 
 
-def _repeat(store: Path | None, number: int, out: Path | None, json: bool) -> None:
+def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code: bool) -> None:
     """Runs one run of a sweep again and compares it with the store: `mrctl run STORE --run K`."""
     from mrctl.experiments import single
     from mrctl.sweep import jobs
@@ -308,6 +322,7 @@ def _repeat(store: Path | None, number: int, out: Path | None, json: bool) -> No
 
     if store is None:
         raise InputError("run: --run needs the store of a sweep, as in mrctl run STORE --run 3")
+    jobs.stages_of(store, code)
     if out is not None or json:
         print(single.run(jobs.scenario_of(store, number), out, json, Store(store).manifest["sweep"]["controller"])[0])
     repeated = jobs.repeat(store, number)
@@ -388,6 +403,8 @@ def suite(
     from mrctl.experiments import suite as uncertainty
     from mrctl.experiments.cases import HINDSIGHT, RANDOM, REPLICATES, Mode
 
+    if workers is not None and workers < 1:
+        raise InputError(f"workers: {workers} is below 1")
     if quick + full + (held_out is not None) > 1:
         raise InputError("quick: give one of --quick, --full and --held-out")
     if held_out is not None:
@@ -532,6 +549,7 @@ def view(
     export: Path | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
+    code: bool = True,
 ) -> None:
     """Shows robots in the browser: a live session of a scenario, or the replay of a result or sweep.
 
@@ -544,10 +562,11 @@ def view(
         export: HTML file to write instead of serving a page; it plays without a server.
         host: Address to listen on; an address other than 127.0.0.1 lets others in without a password.
         port: Number of the port to listen on.
+        code: Whether a sweep may run the Python files of the controller that it names.
     """
     from mrctl.viewer.view import view as show
 
-    show(file, compare, number, export, host, port)
+    show(file, compare, number, export, host, port, code)
 
 
 def export(

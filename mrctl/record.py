@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import stat
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -13,11 +15,36 @@ from typing_extensions import override
 
 from mrctl import __version__
 
+LARGEST = 64 * 2**20  # bytes of a TOML file
 WRITTEN_BY = "# written by mrctl "  # first line of a TOML file that `to_toml` made
 
 
 class InputError(ValueError):
     """Input from outside is invalid; the message is one line that names the field or the file."""
+
+
+@contextlib.contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Turns whatever a library raises over a damaged file into one line that names the file.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # noqa: BLE001 (readers of damaged files raise errors of every kind)
+        text = printable(f"{type(error).__name__}: {error}")
+        raise InputError(f"{path}: damaged or missing: {text[:300]}") from None
+
+
+def printable(text: str) -> str:
+    """Returns a text of somebody else as one line of at most 2,000 characters without control characters."""
+    words = " ".join(
+        "".join(c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in text).split()
+    )
+    return words if len(words) <= 2000 else f"{words[:1000]} … {words[-900:]}"
 
 
 class Record(BaseModel):
@@ -71,6 +98,8 @@ class Record(BaseModel):
             return cls.model_validate(values)
         except ValidationError as error:
             raise InputError(describe(error, source)) from None
+        except OSError as error:  # of a field that names a file
+            raise InputError(printable(f"{source}: {error.filename}: {error.strerror}".removeprefix(": "))) from None
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
@@ -81,7 +110,11 @@ class Record(BaseModel):
                 mrctl that wrote the file, if another one did.
         """
         try:
+            if stat.S_ISFIFO((found := Path(path).stat()).st_mode) or found.st_size > LARGEST:
+                raise InputError(f"{path}: a pipe, or larger than {LARGEST / 2**20:g} MiB")
             text = Path(path).read_bytes().decode()
+        except InputError:
+            raise
         except (OSError, ValueError) as error:
             raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
         try:
@@ -120,4 +153,4 @@ def describe(error: ValidationError, source: str = "") -> str:
     field = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
     more = f" (and {len(rest)} more)" if rest else ""
-    return " ".join((": ".join(part for part in (source, field, message) if part) + more).split())
+    return printable(": ".join(part for part in (source, field, message) if part) + more)

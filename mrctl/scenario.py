@@ -98,8 +98,9 @@ class Scenario(Record):
     touches one."""
     robot: RobotFile = CAR
     """Robot that drives; by default the world's own."""
-    steering: Steering = "compliant"
-    """Servo of the front wheel: soft (`compliant`), none, so that the wheel trails (`caster`), or stiff (`rigid`)."""
+    steering: Steering | None = None
+    """Servo of the front wheel: soft (`compliant`), none, so that the wheel trails (`caster`), or stiff (`rigid`); by
+    default that of the robot, which is `compliant` for the default robot."""
     reference: Reference = Lemniscate()
     """Reference trajectory that the robot follows."""
     laps: Annotated[int, Field(ge=1, le=10_000)] = 8

@@ -64,6 +64,9 @@ class Check(NamedTuple):
                 return self.function(model, robot)
         except (Unstable, np.linalg.LinAlgError):
             return [compare("the simulation stays finite (1: yes)", 0.0, 1.0)]
+        except Exception as error:  # noqa: BLE001 (a robot that breaks a check fails it)
+            text = " ".join(f"{type(error).__name__}: {error}".split())
+            return [compare(f"the check can be done (1: yes), {text}", 0.0, 1.0)]
 
     def run(self, model: mujoco.MjModel, robot: Robot) -> Report:
         """Measures all values, and returns them if all pass.

@@ -15,6 +15,7 @@ that are consistent but belong to no robot (no rotor inertia behind a gear, limi
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -25,6 +26,7 @@ import numpy as np
 from mrctl.checks.catalogue import CHECKS, Check
 from mrctl.checks.comparison import Comparison, Report
 from mrctl.checks.inspections import Suspect, suspects
+from mrctl.checks.open_loop import limited
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
 from mrctl.theory.robot import Steering
@@ -34,6 +36,8 @@ Load = Callable[[Steering | None], mujoco.MjModel]  # None: the robot's own arra
 # Checks that have to be explained before others run, because a robot that fails them fails others for the same cause.
 PREREQUISITES = {"stance": (), "inertias": (), "motors": (), "limits": ("stance",), "turning_limits": ("stance",)}
 PREREQUISITES_OF_OTHERS = ("stance", "limits", "inertias")
+SECONDS = 20.0  # s of processor time for all checks and explanations of a robot; the default robot takes 4
+SECONDS_OF_ONE = 5.0  # s of processor time for one check
 STEP_DIVISOR = 8  # by which the time step is divided where no repair explains a failure
 
 
@@ -93,6 +97,7 @@ class Examination:
         """
         self._load = load
         self.suspects = suspects(load(None))
+        self._left = SECONDS
         self._findings: dict[str, Finding] = {}
 
     def examine(self, check: Check) -> Finding:
@@ -109,11 +114,22 @@ class Examination:
         model = self._load(check.steering)
         if reason := check.unsuited(model):
             return Finding(check, [], reason=reason)
-        report = check.measure(model, read_robot(model))
+        report = self._measure(check, model)
         return Finding(check, report, () if _passes(report) else self._explain(check, report))
+
+    def _measure(self, check: Check, model: mujoco.MjModel) -> Report:
+        """Values of a check, for which there is a limited time."""
+        start = time.process_time()
+        try:
+            with limited(min(SECONDS_OF_ONE, self._left)):
+                return check.measure(model, read_robot(model))
+        finally:
+            self._left -= time.process_time() - start
 
     def _explain(self, check: Check, report: Report) -> tuple[Explanation, ...]:
         """Names the suspects without whose repair the check still fails when all others are repaired."""
+        if self._left <= 0:
+            return ()
         worst = max((c for c in report if not c.passed), key=excess)
         suspected = self.suspects
         repaired = self._repaired(check, suspected) if suspected else []
@@ -137,7 +153,7 @@ class Examination:
             suspect.repair(model)
         try:
             mujoco.mj_setConst(model, mujoco.MjData(model))
-            return check.measure(model, read_robot(model))
+            return self._measure(check, model)
         except (InputError, mujoco.FatalError):
             return []
 

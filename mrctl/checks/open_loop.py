@@ -9,7 +9,11 @@ experiment; functions of a model return variants of it in which one law shows al
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 import mujoco
@@ -34,11 +38,30 @@ COMPONENTS = {
 """Signals that are components of a field of `READING`."""
 OFF = (0.0, 0.0, 0.0, 0.0)  # no voltage, which shorts the motors, and wheels straight on
 HOLD = 0.02  # s for which a control is held
+LONGEST = 600.0  # s, longest drive; the slowest robot that comes with mrctl needs 20
+MOST = 1_000_000  # steps in a drive
 DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
 class Unstable(Exception):
     """The simulation has diverged."""
+
+
+class TooLong(Exception):
+    """A check would simulate for too long, or has computed for too long; the message says which."""
+
+
+_deadline: ContextVar[float] = ContextVar("deadline", default=math.inf)
+
+
+@contextlib.contextmanager
+def limited(seconds: float) -> Iterator[None]:
+    """Limits the processor time, in s, within which the drives of a check must be done."""
+    token = _deadline.set(time.process_time() + seconds)
+    try:
+        yield
+    finally:
+        _deadline.reset(token)
 
 
 @dataclass(frozen=True)
@@ -90,7 +113,11 @@ class Car:
 
         Raises:
             Unstable: The simulation has diverged.
+            TooLong: The drive would last longer than `LONGEST`, or take more than `MOST` steps, or time is up.
         """
+        if not (0 <= seconds <= LONGEST and seconds <= MOST * self.model.opt.timestep):
+            step = self.model.opt.timestep
+            raise TooLong(f"it would drive for {seconds:.3g} s in steps of {step:.3g} s; look for a wrong unit")
         law = control if callable(control) else lambda _: control
         substeps = max(1, round(hold / self.model.opt.timestep))
         hold = substeps * self.model.opt.timestep  # in whole steps
@@ -98,6 +125,8 @@ class Car:
         qpos, qvel = np.empty((ticks + 1, self.model.nq)), np.empty((ticks + 1, self.model.nv))
         qpos[0], qvel[0] = self.data.qpos, self.data.qvel
         for k in range(ticks):
+            if time.process_time() > _deadline.get():
+                raise TooLong("its time is up")
             self.control(law(k * hold))
             mujoco.mj_step(self.model, self.data, substeps)
             qpos[k + 1], qvel[k + 1] = self.data.qpos, self.data.qvel

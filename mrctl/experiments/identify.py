@@ -35,7 +35,7 @@ from scipy import stats
 from mrctl.checks.open_loop import on_skid
 from mrctl.experiments.tables import json_text, machine, markdown
 from mrctl.physics import mjcf
-from mrctl.physics.parameters import read_robot
+from mrctl.physics.elements import is_level
 from mrctl.physics.plant import Plant, build
 from mrctl.record import InputError
 from mrctl.results.dataset import versions
@@ -150,11 +150,16 @@ def identify(
         seed: Seed of signals and sensors.
 
     Raises:
-        InputError: The robot fails during a drive, or the encoders or the gyro are too slow for the signals.
+        InputError: The ground is not level, the robot fails during a drive, or the encoders or the gyro are too slow
+            for the signals.
     """
+    if seed < 0:
+        raise InputError(f"seed: {seed} is negative")
     own = mjcf.arrangement(robot)
     steering = "rigid" if own == "compliant" else own
-    nominal = read_robot(mjcf.load(world, steering, robot=robot))
+    model, nominal = mjcf.build(world, steering, robot=robot)
+    if perturbation.slope or not is_level(model):
+        raise InputError(f"{'perturbation.slope' if perturbation.slope else 'world'}: the ground must be level")
     tau = min(nominal.velocity_time_constant, nominal.rotation_time_constant)
     substeps = max(5, int(np.ceil(FINE * TICK / tau)))
     model = mjcf.load(world, steering, TICK / substeps, robot)

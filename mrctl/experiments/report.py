@@ -118,7 +118,7 @@ def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
     lap = simulation.log.ticks[-round(scenario.reference.period / scenario.control_period) :, 0]
     path = np.stack([lap["v_command"], lap["omega_command"]], axis=1)
     v, omega, shape = np.linspace(0, 1.2, GRID), np.linspace(-2, 2, GRID), (GRID, GRID, 2)
-    truth = Prior([simulation.plant.truth[0]], rigid=scenario.steering == "rigid")
+    truth = Prior([simulation.plant.truth[0]], rigid=simulation.scenarios[0].steering == "rigid")
     mine, true = (
         np.reshape([np.array(law(np.array([[x, y]]), np.zeros((1, 2))))[0] for y in omega for x in v], shape)
         for law in (simulation.hierarchy.feedforward, truth.output)

@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 from mrctl.control.feedforward import STEERING_SCALE
 from mrctl.control.guard import Guard
 from mrctl.loop.hierarchy import TAKE_OVER
-from mrctl.loop.simulation import Simulation
+from mrctl.loop.simulation import Simulation, arranged
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, Scenario
 from mrctl.theory.references import Line
@@ -104,7 +104,7 @@ def measure(scenarios: Sequence[Scenario], channel: int, speed: float = Line().s
     Raises:
         InputError: A robot failed.
     """
-    first = scenarios[0]
+    first = arranged(scenarios[0])
     harmonics = lines(SAMPLES)
     signal = np.zeros((SAMPLES, 2))
     scale = STEERING_SCALE if channel == 1 and first.steering == "rigid" else 1.0

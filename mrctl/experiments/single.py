@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+
+import xarray as xr
+from matplotlib.figure import Figure
 
 from mrctl.control.stages import Stages
 from mrctl.experiments.tables import markdown, number, output_folder
@@ -28,6 +32,14 @@ COLUMNS = {
     "guard_actions": ("guard acted", 1.0),
 }
 
+FIGURES: dict[str, Callable[[xr.Dataset], Figure]] = {
+    "path": plots.path,
+    "velocities": plots.velocities,
+    "errors": plots.errors,
+    "voltages": plots.voltages,
+    "learning": plots.learning_curve,
+}
+
 
 def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = None) -> tuple[str, str]:
     """Runs a scenario.
@@ -44,24 +56,30 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     Raises:
         InputError: The scenario or a stage is bad, or the folder cannot be written or holds a result already.
     """
-    if out is not None and (output_folder(out) / "result.zarr").exists():
-        raise InputError(f"out: {out} holds a result already; nothing was overwritten")
+    written = (
+        "result.zarr",
+        "learned.safetensors",
+        *(f"{name}.{suffix}" for name in FIGURES for suffix in plots.FORMATS),
+    )
+    if out is not None and (held := [name for name in written if (out / name).exists()]):
+        raise InputError(f"out: {out} holds {held[0]} already; nothing was overwritten")
     stages: Stages = user_files.load(own) if own else {}
-    result = simulate([scenario], progress=True, **stages)
+    new = out is not None and not out.exists()
+    try:
+        if out is not None:
+            output_folder(out)
+        result = simulate([scenario], progress=True, **stages)
+    except InputError:
+        if out is not None and new and out.is_dir():
+            out.rmdir()
+        raise
     laps = metrics.per_lap(result)
     if out is not None:
         save(result, out / "result.zarr")
         if "weights" in result and not result["failed"].any():
             save_learned(out / "learned.safetensors", result)
-        figures = {
-            "path": plots.path(result),
-            "velocities": plots.velocities(result),
-            "errors": plots.errors(result),
-            "voltages": plots.voltages(result),
-            "learning": plots.learning_curve(laps),
-        }
-        for name, figure in figures.items():
-            plots.save(figure, out, name)
+        for name, draw in FIGURES.items():
+            plots.save(draw(laps if name == "learning" else result), out, name)
     failure = str(result["failure"].values[0])
     row = laps.isel(run=0)
     events = metrics.guard_events(result).drop(columns="run")
@@ -83,7 +101,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         for k in range(row.sizes["lap"])
     ]
     name = str(result["feedforward"].values[0]) + (f", own stages {own}" if own else "")
-    lines = [f"RMSE per lap against the reference, feedforward {name}, steering {scenario.steering}"]
+    lines = [f"RMSE per lap against the reference, feedforward {name}, steering {result['steering'].values[0]}"]
     if failure:
         lines.append(f"failed after {float(row['failure_time']):.2f} s: {failure}")
     acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]

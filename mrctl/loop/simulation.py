@@ -64,7 +64,8 @@ def simulate(
         InputError: A scenario asks for something that does not exist or that the robot cannot do, and the message names
             the field; or a stage of the user cannot be made.
     """
-    several = [s.replace() for s in ([scenarios] if isinstance(scenarios, Scenario) else scenarios)]  # validated
+    given = [s.replace() for s in ([scenarios] if isinstance(scenarios, Scenario) else scenarios)]  # validated
+    several = [arranged(s) for s in given]
     if not several:
         raise InputError("scenarios: none given")
     if len({s.control_period for s in several}) > 1:
@@ -75,7 +76,7 @@ def simulate(
     at_once = 1 if any(stages.values()) else threads
     with tqdm(total=total, unit="tick", unit_scale=True, disable=not progress) as bar:
         run([simulation for _, simulation in parts], bar.update if progress else None, threads=at_once)
-    whole = dataset.combine([(rows, simulation.result()) for rows, simulation in parts], several)
+    whole = dataset.combine([(rows, simulation.result()) for rows, simulation in parts], given)
     return whole.isel(run=0) if isinstance(scenarios, Scenario) else whole
 
 
@@ -154,6 +155,15 @@ def run(
             raise
 
 
+def arranged(scenario: Scenario) -> Scenario:
+    """Returns the scenario with the steering arrangement of its robot, where it names none.
+
+    Raises:
+        InputError: The robot's file has no robot that can be driven.
+    """
+    return scenario if scenario.steering else scenario.replace(steering=mjcf.arrangement(scenario.robot))
+
+
 def group_of(s: Scenario) -> Hashable:
     """Returns what the runs of one simulation must share."""
     rates = s.ticks, s.physics_step, s.control_period, s.motion_period
@@ -189,8 +199,9 @@ class Simulation:
         Raises:
             InputError: A scenario or a stage is refused, as in `simulate`.
         """
+        scenarios = [arranged(s) for s in scenarios]
         first, size = scenarios[0], len(scenarios)
-        self.scenarios = list(scenarios)
+        self.scenarios = scenarios
         self.ticks, self.tick, self.period = first.ticks, 0, first.control_period
         self.model, robot = mjcf.build(first.world, first.steering, first.physics_step, first.robot, first.obstacles)
         self._reverses = mjcf.reverses(self.model, first.steering)
@@ -208,6 +219,10 @@ class Simulation:
         self.plant: Plant = build(
             self.model, robot, size, round(self.period / first.physics_step), threads, first.obstacles
         )
+        later = [event.perturbation for scenario in scenarios for event in scenario.events]
+        for k, perturbation in enumerate(later):  # before anything is computed
+            if perturbation is not None and perturbation not in later[:k]:
+                self.plant.check(perturbation)
         own = users.pop("estimator", None)
         self.hierarchy = UserHierarchy(scenarios, robot, users) if users else Hierarchy(scenarios, robot)
         sensing = [s.sensing for s in scenarios]

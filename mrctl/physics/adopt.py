@@ -73,8 +73,9 @@ class _Adoption:
 
     def __init__(self, robot: RobotFile, path: Path) -> None:
         self.spec = mujoco.MjSpec.from_file(str(path))
-        for k, body in enumerate(self.spec.bodies):
-            body.name = body.name or f"body_{k}"
+        for kind, elements in (("body", self.spec.bodies), ("joint", self.spec.joints)):
+            for k, element in enumerate(elements):  # looked up by name below
+                element.name = element.name or f"{kind}_{k}"
         self.model = self.spec.compile()
         self.data = mujoco.MjData(self.model)
         mujoco.mj_kinematics(self.model, self.data)
@@ -96,10 +97,10 @@ class _Adoption:
         joints = list(names) or [
             a.target for a in self.spec.actuators if a.gaintype == mujoco.mjtGain.mjGAIN_DCMOTOR and self._is_hinge(a)
         ]
-        if len(set(joints)) != 2:
+        if len(joints) != 2 or len(set(joints)) != 2:
             level = [j for j in self._hinges() if abs(self._axis(j)[2]) < 0.5]
             raise InputError(
-                f"wheels: {len(joints)} joints have a <dcmotor>; name the joints of the two driven wheels, "
+                f"wheels: {len(joints)} joints, {_listed(joints)}, not two with a <dcmotor>; name those of the wheels, "
                 f"of {_listed(level)}, and give each {DCMOTOR.format('JOINT')}"
             )
         return [self._hinge(name, "wheels") for name in joints]
@@ -109,11 +110,12 @@ class _Adoption:
         moved = {a.target for a in self.spec.actuators if self._is_hinge(a)}
         upright = [name for name in self._hinges() if abs(self._axis(name)[2]) > 0.9 and name in moved]
         joints = list(names) or upright
-        if len(joints) > 2:
-            raise InputError(
-                f"steering: {_listed(joints)} are upright joints with an actuator; name one or two of them"
-            )
-        return [self._hinge(name, "steering") for name in joints]
+        if len(joints) > 2 or len(set(joints)) < len(joints):
+            raise InputError(f"steering: {_listed(joints)}; name one or two upright joints with an actuator")
+        for name in joints:
+            if abs(self._axis(self._hinge(name, "steering"))[2]) < 0.5:
+                raise InputError(f"steering: the joint {name!r} is not upright; {_listed(upright)} could be steered")
+        return joints
 
     def _carrier(self, name: str, wheels: Sequence[str]) -> str:
         """Returns the body that carries both wheels: the one named, or their root."""
@@ -195,7 +197,7 @@ class _Adoption:
     def _roller(self, body: str) -> str:
         """Returns the joint on which a caster's body rolls, a ball or a level hinge; empty where it slides."""
         joints = [j for j in range(self.model.njnt) if self.model.jnt_bodyid[j] == self.model.body(body).id]
-        if body == self.chassis or len(joints) != 1 or not self.model.joint(joints[0]).name:
+        if body == self.chassis or len(joints) != 1:
             return ""
         kind, level = self.model.jnt_type[joints[0]], abs(self.data.xaxis[joints[0]][2]) < 0.1
         ball = kind == mujoco.mjtJoint.mjJNT_BALL

@@ -85,3 +85,14 @@ def left_tyre_pairs(model: mujoco.MjModel) -> list[int]:
     wheel = model.geom("wheel_left").id
     pairs = [p for p in range(model.npair) if wheel in (model.pair_geom1[p], model.pair_geom2[p])]
     return sorted(pairs, key=lambda p: model.pair(p).name != "tyre_left")
+
+
+def is_level(model: mujoco.MjModel) -> bool:
+    """Tells whether gravity is vertical and every floor below the left wheel is a plane that lies flat."""
+    pairs = left_tyre_pairs(model)
+    floors = {int(g) for p in pairs for g in (model.pair_geom1[p], model.pair_geom2[p])} - {model.geom("wheel_left").id}
+    flat = all(
+        model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE and np.abs(model.geom_quat[g, 1:3]).max() < 1e-9
+        for g in floors
+    )
+    return flat and not model.opt.gravity[:2].any()

@@ -30,6 +30,9 @@ from mrctl.theory.robot import ANY_ANGLE, CAR, GRAVITY, STEERINGS, Robot, RobotF
 
 NONE = Obstacles()
 
+INCLUDED = f'<include file="{CAR.path}.xml"/>'
+"""The line with which a world includes the default robot."""
+
 REQUIRED = {
     "body": ("chassis", "wheel_left", "wheel_right", "fork", "front_wheel"),
     "joint": ("chassis", "wheel_left", "wheel_right", "steering", "front_wheel"),
@@ -41,7 +44,7 @@ REQUIRED = {
 
 def build(
     world: str = "flat",
-    steering: Steering = "compliant",
+    steering: Steering | None = None,
     timestep: float | None = None,
     robot: RobotFile = CAR,
     obstacles: Obstacles = NONE,
@@ -50,7 +53,8 @@ def build(
 
     Args:
         world: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file.
-        steering: Steering arrangement, one of `steerings`. The default robot is `compliant` as its MJCF stands;
+        steering: Steering arrangement, one of `steerings`, by default the first. The default robot is `compliant` as
+            its MJCF stands;
             `caster` and `rigid` take stiffness (N·m/rad), damping (N·m·s/rad) and trail (m) of the fork from the
             numerics `steering_caster` and `steering_rigid`.
         timestep: Time step of the physics in s; by default the file's own.
@@ -67,10 +71,11 @@ def build(
     path = world_path(world)
     source = path if robot == CAR else robot_path(robot)
     try:
-        model = mujoco.MjModel.from_xml_path(str(path)) if robot == CAR else adopt.adopted(robot, path).compile()
+        spec = _assembled(path, robot)
+        model = spec.compile()
         nominal = _arranged(model, steering, robot)
         if obstacles.shapes:
-            spec = mujoco.MjSpec.from_file(str(path)) if robot == CAR else adopt.adopted(robot, path)
+            spec = _assembled(path, robot)
             walls.add(spec, obstacles, footprint(model))
             model = spec.compile()
             nominal = _arranged(model, steering, robot)
@@ -81,13 +86,35 @@ def build(
     return model, nominal
 
 
-def _arranged(model: mujoco.MjModel, steering: Steering, robot: RobotFile) -> Robot:
+def _assembled(world: Path, robot: RobotFile) -> mujoco.MjSpec:
+    """Returns a world with a robot, which compiles.
+
+    A copy of the default robot's file keeps its names, and so its servo and its steering arrangements: it takes the
+    place of that file in a world that includes it. The robot of any other file is adopted.
+    """
+    if robot != CAR and robot == RobotFile(path=robot.path) and INCLUDED in world.read_text():
+        text = robot_path(robot).read_bytes()
+        if _has_names_of_car(mujoco.MjSpec.from_file(str(robot_path(robot)))):
+            return mujoco.MjSpec.from_file(str(world), include={f"{CAR.path}.xml": text})
+    return mujoco.MjSpec.from_file(str(world)) if robot == CAR else adopt.adopted(robot, world)
+
+
+def _has_names_of_car(spec: mujoco.MjSpec) -> bool:
+    """Tells whether a file has the elements of the default robot, and no floor."""
+    elements = {"body": spec.bodies, "joint": spec.joints, "geom": spec.geoms, "actuator": spec.actuators}
+    named = all({*REQUIRED[kind]} <= {element.name for element in found} for kind, found in elements.items())
+    numerics = {*NUMERICS, *(f"steering_{steering}" for steering in STEERINGS[1:])}
+    return named and numerics <= {numeric.name for numeric in spec.numerics} and not spec.pairs
+
+
+def _arranged(model: mujoco.MjModel, steering: Steering | None, robot: RobotFile) -> Robot:
     """Checks a compiled model, gives it its steering arrangement, and returns the parameters of its robot.
 
     Raises:
         InputError: An element is missing, or the robot is not driven with this steering.
     """
     offered = steerings(model)
+    steering = steering or offered[0]
     if robot != CAR and steering not in offered:
         raise InputError(f"steering: {robot.path} is driven with {' or '.join(offered)}, not {steering}")
     _check_elements(model, steering)
@@ -102,7 +129,7 @@ def _arranged(model: mujoco.MjModel, steering: Steering, robot: RobotFile) -> Ro
 
 def load(
     world: str = "flat",
-    steering: Steering = "compliant",
+    steering: Steering | None = None,
     timestep: float | None = None,
     robot: RobotFile = CAR,
     obstacles: Obstacles = NONE,
@@ -133,7 +160,7 @@ def load_robot(
     steered = (steering,) if isinstance(steering, str) else tuple(steering)
     values = {"path": str(path), "wheels": tuple(wheels), "steering": steered, "chassis": chassis}
     robot = RobotFile.from_dict(values, "robot")
-    load(steering=arrangement(robot), robot=robot)
+    load(robot=robot)
     return robot
 
 
@@ -143,7 +170,7 @@ def arrangement(robot: RobotFile) -> Steering:
     Raises:
         InputError: The file has no robot that can be driven.
     """
-    return "compliant" if robot == CAR else steerings(adopt.adopted(robot, world_path("flat")).compile())[0]
+    return STEERINGS[0] if robot == CAR else steerings(load(robot=robot))[0]
 
 
 def steerings(model: mujoco.MjModel) -> tuple[Steering, ...]:
@@ -157,7 +184,7 @@ def steerings(model: mujoco.MjModel) -> tuple[Steering, ...]:
     return ("rigid",) if has(model, "text", RIGID) else STEERINGS
 
 
-def reverses(model: mujoco.MjModel, steering: Steering) -> bool:
+def reverses(model: mujoco.MjModel, steering: Steering | None) -> bool:
     """Tells whether a robot can be driven backwards; a fork that trails would jackknife."""
     return steering == "rigid" or not has(model, "joint", "steering")
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import shutil
+import uuid
 from collections.abc import Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+import zarr
 from numpy.typing import NDArray
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from mrctl import __version__
-from mrctl.record import InputError
+from mrctl.record import InputError, reading
 from mrctl.scenario import Scenario
 
 # Name: (unit, meaning). A sample at time t holds the state at t, the commands
@@ -78,6 +81,7 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "pitch_angle": ("rad", "pitch, positive nose down; after the heading"),
 }
 
+WHOLE = "all_chunks"  # attribute of a saved result whose files hold all chunks, also those of NaN alone
 SINCE_0_4_2 = ("z", "roll_angle", "pitch_angle")  # signals that older results lack
 
 TICK = np.dtype([(name, "f8") for name in SIGNALS])  # the signals of one robot at one control tick
@@ -190,14 +194,17 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     path = Path(path)
     if path.exists():
         raise InputError(f"{path}: exists already, nothing was overwritten")
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
-        result.to_zarr(partial, mode="w", zarr_format=3, consolidated=False)
+        checked = {str(name): {"compressors": (ZstdCodec(), Crc32cCodec())} for name in result.variables}
+        result = result.assign_attrs({WHOLE: 1})
+        result.to_zarr(partial, mode="w", zarr_format=3, consolidated=False, encoding=checked, write_empty_chunks=True)
         partial.rename(path)
     except OSError as error:
-        shutil.rmtree(partial, ignore_errors=True)
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def open_result(path: str | Path) -> xr.Dataset:
@@ -206,12 +213,23 @@ def open_result(path: str | Path) -> xr.Dataset:
     What needs a variable or a field of a scenario that the result lacks says so, and names the version that wrote it.
 
     Raises:
-        InputError: There is no result at this path.
+        InputError: There is no result at this path, or a file of it is damaged or missing.
     """
-    try:
-        result = xr.open_zarr(path, consolidated=False).load()
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: not a saved result: {' '.join(str(error).split())}") from None
+    if not (Path(path) / "zarr.json").is_file():
+        raise InputError(f"{path}: not a saved result, nor a sweep's store: no zarr.json")
+    arrays: dict[Path, zarr.Array] = {}
+    for folder in sorted(file.parent for file in Path(path).glob("*/zarr.json")):
+        with reading(folder):
+            arrays[folder] = zarr.open_array(folder, mode="r", zarr_format=3)
+    with reading(f"{path}: not a saved result"):
+        result = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
+    for folder, array in arrays.items():
+        if WHOLE in result.attrs and (lost := array.nchunks - array.nchunks_initialized):
+            raise InputError(f"{folder}: {lost} chunks are missing")
+    for name in result.variables:
+        with reading(f"{path}/{name}"):
+            result[name].load()
+    result.attrs.pop(WHOLE, None)
     if missing := {"scenarios", "versions", "control_period"} - set(result.attrs):
         raise InputError(f"{path}: not a saved result: no {min(missing)}")
     return result

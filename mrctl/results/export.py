@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import uuid
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -40,7 +41,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
-from mrctl.record import InputError
+from mrctl.record import InputError, reading
 from mrctl.results.dataset import SIGNALS, SINCE_0_4_2, require, scenarios_of
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import GRAVITY
@@ -141,7 +142,7 @@ def export(
     writers: dict[Format, Callable[[xr.Dataset, Path], None]] = {
         "mcap": partial(_mcap, scenario), "csv": _csv, "parquet": _parquet, "npz": _npz,
     }  # fmt: skip
-    unfinished = out.with_name(out.name + ".partial")
+    unfinished = out.with_name(f".{out.name}.{uuid.uuid4().hex}.partial")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         writers[to](whole, unfinished)
@@ -157,7 +158,8 @@ def export(
 def _runs(whole: xr.Dataset) -> Iterator[tuple[int, Columns]]:
     """Number and signals of each run, with their times, until it ended; one run is in memory at a time."""
     for k, number in enumerate(whole["run"].values):
-        one = whole.isel(run=k).load()
+        with reading(f"signals of run {int(number)}"):
+            one = whole.isel(run=k).load()
         drove = np.isfinite(one["x"].values)
         yield int(number), {name: one[name].values[drove] for name in ("time", *SIGNALS) if name in one}
 
@@ -199,7 +201,8 @@ def _csv(whole: xr.Dataset, path: Path) -> None:
 
 def _npz(whole: xr.Dataset, path: Path) -> None:
     """Writes `time` (T,), `run` (R,) and each signal (R, T), NaN after a failure; units and scenarios are JSON."""
-    whole = whole.load()
+    with reading("signals"):
+        whole = whole.load()
     names = [name for name in SIGNALS if name in whole]
     arrays: Columns = {name: whole[name].transpose("run", "time").values for name in names}
     arrays |= {"time": whole["time"].values, "run": whole["run"].values}

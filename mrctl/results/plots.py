@@ -84,9 +84,17 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     @wraps(draw)
     def inner(*args: P.args, **kwargs: P.kwargs) -> Figure:
         with mpl.rc_context(STYLE):
-            return draw(*args, **kwargs)
+            return draw(*map(_literal, args), **{k: _literal(v) for k, v in kwargs.items()})  # type: ignore[arg-type]
 
     return inner
+
+
+def _literal(value: Any) -> Any:  # noqa: ANN401
+    """Returns a result with labels in which a dollar begins no formula; other values stay as they are."""
+    if not isinstance(value, xr.Dataset) or "label" not in value:
+        return value
+    labels = np.array([str(label).replace("$", r"\$") for label in value["label"].values.flat], object)
+    return value.assign_coords(label=(value["label"].dims, labels.reshape(value["label"].shape)))
 
 
 def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:

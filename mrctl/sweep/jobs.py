@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
@@ -20,13 +22,13 @@ from tqdm import tqdm
 from mrctl import __version__
 from mrctl.control.stages import METHODS, Stages
 from mrctl.loop import user_files
-from mrctl.loop.simulation import Simulation, cores, simulate
+from mrctl.loop.simulation import Simulation, arranged, cores, simulate
 from mrctl.physics import mjcf
-from mrctl.record import InputError
+from mrctl.record import InputError, printable
 from mrctl.results import metrics
 from mrctl.results.dataset import SIGNALS, versions
 from mrctl.scenario import Scenario
-from mrctl.sweep.plan import Sweep
+from mrctl.sweep.plan import TRIED, Sweep
 from mrctl.sweep.pool import Cluster, Outcome, Pool, Processes, Work
 from mrctl.sweep.store import Store
 from mrctl.theory.robot import CAR
@@ -72,11 +74,16 @@ def run(
     """
     if workers is not None and (scheduler or workers < 1):
         raise InputError("workers: not together with a scheduler" if scheduler else f"workers: {workers} is below 1")
+    if scheduler is not None and not re.fullmatch(r"\w+://.+:\d+", scheduler):
+        raise InputError(f"scheduler: {scheduler!r} is no address such as tcp://127.0.0.1:8786")
+    if sweep.controller:  # so that the store finds its files from every folder
+        sweep = sweep.model_copy(update={"controller": user_files.absolute(sweep.controller)})
     work, path = work or compute, Path(out).absolute()
     try:
+        manifest = _manifest(sweep)  # first, so that a sweep that is refused leaves nothing behind
         Store.prepare(path)
         with Store.locked(path):
-            store = Store.begin(path, _manifest(sweep))
+            store = Store.begin(path, manifest)
             pending = sorted(set(range(store.jobs)) - store.done())
             aside = {}
             if pending:
@@ -143,11 +150,19 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
         InputError: A world does not compile, or the robot cannot follow the reference.
     """
     models = _models(sweep)
-    if scenario := sweep.valid(0):
+    refusals: list[InputError] = []
+    for scenario in filter(None, map(sweep.valid, range(min(sweep.size, TRIED)))):
+        try:
+            Simulation([scenario])
+        except InputError as error:  # what was drawn for one run says nothing about the others
+            refusals.append(error)
+            continue
         if sweep.controller:
             user_files.trial(sweep.controller, scenario)
-        else:
-            Simulation([scenario])
+        refusals.clear()
+        break
+    if refusals:
+        raise refusals[0]
     return {
         "sweep": sweep.model_dump(mode="json"),
         "versions": versions(),
@@ -164,7 +179,7 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
 def _models(sweep: Sweep) -> dict[str, str]:
     """Digests of the compiled worlds with their robots, and of the files of the user's stages."""
     worlds = {
-        f"{world}, {steering}" + (f", {robot.path}" if robot != CAR else ""): mjcf.digest(
+        ", ".join(filter(None, (world, steering))) + (f", {robot.path}" if robot != CAR else ""): mjcf.digest(
             mjcf.load(world, steering, robot=robot)
         )
         for world, steering, robot in sweep.worlds
@@ -260,7 +275,11 @@ def _row(sweep: Sweep, run: int, failure: str = "", **found: object) -> dict[str
     row: dict[str, Any] = {name: np.nan for name in (*metrics.METRICS, "lap_time")}
     row |= {name: [] for name in sweep.columns.names if name.endswith("_per_lap")}
     row |= {"run": run, "label": scenario.name or scenario.feedforward, "feedforward": scenario.feedforward}
-    row |= {"steering": scenario.steering, "seed": valid.seed if valid else values["seed"], "laps": 0}
+    row |= {
+        "steering": found.get("steering") or arranged(scenario).steering,
+        "seed": valid.seed if valid else values["seed"],
+        "laps": 0,
+    }
     row |= {"failed": bool(failure), "failure": failure, "failure_time": 0.0 if failure else np.nan}
     return row | found | {axis.field: axis.cell(values[axis.field]) for axis in sweep.axes}
 
@@ -286,6 +305,27 @@ def scenario_of(out: str | Path, run: int) -> Scenario:
             of mrctl, which the message names, wrote a field that this one does not know.
     """
     return _sweep(Store(out)).scenario(run)
+
+
+def stages_of(out: str | Path, code: bool = True) -> Stages:
+    """The user's stages that a stored sweep was driven with, as arguments of `simulate`; says which files it runs.
+
+    Args:
+        out: The store.
+        code: Whether the store may run the Python files that it names.
+
+    Raises:
+        InputError: It names some and may not run them, or they are missing or have changed since.
+    """
+    store = Store(out)
+    if not (controller := store.manifest["sweep"]["controller"]):
+        return {}
+    if not code:
+        raise InputError(f"code: {out} names {printable(controller)}, which --no-code forbids to run")
+    if user_files.digest(controller) != store.manifest["models"].get(controller):
+        raise InputError(f"controller: {printable(controller)} is not the file that {out} was computed with")
+    print(f"mrctl: runs {printable(controller)}, which {out} names", file=sys.stderr)
+    return user_files.load(controller)
 
 
 def _sweep(store: Store) -> Sweep:

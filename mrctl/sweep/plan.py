@@ -27,6 +27,7 @@ from mrctl.scenario import Scenario
 from mrctl.theory.robot import RobotFile
 
 CHUNK_BYTES = 2**27  # largest size of the signals of a job in memory
+LARGEST = 2**43  # bytes of the signals of all runs, before they are compressed
 TRIED = 20  # first runs, of which at least one must have a valid scenario
 WHOLE = "scenario"  # the field of an axis whose values are tables of changes to the scenario
 
@@ -154,6 +155,9 @@ class Sweep(Record):
                 raise ValueError(f"axes: {names} are zipped, but differ in length or in `paired`")
         if self.size > 100_000_000:
             raise ValueError(f"runs: {self.size:,} of them, at most 100,000,000")
+        kept = self.size * self.base.ticks // self.stride * 8 * len(SIGNALS)
+        if self.record in ("decimated", "full") and kept > LARGEST:
+            raise ValueError(f"record: {self.size:,} runs would keep {kept / 1e12:,.0f} TB of signals; keep metrics")
         self._check_values()
         return self
 

@@ -10,6 +10,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from queue import Empty, SimpleQueue
@@ -88,6 +89,7 @@ class Processes:
             pipe.send(job)
 
     def _start(self) -> tuple[BaseProcess, Connection]:
+        resource_tracker.ensure_running()  # which unblocks Ctrl-C when it has started
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_serve, args=(self._work, self._path, theirs), daemon=True)
         with _uninterrupted():

@@ -22,10 +22,11 @@ import os
 import shutil
 import socket
 import uuid
+import warnings
 from collections.abc import Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO
 
 import numpy as np
 import pandas as pd
@@ -34,17 +35,45 @@ import pyarrow.parquet as pq
 import xarray as xr
 import zarr
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec
+from pydantic import ConfigDict, Field
+from zarr.codecs import BloscCodec, Crc32cCodec
 
 from mrctl import __version__
-from mrctl.record import InputError
+from mrctl.record import InputError, Record, reading
 from mrctl.results.dataset import SIGNALS, open_result
 from mrctl.results.metrics import METRICS
+from mrctl.scenario import LONGEST
 
 KIND, FORMAT = "mrctl sweep", 2
 ROW_GROUP = 16384  # rows of the table that are in memory at once
 INNER = 16  # runs that are compressed together, signal by signal
 COMPLETE = b"complete"  # key in the metadata of the table: whether it holds every job
+
+
+class _Axis(Record):
+    model_config = ConfigDict(extra="ignore")
+    field: str
+
+
+class _Described(Record):
+    model_config = ConfigDict(extra="ignore")
+    axes: tuple[_Axis, ...]
+    record: str
+    controller: str | None
+
+
+class _Manifest(Record):
+    """What a manifest must hold, whichever version wrote it."""
+
+    model_config = ConfigDict(extra="ignore")
+    sweep: _Described
+    models: dict[str, str]
+    size: Annotated[int, Field(ge=0, le=100_000_000)]
+    chunk: Annotated[int, Field(ge=1, le=100_000_000)]
+    samples: Annotated[int, Field(ge=0, le=LONGEST)]
+    stride: Annotated[int, Field(ge=1)]
+    control_period: Annotated[float, Field(gt=0)]
+    signals: tuple[str, ...] = ()
 
 
 class Store:
@@ -67,8 +96,9 @@ class Store:
         try:
             self.manifest: dict[str, Any] = json.loads((self.path / "sweep.json").read_bytes())
             found, self.writer = self.manifest[KIND], str(self.manifest["versions"]["mrctl"])
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             raise InputError(f"{path}: not a sweep's store") from None
+        _Manifest.from_dict(self.manifest, f"{path}/sweep.json")
         if found not in range(1, FORMAT + 1):
             raise InputError(
                 f"{path}: mrctl {self.writer} wrote this store in format {found}; "
@@ -187,7 +217,8 @@ class Store:
     @property
     def complete(self) -> bool:
         """Whether the table holds every job."""
-        return self.table.exists() and pq.read_schema(self.table).metadata.get(COMPLETE) == b"1"
+        with reading(self.table):
+            return self.table.exists() and pq.read_schema(self.table).metadata.get(COMPLETE) == b"1"
 
     def done(self) -> set[int]:
         """Numbers of the jobs that are done."""
@@ -203,7 +234,7 @@ class Store:
         if signals is not None:
             runs = self.runs(job)
             self._signals[runs.start : runs.stop] = signals  # zarr renames a whole shard
-            if (shard := self.path / "signals.zarr" / "signals" / "c" / str(job) / "0" / "0").exists():
+            if (shard := self._shard(job)).exists():
                 _synchronise(shard)  # zarr keeps no shard that is all NaN
         self._part(job).parent.mkdir(exist_ok=True)
         buffer = pa.BufferOutputStream()
@@ -211,20 +242,36 @@ class Store:
         with _whole(self._part(job)) as file:
             file.write(buffer.getvalue())
 
+    def _shard(self, job: int) -> Path:
+        return self.path / "signals.zarr" / "signals" / "c" / str(job) / "0" / "0"
+
+    def lost(self, frame: pd.DataFrame) -> dict[Path, list[int]]:
+        """Shards that are missing although a run of theirs drove, with their runs of the table."""
+        if not self.samples:
+            return {}
+        _ = self._signals  # raises an error where there are none at all
+        drove = ~(frame["failed"] & ~(frame["failure_time"] > 0))
+        jobs = frame["run"] // self.manifest["chunk"]
+        found = ((job, self._shard(job)) for job in sorted(set(jobs[drove])))
+        return {shard: frame["run"][jobs == job].tolist() for job, shard in found if not shard.exists()}
+
     def rows(self, job: int) -> pa.Table:
         """Rows of a job that is done."""
-        return pq.read_table(self._part(job))
+        with reading(self._part(job)):
+            return pq.read_table(self._part(job))
 
     def row(self, run: int) -> dict[str, Any] | None:
         """Row of one run, or None if it is not done."""
         job = run // self.manifest["chunk"]
         source = self._part(job) if self._part(job).exists() else self.table
-        found = pq.read_table(source, filters=[("run", "=", run)]).to_pylist() if source.exists() else []
+        with reading(source):
+            found = pq.read_table(source, filters=[("run", "=", run)]).to_pylist() if source.exists() else []
         return found[0] if found else None
 
     def signals(self, run: int) -> NDArray[np.float64]:
         """Signals of one run `(samples, signals)`, if the store keeps them."""
-        return np.asarray(self._signals[run])
+        with reading(self._shard(run // self.manifest["chunk"])):
+            return np.asarray(self._signals[run])
 
     def finish(self, schema: pa.Schema, rows: Iterable[pa.Table], complete: bool) -> None:
         """Writes the rows of all jobs to the table; only a bounded number of rows is in memory.
@@ -243,7 +290,8 @@ class Store:
 
     @cached_property
     def _signals(self) -> zarr.Array:
-        return zarr.open_array(self.path / "signals.zarr" / "signals", mode="r+")
+        with reading(self.path / "signals.zarr"):
+            return zarr.open_array(self.path / "signals.zarr" / "signals", mode="r+", zarr_format=3)
 
     def _create_signals(self) -> None:
         chunk = self.manifest["chunk"]
@@ -254,7 +302,7 @@ class Store:
             chunks=(math.gcd(chunk, INNER), self.samples, 1),
             dtype="float64",
             fill_value=np.nan,
-            compressors=BloscCodec(cname="zstd", clevel=3, shuffle="shuffle"),
+            compressors=[BloscCodec(cname="zstd", clevel=3, shuffle="shuffle"), Crc32cCodec()],
             dimension_names=("run", "time", "signal"),
         )
 
@@ -265,7 +313,8 @@ class Store:
             InputError: No run is done.
         """
         if self.table.exists():
-            return pd.read_parquet(self.table)
+            with reading(self.table):
+                return pd.read_parquet(self.table)
         if not (jobs := sorted(self.done())):
             raise InputError(f"{self.path}: no job is done yet")
         return pa.concat_tables(self.rows(job) for job in jobs).to_pandas()
@@ -273,10 +322,19 @@ class Store:
     def dataset(self) -> xr.Dataset:
         """The runs that are done as one dataset, labelled as `mrctl.simulate` does; signals are read when used.
 
+        Runs whose signals are missing are left out, with a warning.
+
         Raises:
-            InputError: No run is done, or an older version kept signals of which the store does not say the names.
+            InputError: No run is done, or an older version kept signals of which the store does not say the names; or
+                a file is damaged, which the message names.
         """
-        frame = self.frame()
+        with reading(self.path):
+            return self._dataset(self.frame())
+
+    def _dataset(self, frame: pd.DataFrame) -> xr.Dataset:
+        for shard, runs in self.lost(frame).items():
+            warnings.warn(f"{shard}: missing; runs {runs[0]} to {runs[-1]} are left out", stacklevel=4)
+            frame = frame.loc[~frame["run"].isin(runs)]
         frame[[name for name in METRICS if name not in frame]] = np.nan
         units = {"lap_time": "s", "failure_time": "s"} | {name: unit for name, (unit, _) in METRICS.items()}
 
@@ -304,7 +362,7 @@ class Store:
             return xr.Dataset(outcome | columns(["laps"]) | found, coords | {"lap": number}, attrs)
         if not self.samples:
             return xr.Dataset(outcome | columns(METRICS), coords, attrs)
-        whole = xr.open_zarr(self.path / "signals.zarr", chunks=None, consolidated=False)["signals"]
+        whole = xr.open_zarr(self.path / "signals.zarr", chunks=None, consolidated=False, zarr_format=3)["signals"]
         whole = whole.assign_coords(signal=self.signal_names)
         signals = whole.isel(run=frame["run"].to_numpy()).to_dataset("signal")
         for name, (unit, meaning) in SIGNALS.items():

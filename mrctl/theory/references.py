@@ -11,6 +11,7 @@ A reference starts at the origin along +x unless its docstring says otherwise. A
 from __future__ import annotations
 
 import cmath
+import contextlib
 from functools import cached_property, lru_cache
 from typing import Annotated, Literal, NamedTuple
 
@@ -459,15 +460,18 @@ def check(reference: Reference, robot: Robot, reverse: bool) -> None:
 
 @lru_cache(1024)
 def _check(reference: Reference, robot: Robot, reverse: bool) -> None:
+    if fault := _fault(reference, robot, reverse):
+        raise InputError(f"reference {reference.kind}: {fault}{_remedy(reference, robot, reverse)}")
+
+
+def _fault(reference: Reference, robot: Robot, reverse: bool) -> str:
+    """Returns the first reason why a robot cannot follow a reference, or ""."""
     # Samples are at most 10 ms apart up to a period of 5000 s, so that short moves between long rests are seen.
     t = np.linspace(0, reference.period, int(np.clip(100 * reference.period, 2000, 500_000)) + 1)
     _, (v, omega), (v_dot, omega_dot) = (part.T for part in reference.sample(t))
     if not reverse and v.min() < -1e-9:
         when = t[np.argmax(v < -1e-9)]
-        raise InputError(
-            f"reference {reference.kind}: reverses at t = {when:.2f} s, "
-            "which compliant and caster steering cannot do; use rigid"
-        )
+        return f"reverses at t = {when:.2f} s, which compliant and caster steering cannot do; use rigid"
     # atan2 keeps the ratio θ̇/V as the robot comes to rest, and is zero at rest, which needs no steering angle.
     steering = np.arctan2(abs(robot.wheelbase) * np.abs(omega), np.abs(v))
     for name, values, unit, limit, bound in (
@@ -480,7 +484,20 @@ def _check(reference: Reference, robot: Robot, reverse: bool) -> None:
     ):
         worst = int(np.argmax(np.abs(values)))
         if (peak := abs(values[worst])) > bound * (1 + 1e-9):
-            raise InputError(
-                f"reference {reference.kind}: {name} {peak:.3g} {unit} at t = {t[worst]:.2f} s "
-                f"exceeds the robot's {limit} {bound:.3g} {unit}"
-            )
+            return f"{name} {peak:.3g} {unit} at t = {t[worst]:.2f} s exceeds the robot's {limit} {bound:.3g} {unit}"
+    return ""
+
+
+def _remedy(reference: Reference, robot: Robot, reverse: bool) -> str:
+    """Names the nearest of some sizes and periods of a circle or lemniscate that a robot can follow, or returns ""."""
+    if not isinstance(reference, (Circle, Lemniscate)):
+        return ""
+    name = "radius" if isinstance(reference, Circle) else "size"
+    for wider in (1, 1.5, 2, 3, 4):
+        for slower in (1, 1.25, 1.5, 2, 3, 4, 6, 10):
+            factors = {name: wider, "period": slower}
+            changes = {field: float(f"{factor * getattr(reference, field):.3g}") for field, factor in factors.items()}
+            with contextlib.suppress(InputError):  # beyond what a reference may be
+                if not _fault(reference.replace(**changes), robot, reverse):
+                    return f"; {name} {changes[name]:g} m with period {changes['period']:g} s would do"
+    return ""

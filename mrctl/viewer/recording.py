@@ -11,7 +11,6 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
@@ -25,7 +24,7 @@ from mrctl.results.controllers import title_of
 from mrctl.results.dataset import SIGNALS, blank, scenarios_of
 from mrctl.results.metrics import as_runs, summary
 from mrctl.scenario import Scenario
-from mrctl.sweep import store
+from mrctl.sweep import jobs, store
 from mrctl.sweep.store import Store
 from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.looks import Look, looks
@@ -154,16 +153,20 @@ class Library:
         table: Row of each run with the values that vary and the metrics of its last lap.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, code: bool = True) -> None:
         """Opens a folder that `mrctl.save` or `mrctl sweep` wrote.
 
+        Args:
+            path: The folder.
+            code: Whether a sweep may run the Python files of the user's stages that it was driven with.
+
         Raises:
-            InputError: The folder is neither a result nor a sweep, or has no run yet.
+            InputError: The folder is neither a result nor a sweep, or has no run yet; or as `jobs.stages_of`.
         """
         self._path, self._result = path, None
         if (path / "sweep.json").is_file():
-            Store(path)  # raises if the folder is not a sweep
-            self.table = pd.read_parquet(path / "runs.parquet").set_index("run", drop=False)
+            self.table = Store(path).frame().set_index("run", drop=False)
+            self._stages = jobs.stages_of(path, code)
         else:
             self._result = as_runs(store.open(path))
             self.table = summary(self._result).set_index(np.arange(self._result.sizes["run"]))
@@ -180,6 +183,4 @@ class Library:
             raise InputError(f"run: {self._path} has no run {run}")
         if self._result is not None:
             return Recording(self._result.isel(run=run))
-        from mrctl.sweep import jobs
-
-        return Recording(simulate([jobs.scenario_of(self._path, run)]).isel(run=0))
+        return Recording(simulate([jobs.scenario_of(self._path, run)], **self._stages).isel(run=0))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mrctl.control.design import motion
 from mrctl.control.margins import Gains
 from mrctl.kernel import Rows
-from mrctl.loop.simulation import Simulation, uniform
+from mrctl.loop.simulation import Simulation, arranged, uniform
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank
 from mrctl.scenario import Event, Scenario
@@ -45,6 +45,7 @@ class Session:
         Raises:
             InputError: A scenario is refused, as by `mrctl.simulate`, or robots differ in a field of `SHARED_FIELDS`.
         """
+        scenarios = [arranged(s) for s in scenarios]
         for name in SHARED_FIELDS:
             if len({getattr(s, name) for s in scenarios}) > 1:
                 raise InputError(f"{name}: robots in one scene must share it")

@@ -18,7 +18,13 @@ if TYPE_CHECKING:
 
 
 def view(
-    file: Path | None, compare: Sequence[FeedforwardName], run: int | None, export: Path | None, host: str, port: int
+    file: Path | None,
+    compare: Sequence[FeedforwardName],
+    run: int | None,
+    export: Path | None,
+    host: str,
+    port: int,
+    code: bool = True,
 ) -> None:
     """Shows robots in the browser: a live session, or the replay of a result or a sweep.
 
@@ -29,6 +35,7 @@ def view(
         export: File to write instead of serving a page.
         host: Address to listen on.
         port: Port to listen on.
+        code: Whether a sweep may run the Python files that it names.
 
     Raises:
         InputError: The file is refused, as by `mrctl.simulate` or `mrctl.open`; the server cannot listen on the
@@ -42,7 +49,7 @@ def view(
     if file is not None and file.is_dir():
         if compare:
             raise InputError("compare: it needs a scenario; the ghosts of a replay are chosen in the page")
-        library = Library(file)
+        library = Library(file / "result.zarr" if (file / "result.zarr").is_dir() else file, code)
         table = library.table
         shown = [int(table.index[0]) if run is None else run]
         if run is None and len(table) <= MAX_SHOWN:

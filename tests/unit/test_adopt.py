@@ -1,11 +1,14 @@
 """A robot adopted from another MJCF file is the same whatever the file calls its parts and wherever it puts them."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
 
 import mrctl
 from mrctl import InputError, Perturbation, Robot, RobotFile
+from mrctl.loop.simulation import Simulation
 from mrctl.physics import mjcf
 from mrctl.physics.elements import fronts
 from mrctl.physics.files import models_folder
@@ -174,9 +177,49 @@ def test_front_rates(file):
         assert rates[name] == pytest.approx(v / turn * np.hypot(turn - y, 0.5) / 0.1, rel=1e-3)
 
 
-def test_default_robot_adopted():
-    """The default robot, adopted from its own file, has the default robot's parameters but the tyres' friction."""
-    robot = mrctl.load_robot(models_folder() / "car.xml")
+def test_copy_of_the_default_robot(file):
+    """A copy of the default robot's file is that robot, bit for bit, in every world and arrangement, until edited."""
+    text = (models_folder() / "car.xml").read_text()
+    copy = mrctl.load_robot(file(text))
+    for world in ("flat", "slope", "rough", "patch"):
+        for steering in ("compliant", "caster", "rigid"):
+            assert mjcf.digest(mjcf.load(world, steering, robot=copy)) == mjcf.digest(mjcf.load(world, steering))
+    file(text.replace('mass="17.2"', 'mass="27.2"'))
+    heavy, own = (mjcf.build(robot=robot)[1] for robot in (copy, RobotFile()))
+    assert heavy.mass == pytest.approx(own.mass + 10) and heavy.steering_stiffness == own.steering_stiffness > 0
+
+
+@pytest.mark.parametrize(("name", "steering"), [("turtlebot", "caster"), ("racecar", "rigid"), ("car", "compliant")])
+def test_robot_brings_its_steering(name, steering):
+    """A scenario that names a robot and no steering drives with that robot's, and its result says which."""
+    slow = mrctl.Circle(radius=1.5, period=30.0)
+    simulation = Simulation([mrctl.Scenario(robot=RobotFile(path=name), reference=slow)])
+    assert simulation.scenarios[0].steering == steering
+
+
+@pytest.mark.parametrize(("name", "limit"), [("turtlebot", "max_speed"), ("racecar", "steering_limit")])
+def test_refused_reference_says_what_would_do(name, limit):
+    """The refusal of the default reference names a size and a period with which the robot can follow, and it can."""
+    scenario = mrctl.Scenario(robot=RobotFile(path=name))
+    with pytest.raises(InputError, match=limit) as refusal:
+        Simulation([scenario])
+    found = re.search(r"; size (\S+) m with period (\S+) s would do", str(refusal.value))
+    assert found
+    Simulation([scenario.replace(reference=mrctl.Lemniscate(size=float(found[1]), period=float(found[2])))])
+
+
+def test_caster_that_swivels_on_a_joint_without_a_name(file):
+    """Joints need no names but those of the driven wheels, and a caster may swivel and roll."""
+    fork = """<body pos="0.3 0 -0.02"><joint axis="0 0 1"/><geom type="sphere" size="0.01" mass="0.1"/>
+      <body pos="-0.02 0 -0.04"><joint axis="0 1 0"/><geom type="sphere" size="0.04" mass="0.1"/></body></body>"""
+    _, model = read(file(document(DIFF.replace(BALL.format(0.3), fork), MOTORS)))
+    assert mjcf.steerings(model) == ("caster",) and fronts(model) == ["caster_left"]
+
+
+def test_default_robot_adopted(file):
+    """The default robot, adopted from a file of other names, has its parameters but the tyres' friction."""
+    text = (models_folder() / "car.xml").read_text().replace("steering_rigid", "another")
+    robot = mrctl.load_robot(file(text))
     found = read_robot(mjcf.load("flat", "rigid", robot=robot))
     own = read_robot(mjcf.load("flat"))
     different = {n for n in Robot.model_fields if getattr(found, n) != pytest.approx(getattr(own, n), rel=1e-9)}
@@ -251,6 +294,13 @@ ERRORS = {
     "another motor": (document(DIFF, PLAIN), {"wheels": ("a", "b")}, ("motor", "'a'", "'drive'", "<dcmotor joint=")),
     "no supply": (document(DIFF, MOTORS.replace('ctrlrange="-12 12"', "")), {}, ("motor", "ctrlrange")),
     "no such wheel": (document(DIFF, MOTORS), {"wheels": ("a", "z")}, ("wheels", "'z'", "'a', 'b'")),
+    "wheel named twice": (document(DIFF, MOTORS), {"wheels": ("a", "a")}, ("wheels", "'a', 'a'")),
+    "wheel named three times": (document(DIFF, MOTORS), {"wheels": ("a", "b", "a")}, ("wheels", "'a', 'b', 'a'")),
+    "a wheel as steering": (document(DIFF, MOTORS), {"steering": ("a",)}, ("steering", "'a' is not upright")),
+    "steering named twice": (document(TRICYCLE, MOTORS), {"steering": ("s1", "s1")}, ("steering", "'s1', 's1'")),
+    "wheel joint in the chassis": (
+        document(DIFF.replace("<freejoint/>", '<joint name="z" axis="0 1 0"/>'), MOTORS.replace('"a"', '"z"')), {},
+        ("chassis", "'base'")),
     "no such chassis": (document(DIFF, MOTORS), {"chassis": "z"}, ("chassis", "'z'", "'base'")),
     "no caster": (document(DIFF.replace(BALL.format(0.3), ""), MOTORS), {}, ("caster",)),
     "casters around": (document(DIFF + BALL.format(-0.3).replace("ball", "o"), MOTORS), {}, ("caster", "both")),

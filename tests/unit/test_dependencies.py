@@ -58,10 +58,10 @@ def test_every_import_is_declared() -> None:
 
 
 def test_every_dependency_is_imported() -> None:
-    """Nobody installs what nothing uses."""
+    """Nobody installs what nothing uses; of numcodecs, which zarr brings, the version matters."""
     modules = set().union(*map(imported, PACKAGE.rglob("*.py")))
     used = set().union(*(PROVIDERS.get(module, set()) for module in modules))
-    assert not DECLARED - used
+    assert DECLARED - used == {"numcodecs"}
 
 
 def test_optional_files_use_their_extra() -> None:

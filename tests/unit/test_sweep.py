@@ -231,7 +231,7 @@ def test_list_of_scenarios():
     one = Sweep.of(scenarios, record="laps", chunk=3)
     assert [one.scenario(run) for run in range(one.size)] == scenarios
     own = RobotFile()
-    assert one.worlds == [("flat", "compliant", own), ("rough", "rigid", own)] and one.samples == 0
+    assert one.worlds == [("flat", None, own), ("rough", "rigid", own)] and one.samples == 0
     assert Sweep.from_dict(one.model_dump(mode="json")) == one
 
 

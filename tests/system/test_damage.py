@@ -1,0 +1,129 @@
+"""Damaged stores and results, and stores that name code: one line names the file, and what is whole still opens."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mrctl
+from mrctl import InputError, cli
+from mrctl.sweep import jobs
+from mrctl.sweep.plan import Sweep
+from mrctl.viewer.recording import Library
+
+BASE = {"laps": 1, "learner": "none", "reference": {"kind": "circle", "radius": 0.5, "period": 4.0}}
+MASSES = {"field": "perturbation.mass_factor", "values": [1.0, 1.2, 1.4, 1.6]}
+OWN = """
+class Half:
+    def __init__(self, robot, size):
+        self.gain = 0.5 / robot.velocity_gain, 0.5 / robot.rotation_gain
+    def output(self, command, derivative):
+        return command * self.gain
+    def learn(self, feedback, saturated, twist, voltage):
+        pass
+"""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of two jobs with all signals, one with the user's controller, and a result."""
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "own.py").write_text(OWN)
+    sweep = {"record": "full", "chunk": 2, "base": BASE, "axes": [MASSES]}
+    jobs.run(Sweep.from_dict(sweep), folder / "store", 1)
+    jobs.run(Sweep.from_dict(sweep | {"controller": f"{folder}/own.py:Half"}), folder / "own", 1)
+    mrctl.save(mrctl.simulate([mrctl.Scenario.from_dict(BASE)]), folder / "out" / "result.zarr")
+    return folder
+
+
+def flipped(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 0x10
+    path.write_bytes(data)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def edited(**changes: object) -> Callable[[Path], None]:
+    def damage(path: Path) -> None:
+        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+    return damage
+
+
+def cleared(path: Path) -> None:
+    path.write_text("{")
+
+
+SHARD = "store/signals.zarr/signals/c/1/0/0"
+DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
+    (SHARD, flipped, "run 2"),
+    (SHARD, cut, "run 2"),
+    ("store/runs.parquet", cut, "runs.parquet"),
+    ("store/runs.parquet", cleared, "runs.parquet"),
+    ("store/runs.parquet", Path.unlink, "no job is done"),
+    ("store/signals.zarr/signals/zarr.json", cleared, "store"),
+    ("store/signals.zarr", shutil.rmtree, "signals.zarr"),
+    ("store/sweep.json", cleared, "not a saved result, nor a sweep"),
+    ("store/sweep.json", edited(size="x"), "sweep.json: size"),
+    ("store/sweep.json", edited(samples=None), "sweep.json: samples"),
+    ("store/sweep.json", edited(chunk=0), "sweep.json: chunk"),
+    ("store/sweep.json", edited(sweep={}), "sweep.json: sweep.axes"),
+    ("store/sweep.json", edited(samples=10**12), "sweep.json: samples"),
+    ("out/result.zarr/x/c", shutil.rmtree, "result.zarr/x: 1 chunks are missing"),
+    ("out/result.zarr/x/c/0/0", flipped, "result.zarr/x"),
+    ("out/result.zarr/x/zarr.json", cleared, "result.zarr"),
+    ("out/result.zarr/zarr.json", cleared, "result.zarr: not a saved result"),
+]
+
+
+@pytest.mark.parametrize(("file", "damage", "says"), DAMAGES, ids=lambda part: getattr(part, "__name__", str(part)))
+def test_damage_is_one_line(
+    whole: Path, tmp_path: Path, file: str, damage: Callable[[Path], None], says: str, capsys: pytest.CaptureFixture
+) -> None:
+    """A damaged file is never read as numbers, and one line names it."""
+    name = file.partition("/")[0]
+    shutil.copytree(whole / name, tmp_path / name)
+    damage(tmp_path / file)
+    assert cli.main(["export", str(tmp_path / name), "--to", "csv", "--out", str(tmp_path / "x.csv")]) == 2
+    said = capsys.readouterr().err
+    assert says in said.replace("not a sweep's store", "not a saved result, nor a sweep") and said.count("\n") == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == [name]
+
+
+def test_missing_shard_leaves_its_runs_out(whole: Path, tmp_path: Path) -> None:
+    """The runs of a shard that is gone are not NaN without failure: they are left out, and a warning names the file."""
+    shutil.copytree(whole / "store", tmp_path / "store")
+    shutil.rmtree(tmp_path / "store/signals.zarr/signals/c/1")
+    with pytest.warns(UserWarning, match="signals/c/1/0/0: missing; runs 2 to 3 are left out"):
+        found = mrctl.open(tmp_path / "store")
+    assert found["run"].values.tolist() == [0, 1] and found.attrs["unfinished"] == 2
+    np.testing.assert_array_equal(found["x"], mrctl.open(whole / "store")["x"][:2])
+
+
+def test_view_drives_the_controller_of_the_sweep(whole: Path) -> None:
+    """A run of a sweep with the user's controller is shown with it, with the bits that are stored."""
+    shown = Library(whole / "own").recording(1)
+    np.testing.assert_array_equal(shown.log["v"], mrctl.open(whole / "own")["v"].values[1])
+    assert shown.controller == "Half"
+
+
+def test_code_of_a_store(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """A store names its file absolutely, says so before it runs it, runs no other, and none where that is refused."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text("raise RuntimeError")
+    assert cli.main(["run", str(whole / "own"), "--run", "1"]) == 0
+    assert f"mrctl: runs {whole}/own.py:Half, which {whole}/own names" in capsys.readouterr().err
+    for command in (["run", "--run", "1"], ["view", "--export", "x.html"]):
+        assert cli.main([command[0], str(whole / "own"), *command[1:], "--no-code"]) == 2
+        assert f"code: {whole}/own names {whole}/own.py:Half" in capsys.readouterr().err
+    monkeypatch.setattr(jobs.user_files, "digest", lambda name: "of another file")
+    with pytest.raises(InputError, match="is not the file that"):
+        jobs.stages_of(whole / "own")
