@@ -167,7 +167,7 @@ def compare(table: pd.DataFrame, scenarios: Sequence[Scenario]) -> list[dict[str
     for k, one in enumerate(scenarios):
         bare = scenarios.index(one.model_copy(update=FEEDFORWARDS["none"]))
         row: dict[str, Any] = {
-            "steering": one.steering,
+            "steering": table["steering"].iloc[k],
             "plant": one.name,
             "sensing": one.sensing.tier,
             "estimator": one.sensing.source,
