@@ -37,6 +37,9 @@ FROM_FILES = ("events", "obstacles")
 GIVEN = (*FROM_FILES, "reference", "laps", "initial_pose")
 """Fields of `Scenario` that are no flags of `mrctl navigate`, because the mission gives them."""
 
+BEST: FeedforwardName = "model+composite"
+"""Feedforward with the least errors in the README; `navigate` drives with it, and `view` shows it beside PID alone."""
+
 LAB = Sensing(tier="lab")
 DELAYS = 0.0, 0.01, 0.02  # s
 
@@ -115,7 +118,7 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
         "identify": identify,
         "check": check,
         "bench": bench,
-        "view": view,
+        "view": _view_with(arguments),
         "export": export,
     }
     if not arguments[0].startswith("-") and arguments[0] not in commands:
@@ -174,7 +177,9 @@ def _one_line(box: str) -> str:
 def _is_short_help(arguments: Sequence[str]) -> bool:
     """Tells whether a command line asks for the short help of a scenario; that of a reference is short in itself."""
     asked = bool({"-h", "--help"} & set(arguments))
-    return arguments[0] in ("run", "navigate") and asked and not any(a.startswith("reference:") for a in arguments)
+    return (
+        arguments[0] in ("run", "navigate", "view") and asked and not any(a.startswith("reference:") for a in arguments)
+    )
 
 
 def _part(scenario: Scenario, names: Sequence[str]) -> Record:
@@ -189,7 +194,7 @@ def _part(scenario: Scenario, names: Sequence[str]) -> Record:
 
 def _further_flags(command: str) -> str:
     """Lists the flags that the short help of a command leaves out, a field or group of fields each, explained."""
-    never = FROM_FILES if command == "run" else GIVEN
+    never = GIVEN if command == "navigate" else FROM_FILES
     left_out = [name for name in Scenario.model_fields if name not in (*FIRST, *never)]
     # Perturbations are what people change most.
     names = sorted(left_out, key=lambda name: name != "perturbation")
@@ -250,7 +255,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
 def _navigate_with(arguments: list[str]) -> Callable[..., None]:
     """Returns the `navigate` command, whose short help leaves out what that of `run` does."""
     names = FIRST if _is_short_help(arguments) else Scenario.model_fields
-    part = _part(Scenario(prior="model", learner="composite"), [name for name in names if name not in GIVEN])
+    part = _part(Scenario(**FEEDFORWARDS[BEST]), [name for name in names if name not in GIVEN])
 
     def navigate(
         world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="WORLD|GENERATOR:SEED")],
@@ -293,7 +298,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
 
 
 def _scenario_file(arguments: Sequence[str]) -> str | None:
-    """Returns the argument of `run` that is a scenario file: it ends in .toml and is not the value of a flag."""
+    """Returns the argument of `run` or `view` that is a scenario file: it ends in .toml and is no value of a flag."""
     for before, argument in zip(arguments, arguments[1:], strict=False):
         if argument.endswith(".toml") and not argument.startswith("-") and not re.match("--(?!json$)", before):
             return str(Path(argument))
@@ -524,30 +529,60 @@ def bench(json: bool = False) -> None:
     print(jsonlib.dumps(figures, indent=2, ensure_ascii=False) if json else benchmark.text(figures))
 
 
-def view(
-    file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml|RESULT")] = None,
-    /,
-    compare: Annotated[tuple[FeedforwardName, ...], tyro.conf.arg(metavar="NAME ...")] = (),
-    number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
-    export: Path | None = None,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-) -> None:
-    """Shows robots in the browser: a live session of a scenario, or the replay of a result or sweep.
+def _view_with(arguments: list[str]) -> Callable[..., None]:
+    """Returns the `view` command, which takes the scenario flags of `run`.
 
-    Args:
-        file: Scenario file, or result of `mrctl run --out` or `mrctl sweep`; by default the best learner and PID alone,
-            live.
-        compare: Feedforwards of further robots, such as none or model+composite, which are shown as ghosts with the
-            same seed and events.
-        number: Number of the run to show first, in a result or sweep.
-        export: HTML file to write instead of serving a page; it plays without a server.
-        host: Address to listen on; an address other than 127.0.0.1 lets others in without a password.
-        port: Number of the port to listen on.
+    Without a file and a choice of controllers, the best learner is shown beside PID alone. A robot that is chosen
+    without its steering or a reference brings those that suit it.
     """
-    from mrctl.viewer.view import view as show
+    asked = arguments[0] == "view"
+    given = {re.split("[.:=]", argument.removeprefix("--"))[0] for argument in arguments} if asked else set()
+    scenario_file = _scenario_file(arguments) if asked else None
+    chosen = scenario_file is not None or bool(given & {"prior", "learner", "compare"})
+    default = Scenario() if chosen else Scenario(**FEEDFORWARDS[BEST])
+    if scenario_file:
+        default = Scenario.from_toml(scenario_file)
 
-    show(file, compare, number, export, host, port)
+    def view(
+        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml|RESULT")] = None,
+        /,
+        scenario: Annotated[Scenario, tyro.conf.arg(name="")] = default,
+        compare: Annotated[tuple[FeedforwardName, ...], tyro.conf.arg(metavar="NAME ...")] = (),
+        number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
+        export: Path | None = None,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ) -> None:
+        """Shows robots in the browser: a live session of a scenario, or the replay of a result or sweep.
+
+        Args:
+            file: Scenario file, whose values flags override, or result of `mrctl run --out` or `mrctl sweep`; by
+                default the best learner and PID alone, live.
+            scenario: The scenario. A robot brings the steering and the reference that suit it, unless they are given.
+            compare: Feedforwards of further robots, such as none or model+composite, which are shown as ghosts with the
+                same seed and events.
+            number: Number of the run to show first, in a result or sweep.
+            export: HTML file to write instead of serving a page; it plays without a server.
+            host: Address to listen on; an address other than 127.0.0.1 lets others in without a password.
+            port: Number of the port to listen on.
+        """
+        from mrctl.viewer import view as viewing
+
+        if file is not None and str(file) != scenario_file:
+            if scenario != default:
+                raise InputError(f"view: {file} has its own scenarios; flags of a scenario need a live session")
+            return viewing.replay(file, compare, number, export, host, port)
+        if number is not None:
+            raise InputError("run: only a result or a sweep has several")
+        if "robot" in given and not scenario_file:
+            scenario = viewing.suited(scenario, given)
+        viewing.live(scenario, compare if chosen else ("none",), export, host, port)
+
+    if not asked or _is_short_help(arguments):
+        short = _part(default, FIRST)
+        view.__annotations__["scenario"] = Annotated[type(short), tyro.conf.arg(name="")]
+        view.__defaults__ = (None, short, *(view.__defaults__ or ())[2:])
+    return view
 
 
 def export(

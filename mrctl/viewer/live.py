@@ -20,6 +20,7 @@ from mrctl.results.controllers import title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.robot import Robot
 from mrctl.viewer.controls import Controls
 from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
@@ -36,13 +37,6 @@ TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each 
 PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
 REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
 MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
-# Label of each group of buttons, its buttons, and the change of the perturbation or the push that a button makes.
-BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
-    "Payload": {"drop payload": {"payload": 10.0, "payload_x": 0.05, "payload_y": 0.06}, "remove": {"payload": 0.0}},
-    "Supply": {"sag supply": {"supply_factor": 0.7}, "restore": {"supply_factor": 1.0}},
-    "Floor": {"slippery patch": {"tyre_friction_factor": 0.15}, "dry": {"tyre_friction_factor": 1.0}},
-    "Push": {"push": {"push": (0.0, 60.0, 0.0)}, "spin": {"push": (0.0, 0.0, 15.0)}},
-}
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
 DRIVER = ("prior", "learner")  # what the ghosts differ in
@@ -59,6 +53,30 @@ HIDDEN = (
     "control_period",
     "motion_period",
 )
+
+
+def buttons(robot: Robot) -> dict[str, dict[str, dict[str, Any]]]:
+    """Returns the groups of buttons: label, buttons, and the change of the perturbation or the push that each makes.
+
+    Payload and push are in proportion to the robot: the payload is half of its mass.
+    """
+    mass, half_track = robot.mass, robot.half_track
+    load = _rounded(mass / 2, robot.com_offset / 2, 0.32 * half_track, 5 / 3 * robot.com_height)
+    push, spin = _rounded(3 * mass, 4 * mass * half_track)  # N and N·m
+    return {
+        "Payload": {
+            "drop payload": dict(zip(("payload", "payload_x", "payload_y", "payload_z"), load, strict=True)),
+            "remove": {"payload": 0.0},
+        },
+        "Supply": {"sag supply": {"supply_factor": 0.7}, "restore": {"supply_factor": 1.0}},
+        "Floor": {"slippery patch": {"tyre_friction_factor": 0.15}, "dry": {"tyre_friction_factor": 1.0}},
+        "Push": {"push": {"push": (0.0, push, 0.0)}, "spin": {"push": (0.0, 0.0, spin)}},
+    }
+
+
+def _rounded(*values: float) -> list[float]:
+    """Returns numbers to two digits, as somebody would type them."""
+    return [float(f"{value:.2g}") for value in values]
 
 
 class Live(Page):
@@ -102,9 +120,9 @@ class Live(Page):
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
             self.on(speed, lambda name: self._set_speed(SPEEDS[name]))
             self._follow = gui.add_checkbox("Camera follows", False, hint="The first robot stays in the middle.")
-            for label, choices in BUTTONS.items():
+            for label, choices in buttons(self.session.robot).items():
                 group = gui.add_button_group(label, tuple(choices))
-                self.on(group, partial(self._press, choices))
+                self.on(group, partial(self._press, label))
             self.add_sensors()
             self._timeline = gui.add_html("")
             save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
@@ -182,7 +200,8 @@ class Live(Page):
     def _set_speed(self, speed: float) -> None:
         self.speed, self._due = speed, 0.0
 
-    def _press(self, choices: dict[str, dict[str, Any]], name: str) -> None:
+    def _press(self, group: str, name: str) -> None:
+        choices = buttons(self.session.robot)[group]
         if name not in choices:
             raise InputError(f"{name}: not one of the choices")
         change = choices[name]

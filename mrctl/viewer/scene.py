@@ -33,8 +33,8 @@ GLASS: Colour = (150, 155, 160)  # of the first robot while marks are drawn, whi
 TRAIL_POINTS = 240  # number of points in the trail of a robot
 TRAIL_POINTS_OF_ALL = 1600  # largest number of points in the trails of all robots
 PATH_POINTS = 600  # number of points in the path of a finished run
-TOGETHER = 0.5  # m, distance of robots that have one label
-LABEL_HEIGHT = 0.4  # m
+# Relative to the diagonal of the robot's outline: distance of robots that have one label, and its height.
+TOGETHER, LABEL_HEIGHT = 0.7, 0.6
 CLEARANCE = 0.05  # m, least height of a camera above the floor
 # Initial camera, relative to the middle of the reference and in units of its size.
 CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])
@@ -84,6 +84,7 @@ class Scene:
         self._looks: list[tuple[viser.GlbHandle, viser.MeshHandle]] = []  # of each body, solid and translucent
         self._footprint = np.array([[np.inf, np.inf], [-np.inf, -np.inf]])
         self._parts = self._draw_bodies()
+        self._length = float(np.hypot(*(self._footprint[1] - self._footprint[0])))
         self._frames = [self._draw_robot(row) for row in range(self.size)]
         self._labels = [
             self._scene.add_label(f"/world/label{row}", robot.label, font_screen_scale=0.8)
@@ -263,7 +264,7 @@ class Scene:
         """Moves the labels; robots that are close together have one label, which names at most three of them."""
         here, near = self._positions[:, self._chassis], {}
         for row in range(len(self._labels)):
-            first = next((r for r in near if np.hypot(*(here[r] - here[row])[:2]) < TOGETHER), row)
+            first = next((r for r in near if np.hypot(*(here[r] - here[row])[:2]) < TOGETHER * self._length), row)
             near.setdefault(first, []).append(self._robots[row].label)
         for row, label in enumerate(self._labels):
             label.visible = row in near
@@ -273,7 +274,7 @@ class Scene:
                 text = ", ".join(names[: 2 if more else 3]) + more
                 if label.text != text:
                     label.text = text
-                label.position = here[row] + [0, 0, LABEL_HEIGHT]
+                label.position = here[row] + [0, 0, LABEL_HEIGHT * self._length]
 
     def show_payload(self, row: int, perturbation: Perturbation) -> None:
         """Draws the payload of a robot as a cube with the density of water at its place; if there is none, nothing."""

@@ -61,6 +61,11 @@ class Session:
         return len(self.start)
 
     @property
+    def robot(self) -> Robot:
+        """Parameters of the robots without their perturbations."""
+        return self.simulations[0][1].plant.robot
+
+    @property
     def time(self) -> float:
         """Simulated time in s."""
         return self.tick * self.period
@@ -129,9 +134,9 @@ class Session:
     @property
     def _design(self) -> tuple[Robot, bool, float, float]:
         """For what the controllers are designed: robot, whether its steering is rigid, delay and period in s."""
-        start, (sim, _) = self.start[0], self._place[0]
+        start = self.start[0]
         delay = start.sensing.periods("delay", self.period) * self.period
-        return sim.plant.robot, start.steering == "rigid", delay, self.period
+        return self.robot, start.steering == "rigid", delay, self.period
 
     def saved(self) -> list[Scenario]:
         """Returns scenarios that repeat the session, to the end of the present lap of each robot."""
