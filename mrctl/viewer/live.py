@@ -26,6 +26,7 @@ from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.scene import Scene
+from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
@@ -114,6 +115,8 @@ class Live(Page):
         gui, tabs = self.server.gui, self.server.gui.add_tab_group()
         self._plots = Plots(gui, self.curves)
         with tabs.add_tab("Drive"):
+            self.on(gui.add_button_group("Watch", tuple(STORIES)), self._tell)
+            self._story = gui.add_html("")
             self._status = gui.add_html("")
             self._play = gui.add_button_group("", ("play", "pause", "step", "reset"))
             self.on(self._play, self._command)
@@ -123,7 +126,7 @@ class Live(Page):
             for label, choices in buttons(self.session.robot).items():
                 group = gui.add_button_group(label, tuple(choices))
                 self.on(group, partial(self._press, label))
-            self.add_sensors()
+            self.add_drawing()
             self._timeline = gui.add_html("")
             save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
 
@@ -168,12 +171,15 @@ class Live(Page):
             self._shown_sensing = sensing
             spread = max(np.inf if s.source == "odometry" else s["fix_position_noise"] for s in sensing)
             self.set_marks(any(s.source != "truth" for s in sensing), spread)
+        told = [story.watch for story in STORIES.values() if story.scenarios == session.start]
+        write(self._story, block("story", *told) if told else "")
         self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
         self._scene.show_reference(first)
         self._scene.forget_trails()
         for name, ghost in self._ghosts.items():
             ghost.value = any(s.feedforward == name for s in session.start[1:])
         self._drawn = self._plotted = None
+        self._deviation = 1  # factor on the deviations from the reference in the picture
         self._laps: list[dict[str, Any]] = []  # metrics of the whole laps until now
         self._counted = (time.monotonic(), session.tick)
         self._happened = 0  # number of the scenarios' own events that have happened
@@ -196,6 +202,12 @@ class Live(Page):
             self.session.step()
         else:
             self.playing = name == "play" and self.session.running
+
+    def _tell(self, name: str) -> None:
+        if name not in STORIES:
+            raise InputError(f"{name}: not one of the choices")
+        self._restart(STORIES[name].scenarios)
+        self.playing = True
 
     def _set_speed(self, speed: float) -> None:
         self.speed, self._due = speed, 0.0
@@ -309,7 +321,7 @@ class Live(Page):
     @override
     def draw(self) -> None:
         session, (marked, magnified) = self.session, self.marks
-        now = session.tick, self._follow.value, marked, magnified
+        now = session.tick, self._follow.value, marked, magnified, self._deviation
         if now == self._drawn:
             return
         self._drawn = now
@@ -320,6 +332,8 @@ class Live(Page):
             ticks = round(FIX_AGE / session.period) + max(self._latencies)
             logs = list(session.log(max(0, session.tick - ticks)).T)
         with self.server.atomic():
+            if session.tick:
+                self._scene.show_targets(session.log(session.tick - 1)[-1], self._deviation)
             self._scene.show_sensors(logs, session.period, self._latencies, magnified)
             self._scene.flush(self._follow.value)
 
@@ -372,7 +386,8 @@ class Live(Page):
             every = -(-ticks // (self._scene.trail_points - 2))
             marked = session.tick // every * every - every * np.arange(self._scene.trail_points - 1)[::-1]
             rows = np.append(marked, session.tick - 1) - first  # the same moments of the run in every picture
-            self._scene.show_trails(log[np.clip(rows, 0, len(log) - 1)])
+            self._deviation = self.magnified_deviation(log)
+            self._scene.show_trails(log[np.clip(rows, 0, len(log) - 1)], self._deviation)
 
     def _describe(self) -> None:
         """Writes the timeline, and sets the inputs to the present values."""

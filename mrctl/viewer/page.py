@@ -17,7 +17,7 @@ import viser
 
 from mrctl.kernel import Rows
 from mrctl.record import InputError
-from mrctl.viewer import sensors
+from mrctl.viewer import deviation, sensors
 from mrctl.viewer.scene import MAX_MARKED, Scene
 from mrctl.viewer.server import Server
 
@@ -75,9 +75,13 @@ class Page(ABC):
         self._message = text
         write(self._notice, block("message", warning(text)) if text else "")
 
-    def add_sensors(self) -> None:
-        """Adds the inputs that say whether and how estimates and fixes are drawn, in the present context of the GUI."""
+    def add_drawing(self) -> None:
+        """Adds the inputs that say how deviations, estimates and fixes are drawn, in the present context of the GUI."""
         gui = self.server.gui
+        self.deviation = gui.add_dropdown(
+            "Deviation ×", deviation.CHOICES,
+            hint="Factor on the distance of trails and balls from the reference; robots stand where they are.",
+        )  # fmt: skip
         self.sensors = gui.add_checkbox("Sensors", False, hint="Draws what the robot knows of its posture.")
         self.magnified = gui.add_dropdown(
             "Errors drawn", tuple(f"{m}×" for m in sensors.MAGNIFICATIONS),
@@ -85,14 +89,20 @@ class Page(ABC):
         )  # fmt: skip
         self._sensed = gui.add_html("")
 
+    def magnified_deviation(self, rows: Rows) -> int:
+        """Returns the factor on the deviations of some records; by default the largest that keeps them in view."""
+        chosen = self.deviation.value
+        return sensors.magnification(deviation.extent(rows)) if chosen == "automatic" else int(chosen.rstrip("×"))
+
     @property
     def marks(self) -> tuple[bool, int]:
         """Whether estimates and fixes are drawn, and the factor on their errors."""
         return self.sensors.value, int(self.magnified.value.removesuffix("×"))
 
     def set_marks(self, on: bool, spread: float) -> None:
-        """Sets the inputs: whether estimates are drawn, and the factor that suits errors of `spread` in m."""
-        self.sensors.value, self.magnified.value = on, f"{sensors.magnification(spread)}×"
+        """Sets the inputs for errors of `spread` in m: whether estimates are drawn, if it is not tiny, and a factor."""
+        factor = sensors.magnification(spread)
+        self.sensors.value, self.magnified.value = on and factor < max(sensors.MAGNIFICATIONS), f"{factor}×"
 
     def describe_estimates(self, labels: Sequence[str], last: Rows) -> None:
         """Writes what the marks mean, and the errors that they show.

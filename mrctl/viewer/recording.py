@@ -28,6 +28,7 @@ from mrctl.scenario import Scenario
 from mrctl.sweep import store
 from mrctl.sweep.store import Store
 from mrctl.theory.perturbation import Perturbation
+from mrctl.viewer.deviation import drawn
 from mrctl.viewer.looks import Look, looks
 from mrctl.viewer.session import state
 
@@ -110,16 +111,17 @@ class Recording:
         return qpos
 
 
-def path(rows: Rows, radius: float, height: float) -> Array:
+def path(rows: Rows, radius: float, height: float, magnified: int) -> Array:
     """Returns the path of P, a little above the ground, in m, with the shape of `rows` and 3.
 
     Args:
         rows: Records of `TICK`.
         radius: Radius of the driven wheels in m.
         height: Height of the middle between them in m, where none was recorded.
+        magnified: Factor on the deviation from the reference.
     """
     z = np.where(np.isfinite(rows["z"]), rows["z"], height)
-    return np.stack([rows["x"], rows["y"], z - radius + ABOVE], axis=-1)
+    return np.concatenate([drawn(rows, magnified), (z - radius + ABOVE)[..., None]], axis=-1)
 
 
 def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows]:

@@ -64,7 +64,8 @@ class Replay(Page):
                 lambda name: setattr(self, "speed", SPEEDS[name]),
             )
             self._follow = gui.add_checkbox("Camera follows", False)
-            self.add_sensors()
+            self.add_drawing()
+            self.on(self.deviation, lambda _: self._show(self.runs))
             self._chosen = gui.add_number(
                 "Run", float(run), min=float(table.index[0]), max=float(table.index[-1]), step=1.0
             )
@@ -153,9 +154,10 @@ class Replay(Page):
             self._scene.remove()
         self.runs, self.recordings = list(runs), recordings
         self._scene = Scene(self.server, recordings[0].model, robots)
-        self._scene.show_recordings(recordings)
         self._plots.set_robots(robots, recordings[0].period)
         times, self._log = joint_log(recordings)
+        self._deviation = self.magnified_deviation(self._log)
+        self._scene.show_recordings(recordings, self._deviation)
         self._plots.show(times, self._log, max(1, len(self._log) // SAMPLES))
         self._lap = round(recordings[0].scenario.reference.period / recordings[0].period)
         self._laps = whole_laps(self._log, self._lap, recordings[0].period)
@@ -207,7 +209,9 @@ class Replay(Page):
             for recording, latency in zip(self.recordings, self._latencies, strict=True):
                 index = recording.index(self.time)
                 logs.append(recording.log[max(0, index + 1 - ticks - latency) : index + 1])
+        now = np.stack([recording.log[recording.index(self.time)] for recording in self.recordings])
         with self.server.atomic():
+            self._scene.show_targets(now, self._deviation)
             self._scene.show_sensors(logs, period, self._latencies, magnified)
             self._scene.flush(self._follow.value)
 

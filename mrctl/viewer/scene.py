@@ -22,6 +22,7 @@ from mrctl.physics.stand import ground
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.perturbation import Perturbation
+from mrctl.viewer.deviation import Target
 from mrctl.viewer.looks import Colour, Look
 from mrctl.viewer.recording import ABOVE, Recording, joint_log, path
 from mrctl.viewer.sensors import Marks
@@ -34,12 +35,14 @@ TRAIL_POINTS = 240  # number of points in the trail of a robot
 TRAIL_POINTS_OF_ALL = 1600  # largest number of points in the trails of all robots
 PATH_POINTS = 600  # number of points in the path of a finished run
 # Relative to the diagonal of the robot's outline: distance of robots that have one label, and its height.
-TOGETHER, LABEL_HEIGHT = 0.7, 0.6
+TOGETHER, LABEL_HEIGHT = 0.7, 0.8
 CLEARANCE = 0.05  # m, least height of a camera above the floor
 # Initial camera, relative to the middle of the reference and in units of its size.
 CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])
 GHOST_OPACITY, GLASS_OPACITY = 0.4, 0.55
-MAX_MARKED = 4  # number of robots whose estimates are drawn
+MAX_MARKED = 4  # number of robots whose estimates and targets are drawn
+NEXT_TRAIL = 0.001  # m, from the height of the trails of one colour to that of the next; equal ones would flicker
+TRAIL_WIDTH = 0.004  # as a share of the width of the view; the reference is twice as wide
 LEAST_VIEW = 1.2  # m, least width of the view
 SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
 
@@ -102,6 +105,10 @@ class Scene:
         self._marks = [
             Marks(self._scene, row, self._footprint, robot.colour) for row, robot in enumerate(robots[:MAX_MARKED])
         ]
+        self._targets = [
+            Target(self._scene, row, self._length, robot.colour) for row, robot in enumerate(robots[:MAX_MARKED])
+        ]
+        self._factor = self._scene.add_label("/world/deviation", "", visible=False, font_screen_scale=0.8)
         self._perturbations: list[Perturbation | None] = [None] * self.size  # as drawn
         self._ribbons: list[viser.MeshHandle] = []
 
@@ -186,10 +193,12 @@ class Scene:
             pose = reference.sample(np.linspace(0, reference.period, 401)).pose
             heights = [self._height(x, y) + 0.006 for x, y in pose[:, :2]]
             lines.append(np.column_stack([pose[:, :2], heights]))
-        self._draw_lines("/world/reference", np.stack(lines), 0.025, REFERENCE_COLOUR)
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
-        middle, size = (low + high) / 2, max(LEAST_VIEW, *(high - low))
-        self._look(middle + size * CAMERA_POSITION, middle + size * CAMERA_TARGET)
+        self._view = max(LEAST_VIEW, *(high - low))
+        self._draw_lines("/world/reference", np.stack(lines), 2 * TRAIL_WIDTH * self._view, REFERENCE_COLOUR)
+        self._factor.position = [(low[0] + high[0]) / 2, high[1] + self._length / 2, high[2]]
+        middle = (low + high) / 2
+        self._look(middle + self._view * CAMERA_POSITION, middle + self._view * CAMERA_TARGET)
 
     def _look(self, position: Array, target: Array) -> None:
         """Sets the camera of pages to come, and of open ones if it is another than before."""
@@ -213,13 +222,13 @@ class Scene:
             name, vertices, faces, color=colour, side="double", cast_shadow=False, receive_shadow=False
         )
 
-    def show_recordings(self, recordings: Sequence[Recording]) -> None:
-        """Draws the references and the paths of finished runs."""
+    def show_recordings(self, recordings: Sequence[Recording], magnified: int) -> None:
+        """Draws the references and the paths of finished runs, with deviations `magnified` times."""
         self.show_reference(recordings[0].scenario)
         for row, recording in enumerate(recordings):
             self.show(row, recording.qpos(len(recording.log) - 1))
         _, log = joint_log(recordings)
-        self.show_trails(log[np.linspace(0, len(log) - 1, PATH_POINTS).astype(int)])
+        self.show_trails(log[np.linspace(0, len(log) - 1, PATH_POINTS).astype(int)], magnified)
 
     def _height(self, x: float, y: float) -> float:
         try:
@@ -309,25 +318,47 @@ class Scene:
         """Number of points in the trail of a robot."""
         return min(TRAIL_POINTS, TRAIL_POINTS_OF_ALL // self.size)
 
-    def show_trails(self, rows: Rows) -> None:
-        """Draws where the robots were.
+    def show_targets(self, now: Rows, magnified: int) -> None:
+        """Draws where the robots should be, and a line from there to where they are.
+
+        Args:
+            now: Record of `TICK` of each robot, `(B,)`.
+            magnified: Factor on the deviation from the reference, as in `show_trails`.
+        """
+        heights = self._positions[:, self._chassis, 2] - self._radius
+        for target, row, height in zip(self._targets, now, heights, strict=False):
+            target.show(row, height, magnified)
+
+    def show_trails(self, rows: Rows, magnified: int) -> None:
+        """Draws where the robots were, and says how many times their deviation from the reference is magnified.
 
         Args:
             rows: Record of `TICK` at any number of times, always the same number, `(n, B)`. A robot that has stopped
                 remains where it is.
+            magnified: Factor on the deviation.
         """
         here = self._positions[:, self._chassis]
-        paths = path(rows, self._radius, here[0, 2])
-        paths = np.where(np.isfinite(paths), paths, here - [0, 0, self._radius - ABOVE]).swapaxes(0, 1)
+        paths = path(rows, self._radius, here[0, 2], magnified)
+        last = here - [0, 0, self._radius - ABOVE]
+        for row, line in enumerate(paths.swapaxes(0, 1)):
+            known = np.isfinite(line).all(axis=-1)
+            line[~known] = line[known][-1] if known.any() else last[row]
         colours = list(dict.fromkeys(robot.colour for robot in self._robots))
-        groups = [paths[[robot.colour == colour for robot in self._robots]] for colour in colours]
+        groups = [
+            paths[:, [robot.colour == colour for robot in self._robots]].swapaxes(0, 1) + [0, 0, NEXT_TRAIL * k]
+            for k, colour in enumerate(colours)
+        ]
+        width = TRAIL_WIDTH * self._view
+        self._factor.visible = magnified > 1
+        if magnified > 1:
+            self._factor.text = f"deviation from the reference × {magnified}"
         if not self._ribbons:
             self._ribbons = [
-                self._draw_lines(f"/world/trail/{k}", group, 0.012, colours[k]) for k, group in enumerate(groups)
+                self._draw_lines(f"/world/trail/{k}", group, width, colours[k]) for k, group in enumerate(groups)
             ]
             return
         for ribbon, group in zip(self._ribbons, groups, strict=True):
-            ribbon.vertices = ribbons(group, 0.012)[0]
+            ribbon.vertices = ribbons(group, width)[0]
 
     def forget_trails(self) -> None:
         """Removes the trails."""

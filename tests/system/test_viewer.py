@@ -160,6 +160,13 @@ def test_live(browser, tmp_path):
         apart = np.linalg.norm(place[None] - drawn[:, None], axis=-1)  # (30, T, B)
         assert len(np.unique(drawn[:, 0], axis=0)) > 1 and apart.max(axis=2).min(axis=1).max() < 1e-3  # of one tick
 
+        now, factor = live.session.log()[-1, 1], live._deviation
+        target = node(page, "/world/target/1")
+        assert target[:2] == pytest.approx([now["x_ref"], now["y_ref"]], abs=1e-6) and target[2] > 0.3
+        off = np.hypot(now["longitudinal_error"], now["lateral_error"])
+        assert node(page, "/world/target/1/ball")[0] == pytest.approx(factor * off, rel=1e-4) and factor == 100
+        assert live._scene._factor.visible and live._scene._factor.text.endswith("× 100")
+
         page.get_by_text("drop payload").click()
         until(lambda: "payload 0 → 10" in page.inner_text("#mrctl-timeline"), "the payload in the timeline")
         page.get_by_text("play", exact=True).click()
