@@ -14,8 +14,7 @@ from mrctl.viewer.shapes import ball, bar
 Array = NDArray[np.float64]
 
 CHOICES = ("automatic", "1×", "10×", "100×")
-HEIGHT, THICK = 0.5, 0.012  # of targets over the ground and of their lines, in diagonals of the robot's outline
-DARK = (17, 24, 39)
+PIN_COLOUR = (75, 85, 99)
 
 
 def extent(rows: Rows) -> float:
@@ -46,21 +45,24 @@ class Target:
     the ball is a node of its own, and only the length of the line is late.
     """
 
-    def __init__(self, scene: viser.SceneApi, row: int, size: float, colour: tuple[int, int, int]) -> None:
+    def __init__(
+        self, scene: viser.SceneApi, row: int, height: float, thick: float, colour: tuple[int, int, int]
+    ) -> None:
         """Adds the target to a scene; it is invisible until `show`.
 
         Args:
             scene: The scene.
             row: Index of the robot.
-            size: Diagonal of the robot's outline in m.
+            height: Height of the target over the ground in m.
+            thick: Thickness of the line in m.
             colour: Colour of the robot.
         """
-        name, self._height, thick = f"/world/target/{row}", HEIGHT * size, THICK * size
+        name, self._height = f"/world/target/{row}", height
         plain: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
         self._root = scene.add_frame(name, show_axes=False, visible=False)
         pin = bar(np.array([0, 0, -self._height]), np.zeros(3), thick / 2)
-        scene.add_mesh_simple(f"{name}/pin", *pin, color=DARK, flat_shading=True, **plain)
-        scene.add_mesh_simple(f"{name}/head", *ball(2 * thick), color=DARK, flat_shading=True, **plain)
+        scene.add_mesh_simple(f"{name}/pin", *pin, color=PIN_COLOUR, flat_shading=True, **plain)
+        scene.add_mesh_simple(f"{name}/head", *ball(2 * thick), color=PIN_COLOUR, flat_shading=True, **plain)
         self._line = scene.add_mesh_simple(
             f"{name}/line", *bar(np.zeros(3), np.array([1.0, 0, 0]), thick), color=colour, flat_shading=True, **plain
         )

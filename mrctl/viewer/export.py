@@ -16,7 +16,7 @@ from mrctl.record import InputError
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
 from mrctl.viewer.plots import charts, legend
-from mrctl.viewer.recording import Recording, joint_log
+from mrctl.viewer.recording import Recording, event_times, joint_log
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.sensors import magnification
 from mrctl.viewer.server import Server
@@ -106,9 +106,7 @@ def _curves(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
                 ],
             }
         )
-    events = {e.time - r.start for r in recordings for e in r.scenario.events}
-    marks = sorted(t for t in events if 0 <= t <= times[-1])
-    data: dict[str, Any] = {"time": _rounded(times[::step]), "charts": drawn, "marks": marks}
+    data: dict[str, Any] = {"time": _rounded(times[::step]), "charts": drawn, "marks": event_times(recordings)}
     return json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
 
 

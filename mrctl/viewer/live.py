@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import viser
 from typing_extensions import override
+from viser._messages import HotkeyKey
 
 from mrctl.record import InputError
 from mrctl.results.controllers import title_of
@@ -38,6 +39,7 @@ TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each 
 PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
 REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
 MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
+KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of each group
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
 DRIVER = ("prior", "learner")  # what the ghosts differ in
@@ -133,6 +135,13 @@ class Live(Page):
             @save.on_click
             async def _(event: viser.GuiEvent) -> None:
                 self.ask(self._save, event.client)
+
+        self.add_key("space", "Play or pause", lambda: self._command("pause" if self.playing else "play"))
+        self.add_key("arrowright", "Step", lambda: self._command("step"))
+        self.add_key("R", "Reset", lambda: self._command("reset"))
+        self.add_key("F", "Camera follows", lambda: setattr(self._follow, "value", not self._follow.value))
+        for key, (group, choices) in zip(KEYS, buttons(self.session.robot).items(), strict=True):
+            self.add_key(key, next(iter(choices)).capitalize(), partial(self._press, group, next(iter(choices))))
 
         self._controls = Controls(gui, partial(self.ask, self._note_input))
         self._controls.designed = self.session.designed()
@@ -379,7 +388,8 @@ class Live(Page):
         log = session.log(first)
         if len(log) < 2:
             return self._plots.clear(WINDOW)
-        self._plots.show(np.arange(first, first + len(log), dtype=float) * session.period, log, step)
+        times = np.arange(first, first + len(log), dtype=float) * session.period
+        self._plots.show(times, log, step, self._event_times())
         self._plots_since_trail += 1
         if self._plots_since_trail >= PLOTS_PER_TRAIL or not self.playing:
             self._plots_since_trail = 0
@@ -389,8 +399,13 @@ class Live(Page):
             self._deviation = self.magnified_deviation(log)
             self._scene.show_trails(log[np.clip(rows, 0, len(log) - 1)], self._deviation)
 
+    def _event_times(self) -> list[float]:
+        """Returns the times of the events until now in s."""
+        events = {event.time for scenario in self.session.saved() for event in scenario.events}
+        return sorted(time for time in events if time <= self.session.time)
+
     def _describe(self) -> None:
-        """Writes the timeline, and sets the inputs to the present values."""
+        """Writes the timeline, marks the events on the track, and sets the inputs to the present values."""
         scenario = max(self.session.saved(), key=lambda s: len(s.events))
         before: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE}
         lines = []
@@ -398,6 +413,9 @@ class Live(Page):
             lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_in_words(event, before))}")
             before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
         write(self._timeline, block("timeline", *(reversed(lines[-50:]) if lines else ["no events yet"])))
+        driven = self.session.driven()
+        ticks = np.minimum(np.round(np.array(self._event_times()) / self.session.period).astype(int), len(driven) - 1)
+        self._scene.show_events(driven[ticks[ticks >= 0]])
         present = self._present(self.session.start[0])
         for row, saved in enumerate(self.session.saved()):
             self._scene.show_payload(row, state(saved, self.session.time)["perturbation"])

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import viser
+from viser._messages import HotkeyKey
 
 from mrctl.kernel import Rows
 from mrctl.record import InputError
@@ -88,6 +89,19 @@ class Page(ABC):
             hint="Factor on errors of x and y in the picture, about the true position; headings are not magnified.",
         )  # fmt: skip
         self._sensed = gui.add_html("")
+        self.on(gui.add_checkbox("Dark page", self.server.dark), self._set_dark)
+
+    def _set_dark(self, dark: bool) -> None:
+        self.server.set_dark(dark)
+        self._scene.paint(dark)
+
+    def add_key(self, key: HotkeyKey, label: str, action: Callable[[], None]) -> None:
+        """Queues an action whenever a visitor presses a key; viser lists it under its label with Ctrl-K."""
+
+        async def called(_: viser.CommandEvent) -> None:
+            self.ask(action)
+
+        self.server.gui.add_command(label, hotkey=key).on_trigger(called)
 
     def magnified_deviation(self, rows: Rows) -> int:
         """Returns the factor on the deviations of some records; by default the largest that keeps them in view."""

@@ -132,6 +132,13 @@ def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows]:
     return recordings[0].period * np.arange(len(log), dtype=float), log
 
 
+def event_times(recordings: Sequence[Recording]) -> list[float]:
+    """Returns the times of the events of recordings in s, from the first sample on."""
+    longest = max(r.duration for r in recordings)
+    times = {event.time - r.start for r in recordings for event in r.scenario.events}
+    return sorted(time for time in times if 0 <= time <= longest)
+
+
 def looks_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[Look]:
     """Returns the look of each run, with its number in the label if labels would be equal.
 

@@ -13,7 +13,7 @@ from typing_extensions import override
 from mrctl.record import InputError
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
-from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of
+from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE, error
@@ -72,6 +72,10 @@ class Replay(Page):
             self.on(self._chosen, lambda run: self._choose(int(run)))
             self.on(gui.add_button("Keep this run as a ghost"), lambda _: self._keep())
             self.on(gui.add_button("Only this run"), lambda _: self._only())
+        self.add_key("space", "Play or pause", lambda: self._command("pause" if self.playing else "play"))
+        self.add_key("arrowright", "Forward by 0.1 s", lambda: self._scrub(self.time + 0.1))
+        self.add_key("R", "Start", lambda: self._command("start"))
+        self.add_key("F", "Camera follows", lambda: setattr(self._follow, "value", not self._follow.value))
         numbers = [str(name) for name, values in table.select_dtypes("number").nunique().items() if values > 1]
         self._board: list[Any] = []
         if len(table) > MAX_SHOWN and numbers:
@@ -158,7 +162,8 @@ class Replay(Page):
         times, self._log = joint_log(recordings)
         self._deviation = self.magnified_deviation(self._log)
         self._scene.show_recordings(recordings, self._deviation)
-        self._plots.show(times, self._log, max(1, len(self._log) // SAMPLES))
+        events = event_times(recordings)
+        self._plots.show(times, self._log, max(1, len(self._log) // SAMPLES), events)
         self._lap = round(recordings[0].scenario.reference.period / recordings[0].period)
         self._laps = whole_laps(self._log, self._lap, recordings[0].period)
         self._labels, sensing = [robot.label for robot in robots], [r.scenario.sensing for r in recordings]

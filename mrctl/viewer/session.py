@@ -151,6 +151,11 @@ class Session:
             parts[: len(done), rows] = done
         return parts
 
+    def driven(self) -> Rows:
+        """Returns a view of the log of the first robot, a record of `TICK` for each tick that it has driven."""
+        sim, k = self._place[0]
+        return sim.log.ticks[: sim.tick, k]
+
     def qpos(self, row: int) -> NDArray[np.float64]:
         """Returns the generalised position of a robot, `(nq,)`."""
         sim, k = self._place[row]

@@ -1,6 +1,7 @@
 """The viewer in a real headless browser: what a visitor sees and does. Screenshots are in pytest's folders."""
 
 import io
+import re
 import shutil
 import threading
 import time
@@ -169,14 +170,21 @@ def test_live(browser, tmp_path):
 
         page.get_by_text("drop payload").click()
         until(lambda: "payload 0 → 10" in page.inner_text("#mrctl-timeline"), "the payload in the timeline")
-        page.get_by_text("play", exact=True).click()
+        page.keyboard.press("Space")
         until(lambda: live.session.tick > tick + 250, "the robots to drive on")
         page.get_by_text("pause", exact=True).click()
         until(lambda: "paused" in page.inner_text("#mrctl-status"), "the second pause")
         time.sleep(1.0)
         assert moved(still, picture(page, tmp_path / "live_payload.png")) > 300
-        t, _, without = until(lambda: curves(page, "position error, mm") or None, "the curves")[0]
+        t, _, without, marks = until(lambda: curves(page, "position error, mm") or None, "the curves")[0]
         dropped = live.session.saved()[1].events[0].time
+        assert t[marks == 1] == pytest.approx([dropped], abs=0.05)
+        post = places(page, "/world/events")[:, :2].mean(axis=0)
+        now = live.session.driven()[round(dropped / live.session.period)]
+        assert post == pytest.approx([now["x_ref"], now["y_ref"]], abs=0.01)  # within a tick
+        page.locator(".u-over").nth(2).hover()
+        values = page.locator(".u-legend").nth(2).inner_text()
+        assert "PID alone position error" in values and re.search(r"\d\.\d", values), values
         before = without[(t > dropped - 0.3) & (t < dropped)]  # steady to 0.1 µm
         assert without[t > dropped].max() - before.max() > 0.015 > 100 * np.ptp(before)
         assert t[-1] == pytest.approx(live.session.time, abs=0.1)
@@ -319,7 +327,7 @@ def test_replay(browser, tmp_path):
         time.sleep(1.0)
         picture(page, tmp_path / "replay.png")
         t, *drawn = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
-        assert t[-1] == pytest.approx(11.98, abs=0.02) and len(drawn) == 1 + 2 * 2  # reference, estimates and truths
+        assert t[-1] == pytest.approx(11.98, abs=0.02) and len(drawn) == 1 + 2 * 2 + 1  # and the marks of events
         for title, axes in page.evaluate(AXES).items():
             assert axes["cursor"] == pytest.approx(7.5, abs=0.05) and axes["times"], title
         last = result.isel(run=1).dropna("time", subset=["x"]).isel(time=-1)
@@ -419,7 +427,7 @@ def test_estimate_live(browser, tmp_path):
         assert page.evaluate(VISIBLE, f"{MARKS}/estimate")
 
         def chart():
-            t, reference, estimated, true = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
+            t, reference, estimated, true, _ = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
             return len(t) > 60 and (t, estimated, true)
 
         t, estimated, true = until(chart, "the curves of V")
