@@ -23,9 +23,11 @@ from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import Robot
 from mrctl.viewer.controls import Controls
+from mrctl.viewer.embed import LONGEST
 from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
+from mrctl.viewer.recording import Recording
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.score import whole_laps
@@ -135,6 +137,8 @@ class Live(Page):
             @save.on_click
             async def _(event: viser.GuiEvent) -> None:
                 self.ask(self._save, event.client)
+
+            self.add_download()
 
         self.add_key("space", "Play or pause", lambda: self._command("pause" if self.playing else "play"))
         self.add_key("arrowright", "Step", lambda: self._command("step"))
@@ -302,6 +306,13 @@ class Live(Page):
         for scenario in self.session.saved():
             name = f"session-{scenario.name or scenario.feedforward}.toml"
             client.send_file_download(name, scenario.to_toml().encode(), save_immediately=True)
+
+    @override
+    def shown(self) -> list[Recording]:
+        if self.session.tick < 2:
+            raise InputError("download: nothing has happened yet")
+        result = self.session.result(LONGEST)
+        return [Recording(result.isel(run=row)) for row in range(self.session.size)]
 
     # -- the loop ----------------------------------------------------------------------------------------------------
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import queue
 import sys
+import threading
 import time
 import traceback
 from abc import ABC, abstractmethod
@@ -19,6 +20,7 @@ from viser._messages import HotkeyKey
 from mrctl.kernel import Rows
 from mrctl.record import InputError
 from mrctl.viewer import deviation, sensors
+from mrctl.viewer.recording import Recording, looks_of
 from mrctl.viewer.scene import MAX_MARKED, Scene
 from mrctl.viewer.server import Server
 
@@ -49,6 +51,7 @@ class Page(ABC):
         self.speed = 1.0
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._closing = False
+        self._making: threading.Thread | None = None
         panel = server.gui.add_panel()
         self.curves = panel.add_tab("Curves", viser.Icon.CHART_LINE)
         panel.dock_left()
@@ -90,6 +93,38 @@ class Page(ABC):
         )  # fmt: skip
         self._sensed = gui.add_html("")
         self.on(gui.add_checkbox("Dark page", self.server.dark), self._set_dark)
+
+    def add_download(self) -> None:
+        """Adds the button that makes one HTML file, in the present context of the GUI."""
+        button = self.server.gui.add_button(
+            "Download as one HTML file", icon=viser.Icon.DOWNLOAD, hint="It plays without a server and a network."
+        )
+
+        @button.on_click
+        async def _(event: viser.GuiEvent) -> None:
+            self.ask(self._download, event.client)
+
+    def _download(self, client: viser.ClientHandle) -> None:
+        """Makes the file in another thread, so that the session goes on; one at a time."""
+        if self._making is not None and self._making.is_alive():
+            raise InputError("download: the file is still being made")
+        recordings = self.shown()
+        self._making = threading.Thread(target=self._send, args=(client, recordings), daemon=True)
+        self._making.start()
+
+    def _send(self, client: viser.ClientHandle, recordings: Sequence[Recording]) -> None:
+        from mrctl.viewer.export import page  # which imports this room's scene
+
+        try:
+            content = page(recordings, looks_of(recordings, range(len(recordings)))).encode()
+        except InputError as error:
+            return self.ask(self.complain, error)
+        if client.client_id in self.server.get_clients():  # the visitor may have left
+            client.send_file_download("mrctl.html", content, save_immediately=True)
+
+    @abstractmethod
+    def shown(self) -> list[Recording]:
+        """Returns what the page shows, as recordings."""
 
     def _set_dark(self, dark: bool) -> None:
         self.server.set_dark(dark)

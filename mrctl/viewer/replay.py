@@ -72,6 +72,7 @@ class Replay(Page):
             self.on(self._chosen, lambda run: self._choose(int(run)))
             self.on(gui.add_button("Keep this run as a ghost"), lambda _: self._keep())
             self.on(gui.add_button("Only this run"), lambda _: self._only())
+            self.add_download()
         self.add_key("space", "Play or pause", lambda: self._command("pause" if self.playing else "play"))
         self.add_key("arrowright", "Forward by 0.1 s", lambda: self._scrub(self.time + 0.1))
         self.add_key("R", "Start", lambda: self._command("start"))
@@ -177,6 +178,10 @@ class Replay(Page):
         self.duration = float(times[-1])
         self.scrubber.max = self.duration
         self._scrub(self.time, pause=False)
+
+    @override
+    def shown(self) -> list[Recording]:
+        return self.recordings
 
     def _command(self, name: str) -> None:
         self.playing = name == "play"

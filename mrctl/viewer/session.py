@@ -7,6 +7,7 @@ from math import ceil, floor, sqrt
 from typing import Any, TypeVar
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from mrctl.control.design import motion
@@ -14,7 +15,7 @@ from mrctl.control.margins import Gains
 from mrctl.kernel import Rows
 from mrctl.loop.simulation import Simulation, uniform
 from mrctl.record import InputError, Record
-from mrctl.results.dataset import blank
+from mrctl.results.dataset import blank, combine, dataset
 from mrctl.scenario import Event, Scenario
 from mrctl.theory.robot import Robot
 
@@ -150,6 +151,16 @@ class Session:
             done = sim.log.ticks[first : sim.tick]
             parts[: len(done), rows] = done
         return parts
+
+    def result(self, longest: float) -> xr.Dataset:
+        """Returns the signals of the last `longest` s, as a result of `simulate` without what was learned."""
+        first = max(0, self.tick - round(longest / self.period))
+        names, failure = [s.feedforward for s in self.start], [self.failure(row) for row in range(self.size)]
+        nothing = np.full(self.size, np.nan)
+        saved = self.saved()
+        part = dataset(saved, names, names, self.log(first), failure, nothing, None)
+        found = combine([(range(self.size), part)], saved)
+        return found.assign_coords(time=found["time"] + first * self.period)
 
     def driven(self) -> Rows:
         """Returns a view of the log of the first robot, a record of `TICK` for each tick that it has driven."""
