@@ -119,6 +119,7 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
         "check": check,
         "bench": bench,
         "view": _view_with(arguments),
+        "record": record,
         "export": export,
     }
     if not arguments[0].startswith("-") and arguments[0] not in commands:
@@ -583,6 +584,27 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
         view.__annotations__["scenario"] = Annotated[type(short), tyro.conf.arg(name="")]
         view.__defaults__ = (None, short, *(view.__defaults__ or ())[2:])
     return view
+
+
+def record(
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")],
+    /,
+    out: Path,
+    number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
+) -> None:
+    """Writes a video of a result: the robots in three dimensions with the reference and their trails.
+
+    Args:
+        file: Result of `mrctl run --out` or `mrctl sweep`.
+        out: File to write, which ends in .gif, or in .mp4, which needs the program ffmpeg.
+        number: Number of the run to show; by default at most four runs, the others as ghosts of the first one.
+    """
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # which mujoco reads when it is imported
+    from mrctl.viewer import video
+
+    video.record(file, number, out)
+    print(f"video: {out}")
 
 
 def export(

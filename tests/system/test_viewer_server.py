@@ -12,13 +12,15 @@ import urllib.error
 import urllib.request
 
 import msgspec
+import numpy as np
 import pytest
 import viser
+from PIL import Image
 from viser import _messages
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from mrctl import Circle, Scenario, per_lap, simulate
+from mrctl import Circle, Line, Scenario, per_lap, save, simulate
 from mrctl.cli import main
 from mrctl.viewer import server as module
 from mrctl.viewer import view as viewing
@@ -240,3 +242,23 @@ def _random_value(handle, rng):
     if hasattr(handle, "max"):
         return rng.uniform(handle.min, handle.max)
     return True
+
+
+def test_record(tmp_path, capsys):
+    """A GIF of a result shows the robot on its way; where MuJoCo cannot draw, one line says so."""
+    result = tmp_path / "result.zarr"
+    save(simulate([Scenario(reference=Line(length=0.8), laps=1, learner="none")]), result)
+    command = [sys.executable, "-m", "mrctl.cli", "record", str(result), "--out", str(tmp_path / "run.gif")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    if done.returncode:
+        assert done.returncode == 2 and done.stderr.count("\n") == 1 and "EGL" in done.stderr
+    else:
+        with Image.open(tmp_path / "run.gif") as video:
+            assert (video.n_frames, video.size, video.info["duration"]) == (13, (640, 360), 80)
+            first = np.asarray(video.convert("RGB"), float)
+            video.seek(12)
+            assert (np.abs(np.asarray(video.convert("RGB"), float) - first).max(axis=-1) > 60).sum() > 500
+    (tmp_path / "there.gif").touch()
+    for name in ("run.avi", "there.gif", "none/run.gif"):
+        assert main(["record", str(tmp_path / "no.zarr"), "--out", str(tmp_path / name)]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
