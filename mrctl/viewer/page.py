@@ -28,6 +28,13 @@ FRAME, REFRESH = 1 / 25, 1 / 15  # s of wall time between two pictures, and betw
 SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "as fast as it goes": float("inf")}
 
 
+# On a phone the panel is as wide as the screen and leaves half of it to the scene, and a finger finds the buttons.
+PHONE = """<style>@media (max-width: 576px) {
+.mantine-Button-root { min-height: 44px !important }
+[style*="width: 20em"] { width: 100vw !important; max-height: 50% !important }
+}</style>"""
+
+
 class Page(ABC):
     """A page and the loop behind it.
 
@@ -45,6 +52,7 @@ class Page(ABC):
     def __init__(self, server: Server) -> None:
         """Takes the server; a subclass builds the rest of the page."""
         self.server = server
+        server.gui.add_html(PHONE)
         self._notice = server.gui.add_html("")  # above the tabs, so that it is seen on each of them
         self.message = ""
         self.playing = True

@@ -215,6 +215,11 @@ def test_live(browser, tmp_path):
         assert np.linalg.norm(np.diff(trail, axis=0), axis=-1).max() < 0.12  # m, in 1/8 s
         assert np.abs(np.hypot(*(trail[:, :2] - [0, 0.8]).T) - 0.8).max() < 0.1
 
+        page.set_viewport_size({"width": 390, "height": 844})
+        button = page.get_by_role("button", name="reset", exact=True)
+        until(lambda: (box := button.bounding_box()) and box["height"] >= 44, "a button for a finger")
+        page.screenshot(path=tmp_path / "phone.png", timeout=PATIENCE)
+        page.set_viewport_size({"width": 1280, "height": 800})
         page.get_by_text("reset", exact=True).click()
         until(lambda: np.isnan(curves(page, "V, m/s")[0][1:]).all(), "the old curves to go")
         until(
@@ -485,6 +490,9 @@ def test_export(browser, tmp_path):
         half = until(lambda: (p := node(page, ROBOT, scene)) is not None and p[1] > 1.4 and p, "the robot to follow")
         assert np.allclose(half[:2], [0, 1.6], atol=0.1)  # half way around
         picture(page, tmp_path / "export.png")
+        page.set_viewport_size({"width": 390, "height": 844})
+        boxes = [page.locator(part).bounding_box() for part in ("#scene", "#curves")]
+        assert all(box["width"] > 380 for box in boxes) and boxes[0]["height"] > 400 < boxes[1]["y"]
     assert main(["view", str(scenario), "--export", str(file)]) == 2  # not overwritten
 
 
