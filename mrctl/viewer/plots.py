@@ -169,7 +169,9 @@ class Plots:
             if handle.series != (series := _series(chart)):
                 handle.series = series
 
-    def show(self, time: Array, log: Rows, step: int, events: Sequence[float] = ()) -> None:
+    def show(
+        self, time: Array, log: Rows, step: int, events: Sequence[float] = (), within: slice = slice(None)
+    ) -> None:
         """Draws a log.
 
         Args:
@@ -177,16 +179,16 @@ class Plots:
             log: Record of `TICK` for each sample and robot, `(T, B)`.
             step: Number of samples from one drawn sample to the next.
             events: Times of events in s.
+            within: Samples that are drawn.
         """
-        drawn = time[::step]
+        drawn = time[within][::step]
         marks = np.full(len(drawn), np.nan)
         for first in np.searchsorted(drawn, events):
             if 0 < first < len(drawn):
                 marks[first - 1 : first + 1] = 1.0, 0.0  # a line from top to bottom, one sample wide
         for handle, chart in zip(self._handles, charts(log, self._robots, self._period), strict=True):
-            handle.data = tuple(np.ascontiguousarray(v[::step]) for v in (time, *(c.values for c in chart.curves))) + (
-                marks,
-            )
+            values = [time, *(curve.values for curve in chart.curves)]
+            handle.data = (*(np.ascontiguousarray(v[within][::step]) for v in values), marks)
 
     def score(self, now: Rows, laps: Sequence[dict[str, Array]]) -> None:
         """Writes the score, as `score.table` does."""
@@ -200,7 +202,7 @@ class Plots:
         """Draws a vertical line in all charts at a share of their time; their data need not be sent again."""
         left = f"{100 * share:.3f}%"
         line = f"content:'';position:absolute;top:0;bottom:0;left:{left};border-left:1px solid rgb{CURSOR_COLOUR}"
-        self._cursor.content = f"<style>.u-over::after{{{line}}}</style>"
+        self._cursor.content = f"<style>.u-over{{overflow:hidden}}.u-over::after{{{line}}}</style>"
 
 
 def legend(robots: Sequence[Look]) -> str:

@@ -58,6 +58,8 @@ class Replay(Page):
             self.on(gui.add_button_group("", ("play", "pause", "start")), self._command)
             self.scrubber = gui.add_slider("Time, s", 0.0, 1.0, 0.01, 0.0)
             self.on(self.scrubber, self._scrub)
+            self._interval = gui.add_multi_slider("Curves, s", 0.0, 1.0, 0.01, (0.0, 1.0))
+            self.on(self._interval, lambda _: self._draw_curves())
             speeds = tuple(name for name, speed in SPEEDS.items() if np.isfinite(speed))
             self.on(
                 gui.add_dropdown("Speed", speeds, initial_value="1×"),
@@ -163,8 +165,7 @@ class Replay(Page):
         times, self._log = joint_log(recordings)
         self._deviation = self.magnified_deviation(self._log)
         self._scene.show_recordings(recordings, self._deviation)
-        events = event_times(recordings)
-        self._plots.show(times, self._log, max(1, len(self._log) // SAMPLES), events)
+        self._times, self._events = times, event_times(recordings)
         self._lap = round(recordings[0].scenario.reference.period / recordings[0].period)
         self._laps = whole_laps(self._log, self._lap, recordings[0].period)
         self._labels, sensing = [robot.label for robot in robots], [r.scenario.sensing for r in recordings]
@@ -176,8 +177,18 @@ class Replay(Page):
             max(np.sqrt(np.mean(off**2, axis=0)).max(), *(s["fix_position_noise"] for s in sensing)),
         )
         self.duration = float(times[-1])
-        self.scrubber.max = self.duration
+        self.scrubber.max = self._interval.max = self.duration
+        self._interval.value = (0.0, self.duration)
+        self._draw_curves()
         self._scrub(self.time, pause=False)
+
+    def _draw_curves(self) -> None:
+        """Draws the curves in the chosen interval, the finer the shorter it is."""
+        first, last = np.searchsorted(self._times, self._interval.value)
+        within = slice(max(0, min(first, len(self._times) - 2)), max(last, first + 1) + 1)
+        count = len(self._times[within])
+        self._plots.show(self._times, self._log, max(1, count // SAMPLES), self._events, within)
+        self._plotted = None
 
     @override
     def shown(self) -> list[Recording]:
@@ -245,7 +256,8 @@ class Replay(Page):
             self.scrubber.value = self.time
             tick = min(round(self.time / self.recordings[0].period), len(self._log) - 1)
             self._plots.score(self._log[tick], self._laps[: (tick + 1) // self._lap])
-            self._plots.point(self.time / self.duration if self.duration else 0.0)
+            start, end = self._interval.value
+            self._plots.point((self.time - start) / (end - start) if end > start else 0.0)
 
 
 def _sphere() -> tuple[np.ndarray, np.ndarray]:

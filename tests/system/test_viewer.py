@@ -339,6 +339,11 @@ def test_replay(browser, tmp_path):
         assert t[-1] == pytest.approx(11.98, abs=0.02) and len(drawn) == 1 + 2 * 2 + 1  # and the marks of events
         for title, axes in page.evaluate(AXES).items():
             assert axes["cursor"] == pytest.approx(7.5, abs=0.05) and axes["times"], title
+        replay.ask(setattr, replay._interval, "value", (7.0, 8.0))
+        replay.ask(replay._draw_curves)
+        t = until(lambda: len(now := curves(page, "V, m/s")[0][0]) < 105 and now, "one second of the curves")
+        assert (t[0], t[-1], len(t)) == (pytest.approx(7.0), pytest.approx(8.0), 101)  # every sample
+        until(lambda: page.evaluate(AXES)["V, m/s"]["cursor"] == pytest.approx(7.5, abs=0.01), "the cursor")
         last = result.isel(run=1).dropna("time", subset=["x"]).isel(time=-1)
         tilt = np.arccos(np.cos(last.pitch_angle) * np.cos(last.roll_angle))
         assert tilt > 0.4
