@@ -39,6 +39,9 @@ FROM_FILES = ("events", "obstacles")
 GIVEN = (*FROM_FILES, "reference", "laps", "initial_pose")
 """Fields of `Scenario` that are no flags of `mrctl navigate`, because the mission gives them."""
 
+BEST: FeedforwardName = "model+composite"
+"""Feedforward with the least errors in the README; `navigate` drives with it, and `view` shows it beside PID alone."""
+
 LAB = Sensing(tier="lab")
 DELAYS = 0.0, 0.01, 0.02  # s
 
@@ -127,7 +130,8 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
         "identify": identify,
         "check": check,
         "bench": bench,
-        "view": view,
+        "view": _view_with(arguments),
+        "record": record,
         "export": export,
     }
     if not arguments[0].startswith("-") and arguments[0] not in commands:
@@ -186,7 +190,24 @@ def _one_line(box: str) -> str:
 def _is_short_help(arguments: Sequence[str]) -> bool:
     """Tells whether a command line asks for the short help of a scenario; that of a reference is short in itself."""
     asked = bool({"-h", "--help"} & set(arguments))
-    return arguments[0] in ("run", "navigate") and asked and not any(a.startswith("reference:") for a in arguments)
+    return (
+        arguments[0] in ("run", "navigate", "view") and asked and not any(a.startswith("reference:") for a in arguments)
+    )
+
+
+def _given(arguments: Sequence[str]) -> set[str]:
+    """Names of what a command line sets, of fields within fields the first one: `robot` of --robot.path."""
+    return {re.split("[.:=]", argument.removeprefix("--"))[0] for argument in arguments[1:]}
+
+
+def _suited(scenario: Scenario, arguments: Sequence[str], scenario_file: str | None) -> Scenario:
+    """Returns the scenario, whose reference suits the robot where a command line names a robot and no reference."""
+    given = _given(arguments)
+    if scenario_file or "robot" not in given or "reference" in given:
+        return scenario
+    from mrctl.loop.simulation import suited
+
+    return suited(scenario)
 
 
 def _part(scenario: Scenario, names: Sequence[str]) -> Record:
@@ -201,7 +222,7 @@ def _part(scenario: Scenario, names: Sequence[str]) -> Record:
 
 def _further_flags(command: str) -> str:
     """Lists the flags that the short help of a command leaves out, a field or group of fields each, explained."""
-    never = FROM_FILES if command == "run" else GIVEN
+    never = GIVEN if command == "navigate" else FROM_FILES
     left_out = [name for name in Scenario.model_fields if name not in (*FIRST, *never)]
     # Perturbations are what people change most.
     names = sorted(left_out, key=lambda name: name != "perturbation")
@@ -249,7 +270,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             raise InputError(f"run: {file} is not a scenario file, whose name ends in .toml; see mrctl run --help")
         from mrctl.experiments import single
 
-        text, failure = single.run(scenario, out, json, controller)
+        text, failure = single.run(_suited(scenario, arguments, scenario_file), out, json, controller)
         print(text)
         if failure:
             raise _Incomplete(f"the run failed: {failure}")
@@ -264,7 +285,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
 def _navigate_with(arguments: list[str]) -> Callable[..., None]:
     """Returns the `navigate` command, whose short help leaves out what that of `run` does."""
     names = FIRST if _is_short_help(arguments) else Scenario.model_fields
-    part = _part(Scenario(prior="model", learner="composite"), [name for name in names if name not in GIVEN])
+    part = _part(Scenario(**FEEDFORWARDS[BEST]), [name for name in names if name not in GIVEN])
 
     def navigate(
         world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="WORLD|GENERATOR:SEED")],
@@ -307,7 +328,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
 
 
 def _scenario_file(arguments: Sequence[str]) -> str | None:
-    """Returns the argument of `run` that is a scenario file: it ends in .toml and is not the value of a flag."""
+    """Returns the argument of `run` or `view` that is a scenario file: it ends in .toml and is no value of a flag."""
     for before, argument in zip(arguments, arguments[1:], strict=False):
         if argument.endswith(".toml") and not argument.startswith("-") and not re.match("--(?!json$)", before):
             return str(Path(argument))
@@ -541,32 +562,81 @@ def bench(json: bool = False) -> None:
     print(jsonlib.dumps(figures, indent=2, ensure_ascii=False) if json else benchmark.text(figures))
 
 
-def view(
-    file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml|RESULT")] = None,
+def _view_with(arguments: list[str]) -> Callable[..., None]:
+    """Returns the `view` command, which takes the scenario flags of `run`.
+
+    Without a file and a choice of controllers, the best learner is shown beside PID alone. A robot that is chosen
+    without its steering or a reference brings those that suit it.
+    """
+    asked = arguments[0] == "view"
+    scenario_file = _scenario_file(arguments) if asked else None
+    chosen = scenario_file is not None or bool(_given(arguments) & {"prior", "learner", "compare"})
+    default = Scenario() if chosen else Scenario(**FEEDFORWARDS[BEST])
+    if scenario_file:
+        default = Scenario.from_toml(scenario_file)
+
+    def view(
+        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml|RESULT")] = None,
+        /,
+        scenario: Annotated[Scenario, tyro.conf.arg(name="")] = default,
+        compare: Annotated[tuple[FeedforwardName, ...], tyro.conf.arg(metavar="NAME ...")] = (),
+        number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
+        export: Path | None = None,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        code: bool = True,
+    ) -> None:
+        """Shows robots in the browser: a live session of a scenario, or the replay of a result or sweep.
+
+        Args:
+            file: Scenario file, whose values flags override, or result of `mrctl run --out` or `mrctl sweep`; by
+                default the best learner and PID alone, live.
+            scenario: The scenario. A robot brings the steering and the reference that suit it, unless they are given.
+            compare: Feedforwards of further robots, such as none or model+composite, which are shown as ghosts with the
+                same seed and events.
+            number: Number of the run to show first, in a result or sweep.
+            export: HTML file to write instead of serving a page; it plays without a server.
+            host: Address to listen on; an address other than 127.0.0.1 lets others in without a password.
+            port: Number of the port to listen on.
+            code: Whether a sweep may run the Python files of the controller that it names.
+        """
+        from mrctl.viewer import view as viewing
+
+        if file is not None and str(file) != scenario_file:
+            if scenario != default:
+                raise InputError(f"view: {file} has its own scenarios; flags of a scenario need a live session")
+            return viewing.replay(file, compare, number, export, host, port, code)
+        if number is not None:
+            raise InputError("run: only a result or a sweep has several")
+        scenario = _suited(scenario, arguments, scenario_file)
+        viewing.live(scenario, compare if chosen else ("none",), export, host, port)
+
+    if not asked or _is_short_help(arguments):
+        short = _part(default, FIRST)
+        view.__annotations__["scenario"] = Annotated[type(short), tyro.conf.arg(name="")]
+        view.__defaults__ = (None, short, *(view.__defaults__ or ())[2:])
+    return view
+
+
+def record(
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")],
     /,
-    compare: Annotated[tuple[FeedforwardName, ...], tyro.conf.arg(metavar="NAME ...")] = (),
+    out: Path,
     number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
-    export: Path | None = None,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    code: bool = True,
 ) -> None:
-    """Shows robots in the browser: a live session of a scenario, or the replay of a result or sweep.
+    """Writes a video of a result: the robots in three dimensions with the reference and their trails.
 
     Args:
-        file: Scenario file, or result of `mrctl run --out` or `mrctl sweep`; by default the best learner and PID alone,
-            live.
-        compare: Feedforwards of further robots, such as none or model+composite, which are shown as ghosts with the
-            same seed and events.
-        number: Number of the run to show first, in a result or sweep.
-        export: HTML file to write instead of serving a page; it plays without a server.
-        host: Address to listen on; an address other than 127.0.0.1 lets others in without a password.
-        port: Number of the port to listen on.
-        code: Whether a sweep may run the Python files of the controller that it names.
+        file: Result of `mrctl run --out` or `mrctl sweep`.
+        out: File to write, which ends in .gif, or in .mp4, which needs the program ffmpeg.
+        number: Number of the run to show; by default at most four runs, the others as ghosts of the first one.
     """
-    from mrctl.viewer.view import view as show
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # which mujoco reads when it is imported
+    from mrctl.viewer import video
 
-    show(file, compare, number, export, host, port, code)
+    video.record(file, number, out)
+    print(f"video: {out}")
 
 
 def export(

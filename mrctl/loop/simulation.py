@@ -32,9 +32,11 @@ from mrctl.sensing.sensors import Sensors
 from mrctl.theory.clearance import clearances
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.obstacles import Surroundings
-from mrctl.theory.references import check
+from mrctl.theory.references import check, enlarged
 
 LEAST = 8  # robots in a thread, for fewer do not pay for it
+RESERVE = 0.9  # share of the robot's limits that a suited reference takes
+LIMITS = ("max_speed", "max_rotation", "max_acceleration", "max_rotation_acceleration", "steering_limit")
 
 
 def simulate(
@@ -162,6 +164,21 @@ def arranged(scenario: Scenario) -> Scenario:
         InputError: The robot's file has no robot that can be driven.
     """
     return scenario if scenario.steering else scenario.replace(steering=mjcf.arrangement(scenario.robot))
+
+
+def suited(scenario: Scenario) -> Scenario:
+    """Returns the scenario with the steering of its robot, and with a lemniscate that the robot can follow.
+
+    The lemniscate is that of the scenario where possible; otherwise it is larger, then slower.
+
+    Raises:
+        InputError: The robot cannot be driven.
+    """
+    scenario = arranged(scenario)
+    model, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
+    careful = robot.replace(**{name: RESERVE * getattr(robot, name) for name in LIMITS})
+    found = enlarged(scenario.reference, careful, mjcf.reverses(model, scenario.steering))
+    return scenario.replace(reference=found or scenario.reference)
 
 
 def group_of(s: Scenario) -> Hashable:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import cmath
 import contextlib
 from functools import cached_property, lru_cache
+from itertools import product
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -488,16 +489,33 @@ def _fault(reference: Reference, robot: Robot, reverse: bool) -> str:
     return ""
 
 
-def _remedy(reference: Reference, robot: Robot, reverse: bool) -> str:
-    """Names the nearest of some sizes and periods of a circle or lemniscate that a robot can follow, or returns ""."""
+def enlarged(reference: Reference, robot: Robot, reverse: bool) -> Circle | Lemniscate | None:
+    """Returns a circle or lemniscate enlarged by as little as needed for a robot to follow it, and then slowed.
+
+    Args:
+        reference: The reference.
+        robot: The robot.
+        reverse: Whether the robot can be driven backwards.
+
+    Returns:
+        The reference, or None if there is none, or for a reference of another kind.
+    """
     if not isinstance(reference, (Circle, Lemniscate)):
-        return ""
+        return None
     name = "radius" if isinstance(reference, Circle) else "size"
-    for wider in (1, 1.5, 2, 3, 4):
-        for slower in (1, 1.25, 1.5, 2, 3, 4, 6, 10):
-            factors = {name: wider, "period": slower}
-            changes = {field: float(f"{factor * getattr(reference, field):.3g}") for field, factor in factors.items()}
-            with contextlib.suppress(InputError):  # beyond what a reference may be
-                if not _fault(reference.replace(**changes), robot, reverse):
-                    return f"; {name} {changes[name]:g} m with period {changes['period']:g} s would do"
-    return ""
+    for larger, slower in product(range(12), range(12)):
+        size, period = getattr(reference, name) * 2 ** (larger / 4), reference.period * 2 ** (slower / 4)
+        with contextlib.suppress(InputError):  # beyond what a reference may be
+            found = reference.replace(**{name: round(size, 2), "period": round(period, 1)})
+            if not _fault(found, robot, reverse):
+                return found
+    return None
+
+
+def _remedy(reference: Reference, robot: Robot, reverse: bool) -> str:
+    """Names the circle or lemniscate that a robot can follow, or returns ""."""
+    found = enlarged(reference, robot, reverse)
+    if found is None:
+        return ""
+    size = f"radius {found.radius:g}" if isinstance(found, Circle) else f"size {found.size:g}"
+    return f"; {size} m with period {found.period:g} s would do"

@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.record import InputError
+from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
 from mrctl.viewer.plots import charts, legend
-from mrctl.viewer.recording import Recording, joint_log
+from mrctl.viewer.recording import Recording, event_times, joint_log
 from mrctl.viewer.scene import Scene
+from mrctl.viewer.sensors import magnification
 from mrctl.viewer.server import Server
 
 PICTURE_RATE = 25  # pictures for each second of the replay
@@ -63,13 +65,16 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
     server = Server(port=0)
     try:
         scene = Scene(server, recordings[0].model, robots)
-        scene.show_recordings(recordings)
+        _, log = joint_log(recordings)
+        magnified = magnification(extent(log))
+        scene.show_recordings(recordings, magnified)
         duration = max(r.duration for r in recordings)
         serializer = server.get_scene_serializer()
         for time in np.arange(0, duration, 1 / PICTURE_RATE):
             for row, recording in enumerate(recordings):
                 scene.show(row, recording.qpos(recording.index(time)))
                 scene.show_payload(row, recording.perturbation(time))
+            scene.show_targets(np.stack([r.log[r.index(time)] for r in recordings]), magnified)
             scene.flush(follow=False)
             serializer.insert_sleep(1 / PICTURE_RATE)
         return serializer.as_html()
@@ -101,9 +106,7 @@ def _curves(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
                 ],
             }
         )
-    events = {e.time - r.start for r in recordings for e in r.scenario.events}
-    marks = sorted(t for t in events if 0 <= t <= times[-1])
-    data: dict[str, Any] = {"time": _rounded(times[::step]), "charts": drawn, "marks": marks}
+    data: dict[str, Any] = {"time": _rounded(times[::step]), "charts": drawn, "marks": event_times(recordings)}
     return json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
 
 

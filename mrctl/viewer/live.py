@@ -14,17 +14,22 @@ from typing import Any
 import numpy as np
 import viser
 from typing_extensions import override
+from viser._messages import HotkeyKey
 
 from mrctl.record import InputError
 from mrctl.results.controllers import title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.robot import Robot
 from mrctl.viewer.controls import Controls
+from mrctl.viewer.embed import LONGEST
 from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
+from mrctl.viewer.recording import Recording
 from mrctl.viewer.scene import Scene
+from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
@@ -36,13 +41,7 @@ TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each 
 PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
 REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
 MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
-# Label of each group of buttons, its buttons, and the change of the perturbation or the push that a button makes.
-BUTTONS: dict[str, dict[str, dict[str, Any]]] = {
-    "Payload": {"drop payload": {"payload": 10.0, "payload_x": 0.05, "payload_y": 0.06}, "remove": {"payload": 0.0}},
-    "Supply": {"sag supply": {"supply_factor": 0.7}, "restore": {"supply_factor": 1.0}},
-    "Floor": {"slippery patch": {"tyre_friction_factor": 0.15}, "dry": {"tyre_friction_factor": 1.0}},
-    "Push": {"push": {"push": (0.0, 60.0, 0.0)}, "spin": {"push": (0.0, 0.0, 15.0)}},
-}
+KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of each group
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
 DRIVER = ("prior", "learner")  # what the ghosts differ in
@@ -59,6 +58,30 @@ HIDDEN = (
     "control_period",
     "motion_period",
 )
+
+
+def buttons(robot: Robot) -> dict[str, dict[str, dict[str, Any]]]:
+    """Returns the groups of buttons: label, buttons, and the change of the perturbation or the push that each makes.
+
+    Payload and push are in proportion to the robot: the payload is half of its mass.
+    """
+    mass, half_track = robot.mass, robot.half_track
+    load = _rounded(mass / 2, robot.com_offset / 2, 0.32 * half_track, 5 / 3 * robot.com_height)
+    push, spin = _rounded(3 * mass, 4 * mass * half_track)  # N and N·m
+    return {
+        "Payload": {
+            "drop payload": dict(zip(("payload", "payload_x", "payload_y", "payload_z"), load, strict=True)),
+            "remove": {"payload": 0.0},
+        },
+        "Supply": {"sag supply": {"supply_factor": 0.7}, "restore": {"supply_factor": 1.0}},
+        "Floor": {"slippery patch": {"tyre_friction_factor": 0.15}, "dry": {"tyre_friction_factor": 1.0}},
+        "Push": {"push": {"push": (0.0, push, 0.0)}, "spin": {"push": (0.0, 0.0, spin)}},
+    }
+
+
+def _rounded(*values: float) -> list[float]:
+    """Returns numbers to two digits, as somebody would type them."""
+    return [float(f"{value:.2g}") for value in values]
 
 
 class Live(Page):
@@ -96,22 +119,33 @@ class Live(Page):
         gui, tabs = self.server.gui, self.server.gui.add_tab_group()
         self._plots = Plots(gui, self.curves)
         with tabs.add_tab("Drive"):
+            self.on(gui.add_button_group("Watch", tuple(STORIES)), self._tell)
+            self._story = gui.add_html("")
             self._status = gui.add_html("")
             self._play = gui.add_button_group("", ("play", "pause", "step", "reset"))
             self.on(self._play, self._command)
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
             self.on(speed, lambda name: self._set_speed(SPEEDS[name]))
             self._follow = gui.add_checkbox("Camera follows", False, hint="The first robot stays in the middle.")
-            for label, choices in BUTTONS.items():
+            for label, choices in buttons(self.session.robot).items():
                 group = gui.add_button_group(label, tuple(choices))
-                self.on(group, partial(self._press, choices))
-            self.add_sensors()
+                self.on(group, partial(self._press, label))
+            self.add_drawing()
             self._timeline = gui.add_html("")
             save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
 
             @save.on_click
             async def _(event: viser.GuiEvent) -> None:
                 self.ask(self._save, event.client)
+
+            self.add_download()
+
+        self.add_key("space", "Play or pause", lambda: self._command("pause" if self.playing else "play"))
+        self.add_key("arrowright", "Step", lambda: self._command("step"))
+        self.add_key("R", "Reset", lambda: self._command("reset"))
+        self.add_key("F", "Camera follows", lambda: setattr(self._follow, "value", not self._follow.value))
+        for key, (group, choices) in zip(KEYS, buttons(self.session.robot).items(), strict=True):
+            self.add_key(key, next(iter(choices)).capitalize(), partial(self._press, group, next(iter(choices))))
 
         self._controls = Controls(gui, partial(self.ask, self._note_input))
         self._controls.designed = self.session.designed()
@@ -150,12 +184,15 @@ class Live(Page):
             self._shown_sensing = sensing
             spread = max(np.inf if s.source == "odometry" else s["fix_position_noise"] for s in sensing)
             self.set_marks(any(s.source != "truth" for s in sensing), spread)
+        told = [story.watch for story in STORIES.values() if story.scenarios == session.start]
+        write(self._story, block("story", *told) if told else "")
         self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
         self._scene.show_reference(first)
         self._scene.forget_trails()
         for name, ghost in self._ghosts.items():
             ghost.value = any(s.feedforward == name for s in session.start[1:])
         self._drawn = self._plotted = None
+        self._deviation = 1  # factor on the deviations from the reference in the picture
         self._laps: list[dict[str, Any]] = []  # metrics of the whole laps until now
         self._counted = (time.monotonic(), session.tick)
         self._happened = 0  # number of the scenarios' own events that have happened
@@ -179,10 +216,17 @@ class Live(Page):
         else:
             self.playing = name == "play" and self.session.running
 
+    def _tell(self, name: str) -> None:
+        if name not in STORIES:
+            raise InputError(f"{name}: not one of the choices")
+        self._restart(STORIES[name].scenarios)
+        self.playing = True
+
     def _set_speed(self, speed: float) -> None:
         self.speed, self._due = speed, 0.0
 
-    def _press(self, choices: dict[str, dict[str, Any]], name: str) -> None:
+    def _press(self, group: str, name: str) -> None:
+        choices = buttons(self.session.robot)[group]
         if name not in choices:
             raise InputError(f"{name}: not one of the choices")
         change = choices[name]
@@ -263,6 +307,13 @@ class Live(Page):
             name = f"session-{scenario.name or scenario.feedforward}.toml"
             client.send_file_download(name, scenario.to_toml().encode(), save_immediately=True)
 
+    @override
+    def shown(self) -> list[Recording]:
+        if self.session.tick < 2:
+            raise InputError("download: nothing has happened yet")
+        result = self.session.result(LONGEST)
+        return [Recording(result.isel(run=row)) for row in range(self.session.size)]
+
     # -- the loop ----------------------------------------------------------------------------------------------------
 
     @override
@@ -290,7 +341,7 @@ class Live(Page):
     @override
     def draw(self) -> None:
         session, (marked, magnified) = self.session, self.marks
-        now = session.tick, self._follow.value, marked, magnified
+        now = session.tick, self._follow.value, marked, magnified, self._deviation
         if now == self._drawn:
             return
         self._drawn = now
@@ -301,6 +352,8 @@ class Live(Page):
             ticks = round(FIX_AGE / session.period) + max(self._latencies)
             logs = list(session.log(max(0, session.tick - ticks)).T)
         with self.server.atomic():
+            if session.tick:
+                self._scene.show_targets(session.log(session.tick - 1)[-1], self._deviation)
             self._scene.show_sensors(logs, session.period, self._latencies, magnified)
             self._scene.flush(self._follow.value)
 
@@ -346,17 +399,24 @@ class Live(Page):
         log = session.log(first)
         if len(log) < 2:
             return self._plots.clear(WINDOW)
-        self._plots.show(np.arange(first, first + len(log), dtype=float) * session.period, log, step)
+        times = np.arange(first, first + len(log), dtype=float) * session.period
+        self._plots.show(times, log, step, self._event_times())
         self._plots_since_trail += 1
         if self._plots_since_trail >= PLOTS_PER_TRAIL or not self.playing:
             self._plots_since_trail = 0
             every = -(-ticks // (self._scene.trail_points - 2))
             marked = session.tick // every * every - every * np.arange(self._scene.trail_points - 1)[::-1]
             rows = np.append(marked, session.tick - 1) - first  # the same moments of the run in every picture
-            self._scene.show_trails(log[np.clip(rows, 0, len(log) - 1)])
+            self._deviation = self.magnified_deviation(log)
+            self._scene.show_trails(log[np.clip(rows, 0, len(log) - 1)], self._deviation)
+
+    def _event_times(self) -> list[float]:
+        """Returns the times of the events until now in s."""
+        events = {event.time for scenario in self.session.saved() for event in scenario.events}
+        return sorted(time for time in events if time <= self.session.time)
 
     def _describe(self) -> None:
-        """Writes the timeline, and sets the inputs to the present values."""
+        """Writes the timeline, marks the events on the track, and sets the inputs to the present values."""
         scenario = max(self.session.saved(), key=lambda s: len(s.events))
         before: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE}
         lines = []
@@ -364,6 +424,9 @@ class Live(Page):
             lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_in_words(event, before))}")
             before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
         write(self._timeline, block("timeline", *(reversed(lines[-50:]) if lines else ["no events yet"])))
+        driven = self.session.driven()
+        ticks = np.minimum(np.round(np.array(self._event_times()) / self.session.period).astype(int), len(driven) - 1)
+        self._scene.show_events(driven[ticks[ticks >= 0]])
         present = self._present(self.session.start[0])
         for row, saved in enumerate(self.session.saved()):
             self._scene.show_payload(row, state(saved, self.session.time)["perturbation"])

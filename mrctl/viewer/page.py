@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import queue
 import sys
+import threading
 import time
 import traceback
 from abc import ABC, abstractmethod
@@ -14,15 +15,24 @@ from typing import Any
 
 import numpy as np
 import viser
+from viser._messages import HotkeyKey
 
 from mrctl.kernel import Rows
 from mrctl.record import InputError
-from mrctl.viewer import sensors
+from mrctl.viewer import deviation, sensors
+from mrctl.viewer.recording import Recording, looks_of
 from mrctl.viewer.scene import MAX_MARKED, Scene
 from mrctl.viewer.server import Server
 
 FRAME, REFRESH = 1 / 25, 1 / 15  # s of wall time between two pictures, and between two updates of the plots
 SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "as fast as it goes": float("inf")}
+
+
+# On a phone the panel is as wide as the screen and leaves half of it to the scene, and a finger finds the buttons.
+PHONE = """<style>@media (max-width: 576px) {
+.mantine-Button-root { min-height: 44px !important }
+[style*="width: 20em"] { width: 100vw !important; max-height: 50% !important }
+}</style>"""
 
 
 class Page(ABC):
@@ -42,12 +52,14 @@ class Page(ABC):
     def __init__(self, server: Server) -> None:
         """Takes the server; a subclass builds the rest of the page."""
         self.server = server
+        server.gui.add_html(PHONE)
         self._notice = server.gui.add_html("")  # above the tabs, so that it is seen on each of them
         self.message = ""
         self.playing = True
         self.speed = 1.0
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._closing = False
+        self._making: threading.Thread | None = None
         panel = server.gui.add_panel()
         self.curves = panel.add_tab("Curves", viser.Icon.CHART_LINE)
         panel.dock_left()
@@ -75,15 +87,69 @@ class Page(ABC):
         self._message = text
         write(self._notice, block("message", warning(text)) if text else "")
 
-    def add_sensors(self) -> None:
-        """Adds the inputs that say whether and how estimates and fixes are drawn, in the present context of the GUI."""
+    def add_drawing(self) -> None:
+        """Adds the inputs that say how deviations, estimates and fixes are drawn, in the present context of the GUI."""
         gui = self.server.gui
+        self.deviation = gui.add_dropdown(
+            "Deviation ×", deviation.CHOICES,
+            hint="Factor on the distance of trails and balls from the reference; robots stand where they are.",
+        )  # fmt: skip
         self.sensors = gui.add_checkbox("Sensors", False, hint="Draws what the robot knows of its posture.")
         self.magnified = gui.add_dropdown(
             "Errors drawn", tuple(f"{m}×" for m in sensors.MAGNIFICATIONS),
             hint="Factor on errors of x and y in the picture, about the true position; headings are not magnified.",
         )  # fmt: skip
         self._sensed = gui.add_html("")
+        self.on(gui.add_checkbox("Dark page", self.server.dark), self._set_dark)
+
+    def add_download(self) -> None:
+        """Adds the button that makes one HTML file, in the present context of the GUI."""
+        button = self.server.gui.add_button(
+            "Download as one HTML file", icon=viser.Icon.DOWNLOAD, hint="It plays without a server and a network."
+        )
+
+        @button.on_click
+        async def _(event: viser.GuiEvent) -> None:
+            self.ask(self._download, event.client)
+
+    def _download(self, client: viser.ClientHandle) -> None:
+        """Makes the file in another thread, so that the session goes on; one at a time."""
+        if self._making is not None and self._making.is_alive():
+            raise InputError("download: the file is still being made")
+        recordings = self.shown()
+        self._making = threading.Thread(target=self._send, args=(client, recordings), daemon=True)
+        self._making.start()
+
+    def _send(self, client: viser.ClientHandle, recordings: Sequence[Recording]) -> None:
+        from mrctl.viewer.export import page  # which imports this room's scene
+
+        try:
+            content = page(recordings, looks_of(recordings, range(len(recordings)))).encode()
+        except InputError as error:
+            return self.ask(self.complain, error)
+        if client.client_id in self.server.get_clients():  # the visitor may have left
+            client.send_file_download("mrctl.html", content, save_immediately=True)
+
+    @abstractmethod
+    def shown(self) -> list[Recording]:
+        """Returns what the page shows, as recordings."""
+
+    def _set_dark(self, dark: bool) -> None:
+        self.server.set_dark(dark)
+        self._scene.paint(dark)
+
+    def add_key(self, key: HotkeyKey, label: str, action: Callable[[], None]) -> None:
+        """Queues an action whenever a visitor presses a key; viser lists it under its label with Ctrl-K."""
+
+        async def called(_: viser.CommandEvent) -> None:
+            self.ask(action)
+
+        self.server.gui.add_command(label, hotkey=key).on_trigger(called)
+
+    def magnified_deviation(self, rows: Rows) -> int:
+        """Returns the factor on the deviations of some records; by default the largest that keeps them in view."""
+        chosen = self.deviation.value
+        return sensors.magnification(deviation.extent(rows)) if chosen == "automatic" else int(chosen.rstrip("×"))
 
     @property
     def marks(self) -> tuple[bool, int]:
@@ -91,8 +157,9 @@ class Page(ABC):
         return self.sensors.value, int(self.magnified.value.removesuffix("×"))
 
     def set_marks(self, on: bool, spread: float) -> None:
-        """Sets the inputs: whether estimates are drawn, and the factor that suits errors of `spread` in m."""
-        self.sensors.value, self.magnified.value = on, f"{sensors.magnification(spread)}×"
+        """Sets the inputs for errors of `spread` in m: whether estimates are drawn, if it is not tiny, and a factor."""
+        factor = sensors.magnification(spread)
+        self.sensors.value, self.magnified.value = on and factor < max(sensors.MAGNIFICATIONS), f"{factor}×"
 
     def describe_estimates(self, labels: Sequence[str], last: Rows) -> None:
         """Writes what the marks mean, and the errors that they show.

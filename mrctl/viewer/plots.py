@@ -14,13 +14,21 @@ from viser import uplot
 from mrctl.kernel import Rows
 from mrctl.results.dataset import blank
 from mrctl.viewer.looks import Colour, Look
-from mrctl.viewer.scene import REFERENCE_COLOUR
+from mrctl.viewer.scene import EVENT_COLOUR, REFERENCE_COLOUR
 from mrctl.viewer.score import table
 
 Array = NDArray[np.float64]
 
 SHARE_WINDOW = 1.0  # s over which the share of the feedback is averaged
-CURSOR_COLOUR: Colour = (17, 24, 39)
+CURSOR_COLOUR: Colour = (107, 114, 128)
+# The values under the mouse stand over a chart, and in the others, whose cursors follow; the marks of events have none.
+HOVER = """<style>
+.uplot-container .u-legend { display: none; position: absolute; top: 1.5em; right: 0.5em; z-index: 9; margin: 0;
+    padding: 0.2em 0.5em; text-align: left; background: var(--mantine-color-body); opacity: 0.9; pointer-events: none }
+.uplot-container:hover .u-legend { display: block }
+.uplot-container .u-legend .u-series { display: block }
+.uplot-container .u-legend .u-series:last-child, .u-over .u-cursor-pt:last-child { display: none }
+</style>"""
 MAX_ROBOTS = 4  # number of robots whose curves are drawn
 
 
@@ -137,6 +145,7 @@ class Plots:
             self._legend = gui.add_html("")
             self._score = gui.add_html("")
             self._cursor = gui.add_html("")
+            gui.add_html(HOVER)
 
     def set_robots(self, robots: Sequence[Look], period: float) -> None:
         """Sets the robots whose curves `show` will draw.
@@ -160,16 +169,26 @@ class Plots:
             if handle.series != (series := _series(chart)):
                 handle.series = series
 
-    def show(self, time: Array, log: Rows, step: int) -> None:
+    def show(
+        self, time: Array, log: Rows, step: int, events: Sequence[float] = (), within: slice = slice(None)
+    ) -> None:
         """Draws a log.
 
         Args:
             time: Times of the samples in s, `(T,)`.
             log: Record of `TICK` for each sample and robot, `(T, B)`.
             step: Number of samples from one drawn sample to the next.
+            events: Times of events in s.
+            within: Samples that are drawn.
         """
+        drawn = time[within][::step]
+        marks = np.full(len(drawn), np.nan)
+        for first in np.searchsorted(drawn, events):
+            if 0 < first < len(drawn):
+                marks[first - 1 : first + 1] = 1.0, 0.0  # a line from top to bottom, one sample wide
         for handle, chart in zip(self._handles, charts(log, self._robots, self._period), strict=True):
-            handle.data = tuple(np.ascontiguousarray(v[::step]) for v in (time, *(c.values for c in chart.curves)))
+            values = [time, *(curve.values for curve in chart.curves)]
+            handle.data = (*(np.ascontiguousarray(v[within][::step]) for v in values), marks)
 
     def score(self, now: Rows, laps: Sequence[dict[str, Array]]) -> None:
         """Writes the score, as `score.table` does."""
@@ -183,7 +202,7 @@ class Plots:
         """Draws a vertical line in all charts at a share of their time; their data need not be sent again."""
         left = f"{100 * share:.3f}%"
         line = f"content:'';position:absolute;top:0;bottom:0;left:{left};border-left:1px solid rgb{CURSOR_COLOUR}"
-        self._cursor.content = f"<style>.u-over::after{{{line}}}</style>"
+        self._cursor.content = f"<style>.u-over{{overflow:hidden}}.u-over::after{{{line}}}</style>"
 
 
 def legend(robots: Sequence[Look]) -> str:
@@ -197,13 +216,16 @@ def legend(robots: Sequence[Look]) -> str:
 
 
 def _series(chart: Chart) -> tuple[uplot.Series, ...]:
-    """Returns the series of a chart: the time, and its curves."""
-    return uplot.Series(label="s"), *(
+    """Returns the series of a chart: the time, its curves, and the marks of events."""
+    points: uplot.Series_Points = {"show": False}
+    curves = [
         uplot.Series(
-            label="", stroke=f"rgb{c.colour}", width=c.width, dash=(5, 4) if c.dashed else (), points={"show": False}
+            label=c.label, stroke=f"rgb{c.colour}", width=c.width, dash=(5, 4) if c.dashed else (), points=points
         )
         for c in chart.curves
-    )
+    ]
+    marks = uplot.Series(label="event", scale="event", stroke=f"rgb{EVENT_COLOUR}", width=1.5, points=points)
+    return uplot.Series(label="s"), *curves, marks
 
 
 def _add(gui: viser.GuiApi, chart: Chart, zoom: bool) -> viser.GuiUplotHandle:
@@ -213,10 +235,9 @@ def _add(gui: viser.GuiApi, chart: Chart, zoom: bool) -> viser.GuiUplotHandle:
         tuple(np.zeros(2) for _ in series),
         series,
         title=chart.title,
-        scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}},
-        legend={"show": False},
+        scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}, "event": {"range": (0.0, 1.0)}},
         axes=({"size": 24, "ticks": {"size": 4}}, {"size": 56, "ticks": {"size": 4}}),
         height=112,
         padding=(8, 8, 0, 0),
-        cursor=None if zoom else {"drag": {"x": False, "y": False}},
+        cursor={"sync": {"key": "mrctl"}, "drag": {"x": zoom, "y": False}},
     )

@@ -27,6 +27,7 @@ from mrctl.scenario import Scenario
 from mrctl.sweep import jobs, store
 from mrctl.sweep.store import Store
 from mrctl.theory.perturbation import Perturbation
+from mrctl.viewer.deviation import drawn
 from mrctl.viewer.looks import Look, looks
 from mrctl.viewer.session import state
 
@@ -109,16 +110,17 @@ class Recording:
         return qpos
 
 
-def path(rows: Rows, radius: float, height: float) -> Array:
+def path(rows: Rows, radius: float, height: float, magnified: int) -> Array:
     """Returns the path of P, a little above the ground, in m, with the shape of `rows` and 3.
 
     Args:
         rows: Records of `TICK`.
         radius: Radius of the driven wheels in m.
         height: Height of the middle between them in m, where none was recorded.
+        magnified: Factor on the deviation from the reference.
     """
     z = np.where(np.isfinite(rows["z"]), rows["z"], height)
-    return np.stack([rows["x"], rows["y"], z - radius + ABOVE], axis=-1)
+    return np.concatenate([drawn(rows, magnified), (z - radius + ABOVE)[..., None]], axis=-1)
 
 
 def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows]:
@@ -127,6 +129,13 @@ def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows]:
     for k, r in enumerate(recordings):
         log[: len(r.log), k] = r.log
     return recordings[0].period * np.arange(len(log), dtype=float), log
+
+
+def event_times(recordings: Sequence[Recording]) -> list[float]:
+    """Returns the times of the events of recordings in s, from the first sample on."""
+    longest = max(r.duration for r in recordings)
+    times = {event.time - r.start for r in recordings for event in r.scenario.events}
+    return sorted(time for time in times if 0 <= time <= longest)
 
 
 def looks_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[Look]:

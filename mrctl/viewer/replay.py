@@ -13,7 +13,7 @@ from typing_extensions import override
 from mrctl.record import InputError
 from mrctl.viewer.page import SPEEDS, Page, block, warning, write
 from mrctl.viewer.plots import Plots
-from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of
+from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE, error
@@ -58,19 +58,27 @@ class Replay(Page):
             self.on(gui.add_button_group("", ("play", "pause", "start")), self._command)
             self.scrubber = gui.add_slider("Time, s", 0.0, 1.0, 0.01, 0.0)
             self.on(self.scrubber, self._scrub)
+            self._interval = gui.add_multi_slider("Curves, s", 0.0, 1.0, 0.01, (0.0, 1.0))
+            self.on(self._interval, lambda _: self._draw_curves())
             speeds = tuple(name for name, speed in SPEEDS.items() if np.isfinite(speed))
             self.on(
                 gui.add_dropdown("Speed", speeds, initial_value="1×"),
                 lambda name: setattr(self, "speed", SPEEDS[name]),
             )
             self._follow = gui.add_checkbox("Camera follows", False)
-            self.add_sensors()
+            self.add_drawing()
+            self.on(self.deviation, lambda _: self._show(self.runs))
             self._chosen = gui.add_number(
                 "Run", float(run), min=float(table.index[0]), max=float(table.index[-1]), step=1.0
             )
             self.on(self._chosen, lambda run: self._choose(int(run)))
             self.on(gui.add_button("Keep this run as a ghost"), lambda _: self._keep())
             self.on(gui.add_button("Only this run"), lambda _: self._only())
+            self.add_download()
+        self.add_key("space", "Play or pause", lambda: self._command("pause" if self.playing else "play"))
+        self.add_key("arrowright", "Forward by 0.1 s", lambda: self._scrub(self.time + 0.1))
+        self.add_key("R", "Start", lambda: self._command("start"))
+        self.add_key("F", "Camera follows", lambda: setattr(self._follow, "value", not self._follow.value))
         numbers = [str(name) for name, values in table.select_dtypes("number").nunique().items() if values > 1]
         self._board: list[Any] = []
         if len(table) > MAX_SHOWN and numbers:
@@ -153,10 +161,11 @@ class Replay(Page):
             self._scene.remove()
         self.runs, self.recordings = list(runs), recordings
         self._scene = Scene(self.server, recordings[0].model, robots)
-        self._scene.show_recordings(recordings)
         self._plots.set_robots(robots, recordings[0].period)
         times, self._log = joint_log(recordings)
-        self._plots.show(times, self._log, max(1, len(self._log) // SAMPLES))
+        self._deviation = self.magnified_deviation(self._log)
+        self._scene.show_recordings(recordings, self._deviation)
+        self._times, self._events = times, event_times(recordings)
         self._lap = round(recordings[0].scenario.reference.period / recordings[0].period)
         self._laps = whole_laps(self._log, self._lap, recordings[0].period)
         self._labels, sensing = [robot.label for robot in robots], [r.scenario.sensing for r in recordings]
@@ -168,8 +177,22 @@ class Replay(Page):
             max(np.sqrt(np.mean(off**2, axis=0)).max(), *(s["fix_position_noise"] for s in sensing)),
         )
         self.duration = float(times[-1])
-        self.scrubber.max = self.duration
+        self.scrubber.max = self._interval.max = self.duration
+        self._interval.value = (0.0, self.duration)
+        self._draw_curves()
         self._scrub(self.time, pause=False)
+
+    def _draw_curves(self) -> None:
+        """Draws the curves in the chosen interval, the finer the shorter it is."""
+        first, last = np.searchsorted(self._times, self._interval.value)
+        within = slice(max(0, min(first, len(self._times) - 2)), max(last, first + 1) + 1)
+        count = len(self._times[within])
+        self._plots.show(self._times, self._log, max(1, count // SAMPLES), self._events, within)
+        self._plotted = None
+
+    @override
+    def shown(self) -> list[Recording]:
+        return self.recordings
 
     def _command(self, name: str) -> None:
         self.playing = name == "play"
@@ -207,7 +230,9 @@ class Replay(Page):
             for recording, latency in zip(self.recordings, self._latencies, strict=True):
                 index = recording.index(self.time)
                 logs.append(recording.log[max(0, index + 1 - ticks - latency) : index + 1])
+        now = np.stack([recording.log[recording.index(self.time)] for recording in self.recordings])
         with self.server.atomic():
+            self._scene.show_targets(now, self._deviation)
             self._scene.show_sensors(logs, period, self._latencies, magnified)
             self._scene.flush(self._follow.value)
 
@@ -231,7 +256,8 @@ class Replay(Page):
             self.scrubber.value = self.time
             tick = min(round(self.time / self.recordings[0].period), len(self._log) - 1)
             self._plots.score(self._log[tick], self._laps[: (tick + 1) // self._lap])
-            self._plots.point(self.time / self.duration if self.duration else 0.0)
+            start, end = self._interval.value
+            self._plots.point((self.time - start) / (end - start) if end > start else 0.0)
 
 
 def _sphere() -> tuple[np.ndarray, np.ndarray]:

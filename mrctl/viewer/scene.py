@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import defaultdict
 from collections.abc import Sequence
 
 import mujoco
@@ -22,24 +23,36 @@ from mrctl.physics.stand import ground
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.perturbation import Perturbation
+from mrctl.viewer.deviation import Target
 from mrctl.viewer.looks import Colour, Look
-from mrctl.viewer.recording import ABOVE, Recording, joint_log, path
+from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, path
 from mrctl.viewer.sensors import Marks
-from mrctl.viewer.shapes import ribbons
+from mrctl.viewer.server import Server
+from mrctl.viewer.shapes import bar, ribbons
 
 Array = NDArray[np.float64]
 REFERENCE_COLOUR: Colour = (110, 115, 122)
+EVENT_COLOUR: Colour = (217, 119, 6)
+# Of the cells and sections of the floor, and of the floor.
+LIGHT_FLOOR = (214, 217, 221), (190, 194, 200), (238, 240, 242)
+DARK_FLOOR = (52, 55, 60), (70, 74, 80), (36, 38, 42)
+HORIZON = 2.0, 9.0  # distances at which things begin to fade and are gone, in widths of the view
 GLASS: Colour = (150, 155, 160)  # of the first robot while marks are drawn, which have its colour
 TRAIL_POINTS = 240  # number of points in the trail of a robot
 TRAIL_POINTS_OF_ALL = 1600  # largest number of points in the trails of all robots
 PATH_POINTS = 600  # number of points in the path of a finished run
-TOGETHER = 0.5  # m, distance of robots that have one label
-LABEL_HEIGHT = 0.4  # m
+# Relative to the diagonal of the robot's outline: distance of robots that have one label, its height over the robot,
+# and that of targets.
+TOGETHER, LABEL_ABOVE, TARGET_ABOVE = 0.7, 0.4, 0.15
 CLEARANCE = 0.05  # m, least height of a camera above the floor
 # Initial camera, relative to the middle of the reference and in units of its size.
 CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])
-GHOST_OPACITY, GLASS_OPACITY = 0.4, 0.55
-MAX_MARKED = 4  # number of robots whose estimates are drawn
+GHOST_OPACITY, GLASS_OPACITY = 0.5, 0.55
+THICK = 0.012  # thickness of the lines from targets to robots, in diagonals of the robot's outline
+HALO = 1.04  # size of a ghost, of which only the far side is drawn: a rim around a robot that stands in it
+MAX_MARKED = 4  # number of robots whose estimates and targets are drawn
+NEXT_TRAIL = 0.001  # m, from the height of the trails of one colour to that of the next; equal ones would flicker
+TRAIL_WIDTH = 0.004  # as a share of the width of the view; the reference is twice as wide
 LEAST_VIEW = 1.2  # m, least width of the view
 SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
 
@@ -58,7 +71,7 @@ class Scene:
     Everything is below the node `/world`: to follow a robot, that node moves instead of the cameras.
     """
 
-    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel, robots: Sequence[Look]) -> None:
+    def __init__(self, server: Server, model: mujoco.MjModel, robots: Sequence[Look]) -> None:
         """Draws the world and its robots.
 
         Args:
@@ -81,9 +94,11 @@ class Scene:
         self._positions = np.zeros((self.size, len(self._bodies), 3))
         self._quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (self.size, len(self._bodies), 1))
         self._draw_world()
-        self._looks: list[tuple[viser.GlbHandle, viser.MeshHandle]] = []  # of each body, solid and translucent
+        self._looks: list[tuple[viser.FrameHandle, viser.MeshHandle]] = []  # of each body, solid and translucent
+        self._top = 0.0  # height of the robot in m
         self._footprint = np.array([[np.inf, np.inf], [-np.inf, -np.inf]])
         self._parts = self._draw_bodies()
+        self._length = float(np.hypot(*(self._footprint[1] - self._footprint[0])))
         self._frames = [self._draw_robot(row) for row in range(self.size)]
         self._labels = [
             self._scene.add_label(f"/world/label{row}", robot.label, font_screen_scale=0.8)
@@ -101,13 +116,20 @@ class Scene:
         self._marks = [
             Marks(self._scene, row, self._footprint, robot.colour) for row, robot in enumerate(robots[:MAX_MARKED])
         ]
+        self._targets = [
+            Target(self._scene, row, self._top + TARGET_ABOVE * self._length, THICK * self._length, robot.colour)
+            for row, robot in enumerate(robots[:MAX_MARKED])
+        ]
+        self._factor = self._scene.add_label("/world/deviation", "", visible=False, font_screen_scale=0.8)
         self._perturbations: list[Perturbation | None] = [None] * self.size  # as drawn
         self._ribbons: list[viser.MeshHandle] = []
+        self._posts: viser.MeshHandle | None = None
 
     def _draw_world(self) -> None:
         model, data = self._model, self._data
         mujoco.mj_kinematics(model, data)
         self._floor = np.array([0.0, 0.0, 1.0]), np.zeros(3)  # its normal and a point of it
+        self._floors: list[viser.GridHandle] = []
         for geom in range(model.ngeom):
             if model.body_weldid[model.geom_bodyid[geom]] or model.geom_group[geom] > SEEN:
                 continue
@@ -116,10 +138,11 @@ class Scene:
             mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
             if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
                 self._floor = data.geom_xmat[geom].reshape(3, 3)[:, 2].copy(), data.geom_xpos[geom].copy()
-                self._scene.add_grid(
-                    name, 24, 24, cell_size=0.5, section_size=1, cell_color=(214, 217, 221),
-                    section_color=(190, 194, 200), plane_color=(238, 240, 242), plane_opacity=1.0, shadow_opacity=0.0,
-                    wxyz=turn, position=data.geom_xpos[geom],
+                self._floors.append(
+                    self._scene.add_grid(
+                        name, 24, 24, cell_size=0.5, section_size=1, plane_opacity=1.0, shadow_opacity=0.0,
+                        wxyz=turn, position=data.geom_xpos[geom],
+                    )
                 )  # fmt: skip
             else:
                 mesh = merge_geoms(model, [geom])
@@ -140,16 +163,37 @@ class Scene:
             parts.append(_rough(model, geoms) if geoms else None)
             if geoms:
                 mesh, name = merge_geoms(model, geoms), self._node(0, body)
-                solid = self._scene.add_mesh_trimesh(f"{name}/mesh", mesh, cast_shadow=False, receive_shadow=False)
+                solid = self._draw_solid(f"{name}/mesh", geoms)
                 glass = self._draw_glass(f"{name}/glass", parts[-1], GLASS, GLASS_OPACITY, visible=False)
                 self._looks.append((solid, glass))
                 corners = mesh.vertices @ self._data.xmat[body].reshape(3, 3).T
-                corners = (corners + self._data.xpos[body] - self._data.xpos[self._bodies[self._chassis]])[:, :2]
+                corners = corners + self._data.xpos[body] - self._data.xpos[self._bodies[self._chassis]]
+                self._top = max(self._top, float(corners[:, 2].max()) + self._radius)
                 low, high = self._footprint
                 self._footprint = np.array(
-                    [np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))]
+                    [np.minimum(low, corners.min(axis=0)[:2]), np.maximum(high, corners.max(axis=0)[:2])]
                 )
         return parts
+
+    def _draw_solid(self, name: str, geoms: Sequence[int]) -> viser.FrameHandle:
+        """Draws geoms of a body in the colours of the MJCF; a mesh of several colours would shine as a dark metal."""
+        model, groups = self._model, defaultdict(list)
+        for geom in geoms:
+            material = model.geom_matid[geom]
+            colour = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+            textured = material >= 0 and model.mat_texid[material].max() >= 0
+            groups[None if textured else tuple((255 * colour[:3]).astype(int).tolist())].append(geom)
+        root = self._scene.add_frame(name, show_axes=False)
+        for k, (colour, same) in enumerate(groups.items()):
+            mesh = merge_geoms(model, same)
+            if colour is None:
+                self._scene.add_mesh_trimesh(f"{name}/{k}", mesh, cast_shadow=False, receive_shadow=False)
+            else:
+                self._scene.add_mesh_simple(
+                    f"{name}/{k}", mesh.vertices, mesh.faces, color=colour, flat_shading=True,
+                    cast_shadow=False, receive_shadow=False,
+                )  # fmt: skip
+        return root
 
     def _draw_glass(
         self, name: str, part: trimesh.Trimesh, colour: Colour, opacity: float, visible: bool = True
@@ -169,7 +213,12 @@ class Scene:
             name = self._node(row, body)
             frames.append(self._scene.add_frame(name, show_axes=False))
             if row and part is not None:
-                self._draw_glass(f"{name}/mesh", part, self._robots[row].colour, GHOST_OPACITY)
+                middle = part.bounds.mean(axis=0)
+                self._scene.add_mesh_simple(
+                    f"{name}/mesh", middle + HALO * (part.vertices - middle), part.faces, side="back",
+                    color=self._robots[row].colour, opacity=GHOST_OPACITY, flat_shading=True,
+                    cast_shadow=False, receive_shadow=False,
+                )  # fmt: skip
         return frames
 
     def _node(self, row: int, body: int) -> str:
@@ -185,10 +234,13 @@ class Scene:
             pose = reference.sample(np.linspace(0, reference.period, 401)).pose
             heights = [self._height(x, y) + 0.006 for x, y in pose[:, :2]]
             lines.append(np.column_stack([pose[:, :2], heights]))
-        self._draw_lines("/world/reference", np.stack(lines), 0.025, REFERENCE_COLOUR)
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
-        middle, size = (low + high) / 2, max(LEAST_VIEW, *(high - low))
-        self._look(middle + size * CAMERA_POSITION, middle + size * CAMERA_TARGET)
+        self._view = max(LEAST_VIEW, *(high - low)) + self._length
+        self._draw_lines("/world/reference", np.stack(lines), 2 * TRAIL_WIDTH * self._view, REFERENCE_COLOUR)
+        self._factor.position = [(low[0] + high[0]) / 2, high[1] + self._length / 2, high[2]]
+        middle = (low + high) / 2
+        self._look(middle + self._view * CAMERA_POSITION, middle + self._view * CAMERA_TARGET)
+        self.paint(self._server.dark)
 
     def _look(self, position: Array, target: Array) -> None:
         """Sets the camera of pages to come, and of open ones if it is another than before."""
@@ -199,6 +251,36 @@ class Scene:
         for client in self._server.get_clients().values():
             client.camera.position = position
             client.camera.look_at = target
+
+    def paint(self, dark: bool) -> None:
+        """Gives floor and horizon the colours of a dark or a light page."""
+        colours = DARK_FLOOR if dark else LIGHT_FLOOR
+        for floor in self._floors:
+            floor.cell_color, floor.section_color, floor.plane_color = colours
+        near, far = HORIZON[0] * self._view, HORIZON[1] * self._view
+        self._scene.configure_fog(near, far, color=(20, 20, 20) if dark else (255, 255, 255))
+
+    def show_events(self, rows: Rows) -> None:
+        """Marks the events of a run with posts on the reference.
+
+        Args:
+            rows: Record of `TICK` at the time of each event, `(n,)`.
+        """
+        if self._posts is not None:
+            self._posts.remove()
+            self._posts = None
+        thick, posts = THICK * self._length, []
+        for x, y in zip(rows["x_ref"], rows["y_ref"], strict=True):
+            if np.isfinite(x):
+                foot = np.array([x, y, self._height(x, y)])
+                posts.append(bar(foot, foot + [0, 0, self._length / 2], thick))
+        if posts:
+            vertices, faces = zip(*posts, strict=True)
+            moved = [face + 8 * k for k, face in enumerate(faces)]
+            self._posts = self._scene.add_mesh_simple(
+                "/world/events", np.concatenate(vertices), np.concatenate(moved), color=EVENT_COLOUR,
+                cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
 
     def above_floor(self, position: Array) -> Array:
         """Returns the nearest position to one in m, `(3,)`, from which a camera sees the floor from above."""
@@ -212,13 +294,14 @@ class Scene:
             name, vertices, faces, color=colour, side="double", cast_shadow=False, receive_shadow=False
         )
 
-    def show_recordings(self, recordings: Sequence[Recording]) -> None:
-        """Draws the references and the paths of finished runs."""
+    def show_recordings(self, recordings: Sequence[Recording], magnified: int) -> None:
+        """Draws the references and the paths of finished runs, with deviations `magnified` times."""
         self.show_reference(recordings[0].scenario)
         for row, recording in enumerate(recordings):
             self.show(row, recording.qpos(len(recording.log) - 1))
         _, log = joint_log(recordings)
-        self.show_trails(log[np.linspace(0, len(log) - 1, PATH_POINTS).astype(int)])
+        self.show_trails(log[np.linspace(0, len(log) - 1, PATH_POINTS).astype(int)], magnified)
+        self.show_events(log[[recordings[0].index(time) for time in event_times(recordings)], 0])
 
     def _height(self, x: float, y: float) -> float:
         try:
@@ -263,7 +346,7 @@ class Scene:
         """Moves the labels; robots that are close together have one label, which names at most three of them."""
         here, near = self._positions[:, self._chassis], {}
         for row in range(len(self._labels)):
-            first = next((r for r in near if np.hypot(*(here[r] - here[row])[:2]) < TOGETHER), row)
+            first = next((r for r in near if np.hypot(*(here[r] - here[row])[:2]) < TOGETHER * self._length), row)
             near.setdefault(first, []).append(self._robots[row].label)
         for row, label in enumerate(self._labels):
             label.visible = row in near
@@ -273,7 +356,7 @@ class Scene:
                 text = ", ".join(names[: 2 if more else 3]) + more
                 if label.text != text:
                     label.text = text
-                label.position = here[row] + [0, 0, LABEL_HEIGHT]
+                label.position = here[row] + [0, 0, self._top - self._radius + LABEL_ABOVE * self._length]
 
     def show_payload(self, row: int, perturbation: Perturbation) -> None:
         """Draws the payload of a robot as a cube with the density of water at its place; if there is none, nothing."""
@@ -308,25 +391,47 @@ class Scene:
         """Number of points in the trail of a robot."""
         return min(TRAIL_POINTS, TRAIL_POINTS_OF_ALL // self.size)
 
-    def show_trails(self, rows: Rows) -> None:
-        """Draws where the robots were.
+    def show_targets(self, now: Rows, magnified: int) -> None:
+        """Draws where the robots should be, and a line from there to where they are.
+
+        Args:
+            now: Record of `TICK` of each robot, `(B,)`.
+            magnified: Factor on the deviation from the reference, as in `show_trails`.
+        """
+        heights = self._positions[:, self._chassis, 2] - self._radius
+        for target, row, height in zip(self._targets, now, heights, strict=False):
+            target.show(row, height, magnified)
+
+    def show_trails(self, rows: Rows, magnified: int) -> None:
+        """Draws where the robots were, and says how many times their deviation from the reference is magnified.
 
         Args:
             rows: Record of `TICK` at any number of times, always the same number, `(n, B)`. A robot that has stopped
                 remains where it is.
+            magnified: Factor on the deviation.
         """
         here = self._positions[:, self._chassis]
-        paths = path(rows, self._radius, here[0, 2])
-        paths = np.where(np.isfinite(paths), paths, here - [0, 0, self._radius - ABOVE]).swapaxes(0, 1)
+        paths = path(rows, self._radius, here[0, 2], magnified)
+        last = here - [0, 0, self._radius - ABOVE]
+        for row, line in enumerate(paths.swapaxes(0, 1)):
+            known = np.isfinite(line).all(axis=-1)
+            line[~known] = line[known][-1] if known.any() else last[row]
         colours = list(dict.fromkeys(robot.colour for robot in self._robots))
-        groups = [paths[[robot.colour == colour for robot in self._robots]] for colour in colours]
+        groups = [
+            paths[:, [robot.colour == colour for robot in self._robots]].swapaxes(0, 1) + [0, 0, NEXT_TRAIL * k]
+            for k, colour in enumerate(colours)
+        ]
+        width = TRAIL_WIDTH * self._view
+        self._factor.visible = magnified > 1
+        if magnified > 1:
+            self._factor.text = f"deviation from the reference × {magnified}"
         if not self._ribbons:
             self._ribbons = [
-                self._draw_lines(f"/world/trail/{k}", group, 0.012, colours[k]) for k, group in enumerate(groups)
+                self._draw_lines(f"/world/trail/{k}", group, width, colours[k]) for k, group in enumerate(groups)
             ]
             return
         for ribbon, group in zip(self._ribbons, groups, strict=True):
-            ribbon.vertices = ribbons(group, 0.012)[0]
+            ribbon.vertices = ribbons(group, width)[0]
 
     def forget_trails(self) -> None:
         """Removes the trails."""

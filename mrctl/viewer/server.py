@@ -55,10 +55,15 @@ class Server(viser.ViserServer):
         if self.get_port() != port:  # another program took it in the meantime
             self.stop()
             raise InputError(f"port: {port} is in use; choose another with --port")
-        self.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        self.set_dark(False)
         self.scene.configure_environment_map(None)
         self.scene.configure_default_lights(cast_shadow=False)
         self.scene.add_light_ambient("/light", intensity=1.2)
+
+    def set_dark(self, dark: bool) -> None:
+        """Makes pages dark or light; `Scene.paint` does so for a scene."""
+        self.dark = dark
+        self.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium", dark_mode=dark)
 
     async def _update_value(self, client: ClientId, message: GuiUpdateMessage) -> None:
         """Sets the value of an input for a client; viser would set whatever attribute of it a client names."""

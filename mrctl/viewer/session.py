@@ -7,6 +7,7 @@ from math import ceil, floor, sqrt
 from typing import Any, TypeVar
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from mrctl.control.design import motion
@@ -14,7 +15,7 @@ from mrctl.control.margins import Gains
 from mrctl.kernel import Rows
 from mrctl.loop.simulation import Simulation, arranged, uniform
 from mrctl.record import InputError, Record
-from mrctl.results.dataset import blank
+from mrctl.results.dataset import blank, combine, dataset
 from mrctl.scenario import Event, Scenario
 from mrctl.theory.robot import Robot
 
@@ -60,6 +61,11 @@ class Session:
     def size(self) -> int:
         """Number of robots."""
         return len(self.start)
+
+    @property
+    def robot(self) -> Robot:
+        """Parameters of the robots without their perturbations."""
+        return self.simulations[0][1].plant.robot
 
     @property
     def time(self) -> float:
@@ -130,9 +136,9 @@ class Session:
     @property
     def _design(self) -> tuple[Robot, bool, float, float]:
         """For what the controllers are designed: robot, whether its steering is rigid, delay and period in s."""
-        start, (sim, _) = self.start[0], self._place[0]
+        start = self.start[0]
         delay = start.sensing.periods("delay", self.period) * self.period
-        return sim.plant.robot, start.steering == "rigid", delay, self.period
+        return self.robot, start.steering == "rigid", delay, self.period
 
     def saved(self) -> list[Scenario]:
         """Returns scenarios that repeat the session, to the end of the present lap of each robot."""
@@ -146,6 +152,21 @@ class Session:
             done = sim.log.ticks[first : sim.tick]
             parts[: len(done), rows] = done
         return parts
+
+    def result(self, longest: float) -> xr.Dataset:
+        """Returns the signals of the last `longest` s, as a result of `simulate` without what was learned."""
+        first = max(0, self.tick - round(longest / self.period))
+        names, failure = [s.feedforward for s in self.start], [self.failure(row) for row in range(self.size)]
+        nothing = np.full(self.size, np.nan)
+        saved = self.saved()
+        part = dataset(saved, names, names, self.log(first), failure, nothing, None)
+        found = combine([(range(self.size), part)], saved)
+        return found.assign_coords(time=found["time"] + first * self.period)
+
+    def driven(self) -> Rows:
+        """Returns a view of the log of the first robot, a record of `TICK` for each tick that it has driven."""
+        sim, k = self._place[0]
+        return sim.log.ticks[: sim.tick, k]
 
     def qpos(self, row: int) -> NDArray[np.float64]:
         """Returns the generalised position of a robot, `(nq,)`."""

@@ -1,8 +1,9 @@
-"""Level shapes on the ground, as vertices and triangles."""
+"""Simple shapes, as vertices and triangles."""
 
 from __future__ import annotations
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -34,3 +35,17 @@ def disc(around: Array) -> Mesh:
     vertices[1:, :2] = around
     corner = np.arange(1, len(around), dtype=np.uint32)
     return vertices, np.stack([np.zeros_like(corner), corner, corner + 1], axis=-1)
+
+
+def ball(radius: float) -> Mesh:
+    """Returns vertices `(12, 3)` and triangles `(20, 3)` of a ball around the origin."""
+    shape = trimesh.creation.icosphere(subdivisions=0, radius=radius)
+    return shape.vertices.astype(np.float32), shape.faces.astype(np.uint32)
+
+
+def bar(start: Array, end: Array, thickness: float) -> Mesh:
+    """Returns vertices `(8, 3)` and triangles `(12, 3)` of a bar along one of the axes between two points `(3,)`."""
+    across = np.where(start == end, thickness / 2, 0.0)
+    low, high = np.minimum(start, end) - across, np.maximum(start, end) + across
+    shape = trimesh.creation.box(bounds=[low, high])
+    return shape.vertices.astype(np.float32), shape.faces.astype(np.uint32)

@@ -1,4 +1,4 @@
-"""The command `mrctl view`: it chooses the page for a file, and serves or exports it."""
+"""The command `mrctl view`: the page of a live session or of a replay, which is served or exported."""
 
 from __future__ import annotations
 
@@ -10,15 +10,38 @@ from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
-BEST: FeedforwardName = "model+composite"  # with the least errors in the README; shown beside PID alone by default
-
 if TYPE_CHECKING:
     from mrctl.viewer.page import Page
     from mrctl.viewer.server import Server
 
 
-def view(
-    file: Path | None,
+def live(scenario: Scenario, compare: Sequence[FeedforwardName], export: Path | None, host: str, port: int) -> None:
+    """Shows a live session in the browser, or exports its runs.
+
+    Args:
+        scenario: Scenario of the first robot.
+        compare: Feedforwards of the ghosts.
+        export: File to write instead of serving a page.
+        host: Address to listen on.
+        port: Port to listen on.
+
+    Raises:
+        InputError: A scenario is refused, as by `mrctl.simulate`; or the server cannot listen on the address.
+    """
+    from mrctl.viewer.export import export as write
+    from mrctl.viewer.live import Live
+    from mrctl.viewer.recording import Recording, looks_of
+
+    scenarios = [scenario, *(scenario.model_copy(update=FEEDFORWARDS[name] | {"name": ""}) for name in compare)]
+    if export is None:
+        return _serve(lambda server: Live(scenarios, server), host, port)
+    result = simulate(scenarios, progress=True)
+    recordings = [Recording(result.isel(run=k)) for k in range(result.sizes["run"])]
+    write(recordings, looks_of(recordings, range(len(recordings))), export)
+
+
+def replay(
+    folder: Path,
     compare: Sequence[FeedforwardName],
     run: int | None,
     export: Path | None,
@@ -26,50 +49,36 @@ def view(
     port: int,
     code: bool = True,
 ) -> None:
-    """Shows robots in the browser: a live session, or the replay of a result or a sweep.
+    """Shows the replay of a result or a sweep in the browser, or exports it.
 
     Args:
-        file: Scenario file, or folder of a result or a sweep; None for the default scenario.
-        compare: Feedforwards of the ghosts beside a scenario; with neither, the best learner and PID alone are shown.
-        run: Number of the run of a result or a sweep that is shown first.
+        folder: Folder of the result or the sweep.
+        compare: Must be empty.
+        run: Number of the run that is shown first.
         export: File to write instead of serving a page.
         host: Address to listen on.
         port: Port to listen on.
         code: Whether a sweep may run the Python files that it names.
 
     Raises:
-        InputError: The file is refused, as by `mrctl.simulate` or `mrctl.open`; the server cannot listen on the
-            address; or options contradict each other.
+        InputError: The folder is refused, as by `mrctl.open`; the server cannot listen on the address; or options
+            contradict each other.
     """
     from mrctl.viewer.export import export as write
-    from mrctl.viewer.live import Live
-    from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, looks_of
+    from mrctl.viewer.recording import MAX_SHOWN, Library, looks_of
     from mrctl.viewer.replay import Replay
 
-    if file is not None and file.is_dir():
-        if compare:
-            raise InputError("compare: it needs a scenario; the ghosts of a replay are chosen in the page")
-        library = Library(file / "result.zarr" if (file / "result.zarr").is_dir() else file, code)
-        table = library.table
-        shown = [int(table.index[0]) if run is None else run]
-        if run is None and len(table) <= MAX_SHOWN:
-            shown = [int(k) for k in table.index]
-        if export is not None:
-            recordings = [library.recording(k) for k in shown]
-            return write(recordings, looks_of(recordings, shown), export)
+    if compare:
+        raise InputError("compare: it needs a scenario; the ghosts of a replay are chosen in the page")
+    library = Library(folder / "result.zarr" if (folder / "result.zarr").is_dir() else folder, code)
+    table = library.table
+    shown = [int(table.index[0]) if run is None else run]
+    if run is None and len(table) <= MAX_SHOWN:
+        shown = [int(k) for k in table.index]
+    if export is None:
         return _serve(lambda server: Replay(library, shown, server), host, port)
-    if run is not None:
-        raise InputError("run: only a result or a sweep has several")
-    scenario = Scenario() if file is None else Scenario.from_toml(file)
-    if file is None and not compare:
-        scenario = scenario.replace(**FEEDFORWARDS[BEST])
-        compare = ["none"]
-    ghosts = [scenario.model_copy(update=FEEDFORWARDS[name] | {"name": ""}) for name in compare]
-    if export is not None:
-        result = simulate([scenario, *ghosts], progress=True)
-        recordings = [Recording(result.isel(run=k)) for k in range(result.sizes["run"])]
-        return write(recordings, looks_of(recordings, range(len(recordings))), export)
-    return _serve(lambda server: Live([scenario, *ghosts], server), host, port)
+    recordings = [library.recording(k) for k in shown]
+    write(recordings, looks_of(recordings, shown), export)
 
 
 def _serve(page: Callable[[Server], Page], host: str, port: int) -> None:

@@ -227,7 +227,20 @@ def test_perturbation_by_name(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
     assert mrctl.Scenario.from_toml(tmp_path / "all.toml").perturbation == mrctl.PERTURBATIONS["all"]
 
 
-COMMANDS = ("run", "navigate", "reproduce", "sweep", "suite", "tune", "identify", "check", "bench", "view", "export")
+COMMANDS = (
+    "run",
+    "navigate",
+    "reproduce",
+    "sweep",
+    "suite",
+    "tune",
+    "identify",
+    "check",
+    "bench",
+    "view",
+    "record",
+    "export",
+)
 REFERENCES = ("line", "circle", "lemniscate", "lane-change", "rounded-square", "stop-and-go", "waypoints")
 
 

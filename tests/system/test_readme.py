@@ -52,7 +52,11 @@ ELSEWHERE = {
     ),
     r"mrctl tune --search .*": ("tests/system/test_search.py::test_command", "mrctl.experiments.search.search"),
     r"mrctl bench": ("tests/benchmarks/test_bench.py::test_command", "mrctl.experiments.bench.run"),
-    r"mrctl view( (?!--export)\S+)*": ("tests/system/test_viewer_server.py::test_command", "mrctl.viewer.view.view"),
+    r"mrctl view( --(?!export)\S+( \w+)*)*": (
+        "tests/system/test_viewer_server.py::test_flags", "mrctl.viewer.view.live",
+    ),
+    r"mrctl record .*": ("tests/system/test_viewer_server.py::test_record", "mrctl.viewer.video.record"),
+    r"mrctl view [\w./]+": ("tests/system/test_viewer.py::test_replay", "mrctl.viewer.view.replay"),
 }  # fmt: skip
 # One draw of each combination in place of hundreds.
 SMALLER = {"sweep.toml": ("runs = 500", "runs = 1"), "ablation.toml": ("runs = 20", "runs = 1")}

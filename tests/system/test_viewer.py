@@ -1,6 +1,7 @@
 """The viewer in a real headless browser: what a visitor sees and does. Screenshots are in pytest's folders."""
 
 import io
+import re
 import shutil
 import threading
 import time
@@ -160,16 +161,30 @@ def test_live(browser, tmp_path):
         apart = np.linalg.norm(place[None] - drawn[:, None], axis=-1)  # (30, T, B)
         assert len(np.unique(drawn[:, 0], axis=0)) > 1 and apart.max(axis=2).min(axis=1).max() < 1e-3  # of one tick
 
+        now, factor = live.session.log()[-1, 1], live._deviation
+        target = node(page, "/world/target/1")
+        assert target[:2] == pytest.approx([now["x_ref"], now["y_ref"]], abs=1e-6) and target[2] > 0.3
+        off = np.hypot(now["longitudinal_error"], now["lateral_error"])
+        assert node(page, "/world/target/1/ball")[0] == pytest.approx(factor * off, rel=1e-4) and factor == 100
+        assert live._scene._factor.visible and live._scene._factor.text.endswith("× 100")
+
         page.get_by_text("drop payload").click()
         until(lambda: "payload 0 → 10" in page.inner_text("#mrctl-timeline"), "the payload in the timeline")
-        page.get_by_text("play", exact=True).click()
+        page.keyboard.press("Space")
         until(lambda: live.session.tick > tick + 250, "the robots to drive on")
         page.get_by_text("pause", exact=True).click()
         until(lambda: "paused" in page.inner_text("#mrctl-status"), "the second pause")
         time.sleep(1.0)
         assert moved(still, picture(page, tmp_path / "live_payload.png")) > 300
-        t, _, without = until(lambda: curves(page, "position error, mm") or None, "the curves")[0]
+        t, _, without, marks = until(lambda: curves(page, "position error, mm") or None, "the curves")[0]
         dropped = live.session.saved()[1].events[0].time
+        assert t[marks == 1] == pytest.approx([dropped], abs=0.05)
+        post = places(page, "/world/events")[:, :2].mean(axis=0)
+        now = live.session.driven()[round(dropped / live.session.period)]
+        assert post == pytest.approx([now["x_ref"], now["y_ref"]], abs=0.01)  # within a tick
+        page.locator(".u-over").nth(2).hover()
+        values = page.locator(".u-legend").nth(2).inner_text()
+        assert "PID alone position error" in values and re.search(r"\d\.\d", values), values
         before = without[(t > dropped - 0.3) & (t < dropped)]  # steady to 0.1 µm
         assert without[t > dropped].max() - before.max() > 0.015 > 100 * np.ptp(before)
         assert t[-1] == pytest.approx(live.session.time, abs=0.1)
@@ -184,6 +199,10 @@ def test_live(browser, tmp_path):
         assert live.session.tick == tick + 1
         assert all(page.evaluate(VISIBLE, f"{robot}/payload") for robot in (ROBOT, GHOST))
 
+        with page.expect_download(timeout=PATIENCE) as download:
+            page.get_by_text("Download as one HTML file").click()
+        text = download.value.path().read_text()
+        assert f'"marks": [{dropped:.5g}' in text and text.count("<canvas") == 0 and len(text) > 1e6
         live.ask(live._set_speed, float("inf"))
         live.ask(live._command, "play")
         until(lambda: live.session.time > 9.0, "some seconds within a few pictures")
@@ -196,6 +215,11 @@ def test_live(browser, tmp_path):
         assert np.linalg.norm(np.diff(trail, axis=0), axis=-1).max() < 0.12  # m, in 1/8 s
         assert np.abs(np.hypot(*(trail[:, :2] - [0, 0.8]).T) - 0.8).max() < 0.1
 
+        page.set_viewport_size({"width": 390, "height": 844})
+        button = page.get_by_role("button", name="reset", exact=True)
+        until(lambda: (box := button.bounding_box()) and box["height"] >= 44, "a button for a finger")
+        page.screenshot(path=tmp_path / "phone.png", timeout=PATIENCE)
+        page.set_viewport_size({"width": 1280, "height": 800})
         page.get_by_text("reset", exact=True).click()
         until(lambda: np.isnan(curves(page, "V, m/s")[0][1:]).all(), "the old curves to go")
         until(
@@ -312,9 +336,14 @@ def test_replay(browser, tmp_path):
         time.sleep(1.0)
         picture(page, tmp_path / "replay.png")
         t, *drawn = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
-        assert t[-1] == pytest.approx(11.98, abs=0.02) and len(drawn) == 1 + 2 * 2  # reference, estimates and truths
+        assert t[-1] == pytest.approx(11.98, abs=0.02) and len(drawn) == 1 + 2 * 2 + 1  # and the marks of events
         for title, axes in page.evaluate(AXES).items():
             assert axes["cursor"] == pytest.approx(7.5, abs=0.05) and axes["times"], title
+        replay.ask(setattr, replay._interval, "value", (7.0, 8.0))
+        replay.ask(replay._draw_curves)
+        t = until(lambda: len(now := curves(page, "V, m/s")[0][0]) < 105 and now, "one second of the curves")
+        assert (t[0], t[-1], len(t)) == (pytest.approx(7.0), pytest.approx(8.0), 101)  # every sample
+        until(lambda: page.evaluate(AXES)["V, m/s"]["cursor"] == pytest.approx(7.5, abs=0.01), "the cursor")
         last = result.isel(run=1).dropna("time", subset=["x"]).isel(time=-1)
         tilt = np.arccos(np.cos(last.pitch_angle) * np.cos(last.roll_angle))
         assert tilt > 0.4
@@ -412,7 +441,7 @@ def test_estimate_live(browser, tmp_path):
         assert page.evaluate(VISIBLE, f"{MARKS}/estimate")
 
         def chart():
-            t, reference, estimated, true = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
+            t, reference, estimated, true, _ = until(lambda: curves(page, "V, m/s") or None, "the curves")[0]
             return len(t) > 60 and (t, estimated, true)
 
         t, estimated, true = until(chart, "the curves of V")
@@ -466,6 +495,9 @@ def test_export(browser, tmp_path):
         half = until(lambda: (p := node(page, ROBOT, scene)) is not None and p[1] > 1.4 and p, "the robot to follow")
         assert np.allclose(half[:2], [0, 1.6], atol=0.1)  # half way around
         picture(page, tmp_path / "export.png")
+        page.set_viewport_size({"width": 390, "height": 844})
+        boxes = [page.locator(part).bounding_box() for part in ("#scene", "#curves")]
+        assert all(box["width"] > 380 for box in boxes) and boxes[0]["height"] > 400 < boxes[1]["y"]
     assert main(["view", str(scenario), "--export", str(file)]) == 2  # not overwritten
 
 

@@ -4,14 +4,16 @@ import asyncio
 import time
 import typing
 
+import numpy as np
 import pytest
 import viser
 
-from mrctl import Event, Kanayama, Perturbation, Pid, Scenario
+from mrctl import Event, Kanayama, Perturbation, Pid, Scenario, per_lap, simulate
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.references import Reference
 from mrctl.viewer import live as module
 from mrctl.viewer.live import Live
+from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import CHANGEABLE
 
@@ -194,6 +196,24 @@ def test_events_of_the_scenario():
     live.refresh()
     assert box.visible and box.dimensions == pytest.approx((0.2, 0.2, 0.2))
     server.stop()
+
+
+def test_stories(live):
+    """A button sets a scene with its events; what its sentence promises happens."""
+    error = {}
+    for name, story in STORIES.items():
+        live._tell(name)
+        assert live.session.start == story.scenarios and story.watch in live._story.content and live.playing
+        result = simulate(story.scenarios)
+        error[name] = 1e3 * per_lap(result).position_rmse.values  # mm, of the learner and of PID alone
+        fails = result.failure.values.tolist()
+        assert fails == ["", "lateral error over 1 m" if "load" in name else ""]
+    load, battery, ice = error.values()
+    assert 15 < load[0, -1] < 25 and (np.diff(load[1, :4]) > 0).all()
+    assert 3.5 < battery[1, -1] / battery[0, -1] < 4.5 and battery[0, 1:].max() < battery[0, 0]
+    assert 0.8 < ice[0, 1] / ice[1, 1] < 1 and ice[0, -1] < ice[0, 0]
+    live._restart([Scenario()])
+    assert live._story.content == ""
 
 
 def test_order(live):

@@ -12,15 +12,18 @@ import urllib.error
 import urllib.request
 
 import msgspec
+import numpy as np
 import pytest
 import viser
+from PIL import Image
 from viser import _messages
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from mrctl import InputError, Scenario
+from mrctl import Circle, Line, Scenario, per_lap, save, simulate
 from mrctl.cli import main
 from mrctl.viewer import server as module
+from mrctl.viewer import view as viewing
 from mrctl.viewer.live import Live
 from mrctl.viewer.server import Server
 
@@ -139,10 +142,30 @@ def test_bad_files(tmp_path, capsys):
     for arguments in (["bad.toml"], ["empty"], ["missing.toml"], ["empty", "--compare", "fel"]):
         assert main(["view", str(tmp_path / arguments[0]), *arguments[1:]]) == 2
         assert capsys.readouterr().err.count("\n") == 1
-    with pytest.raises(InputError, match="several"):
-        from mrctl.viewer.view import view
+    for arguments in (["--run", "3"], [str(tmp_path / "empty"), "--laps", "3"], ["other"], ["--laps", "0"]):
+        assert main(["view", *arguments]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
 
-        view(None, (), 3, None, "127.0.0.1", 0)
+
+def test_flags(monkeypatch):
+    """The flags are those of `run`; a robot brings steering and a reference that it follows, unless they are given."""
+    shown = []
+    monkeypatch.setattr(viewing, "live", lambda scenario, compare, *_: shown.append((scenario, compare)))
+    racecar, turtlebot = ["--robot.path", "racecar"], ["--robot.path", "turtlebot"]
+    for arguments in (
+        [], ["--learner", "fel", "--compare", "none"], [*racecar, "--learner", "fel", "--compare", "none"], turtlebot,
+        [*turtlebot, "--steering", "caster", "--laps", "1", "reference:circle", "--reference.period", "12"],
+    ):  # fmt: skip
+        assert main(["view", *arguments]) == 0
+    pairs = [(scenario.feedforward, *compare) for scenario, compare in shown]
+    assert pairs == [("model+composite", "none"), ("fel", "none"), ("fel", "none"), *[("model+composite", "none")] * 2]
+    first, own, fast, small, asked = (scenario for scenario, _ in shown)
+    assert first == Scenario(prior="model", learner="composite") and own == Scenario()
+    assert (fast.robot.path, fast.steering, small.steering) == ("racecar", "rigid", "caster")
+    assert asked.reference == Circle(period=12.0) and asked.laps == 1
+    for scenario in (fast, small):
+        laps = per_lap(simulate([scenario.replace(laps=1)]))
+        assert not laps.failed.values.any() and laps.position_rmse.values[0, 0] < 0.1
 
 
 CAMERA = _messages.ViewerCameraMessage((1.0, 0.0, 0.0, 0.0), (0, 0, 1), 1.0, 0.1, 100.0, 600, 800, (0, 0, 0), (0, 0, 1))
@@ -219,3 +242,23 @@ def _random_value(handle, rng):
     if hasattr(handle, "max"):
         return rng.uniform(handle.min, handle.max)
     return True
+
+
+def test_record(tmp_path, capsys):
+    """A GIF of a result shows the robot on its way; where MuJoCo cannot draw, one line says so."""
+    result = tmp_path / "result.zarr"
+    save(simulate([Scenario(reference=Line(length=0.8), laps=1, learner="none")]), result)
+    command = [sys.executable, "-m", "mrctl.cli", "record", str(result), "--out", str(tmp_path / "run.gif")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    if done.returncode:
+        assert done.returncode == 2 and done.stderr.count("\n") == 1 and "EGL" in done.stderr
+    else:
+        with Image.open(tmp_path / "run.gif") as video:
+            assert (video.n_frames, video.size, video.info["duration"]) == (13, (640, 360), 80)
+            first = np.asarray(video.convert("RGB"), float)
+            video.seek(12)
+            assert (np.abs(np.asarray(video.convert("RGB"), float) - first).max(axis=-1) > 60).sum() > 500
+    (tmp_path / "there.gif").touch()
+    for name in ("run.avi", "there.gif", "none/run.gif"):
+        assert main(["record", str(tmp_path / "no.zarr"), "--out", str(tmp_path / name)]) == 2
+        assert capsys.readouterr().err.count("\n") == 1

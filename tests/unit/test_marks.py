@@ -1,4 +1,4 @@
-"""What the viewer draws of an estimate."""
+"""What the viewer draws of an estimate, and of the deviation from the reference."""
 
 import numpy as np
 import pytest
@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from mrctl.results.dataset import TICK
+from mrctl.viewer.deviation import drawn, extent
 from mrctl.viewer.sensors import SIGMAS, ellipse, magnification
 
 SPREAD = st.floats(1e-4, 1.0)
@@ -36,3 +37,16 @@ def test_share():
 def test_magnification():
     """Errors of a motion-capture system are drawn 100 times, of a map 10 times, of dead reckoning as they are."""
     assert [magnification(spread) for spread in (0.003, 0.02, 0.3, np.inf, 0.0)] == [100, 10, 1, 1, 100]
+
+
+def test_deviation():
+    """Robots 20 mm and 1 mm beside the reference are drawn 200 mm and 10 mm beside it, which the view has room for."""
+    rows = np.zeros((100, 2), TICK)
+    rows["x_ref"] = rows["x"] = np.linspace(0, 1, 100)[:, None]
+    rows["y"] = rows["lateral_error"] = [0.020, 0.001]
+    rows[-1] = np.nan  # both have stopped
+    factor = magnification(extent(rows))
+    assert factor == 10
+    away = drawn(rows[:-1], factor) - drawn(rows[:-1], 0)
+    np.testing.assert_allclose(away, np.broadcast_to([[0, 0.2], [0, 0.01]], (99, 2, 2)), atol=1e-12)
+    assert extent(rows[:0]) == extent(rows[-1:]) == 0

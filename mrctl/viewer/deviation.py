@@ -1,0 +1,88 @@
+"""How far robots are from the reference: a target that runs along it, a line to each robot, and magnified trails."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from mrctl.kernel import Row, Rows
+from mrctl.viewer.shapes import ball, bar
+
+Array = NDArray[np.float64]
+
+CHOICES = ("automatic", "1×", "10×", "100×")
+PIN_COLOUR = (75, 85, 99)
+
+
+def extent(rows: Rows) -> float:
+    """Returns the distance from the reference in m that the worst robot exceeds 2 % of the time, or 0.
+
+    Args:
+        rows: Record of `TICK` of each sample and robot, `(T, B)`.
+    """
+    distance = np.nan_to_num(np.hypot(rows["longitudinal_error"], rows["lateral_error"]))
+    return float(np.quantile(distance, 0.98, axis=0).max()) if len(distance) else 0.0
+
+
+def drawn(rows: Rows, magnified: int) -> Array:
+    """Returns x and y in m at which robots are drawn, with the shape of `rows` and 2.
+
+    Args:
+        rows: Records of `TICK`.
+        magnified: Factor on the deviation from the reference.
+    """
+    reference, true = (np.stack([rows[x], rows[y]], axis=-1) for x, y in (("x_ref", "y_ref"), ("x", "y")))
+    return reference + magnified * (true - reference)
+
+
+class Target:
+    """A pin on the reference, where a robot should be, and a line from it to a ball, where the robot is.
+
+    Both hover above the robot, which would hide them. Poses of nodes reach the picture at once, sizes a frame late: so
+    the ball is a node of its own, and only the length of the line is late.
+    """
+
+    def __init__(
+        self, scene: viser.SceneApi, row: int, height: float, thick: float, colour: tuple[int, int, int]
+    ) -> None:
+        """Adds the target to a scene; it is invisible until `show`.
+
+        Args:
+            scene: The scene.
+            row: Index of the robot.
+            height: Height of the target over the ground in m.
+            thick: Thickness of the line in m.
+            colour: Colour of the robot.
+        """
+        name, self._height = f"/world/target/{row}", height
+        plain: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
+        self._root = scene.add_frame(name, show_axes=False, visible=False)
+        pin = bar(np.array([0, 0, -self._height]), np.zeros(3), thick / 2)
+        scene.add_mesh_simple(f"{name}/pin", *pin, color=PIN_COLOUR, flat_shading=True, **plain)
+        scene.add_mesh_simple(f"{name}/head", *ball(2 * thick), color=PIN_COLOUR, flat_shading=True, **plain)
+        self._line = scene.add_mesh_simple(
+            f"{name}/line", *bar(np.zeros(3), np.array([1.0, 0, 0]), thick), color=colour, flat_shading=True, **plain
+        )
+        self._ball = scene.add_mesh_simple(f"{name}/ball", *ball(3 * thick), color=colour, flat_shading=True, **plain)
+
+    def show(self, now: Row, ground: float, magnified: int) -> None:
+        """Moves the target; of a robot that has stopped it is invisible.
+
+        Args:
+            now: Record of `TICK`.
+            ground: Height of the ground in m.
+            magnified: Factor on the deviation.
+        """
+        x, y = drawn(now, magnified) - (now["x_ref"], now["y_ref"])
+        self._root.visible = bool(np.isfinite(x))
+        if not self._root.visible:
+            return
+        self._root.position = now["x_ref"], now["y_ref"], ground + self._height
+        half = np.arctan2(y, x) / 2
+        self._root.wxyz = np.cos(half), 0.0, 0.0, np.sin(half)
+        length = float(np.hypot(x, y))
+        self._ball.position = length, 0.0, 0.0
+        self._line.scale = max(length, 1e-6), 1.0, 1.0

@@ -1,0 +1,163 @@
+"""`mrctl record`: a video of a result, drawn by MuJoCo."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+from tqdm import tqdm
+
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
+from mrctl.record import InputError
+from mrctl.viewer.deviation import extent
+from mrctl.viewer.looks import Look
+from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of, path
+from mrctl.viewer.scene import CAMERA_POSITION, CAMERA_TARGET, LEAST_VIEW, REFERENCE_COLOUR
+from mrctl.viewer.sensors import magnification
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+SIZES = {".mp4": (1280, 720), ".gif": (640, 360)}  # pixels
+RATES = {".mp4": 25.0, ".gif": 12.5}  # pictures a second
+LINE_POINTS, TRAIL_POINTS = 200, 100
+TRAIL = 12.0  # s that a trail shows
+GHOST_OPACITY = 0.25
+NEARER = 0.8  # distance of the camera from the track, relative to that in the page
+SHADOW = 1024  # pixels of the map of shadows
+WIDTH = 0.003  # of trails, as a share of the width of the view; the reference is twice as wide
+
+
+def record(folder: Path, run: int | None, out: Path) -> None:
+    """Writes a video of a result: the first run solid, the others as ghosts, with the reference and their trails.
+
+    Args:
+        folder: Folder of a result or a sweep.
+        run: Number of the one run to show; by default those that `mrctl view` shows first.
+        out: File to write, whose name ends in `.mp4` or `.gif`; MP4 needs the program ffmpeg.
+
+    Raises:
+        InputError: The file exists, has another ending or cannot be written; there is no such run; MuJoCo cannot draw
+            on this machine; or ffmpeg is missing or fails.
+    """
+    if out.suffix not in SIZES:
+        raise InputError(f"out: {out} ends neither in .mp4 nor in .gif")
+    if out.exists():
+        raise InputError(f"out: {out} exists already; nothing was overwritten")
+    if out.suffix == ".mp4" and shutil.which("ffmpeg") is None:
+        raise InputError("out: an MP4 needs the program ffmpeg, which is not installed; a name in .gif needs nothing")
+    library = Library(folder)
+    shown = [int(k) for k in library.table.index] if run is None else [run]
+    recordings = [library.recording(k) for k in (shown if len(shown) <= MAX_SHOWN else shown[:1])]
+    times = np.arange(0, max(r.duration for r in recordings), 1 / RATES[out.suffix])
+    pictures = _pictures(recordings, looks_of(recordings, shown), times, *SIZES[out.suffix])
+    progress = tqdm(pictures, total=len(times), unit="picture")
+    try:
+        (_write_gif if out.suffix == ".gif" else _write_mp4)(progress, out)
+    except OSError as error:
+        raise InputError(f"out: {out}: {error.strerror or error}") from None
+
+
+def _write_gif(pictures: Iterable[Picture], out: Path) -> None:
+    first, *others = (Image.fromarray(picture).quantize(64) for picture in pictures)
+    first.save(out, save_all=True, append_images=others, duration=round(1000 / RATES[".gif"]), loop=0)
+
+
+def _write_mp4(pictures: Iterable[Picture], out: Path) -> None:
+    width, height = SIZES[".mp4"]
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(RATES[".mp4"]), "-i", "-"]
+    command = ["ffmpeg", "-loglevel", "error", *raw, "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(out)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stderr is not None
+        try:
+            for picture in pictures:
+                process.stdin.write(picture.tobytes())
+            process.stdin.close()
+        except BrokenPipeError:
+            pass  # ffmpeg says why
+        said = process.stderr.read().decode(errors="replace")
+    if process.returncode:
+        raise InputError(f"out: ffmpeg: {' '.join(said.split()) or process.returncode}")
+
+
+def _pictures(
+    recordings: Sequence[Recording], robots: Sequence[Look], times: Array, width: int, height: int
+) -> Iterator[Picture]:
+    """Draws recordings at some times in s, each picture `(height, width, 3)`.
+
+    Raises:
+        InputError: There is no OpenGL on this machine that draws without a display.
+    """
+    model = mjcf.clone(recordings[0].model)
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = SHADOW, 0  # without a GPU these take most of the time
+    try:
+        renderer = mujoco.Renderer(model, height, width)
+    except Exception as error:  # each backend has errors of its own
+        reason = str(error).split("\n")[0] or type(error).__name__
+        raise InputError(f"record: MuJoCo cannot draw on this machine; is EGL (libegl1) installed? {reason}") from None
+    with renderer:
+        reference = recordings[0].scenario.reference
+        course = reference.sample(np.linspace(0, reference.period, LINE_POINTS)).pose * [1, 1, 0]
+        low, high = course.min(axis=0), course.max(axis=0)
+        view = max(LEAST_VIEW, *(high - low))
+        camera = mujoco.MjvCamera()
+        camera.lookat = (low + high) / 2 + view * CAMERA_TARGET
+        back = NEARER * view * (CAMERA_TARGET - CAMERA_POSITION)
+        camera.distance = float(np.linalg.norm(back))
+        camera.azimuth = np.degrees(np.arctan2(back[1], back[0]))
+        camera.elevation = np.degrees(np.arcsin(back[2] / camera.distance))
+        data, option, nothing = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb()
+        radius, magnified = read_robot(model).wheel_radius, magnification(extent(joint_log(recordings)[1]))
+        for time in times:
+            for row, (recording, robot) in enumerate(zip(recordings, robots, strict=True)):
+                data.qpos[:] = recording.qpos(recording.index(time))
+                mujoco.mj_forward(model, data)
+                scene = renderer.scene
+                if row == 0:
+                    renderer.update_scene(data, camera)
+                    _draw_line(scene, course + [0, 0, 0.004], 2 * WIDTH * view, REFERENCE_COLOUR)
+                else:
+                    before = scene.ngeom
+                    mujoco.mjv_addGeoms(model, data, option, nothing, mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
+                    for geom in scene.geoms[before : scene.ngeom]:
+                        geom.rgba = [*np.array(robot.colour) / 255, GHOST_OPACITY]
+                        geom.matid = -1
+                since, last = recording.index(time - TRAIL), recording.index(time)
+                rows = recording.log[np.linspace(since, last, TRAIL_POINTS).astype(int)]
+                _draw_line(
+                    scene, path(rows, radius, data.body("chassis").xpos[2], magnified), WIDTH * view, robot.colour
+                )
+            yield _labelled(renderer.render(), f"{time:.1f} s, deviation of trails {magnified} times", robots)
+
+
+def _labelled(picture: Picture, text: str, robots: Sequence[Look]) -> Picture:
+    """Writes a text and the names of the robots in their colours into the upper left corner of a picture."""
+    image = Image.fromarray(picture)
+    draw, size = ImageDraw.Draw(image), len(picture) / 25
+    for k, (line, colour) in enumerate([(text, (31, 41, 55)), *robots]):
+        draw.text((size, size * (0.6 + 1.3 * k)), line, colour, font_size=size)
+    return np.asarray(image)
+
+
+def _draw_line(scene: mujoco.MjvScene, points: Array, width: float, colour: Sequence[int]) -> None:
+    """Adds a line through points `(n, 3)` to a scene, with a width in m."""
+    rgba = np.array([*np.array(colour) / 255, 1.0], np.float32)
+    for start, end in zip(points[:-1], points[1:], strict=True):
+        if scene.ngeom >= scene.maxgeom or not np.isfinite([start, end]).all():
+            continue
+        geom = scene.geoms[scene.ngeom]
+        kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+        mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
+        mujoco.mjv_connector(geom, kind, width / 2, start, end)
+        scene.ngeom += 1
