@@ -34,7 +34,7 @@ FIRST = ("name", "world", "steering", "reference", "laps", "prior", "learner", "
 
 FROM_FILES = ("events", "obstacles")
 """Fields of `Scenario` that have no flags, because they come from a scenario file."""
-GIVEN = (*FROM_FILES, "reference", "laps", "initial_pose")
+GIVEN = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
 """Fields of `Scenario` that are no flags of `mrctl navigate`, because the mission gives them."""
 
 LAB = Sensing(tier="lab")

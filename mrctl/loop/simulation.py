@@ -19,6 +19,7 @@ from mrctl.control.stages import Stages
 from mrctl.kernel import Array, Rows
 from mrctl.loop.courses import Courses, start_pose
 from mrctl.loop.events import Events
+from mrctl.loop.goals import Goals
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.log import DIVERGED, Log
 from mrctl.loop.user_stages import StageError, UserEstimator, UserHierarchy, UserStage
@@ -218,6 +219,8 @@ class Simulation:
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period)
         self.log = Log(self.ticks, size)
         self._failure_time = np.full(size, np.nan)
+        self._goals = Goals(scenarios)
+        self._learned: dict[int, Array] = {}  # what robots that arrived or got stuck had adapted then, flat
         self._sensed = -1  # the last tick that was measured
 
         goal = self.courses.at(0)
@@ -229,7 +232,7 @@ class Simulation:
 
     @property
     def running(self) -> bool:
-        """Whether the run goes on: ticks are left, and a robot has not failed."""
+        """Whether the run goes on: ticks are left, and a robot has neither failed nor arrived."""
         return self.tick < self.ticks and self.plant.running > 0
 
     def add(self, event: Event) -> None:
@@ -308,13 +311,27 @@ class Simulation:
         self.tick += 1
         if plant.running < plant.size:
             new = plant.failed & np.isnan(self._failure_time)
+            new[list(self._learned)] = False
             self._failure_time[new] = self.tick * self.period
             self.log.blank(tick, plant.failed)
+        if self._goals.any:
+            self._end(tick)
+
+    def _end(self, tick: int) -> None:
+        """Ends the runs that have reached their goals at a tick, or are stuck; the record of the tick is kept."""
+        stage = self.hierarchy.learner
+        for row, reason in self._goals.ended(tick, self.log.at(tick)).items():
+            self.plant.fail(row, reason)
+            self._learned[row] = stage.adapted()[row] if isinstance(stage, Learner) else np.zeros(0)
+            if reason:
+                self._failure_time[row] = self.tick * self.period
 
     def result(self) -> xr.Dataset:
-        """Returns the signals so far; if every robot has failed, of the whole run, with NaN at the end."""
+        """Returns the signals so far; if every run has ended, of the whole time, with NaN at the end."""
         stage = self.hierarchy.learner
         learned = stage.adapted() if isinstance(stage, Learner) else np.zeros((0, 0))
+        for row, kept in self._learned.items() if learned.size else ():
+            learned[row] = kept
         weights = learned if learned.size else None
         size, robot = len(self.scenarios), self.plant.robot
         length = self.tick if self.running else self.ticks

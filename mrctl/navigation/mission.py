@@ -11,6 +11,7 @@ import pandas as pd
 import xarray as xr
 
 from mrctl.kernel import Array
+from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import simulate
 from mrctl.navigation import generators
 from mrctl.navigation.generators import Task
@@ -46,7 +47,6 @@ GENERATORS: dict[str, Callable[[float, float, int], Task]] = {
 ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
 TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
 CELLS = 4  # of the search in the width of the robot
-NEAR, TURNED, RESTING = 0.1, 0.2, 0.05  # m, rad and m/s, within which a robot has arrived
 PATIENCE = 2  # time after which a robot is out of time, over that of the plan
 
 
@@ -56,7 +56,7 @@ class Mission(NamedTuple):
     plan: Plan
     """Way from start to goal."""
     result: xr.Dataset
-    """Result of one robot or several, of twice the time of the plan unless one failed before."""
+    """Result of one robot or several, until the last of them has ended; NaN after the end of each."""
     table: pd.DataFrame
     """What `outcomes` returns."""
 
@@ -103,7 +103,7 @@ def navigate(
 
     Args:
         task: World, start and goal.
-        scenario: The robot and all else; reference, laps and obstacles are those of the mission.
+        scenario: The robot and all else; reference, laps, goal and obstacles are those of the mission.
         compare: Feedforwards of further robots, which drive the same plan, each alone.
         speed: Largest speed in m/s; by default 0.9 of the robot's.
         margin: Clearance that the plan keeps in m.
@@ -113,14 +113,20 @@ def navigate(
         InputError: Start or goal is in an obstacle, there is no way, or the robot cannot drive the plan.
     """
     found, reference = planned(task, scenario, speed, margin)
-    own = scenario.replace(obstacles=task.obstacles, reference=reference, laps=PATIENCE, initial_pose=task.start)
+    own = scenario.replace(
+        obstacles=task.obstacles, reference=reference, laps=PATIENCE, initial_pose=task.start, goal=task.goal
+    )
     others = [own.replace(name="", **FEEDFORWARDS[name]) for name in compare]
     result = simulate([own, *others], progress=progress)
+    driven = np.flatnonzero(np.isfinite(result["x"].values).any(axis=0))
+    result = result.isel(time=slice(int(driven[-1]) + 1))
     return Mission(found, result, outcomes(result, task.goal, found))
 
 
 def planned(task: Task, scenario: Scenario, speed: float | None, margin: float) -> tuple[Plan, Waypoints]:
     """Returns the plan and its reference; arguments and errors are those of `navigate`."""
+    if arrived(np.array(task.start), 0.0, np.array(task.goal)):
+        raise InputError("goal: the robot starts there")
     if not 0 <= margin <= 10:
         raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
     corners, robot = _robot(scenario)
@@ -134,8 +140,6 @@ def planned(task: Task, scenario: Scenario, speed: float | None, margin: float) 
     where = space(outlines, corners, low, high, cell=float(np.ptp(corners[:, 1])) / CELLS, margin=margin)
     found = plan(where, np.array(task.start), np.array(task.goal), radius, reverse=False)
     found = shortcut(where, found, radius, reverse=False)
-    if found.length < NEAR / 2:
-        raise InputError("goal: the robot starts there")
     reference = found.reference(RESERVE * robot.max_speed if speed is None else speed, Limits.of(robot))
     check(reference, robot, reverse=False)
     times = np.linspace(0, reference.period, max(2, round(found.length / 0.01)))
@@ -153,7 +157,7 @@ def _robot(scenario: Scenario) -> tuple[Array, Robot]:
 def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
     """Returns how each robot of a result fared, until it arrived, failed or was out of time.
 
-    A robot has arrived when it is within 0.1 m and 0.2 rad of the goal and slower than 0.05 m/s.
+    A robot has arrived when it is within 0.1 m and 0.2 rad of the goal and slower than 0.05 m/s (`arrived`).
 
     Args:
         result: What `simulate` returns.
@@ -161,28 +165,24 @@ def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
         found: The plan.
 
     Returns:
-        A row for each robot: `outcome` (arrived, collided, out of time, or why it failed), `time` in s, `length` of its
-        path in m, `spl`, success weighted by path length, ℓ / max(ℓ, length) or 0 unless it arrived, with the length ℓ
-        of the plan (Anderson et al., "On evaluation of embodied navigation agents", 2018), the smallest `clearance` in
-        m, `position_rmse` in m, `energy` in J, and `expanded`, the number of poses that the search expanded.
+        A row for each robot: `outcome` (arrived, collided, stuck, out of time, or why it failed), `time` in s, `length`
+        of its path in m, `spl`, success weighted by path length, ℓ / max(ℓ, length) or 0 unless it arrived, with the
+        length ℓ of the plan (Anderson et al., "On evaluation of embodied navigation agents", 2018), the smallest
+        `clearance` in m, `position_rmse` in m, `energy` in J, and `expanded`, the number of poses that the search
+        expanded.
     """
     runs, period, rows = as_runs(result), control_period(result), []
     for row in range(runs.sizes["run"]):
-        run = runs.isel(run=row)
-        x, y, theta, v = (run[name].values for name in ("x", "y", "theta", "v"))
-        turned = np.abs(np.angle(np.exp(1j * (theta - goal[2]))))
-        near = (np.hypot(x - goal[0], y - goal[1]) < NEAR) & (turned < TURNED) & (np.abs(v) < RESTING)
-        failure = str(run["failure"].values)
-        ended = {"": "out of time", "collision": "collided"}.get(failure, failure)
-        alive = int(np.isfinite(x).sum())
-        last = int(near.argmax()) if near.any() else alive - 1
-        driven = run.isel(time=slice(last + 1))
+        driven = runs.isel(run=row).dropna("time", subset=["x"])
+        end, failure = driven.isel(time=-1), str(driven["failure"].values)
+        pose = np.array([float(end[name]) for name in ("x", "y", "theta")])
+        there = not failure and bool(arrived(pose, float(end["v"]), np.array(goal)))
         length = float(np.hypot(np.diff(driven["x"]), np.diff(driven["y"])).sum())
         rows.append({
-            "outcome": "arrived" if near.any() else ended,
-            "time": last * period,
+            "outcome": "arrived" if there else {"": "out of time", "collision": "collided"}.get(failure, failure),
+            "time": float(end["time"]),
             "length": length,
-            "spl": near.any() * found.length / max(found.length, length),
+            "spl": there * found.length / max(found.length, length),
             "clearance": float(driven["clearance"].min()) if "clearance" in driven else np.inf,
             "position_rmse": float(np.sqrt(np.mean(driven["longitudinal_error"] ** 2 + driven["lateral_error"] ** 2))),
             "energy": float(driven["power"].sum()) * period,
