@@ -253,7 +253,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
     part = _part(Scenario(prior="model", learner="composite"), [name for name in names if name not in GIVEN])
 
     def navigate(
-        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="WORLD|GENERATOR:SEED")],
+        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="WORLD|GENERATOR:SEED")] = "",
         /,
         scenario: Record = part,
         goal: tuple[float, float, float] | None = None,
@@ -263,6 +263,8 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         margin: float = 0.05,
         out: Path | None = None,
         json: bool = False,
+        suite: bool = False,
+        quick: bool = False,
     ) -> None:
         """Plans a way among obstacles, drives it, and prints how that ended.
 
@@ -279,10 +281,21 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             margin: Clearance that the plan keeps in m.
             out: Folder for the result, the table in JSON and the figures.
             json: Print JSON instead of a table.
+            suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
+                model, fel and model+composite, on three plants; it prints first how long that takes. The tables are
+                written to the folder, by default navigate_suite.
+            quick: With --suite, drive fewer draws, so few that some intervals have no end.
         """
-        from mrctl.experiments import mission
+        from mrctl.experiments import mission, mission_suite
 
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
+        if suite:
+            if world or goal or start or compare or speed is not None or json:
+                raise InputError("suite: has worlds, controllers and speeds of its own; give only the robot's flags")
+            print(mission_suite.suite(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
+            return
+        if quick or not world:
+            raise InputError("quick: belongs to --suite" if quick else "world: none given; see mrctl navigate --help")
         text, outcome = mission.run(world, chosen, goal, start, compare, speed, margin, out, json)
         print(text)
         if outcome != "arrived":

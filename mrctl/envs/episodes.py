@@ -155,7 +155,7 @@ class Episodes(Simulation):
         self.sensors.restart(row, seed, self.tick)
         self.estimator.start(row, plant.reading[row], seed, self.tick)
         self._failure_time[row] = np.nan
-        self._goals.restart(row)
+        self._goals.restart(row, self.tick)
         self._learned.pop(row, None)
         self._action[row] = 0.0
 

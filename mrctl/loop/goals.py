@@ -35,16 +35,19 @@ class Goals:
         none = (np.nan, np.nan, np.nan)
         self._goals = np.array([none if s.goal is None else s.goal for s in scenarios])
         self.any = bool(np.isfinite(self._goals).any())
+        ticks = np.array([s.ticks for s in scenarios])
+        self._ticks = np.where(ticks < ticks.max(), ticks, np.inf)  # of those that end before the group does
         self._patience = round(STUCK / scenarios[0].control_period)
         self._place = np.full((len(scenarios), 2), np.inf)  # where each robot was when it last got farther
+        self._start = np.zeros(len(scenarios), int)
         self._since = np.zeros(len(scenarios), int)
 
-    def restart(self, row: int) -> None:
-        """Forgets where one robot was."""
-        self._place[row] = np.inf
+    def restart(self, row: int, tick: int) -> None:
+        """Begins the run of one robot again at a control tick."""
+        self._place[row], self._start[row] = np.inf, tick
 
     def ended(self, tick: int, now: Rows) -> dict[int, str]:
-        """Returns the robots whose runs end, each with why it failed: `stuck`, or "" where it has arrived.
+        """Returns the robots whose runs end, each with why it failed: `stuck`, or "" at a goal or after a last tick.
 
         Args:
             tick: The control tick.
@@ -55,4 +58,5 @@ class Goals:
         self._place[farther, 0], self._place[farther, 1], self._since[farther] = x[farther], y[farther], tick
         there = arrived(np.stack([x, y, now["theta"]], -1), now["v"], self._goals)
         stuck = np.isfinite(x + self._goals[:, 0]) & (tick - self._since >= self._patience)
-        return {int(row): "" if there[row] else "stuck" for row in np.flatnonzero(there | stuck)}
+        over = there | (tick + 1 - self._start >= self._ticks)
+        return {int(row): "" if over[row] else "stuck" for row in np.flatnonzero(over | stuck)}

@@ -156,8 +156,8 @@ def run(
 
 
 def group_of(s: Scenario) -> Hashable:
-    """Returns what the runs of one simulation must share."""
-    rates = s.ticks, s.physics_step, s.control_period, s.motion_period
+    """Returns what the runs of one simulation must share; those with goals end one by one, and need not be as long."""
+    rates = s.ticks if s.goal is None else None, s.physics_step, s.control_period, s.motion_period
     chain = s.sensing.source, s.sensing.periods("delay", s.control_period)
     return s.world, s.obstacles, s.robot, s.steering, s.prior, s.learner, s.fel.hidden, *rates, *chain
 
@@ -176,7 +176,7 @@ class Simulation:
         events: The perturbations, pushes and other changes during the run.
         log: The recorded signals; the records from `tick` on are not written yet.
         tick: Number of control periods done.
-        ticks: Number of control periods in the whole run.
+        ticks: Number of control periods in the whole run, in the longest where they differ.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]) -> None:
@@ -192,7 +192,7 @@ class Simulation:
         """
         first, size = scenarios[0], len(scenarios)
         self.scenarios = list(scenarios)
-        self.ticks, self.tick, self.period = first.ticks, 0, first.control_period
+        self.ticks, self.tick, self.period = max(s.ticks for s in scenarios), 0, first.control_period
         self.model, robot = mjcf.build(first.world, first.steering, first.physics_step, first.robot, first.obstacles)
         self._reverses = mjcf.reverses(self.model, first.steering)
         for scenario in scenarios:

@@ -77,7 +77,7 @@ def task_of(world: str, scenario: Scenario, start: Pose | None = None, goal: Pos
     if colon and name in GENERATORS:
         if not (seed.isdecimal() and len(seed) < 10):
             raise InputError(f"world: {world}: the seed must be a number below 10⁹, as in {name}:3")
-        length, width = np.ptp(_robot(scenario)[0], axis=0).tolist()
+        length, width = np.ptp(robot_of(scenario)[0], axis=0).tolist()
         made = GENERATORS[name](length, width, int(seed))
         return made.replace(start=start or made.start, goal=goal or made.goal)
     if not (read := READERS.get(Path(world).suffix.lower())):
@@ -129,7 +129,7 @@ def planned(task: Task, scenario: Scenario, speed: float | None, margin: float) 
         raise InputError("goal: the robot starts there")
     if not 0 <= margin <= 10:
         raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
-    corners, robot = _robot(scenario)
+    corners, robot = robot_of(scenario)
     still = Obstacles(shapes=tuple(shape for shape in task.obstacles.shapes if shape.course is None))
     outlines = Surroundings(still).at(0.0)
     radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit)))
@@ -148,7 +148,7 @@ def planned(task: Task, scenario: Scenario, speed: float | None, margin: float) 
     return found, reference
 
 
-def _robot(scenario: Scenario) -> tuple[Array, Robot]:
+def robot_of(scenario: Scenario) -> tuple[Array, Robot]:
     """Returns the footprint of a scenario's robot, corners in m, `(n, 2)`, and its parameters."""
     model, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
     return footprint(model), robot
