@@ -261,6 +261,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         compare: Annotated[tuple[FeedforwardName, ...], tyro.conf.arg(metavar="NAME ...")] = (),
         speed: float | None = None,
         margin: float = 0.05,
+        avoid: Literal["none", "barrier", "window", "mppi"] = "none",
         out: Path | None = None,
         json: bool = False,
         suite: bool = False,
@@ -279,6 +280,8 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             compare: Feedforwards of further robots, such as none or model, which drive the same plan.
             speed: Largest speed in m/s; by default 0.9 of what the robot can.
             margin: Clearance that the plan keeps in m.
+            avoid: What keeps the robot from obstacles that move: nothing, a filter that brakes (`barrier`), or a
+                controller that leaves the plan and its times (`window`, `mppi`).
             out: Folder for the result, the table in JSON and the figures.
             json: Print JSON instead of a table.
             suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
@@ -290,13 +293,13 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
 
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
         if suite:
-            if world or goal or start or compare or speed is not None or json:
+            if world or goal or start or compare or speed is not None or avoid != "none" or json:
                 raise InputError("suite: has worlds, controllers and speeds of its own; give only the robot's flags")
             print(mission_suite.suite(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
             return
         if quick or not world:
             raise InputError("quick: belongs to --suite" if quick else "world: none given; see mrctl navigate --help")
-        text, outcome = mission.run(world, chosen, goal, start, compare, speed, margin, out, json)
+        text, outcome = mission.run(world, chosen, goal, start, compare, speed, margin, avoid, out, json)
         print(text)
         if outcome != "arrived":
             raise _Incomplete(f"the robot did not arrive: {outcome}")

@@ -307,7 +307,8 @@ class Simulation:
         near = self.log.record(tick, plant.state, self.estimator.seen, self._goal, self.hierarchy.state)
         if not near:
             for row in np.flatnonzero(np.abs(self.log.at(tick)["lateral_error"]) > DIVERGED):
-                plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
+                if self.scenarios[row].goal is None:  # else it may wait, and go its own way
+                    plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
         self.tick += 1
         if plant.running < plant.size:
             new = plant.failed & np.isnan(self._failure_time)

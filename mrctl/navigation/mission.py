@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -14,17 +16,20 @@ from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import simulate
 from mrctl.navigation import generators
+from mrctl.navigation.avoidance import Avoiding, Barrier, Following
 from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
+from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.planning import Plan, plan, shortcut, space
 from mrctl.navigation.sdf import read_sdf
+from mrctl.navigation.window import Window
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.record import InputError
 from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
-from mrctl.theory.clearance import clearances
-from mrctl.theory.obstacles import Obstacles, Pose, Surroundings
+from mrctl.theory.clearance import clearance, cover
+from mrctl.theory.obstacles import Obstacles, Outlines, Pose, Surroundings
 from mrctl.theory.references import Waypoints, check
 from mrctl.theory.robot import Robot
 from mrctl.theory.timing import RESERVE, Limits
@@ -47,7 +52,12 @@ GENERATORS: dict[str, Callable[[float, float, int], Task]] = {
 ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
 TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
 CELLS = 4  # of the search in the width of the robot
-PATIENCE = 2  # time after which a robot is out of time, over that of the plan
+PATIENCE, WAITING = 2, 4  # time after which a robot is out of time, over that of the plan; where it may wait
+SLIM = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
+PERIOD = 0.05  # s, motion period of `window` and `mppi`
+BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
+
+Avoid = Literal["none", "barrier", "window", "mppi"]
 
 
 class Mission(NamedTuple):
@@ -97,6 +107,7 @@ def navigate(
     compare: Sequence[FeedforwardName] = (),
     speed: float | None = None,
     margin: float = 0.05,
+    avoid: Avoid = "none",
     progress: bool = False,
 ) -> Mission:
     """Plans a way among the obstacles that stand still, and drives it with the hierarchy.
@@ -107,6 +118,9 @@ def navigate(
         compare: Feedforwards of further robots, which drive the same plan, each alone.
         speed: Largest speed in m/s; by default 0.9 of the robot's.
         margin: Clearance that the plan keeps in m.
+        avoid: What keeps the robot from obstacles that move or are near: nothing, so that it follows the plan in time
+            (`none`), the filter on what it would do then (`barrier`), or a motion stage that goes along the plan in its
+            own time (`window`, `mppi`).
         progress: Whether to show a progress bar.
 
     Raises:
@@ -116,22 +130,54 @@ def navigate(
     own = scenario.replace(
         obstacles=task.obstacles, reference=reference, laps=PATIENCE, initial_pose=task.start, goal=task.goal
     )
+    stage = avoiding(avoid, own)
+    if avoid in ("window", "mppi"):
+        own = own.replace(motion_period=PERIOD, laps=WAITING)
     others = [own.replace(name="", **FEEDFORWARDS[name]) for name in compare]
-    result = simulate([own, *others], progress=progress)
+    result = simulate([own, *others], progress=progress, motion=stage)
     driven = np.flatnonzero(np.isfinite(result["x"].values).any(axis=0))
     result = result.isel(time=slice(int(driven[-1]) + 1))
     return Mission(found, result, outcomes(result, task.goal, found))
 
 
-def planned(task: Task, scenario: Scenario, speed: float | None, margin: float) -> tuple[Plan, Waypoints]:
-    """Returns the plan and its reference; arguments and errors are those of `navigate`."""
+def avoiding(avoid: Avoid, scenario: Scenario) -> Callable[[Robot, int], Any] | None:
+    """Returns the factory of the motion stage of a mission, which bears the name in tables; None for that of mrctl."""
+    if avoid == "none":
+        return None
+    corners, robot = robot_of(scenario)
+    plan, obstacles = scenario.reference, scenario.obstacles
+    assert isinstance(plan, Waypoints)
+    barrier = Barrier(cover(corners, 4), 0.02, BRAKING * robot.max_acceleration, scenario.motion_period, 0.3)
+    follow = partial(Following, scenario=scenario)
+
+    def replan(pose: Array, outlines: Outlines) -> Waypoints | None:
+        start = Task.from_dict({"obstacles": obstacles, "start": pose.tolist(), "goal": scenario.goal})
+        with contextlib.suppress(InputError):  # it waits, and tries again
+            return planned(start, scenario, plan.speed, SLIM, outlines)[1]
+
+    def made(robot: Robot, size: int) -> Avoiding | Window | Mppi:
+        if avoid == "barrier":
+            return Avoiding(robot, size, follow, obstacles, barrier)
+        return (Window if avoid == "window" else Mppi)(robot, size, plan, obstacles, corners, replan)
+
+    made.__name__ = avoid
+    return made
+
+
+def planned(
+    task: Task, scenario: Scenario, speed: float | None, margin: float, outlines: Outlines | None = None
+) -> tuple[Plan, Waypoints]:
+    """Returns the plan and its reference; arguments and errors are those of `navigate`.
+
+    The outlines are by default those of the obstacles that stand still.
+    """
     if arrived(np.array(task.start), 0.0, np.array(task.goal)):
         raise InputError("goal: the robot starts there")
     if not 0 <= margin <= 10:
         raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
     corners, robot = robot_of(scenario)
     still = Obstacles(shapes=tuple(shape for shape in task.obstacles.shapes if shape.course is None))
-    outlines = Surroundings(still).at(0.0)
+    outlines = Surroundings(still).at(0.0) if outlines is None else outlines
     radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit)))
     ends = np.array([task.start[:2], task.goal[:2]])
     low, high = ends.min(axis=0) - 3 * radius, ends.max(axis=0) + 3 * radius  # room to turn
@@ -143,7 +189,7 @@ def planned(task: Task, scenario: Scenario, speed: float | None, margin: float) 
     reference = found.reference(RESERVE * robot.max_speed if speed is None else speed, Limits.of(robot))
     check(reference, robot, reverse=False)
     times = np.linspace(0, reference.period, max(2, round(found.length / 0.01)))
-    if clearances(corners, reference.sample(times).pose, times, Surroundings(still)).min() <= 0:
+    if min(clearance(corners, pose, outlines) for pose in reference.sample(times).pose) <= 0:
         raise InputError(f"plan: its smooth path comes nearer to an obstacle than the margin of {margin:g} m; set more")
     return found, reference
 

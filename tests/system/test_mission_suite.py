@@ -35,6 +35,7 @@ def test_corridor_width() -> None:
 def test_width_of_a_run() -> None:
     """In physics a run without walls touches those of a corridor that is 4 mm narrower than it needs, and no others."""
     draw = suite.draw(Scenario(), 1, 1.5 * float(np.ptp(HULL[:, 1])), [1.35])
+    assert draw is not None
     own = Scenario(reference=draw.references[0], goal=draw.goal, laps=2, learner="none", initial_spread=(0, 0, 0))
     free = simulate(own)
     poses = np.stack([free[name].dropna("time").values for name in ("x", "y", "theta")], -1)
