@@ -51,6 +51,7 @@ GENERATORS: dict[str, Callable[[float, float, int], Task]] = {
 }
 ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
 TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
+WIDER = 2.0  # times both, where a plan may reverse, for at a change of direction a spline is straight
 CELLS = 4  # of the search in the width of the robot
 PATIENCE, WAITING = 2, 4  # time after which a robot is out of time, over that of the plan; where it may wait
 SLIM = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
@@ -112,6 +113,8 @@ def navigate(
 ) -> Mission:
     """Plans a way among the obstacles that stand still, and drives it with the hierarchy.
 
+    A robot that can be driven backwards reverses where there is no way forward, but not with `window` and `mppi`.
+
     Args:
         task: World, start and goal.
         scenario: The robot and all else; reference, laps, goal and obstacles are those of the mission.
@@ -126,7 +129,13 @@ def navigate(
     Raises:
         InputError: Start or goal is in an obstacle, there is no way, or the robot cannot drive the plan.
     """
-    found, reference = planned(task, scenario, speed, margin)
+    model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
+    try:
+        found, reference = planned(task, scenario, speed, margin)
+    except InputError:
+        if avoid not in ("none", "barrier") or not mjcf.reverses(model, scenario.steering):
+            raise
+        found, reference = planned(task, scenario, speed, margin, reverse=True)
     own = scenario.replace(
         obstacles=task.obstacles, reference=reference, laps=PATIENCE, initial_pose=task.start, goal=task.goal
     )
@@ -165,11 +174,16 @@ def avoiding(avoid: Avoid, scenario: Scenario) -> Callable[[Robot, int], Any] | 
 
 
 def planned(
-    task: Task, scenario: Scenario, speed: float | None, margin: float, outlines: Outlines | None = None
+    task: Task,
+    scenario: Scenario,
+    speed: float | None,
+    margin: float,
+    outlines: Outlines | None = None,
+    reverse: bool = False,
 ) -> tuple[Plan, Waypoints]:
     """Returns the plan and its reference; arguments and errors are those of `navigate`.
 
-    The outlines are by default those of the obstacles that stand still.
+    The outlines are by default those of the obstacles that stand still, and the plan reverses only if it may.
     """
     if arrived(np.array(task.start), 0.0, np.array(task.goal)):
         raise InputError("goal: the robot starts there")
@@ -178,16 +192,18 @@ def planned(
     corners, robot = robot_of(scenario)
     still = Obstacles(shapes=tuple(shape for shape in task.obstacles.shapes if shape.course is None))
     outlines = Surroundings(still).at(0.0) if outlines is None else outlines
-    radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit)))
+    radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (
+        WIDER if reverse else 1
+    )
     ends = np.array([task.start[:2], task.goal[:2]])
     low, high = ends.min(axis=0) - 3 * radius, ends.max(axis=0) + 3 * radius  # room to turn
     if still.shapes:
         low, high = np.minimum(low, still.bounds[0]), np.maximum(high, still.bounds[1])
     where = space(outlines, corners, low, high, cell=float(np.ptp(corners[:, 1])) / CELLS, margin=margin)
-    found = plan(where, np.array(task.start), np.array(task.goal), radius, reverse=False)
-    found = shortcut(where, found, radius, reverse=False)
+    found = plan(where, np.array(task.start), np.array(task.goal), radius, reverse)
+    found = shortcut(where, found, radius, reverse)
     reference = found.reference(RESERVE * robot.max_speed if speed is None else speed, Limits.of(robot))
-    check(reference, robot, reverse=False)
+    check(reference, robot, reverse)
     times = np.linspace(0, reference.period, max(2, round(found.length / 0.01)))
     if min(clearance(corners, pose, outlines) for pose in reference.sample(times).pose) <= 0:
         raise InputError(f"plan: its smooth path comes nearer to an obstacle than the margin of {margin:g} m; set more")
