@@ -344,14 +344,14 @@ class Waypoints(Record):
 
     def _sample_parts(self, t: Array) -> Motion:
         """Samples a curve with cusps at the times t in s, shape (T,); V is negative in reverse."""
-        samples, since, heading = np.empty((len(t), 7)), 0.0, None
+        samples, since, heading = np.empty((len(t), 7)), 0.0, 0.0
         for part, back in self._parts:
             spline = _spline(part.points, False)
             s, v, a = part._law.at(np.maximum(t - since, 0.0))
             p, theta, k, dk = spline.at(s)
             sign = -1.0 if back else 1.0
             start = spline.heading[0] + np.pi * back
-            turn = 0.0 if heading is None else 2 * np.pi * round((heading - start) / (2 * np.pi))
+            turn = 2 * np.pi * round((heading - start) / (2 * np.pi))
             moved = along_path(p, theta + np.pi * back + turn, sign * k, dk, sign * v, sign * a)
             now = (t >= since) | (since == 0)
             samples[now] = np.hstack(moved)[now]
