@@ -53,7 +53,7 @@ SHARE = 0.95
 DRAWS = {"quick": 20, "core": 80}  # with fewer than 72 the interval of a critical width has no upper end
 EVERY = 2  # control periods between the poses whose widths are looked at
 TIE = 1e-3  # m
-PACE = 150  # simulated s in a s of one core, on the machine of the project's tables
+PACE = 100  # simulated s in a s of one core, planning included
 
 
 Mode = Literal["quick", "core"]

@@ -445,10 +445,10 @@ class _Spline:
         return p, heading + lap * (self.heading[-1] - self.heading[0]), log.imag / step, sharpness
 
 
-_spline = lru_cache(maxsize=64)(_Spline)
+_spline = lru_cache(maxsize=512)(_Spline)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=512)  # a comparison has hundreds of plans, and their scenarios ask for the time again and again
 def _law(points: tuple[tuple[float, float], ...], closed: bool, speed: float, limits: Limits) -> SmoothLaw:
     """The time law along the spline through the points."""
     spline = _spline(points, closed)
