@@ -36,7 +36,7 @@ FIRST = ("name", "world", "steering", "reference", "laps", "prior", "learner", "
 
 FROM_FILES = ("events", "obstacles")
 """Fields of `Scenario` that have no flags, because they come from a scenario file."""
-GIVEN = (*FROM_FILES, "reference", "laps", "initial_pose")
+GIVEN = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
 """Fields of `Scenario` that are no flags of `mrctl navigate`, because the mission gives them."""
 
 BEST: FeedforwardName = "model+composite"
@@ -288,7 +288,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
     part = _part(Scenario(**FEEDFORWARDS[BEST]), [name for name in names if name not in GIVEN])
 
     def navigate(
-        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="WORLD|GENERATOR:SEED")],
+        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="WORLD|GENERATOR:SEED")] = "",
         /,
         scenario: Record = part,
         goal: tuple[float, float, float] | None = None,
@@ -296,8 +296,11 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         compare: Annotated[tuple[FeedforwardName, ...], tyro.conf.arg(metavar="NAME ...")] = (),
         speed: float | None = None,
         margin: float = 0.05,
+        avoid: Literal["none", "barrier", "window", "mppi"] = "none",
         out: Path | None = None,
         json: bool = False,
+        suite: bool = False,
+        quick: bool = False,
     ) -> None:
         """Plans a way among obstacles, drives it, and prints how that ended.
 
@@ -312,13 +315,26 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             compare: Feedforwards of further robots, such as none or model, which drive the same plan.
             speed: Largest speed in m/s; by default 0.9 of what the robot can.
             margin: Clearance that the plan keeps in m.
+            avoid: What keeps the robot from obstacles that move: nothing, a filter that brakes (`barrier`), or a
+                controller that leaves the plan and its times (`window`, `mppi`).
             out: Folder for the result, the table in JSON and the figures.
             json: Print JSON instead of a table.
+            suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
+                model, fel and model+composite, on three plants; it prints first how long that takes. The tables are
+                written to the folder, by default navigate_suite.
+            quick: With --suite, drive fewer draws, so few that some intervals have no end.
         """
-        from mrctl.experiments import mission
+        from mrctl.experiments import mission, mission_suite
 
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
-        text, outcome = mission.run(world, chosen, goal, start, compare, speed, margin, out, json)
+        if suite:
+            if world or goal or start or compare or speed is not None or avoid != "none" or json:
+                raise InputError("suite: has worlds, controllers and speeds of its own; give only the robot's flags")
+            print(mission_suite.suite(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
+            return
+        if quick or not world:
+            raise InputError("quick: belongs to --suite" if quick else "world: none given; see mrctl navigate --help")
+        text, outcome = mission.run(world, chosen, goal, start, compare, speed, margin, avoid, out, json)
         print(text)
         if outcome != "arrived":
             raise _Incomplete(f"the robot did not arrive: {outcome}")

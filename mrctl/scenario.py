@@ -140,6 +140,9 @@ class Scenario(Record):
     """Changes during the run."""
     initial_pose: tuple[float, float, float] | None = None
     """Pose at the start: x and y in m, θ in rad; by default that of the reference."""
+    goal: tuple[float, float, float] | None = None
+    """Pose at which the run ends: x and y in m, θ in rad; it ends when the robot rests within 0.1 m and 0.2 rad of it,
+    or fails as `stuck` when it does not get 5 cm farther in 5 s. By default only the laps end it."""
     initial_spread: tuple[Spread, Spread, Annotated[float, Field(ge=0, le=0.5)]] = (0.02, 0.02, 0.03)
     """Standard deviations of a random offset from that pose: x and y in m, θ in rad."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0

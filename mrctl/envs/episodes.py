@@ -155,6 +155,8 @@ class Episodes(Simulation):
         self.sensors.restart(row, seed, self.tick)
         self.estimator.start(row, plant.reading[row], seed, self.tick)
         self._failure_time[row] = np.nan
+        self._goals.restart(row, self.tick)
+        self._learned.pop(row, None)
         self._action[row] = 0.0
 
     def begin_all(self, seeds: Sequence[int]) -> None:

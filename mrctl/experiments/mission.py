@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mrctl.experiments.tables import json_text, markdown, number, output_folder, write_json
-from mrctl.navigation.mission import navigate, task_of
+from mrctl.navigation.mission import Avoid, navigate, task_of
 from mrctl.record import InputError
 from mrctl.results import plots
 from mrctl.results.dataset import save, versions
@@ -31,6 +31,7 @@ def run(
     compare: Sequence[FeedforwardName],
     speed: float | None,
     margin: float,
+    avoid: Avoid,
     out: Path | None,
     as_json: bool,
 ) -> tuple[str, str]:
@@ -44,6 +45,7 @@ def run(
         compare: Further feedforwards.
         speed: Largest speed in m/s, or None.
         margin: Clearance of the plan in m.
+        avoid: What keeps the robot from obstacles.
         out: Folder for `result.zarr`, `mission.json` and figures; None saves nothing.
         as_json: Whether to return JSON instead of a table.
 
@@ -56,7 +58,7 @@ def run(
     task = task_of(world, scenario, start, goal)
     if out is not None and (output_folder(out) / "result.zarr").exists():
         raise InputError(f"out: {out} holds a result already; nothing was overwritten")
-    driven = navigate(task, scenario, compare, speed, margin, progress=True)
+    driven = navigate(task, scenario, compare, speed, margin, avoid, progress=True)
     table = driven.table
     values = {
         "world": world,

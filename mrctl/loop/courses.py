@@ -48,7 +48,7 @@ class Courses:
 
     def __init__(self, scenarios: Sequence[Scenario], lead: int = 0) -> None:
         """Takes the scenario of each robot, and the largest number of control ticks `ahead` of `at`."""
-        self._ticks, self._lead = scenarios[0].ticks, lead
+        self._ticks, self._lead = max(s.ticks for s in scenarios), lead
         self._courses, self._place = distinct_courses(scenarios)
         self._own = len(self._courses) == len(scenarios)  # whether no two robots share a course
         self._block = range(0)

@@ -19,6 +19,7 @@ from mrctl.control.stages import Stages
 from mrctl.kernel import Array, Rows
 from mrctl.loop.courses import Courses, start_pose
 from mrctl.loop.events import Events
+from mrctl.loop.goals import Goals
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.log import DIVERGED, Log
 from mrctl.loop.user_stages import StageError, UserEstimator, UserHierarchy, UserStage
@@ -182,8 +183,8 @@ def suited(scenario: Scenario) -> Scenario:
 
 
 def group_of(s: Scenario) -> Hashable:
-    """Returns what the runs of one simulation must share."""
-    rates = s.ticks, s.physics_step, s.control_period, s.motion_period
+    """Returns what the runs of one simulation must share; those with goals end one by one, and need not be as long."""
+    rates = s.ticks if s.goal is None else None, s.physics_step, s.control_period, s.motion_period
     chain = s.sensing.source, s.sensing.periods("delay", s.control_period)
     return s.world, s.obstacles, s.robot, s.steering, s.prior, s.learner, s.fel.hidden, *rates, *chain
 
@@ -202,7 +203,7 @@ class Simulation:
         events: The perturbations, pushes and other changes during the run.
         log: The recorded signals; the records from `tick` on are not written yet.
         tick: Number of control periods done.
-        ticks: Number of control periods in the whole run.
+        ticks: Number of control periods in the whole run, in the longest where they differ.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]) -> None:
@@ -219,7 +220,7 @@ class Simulation:
         scenarios = [arranged(s) for s in scenarios]
         first, size = scenarios[0], len(scenarios)
         self.scenarios = scenarios
-        self.ticks, self.tick, self.period = first.ticks, 0, first.control_period
+        self.ticks, self.tick, self.period = max(s.ticks for s in scenarios), 0, first.control_period
         self.model, robot = mjcf.build(first.world, first.steering, first.physics_step, first.robot, first.obstacles)
         self._reverses = mjcf.reverses(self.model, first.steering)
         for scenario in scenarios:
@@ -250,6 +251,8 @@ class Simulation:
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period)
         self.log = Log(self.ticks, size)
         self._failure_time = np.full(size, np.nan)
+        self._goals = Goals(scenarios)
+        self._learned: dict[int, Array] = {}  # what robots that arrived or got stuck had adapted then, flat
         self._sensed = -1  # the last tick that was measured
 
         goal = self.courses.at(0)
@@ -261,7 +264,7 @@ class Simulation:
 
     @property
     def running(self) -> bool:
-        """Whether the run goes on: ticks are left, and a robot has not failed."""
+        """Whether the run goes on: ticks are left, and a robot has neither failed nor arrived."""
         return self.tick < self.ticks and self.plant.running > 0
 
     def add(self, event: Event) -> None:
@@ -336,17 +339,32 @@ class Simulation:
         near = self.log.record(tick, plant.state, self.estimator.seen, self._goal, self.hierarchy.state)
         if not near:
             for row in np.flatnonzero(np.abs(self.log.at(tick)["lateral_error"]) > DIVERGED):
-                plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
+                if self.scenarios[row].goal is None:  # else it may wait, and go its own way
+                    plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
         self.tick += 1
         if plant.running < plant.size:
             new = plant.failed & np.isnan(self._failure_time)
+            new[list(self._learned)] = False
             self._failure_time[new] = self.tick * self.period
             self.log.blank(tick, plant.failed)
+        if self._goals.any:
+            self._end(tick)
+
+    def _end(self, tick: int) -> None:
+        """Ends the runs that have reached their goals at a tick, or are stuck; the record of the tick is kept."""
+        stage = self.hierarchy.learner
+        for row, reason in self._goals.ended(tick, self.log.at(tick)).items():
+            self.plant.fail(row, reason)
+            self._learned[row] = stage.adapted()[row] if isinstance(stage, Learner) else np.zeros(0)
+            if reason:
+                self._failure_time[row] = self.tick * self.period
 
     def result(self) -> xr.Dataset:
-        """Returns the signals so far; if every robot has failed, of the whole run, with NaN at the end."""
+        """Returns the signals so far; if every run has ended, of the whole time, with NaN at the end."""
         stage = self.hierarchy.learner
         learned = stage.adapted() if isinstance(stage, Learner) else np.zeros((0, 0))
+        for row, kept in self._learned.items() if learned.size else ():
+            learned[row] = kept
         weights = learned if learned.size else None
         size, robot = len(self.scenarios), self.plant.robot
         length = self.tick if self.running else self.ticks

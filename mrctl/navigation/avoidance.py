@@ -14,8 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mrctl.control.design import motion as design
+from mrctl.control.kanayama import GAINS, kanayama, posture_error
 from mrctl.control.stages import Motion
 from mrctl.kernel import Array, kernel
+from mrctl.loop.simulation import arranged
+from mrctl.scenario import Scenario
 from mrctl.theory.clearance import outside, point_to_segment
 from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings, moved
 from mrctl.theory.robot import Robot
@@ -83,6 +87,32 @@ class Avoiding:
         requests, outlines = np.asarray(self._motion.output(pose, twist, reference)), self._around.at(self._time)
         self._time += self._period
         return np.stack([avoid(r, p, outlines, self._barrier) for r, p in zip(requests, pose, strict=True)])
+
+
+class Following:
+    """Kanayama's motion controller as a stage, with the gains that a scenario has or that are designed for it."""
+
+    def __init__(self, robot: Robot, size: int, scenario: Scenario) -> None:
+        """Takes the nominal robot, the number of robots, and the scenario of all, which differ in what they learn."""
+        rigid = arranged(scenario).steering == "rigid"
+        latency = scenario.sensing.periods("delay", scenario.control_period) * scenario.control_period
+        gains = scenario.pid.channels(robot, rigid, latency, scenario.control_period)
+        designed = design(robot, rigid, gains, latency, scenario.control_period).kanayama
+        self._gains = np.zeros((), GAINS)
+        for name in self._gains.dtype.names or ():
+            own = getattr(scenario.kanayama, name)
+            self._gains[name] = getattr(designed, name) if own is None else own
+
+    def reset(self, pose: Array, reference: Array, period: float) -> None:
+        """Has nothing to start."""
+
+    def output(self, pose: Array, twist: Array, reference: Array) -> Array:
+        """Returns the requested twists, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
+        error, requests = np.empty(3), np.empty((len(pose), 2))
+        for row in range(len(pose)):
+            posture_error.compiled(pose[row], reference[row, :3], error)
+            kanayama.compiled(error, reference[row, 3:5], self._gains[()], requests[row])
+        return requests
 
 
 @kernel

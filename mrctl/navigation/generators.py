@@ -7,10 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.kernel import Array
 from mrctl.record import InputError, Record
 from mrctl.theory.obstacles import Box, Disc, Obstacle, Obstacles, Polygon, Pose
 
 THICK = 0.1  # m, thickness of walls
+
+Plane = NDArray[np.complexfloating]
 
 
 class Task(Record):
@@ -76,12 +79,7 @@ def corridor(width: float, seed: int = 0, pieces: int = 4, length: float = 3.0, 
     _positive(width=width, pieces=pieces, length=length)
     if not 0 <= turn < np.pi / 2 or (width / 2 + THICK) * np.tan(turn / 2) >= length / 2:
         raise InputError(f"turn: pieces of {length:g} m that are {width:g} m wide cannot bend by {turn:g} rad")
-    bends = np.random.default_rng(seed).uniform(-turn, turn, pieces - 1)
-    headings = np.clip(np.concatenate([[0.0], np.cumsum(bends)]), -np.pi / 2, np.pi / 2)  # it never comes back
-    half = np.concatenate([[0.0], np.diff(headings) / 2, [0.0]])
-    middle = np.concatenate([[0], np.cumsum(length * np.exp(1j * headings))])
-    # At a bend the walls meet on the bisector, farther from the middle line by 1/cos of half the bend.
-    mitre = 1j * np.exp(1j * (np.append(headings, headings[-1]) - half)) / np.cos(half)
+    headings, middle, mitre = bent_line(seed, pieces, length, turn)
     walls = []
     for side in (-1, 1):
         near, far = (middle + side * offset * mitre for offset in (width / 2, width / 2 + THICK))
@@ -91,6 +89,53 @@ def corridor(width: float, seed: int = 0, pieces: int = 4, length: float = 3.0, 
     inward = min(0.5, length / 4)
     first, last = middle[0] + inward, middle[-1] - inward * np.exp(1j * headings[-1])
     return _task(walls, (first.real, first.imag, 0.0), (last.real, last.imag, headings[-1]))
+
+
+def bent_line(seed: int, pieces: int, length: float, turn: float) -> tuple[Array, Plane, Plane]:
+    """Returns the middle line of a corridor; the arguments are those of `corridor`.
+
+    Returns:
+        Heading of each piece in rad, `(pieces,)`; and as x + i y the ends of the pieces in m and what has to be added
+        to them for each metre to the left, along the bisectors of the bends, `(pieces + 1,)` each.
+    """
+    bends = np.random.default_rng(seed).uniform(-turn, turn, pieces - 1)
+    headings = np.clip(np.concatenate([[0.0], np.cumsum(bends)]), -np.pi / 2, np.pi / 2)  # it never comes back
+    half = np.concatenate([[0.0], np.diff(headings) / 2, [0.0]])
+    middle = np.concatenate([[0], np.cumsum(length * np.exp(1j * headings))])
+    # At a bend the walls meet on the bisector, farther from the middle line by 1/cos of half the bend.
+    return headings, middle, 1j * np.exp(1j * (np.append(headings, headings[-1]) - half)) / np.cos(half)
+
+
+def corridor_width(footprint: Array, poses: Array, seed: int, pieces: int, length: float, turn: float) -> float:
+    """Returns the width in m of the narrowest corridor in which a robot touches no wall.
+
+    A wall at the offset h from the middle line is touched where a corner of the robot, or one of its sides at the
+    bisector of a bend, is at the offset h from the piece of the line beside it.
+
+    Args:
+        footprint: Corners of the robot in its frame in m, counter-clockwise, `(n, 2)`.
+        poses: x and y in m and θ in rad, `(T, 3)`.
+        seed: Seed, pieces, length and turn are those of `corridor`.
+        pieces: See there.
+        length: See there.
+        turn: See there.
+    """
+    headings, middle, mitre = bent_line(seed, pieces, length, turn)
+    corners = (poses[:, 0] + 1j * poses[:, 1])[:, None] + np.exp(1j * poses[:, 2:]) * (footprint @ [1, 1j])
+    following = np.roll(corners, -1, axis=1)
+    points = [corners]
+    for bend, left in zip(middle[1:-1], mitre[1:-1], strict=True):
+        here, there = (((p - bend) * left.conjugate()).imag for p in (corners, following))  # below 0 ahead of the bend
+        crosses = here * there < 0
+        points.append(
+            np.where(crosses, corners + (following - corners) * here / np.where(crosses, here - there, 1), corners)
+        )
+    every = np.concatenate(points, axis=1)
+    passed = [
+        ((every - bend) * left.conjugate()).imag < 0 for bend, left in zip(middle[1:-1], mitre[1:-1], strict=True)
+    ]
+    piece = np.sum(passed, axis=0, initial=0).astype(int)
+    return 2 * float(np.abs(((every - middle[piece]) * np.exp(-1j * headings[piece])).imag).max())
 
 
 def slalom(gap: float, seed: int = 0, gates: int = 5, spacing: float = 2.0, radius: float = 0.15) -> Task:

@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from mrctl.kernel import Array
+from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import simulate
 from mrctl.navigation import generators
+from mrctl.navigation.avoidance import Avoiding, Barrier, Following
 from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
+from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.planning import Plan, plan, shortcut, space
 from mrctl.navigation.sdf import read_sdf
+from mrctl.navigation.window import Window
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.record import InputError
 from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
-from mrctl.theory.clearance import clearances
-from mrctl.theory.obstacles import Obstacles, Pose, Surroundings
+from mrctl.theory.clearance import clearance, cover
+from mrctl.theory.obstacles import Obstacles, Outlines, Pose, Surroundings
 from mrctl.theory.references import Waypoints, check
 from mrctl.theory.robot import Robot
 from mrctl.theory.timing import RESERVE, Limits
@@ -45,9 +51,14 @@ GENERATORS: dict[str, Callable[[float, float, int], Task]] = {
 }
 ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
 TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
+WIDER = 2.0  # times both, where a plan may reverse, for at a change of direction a spline is straight
 CELLS = 4  # of the search in the width of the robot
-NEAR, TURNED, RESTING = 0.1, 0.2, 0.05  # m, rad and m/s, within which a robot has arrived
-PATIENCE = 2  # time after which a robot is out of time, over that of the plan
+PATIENCE, WAITING = 2, 4  # time after which a robot is out of time, over that of the plan; where it may wait
+SLIM = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
+PERIOD = 0.05  # s, motion period of `window` and `mppi`
+BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
+
+Avoid = Literal["none", "barrier", "window", "mppi"]
 
 
 class Mission(NamedTuple):
@@ -56,7 +67,7 @@ class Mission(NamedTuple):
     plan: Plan
     """Way from start to goal."""
     result: xr.Dataset
-    """Result of one robot or several, of twice the time of the plan unless one failed before."""
+    """Result of one robot or several, until the last of them has ended; NaN after the end of each."""
     table: pd.DataFrame
     """What `outcomes` returns."""
 
@@ -77,7 +88,7 @@ def task_of(world: str, scenario: Scenario, start: Pose | None = None, goal: Pos
     if colon and name in GENERATORS:
         if not (seed.isdecimal() and len(seed) < 10):
             raise InputError(f"world: {world}: the seed must be a number below 10⁹, as in {name}:3")
-        length, width = np.ptp(_robot(scenario)[0], axis=0).tolist()
+        length, width = np.ptp(robot_of(scenario)[0], axis=0).tolist()
         made = GENERATORS[name](length, width, int(seed))
         return made.replace(start=start or made.start, goal=goal or made.goal)
     if not (read := READERS.get(Path(world).suffix.lower())):
@@ -97,54 +108,109 @@ def navigate(
     compare: Sequence[FeedforwardName] = (),
     speed: float | None = None,
     margin: float = 0.05,
+    avoid: Avoid = "none",
     progress: bool = False,
 ) -> Mission:
     """Plans a way among the obstacles that stand still, and drives it with the hierarchy.
 
+    A robot that can be driven backwards reverses where there is no way forward, but not with `window` and `mppi`.
+
     Args:
         task: World, start and goal.
-        scenario: The robot and all else; reference, laps and obstacles are those of the mission.
+        scenario: The robot and all else; reference, laps, goal and obstacles are those of the mission.
         compare: Feedforwards of further robots, which drive the same plan, each alone.
         speed: Largest speed in m/s; by default 0.9 of the robot's.
         margin: Clearance that the plan keeps in m.
+        avoid: What keeps the robot from obstacles that move or are near: nothing, so that it follows the plan in time
+            (`none`), the filter on what it would do then (`barrier`), or a motion stage that goes along the plan in its
+            own time (`window`, `mppi`).
         progress: Whether to show a progress bar.
 
     Raises:
         InputError: Start or goal is in an obstacle, there is no way, or the robot cannot drive the plan.
     """
-    found, reference = planned(task, scenario, speed, margin)
-    own = scenario.replace(obstacles=task.obstacles, reference=reference, laps=PATIENCE, initial_pose=task.start)
+    model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
+    try:
+        found, reference = planned(task, scenario, speed, margin)
+    except InputError:
+        if avoid not in ("none", "barrier") or not mjcf.reverses(model, scenario.steering):
+            raise
+        found, reference = planned(task, scenario, speed, margin, reverse=True)
+    own = scenario.replace(
+        obstacles=task.obstacles, reference=reference, laps=PATIENCE, initial_pose=task.start, goal=task.goal
+    )
+    stage = avoiding(avoid, own)
+    if avoid in ("window", "mppi"):
+        own = own.replace(motion_period=PERIOD, laps=WAITING)
     others = [own.replace(name="", **FEEDFORWARDS[name]) for name in compare]
-    result = simulate([own, *others], progress=progress)
+    result = simulate([own, *others], progress=progress, motion=stage)
+    driven = np.flatnonzero(np.isfinite(result["x"].values).any(axis=0))
+    result = result.isel(time=slice(int(driven[-1]) + 1))
     return Mission(found, result, outcomes(result, task.goal, found))
 
 
-def planned(task: Task, scenario: Scenario, speed: float | None, margin: float) -> tuple[Plan, Waypoints]:
-    """Returns the plan and its reference; arguments and errors are those of `navigate`."""
+def avoiding(avoid: Avoid, scenario: Scenario) -> Callable[[Robot, int], Any] | None:
+    """Returns the factory of the motion stage of a mission, which bears the name in tables; None for that of mrctl."""
+    if avoid == "none":
+        return None
+    corners, robot = robot_of(scenario)
+    plan, obstacles = scenario.reference, scenario.obstacles
+    assert isinstance(plan, Waypoints)
+    barrier = Barrier(cover(corners, 4), 0.02, BRAKING * robot.max_acceleration, scenario.motion_period, 0.3)
+    follow = partial(Following, scenario=scenario)
+
+    def replan(pose: Array, outlines: Outlines) -> Waypoints | None:
+        start = Task.from_dict({"obstacles": obstacles, "start": pose.tolist(), "goal": scenario.goal})
+        with contextlib.suppress(InputError):  # it waits, and tries again
+            return planned(start, scenario, plan.speed, SLIM, outlines)[1]
+
+    def made(robot: Robot, size: int) -> Avoiding | Window | Mppi:
+        if avoid == "barrier":
+            return Avoiding(robot, size, follow, obstacles, barrier)
+        return (Window if avoid == "window" else Mppi)(robot, size, plan, obstacles, corners, replan)
+
+    made.__name__ = avoid
+    return made
+
+
+def planned(
+    task: Task,
+    scenario: Scenario,
+    speed: float | None,
+    margin: float,
+    outlines: Outlines | None = None,
+    reverse: bool = False,
+) -> tuple[Plan, Waypoints]:
+    """Returns the plan and its reference; arguments and errors are those of `navigate`.
+
+    The outlines are by default those of the obstacles that stand still, and the plan reverses only if it may.
+    """
+    if arrived(np.array(task.start), 0.0, np.array(task.goal)):
+        raise InputError("goal: the robot starts there")
     if not 0 <= margin <= 10:
         raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
-    corners, robot = _robot(scenario)
+    corners, robot = robot_of(scenario)
     still = Obstacles(shapes=tuple(shape for shape in task.obstacles.shapes if shape.course is None))
-    outlines = Surroundings(still).at(0.0)
-    radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit)))
+    outlines = Surroundings(still).at(0.0) if outlines is None else outlines
+    radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (
+        WIDER if reverse else 1
+    )
     ends = np.array([task.start[:2], task.goal[:2]])
     low, high = ends.min(axis=0) - 3 * radius, ends.max(axis=0) + 3 * radius  # room to turn
     if still.shapes:
         low, high = np.minimum(low, still.bounds[0]), np.maximum(high, still.bounds[1])
     where = space(outlines, corners, low, high, cell=float(np.ptp(corners[:, 1])) / CELLS, margin=margin)
-    found = plan(where, np.array(task.start), np.array(task.goal), radius, reverse=False)
-    found = shortcut(where, found, radius, reverse=False)
-    if found.length < NEAR / 2:
-        raise InputError("goal: the robot starts there")
+    found = plan(where, np.array(task.start), np.array(task.goal), radius, reverse)
+    found = shortcut(where, found, radius, reverse)
     reference = found.reference(RESERVE * robot.max_speed if speed is None else speed, Limits.of(robot))
-    check(reference, robot, reverse=False)
+    check(reference, robot, reverse)
     times = np.linspace(0, reference.period, max(2, round(found.length / 0.01)))
-    if clearances(corners, reference.sample(times).pose, times, Surroundings(still)).min() <= 0:
+    if min(clearance(corners, pose, outlines) for pose in reference.sample(times).pose) <= 0:
         raise InputError(f"plan: its smooth path comes nearer to an obstacle than the margin of {margin:g} m; set more")
     return found, reference
 
 
-def _robot(scenario: Scenario) -> tuple[Array, Robot]:
+def robot_of(scenario: Scenario) -> tuple[Array, Robot]:
     """Returns the footprint of a scenario's robot, corners in m, `(n, 2)`, and its parameters."""
     model, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
     return footprint(model), robot
@@ -153,7 +219,7 @@ def _robot(scenario: Scenario) -> tuple[Array, Robot]:
 def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
     """Returns how each robot of a result fared, until it arrived, failed or was out of time.
 
-    A robot has arrived when it is within 0.1 m and 0.2 rad of the goal and slower than 0.05 m/s.
+    A robot has arrived when it is within 0.1 m and 0.2 rad of the goal and slower than 0.05 m/s (`arrived`).
 
     Args:
         result: What `simulate` returns.
@@ -161,28 +227,24 @@ def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
         found: The plan.
 
     Returns:
-        A row for each robot: `outcome` (arrived, collided, out of time, or why it failed), `time` in s, `length` of its
-        path in m, `spl`, success weighted by path length, ℓ / max(ℓ, length) or 0 unless it arrived, with the length ℓ
-        of the plan (Anderson et al., "On evaluation of embodied navigation agents", 2018), the smallest `clearance` in
-        m, `position_rmse` in m, `energy` in J, and `expanded`, the number of poses that the search expanded.
+        A row for each robot: `outcome` (arrived, collided, stuck, out of time, or why it failed), `time` in s, `length`
+        of its path in m, `spl`, success weighted by path length, ℓ / max(ℓ, length) or 0 unless it arrived, with the
+        length ℓ of the plan (Anderson et al., "On evaluation of embodied navigation agents", 2018), the smallest
+        `clearance` in m, `position_rmse` in m, `energy` in J, and `expanded`, the number of poses that the search
+        expanded.
     """
     runs, period, rows = as_runs(result), control_period(result), []
     for row in range(runs.sizes["run"]):
-        run = runs.isel(run=row)
-        x, y, theta, v = (run[name].values for name in ("x", "y", "theta", "v"))
-        turned = np.abs(np.angle(np.exp(1j * (theta - goal[2]))))
-        near = (np.hypot(x - goal[0], y - goal[1]) < NEAR) & (turned < TURNED) & (np.abs(v) < RESTING)
-        failure = str(run["failure"].values)
-        ended = {"": "out of time", "collision": "collided"}.get(failure, failure)
-        alive = int(np.isfinite(x).sum())
-        last = int(near.argmax()) if near.any() else alive - 1
-        driven = run.isel(time=slice(last + 1))
+        driven = runs.isel(run=row).dropna("time", subset=["x"])
+        end, failure = driven.isel(time=-1), str(driven["failure"].values)
+        pose = np.array([float(end[name]) for name in ("x", "y", "theta")])
+        there = not failure and bool(arrived(pose, float(end["v"]), np.array(goal)))
         length = float(np.hypot(np.diff(driven["x"]), np.diff(driven["y"])).sum())
         rows.append({
-            "outcome": "arrived" if near.any() else ended,
-            "time": last * period,
+            "outcome": "arrived" if there else {"": "out of time", "collision": "collided"}.get(failure, failure),
+            "time": float(end["time"]),
             "length": length,
-            "spl": near.any() * found.length / max(found.length, length),
+            "spl": there * found.length / max(found.length, length),
             "clearance": float(driven["clearance"].min()) if "clearance" in driven else np.inf,
             "position_rmse": float(np.sqrt(np.mean(driven["longitudinal_error"] ** 2 + driven["lateral_error"] ** 2))),
             "energy": float(driven["power"].sum()) * period,

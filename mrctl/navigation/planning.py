@@ -11,6 +11,7 @@ pose.
 from __future__ import annotations
 
 import heapq
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -83,7 +84,9 @@ class Plan(NamedTuple):
         return float(np.hypot(*np.diff(self.poses[:, :2], axis=0).T).sum())
 
     def reference(self, speed: float, limits: Limits, spacing: float = 0.25) -> Waypoints:
-        """Returns the plan as a reference: a spline of continuous curvature, with the time law under all limits.
+        """Returns the plan as a reference: splines of continuous curvature, with the time law under all limits.
+
+        Where the plan changes its direction, a spline ends at rest and without curvature, and another one begins.
 
         Args:
             speed: Largest speed in m/s.
@@ -91,17 +94,24 @@ class Plan(NamedTuple):
             spacing: Distance of the points that the spline goes through in m.
 
         Raises:
-            InputError: The plan reverses, which no spline does, or the speed is not positive.
+            InputError: The speed is not positive, or a spline turns too far from the plan at a change of direction.
         """
-        if self.ways.min() < 0:
-            raise InputError("plan: reverses; plan with reverse = False for a reference")
-        way = np.append(0, np.cumsum(np.hypot(*np.diff(self.poses[:, :2], axis=0).T)))
-        places = np.linspace(0, way[-1], max(2, round(way[-1] / spacing) + 1))
-        if places[1] > 2 * CHECK:  # one more point near either end holds the heading there
-            places = np.concatenate([places[:1], [CHECK], places[1:-1], [way[-1] - CHECK], places[-1:]])
-        points = np.column_stack([np.interp(places, way, self.poses[:, k]) for k in range(2)])
+        turns = np.flatnonzero(self.ways[2:] * self.ways[1:-1] < 0) + 1
+        ends = [0, *turns.tolist(), len(self.poses) - 1]
+        legs = [_points(self.poses[a : b + 1], spacing) for a, b in pairwise(ends)]
+        points = np.concatenate([legs[0][:1], *(leg[1:] for leg in legs)])
+        cusps = np.cumsum([len(leg) - 1 for leg in legs[:-1]], dtype=int).tolist()
         values = {"points": points.tolist(), "closed": False, "timing": "limits", "speed": speed, "limits": limits}
-        return Waypoints.from_dict(values, "plan")
+        return Waypoints.from_dict(values | {"cusps": [*([0] if self.ways[1] < 0 else []), *cusps]}, "plan")
+
+
+def _points(poses: Array, spacing: float) -> Array:
+    """Returns points at equal distances of about the spacing in m along poses, `(n, 2)`, with two more at the ends."""
+    way = np.append(0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+    places = np.linspace(0, way[-1], max(2, round(way[-1] / spacing) + 1))
+    if places[1] > 2 * CHECK:  # one more point near either end holds the heading there
+        places = np.concatenate([places[:1], [CHECK], places[1:-1], [way[-1] - CHECK], places[-1:]])
+    return np.column_stack([np.interp(places, way, poses[:, k]) for k in range(2)])
 
 
 def space(

@@ -186,7 +186,7 @@ def steerings(model: mujoco.MjModel) -> tuple[Steering, ...]:
 
 def reverses(model: mujoco.MjModel, steering: Steering | None) -> bool:
     """Tells whether a robot can be driven backwards; a fork that trails would jackknife."""
-    return steering == "rigid" or not has(model, "joint", "steering")
+    return (steering or steerings(model)[0]) == "rigid" or not has(model, "joint", "steering")
 
 
 def _set_timestep(model: mujoco.MjModel, timestep: float) -> None:

@@ -122,10 +122,39 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 
     wins, ties, n = int(((first < second) & ~tied).sum()), int(tied.sum()), len(first)
     if not n:
         return Superiority(np.nan, np.nan, np.nan, 0, 0, 0)
-    p, z = (wins + ties / 2) / n, NormalDist().inv_cdf((1 + level) / 2)
-    centre, half = p + z * z / (2 * n), z * np.sqrt(p * (1 - p) / n + (z / (2 * n)) ** 2)
+    p = (wins + ties / 2) / n
+    return Superiority(p, *wilson(p, n, level), wins, ties, n - wins - ties)
+
+
+def wilson(share: float, n: int, level: float = 0.95) -> tuple[float, float]:
+    """Wilson's (1927) score interval of a share of n trials."""
+    z = NormalDist().inv_cdf((1 + level) / 2)
+    centre, half = share + z * z / (2 * n), z * np.sqrt(share * (1 - share) / n + (z / (2 * n)) ** 2)
     low, high = (float(np.clip((centre + sign * half) / (1 + z * z / n), 0, 1)) for sign in (-1, 1))
-    return Superiority(p, low, high, wins, ties, n - wins - ties)
+    return low, high
+
+
+def quantile_interval(samples: ArrayLike, share: float, level: float = 0.95) -> Interval:
+    """Quantile with the interval between two order statistics, which holds for any distribution (Conover 1999, 3.2).
+
+    Args:
+        samples: One number a run (n,); NaN or infinite where it failed, which counts as infinite.
+        share: Share of the samples that are at most the quantile, between 0 and 1.
+        level: Confidence level, between 0 and 1.
+
+    Returns:
+        The least sample that this share of the samples do not exceed; an end of the interval is infinite where the
+        samples are too few for it. `samples` are all that are finite.
+    """
+    from scipy.stats import binom  # the import takes 0.4 s
+
+    values = np.asarray(samples, float).ravel()
+    fine = np.isfinite(values)
+    ordered, n = np.sort(np.where(fine, values, np.inf)), len(values)
+    low, high = (int(rank) for rank in binom.ppf([(1 - level) / 2, (1 + level) / 2], n, share))
+    ends = np.concatenate([[-np.inf], ordered, [np.inf]])  # the number of samples up to the quantile is binomial
+    value = float(ordered[int(np.ceil(share * n - 1e-9)) - 1]) if n else np.nan
+    return Interval(value, float(ends[low]), float(ends[high + 1]), int(fine.sum()), int((~fine).sum()))
 
 
 def cvar(samples: ArrayLike, share: float = 0.05) -> float:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import cmath
 import contextlib
 from functools import cached_property, lru_cache
-from itertools import product
+from itertools import pairwise, product
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -271,6 +271,7 @@ class StopAndGo(Record):
         return along_path(start * self.distance + x + 0j, 0, 0, 0, v, a)
 
 
+KINK = 0.15  # rad, largest change of the heading at a cusp
 _LOOP = ((0.0, 0.0), (1.5, 0.0), (3.0, 0.8), (2.5, 2.2), (1.0, 1.6), (-0.8, 2.0), (-1.2, 0.6))
 
 
@@ -291,9 +292,14 @@ class Waypoints(Record):
     """Keep the speed all along the path (`constant`), or drive as fast as the `limits` allow, an open one from rest."""
     limits: Limits = Limits()
     """Limits that `timing` = `limits` keeps, besides the speed."""
+    cusps: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    """Indices of the points at which the robot stops and drives on in the other direction, with 0 for a start in
+    reverse; only for an open curve with `timing` = `limits`."""
 
     @model_validator(mode="after")
     def _regular(self) -> Waypoints:
+        if self.cusps:
+            return self._turning()
         least = 3 if self.closed else 2
         if len(self.points) < least:
             raise ValueError(f"points: {'a closed' if self.closed else 'an open'} curve needs at least {least} points")
@@ -313,6 +319,46 @@ class Waypoints(Record):
             raise ValueError(f"stop_time: too long to stop from {self.speed:g} m/s within {path.length:.2f} m")
         return self
 
+    def _turning(self) -> Waypoints:
+        """Checks a curve with cusps, each part of it as a curve of its own."""
+        if self.closed or self.timing != "limits":
+            raise ValueError("cusps: only an open curve with timing = limits has them")
+        if list(self.cusps) != sorted(set(self.cusps)) or self.cusps[-1] >= len(self.points) - 1:
+            raise ValueError(f"cusps: must increase, and be before the last point, {len(self.points) - 1}")
+        heading = None
+        for part, back in self._parts:
+            ends = _spline(part.points, False).heading[[0, -1]] + np.pi * back
+            if heading is not None and abs(cmath.phase(cmath.exp(1j * (ends[0] - heading)))) > KINK:
+                raise ValueError(f"cusps: the curve turns by more than {KINK:g} rad at one")
+            heading = ends[1]
+        return self
+
+    @property
+    def _parts(self) -> list[tuple[Waypoints, bool]]:
+        """The curves between the cusps, and whether each is driven in reverse."""
+        places = [0, *(cusp for cusp in self.cusps if cusp), len(self.points) - 1]
+        first = 0 in self.cusps
+        return [
+            (self.model_copy(update={"points": self.points[a : b + 1], "cusps": ()}), (k + first) % 2 == 1)
+            for k, (a, b) in enumerate(pairwise(places))
+        ]
+
+    def _sample_parts(self, t: Array) -> Motion:
+        """Samples a curve with cusps at the times t in s, shape (T,); V is negative in reverse."""
+        samples, since, heading = np.empty((len(t), 7)), 0.0, 0.0
+        for part, back in self._parts:
+            spline = _spline(part.points, False)
+            s, v, a = part._law.at(np.maximum(t - since, 0.0))
+            p, theta, k, dk = spline.at(s)
+            sign = -1.0 if back else 1.0
+            start = spline.heading[0] + np.pi * back
+            turn = 2 * np.pi * round((heading - start) / (2 * np.pi))
+            moved = along_path(p, theta + np.pi * back + turn, sign * k, dk, sign * v, sign * a)
+            now = (t >= since) | (since == 0)
+            samples[now] = np.hstack(moved)[now]
+            since, heading = since + part._law.duration, spline.heading[-1] + np.pi * back + turn
+        return Motion(samples[:, :3], samples[:, 3:5], samples[:, 5:])
+
     @property
     def _law(self) -> SmoothLaw:
         return _law(self.points, self.closed, self.speed, self.limits)  # type: ignore[arg-type]
@@ -320,6 +366,8 @@ class Waypoints(Record):
     @property
     def period(self) -> float:
         """Time of one lap, or until rest, in s."""
+        if self.cusps:
+            return sum(part.period for part, _ in self._parts)
         if self.timing == "limits":
             return self._law.duration
         return _spline(self.points, self.closed).length / self.speed + (0 if self.closed else self.stop_time / 2)
@@ -329,6 +377,8 @@ class Waypoints(Record):
 
         A closed spline is periodic with four continuous derivatives. An open one has no curvature at its ends.
         """
+        if self.cusps:
+            return self._sample_parts(t)
         if self.timing == "limits":
             s, v, a = self._law.at(t)
             return along_path(*_spline(self.points, self.closed).at(s), v, a)
@@ -396,10 +446,10 @@ class _Spline:
         return p, heading + lap * (self.heading[-1] - self.heading[0]), log.imag / step, sharpness
 
 
-_spline = lru_cache(maxsize=64)(_Spline)
+_spline = lru_cache(maxsize=512)(_Spline)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=512)  # a comparison has hundreds of plans, and their scenarios ask for the time again and again
 def _law(points: tuple[tuple[float, float], ...], closed: bool, speed: float, limits: Limits) -> SmoothLaw:
     """The time law along the spline through the points."""
     spline = _spline(points, closed)

@@ -52,6 +52,7 @@ HIDDEN = (
     "events",
     "obstacles",
     "initial_pose",
+    "goal",
     "initial_spread",
     "robot",
     "physics_step",

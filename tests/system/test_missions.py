@@ -54,6 +54,33 @@ def test_outcomes() -> None:
     assert late.table["time"].iloc[0] == pytest.approx(late.result.sizes["time"] * 0.01, abs=0.02)
 
 
+def test_ends() -> None:
+    """A run ends where the robot rests at its goal, or is stuck; alone it has the bits that it has beside others."""
+    line = mrctl.Waypoints(points=((0, 0), (1, 0), (2, 0)), closed=False, timing="limits", speed=0.8)
+    own = Scenario(reference=line, laps=8, goal=(2.0, 0.0, 0.0), learner="composite", prior="model")
+    cases = [
+        own,
+        own.replace(seed=1, perturbation="all"),
+        own.replace(goal=(1.0, 0.0, 0.0)),  # where it does not rest
+        own.replace(perturbation={"supply_factor": 0.02}),
+        own.replace(goal=None),
+    ]
+    together = mrctl.simulate(cases)
+    assert together["failure"].values.tolist() == ["", "", "stuck", "stuck", ""]
+    for row, scenario in enumerate(cases):
+        alone, beside = mrctl.simulate(scenario), together.isel(run=row)
+        for name in ("x", "v", "voltage_left", "failure_time", "weights"):
+            np.testing.assert_array_equal(alone[name], beside[name], name)
+    driven = together.isel(run=1).dropna("time", subset=["x"])
+    rests = (np.hypot(driven["x"] - 2, driven["y"]) < 0.1) & (np.abs(driven["v"]) < 0.05)
+    assert line.period - 1 < float(driven["time"][-1]) < line.period + 2 and np.flatnonzero(rests).tolist() == [
+        driven.sizes["time"] - 1
+    ]
+    stands = together["x"].isel(run=3).dropna("time").values
+    assert len(stands) == 501 and float(np.ptp(stands)) < 0.05
+    assert bool(np.isfinite(together["x"].isel(run=4)).all())
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

@@ -3,12 +3,26 @@
 import numpy as np
 
 from mrctl import Limits, Scenario, simulate
-from mrctl.navigation.generators import doorway
+from mrctl.navigation.generators import doorway, parking_bay
+from mrctl.navigation.mission import navigate
 from mrctl.navigation.planning import plan, shortcut, space
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
+from mrctl.results.dataset import scenarios_of
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.obstacles import Surroundings
+
+
+def test_parks():
+    """The racing car, which has no way forward into a bay, goes back and forth, rests at every cusp, and parks."""
+    scenario = Scenario(robot={"path": "racecar"}, steering="rigid", prior="model", learner="none")
+    parked = navigate(parking_bay(1.5, 0.8, 1), scenario, margin=0.03)
+    (own,) = scenarios_of(parked.result)
+    assert parked.table["outcome"].tolist() == ["arrived"] and own.reference.cusps
+    run = parked.result.isel(run=0)
+    assert float(run["v"].min()) < -0.3 and float(run["v"].max()) > 0.3
+    assert np.abs(run["v"].values[np.isclose(run["v_ref"], 0, atol=1e-3)]).max() < 0.05
+    assert parked.plan.ways.min() < 0 and float(run["clearance"].min()) > 0.02
 
 
 def test_through_a_door():

@@ -131,3 +131,15 @@ def test_floor():
     """Errors that differ by no more than the floor are a tie; one that failed loses at any floor."""
     found = comparison.superiority([1.0, 2.0, 3.0, np.nan, 1.0], [1.05, 1.0, 3.5, 9.0, np.nan], floor=0.1)
     assert (found.wins, found.ties, found.losses) == (2, 1, 2) and found.value == pytest.approx(0.5)
+
+
+def test_quantile_interval():
+    """The interval holds the true quantile as often as it says, and has no end where the samples are too few."""
+    random = np.random.default_rng(3)
+    found = [comparison.quantile_interval(random.exponential(size=80), 0.95) for _ in range(500)]
+    held = [one.low <= -np.log(0.05) <= one.high for one in found]
+    assert 0.94 <= np.mean(held) <= 0.99
+    few = comparison.quantile_interval([3, 1, np.nan, 2], 0.75)
+    assert few == (3, 1, np.inf, 3, 1)
+    assert comparison.quantile_interval(np.arange(71.0), 0.95).high == np.inf > 71  # 0.95⁷¹ > 0.025
+    assert comparison.quantile_interval(np.arange(72.0), 0.95).high == 71

@@ -118,7 +118,7 @@ def test_around():
 
 
 def test_reference():
-    """A forward plan becomes a reference of the same course, which keeps the limits and the clearance."""
+    """A forward plan becomes a reference of the same course, which keeps limits and clearance; another one reverses."""
     task = corridor(1.2, 2)
     low, high = task.obstacles.bounds
     where = space(Surroundings(task.obstacles).at(0.0), FOOTPRINT, low, high)
@@ -135,8 +135,10 @@ def test_reference():
     assert min(shapely.Polygon(turned(FOOTPRINT, pose)).distance(walls) for pose in motion.pose) > 0.02
     where = prepared(Obstacles(shapes=(Disc(x=3.9, y=3.9),)))
     back = plan(where, (0, 0, 0), (-1, 0, 0), RADIUS, True)
-    with pytest.raises(InputError, match="plan: reverses"):
-        back.reference(0.8, Limits())
+    reference = back.reference(0.8, Limits())
+    pose, (v, omega), _ = (part.T for part in reference.sample(np.linspace(0, reference.period, 500)))
+    assert reference.cusps == (0,) and v.min() < -0.5 and v.max() < 1e-9 and np.abs(omega).max() < 1e-9
+    assert np.allclose(pose[:, -1], (-1, 0, 0), atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -301,3 +301,51 @@ def test_bad_field(values, words):
     message = describe(refusal.value)
     assert "\n" not in message
     assert re.search(words, message), message
+
+
+CUSPS = {
+    "points": ((0, 0), (0.6, 0.1), (1.2, 0.5), (0.7, 0.35), (0.1, 0.5), (0.6, 0.4), (1.2, 0.4)),
+    "closed": False,
+    "timing": "limits",
+    "speed": 0.6,
+}
+
+
+@pytest.mark.parametrize("cusps", [(2, 4), (0, 2, 4)])
+def test_cusps(cusps: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    """At each cusp the robot rests and changes its direction; twist and acceleration are derivatives of the pose."""
+    monkeypatch.setattr("mrctl.theory.references.KINK", 1.0)  # these points were not made with care
+    reference = Waypoints(**CUSPS, cusps=cusps)
+    t = np.linspace(0, reference.period, 20_001)
+    pose, twist, acceleration = reference.sample(t)
+    step = t[1]
+    rests = np.abs(twist[:, 0]) < 1e-6
+    turns = np.flatnonzero(np.diff(np.sign(twist[~rests, 0])))
+    assert len(turns) == 2 and np.sign(twist[~rests, 0][0]) == (-1 if 0 in cusps else 1)
+    at = [np.argmin(np.hypot(*(pose[:, :2] - CUSPS["points"][k]).T)) for k in (2, 4)]
+    assert np.abs(twist[at]).max() < 1e-3 and np.hypot(*(pose[-1, :2] - CUSPS["points"][-1])) < 1e-9
+    smooth = np.ones(len(t), bool)
+    for k in at:
+        smooth[max(0, k - 3) : k + 4] = False  # where the heading may jump by the kink
+    rate = np.gradient(pose, step, axis=0)
+    along = rate[:, 0] * np.cos(pose[:, 2]) + rate[:, 1] * np.sin(pose[:, 2])
+    inner = slice(2, -2)
+    np.testing.assert_allclose(along[smooth][inner], twist[smooth, 0][inner], atol=1e-4)
+    np.testing.assert_allclose(rate[smooth, 2][inner], twist[smooth, 1][inner], atol=2e-3)
+    change = np.gradient(twist, step, axis=0)
+    np.testing.assert_allclose(change[smooth][inner], acceleration[smooth][inner], atol=2e-2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"closed": True}, "cusps: only an open curve"),
+        ({"cusps": (4, 2)}, "cusps: must increase"),
+        ({"cusps": (6,)}, "cusps: must increase"),
+        ({"cusps": (1,)}, "cusps: the curve turns"),
+    ],
+)
+def test_bad_cusps(changes: dict, words: str) -> None:
+    """Cusps that no robot can drive are refused."""
+    with pytest.raises(InputError, match=words):
+        Waypoints.from_dict(CUSPS | {"cusps": (2, 4)} | changes)

@@ -1,0 +1,294 @@
+"""`mrctl navigate --suite`: how narrow a corridor, and how fast, for velocity controllers that drive the same plans.
+
+A draw is a corridor with a plan through it, and a robot on one day (`mrctl.scenario.replicates`); all controllers have
+the same draws. A plan keeps as far from the walls as it can. The robots follow it in time and do not see walls, so a
+run in the open shows how wide the corridor must be for them to touch none: a run that ends at its goal needs that
+width, and any other an infinite one. The critical width is what 95 % of the draws need at most, at the largest speed;
+the allowance is the same of the width beyond that of the plan, which perfect tracking needs. The critical speed is the
+largest at which, and at all slower ones, 95 % of the draws need no more than a given allowance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from tqdm import tqdm
+
+from mrctl.experiments.cases import HARD
+from mrctl.experiments.suite_tables import TITLES, Table
+from mrctl.experiments.tables import machine, number, output_folder, write_json
+from mrctl.kernel import Array
+from mrctl.loop.goals import arrived
+from mrctl.loop.simulation import cores, simulate
+from mrctl.navigation.generators import corridor, corridor_width
+from mrctl.navigation.mission import PATIENCE, planned, robot_of
+from mrctl.record import InputError
+from mrctl.results.comparison import quantile_interval, superiority, wilson
+from mrctl.results.dataset import versions
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
+from mrctl.theory.obstacles import Pose
+from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
+from mrctl.theory.references import Waypoints
+from mrctl.theory.timing import RESERVE, Limits
+
+CONTROLLERS: tuple[FeedforwardName, ...] = ("none", "model", "fel", "model+composite")
+PLANTS: dict[str, Perturbation] = {
+    "nominal": Perturbation(),
+    "all": PERTURBATIONS["all"],
+    "sagging battery": HARD["sagging battery"],
+}
+SPEEDS = (0.3, 0.45, 0.6, 0.75, RESERVE)  # over the robot's largest
+SHAPE: dict[str, Any] = {"pieces": 3, "length": 2.0, "turn": np.pi / 4}  # of the corridors, in m and rad
+ROOMY = 1.5  # width of the corridor of a plan over that of the robot
+MARGINS = (0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)  # of the plan, over half of the rest; the largest that it can keep
+SLACK = 0.005  # m, the allowance for the critical speed; chosen
+MOST = 10  # corridors that are made, over the number of draws
+SHARE = 0.95
+DRAWS = {"quick": 20, "core": 80}  # with fewer than 72 the interval of a critical width has no upper end
+EVERY = 2  # control periods between the poses whose widths are looked at
+TIE = 1e-3  # m
+PACE = 100  # simulated s in a s of one core, planning included
+
+
+Mode = Literal["quick", "core"]
+POSE = ("x", "y", "theta")
+
+
+class Draw(NamedTuple):
+    """A corridor, and the plan through it at each speed."""
+
+    seed: int
+    references: list[Waypoints]
+    goal: Pose
+
+
+class Found(NamedTuple):
+    """The widths in m that the runs need, infinite where a robot did not arrive."""
+
+    needed: Array
+    """At each speed, `(speeds, controllers, plants, draws)`."""
+    posture_known: Array
+    """At the largest speed, where the true posture replaces the estimate, `(controllers, plants, draws)`."""
+    on_reference: Array
+    """At the largest speed, if the estimate were always on the reference, `(controllers, plants, draws)`."""
+    plans: Array
+    """Of the plans themselves, `(draws,)`."""
+    speeds: list[float]
+    """In m/s."""
+    impassable: int
+    """Number of corridors that were left out, for no plan goes through them."""
+
+
+def suite(base: Scenario, mode: Mode, out: Path) -> str:
+    """Drives all draws; writes `table.md` and `table.json`.
+
+    Args:
+        base: Robot, steering, sensing and all else that is the same for all.
+        mode: Which suite.
+        out: Folder.
+
+    Returns:
+        The tables in Markdown.
+
+    Raises:
+        InputError: The folder cannot be written, or the robot does not fit most corridors.
+    """
+    output_folder(out)
+    found = drive(base, DRAWS[mode])
+    shown = f"{base.robot.path}, {mode}"
+    tables = [critical_widths(found, shown), critical_speeds(found, shown), budget(found, shown)]
+    text = "\n".join(table.markdown for table in tables)
+    (out / "table.md").write_text(text)
+    values = {name: np.asarray(part).tolist() for name, part in found._asdict().items()}
+    source = {"versions": versions(), "machine": machine(), "mode": mode, "scenario": base.model_dump(mode="json")}
+    write_json(out / "table.json", source | {"controllers": CONTROLLERS, "plants": list(PLANTS)} | values)
+    return text
+
+
+def drive(base: Scenario, count: int) -> Found:
+    """Drives so many draws at all speeds with all controllers on all plants; says first how long that takes."""
+    corners, robot = robot_of(base)
+    width = ROOMY * float(np.ptp(corners[:, 1]))
+    speeds = [share * robot.max_speed for share in SPEEDS]
+    every = (draw(base, seed, width, speeds) for seed in range(MOST * count))
+    draws = list(islice(filter(None, every), count))
+    if len(draws) < count:
+        raise InputError(f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m")
+    times = sum(reference.period for one in draws for reference in (*one.references, one.references[-1]))
+    minutes = times * len(CONTROLLERS) * len(PLANTS) / PACE / cores() / 60
+    runs = count * len(CONTROLLERS) * len(PLANTS) * (len(SPEEDS) + 1)
+    print(f"{runs:,} runs, about {max(1, round(minutes))} min on {cores()} cores", flush=True)
+    size = len(CONTROLLERS), len(PLANTS), count
+    needed, known, on_reference = np.empty((len(SPEEDS), *size)), np.empty(size), np.empty(size)
+    with tqdm(total=len(CONTROLLERS) * (len(SPEEDS) + 1), unit="batch") as bar:
+        for c, name in enumerate(CONTROLLERS):
+            own = base.replace(**FEEDFORWARDS[name])
+            for k in range(len(SPEEDS)):
+                needed[k, c], on_reference[c] = _widths(_simulated(own, draws, k), draws, corners)
+                bar.update()
+            informed = own.replace(sensing=own.sensing.replace(estimator="truth"))
+            known[c], _ = _widths(_simulated(informed, draws, -1), draws, corners)
+            bar.update()
+    plans = []
+    for one in draws:
+        fastest = one.references[-1]
+        poses = fastest.sample(np.arange(0, fastest.period, 0.02)).pose
+        plans.append(corridor_width(corners, poses, one.seed, **SHAPE))
+    return Found(needed, known, on_reference, np.array(plans), speeds, draws[-1].seed + 1 - count)
+
+
+def draw(base: Scenario, seed: int, width: float, speeds: Sequence[float]) -> Draw | None:
+    """Plans a draw once, with the largest margin that there is a plan for, and times it for each speed.
+
+    Args:
+        base: The robot.
+        seed: Seed of the corridor, and of the robot on that day.
+        width: Width of the corridor in m.
+        speeds: Largest speeds in m/s.
+
+    Returns:
+        The draw, or None where no plan goes through the corridor.
+    """
+    limits = Limits.of(robot_of(base)[1])
+    task, rest = corridor(width, seed, **SHAPE), width * (1 - 1 / ROOMY)
+    for share in MARGINS:
+        try:
+            found, fastest = planned(task, base, speeds[-1], share * rest / 2)
+        except InputError:
+            continue
+        return Draw(seed, [*(found.reference(speed, limits) for speed in speeds[:-1]), fastest], task.goal)
+    return None
+
+
+def _simulated(own: Scenario, draws: Sequence[Draw], speed: int) -> xr.Dataset:
+    """Drives all draws on all plants at one speed; run p · D + d is draw d of D on plant p."""
+    own = own.replace(laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
+    scenarios = [
+        own.replace(perturbation=plant, reference=one.references[speed], goal=one.goal)
+        for plant in PLANTS.values()
+        for one in draws
+    ]
+    return simulate([replicates(s, 1, draws[k % len(draws)].seed)[0] for k, s in enumerate(scenarios)])
+
+
+def _widths(result: xr.Dataset, draws: Sequence[Draw], corners: Array) -> tuple[Array, Array]:
+    """Returns the width that each run needs in m, and what it would if the estimate were always on the reference.
+
+    Both are infinite where the robot did not arrive, `(plants, draws)` each.
+    """
+    pose, seen, wanted = (
+        np.stack([result[f"{name}{end}"].values for name in POSE], -1) for end in ("", "_measured", "_ref")
+    )
+    v, failure = result["v"].values, result["failure"].values
+    found = np.full((2, len(pose)), np.inf)
+    for row in range(len(pose)):
+        one, driven = draws[row % len(draws)], np.flatnonzero(np.isfinite(v[row]))
+        if failure[row] == "" and arrived(pose[row, driven[-1]], v[row, driven[-1]], np.array(one.goal)):
+            own = pose[row, driven[::EVERY]]
+            on_reference = wanted[row, driven[::EVERY]] + own - seen[row, driven[::EVERY]]
+            found[:, row] = [corridor_width(corners, poses, one.seed, **SHAPE) for poses in (own, on_reference)]
+    first, second = found.reshape(2, len(PLANTS), -1)
+    return first, second
+
+
+def critical_widths(found: Found, shown: str) -> Table:
+    """The critical widths at the largest speed, and in how many draws a controller needs less than two others."""
+    needed, rows = found.needed[-1], []
+    for plant, own in zip(PLANTS, needed.swapaxes(0, 1), strict=True):
+        for name, one in zip(CONTROLLERS, own, strict=True):
+            there = int(np.isfinite(one).sum())
+            low, high = wilson(there / len(one), len(one))
+            share = f"{there}/{len(one)} [{100 * low:.0f}, {100 * high:.0f}] %"
+            rows.append([plant, TITLES.get(name, name), share, _quantile(one, 1e3), _quantile(one - found.plans, 1e3)])
+            for rival in ("none", "model"):
+                wins = superiority(one, own[CONTROLLERS.index(rival)], floor=TIE)
+                rows[-1].append("" if rival == name else f"{wins.value:.2f} [{wins.low:.2f}, {wins.high:.2f}]")
+    header = [
+        "plant",
+        "controller",
+        "arrived",
+        "critical width, mm",
+        "allowance, mm",
+        "needs less than PID",
+        "less than model",
+    ]
+    says = (
+        f"At 95 % success the plans themselves need {_quantile(found.plans, 1e3)} mm; corridors left out because no "
+        f"plan goes through: {found.impassable}. In paired draws, with 95 % "
+        f"confidence and differences up to {1e3 * TIE:.0f} mm as ties: {_against('none', needed)}; "
+        f"{_against('model', needed)}."
+    )
+    return Table(f"Critical width of a corridor at {found.speeds[-1]:.2f} m/s ({shown})", says, _frame(rows, header))
+
+
+def critical_speeds(found: Found, shown: str) -> Table:
+    """The critical speeds."""
+    fits = np.cumprod(found.needed <= found.plans + SLACK, axis=0).sum(axis=0)  # how many speeds, from the slowest on
+    critical, rows = np.array([0.0, *found.speeds])[fits], []
+    for plant, own in zip(PLANTS, critical.swapaxes(0, 1), strict=True):
+        for name, one in zip(CONTROLLERS, own, strict=True):
+            counts = " / ".join(f"{np.mean(one >= speed):.2f}" for speed in found.speeds)
+            rows.append([plant, TITLES.get(name, name), _quantile(-one, -1), counts])
+    header = ["plant", "controller", "critical speed, m/s", "success up to each speed"]
+    says = (
+        f"Speeds of {', '.join(f'{speed:.2f}' for speed in found.speeds)} m/s; 0 where even the slowest is too fast. "
+        f"In paired draws, with 95 % confidence: {_against('none', -critical)}; {_against('model', -critical)}."
+    )
+    return Table(f"Critical speed with an allowance of {1e3 * SLACK:.0f} mm ({shown})", says, _frame(rows, header))
+
+
+def budget(found: Found, shown: str) -> Table:
+    """What is left of the allowance when one source of error is taken away."""
+    rows, gains = [], {}
+    for p, plant in enumerate(PLANTS):
+        for c, name in enumerate(CONTROLLERS):
+            every = found.needed[-1, c, p], found.posture_known[c, p], found.on_reference[c, p]
+            parts = [needed - found.plans for needed in every]
+            rows.append([plant, TITLES.get(name, name), *(_quantile(part, 1e3) for part in parts)])
+            value = [quantile_interval(part, SHARE).value for part in parts]
+            if plant == "nominal" and np.isfinite(value).all():
+                gains[TITLES.get(name, name)] = (
+                    f"{1e3 * (value[0] - value[1]):.1f} and {1e3 * (value[0] - value[2]):.1f}"
+                )
+    told = "; ".join(f"`{name}` {gain} mm" for name, gain in gains.items())
+    says = (
+        "On the nominal plant a known posture takes from the allowance, and an estimate that is always on the "
+        f"reference: {told}. The map has no errors here."
+    )
+    header = ["plant", "controller", "allowance, mm", "with a known posture", "with the estimate on the reference"]
+    return Table(f"Error budget of the allowance ({shown})", says, _frame(rows, header))
+
+
+def _frame(rows: list[list[str]], header: list[str]) -> pd.DataFrame:
+    return pd.DataFrame(rows, columns=header)  # pyright: ignore[reportArgumentType] (a list of names)
+
+
+def _quantile(samples: Array, scale: float) -> str:
+    """A quantile with its interval; of samples that were negated the scale is negative, so that the ends swap."""
+    value, low, high, *_ = quantile_interval(samples, SHARE)
+    low, high = sorted((scale * low, scale * high))
+    return f"{_text(scale * value)} [{_text(low)}, {_text(high)}]"
+
+
+def _text(value: float) -> str:
+    return "∞" if value == np.inf else "–" if not np.isfinite(value) else number(value, 4) if value else "0"
+
+
+def _against(rival: FeedforwardName, samples: Array) -> str:
+    """Who does better or worse than a rival on which plants; samples `(controllers, plants, draws)`, less is better."""
+    told = {"better": [], "worse": []}
+    for c, name in enumerate(CONTROLLERS):
+        for p, plant in enumerate(PLANTS):
+            wins = superiority(samples[c, p], samples[CONTROLLERS.index(rival), p], floor=TIE)
+            if name != rival and (wins.low > 0.5 or wins.high < 0.5):
+                told["better" if wins.low > 0.5 else "worse"].append(f"`{TITLES.get(name, name)}` ({plant})")
+    parts = [
+        f"{word} than `{TITLES.get(rival, rival)}` are {', '.join(names)}" for word, names in told.items() if names
+    ]
+    return "; ".join(parts) or f"none differs from `{TITLES.get(rival, rival)}`"

@@ -1,0 +1,47 @@
+"""Model predictive path integral control: the mean of many random twists, weighted by what their roll-outs cost.
+
+Williams, Aldrich and Theodorou, "Model predictive path integral control: from theory to parallel computation", Journal
+of Guidance, Control, and Dynamics 40(2), 2017. With costs S of K roll-outs the twists are Σ w u, w ∝ exp(−S/λ). Every
+limit that the twists of a roll-out keep is kept by their mean, as it is convex. The cost has no term of the noise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrctl.kernel import Array
+from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Reactive, Scene, roll_out
+
+SAMPLES = 2000
+TEMPERATURE = 0.05  # λ, in units of the cost; chosen
+SPREAD = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
+
+
+class Mppi(Reactive):
+    """A motion stage that samples twists around those of the period before; the same noise for every robot."""
+
+    def reset(self, pose: Array, reference: Array, period: float) -> None:
+        """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
+        super().reset(pose, reference, period)
+        self._nominal = np.zeros((len(pose), STEPS, 2))
+        self._twists, self._costs = np.empty((SAMPLES, STEPS, 2)), np.empty(SAMPLES)
+
+    def begin(self, tick: int) -> None:
+        """Draws the noise of a period, whose seed is its number; one roll-out is nominal, and another brakes."""
+        spread = np.array(SPREAD) * (self.bounds.speed, self.bounds.rotation)
+        self._knots = np.random.default_rng(tick).standard_normal((SAMPLES, KNOTS, 2)) * spread
+        self._knots[0] = 0.0
+        self._knots[1] = -self.bounds.speed, 0.0
+
+    def choose(self, row: int, pose: Array, last: Array, period: float, scene: Scene) -> Array:
+        """Returns the first of the mean twists; where their roll-out touches an obstacle, of the cheapest sample."""
+        nominal, twists, costs = self._nominal[row], self._twists, self._costs
+        nominal[:-1] = nominal[1:].copy()  # a period has passed
+        roll_out.compiled(self._knots, nominal, pose, last, period, self.bounds, scene, twists, costs)
+        weights = np.exp((costs.min() - costs) / TEMPERATURE)
+        mean = np.tensordot(weights / weights.sum(), twists, 1)
+        cheapest = twists[costs.argmin()].copy()
+        touches = costs.min() >= TOUCH
+        roll_out.compiled(self._knots[:1], mean, pose, last, period, self.bounds, scene, twists[:1], costs[:1])
+        nominal[:] = mean if touches or costs[0] < TOUCH else cheapest
+        return nominal[0]

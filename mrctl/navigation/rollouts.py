@@ -1,0 +1,252 @@
+"""What the reactive controllers share: what they see of the plan and the obstacles, and roll-outs of twists.
+
+A roll-out integrates the unicycle with twists that are obeyed at once, from the pose of the robot over a horizon, and
+has a cost: the distance from the plan, and how near it comes to obstacles. Its twists are first made ones that the
+robot can drive: forward, below its largest speed, rotation and curvature, and within its acceleration.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from mrctl.kernel import Array, kernel
+from mrctl.theory.clearance import cover
+from mrctl.theory.grid import Field, at, field_of
+from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings
+from mrctl.theory.references import Waypoints
+from mrctl.theory.robot import Robot
+from mrctl.theory.timing import RESERVE
+
+STEPS = 56  # of a roll-out, each a motion period
+KNOTS = 8  # of a roll-out, between which what is added to its twists changes linearly
+PLACE, HEADING, NEAR, TOUCH = 10.0, 1.0, 5.0, 1000.0  # costs in 1/(m² s), 1/s, 1/s and for a collision; chosen
+KEPT = 0.1  # m from obstacles, below which it costs
+CELL = 0.04  # m, of the distance field
+AROUND = 3.0  # m around the plan, which the field covers
+DISCS = 4  # that cover the robot
+AHEAD = 100  # samples of the plan, a motion period apart at most, among which its next place is looked for
+FINE = 5  # samples of the plan in a motion period
+OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen, like the next two
+WAITED = 1.0, 0.05  # s and m: so does one that within this time gets no farther than this
+RETRY = 1.0  # s, least time between two plans
+
+
+class Bounds(NamedTuple):
+    """What twists a robot can drive."""
+
+    speed: float
+    """Largest V in m/s."""
+    rotation: float
+    """Largest |θ̇| in rad/s."""
+    curvature: float
+    """Largest |θ̇| / V in 1/m."""
+    acceleration: float
+    """Largest |V̇| in m/s²."""
+    rotation_acceleration: float
+    """Largest |θ̈| in rad/s², which braking in the tightest curve may exceed."""
+
+    @classmethod
+    def of(cls, robot: Robot, speed: float) -> Bounds:
+        """Returns 0.9 of the limits of a robot, and the speed, which is in m/s, as it is."""
+        curvature = float(np.tan(RESERVE * robot.steering_limit)) / abs(robot.wheelbase)
+        rates = robot.max_rotation, curvature / RESERVE, robot.max_acceleration, robot.max_rotation_acceleration
+        return cls(speed, *(RESERVE * limit for limit in rates))
+
+
+class Scene(NamedTuple):
+    """What a roll-out is held against."""
+
+    targets: Array
+    """Where the plan is after each step, if it goes on from beside the robot: x and y in m, cos θ, sin θ, `(n, 4)`."""
+    discs: Array
+    """Discs that cover the robot, as of `cover`, `(k, 3)`."""
+    field: Field
+    """Distance from the obstacles that stand still."""
+    movers: Array
+    """Circles around those that move: x and y in m, their velocities in m/s, radius in m, `(M, 5)`."""
+
+
+Replan = Callable[[Array, Outlines], Waypoints | None]
+"""Plans from a pose in m, m, rad, `(3,)`, among obstacles as they are now; None where there is no way."""
+
+
+class Reactive(ABC):
+    """A motion stage that asks for twists along a plan, and makes another plan when it is off this one or waits."""
+
+    def __init__(
+        self, robot: Robot, size: int, plan: Waypoints, obstacles: Obstacles, footprint: Array, replan: Replan
+    ) -> None:
+        """Makes the stage.
+
+        Args:
+            robot: Nominal robot.
+            size: Number of robots B.
+            plan: The plan with its time law.
+            obstacles: All obstacles; those that move are seen with their place and velocity, but not their course.
+            footprint: Corners of the robot in its frame in m, `(n, 2)`.
+            replan: Makes a plan to the goal.
+        """
+        self._replan, self._around = replan, Surroundings(obstacles)
+        self.bounds = Bounds.of(robot, plan.speed)
+        self._size, self._plan, self._discs = size, plan, cover(footprint, DISCS)
+        still = tuple(shape for shape in obstacles.shapes if shape.course is None)
+        places = plan.sample(np.linspace(0, plan.period, 200)).pose[:, :2]
+        outlines = Surroundings(Obstacles(shapes=still)).at(0.0)
+        self._field = field_of(outlines, places.min(axis=0) - AROUND, places.max(axis=0) + AROUND, CELL)
+        self._moving = Surroundings(Obstacles(shapes=obstacles.moving))
+
+    def reset(self, pose: Array, reference: Array, period: float) -> None:
+        """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
+        self._period, self._tick, self._place = period, 0, np.zeros(self._size, int)
+        self._tables = [self._sampled(self._plan)] * self._size
+        self._anchor, self._since, self._tried = pose[:, :2].copy(), np.zeros(self._size), np.zeros(self._size)
+        self.last = np.zeros((self._size, 2))
+
+    def _sampled(self, plan: Waypoints) -> Array:
+        """Returns a plan as rows of `Scene.targets`, `FINE` in a motion period."""
+        count = int(np.ceil(plan.period / self._period)) * FINE + 1
+        poses = plan.sample(self._period / FINE * np.arange(count + 1.0)).pose
+        return np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+
+    def output(self, pose: Array, twist: Array, reference: Array) -> Array:
+        """Returns twists that the robots can drive, `(B, 2)`; arguments are those of `mrctl.control.stages.Motion`."""
+        movers = self._movers()
+        self.begin(self._tick)
+        for row in range(self._size):
+            table, first = self._tables[row], self._place[row]
+            away = np.hypot(*(table[first : first + AHEAD, :2] - pose[row, :2]).T)
+            self._place[row] = first + int(away.argmin())
+            if self._lost(row, pose[row], float(away.min())) and (other := self._planned(pose[row])):
+                table, self._place[row] = self._sampled(other), 0
+                self._tables[row] = table
+            targets = table[np.minimum(self._place[row] + FINE * np.arange(1, STEPS + 1), len(table) - 1)]
+            scene = Scene(targets, self._discs, self._field, movers)
+            self.last[row] = self.choose(row, pose[row], self.last[row], self._period, scene)
+        self._tick += 1
+        return self.last.copy()
+
+    def _lost(self, row: int, pose: Array, away: float) -> bool:
+        """Tells whether a robot needs another plan: it is so far away from its own, or has got nowhere, in m."""
+        now = self._period * self._tick
+        if np.hypot(*(pose[:2] - self._anchor[row])) > WAITED[1]:
+            self._anchor[row], self._since[row] = pose[:2], now
+        lost = (away > OFF or now - self._since[row] > WAITED[0]) and now - self._tried[row] > RETRY
+        if lost:
+            self._tried[row] = now
+        return lost
+
+    def _planned(self, pose: Array) -> Waypoints | None:
+        return self._replan(pose, self._around.at(self._period * self._tick))
+
+    def begin(self, tick: int) -> None:  # noqa: B027 (most have nothing to do)
+        """Is called once in a motion period, before `choose` for each robot."""
+
+    @abstractmethod
+    def choose(self, row: int, pose: Array, last: Array, period: float, scene: Scene) -> Array:
+        """Returns the twist of one robot.
+
+        Args:
+            row: Which robot.
+            pose: x and y in m and θ in rad, `(3,)`.
+            last: The twist before, V in m/s and θ̇ in rad/s, `(2,)`.
+            period: Motion period in s, which is also a step of a roll-out.
+            scene: What it sees.
+        """
+
+    def _movers(self) -> Array:
+        """Returns the circles around the obstacles that move, with the velocities of the last period, `(M, 5)`."""
+        times = self._period * self._tick, self._period * max(0, self._tick - 1)
+        now, before = (np.concatenate([o.discs, o.rings]) for o in map(self._moving.at, times))
+        return np.column_stack([now[:, :2], (now[:, :2] - before[:, :2]) / self._period, now[:, 2]])
+
+
+@kernel
+def clear(
+    x: float, y: float, c: float, s: float, time: float, reach: float, discs: Array, field: Field, movers: Array
+) -> float:
+    """Returns the distance in m of the discs of a robot from all obstacles, or `KEPT` where it is larger.
+
+    Args:
+        x: x of the robot in m.
+        y: y of the robot in m.
+        c: Cosine of its heading.
+        s: Sine of its heading.
+        time: Time in s, from now on, for which the obstacles that move go on as they do now.
+        reach: Radius in m of a circle around the robot's own point that holds all its discs.
+        discs: As in `Scene`, like what follows.
+        field: See there.
+        movers: See there.
+    """
+    free = KEPT
+    if at(field, x, y)[0] < reach + KEPT:  # else no disc can be nearer
+        for d in range(len(discs)):
+            px, py = x + c * discs[d, 0] - s * discs[d, 1], y + s * discs[d, 0] + c * discs[d, 1]
+            free = min(free, at(field, px, py)[0] - discs[d, 2])
+    for m in range(len(movers)):
+        mx, my = movers[m, 0] + time * movers[m, 2] - x, movers[m, 1] + time * movers[m, 3] - y
+        if mx * mx + my * my < (movers[m, 4] + reach + KEPT) ** 2:
+            for d in range(len(discs)):
+                ahead, aside = c * mx + s * my - discs[d, 0], c * my - s * mx - discs[d, 1]
+                free = min(free, np.sqrt(ahead * ahead + aside * aside) - movers[m, 4] - discs[d, 2])
+    return free
+
+
+@kernel
+def roll_out(
+    knots: Array, nominal: Array, pose: Array, twist: Array, step: float, bounds: Bounds, scene: Scene,
+    twists: Array, costs: Array,
+) -> None:  # fmt: skip
+    """Makes twists that the robot can drive of nominal ones with something added, and finds their costs.
+
+    Args:
+        knots: What is added to V in m/s and θ̇ in rad/s, at equal distances over the horizon, `(K, KNOTS, 2)`.
+        nominal: Nominal twists, `(STEPS, 2)`.
+        pose: x and y in m and θ in rad, `(3,)`.
+        twist: The twist before, `(2,)`.
+        step: Duration of a step in s.
+        bounds: What twists the robot can drive.
+        scene: Plan and obstacles.
+        twists: Out: the twists, `(K, STEPS, 2)`.
+        costs: Out: their costs, `(K,)`.
+    """
+    targets, discs, field, movers = scene
+    steps, reach = len(nominal), 0.0
+    for d in range(len(discs)):
+        reach = max(reach, np.hypot(discs[d, 0], discs[d, 1]) + discs[d, 2])
+    for n in range(len(knots)):
+        x, y, c, s, v, omega, cost = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]), twist[0], twist[1], 0.0
+        touched = False
+        for k in range(steps):
+            along = k * (knots.shape[1] - 1) / (steps - 1)
+            i = min(int(along), knots.shape[1] - 2)
+            share = along - i
+            wanted = nominal[k, 0] + (1 - share) * knots[n, i, 0] + share * knots[n, i + 1, 0]
+            turning = nominal[k, 1] + (1 - share) * knots[n, i, 1] + share * knots[n, i + 1, 1]
+            change = bounds.acceleration * step
+            v = min(max(min(max(wanted, v - change), v + change), 0.0), bounds.speed)
+            change = bounds.rotation_acceleration * step
+            omega = min(max(turning, omega - change), omega + change)
+            most = min(bounds.rotation, bounds.curvature * v)
+            omega = min(max(omega, -most), most)
+            twists[n, k, 0], twists[n, k, 1] = v, omega
+            if touched:
+                continue
+            # Half of the turn, the way, and the other half; the cosine of so small an angle is that of its series.
+            half = omega * step / 2
+            ch, sh = 1 - half * half / 2 * (1 - half * half / 12), half * (1 - half * half / 6 * (1 - half * half / 20))
+            c, s = c * ch - s * sh, s * ch + c * sh
+            x, y = x + v * step * c, y + v * step * s
+            c, s = c * ch - s * sh, s * ch + c * sh
+            dx, dy = targets[k, 0] - x, targets[k, 1] - y
+            cost += step * (PLACE * (dx * dx + dy * dy) + HEADING * (1 - c * targets[k, 2] - s * targets[k, 3]))
+            free = clear(x, y, c, s, (k + 1) * step, reach, discs, field, movers)
+            if free <= 0:
+                touched = True
+                cost += TOUCH * (1 + (steps - k) / steps)  # the earlier, the worse
+            elif free < KEPT:
+                cost += step * NEAR * (1 - free / KEPT) ** 2
+        costs[n] = cost

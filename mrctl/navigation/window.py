@@ -1,0 +1,40 @@
+"""The dynamic window: of the twists that the robot can reach in a moment, the one whose constant course costs least.
+
+Fox, Burgard and Thrun, "The dynamic window approach to collision avoidance", IEEE Robotics and Automation Magazine
+4(1), 1997. Their objective rewards heading, clearance and speed; here it is the cost of a roll-out along the plan. A
+twist is admissible if the robot, once it has it, can brake without touching an obstacle; if none is, the robot brakes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrctl.kernel import Array
+from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Reactive, Scene, roll_out
+
+SPEEDS, ROTATIONS = 9, 15  # of the window
+MOMENT = 0.25  # s, in which the twists of the window can be reached
+LOOK = 20  # steps, over which a constant twist is looked at
+
+
+class Window(Reactive):
+    """A motion stage that keeps the best constant twist."""
+
+    def choose(self, row: int, pose: Array, last: Array, period: float, scene: Scene) -> Array:
+        """Returns the first twist towards the best one of the window."""
+        bounds = self.bounds
+        reach, turn = MOMENT * bounds.acceleration, MOMENT * bounds.rotation_acceleration
+        speeds = np.linspace(max(0.0, last[0] - reach), min(bounds.speed, last[0] + reach), SPEEDS)
+        rotations = np.linspace(max(-bounds.rotation, last[1] - turn), min(bounds.rotation, last[1] + turn), ROTATIONS)
+        grid = np.stack(np.meshgrid(speeds, rotations), -1).reshape(-1, 1, 2)
+        constant, rest = np.repeat(grid, KNOTS, axis=1), np.zeros((STEPS, 2))
+        ahead, costs = np.empty((len(grid), LOOK, 2)), np.empty(len(grid))
+        near = scene._replace(targets=scene.targets[:LOOK])
+        roll_out.compiled(constant, rest[:LOOK], pose, last, period, bounds, near, ahead, costs)
+        stops, braking = np.empty((len(grid), STEPS, 2)), np.empty(len(grid))
+        falling = constant * np.array([1.0, *[0.0] * (KNOTS - 1)])[:, None]
+        falling[:, :, 1] = constant[:, :, 1]  # the curvature bounds θ̇ as V falls
+        roll_out.compiled(falling, rest, pose, last, period, bounds, scene, stops, braking)
+        costs[braking >= TOUCH] = np.inf
+        best = int(costs.argmin())
+        return ahead[best, 0] if np.isfinite(costs[best]) else stops[int(braking.argmin()), 0]

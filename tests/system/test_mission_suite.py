@@ -1,0 +1,66 @@
+"""The comparison of velocity controllers in corridors: the width that a run needs, and the command."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_commands import refused
+
+import mrctl.experiments.mission_suite as suite
+from mrctl import Scenario, cli, simulate
+from mrctl.navigation.generators import bent_line, corridor, corridor_width
+from mrctl.physics import mjcf
+from mrctl.physics.hull import footprint
+from mrctl.theory.clearance import clearances
+from mrctl.theory.obstacles import Surroundings
+
+HULL = footprint(mjcf.load())
+
+
+def test_corridor_width() -> None:
+    """A robot at random poses touches the walls of a narrower corridor, and not those of a wider one."""
+    random = np.random.default_rng(0)
+    for seed in range(100):
+        shape = {"pieces": int(random.integers(1, 4)), "length": 2.0, "turn": 0.9}
+        ends = bent_line(seed, **shape)[1]
+        places = np.interp(random.uniform(0.3, 0.9, 5), np.linspace(0, 1, len(ends)), ends)
+        poses = np.column_stack([places.real, places.imag, np.zeros(5)]) + random.uniform(-0.3, 0.3, (5, 3))
+        width = corridor_width(HULL, poses, seed, **shape)
+        for wider in (1e-6, -1e-6):
+            walls = Surroundings(corridor(width + wider, seed, **shape).obstacles)
+            assert (clearances(HULL, poses, np.zeros(5), walls).min() > 0) == (wider > 0)
+
+
+def test_width_of_a_run() -> None:
+    """In physics a run without walls touches those of a corridor that is 4 mm narrower than it needs, and no others."""
+    draw = suite.draw(Scenario(), 1, 1.5 * float(np.ptp(HULL[:, 1])), [1.35])
+    assert draw is not None
+    own = Scenario(reference=draw.references[0], goal=draw.goal, laps=2, learner="none", initial_spread=(0, 0, 0))
+    free = simulate(own)
+    poses = np.stack([free[name].dropna("time").values for name in ("x", "y", "theta")], -1)
+    width = corridor_width(HULL, poses, draw.seed, **suite.SHAPE)
+    for wider, failure in ((0.004, ""), (-0.004, "collision")):
+        walls = corridor(width + wider, draw.seed, **suite.SHAPE).obstacles
+        assert simulate(own.replace(obstacles=walls))["failure"] == failure
+
+
+def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """The tables say what the numbers beside them say."""
+    monkeypatch.setattr(suite, "DRAWS", {"quick": 3})
+    monkeypatch.setattr(suite, "SPEEDS", (0.6, 0.9))
+    monkeypatch.setattr(suite, "PLANTS", {"nominal": suite.PLANTS["nominal"]})
+    assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
+    printed, values = capsys.readouterr().out, json.loads((tmp_path / "table.json").read_text())
+    assert printed.startswith("36 runs, about 1 min") and (tmp_path / "table.md").read_text() in printed
+    needed = np.array(values["needed"], float)
+    assert needed.shape == (2, 4, 1, 3) and np.all(needed > np.ptp(HULL[:, 1]))
+    assert np.abs(needed - values["plans"]).max() < 0.1
+    assert f"{1e3 * needed[-1, 0, 0].max():.1f} [" in printed and "| 3/3 [44, 100] %" in printed
+
+
+def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The suite has worlds of its own, and a mission needs one."""
+    assert "suite: " in refused(capsys, "navigate", "doorway:3", "--suite", "--out", str(tmp_path))
+    assert "quick: " in refused(capsys, "navigate", "doorway:3", "--quick")
+    assert "world: " in refused(capsys, "navigate")

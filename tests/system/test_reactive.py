@@ -1,0 +1,110 @@
+"""Reactive missions: robots that go along their plans in their own time, around what moves and what no map shows."""
+
+import numpy as np
+import pytest
+
+import mrctl
+from mrctl import Box, Disc, Obstacles, Scenario
+from mrctl.navigation.generators import Task
+from mrctl.navigation.mission import Avoid, avoiding, navigate, planned, robot_of
+from mrctl.navigation.rollouts import KNOTS, STEPS, Bounds, Scene, roll_out
+from mrctl.theory.clearance import clearance, cover
+from mrctl.theory.grid import field_of
+from mrctl.theory.obstacles import Surroundings
+
+PLANNED = Scenario(prior="model", learner="none")
+FOOTPRINT = np.array([[-0.1, -0.2], [0.44, -0.2], [0.44, 0.2], [-0.1, 0.2]])
+BOUNDS = Bounds(1.3, 2.7, 3.9, 1.35, 5.4)
+
+
+def crossing(speed: float) -> Disc:
+    """A disc that crosses x = 2 m along +y, from y = −1.5 m on; its own x axis is that of its course."""
+    return Disc(x=-1.5, y=-2.0, radius=0.2, course=mrctl.Line(heading=np.pi / 2, speed=speed))
+
+
+def test_roll_out() -> None:
+    """Twists stay within the bounds, their roll-outs touch what their poses touch, and detours cost more."""
+    random = np.random.default_rng(0)
+    still = Obstacles(shapes=(Disc(x=1.2, y=0.7, radius=0.3), Box(x=0.5, y=-1.0, length=1.0, width=0.2)))
+    around = Surroundings(still).at(0.0)
+    field = field_of(around, np.array([-2.0, -3.0]), np.array([5.0, 3.0]), 0.02)
+    ahead = 0.05 * np.arange(1.0, STEPS + 1)
+    targets = np.column_stack([ahead, np.zeros(STEPS), np.ones(STEPS), np.zeros(STEPS)])
+    discs = cover(FOOTPRINT, 4)
+    mover = np.array([[2.0, -1.5, 0.0, 0.6, 0.2]])
+    knots = random.normal(size=(200, KNOTS, 2)) * [0.5, 1.5]
+    knots[0] = 0.0
+    twists, costs = np.empty((200, STEPS, 2)), np.empty(200)
+    start, last = np.zeros(3), np.array([1.0, 0.0])
+    roll_out(
+        knots, np.tile(last, (STEPS, 1)), start, last, 0.05, BOUNDS, Scene(targets, discs, field, mover), twists, costs
+    )
+    v, omega = twists[..., 0], twists[..., 1]
+    assert v.min() >= 0 and v.max() <= BOUNDS.speed and np.abs(omega).max() <= BOUNDS.rotation
+    assert np.all(np.abs(omega) <= BOUNDS.curvature * v + 1e-12)
+    assert np.abs(np.diff(v, axis=1, prepend=1.0)).max() <= BOUNDS.acceleration * 0.05 * (1 + 1e-9)
+    verdicts = []
+    for sample, cost in zip(twists, costs, strict=True):
+        pose, free = np.zeros(3), np.inf
+        for k, (speed, turn) in enumerate(sample):
+            middle = pose[2] + turn * 0.025
+            pose = pose + 0.05 * np.array([speed * np.cos(middle), speed * np.sin(middle), turn])
+            moved = Surroundings(
+                Obstacles(shapes=(*still.shapes, Disc(x=2.0, y=-1.5 + 0.03 * (k + 1), radius=0.2)))
+            ).at(0.0)
+            c, s = np.cos(pose[2]), np.sin(pose[2])
+            for x, y, radius in discs:
+                point = np.array([[1e-6, 0], [0, 1e-6], [-1e-6, 0]])
+                centre = np.array([pose[0] + c * x - s * y, pose[1] + s * x + c * y, 0.0])
+                free = min(free, clearance(point, centre, moved) - radius)
+        if abs(free) > 0.03:  # of the interpolated field
+            verdicts.append(free < 0)
+            assert (cost >= 1000) == (free < 0)
+    assert 20 < sum(verdicts) < len(verdicts) - 20
+
+
+@pytest.mark.parametrize("avoid", ["window", "mppi"])
+def test_crossing(avoid: Avoid) -> None:
+    """A disc that crosses is hit by a robot in track mode, and passed in reactive mode, alone as in a batch."""
+    shapes = (Disc(x=2.0, y=1.6, radius=0.2), crossing(0.6))
+    task = Task(obstacles=Obstacles(shapes=shapes), start=(0.0, 0.0, 0.0), goal=(4.0, 0.0, 0.0))
+    assert navigate(task, PLANNED).table["outcome"].tolist() == ["collided"]
+    both = navigate(task, PLANNED, compare=["model"], avoid=avoid)
+    assert both.table["outcome"].tolist() == ["arrived"] * 2 and float(both.table["clearance"].to_numpy().min()) > 0.03
+    alone = navigate(task, PLANNED, avoid=avoid).result
+    for name in ("x", "v", "omega_command"):
+        values = both.result[name].values
+        np.testing.assert_array_equal(values[1], values[0])
+        np.testing.assert_array_equal(alone[name].values[0], values[0])
+
+
+def test_blocked_door() -> None:
+    """A door of two is blocked, which no map shows: the robot sees it, plans again, and takes the other one."""
+    creeping = mrctl.Line(speed=0.01)
+    walls = [Box(x=2.0, y=y, length=0.1, width=width) for y, width in ((-2.3, 1.4), (0.0, 1.4), (2.3, 1.4))]
+    outer = [Box(x=2.0, y=side * 3.0, length=6.0, width=0.1) for side in (-1, 1)]
+    plug = Box(x=1.9, y=-1.15, length=0.2, width=0.7, course=creeping)
+    task = Task(obstacles=Obstacles(shapes=(*walls, *outer, plug)), start=(0.0, -0.4, 0.0), goal=(4.0, -0.4, 0.0))
+    assert navigate(task, PLANNED, speed=0.8).table["outcome"].tolist() == ["collided"]
+    driven = navigate(task, PLANNED, speed=0.8, avoid="mppi")
+    run = driven.result.isel(run=0)
+    assert driven.table["outcome"].tolist() == ["arrived"]
+    assert float(run["y"].values[np.argmax(run["x"].values > 2)]) > 0.7 and driven.plan.poses[:, 1].max() < 0.7
+
+
+def test_limits() -> None:
+    """What the stages ask for is within the bounds at every tick, also where the robot is thrown about."""
+    task = Task(obstacles=Obstacles(shapes=(crossing(0.4),)), start=(0.0, 0.0, 0.0), goal=(4.0, 0.0, 0.0))
+    plan = planned(task, PLANNED, None, 0.05)[1]
+    own = PLANNED.replace(obstacles=task.obstacles, reference=plan, goal=task.goal)
+    robot, random = robot_of(own)[1], np.random.default_rng(1)
+    for avoid in ("window", "mppi"):
+        make = avoiding(avoid, own)
+        assert make is not None
+        stage, pose = make(robot, 1), np.zeros((1, 3))
+        stage.reset(pose, np.zeros((1, 7)), 0.05)
+        for _ in range(40):
+            ((v, omega),) = stage.output(pose, np.zeros((1, 2)), np.zeros((1, 7)))
+            assert 0 <= v <= robot.max_speed and abs(omega) <= robot.max_rotation
+            assert abs(omega) <= v * np.tan(robot.steering_limit) / robot.wheelbase + 1e-12
+            pose = pose + [[0.05 * v, 0.0, 0.05 * omega]] + random.normal(size=(1, 3)) * 0.05
