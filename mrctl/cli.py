@@ -328,7 +328,9 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
 
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
         if suite:
-            if world or goal or start or compare or speed is not None or avoid != "none" or json:
+            default = Scenario(**FEEDFORWARDS[BEST])
+            set_there = any(getattr(chosen, n) != getattr(default, n) for n in ("prior", "learner", "perturbation"))
+            if set_there or world or goal or start or compare or speed or margin != 0.05 or avoid != "none" or json:
                 raise InputError("suite: has worlds, controllers and speeds of its own; give only the robot's flags")
             print(mission_suite.suite(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
             return

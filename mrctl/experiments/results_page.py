@@ -42,6 +42,7 @@ def main(
     held_out: Path | None = None,
     tune: Path | None = None,
     search: tuple[Path, ...] = (),
+    navigate: tuple[Path, ...] = (),
     identify: tuple[Path, ...] = (),
     bench: Path | None = None,
     out: Path = Path("RESULTS.md"),
@@ -54,6 +55,7 @@ def main(
         held_out: Folder that `mrctl suite --held-out` wrote.
         tune: Folder that `mrctl tune --out` wrote.
         search: Folders that `mrctl tune --search` wrote, one for each entry.
+        navigate: Folders that `mrctl navigate --suite` wrote, one for each robot.
         identify: Files with the output of `mrctl identify --json`, one for each robot.
         bench: File with the output of `mrctl bench --json`.
         out: The page to write.
@@ -82,6 +84,14 @@ def main(
     if search:
         tables = [_read(folder / "table.json", "entry", "shipped", "tiers") for folder in search]
         written["The search of settings"] = _section("mrctl tune --search NAME", tables[0], search_text(tables))
+    if navigate:
+        parts = []
+        for folder in navigate:
+            table = _read(folder / "table.json", "scenario", "mode", "needed")
+            flags = " --quick" if table["mode"] == "quick" else ""
+            flags += f" --robot.path {table['scenario']['robot']['path']}"
+            parts.append(_section(f"mrctl navigate --suite{flags}", table, _text(folder / "table.md").strip()))
+        written["How narrow and how fast"] = "\n\n".join(parts).replace("\n## ", "\n### ")
     if identify:
         tables = [_read(file, "constants", "robot") for file in identify]
         parts = [_section(f"mrctl identify --robot.path {t['robot']['path']}", t, identify_text(t)) for t in tables]

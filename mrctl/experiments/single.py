@@ -101,7 +101,11 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         for k in range(row.sizes["lap"])
     ]
     name = str(result["feedforward"].values[0]) + (f", own stages {own}" if own else "")
-    lines = [f"RMSE per lap against the reference, feedforward {name}, steering {result['steering'].values[0]}"]
+    steering, course = result["steering"].values[0], scenario.reference
+    lines = [
+        f"RMSE per lap against the reference, a {course.kind} of {course.period:.3g} s; feedforward {name}, "
+        f"steering {steering}"
+    ]
     if failure:
         lines.append(f"failed after {float(row['failure_time']):.2f} s: {failure}")
     acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]

@@ -96,7 +96,7 @@ class Page(ABC):
         )  # fmt: skip
         self.sensors = gui.add_checkbox("Sensors", False, hint="Draws what the robot knows of its posture.")
         self.magnified = gui.add_dropdown(
-            "Errors drawn", tuple(f"{m}×" for m in sensors.MAGNIFICATIONS),
+            "Sensor errors ×", tuple(f"{m}×" for m in sensors.MAGNIFICATIONS),
             hint="Factor on errors of x and y in the picture, about the true position; headings are not magnified.",
         )  # fmt: skip
         self._sensed = gui.add_html("")

@@ -71,6 +71,12 @@ def searched(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
+def navigated(tmp_path: Path) -> Path:
+    values = {"scenario": {"robot": {"path": "racecar"}}, "mode": "quick", "needed": []}
+    return written(tmp_path / "navigated", values, "## Critical width\n\nAll tie.\n\n| plant |\n| --- |\n")
+
+
+@pytest.fixture
 def identified(tmp_path: Path) -> Path:
     constant = identify.Constant("M_e", "kg", 21.32, 21.0, 21.64, 21.28)
     values = {"robot": {"path": "racecar"}, "constants": [constant._asdict() | {"error": constant.error}]}
@@ -96,17 +102,19 @@ def figures(tmp_path: Path) -> Path:
 
 
 def test_sections(
-    suite: Path, reproduction: Path, tune: Path, searched: Path, identified: Path, figures: Path, tmp_path: Path
-) -> None:
+    suite: Path, reproduction: Path, tune: Path, searched: Path, navigated: Path, identified: Path, figures: Path,
+    tmp_path: Path,
+) -> None:  # fmt: skip
     """Every input becomes a section with its numbers, and with the versions and the machine that it names."""
     out = tmp_path / "RESULTS.md"
     inputs = {"suite": suite, "reproduce": reproduction, "tune": tune, "search": searched}
+    inputs |= {"navigate": navigated}
     inputs |= {"identify": identified, "bench": figures}
     words = [word for name, path in inputs.items() for word in (f"--{name}", str(path))]
     assert results_page.command([*words, "--out", str(out)]) == 0
     page = results_page.sections(out.read_text())
     titles = ["The paper", "The uncertainty suite", "Where learning is safe", "The search of settings"]
-    titles += ["Identification", "Speed"]
+    titles += ["How narrow and how fast", "Identification", "Speed"]
     assert list(page) == ["", *titles]
     assert all(MADE in page[title] and "on Abacus with 3 cores." in page[title] for title in titles)
     short, *folded = page["The uncertainty suite"].split("<details>")
@@ -132,6 +140,9 @@ def test_sections(
         "",
     ]
     assert [cell.strip() for cell in row.split("|")] == cells and "best of 121" in page["The search of settings"]
+    corridors = page["How narrow and how fast"]
+    assert corridors.startswith("`mrctl navigate --suite --quick --robot.path racecar` made this")
+    assert "\n\n### Critical width\n\nAll tie." in corridors
     assert "`mrctl identify --robot.path racecar`" in page["Identification"]
     assert "| 21.32    | 21 to 21.64   | 21.28 | +0.19 % |" in page["Identification"]
     assert "| 0.912 |" in page["Speed"] and bench.text(json.loads(figures.read_text())) in page["Speed"]
