@@ -285,10 +285,11 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
 def _navigate_with(arguments: list[str]) -> Callable[..., None]:
     """Returns the `navigate` command, whose short help leaves out what that of `run` does."""
     names = FIRST if _is_short_help(arguments) else Scenario.model_fields
-    part = _part(Scenario(**FEEDFORWARDS[BEST]), [name for name in names if name not in GIVEN])
+    default = Scenario() if {"prior", "learner"} & _given(arguments) else Scenario(**FEEDFORWARDS[BEST])
+    part = _part(default, [name for name in names if name not in GIVEN])
 
     def navigate(
-        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="WORLD|GENERATOR:SEED")] = "",
+        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MAP|GENERATOR:SEED")] = "",
         /,
         scenario: Record = part,
         goal: tuple[float, float, float] | None = None,
@@ -304,7 +305,8 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
     ) -> None:
         """Plans a way among obstacles, drives it, and prints how that ended.
 
-        The exit status is 1 if the robot does not arrive.
+        The exit status is 1 if the first robot does not arrive. Its controller is that of --prior and --learner, with
+        the defaults of `mrctl run` where one of them is given, and model+composite where none is.
 
         Args:
             world: TOML file of obstacles, yaml file of a ROS map, world in SDF, or a generator with a seed, such as
@@ -315,8 +317,9 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             compare: Feedforwards of further robots, such as none or model, which drive the same plan.
             speed: Largest speed in m/s; by default 0.9 of what the robot can.
             margin: Clearance that the plan keeps in m.
-            avoid: What keeps the robot from obstacles that move: nothing, a filter that brakes (`barrier`), or a
-                controller that leaves the plan and its times (`window`, `mppi`).
+            avoid: What keeps the robot from obstacles that move, which the first plan does not know: nothing, a filter
+                that brakes (`barrier`), or a controller that follows the plan at its own pace and goes around what is
+                in the way (`window`, `mppi`).
             out: Folder for the result, the table in JSON and the figures.
             json: Print JSON instead of a table.
             suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
@@ -328,9 +331,8 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
 
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
         if suite:
-            default = Scenario(**FEEDFORWARDS[BEST])
-            set_there = any(getattr(chosen, n) != getattr(default, n) for n in ("prior", "learner", "perturbation"))
-            if set_there or world or goal or start or compare or speed or margin != 0.05 or avoid != "none" or json:
+            taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _given(arguments)
+            if taken or world or goal or start or compare or speed or avoid != "none" or json:
                 raise InputError("suite: has worlds, controllers and speeds of its own; give only the robot's flags")
             print(mission_suite.suite(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
             return
@@ -610,6 +612,8 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
             file: Scenario file, whose values flags override, or result of `mrctl run --out` or `mrctl sweep`; by
                 default the best learner and PID alone, live.
             scenario: The scenario. A robot brings the steering and the reference that suit it, unless they are given.
+                Without --prior, --learner and --compare it is model+composite beside PID alone; with one of them the
+                defaults are those of `mrctl run`. A live session goes on after the last lap.
             compare: Feedforwards of further robots, such as none or model+composite, which are shown as ghosts with the
                 same seed and events.
             number: Number of the run to show first, in a result or sweep.
@@ -647,7 +651,8 @@ def record(
     Args:
         file: Result of `mrctl run --out` or `mrctl sweep`.
         out: File to write, which ends in .gif, or in .mp4, which needs the program ffmpeg.
-        number: Number of the run to show; by default at most four runs, the others as ghosts of the first one.
+        number: Number of the run to show; by default all if there are at most four, the first one solid and the others
+            as ghosts, else the first one.
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # which mujoco reads when it is imported

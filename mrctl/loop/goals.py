@@ -1,4 +1,4 @@
-"""The ends of missions: a run with a goal ends where the robot rests at the goal, or when it is stuck."""
+"""The ends of missions: a run with a goal ends when the robot stands at the goal, or when it is stuck."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from mrctl.kernel import Array, Rows
 from mrctl.scenario import Scenario
 
 NEAR, TURNED, RESTING = 0.1, 0.2, 0.05  # m, rad and m/s, within which a robot has arrived
-HEADWAY, STUCK = 0.05, 5.0  # m that a robot gets farther in so many s, or it is stuck
+HEADWAY, STUCK = 0.05, 5.0  # m by which a robot gets away, in any direction, within so many s, or it is stuck
 
 
 def arrived(pose: Array, v: ArrayLike, goal: Array) -> NDArray[np.bool]:
-    """Tells which robots rest at their goals: within 0.1 m and 0.2 rad, and slower than 0.05 m/s.
+    """Tells which robots stand at their goals: within 0.1 m and 0.2 rad, and slower than 0.05 m/s.
 
     Args:
         pose: x and y in m and θ in rad, `(…, 3)`.

@@ -170,7 +170,7 @@ def arranged(scenario: Scenario) -> Scenario:
 def suited(scenario: Scenario) -> Scenario:
     """Returns the scenario with the steering of its robot, and with a lemniscate that the robot can follow.
 
-    The lemniscate is that of the scenario where possible; otherwise it is larger, then slower.
+    It is that of the scenario where possible, else it is slower, and larger where no period would be enough.
 
     Raises:
         InputError: The robot cannot be driven.

@@ -53,7 +53,7 @@ ROOM = 1.4  # turning radius of the plan over the robot's least one, for a splin
 TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
 WIDER = 2.0  # times both, where a plan may reverse, for at a change of direction a spline is straight
 CELLS = 4  # of the search in the width of the robot
-PATIENCE, WAITING = 2, 4  # time after which a robot is out of time, over that of the plan; where it may wait
+PATIENCE, WAITING = 2, 4  # time of a mission over that of its plan; WAITING with `window` and `mppi`
 SLIM = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
 PERIOD = 0.05  # s, motion period of `window` and `mppi`
 BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
@@ -77,7 +77,7 @@ def task_of(world: str, scenario: Scenario, start: Pose | None = None, goal: Pos
 
     Args:
         world: TOML file of obstacles, yaml file of a ROS map, SDF world, or a generator with its seed, as `doorway:3`.
-        scenario: Scenario with the robot, to whose size a generator makes its openings.
+        scenario: Scenario with the robot, whose size sets the openings of all generators but `cellular`.
         start: x and y in m and θ in rad; by default that of the generator, or the origin.
         goal: x and y in m and θ in rad; by default that of the generator.
 
@@ -117,13 +117,14 @@ def navigate(
 
     Args:
         task: World, start and goal.
-        scenario: The robot and all else; reference, laps, goal and obstacles are those of the mission.
+        scenario: The robot and all else. Reference, laps, goal, obstacles and initial pose are those of the mission,
+            and the motion period is 0.05 s with `window` and `mppi`.
         compare: Feedforwards of further robots, which drive the same plan, each alone.
         speed: Largest speed in m/s; by default 0.9 of the robot's.
         margin: Clearance that the plan keeps in m.
-        avoid: What keeps the robot from obstacles that move or are near: nothing, so that it follows the plan in time
-            (`none`), the filter on what it would do then (`barrier`), or a motion stage that goes along the plan in its
-            own time (`window`, `mppi`).
+        avoid: What keeps the robot from obstacles that move, which the first plan does not know: nothing, so that it
+            follows the plan in time (`none`), the filter on what it would do then (`barrier`), or a motion stage that
+            goes along the plan at its own pace (`window`, `mppi`).
         progress: Whether to show a progress bar.
 
     Raises:

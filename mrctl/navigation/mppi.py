@@ -1,8 +1,8 @@
-"""Model predictive path integral control: the mean of many random twists, weighted by what their roll-outs cost.
+"""Model predictive path integral control: a mean of many random twists, in which those of cheap roll-outs weigh most.
 
 Williams, Aldrich and Theodorou, "Model predictive path integral control: from theory to parallel computation", Journal
 of Guidance, Control, and Dynamics 40(2), 2017. With costs S of K roll-outs the twists are Σ w u, w ∝ exp(−S/λ). Every
-limit that the twists of a roll-out keep is kept by their mean, as it is convex. The cost has no term of the noise.
+limit is a convex set of twists, so their mean keeps it. Unlike in the paper, the cost has no term of control effort.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ class Mppi(Reactive):
         self._twists, self._costs = np.empty((SAMPLES, STEPS, 2)), np.empty(SAMPLES)
 
     def begin(self, tick: int) -> None:
-        """Draws the noise of a period, whose seed is its number; one roll-out is nominal, and another brakes."""
+        """Draws the noise of a period, whose number is the only seed; one roll-out is nominal, and another brakes."""
         spread = np.array(SPREAD) * (self.bounds.speed, self.bounds.rotation)
         self._knots = np.random.default_rng(tick).standard_normal((SAMPLES, KNOTS, 2)) * spread
         self._knots[0] = 0.0
         self._knots[1] = -self.bounds.speed, 0.0
 
     def choose(self, row: int, pose: Array, last: Array, period: float, scene: Scene) -> Array:
-        """Returns the first of the mean twists; where their roll-out touches an obstacle, of the cheapest sample."""
+        """Returns the first of the mean twists, or of the cheapest sample where only the mean touches an obstacle."""
         nominal, twists, costs = self._nominal[row], self._twists, self._costs
         nominal[:-1] = nominal[1:].copy()  # a period has passed
         roll_out.compiled(self._knots, nominal, pose, last, period, self.bounds, scene, twists, costs)

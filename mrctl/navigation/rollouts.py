@@ -1,8 +1,9 @@
 """What the reactive controllers share: what they see of the plan and the obstacles, and roll-outs of twists.
 
 A roll-out integrates the unicycle with twists that are obeyed at once, from the pose of the robot over a horizon, and
-has a cost: the distance from the plan, and how near it comes to obstacles. Its twists are first made ones that the
-robot can drive: forward, below its largest speed, rotation and curvature, and within its acceleration.
+has a cost: squared distance and heading error from the plan, nearness to obstacles, and collision. Its twists are
+limited to what the robot can drive: forward, below its largest speed, rotation and curvature, and within its
+acceleration.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ KEPT = 0.1  # m from obstacles, below which it costs
 CELL = 0.04  # m, of the distance field
 AROUND = 3.0  # m around the plan, which the field covers
 DISCS = 4  # that cover the robot
-AHEAD = 100  # samples of the plan, a motion period apart at most, among which its next place is looked for
+AHEAD = 100  # samples of the plan, 20 motion periods, among which its nearest place is looked for
 FINE = 5  # samples of the plan in a motion period
 OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen, like the next two
 WAITED = 1.0, 0.05  # s and m: so does one that within this time gets no farther than this
@@ -51,7 +52,12 @@ class Bounds(NamedTuple):
 
     @classmethod
     def of(cls, robot: Robot, speed: float) -> Bounds:
-        """Returns 0.9 of the limits of a robot, and the speed, which is in m/s, as it is."""
+        """Returns 0.9 of the limits of a robot; that of the curvature is at 0.9 of the steering limit.
+
+        Args:
+            robot: The robot.
+            speed: Largest V in m/s, which stays as it is.
+        """
         curvature = float(np.tan(RESERVE * robot.steering_limit)) / abs(robot.wheelbase)
         rates = robot.max_rotation, curvature / RESERVE, robot.max_acceleration, robot.max_rotation_acceleration
         return cls(speed, *(RESERVE * limit for limit in rates))
@@ -61,7 +67,8 @@ class Scene(NamedTuple):
     """What a roll-out is held against."""
 
     targets: Array
-    """Where the plan is after each step, if it goes on from beside the robot: x and y in m, cos θ, sin θ, `(n, 4)`."""
+    """Where the plan is after each of n steps, counted from its place nearest to the robot: x and y in m, cos θ, sin θ,
+    `(n, 4)`."""
     discs: Array
     """Discs that cover the robot, as of `cover`, `(k, 3)`."""
     field: Field
@@ -130,7 +137,7 @@ class Reactive(ABC):
         return self.last.copy()
 
     def _lost(self, row: int, pose: Array, away: float) -> bool:
-        """Tells whether a robot needs another plan: it is so far away from its own, or has got nowhere, in m."""
+        """Tells whether a robot needs another plan: it is `away` m off its own, or has hardly moved for a while."""
         now = self._period * self._tick
         if np.hypot(*(pose[:2] - self._anchor[row])) > WAITED[1]:
             self._anchor[row], self._since[row] = pose[:2], now
@@ -152,7 +159,7 @@ class Reactive(ABC):
         Args:
             row: Which robot.
             pose: x and y in m and θ in rad, `(3,)`.
-            last: The twist before, V in m/s and θ̇ in rad/s, `(2,)`.
+            last: The twist that was requested in the last period, V in m/s and θ̇ in rad/s, `(2,)`.
             period: Motion period in s, which is also a step of a roll-out.
             scene: What it sees.
         """
@@ -177,9 +184,9 @@ def clear(
         s: Sine of its heading.
         time: Time in s, from now on, for which the obstacles that move go on as they do now.
         reach: Radius in m of a circle around the robot's own point that holds all its discs.
-        discs: As in `Scene`, like what follows.
-        field: See there.
-        movers: See there.
+        discs: `Scene.discs`.
+        field: `Scene.field`.
+        movers: `Scene.movers`.
     """
     free = KEPT
     if at(field, x, y)[0] < reach + KEPT:  # else no disc can be nearer
@@ -200,17 +207,17 @@ def roll_out(
     knots: Array, nominal: Array, pose: Array, twist: Array, step: float, bounds: Bounds, scene: Scene,
     twists: Array, costs: Array,
 ) -> None:  # fmt: skip
-    """Makes twists that the robot can drive of nominal ones with something added, and finds their costs.
+    """Adds knots to nominal twists, limits the sums to what the robot can drive, and returns the cost of each roll-out.
 
     Args:
         knots: What is added to V in m/s and θ̇ in rad/s, at equal distances over the horizon, `(K, KNOTS, 2)`.
-        nominal: Nominal twists, `(STEPS, 2)`.
+        nominal: Nominal twists, `(n, 2)`.
         pose: x and y in m and θ in rad, `(3,)`.
-        twist: The twist before, `(2,)`.
+        twist: The twist that was requested in the last period, `(2,)`.
         step: Duration of a step in s.
         bounds: What twists the robot can drive.
         scene: Plan and obstacles.
-        twists: Out: the twists, `(K, STEPS, 2)`.
+        twists: Out: the twists of K roll-outs of n steps, `(K, n, 2)`.
         costs: Out: their costs, `(K,)`.
     """
     targets, discs, field, movers = scene

@@ -2,7 +2,8 @@
 
 Fox, Burgard and Thrun, "The dynamic window approach to collision avoidance", IEEE Robotics and Automation Magazine
 4(1), 1997. Their objective rewards heading, clearance and speed; here it is the cost of a roll-out along the plan. A
-twist is admissible if the robot, once it has it, can brake without touching an obstacle; if none is, the robot brakes.
+twist is admissible if the robot can set out towards it and then brake without touching an obstacle. If none is, the
+robot does what it does first in the cheapest of these braking roll-outs.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ A position is a complex number p = x + i y. A path with heading θ then has the 
 and the logarithmic derivative p''/p' = v̇/v + i θ̇ gives acceleration and rotation at once. Nothing is differenced
 numerically, and every sample depends on its own time alone, headings included.
 
-A reference starts at the origin along +x unless its docstring says otherwise. A new kind is a `Record` with `kind`,
-`period` and the method `sample`, and is added to the union `Reference`.
+A reference starts at the origin along +x; a line starts along its heading, and waypoints at the first one. A new kind
+is a `Record` with `kind`, `period` and the method `sample`, and is added to the union `Reference`.
 """
 
 from __future__ import annotations
@@ -540,7 +540,7 @@ def _fault(reference: Reference, robot: Robot, reverse: bool) -> str:
 
 
 def enlarged(reference: Reference, robot: Robot, reverse: bool) -> Circle | Lemniscate | None:
-    """Returns a circle or lemniscate enlarged by as little as needed for a robot to follow it, and then slowed.
+    """Returns a circle or lemniscate slowed so that a robot can follow it, and enlarged where no period is enough.
 
     Args:
         reference: The reference.

@@ -22,7 +22,12 @@ PID = Scenario(learner="none")
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Two robots drive one plan through a door; the table says what the saved result says."""
     out = tmp_path / "out"
-    assert cli.main(["navigate", "doorway:3", "--learner", "none", "--compare", "none", "--out", str(out)]) == 0
+    assert (
+        cli.main(
+            ["navigate", "doorway:3", "--prior", "model", "--learner", "none", "--compare", "none", "--out", str(out)]
+        )
+        == 0
+    )
     printed = capsys.readouterr().out
     mission, result = json.loads((out / "mission.json").read_text()), mrctl.open(out / "result.zarr")
     assert [robot["label"] for robot in mission["robots"]] == ["model", "none"] == result["label"].values.tolist()
