@@ -133,5 +133,7 @@ def test_command(capsys):
     assert cli.main(["run", *flags, "--steering", "caster", "reference:circle", "--reference.radius", "0.5",
                      "--reference.period", "10"]) == 0  # fmt: skip
     assert '"path": "turtlebot"' in capsys.readouterr().out
-    assert cli.main(["run", *flags]) == 2
-    assert "driven with caster, not compliant" in capsys.readouterr().err
+    assert cli.main(["run", *flags]) == 0  # it brings its steering, and a lemniscate that it can follow
+    assert '"steering": "caster"' in capsys.readouterr().out
+    assert cli.main(["run", *flags, "--steering", "rigid"]) == 2
+    assert "driven with caster, not rigid" in capsys.readouterr().err
