@@ -365,7 +365,9 @@ def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code:
         raise InputError("run: --run needs the store of a sweep, as in mrctl run STORE --run 3")
     jobs.stages_of(store, code)
     if out is not None or json:
-        print(single.run(jobs.scenario_of(store, number), out, json, Store(store).manifest["sweep"]["controller"])[0])
+        print(
+            single.run(jobs.scenario_of(store, number), out, json, Store(store).manifest["sweep"].get("controller"))[0]
+        )
     repeated = jobs.repeat(store, number)
     verdict = f"run {number}: {repeated.verdict}"
     if not repeated.same:

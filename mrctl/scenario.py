@@ -100,7 +100,7 @@ class Scenario(Record):
     """Robot that drives; by default the world's own."""
     steering: Steering | None = None
     """Servo of the front wheel: soft (`compliant`), none, so that the wheel trails (`caster`), or stiff (`rigid`); by
-    default that of the robot, which is `compliant` for the default robot."""
+    default the robot's own."""
     reference: Reference = Lemniscate()
     """Reference trajectory that the robot follows."""
     laps: Annotated[int, Field(ge=1, le=10_000)] = 8
@@ -141,10 +141,10 @@ class Scenario(Record):
     initial_pose: tuple[float, float, float] | None = None
     """Pose at the start: x and y in m, θ in rad; by default that of the reference."""
     goal: tuple[float, float, float] | None = None
-    """Pose at which the run ends: x and y in m, θ in rad; it ends when the robot rests within 0.1 m and 0.2 rad of it,
-    or fails as `stuck` when it does not get 5 cm farther in 5 s. By default only the laps end it."""
+    """Pose at which the run ends, x and y in m, θ in rad; by default only the laps end it. It fails as `stuck`
+    where the robot moves less than 5 cm in 5 s."""
     initial_spread: tuple[Spread, Spread, Annotated[float, Field(ge=0, le=0.5)]] = (0.02, 0.02, 0.03)
-    """Standard deviations of a random offset from that pose: x and y in m, θ in rad."""
+    """Standard deviations of a random offset from the initial pose: x and y in m, θ in rad."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Seed of the random numbers: initial offset, initial weights, noise and biases of the sensors."""
     prefilter: Annotated[float, Field(ge=0.01, le=1)] | None = None

@@ -318,7 +318,7 @@ def stages_of(out: str | Path, code: bool = True) -> Stages:
         InputError: It names some and may not run them, or they are missing or have changed since.
     """
     store = Store(out)
-    if not (controller := store.manifest["sweep"]["controller"]):
+    if not (controller := store.manifest["sweep"].get("controller")):
         return {}
     if not code:
         raise InputError(f"code: {out} names {printable(controller)}, which --no-code forbids to run")

@@ -59,7 +59,7 @@ class _Described(Record):
     model_config = ConfigDict(extra="ignore")
     axes: tuple[_Axis, ...]
     record: str
-    controller: str | None
+    controller: str | None = None
 
 
 class _Manifest(Record):

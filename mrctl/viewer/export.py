@@ -37,12 +37,17 @@ def export(recordings: Sequence[Recording], robots: Sequence[Look], path: Path) 
     Raises:
         InputError: The file exists or cannot be written.
     """
-    if path.exists():
-        raise InputError(f"export: {path} exists already; nothing was overwritten")
+    refuse_existing(path)
     try:
         path.write_text(page(recordings, robots))
     except OSError as error:
         raise InputError(f"export: {path}: {error.strerror or error}") from None
+
+
+def refuse_existing(path: Path) -> None:
+    """Raises `InputError` if a file exists that should be written."""
+    if path.exists():
+        raise InputError(f"export: {path} exists already; nothing was overwritten")
 
 
 def page(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:

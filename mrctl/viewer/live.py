@@ -16,6 +16,7 @@ import viser
 from typing_extensions import override
 from viser._messages import HotkeyKey
 
+from mrctl.loop.simulation import arranged
 from mrctl.record import InputError
 from mrctl.results.controllers import title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
@@ -185,7 +186,7 @@ class Live(Page):
             self._shown_sensing = sensing
             spread = max(np.inf if s.source == "odometry" else s["fix_position_noise"] for s in sensing)
             self.set_marks(any(s.source != "truth" for s in sensing), spread)
-        told = [story.watch for story in STORIES.values() if story.scenarios == session.start]
+        told = [story.watch for story in STORIES.values() if [arranged(s) for s in story.scenarios] == session.start]
         write(self._story, block("story", *told) if told else "")
         self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
         self._scene.show_reference(first)

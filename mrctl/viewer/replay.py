@@ -160,7 +160,7 @@ class Replay(Page):
         if self.recordings:
             self._scene.remove()
         self.runs, self.recordings = list(runs), recordings
-        self._scene = Scene(self.server, recordings[0].model, robots)
+        self._scene = Scene(self.server, recordings[0].model, robots, fog=not self._board)
         self._plots.set_robots(robots, recordings[0].period)
         times, self._log = joint_log(recordings)
         self._deviation = self.magnified_deviation(self._log)

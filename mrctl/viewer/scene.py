@@ -71,15 +71,16 @@ class Scene:
     Everything is below the node `/world`: to follow a robot, that node moves instead of the cameras.
     """
 
-    def __init__(self, server: Server, model: mujoco.MjModel, robots: Sequence[Look]) -> None:
+    def __init__(self, server: Server, model: mujoco.MjModel, robots: Sequence[Look], fog: bool = True) -> None:
         """Draws the world and its robots.
 
         Args:
             server: Server of the page.
             model: Compiled world; it is not changed.
             robots: Look of each robot.
+            fog: Whether the horizon fades; viser cannot draw meshes that are clicked on in fog.
         """
-        self.size, self._robots = len(robots), list(robots)
+        self.size, self._robots, self._fog = len(robots), list(robots), fog
         self._scene, self._number = server.scene, next(_NUMBERS)
         self._server = server
         self._model, self._data = mjcf.clone(model), mujoco.MjData(model)
@@ -258,7 +259,8 @@ class Scene:
         for floor in self._floors:
             floor.cell_color, floor.section_color, floor.plane_color = colours
         near, far = HORIZON[0] * self._view, HORIZON[1] * self._view
-        self._scene.configure_fog(near, far, color=(20, 20, 20) if dark else (255, 255, 255))
+        colour = (20, 20, 20) if dark else (255, 255, 255)
+        self._scene.configure_fog(near, far, color=colour, enabled=self._fog)
 
     def show_events(self, rows: Rows) -> None:
         """Marks the events of a run with posts on the reference.

@@ -29,9 +29,12 @@ def live(scenario: Scenario, compare: Sequence[FeedforwardName], export: Path | 
         InputError: A scenario is refused, as by `mrctl.simulate`; or the server cannot listen on the address.
     """
     from mrctl.viewer.export import export as write
+    from mrctl.viewer.export import refuse_existing
     from mrctl.viewer.live import Live
     from mrctl.viewer.recording import Recording, looks_of
 
+    if export is not None:
+        refuse_existing(export)
     scenarios = [scenario, *(scenario.model_copy(update=FEEDFORWARDS[name] | {"name": ""}) for name in compare)]
     if export is None:
         return _serve(lambda server: Live(scenarios, server), host, port)

@@ -44,7 +44,7 @@ RUN = [
     "--perturbation.mass-factor -1", "--perturbation.payload nan", "--perturbation.control-delay 0.013",
     "--perturbation.slope 9", "--initial-pose 1 2", "--initial-pose a b c", "--initial-spread 9 9 9",
     "--robot.path nothing", "--robot.path missing.xml", "--robot.path empty.xml", "--robot.path broken.xml",
-    "--robot.path flat", "--robot.path turtlebot", "--robot.path turtlebot --steering rigid", "--robot.path .",
+    "--robot.path flat", "--robot.path turtlebot --steering rigid", "--robot.path .",
     "--robot.path racecar --robot.wheels a b", "--robot.path racecar --robot.chassis z", f"--robot.path {LONG}.xml",
     "--world moon", "--world missing.xml", "--world empty.xml", "--world broken.xml", "--world turtlebot",
     f"--world {LONG}.xml", "--world ..", "--learned missing.safetensors", "--learned junk.safetensors",

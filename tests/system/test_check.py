@@ -166,8 +166,8 @@ HUB = '<joint name="rear_left_wheel_joint"{}/>'
 ADOPTED = {
     "turtlebot": ('armature="7e-7"', "", "motors", "missing armature"),
     "racecar": (HUB.format(""), HUB.format(' damping="0.001"'), "mirror", "drag"),
-    # Without its floor the default robot is one that is steered by a servo, for which its own is too soft.
-    "car": ("", "", "circle", "soft steering servo"),
+    # Under another name the fork of the default robot is one that is steered by a servo, for which its own is too soft.
+    "car": ('<body name="fork"', '<body name="pivot"', "circle", "soft steering servo"),
 }
 
 

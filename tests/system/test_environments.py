@@ -17,7 +17,7 @@ from mrctl import FEEDFORWARDS, PERTURBATIONS, Circle, Event, InputError, Line, 
 from mrctl.envs.dm_env import SUITE, Environment, Tracking, register
 from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Episodes
 from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
-from mrctl.loop.simulation import simulate
+from mrctl.loop.simulation import arranged, simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.sensing.tiers import Sensing
 
@@ -310,7 +310,9 @@ def test_scenario_file(tmp_path):
     """The scenario files of the command line are the environments' too."""
     file = tmp_path / "scenario.toml"
     file.write_text(BUSY.to_toml())
-    assert TrackingEnv(file).episodes.scenarios == SUITE["residual"](str(file)).task.episodes.scenarios == [BUSY]
+    assert (
+        TrackingEnv(file).episodes.scenarios == SUITE["residual"](str(file)).task.episodes.scenarios == [arranged(BUSY)]
+    )
 
 
 def test_without_gymnasium():

@@ -9,6 +9,7 @@ import pytest
 import viser
 
 from mrctl import Event, Kanayama, Perturbation, Pid, Scenario, per_lap, simulate
+from mrctl.loop.simulation import arranged
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.references import Reference
 from mrctl.viewer import live as module
@@ -81,7 +82,7 @@ def test_refusals(live):
     live._restart([Scenario()])
     live._note_input(("reference",), "stop_and_go")  # reverses, with a fork that cannot
     live._apply_inputs()
-    assert "reverses" in live.message and live.session.start == [Scenario()]
+    assert "reverses" in live.message and live.session.start == [arranged(Scenario())]
     live._note_input(("perturbation", "payload_x"), -1.0)
     live._note_input(("perturbation", "payload"), 200.0)
     live._apply_inputs()
@@ -203,7 +204,11 @@ def test_stories(live):
     error = {}
     for name, story in STORIES.items():
         live._tell(name)
-        assert live.session.start == story.scenarios and story.watch in live._story.content and live.playing
+        assert (
+            live.session.start == [arranged(s) for s in story.scenarios]
+            and story.watch in live._story.content
+            and live.playing
+        )
         result = simulate(story.scenarios)
         error[name] = 1e3 * per_lap(result).position_rmse.values  # mm, of the learner and of PID alone
         fails = result.failure.values.tolist()

@@ -39,7 +39,9 @@ def test_complete_and_paired(mode):
         for tier in ("ideal", "lab", "field"):
             driven = [s for case in found if case.part in ("steady", "tier") for s in case.scenarios]
             assert {s.perturbation for s in driven if s.sensing.tier == tier} >= set(drawn.values())
-        ladder = {(s.steering, s.perturbation) for case in found if not case.change for s in case.scenarios}
+        ladder = {
+            (s.steering or "compliant", s.perturbation) for case in found if not case.change for s in case.scenarios
+        }
         assert ladder >= {(steering, drawn[p]) for steering in cases.STEERINGS for p in cases.LADDER}
     if mode == "core":
         lab = {s.perturbation for case in found if case.part == "steady" for s in case.scenarios}
