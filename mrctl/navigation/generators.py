@@ -32,7 +32,7 @@ def cellular(seed: int, fill: float = 0.2, steps: int = 3, cell: float = 0.15, c
 
     Each cell is filled at random. In each step a cell is filled if at least 5 of its 8 neighbours are, and emptied if
     at most 1 is (Perille, Truong, Xiao and Stone, "Benchmarking metric ground navigation", IEEE SSRR 2020). Each filled
-    cell is a cylinder as wide as the cell. Nothing ensures that there is a way through.
+    cell with a free neighbour is a cylinder as wide as the cell. Nothing ensures that there is a way through.
 
     Args:
         seed: Seed of the field.
@@ -202,7 +202,7 @@ def parking_bay(length: float, width: float, seed: int = 0, lane: float = 1.5) -
 def warehouse(
     aisle: float, seed: int = 0, rows: int = 4, columns: int = 3, shelf: tuple[float, float] = (2.0, 0.5)
 ) -> Task:
-    """Makes rows of shelves with aisles all around them, in a hall with walls; a tenth of the shelves is missing.
+    """Makes rows of shelves with aisles all around them, in a hall with walls; a shelf is missing with probability 0.1.
 
     Args:
         aisle: Width of the aisles in m.
