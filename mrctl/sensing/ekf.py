@@ -251,6 +251,10 @@ def step(t: int, ring: Rows, i: int, geometry: Array, period: float, delay: int,
     jolt = now.acceleration[0] - ring[(t - 1) % len(ring), i].acceleration[0]
     if (t - start) * period < LOADING:
         jolt = max(abs(jolt), LOAD)
+    if now.grip[0] + now.grip[1] == 0:  # nothing shows o, and what the encoders last did to it would be integrated
+        for i in range(N):
+            s.P[OFFSET, i] = s.P[i, OFFSET] = 0.0
+        s.mean[OFFSET], s.P[OFFSET, OFFSET] = s.offset, START_OFFSET**2
     propagate(forward - s.mean[OFFSET], omega_dot, jolt, now.grip, geometry, period, s)
     measure(now, omega_dot, geometry[3], s)
 

@@ -74,6 +74,9 @@ def joseph(x, P, residual, H, R):
 def textbook(s, sample, before, theta_dot_dot, loading):
     """Returns mean and covariance of one step of the filter: prediction, encoders, gyro."""
     x, P, grip = s["mean"].copy(), s["P"].copy(), sample["grip"] == 1
+    if not grip.any():  # nothing shows the offset, which is known afresh
+        P[OFFSET], P[:, OFFSET] = 0, 0
+        x[OFFSET], P[OFFSET, OFFSET] = s["offset"], laws.START_OFFSET**2
     acceleration = sample["acceleration"][0] + AHEAD * x[OMEGA] ** 2 - x[OFFSET]
     F = jacobian(lambda z: motion(z, acceleration, theta_dot_dot), x)
     F[V, OFFSET] = -T  # the acceleration is an input less the offset, whose effect of T²/2 on x, y and λ is left out
