@@ -109,7 +109,7 @@ class Live(Page):
         self._shown_setup: tuple[object, ...] | None = None  # world, robot, steering and labels of the present scene
         self._shown_sensing: list[Sensing] | None = None
         self._drawn: tuple[object, ...] | None = None
-        self._plotted: int | None = None
+        self._plotted: tuple[object, ...] | None = None
         self._plots_since_trail = 0
         self._tidied = time.monotonic()
         self._build()
@@ -381,8 +381,9 @@ class Live(Page):
         if happened != self._happened:  # events that the scenarios brought along
             self._happened = happened
             self._describe()
-        if session.tick != self._plotted:
-            self._plotted = session.tick
+        past = session.tick, self.playing, self.deviation.value  # a pause draws what was left out before it
+        if past != self._plotted:
+            self._plotted = past
             self._show_past()
         if session.tick:
             now = session.log(session.tick - 1)[-1]
