@@ -44,8 +44,8 @@ STORIES = {
     ),
     "ice": _story(
         Scenario(laps=5, events=(Event(time=12.0, perturbation=_ICE), Event(time=36.0, perturbation=Perturbation()))),
-        "From 12 s the left wheel runs on ice, and both robots are off by about as much. The learner does not learn "
-        "from a wheel that slips, so it is as good as before when the ice ends at 36 s.",
+        "From 12 s the left wheel runs on ice, and both robots are off by 4 to 7 mm. The learner does not learn from a "
+        "wheel that slips, so it is as good as before when the ice ends at 36 s.",
     ),
 }
 """Scenes by the name on their buttons."""

@@ -45,7 +45,7 @@ DIVERGING = {
             laps=2,
             learner="none",
             steering="caster",
-            perturbation=Perturbation(mass_factor=4, tyre_friction_factor=0.05),
+            perturbation=Perturbation(mass_factor=4, tyre_friction_factor=0.02),
         ),
         "lateral error over 1 m",
     ),
