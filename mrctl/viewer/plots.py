@@ -182,10 +182,10 @@ class Plots:
             within: Samples that are drawn.
         """
         drawn = time[within][::step]
-        marks = np.full(len(drawn), np.nan)
+        marks = np.full(len(drawn), -1.0)  # below the chart, since uPlot draws a line across NaN
         for first in np.searchsorted(drawn, events):
             if 0 < first < len(drawn):
-                marks[first - 1 : first + 1] = 1.0, 0.0  # a line from top to bottom, one sample wide
+                marks[first] = 1.0
         for handle, chart in zip(self._handles, charts(log, self._robots, self._period), strict=True):
             values = [time, *(curve.values for curve in chart.curves)]
             handle.data = (*(np.ascontiguousarray(v[within][::step]) for v in values), marks)
