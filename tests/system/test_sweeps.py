@@ -212,7 +212,7 @@ def test_changed_sweep(file, sweep, tmp_path, capsys, whole):
         line = refused(capsys, "sweep", file, "--out", store)
     assert f"mrctl {mrctl.__version__} began this sweep and this is mrctl 9.1" in line
     with mock.patch("mrctl.physics.mjcf.digest", lambda model: "another"):
-        assert "models.flat" in refused(capsys, "sweep", file, "--out", store)
+        assert "begun with another models.flat (" in refused(capsys, "sweep", file, "--out", store)
     assert content(store) == whole
 
 

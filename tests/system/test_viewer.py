@@ -222,7 +222,8 @@ def test_live(browser, tmp_path):
         page.screenshot(path=tmp_path / "phone.png", timeout=PATIENCE)
         page.set_viewport_size({"width": 1280, "height": 800})
         page.get_by_text("reset", exact=True).click()
-        until(lambda: np.isnan(curves(page, "V, m/s")[0][1:-1]).all(), "the old curves to go")
+        emptied = lambda drawn, marks: np.isnan(drawn).all() and (marks < 0).all()  # noqa: E731
+        until(lambda: emptied((now := curves(page, "V, m/s")[0])[1:-1], now[-1]), "the old curves to go")
         until(
             lambda: (
                 "/world/trail" not in page.evaluate("Object.keys(window.__viserSceneTree.getState())")
