@@ -23,7 +23,7 @@ from mrctl.loop.goals import Goals
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.log import DIVERGED, Log
 from mrctl.loop.user_stages import StageError, UserEstimator, UserHierarchy, UserStage
-from mrctl.physics import hull, mjcf
+from mrctl.physics import hull, mjcf, tyres
 from mrctl.physics.plant import Plant, build
 from mrctl.record import InputError
 from mrctl.results import dataset
@@ -34,6 +34,7 @@ from mrctl.theory.clearance import clearances
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.references import check, enlarged
+from mrctl.theory.robot import Tyres
 
 LEAST = 8  # robots in a thread, for fewer do not pay for it
 RESERVE = 0.9  # share of the robot's limits that a suited reference takes
@@ -246,7 +247,8 @@ class Simulation:
         sensing = [s.sensing for s in scenarios]
         self.sensors = Sensors(sensing, [s.seed for s in scenarios], self.period)
         # The engine integrates positions with the velocities at the end of a step: velocities are half a step behind.
-        parts = sensing, robot, self.sensors, self.plant.imu, first.physics_step / 2, first.obstacles
+        skew = first.physics_step / 2
+        parts = sensing, robot, self.sensors, self.plant.imu, skew, self._tyres(first), first.obstacles
         self.estimator = UserEstimator(own, *parts) if own else Estimator(first.sensing.source, *parts)
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period)
         self.log = Log(self.ticks, size)
@@ -261,6 +263,14 @@ class Simulation:
         self.hierarchy.reset(goal["twist"], goal["acceleration"], self.plant.reading["steering_angle"])
         for row, scenario in enumerate(scenarios):
             self.estimator.start(row, self.plant.reading[row], scenario.seed, 0)
+
+    def _tyres(self, scenario: Scenario) -> Tyres:
+        """Measures the tyres of the nominal robot on a level floor, where the estimator needs them."""
+        if scenario.sensing.source != "ekf":
+            return Tyres()
+        if scenario.world == "flat" and not scenario.obstacles.shapes:
+            return tyres.measure(self.model)
+        return tyres.measure(mjcf.load("flat", scenario.steering, scenario.physics_step, scenario.robot))
 
     @property
     def running(self) -> bool:

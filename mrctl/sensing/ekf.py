@@ -3,15 +3,18 @@
     x = (x, y, θ, V, θ̇, b, o, λ_l, λ_r, s_l, s_r)
 
     (ẋ, ẏ) = V (cos θ, sin θ) + v_y (−sin θ, cos θ),    v_y = −c V θ̇
-    V̇ = a − o,    θ̈ = θ̈_c,    λ̇_l,r = (V ∓ D θ̇)/(r (1 + s_l,r)),    b, o and s constant;    each plus noise
+    V̇ = a − o,    θ̈ = θ̈_c,    λ̇_l,r = (u_l,r − κ u̇_l,r)/(r (1 + s_l,r ± ρ a_y)),    u_l,r = V ∓ D θ̇
+    b, o and s constant;    each plus noise
 
     encoder_l,r = λ_l,r + quantisation,    gyro = θ̇ + b + noise,    fix = (x, y, θ) + noise
 
 b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii. The accelerometer a, corrected for its
 place ahead of the axle, is an input; its offset o is the sum of its bias and a component of gravity. θ̈_c is the
-commanded acceleration that acts in the period. The wheel angles λ are part of the state, so that the error of an
-encoder stays bounded in angle; modelled as noise on V, it would become a random walk of the position. A fix corrects
-the state at the time when it was taken: the filter stores that state, and repeats the periods since then.
+commanded acceleration that acts in the period. κ and ρ are `lag` and `load` of the tyres (`theory.robot.Tyres`), and
+a_y is measured, too. The wheel angles λ are part of the state, so that the error of an encoder stays bounded in angle;
+modelled as noise on V, it would become a random walk of the position. The noise of a and θ̈ moves the positions of the
+same period, so that an encoder sees it at once. A fix corrects the state at the time when it was taken: the filter
+stores that state, and repeats the periods since then.
 """
 
 from __future__ import annotations
@@ -27,15 +30,16 @@ KEPT = 5  # largest number of states that are stored for fixes that have not arr
 
 # Process noise. All values but JOLT are chosen, and tests check them by the filter's error (NEES, chi-square).
 TURN = 0.1  # deviation from the commanded θ̈, rad/s²/√Hz
-SETTLE = 1.0  # s, time in which o follows the faster offset of `find_grip`
+SETTLE = 1.5  # s, time in which o follows the faster offset of `find_grip`
 LOOSE_V = 0.5  # of V̇ while no wheel grips, m/s²/√Hz
-INCLINE = 0.02  # random walk of the component of gravity in the accelerometer, m/s²/√s
-SIDE_SLIP, SKID = 2e-4, 0.02  # lateral motion of the rear axle beyond v_y, while both wheels grip and otherwise, m/√s
-CREEP = 0.7e-4  # noise of the slip ratio of a rolling tyre, √s
-JOLT = 1e-3  # slip of a tyre while its force changes, rad/(m/s²); measured where a motor's current jumps by 4.7 A
+INCLINE = 0.012  # random walk of the component of gravity in the accelerometer, m/s²/√s
+SIDE_SLIP, SKID = 3e-5, 0.02  # lateral motion of the rear axle beyond v_y, while both wheels grip and otherwise, m/√s
+JOLT = 1e-3  # slip of a tyre while its force jumps, rad/(m/s²); measured where a motor's current jumps by 4.7 A
+SLIDE = 7e-4  # slip of the wheel that grips while the other one does not, and it carries all of the force, m/√s
+JUMP = 3.0  # a change of the acceleration is a jump as far as it is larger than this number of its deviations
 LOADING, LOAD = 0.1, 2.0  # s at the start in which the tyres take up their load, as if such jolts acted, m/s²
 RADIUS = 0.01  # standard deviation of the relative error of a wheel's radius at the start
-RADIUS_WALK = 1e-5  # random walk of that error, 1/√s
+RADIUS_WALK = 5e-6  # random walk of that error, 1/√s
 START_OFFSET = 0.2  # standard deviation of the component of gravity in the accelerometer at the start, m/s²
 START_TWIST = 0.02, 0.02  # standard deviations of V in m/s and θ̇ in rad/s at the start
 
@@ -46,7 +50,7 @@ FIX_GATE = 16.27  # 99.9 % of chi-square with 3 degrees of freedom
 LOST = 10  # number of a rejected fix in a row at which the filter accepts it
 LOOSE = 0.5  # m and rad, standard deviation that is then added to the posture
 GRIP = 0.08  # m/s, difference of encoder and inertial speed of a wheel above which it slips
-TWIST = 3e-3  # m/s, difference of the slip of two wheels that grip
+TWIST = 2e-3  # m/s, difference of the slip of two wheels that grip
 INERTIAL = 5.0  # rad/s, bandwidth of the observer that compares encoders with the accelerometer
 
 EKF = np.dtype(
@@ -56,7 +60,7 @@ EKF = np.dtype(
         ("kept_mean", "f8", (KEPT, N)),  # estimates at the ticks of fixes that have not arrived
         ("kept_P", "f8", (KEPT, N, N)),
         ("kept_tick", "i8", KEPT),  # these ticks
-        ("g", "f8", N),  # scratch: covariance of the state with a measurement
+        ("g", "f8", N),  # scratch: covariance of the state with a measurement, or its derivative by an input
         ("encoder_variance", "f8"),  # rad²
         ("gyro_variance", "f8"),  # (rad/s)²
         ("bias_walk", "f8"),  # of the gyro, rad/s/√s
@@ -74,17 +78,44 @@ EKF = np.dtype(
 
 
 @kernel
-def propagate(v_dot: float, omega_dot: float, jolt: float, grip: Array, geometry: Array, period: float, s: Row) -> None:
-    """Predicts the state over one period: P ← F P Fᵀ + Q; `jolt` is the change of the measured acceleration in m/s²."""
+def excite(variance: float, s: Row) -> None:
+    """Adds the noise of an input: P ← P + g gᵀ σ², where `s.g` is the derivative of the new state by the input."""
+    g, P = s.g, s.P
+    for i in range(N):
+        if g[i] != 0.0:
+            for j in range(N):
+                P[i, j] += variance * g[i] * g[j]
+
+
+@kernel
+def propagate(
+    v_dot: float, omega_dot: float, growth: float, jolt: float, grip: Array, geometry: Array, period: float, s: Row
+) -> None:
+    """Predicts the state over one period: P ← F P Fᵀ + Q + g_a g_aᵀ σ_a² + g_θ g_θᵀ σ_θ².
+
+    g_a and g_θ are the derivatives of the new state by the accelerations V̇ and θ̈.
+
+    Args:
+        v_dot: V̇ in m/s².
+        omega_dot: θ̈ in rad/s².
+        growth: Relative growth of the left wheel's radius by the load, and shrinking of the right one's.
+        jolt: Jump of the measured acceleration in m/s².
+        grip: Whether the wheels grip, `(2,)`.
+        geometry: As for the estimator `truth`.
+        period: Control period in s.
+        s: In and out: a record of `EKF`.
+    """
     m, P, T = s.mean, s.P, period
     r, D = geometry[0], geometry[1]
     middle = T / 2 + geometry[3]  # of the period of positions, behind which velocities lag
     v, omega = m[V] + v_dot * middle, m[OMEGA] + omega_dot * middle
     heading = m[THETA] + omega * (T / 2 - SIDE)  # of the motion, which v_y turns outwards
     c, sn = T * np.cos(heading), T * np.sin(heading)
-    grow_left, grow_right = 1 + m[SCALE_LEFT], 1 + m[SCALE_RIGHT]
+    grow_left, grow_right = 1 + m[SCALE_LEFT] + growth, 1 + m[SCALE_RIGHT] - growth
     b_left, b_right = T / (r * grow_left), T / (r * grow_right)
-    turn_left, turn_right = b_left * (v - D * omega), b_right * (v + D * omega)
+    rolled = middle - geometry[4]  # of the wheels, which lag behind the way
+    v_wheel, omega_wheel = m[V] + v_dot * rolled, m[OMEGA] + omega_dot * rolled
+    turn_left, turn_right = b_left * (v_wheel - D * omega_wheel), b_right * (v_wheel + D * omega_wheel)
     m[X] += v * c
     m[Y] += v * sn
     m[THETA] += T * omega
@@ -96,11 +127,12 @@ def propagate(v_dot: float, omega_dot: float, jolt: float, grip: Array, geometry
     for transposed in range(2):
         Q = P.T if transposed else P
         for j in range(N):
+            speed, wheels = Q[V, j] - middle * Q[OFFSET, j], Q[V, j] - rolled * Q[OFFSET, j]
             direction = v * (Q[THETA, j] + (T / 2 - SIDE) * Q[OMEGA, j])
-            Q[X, j] += c * Q[V, j] - sn * direction
-            Q[Y, j] += sn * Q[V, j] + c * direction
-            Q[LEFT, j] += b_left * (Q[V, j] - D * Q[OMEGA, j]) - turn_left / grow_left * Q[SCALE_LEFT, j]
-            Q[RIGHT, j] += b_right * (Q[V, j] + D * Q[OMEGA, j]) - turn_right / grow_right * Q[SCALE_RIGHT, j]
+            Q[X, j] += c * speed - sn * direction
+            Q[Y, j] += sn * speed + c * direction
+            Q[LEFT, j] += b_left * (wheels - D * Q[OMEGA, j]) - turn_left / grow_left * Q[SCALE_LEFT, j]
+            Q[RIGHT, j] += b_right * (wheels + D * Q[OMEGA, j]) - turn_right / grow_right * Q[SCALE_RIGHT, j]
             Q[THETA, j] += T * Q[OMEGA, j]
             Q[V, j] -= T * Q[OFFSET, j]
     gripping = grip[0] + grip[1]
@@ -109,12 +141,22 @@ def propagate(v_dot: float, omega_dot: float, jolt: float, grip: Array, geometry
     P[X, Y] -= side * sn * c
     P[Y, X] -= side * sn * c
     P[Y, Y] += side * c * c
-    P[V, V] += T**2 * s.acceleration_variance + (T * LOOSE_V**2 if gripping == 0 else 0.0)
-    P[OMEGA, OMEGA] += T * TURN**2
+    g = s.g
+    for i in range(N):
+        g[i] = 0.0
+    g[X], g[Y], g[V] = c * middle, sn * middle, T
+    g[LEFT], g[RIGHT] = b_left * rolled, b_right * rolled
+    excite(s.acceleration_variance, s)
+    across = v * (T / 2 - SIDE) * middle  # by the change of heading
+    g[X], g[Y], g[THETA], g[V], g[OMEGA] = -sn * across, c * across, T * middle, 0.0, T
+    g[LEFT], g[RIGHT] = -b_left * D * rolled, b_right * D * rolled
+    excite(TURN**2 / T, s)
+    P[V, V] += T * LOOSE_V**2 if gripping == 0 else 0.0
     P[BIAS, BIAS] += T * s.bias_walk**2
     P[OFFSET, OFFSET] += T * (s.offset_walk**2 + (s.offset - m[OFFSET]) ** 2 / SETTLE)
-    P[LEFT, LEFT] += CREEP**2 * turn_left**2 / T + JOLT**2 * jolt**2
-    P[RIGHT, RIGHT] += CREEP**2 * turn_right**2 / T + JOLT**2 * jolt**2
+    slip = JOLT**2 * jolt**2 + (T * (SLIDE / r) ** 2 if gripping == 1 else 0.0)
+    P[LEFT, LEFT] += slip
+    P[RIGHT, RIGHT] += slip
     P[SCALE_LEFT, SCALE_LEFT] += T * RADIUS_WALK**2
     P[SCALE_RIGHT, SCALE_RIGHT] += T * RADIUS_WALK**2
 
@@ -139,11 +181,8 @@ def absorb(residual: float, variance: float, s: Row) -> None:
 
 
 @kernel
-def measure(now: Row, omega_dot: float, skew: float, s: Row) -> None:
-    """Updates by encoders and gyro; the encoder of a wheel that slips only resets the angle of that wheel.
-
-    The gyro measures θ̇ of `skew` s ago; the commanded θ̈ accounts for the difference.
-    """
+def measure(now: Row, s: Row) -> None:
+    """Updates by encoders and gyro; the encoder of a wheel that slips only resets the angle of that wheel."""
     P = s.P
     if now.encoder_new:
         for k in range(2):
@@ -163,7 +202,7 @@ def measure(now: Row, omega_dot: float, skew: float, s: Row) -> None:
         for i in range(N):
             s.g[i] = P[OMEGA, i] + P[BIAS, i]
         variance = s.g[OMEGA] + s.g[BIAS] + s.gyro_variance
-        residual = now.gyro - (s.mean[OMEGA] - omega_dot * skew) - s.mean[BIAS]
+        residual = now.gyro - s.mean[OMEGA] - s.mean[BIAS]
         s.innovations[2] = residual / np.sqrt(variance)
         absorb(residual, variance, s)
 
@@ -248,15 +287,17 @@ def step(t: int, ring: Rows, i: int, geometry: Array, period: float, delay: int,
     now, p = ring[t % len(ring), i], t - 1 - delay
     omega_dot = ring[p % len(ring), i].command[1] if p >= start else 0.0
     forward = now.acceleration[0] + geometry[2] * s.mean[OMEGA] ** 2  # the accelerometer is ahead of the rear axle
-    jolt = now.acceleration[0] - ring[(t - 1) % len(ring), i].acceleration[0]
+    jolt = abs(now.acceleration[0] - ring[(t - 1) % len(ring), i].acceleration[0])
+    jolt = max(0.0, jolt - JUMP * np.sqrt(2 * s.acceleration_variance))
     if (t - start) * period < LOADING:
-        jolt = max(abs(jolt), LOAD)
+        jolt = max(jolt, LOAD)
     if now.grip[0] + now.grip[1] == 0:  # nothing shows o, and what the encoders last did to it would be integrated
         for i in range(N):
             s.P[OFFSET, i] = s.P[i, OFFSET] = 0.0
         s.mean[OFFSET], s.P[OFFSET, OFFSET] = s.offset, START_OFFSET**2
-    propagate(forward - s.mean[OFFSET], omega_dot, jolt, now.grip, geometry, period, s)
-    measure(now, omega_dot, geometry[3], s)
+    growth = geometry[5] * now.acceleration[1]
+    propagate(forward - s.mean[OFFSET], omega_dot, growth, jolt, now.grip, geometry, period, s)
+    measure(now, s)
 
 
 @kernel

@@ -20,7 +20,7 @@ from mrctl.sensing.sensors import Sensors
 from mrctl.sensing.slip import slip_ratio
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.obstacles import Obstacles
-from mrctl.theory.robot import Robot
+from mrctl.theory.robot import Robot, Tyres
 
 MOTION = np.dtype(
     [
@@ -45,7 +45,8 @@ def truth(
         i: Index of the robot.
         sensor: Its record of `SENSOR`.
         geometry: Wheel radius r, half track D and distance of the accelerometer ahead of the rear axle in m, and the
-            time `skew` in s by which velocities lag behind positions (see `Estimator`), `(4,)`.
+            time `skew` in s by which velocities lag behind positions (see `Estimator`), lag κ in s and load ρ in s²/m
+            of the tyres, `(6,)`.
         period: Control period in s.
         memory: In and out: state of the estimator for this robot.
         s: Out: its record of `SEEN`, of which an estimator writes `estimate` and `variance`.
@@ -163,6 +164,7 @@ class Estimator:
         sensors: Sensors,
         imu: Array,
         skew: float,
+        tyres: Tyres,
         obstacles: Obstacles = NONE,
     ) -> None:
         """Builds the estimator.
@@ -175,6 +177,7 @@ class Estimator:
             imu: Position of the accelerometer in the frame of the chassis in m, `(3,)`.
             skew: Time in s by which velocities lag behind positions: half a physics step, because the engine integrates
                 positions with the velocities at the end of the step.
+            tyres: The tyres of the nominal robot.
             obstacles: What a lidar sees; those that stand still are on the map.
 
         Raises:
@@ -182,7 +185,7 @@ class Estimator:
         """
         self._law, memory = estimate_with(name), ESTIMATORS[name][1]
         self._name, self._sensing, self._sensors = name, list(sensing), sensors
-        self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew])
+        self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew, *tyres])
         self.seen = np.zeros(len(sensing), SEEN)
         self.memory = np.zeros(len(sensing), memory)
         self._located = -1

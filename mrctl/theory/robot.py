@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, model_validator
 
@@ -168,6 +168,18 @@ class Robot(Record):
         """Time constant of θ̇ under U_Δ in s."""
         damping = 2 * self.half_track**2 * self.motor_gain * self.back_emf / self.wheel_radius**2
         return self.effective_inertia / damping
+
+
+class Tyres(NamedTuple):
+    """What the driven wheels of the nominal robot do beside rolling: λ̇_l,r r (1 ± load a_y) = u_l,r − lag u̇_l,r.
+
+    u_l,r = V ∓ D θ̇ is the speed of a wheel's axle, and a_y the specific force to the left.
+    """
+
+    lag: float = 0.0
+    """Slip of the driven tyres over their acceleration, in s; positive where the wheels turn less than they roll."""
+    load: float = 0.0
+    """Relative growth of the left rolling radius, and shrinking of the right one, over a_y, in s²/m."""
 
 
 class RobotFile(Record):

@@ -12,31 +12,35 @@ from mrctl.sensing.estimators import Estimator
 from mrctl.sensing.prediction import wrapped
 from mrctl.sensing.sensors import SAMPLE, Sensors
 from mrctl.sensing.tiers import Sensing
+from mrctl.theory.robot import Tyres
 
 N = laws.N
 X, Y, THETA, V, OMEGA, BIAS, OFFSET, LEFT, RIGHT, SCALE_LEFT, SCALE_RIGHT = range(N)
 T, SKEW = 0.01, 0.001
 RADIUS, HALF, AHEAD = 0.098, 0.188, 0.1
-GEOMETRY = np.array([RADIUS, HALF, AHEAD, SKEW])
+LAG, LOAD = 0.3e-3, 2e-4  # of the tyres
+GEOMETRY = np.array([RADIUS, HALF, AHEAD, SKEW, LAG, LOAD])
 MIDDLE = T / 2 + SKEW  # velocities are half a physics step behind positions
 
 
 # -- the filter of a textbook ------------------------------------------------------------------------------------------
 
 
-def motion(x, acceleration, theta_dot_dot):
+def motion(x, force, theta_dot_dot, growth):
     """Returns the state a period later, from the equations in the filter's documentation, by the midpoint rule."""
+    acceleration = force - x[OFFSET]
     v, omega = x[V] + acceleration * MIDDLE, x[OMEGA] + theta_dot_dot * MIDDLE
     # The rear axle moves along θ − c θ̇.
     heading = x[THETA] + omega * T / 2 - laws.SIDE * omega
-    new = np.array(x)
+    new = np.array(x, np.result_type(x, force))
     new[X] += T * v * np.cos(heading)
     new[Y] += T * v * np.sin(heading)
     new[THETA] += T * omega
     new[V] += T * acceleration
     new[OMEGA] += T * theta_dot_dot
-    new[LEFT] += T * (v - HALF * omega) / (RADIUS * (1 + x[SCALE_LEFT]))
-    new[RIGHT] += T * (v + HALF * omega) / (RADIUS * (1 + x[SCALE_RIGHT]))
+    for wheel, scale, side in ((LEFT, SCALE_LEFT, -1), (RIGHT, SCALE_RIGHT, 1)):
+        speed = v + side * HALF * omega - LAG * (acceleration + side * HALF * theta_dot_dot)
+        new[wheel] += T * speed / (RADIUS * (1 + x[scale] - side * growth))
     return new
 
 
@@ -46,20 +50,20 @@ def jacobian(f, x):
     return np.stack(columns, axis=1)
 
 
-def process_noise(x, grip, s, acceleration, theta_dot_dot, jolt):
+def process_noise(x, grip, s, force, theta_dot_dot, growth, jolt):
     """Returns the covariance that a period adds."""
-    v, omega = x[V] + acceleration * MIDDLE, x[OMEGA] + theta_dot_dot * MIDDLE
+    omega = x[OMEGA] + theta_dot_dot * MIDDLE
     heading = x[THETA] + omega * T / 2 - laws.SIDE * omega
     across = np.array([-np.sin(heading), np.cos(heading)])
     Q = np.zeros((N, N))
     Q[:2, :2] = T * (laws.SIDE_SLIP if grip.all() else laws.SKID) ** 2 * np.outer(across, across)
-    Q[V, V] = T**2 * s["acceleration_variance"] + (0 if grip.any() else T * laws.LOOSE_V**2)
-    Q[OMEGA, OMEGA] = T * laws.TURN**2
+    Q[V, V] = 0 if grip.any() else T * laws.LOOSE_V**2
+    inputs = jacobian(lambda u: motion(x, u[0], u[1], growth), np.array([force, theta_dot_dot]))
+    Q += inputs @ np.diag([s["acceleration_variance"], laws.TURN**2 / T]) @ inputs.T
     Q[BIAS, BIAS] = T * s["bias_walk"] ** 2
     Q[OFFSET, OFFSET] = T * (s["offset_walk"] ** 2 + (s["offset"] - x[OFFSET]) ** 2 / laws.SETTLE)
-    for wheel, scale, side in ((LEFT, SCALE_LEFT, -1), (RIGHT, SCALE_RIGHT, 1)):
-        rate = (v + side * HALF * omega) / (RADIUS * (1 + x[scale]))
-        Q[wheel, wheel] = T * (laws.CREEP * rate) ** 2 + (laws.JOLT * jolt) ** 2
+    for wheel, scale in ((LEFT, SCALE_LEFT), (RIGHT, SCALE_RIGHT)):
+        Q[wheel, wheel] += (laws.JOLT * jolt) ** 2 + (T * (laws.SLIDE / RADIUS) ** 2 if grip.sum() == 1 else 0)
         Q[scale, scale] = T * laws.RADIUS_WALK**2
     return Q
 
@@ -77,18 +81,18 @@ def textbook(s, sample, before, theta_dot_dot, loading):
     if not grip.any():  # nothing shows the offset, which is known afresh
         P[OFFSET], P[:, OFFSET] = 0, 0
         x[OFFSET], P[OFFSET, OFFSET] = s["offset"], laws.START_OFFSET**2
-    acceleration = sample["acceleration"][0] + AHEAD * x[OMEGA] ** 2 - x[OFFSET]
-    F = jacobian(lambda z: motion(z, acceleration, theta_dot_dot), x)
-    F[V, OFFSET] = -T  # the acceleration is an input less the offset, whose effect of T²/2 on x, y and λ is left out
-    jolt = sample["acceleration"][0] - before["acceleration"][0]
-    Q = process_noise(x, grip, s, acceleration, theta_dot_dot, max(abs(jolt), laws.LOAD) if loading else jolt)
-    x, P = motion(x, acceleration, theta_dot_dot), F @ P @ F.T + Q
+    force, growth = sample["acceleration"][0] + AHEAD * x[OMEGA] ** 2, LOAD * sample["acceleration"][1]
+    F = jacobian(lambda z: motion(z, force, theta_dot_dot, growth), x)
+    jump = abs(sample["acceleration"][0] - before["acceleration"][0])
+    jolt = max(0, jump - laws.JUMP * np.sqrt(2 * s["acceleration_variance"]))
+    Q = process_noise(x, grip, s, force, theta_dot_dot, growth, max(jolt, laws.LOAD) if loading else jolt)
+    x, P = motion(x, force, theta_dot_dot, growth), F @ P @ F.T + Q
     for k, wheel in enumerate((LEFT, RIGHT)):
         if not grip[k]:  # the angle of a wheel that slips says nothing of the robot, and is known afresh
             P[wheel], P[:, wheel] = 0, 0
             x[wheel], P[wheel, wheel] = sample["encoder"][k], s["encoder_variance"]
     rows = np.array([np.eye(N)[LEFT], np.eye(N)[RIGHT], np.eye(N)[OMEGA] + np.eye(N)[BIAS]])
-    z = np.array([*sample["encoder"], sample["gyro"] + theta_dot_dot * SKEW])
+    z = np.array([*sample["encoder"], sample["gyro"]])
     used = [*grip, True]
     R = np.diag([s["encoder_variance"], s["encoder_variance"], s["gyro_variance"]])
     H = rows[used]
@@ -173,17 +177,16 @@ def test_jacobian(seed, v_dot, omega_dot):
     def moved(mean):
         other = s.copy()
         other["mean"] = mean
-        laws.propagate(v_dot - (mean[OFFSET] - s["mean"][OFFSET]), omega_dot, 0.3, grip, GEOMETRY, T, other)
+        laws.propagate(v_dot - (mean[OFFSET] - s["mean"][OFFSET]), omega_dot, 1e-3, 0.3, grip, GEOMETRY, T, other)
         return other["mean"]
 
     scale = np.array([1, 1, 1, 1, 1, 1, 1, 10, 10, 1, 1]) * 1e-5
     F = np.stack([(moved(s["mean"] + h) - moved(s["mean"] - h)) / 2 / h.sum() for h in np.diag(scale)], axis=1)
-    F[[X, Y, LEFT, RIGHT], OFFSET] = 0  # T²/2 times velocities, which the filter leaves out
     P = s["P"].copy()
     quiet = s.copy()
     quiet["P"] = 0
-    laws.propagate(v_dot, omega_dot, 0.3, grip, GEOMETRY, T, s)
-    laws.propagate(v_dot, omega_dot, 0.3, grip, GEOMETRY, T, quiet)  # leaves Q
+    laws.propagate(v_dot, omega_dot, 1e-3, 0.3, grip, GEOMETRY, T, s)
+    laws.propagate(v_dot, omega_dot, 1e-3, 0.3, grip, GEOMETRY, T, quiet)  # leaves Q
     expected = F @ P @ F.T
     deviation = np.sqrt(np.diag(expected))
     near(s["P"] - quiet["P"], expected, np.outer(deviation, deviation), 1e-6)
@@ -199,7 +202,7 @@ class Drive:
         self.plant = np.zeros(len(sensing), PLANT)
         self.sensors = Sensors(sensing, [seed] * len(sensing), T)
         robot = type("Robot", (), {"wheel_radius": RADIUS, "half_track": HALF})()
-        self.filters = Estimator("ekf", sensing, robot, self.sensors, np.array([AHEAD, 0, 0]), skew)
+        self.filters = Estimator("ekf", sensing, robot, self.sensors, np.array([AHEAD, 0, 0]), skew, Tyres())
         self.tick = 0
         self.state = np.array([0.0, 0.0, 0.3])
         self.angles = np.array([0.2, 0.1])

@@ -1,0 +1,81 @@
+"""Measures what the tyres of the nominal robot add to rolling without slip, as one would on a test bench.
+
+MuJoCo's tyres are soft and creep a little, so that the wheels of a robot turn otherwise than its way divided by the
+radius: by 0.05 % of the radius at rest, which a filter finds by itself, and by what depends on the motion. An estimator
+that knows the latter, too, is wrong by a quarter less, and knows how wrong it is.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import mujoco
+import numpy as np
+
+from mrctl.physics.elements import REAR
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.readout import inputs
+from mrctl.physics.stand import stand
+from mrctl.theory.robot import Tyres
+
+PUSH = 1.0  # m/s², specific force to the left while the load of the wheels is measured
+REST = 0.5  # s, duration of that, after which nothing moves
+START, GAIN = 0.3, 0.2  # speed at which the measured acceleration begins and what is gained, in the largest speed
+RAMP = 1.0  # s, duration of the acceleration, whose first third lets the motors settle
+_CACHED = 32
+
+
+def measure(model: mujoco.MjModel) -> Tyres:
+    """Measures the tyres of a robot that stands and drives on a level floor, without obstacles.
+
+    Two experiments: gravity is tilted to the side, and both contacts are read at rest; the voltage of both motors rises
+    linearly, and the lag of the wheels behind the way is regressed on the way and the speed.
+
+    Args:
+        model: Compiled world with the nominal robot, whose floor is level.
+
+    Returns:
+        The two constants. The same model gives the same numbers, and is measured once.
+    """
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return _measured(buffer.tobytes())
+
+
+@lru_cache(_CACHED)
+def _measured(binary: bytes) -> Tyres:
+    """Measures a model in MuJoCo's binary format."""
+    model = mujoco.MjModel.from_binary_path("tyres.mjb", {"tyres.mjb": binary})
+    robot = read_robot(model)
+    step = model.opt.timestep
+
+    def begin(speed: float) -> mujoco.MjData:
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = stand(model, np.zeros(3), np.array([speed, 0.0]), robot)
+        return data
+
+    data = begin(0.0)
+    model.opt.gravity[1] = -PUSH
+    for _ in range(round(REST / step)):
+        mujoco.mj_step(model, data)
+    model.opt.gravity[1] = 0.0
+    wheels = [model.geom(wheel).id for wheel in REAR]
+    left, right = (data.contact.dist[(data.contact.geom == wheel).any(axis=1)].min(initial=0.0) for wheel in wheels)
+    # A tyre of depth d rolls on the radius r − d/2, as contacts are in the middle of the overlap.
+    load = (left - right) / 4 / robot.wheel_radius / PUSH
+
+    data, motors = begin(START * robot.max_speed), inputs(model)[:2]
+    angles = [model.joint(wheel).qposadr[0] for wheel in REAR]
+    count = round(RAMP / step)
+    rows = np.empty((count, 3))
+    for k in range(count):
+        data.ctrl[motors] = (START + GAIN * k / count) * robot.max_speed / robot.velocity_gain
+        mujoco.mj_step(model, data)
+        rows[k] = data.qpos[0], data.qvel[0], robot.wheel_radius * data.qpos[angles].mean()
+    way, speed, rolled = rows[count // 3 :].T
+    terms = np.column_stack([np.ones_like(way), way, speed])
+    lag = -np.linalg.lstsq(terms, rolled - way, rcond=None)[0][2]
+    return Tyres(lag=float(lag), load=float(load))
