@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import json
 import stat
 import tomllib
@@ -50,12 +51,22 @@ def printable(text: str) -> str:
 class Record(BaseModel):
     """A frozen record of settings, which refuses unknown keys and numbers that are not finite.
 
-    The docstring under a field is its description in help texts and in the viewer.
+    The docstring under a field is its description in help texts, in the viewer and in the docstring of the class.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
     moved: ClassVar[dict[str, str]] = {}
     """Fields of earlier versions, each with what takes its place."""
+
+    @classmethod
+    @override
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Adds the fields to the docstring of the class, so that `help` explains them."""
+        super().__pydantic_init_subclass__(**kwargs)
+        described = {name: field.description for name, field in cls.model_fields.items() if field.description}
+        if described and cls.__doc__:
+            lines = (f"    {name}: {text}".replace("\n", "\n        ") for name, text in described.items())
+            cls.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__), "", "Attributes:", *lines])
 
     @model_validator(mode="before")
     @classmethod
