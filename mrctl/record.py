@@ -16,7 +16,7 @@ from typing_extensions import override
 
 from mrctl import __version__
 
-LARGEST = 64 * 2**20  # bytes of a TOML file
+LARGEST = 4 * 2**20  # bytes of a text file of settings, which takes some seconds to read
 WRITTEN_BY = "# written by mrctl "  # first line of a TOML file that `to_toml` made
 
 
@@ -38,6 +38,25 @@ def reading(path: str | Path) -> Iterator[None]:
     except Exception as error:  # noqa: BLE001 (readers of damaged files raise errors of every kind)
         text = printable(f"{type(error).__name__}: {error}")
         raise InputError(f"{path}: damaged or missing: {text[:300]}") from None
+
+
+def read_file(path: str | Path, largest: int = LARGEST) -> bytes:
+    """Reads a file, which neither a pipe nor a device nor its size can make endless.
+
+    Raises:
+        InputError: It cannot be read, is no regular file, or is larger.
+    """
+    try:
+        found = Path(path).stat()
+        if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):
+            raise InputError(f"{path}: a pipe or a device, not a file")
+        if found.st_size > largest:
+            raise InputError(f"{path}: larger than {largest / 2**20:g} MiB")
+        return Path(path).read_bytes()
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def printable(text: str) -> str:
@@ -121,13 +140,9 @@ class Record(BaseModel):
                 mrctl that wrote the file, if another one did.
         """
         try:
-            if stat.S_ISFIFO((found := Path(path).stat()).st_mode) or found.st_size > LARGEST:
-                raise InputError(f"{path}: a pipe, or larger than {LARGEST / 2**20:g} MiB")
-            text = Path(path).read_bytes().decode()
-        except InputError:
-            raise
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+            text = read_file(path).decode()
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: {error}") from None
         try:
             values = tomllib.loads(text)
         except (ValueError, RecursionError) as error:
