@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import json
 import stat
 import tomllib
@@ -15,7 +16,7 @@ from typing_extensions import override
 
 from mrctl import __version__
 
-LARGEST = 64 * 2**20  # bytes of a TOML file
+LARGEST = 4 * 2**20  # bytes of a text file of settings, which takes some seconds to read
 WRITTEN_BY = "# written by mrctl "  # first line of a TOML file that `to_toml` made
 
 
@@ -39,6 +40,25 @@ def reading(path: str | Path) -> Iterator[None]:
         raise InputError(f"{path}: damaged or missing: {text[:300]}") from None
 
 
+def read_file(path: str | Path, largest: int = LARGEST) -> bytes:
+    """Reads a file, which neither a pipe nor a device nor its size can make endless.
+
+    Raises:
+        InputError: It cannot be read, is no regular file, or is larger.
+    """
+    try:
+        found = Path(path).stat()
+        if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):
+            raise InputError(f"{path}: a pipe or a device, not a file")
+        if found.st_size > largest:
+            raise InputError(f"{path}: larger than {largest / 2**20:g} MiB")
+        return Path(path).read_bytes()
+    except InputError:
+        raise
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+
+
 def printable(text: str) -> str:
     """Returns a text of somebody else as one line of at most 2,000 characters without control characters."""
     words = " ".join(
@@ -50,12 +70,22 @@ def printable(text: str) -> str:
 class Record(BaseModel):
     """A frozen record of settings, which refuses unknown keys and numbers that are not finite.
 
-    The docstring under a field is its description in help texts and in the viewer.
+    The docstring under a field is its description in help texts, in the viewer and in the docstring of the class.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
     moved: ClassVar[dict[str, str]] = {}
     """Fields of earlier versions, each with what takes its place."""
+
+    @classmethod
+    @override
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Adds the fields to the docstring of the class, so that `help` explains them."""
+        super().__pydantic_init_subclass__(**kwargs)
+        described = {name: field.description for name, field in cls.model_fields.items() if field.description}
+        if described and cls.__doc__:
+            lines = (f"    {name}: {text}".replace("\n", "\n        ") for name, text in described.items())
+            cls.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__), "", "Attributes:", *lines])
 
     @model_validator(mode="before")
     @classmethod
@@ -110,13 +140,9 @@ class Record(BaseModel):
                 mrctl that wrote the file, if another one did.
         """
         try:
-            if stat.S_ISFIFO((found := Path(path).stat()).st_mode) or found.st_size > LARGEST:
-                raise InputError(f"{path}: a pipe, or larger than {LARGEST / 2**20:g} MiB")
-            text = Path(path).read_bytes().decode()
-        except InputError:
-            raise
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+            text = read_file(path).decode()
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: {error}") from None
         try:
             values = tomllib.loads(text)
         except (ValueError, RecursionError) as error:

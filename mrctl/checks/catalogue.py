@@ -82,6 +82,7 @@ class Check(NamedTuple):
 
 
 CHECKS = (
+    Check(plausibility.units, "flat", "compliant"),
     Check(plausibility.stance, "flat", "compliant"),
     Check(plausibility.limits, "flat", "compliant"),
     Check(plausibility.turning_limits, "flat", "rigid"),

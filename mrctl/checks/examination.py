@@ -3,7 +3,8 @@
 Inspection lists what may be wrong with the model (see `mrctl.checks.inspections`). Where a check fails, these suspects
 are repaired in a copy and the check runs again. A suspect is named as a cause only if the check passes with all of them
 repaired and fails with this one left as it was, so a model may be odd in many ways and only those that matter for what
-was measured are named. Where no repair helps, a shorter time step is tried; any other failure stays unexplained.
+was measured are named. Where no repair helps, a shorter time step is tried; any other failure stays unexplained. A
+number in a wrong unit is found by arithmetic before anything is driven (see `mrctl.physics.units`).
 
 The parameters that a check expects are read from the same model, so three kinds of mistakes show: parts of a model
 that contradict each other (left and right, geom and axle), physics that departs from equations (1) and (3), and numbers
@@ -28,14 +29,18 @@ from mrctl.checks.comparison import Comparison, Report
 from mrctl.checks.inspections import Suspect, suspects
 from mrctl.checks.open_loop import limited
 from mrctl.physics.parameters import read_robot
+from mrctl.physics.units import bounds, mistake
 from mrctl.record import InputError
 from mrctl.theory.robot import Steering
 
 Load = Callable[[Steering | None], mujoco.MjModel]  # None: the robot's own arrangement
 
 # Checks that have to be explained before others run, because a robot that fails them fails others for the same cause.
-PREREQUISITES = {"stance": (), "inertias": (), "motors": (), "limits": ("stance",), "turning_limits": ("stance",)}
-PREREQUISITES_OF_OTHERS = ("stance", "limits", "inertias")
+PREREQUISITES = {
+    "units": (), "stance": ("units",), "inertias": ("units",), "motors": ("units",), "limits": ("units", "stance"),
+    "turning_limits": ("units", "stance"),
+}  # fmt: skip
+PREREQUISITES_OF_OTHERS = ("units", "stance", "limits", "inertias")
 SECONDS = 20.0  # s of processor time for all checks and explanations of a robot; the default robot takes 4
 SECONDS_OF_ONE = 5.0  # s of processor time for one check
 STEP_DIVISOR = 8  # by which the time step is divided where no repair explains a failure
@@ -115,7 +120,9 @@ class Examination:
         if reason := check.unsuited(model):
             return Finding(check, [], reason=reason)
         report = self._measure(check, model)
-        return Finding(check, report, () if _passes(report) else self._explain(check, report))
+        if _passes(report):
+            return Finding(check, report)
+        return Finding(check, report, _wrong_unit(model) if check.name == "units" else self._explain(check, report))
 
     def _measure(self, check: Check, model: mujoco.MjModel) -> Report:
         """Values of a check, for which there is a limited time."""
@@ -156,6 +163,15 @@ class Examination:
             return self._measure(check, model)
         except (InputError, mujoco.FatalError):
             return []
+
+
+def _wrong_unit(model: mujoco.MjModel) -> tuple[Explanation, ...]:
+    """Names the quantity of an impossible robot that is in a wrong unit, by arithmetic instead of a drive."""
+    found = mistake(model, read_robot(model))
+    if found is None:
+        return ()
+    worst = min(bounds(found.robot), key=lambda bound: bound.margin)
+    return (Explanation("wrong unit", found.text, f"{worst.quantity}: {worst.value:.3g} {worst.unit}".strip()),)
 
 
 def excess(comparison: Comparison) -> float:

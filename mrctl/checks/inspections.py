@@ -21,6 +21,7 @@ from mrctl.checks.open_loop import Car, is_steered, rolling_wheels
 from mrctl.physics.elements import MOTORS, REAR, fronts
 from mrctl.physics.mjcf import steerings
 from mrctl.physics.parameters import read_robot
+from mrctl.physics.units import reaches_limits, sufficient_gears
 from mrctl.theory.robot import GRAVITY, Robot
 
 Part = Any  # the name of an element of a model, or its index
@@ -248,13 +249,12 @@ def _constant(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 def _gear(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
-    if not 100 <= _no_load_rpm(robot) <= 60e3 or _reaches_limits(robot):
+    if not 100 <= _no_load_rpm(robot) <= 60e3 or reaches_limits(robot):
         return None  # a wrong motor constant is another fault
-    gears = robot.gear_ratio * np.geomspace(1e-3, 1e3, 601)
-    sufficient = [gear for gear in gears if _reaches_limits(robot.model_copy(update={"gear_ratio": gear}))]
+    sufficient = sufficient_gears(robot)
     if not sufficient:
         return None
-    lowest, highest = sufficient[0], sufficient[-1]
+    lowest, highest = sufficient
     motor = f"a motor of {_no_load_rpm(robot):,.0f} rpm and wheels of {1e3 * robot.wheel_radius:.3g} mm"
     need = f"the declared limits need one of {lowest:.2g} to {highest:.2g}"
     return _suspect(
@@ -262,20 +262,6 @@ def _gear(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
         {MOTORS: f"gear {robot.gear_ratio:g}: with {motor} {need}"},
         "correct the gear, or the limits",
         lambda m, motors: [(m.actuator(name).gear[:1], np.sqrt(lowest * highest)) for name in motors],
-    )
-
-
-def _reaches_limits(robot: Robot) -> bool:
-    """Whether motors, by equation (3), reach the declared limits with 10 % to spare."""
-    loss = robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2
-    stall = robot.motor_gain * robot.supply - loss
-    speed = robot.velocity_gain * stall / robot.motor_gain
-    force = 2 * stall / robot.wheel_radius
-    return (
-        speed > 1.1 * robot.max_speed
-        and speed / robot.half_track > 1.1 * robot.max_rotation
-        and force / robot.effective_mass > 1.1 * robot.max_acceleration
-        and force * robot.half_track / robot.effective_inertia > 1.1 * robot.max_rotation_acceleration
     )
 
 

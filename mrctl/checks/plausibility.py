@@ -15,8 +15,15 @@ import numpy as np
 from mrctl.checks.comparison import Report, between, compare
 from mrctl.checks.open_loop import HOLD, OFF, Car, Log, on_skid, rolling_wheels
 from mrctl.physics.elements import MOTORS, REAR
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.units import bounds
 from mrctl.theory.dynamics import inverse_dynamics
 from mrctl.theory.robot import Robot
+
+
+def units(model: mujoco.MjModel, robot: Robot) -> Report:
+    """No number is off by the orders of magnitude of a wrong unit; the bounds are those of `mrctl.physics.units`."""
+    return [between(b.quantity, b.value, b.low, b.high, b.unit) for b in bounds(read_robot(model))]
 
 
 def stance(model: mujoco.MjModel, robot: Robot) -> Report:

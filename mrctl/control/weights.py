@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,7 +11,9 @@ import numpy as np
 from mrctl import __version__
 from mrctl.control.features import INPUTS, OUTPUTS
 from mrctl.kernel import Array
-from mrctl.record import InputError
+from mrctl.record import InputError, reading
+
+LARGEST = 64 * 2**20  # bytes of the arrays of a file
 
 
 def shapes(hidden: int) -> dict[str, tuple[int, ...]]:
@@ -107,6 +110,12 @@ def read_arrays(path: str | Path, field: str, expected: Mapping[str, tuple[int, 
     """
     if not Path(path).is_file():
         raise InputError(f"{field}: no file {path}")
+    size = Path(path).stat().st_size
+    if zipfile.is_zipfile(path):  # as torch writes them
+        with reading(path), zipfile.ZipFile(path) as archive:
+            size = sum(part.file_size for part in archive.infolist())
+    if size > LARGEST:
+        raise InputError(f"{field}: {path}: {size / 2**20:,.0f} MiB of weights, at most {LARGEST / 2**20:g}")
     writer = ""
     try:
         if Path(path).suffix == ".safetensors":

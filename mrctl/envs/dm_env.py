@@ -19,7 +19,7 @@ from dm_control.rl import control
 from dm_control.utils import containers
 from dm_env import specs
 
-from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Action, Array, Episodes, read
+from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Action, Array, Draw, Episodes, read
 from mrctl.physics.plant import PhysicsPlant
 from mrctl.scenario import Scenario
 
@@ -35,18 +35,26 @@ class Tracking(control.Task):
         episodes: The closed loop.
     """
 
-    def __init__(self, scenario: Scenario, action: Action, random: int | np.random.RandomState | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        action: Action,
+        random: int | np.random.RandomState | None = None,
+        draw: Draw | None = None,
+    ) -> None:
         """Stands the robot on its reference.
 
         Args:
             scenario: The scenario.
             action: Meaning of an action, as for `mrctl.envs.episodes.Episodes`.
             random: Seed or generator that the seeds of the later episodes are drawn from; by default the scenario's.
+            draw: Draws the perturbation of every episode from a `numpy.random.Generator`, which the seed of the episode
+                determines.
 
         Raises:
             InputError: The scenario is invalid.
         """
-        self.episodes = Episodes([scenario], action)
+        self.episodes = Episodes([scenario], action, draw=draw)
         seed = scenario.seed if random is None else random
         self._random = seed if isinstance(seed, np.random.RandomState) else np.random.RandomState(seed)
         self._next = scenario.seed
@@ -125,8 +133,9 @@ def _add(action: Action) -> None:
         scenario: Scenario | str | Path | None = None,
         random: int | np.random.RandomState | None = None,
         environment_kwargs: dict[str, Any] | None = None,
+        draw: Draw | None = None,
     ) -> Environment:
-        return Environment(Tracking(read(scenario), action, random), **(environment_kwargs or {}))
+        return Environment(Tracking(read(scenario), action, random, draw), **(environment_kwargs or {}))
 
     task.__name__ = action
     task.__doc__ = f"Makes an environment in which an action is a {action}; the scenario is one lap by default."

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from mrctl.control.kanayama import posture_error
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.loop.courses import course, distinct_courses, start_pose
 from mrctl.loop.log import Log
 from mrctl.loop.simulation import Simulation, group_of
-from mrctl.record import InputError
+from mrctl.record import InputError, describe
 from mrctl.scenario import Scenario
+from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import Robot
 
 Action = Literal["twist", "voltage", "residual"]
+Draw = Callable[[np.random.Generator], Perturbation | Mapping[str, Any]]
+"""The perturbation of an episode, drawn at random, such as `PERTURBATIONS["all"].drawn`."""
 ACTION_KINDS: tuple[Action, ...] = ("twist", "voltage", "residual")
 
 OBSERVATIONS: dict[str, int] = {
@@ -27,6 +31,8 @@ OBSERVATIONS: dict[str, int] = {
 """Names and sizes: estimated posture error in the robot's frame (m, m, rad); estimated V and θ̇ (m/s, rad/s); those of
 the reference and their derivatives; rates of the rear wheels from the encoders (rad/s); commanded angle of the fork
 (rad); voltages sent last (V)."""
+EPISODE_METRICS = ("v_rmse", "omega_rmse", "position_rmse")
+"""What is said of an episode at its end: root mean squares as in `mrctl.results.metrics`, in m/s, rad/s and m."""
 RESIDUAL = 0.25  # of the supply, what a residual may add
 NEAR = 0.05  # m off the reference at which the reward is a half
 
@@ -56,6 +62,16 @@ def observe(
             for k in range(len(out)):  # the robot may have blown up
                 if not np.isfinite(out[k]):
                     out[k] = 0.0
+
+
+@kernel
+def add_squares(ticks: Rows, squares: Array) -> None:
+    """Adds the squares of the errors of V, θ̇ and position of one control tick of all robots, `(B, 3)`."""
+    for i in range(len(ticks)):
+        t, total = ticks[i], squares[i]
+        total[0] += (t.v - t.v_ref) ** 2
+        total[1] += (t.omega - t.omega_ref) ** 2
+        total[2] += (t.x_ref - t.x) ** 2 + (t.y_ref - t.y) ** 2
 
 
 class AgentMotion:
@@ -101,14 +117,20 @@ class Episodes(Simulation):
 
     Attributes:
         bound: Largest action of each component, `(2,)`.
+        scale: Largest size of each number that a robot sees, `(14,)`: 5 cm for the posture error (of the rear wheels,
+            where it turns), the robot's limits for twists, reference, wheels and steering, and its supply for voltages.
     """
 
-    def __init__(self, scenarios: Sequence[Scenario], action: Action, *, threads: int = 0) -> None:
+    def __init__(
+        self, scenarios: Sequence[Scenario], action: Action, *, draw: Draw | None = None, threads: int = 0
+    ) -> None:
         """Stands the robots on their references.
 
         Args:
             scenarios: One a robot, which may differ in what `simulate` may run together.
             action: What an action is.
+            draw: Draws the perturbation of every episode, in place of the scenario's, from a generator that its seed
+                determines: with `scenario.perturbation.drawn` the episode of seed k is replicate k of `replicates`.
             threads: Of the batch engine; 0 for all cores.
 
         Raises:
@@ -131,6 +153,13 @@ class Episodes(Simulation):
         limits = robot.max_speed, robot.max_rotation
         share = RESIDUAL if action == "residual" else 1.0
         self.bound = np.array(limits if action == "twist" else [share * robot.supply] * 2)
+        wheel_rate = (robot.max_speed + robot.half_track * robot.max_rotation) / robot.wheel_radius
+        self.scale = np.array(
+            [NEAR, NEAR, NEAR / robot.half_track, *limits, *limits, robot.max_acceleration]
+            + [robot.max_rotation_acceleration, *[wheel_rate] * 2, robot.steering_limit, *[robot.supply] * 2]
+        )
+        self._given, self._draw = [s.perturbation for s in self.scenarios], draw
+        self._squares = np.zeros((len(scenarios), 3))
         self.courses: EpisodeCourses = EpisodeCourses(scenarios, self._lead)  # type: ignore[assignment]
         self.log = Log(1, len(scenarios))
 
@@ -138,14 +167,35 @@ class Episodes(Simulation):
         self._agent = AgentMotion(robot, size)
         return self._agent
 
-    def begin(self, row: int, seed: int) -> None:
+    def _next(self, row: int, seed: int, perturbation: object) -> Scenario:
+        """Returns the scenario of a robot's next episode."""
+        if perturbation is None:
+            perturbation = self._given[row]
+            if self._draw is not None:
+                try:
+                    perturbation = self._draw(np.random.default_rng([seed, 5]))  # as `replicates` draws
+                except ValidationError as error:
+                    raise InputError(f"perturbation.{describe(error)}") from None
+        if perturbation == self.scenarios[row].perturbation:
+            return self.scenarios[row].model_copy(update={"seed": seed})
+        return self.scenarios[row].replace(seed=seed, perturbation=perturbation)
+
+    def begin(self, row: int, seed: int, perturbation: object = None) -> None:
         """Begins another episode of one robot at the coming tick, which must not be sensed yet.
 
         Args:
             row: Which robot.
             seed: Seed of its scenario from now on.
+            perturbation: Perturbation of this episode, a mapping of its fields or one of the names in `PERTURBATIONS`;
+                by default drawn, or that of the scenario.
+
+        Raises:
+            InputError: The perturbation is invalid, or the robot could not stand.
         """
-        scenario = self.scenarios[row] = self.scenarios[row].model_copy(update={"seed": seed})
+        scenario = self._next(row, seed, perturbation)
+        if scenario.perturbation != self.scenarios[row].perturbation:
+            self.events.perturb(row, scenario.perturbation)
+        self.scenarios[row] = scenario
         self.courses.start[row] = self.tick
         self.hierarchy.renew(row, scenario)
         self.events.restart(row, scenario, self.tick)
@@ -157,15 +207,18 @@ class Episodes(Simulation):
         self._failure_time[row] = np.nan
         self._goals.restart(row, self.tick)
         self._learned.pop(row, None)
-        self._action[row] = 0.0
+        self._action[row] = self._squares[row] = 0.0
 
-    def begin_all(self, seeds: Sequence[int]) -> None:
-        """Begins another episode of every robot."""
+    def begin_all(self, seeds: Sequence[int], perturbations: Sequence[object] | None = None) -> None:
+        """Begins another episode of every robot; see `begin` for the perturbations."""
+        perturbations = [None] * len(seeds) if perturbations is None else perturbations
+        if len(perturbations) != len(seeds):
+            raise InputError(f"perturbation: {len(perturbations)} of them for {len(seeds)} robots")
         self._sensed = -1
         if len(seeds) == 1:
             self.hierarchy.restart_clock()
         for row, seed in enumerate(seeds):
-            self.begin(row, seed)
+            self.begin(row, seed, perturbations[row])
 
     def act(self, action: Array) -> None:
         """Sets the action of the coming tick, `(B, 2)`."""
@@ -194,6 +247,16 @@ class Episodes(Simulation):
         observation, reward = np.empty((size, sum(OBSERVATIONS.values()))), np.empty(size)
         observe(self.plant.state, seen, wanted, self._goal, self.hierarchy.state, *constants, observation, reward)
         return observation, reward
+
+    def settle(self) -> None:
+        """As `Simulation.settle`, with the squared errors summed up."""
+        super().settle()
+        add_squares.compiled(self.log.at(self.tick - 1), self._squares)
+
+    def metrics(self, row: int) -> dict[str, float]:
+        """Returns the `METRICS` in `EPISODE_METRICS` over a robot's episode so far; NaN where it has failed."""
+        means = self._squares[row] / (self.tick - self.courses.start[row])
+        return dict(zip(EPISODE_METRICS, np.sqrt(means).tolist(), strict=True))
 
     def over(self) -> NDArray[np.bool]:
         """Which robots have driven their scenario to the end, `(B,)`."""

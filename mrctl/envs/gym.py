@@ -25,7 +25,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Action, Array, Episodes, read
+from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Action, Array, Draw, Episodes, read
+from mrctl.envs.pictures import picture
+from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
 SEEDS = 2**32  # number of seeds that a scenario can have
@@ -34,22 +36,46 @@ OBSERVATION = Box(-np.inf, np.inf, (sum(OBSERVATIONS.values()),), np.float64)
 ACTION = Box(-1.0, 1.0, (2,), np.float64)
 
 
+def asked(options: dict[str, Any] | None) -> Any:  # noqa: ANN401
+    """Returns the perturbation in the options of a reset, or None.
+
+    Raises:
+        InputError: There is another option.
+    """
+    for name in (options or {}).keys() - {"perturbation"}:
+        raise InputError(f"options: there is no {name!r}, only perturbation")
+    return (options or {}).get("perturbation")
+
+
 class TrackingEnv(gymnasium.Env):
     """An environment in which one robot follows the reference of a scenario."""
 
-    metadata = {"render_modes": []}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 100}
 
-    def __init__(self, scenario: Scenario | str | Path | None = None, action: Action = "residual") -> None:
+    def __init__(
+        self,
+        scenario: Scenario | str | Path | None = None,
+        action: Action = "residual",
+        draw: Draw | None = None,
+        render_mode: str | None = None,
+    ) -> None:
         """Stands the robot on its reference.
 
         Args:
             scenario: The scenario or the path of its file; by default one lap of the default scenario.
             action: Meaning of an action, as for `mrctl.envs.episodes.Episodes`.
+            draw: Draws the perturbation of every episode from a `numpy.random.Generator`, which the seed of the episode
+                determines.
+            render_mode: `rgb_array`, for pictures.
 
         Raises:
-            InputError: The file or the scenario is invalid.
+            InputError: The file or the scenario is invalid, or there is no such `render_mode`.
         """
-        self.episodes = Episodes([read(scenario)], action)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError(f"render_mode: {render_mode!r} is not rgb_array")
+        self.render_mode = render_mode
+        self.episodes = Episodes([read(scenario)], action, draw=draw)
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.episodes.period)}
         # Each environment has copies, because a space holds its own random numbers.
         self.observation_space, self.action_space = copy.deepcopy((OBSERVATION, ACTION))
 
@@ -58,14 +84,18 @@ class TrackingEnv(gymnasium.Env):
 
         Args:
             seed: Seed of the scenario; by default the environment's own generator draws one.
-            options: Not used.
+            options: The `perturbation` of this episode: a `Perturbation`, a mapping of its fields, or one of the names
+                in `PERTURBATIONS`; by default drawn, or that of the scenario.
 
         Returns:
             The observation, `(14,)`, and an empty dictionary.
+
+        Raises:
+            InputError: An option is unknown or invalid.
         """
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(SEEDS))
-        self.episodes.begin_all([drawn if seed is None else seed % SEEDS])
+        self.episodes.begin_all([drawn if seed is None else seed % SEEDS], [asked(options)])
         return self.episodes.observe()[0][0], {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -76,16 +106,26 @@ class TrackingEnv(gymnasium.Env):
 
         Returns:
             Observation `(14,)`, reward, whether the robot has failed, whether the scenario is at its end, and a
-            dictionary with the reason under `failure` where the robot has failed.
+            dictionary: at the end of the episode `EPISODE_METRICS`, and where the robot has failed why, as `failure`.
         """
         loop = self.episodes
         loop.act(action * loop.bound)
         with np.errstate(invalid="ignore", over="ignore"):
             loop.step()
             (seen,), (reward,) = loop.observe()
-        failed = bool(loop.plant.failed[0])
-        info = {"failure": loop.plant.failure[0]} if failed else {}
-        return seen, float(reward), failed, bool(loop.over()[0]) and not failed, info
+        failed, over = bool(loop.plant.failed[0]), bool(loop.over()[0])
+        info: dict[str, Any] = {"failure": loop.plant.failure[0]} if failed else {}
+        if failed or over:
+            info |= loop.metrics(0)
+        return seen, float(reward), failed, over and not failed, info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Returns a picture of the robot in its world, `(480, 640, 3)`; None without `render_mode`.
+
+        Raises:
+            InputError: MuJoCo cannot draw on this machine.
+        """
+        return picture(self.episodes) if self.render_mode else None
 
 
 class TrackingVectorEnv(VectorEnv):
@@ -99,6 +139,7 @@ class TrackingVectorEnv(VectorEnv):
         scenario: Scenario | str | Path | Sequence[Scenario] | None = None,
         action: Action = "residual",
         threads: int = 0,
+        draw: Draw | None = None,
     ) -> None:
         """Stands the robots on their references.
 
@@ -108,6 +149,7 @@ class TrackingVectorEnv(VectorEnv):
                 lap of the default scenario.
             action: Meaning of an action, as for `mrctl.envs.episodes.Episodes`.
             threads: Number of threads of the batch engine; 0 for all cores.
+            draw: As for `TrackingEnv`.
 
         Raises:
             InputError: The file or a scenario is invalid, or the scenarios cannot run together.
@@ -120,7 +162,7 @@ class TrackingVectorEnv(VectorEnv):
         if len(scenarios) != num_envs:
             raise ValueError(f"num_envs: {num_envs}, but {len(scenarios)} scenarios")
         self.num_envs = num_envs
-        self.episodes = Episodes(scenarios, action, threads=threads)
+        self.episodes = Episodes(scenarios, action, draw=draw, threads=threads)
         self.single_observation_space, self.single_action_space = copy.deepcopy((OBSERVATION, ACTION))
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -134,10 +176,13 @@ class TrackingVectorEnv(VectorEnv):
 
         Args:
             seed: A seed, to which each robot's row is added, or B seeds; a robot without a seed draws its own.
-            options: Not used.
+            options: The `perturbation` of these episodes, as for `TrackingEnv`, or a list of B of them.
 
         Returns:
             The observations, `(B, 14)`, and an empty dictionary.
+
+        Raises:
+            InputError: An option is unknown or invalid.
         """
         if isinstance(seed, Sequence):
             seeds = list(seed)
@@ -148,7 +193,9 @@ class TrackingVectorEnv(VectorEnv):
             if own is not None:
                 self._randoms[row] = seeding.np_random(own)[0]
         drawn = [self._draw(row) for row in range(self.num_envs)]
-        self.episodes.begin_all([d if s is None else s % SEEDS for s, d in zip(seeds, drawn, strict=True)])
+        perturbation = asked(options)
+        several = perturbation if isinstance(perturbation, list | tuple) else [perturbation] * self.num_envs
+        self.episodes.begin_all([d if s is None else s % SEEDS for s, d in zip(seeds, drawn, strict=True)], several)
         self._over[:] = False
         return self.episodes.observe()[0], {}
 
@@ -164,7 +211,7 @@ class TrackingVectorEnv(VectorEnv):
 
         Returns:
             Observations `(B, 14)`, rewards `(B,)`, which robots have failed `(B,)`, which are at the end of their
-            scenario `(B,)`, and a dictionary with the reasons under `failure`.
+            scenario `(B,)`, and a dictionary as that of `TrackingEnv`, of arrays `(B,)`.
         """
         loop, begun = self.episodes, np.flatnonzero(self._over)
         loop.act(actions * loop.bound)
@@ -178,8 +225,9 @@ class TrackingVectorEnv(VectorEnv):
         truncated = loop.over() & ~terminated
         self._over = terminated | truncated
         info: dict[str, Any] = {}
-        for row in np.flatnonzero(terminated):
-            info = self._add_info(info, {"failure": loop.plant.failure[row]}, int(row))
+        for row in map(int, np.flatnonzero(self._over)):
+            reason = {"failure": loop.plant.failure[row]} if terminated[row] else {}
+            info = self._add_info(info, reason | loop.metrics(row), row)
         return seen, reward, terminated, truncated, info
 
 

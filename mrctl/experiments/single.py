@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import xarray as xr
 from matplotlib.figure import Figure
+from numba.core.event import Event, Listener, install_listener
 
 from mrctl.control.stages import Stages
 from mrctl.experiments.tables import markdown, number, output_folder
@@ -41,6 +43,21 @@ FIGURES: dict[str, Callable[[xr.Dataset], Figure]] = {
 }
 
 
+class _Announcement(Listener):
+    """Says that laws are compiled, which takes most of a first run before its progress bar appears."""
+
+    said = False
+
+    def on_start(self, event: Event) -> None:
+        """Says it once."""
+        if not self.said:
+            self.said = True
+            print("mrctl: compiling the laws, which takes half a minute, once", file=sys.stderr)
+
+    def on_end(self, event: Event) -> None:
+        """Says nothing."""
+
+
 def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = None) -> tuple[str, str]:
     """Runs a scenario.
 
@@ -68,7 +85,8 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     try:
         if out is not None:
             output_folder(out)
-        result = simulate([scenario], progress=True, **stages)
+        with install_listener("numba:compile", _Announcement()):
+            result = simulate([scenario], progress=True, **stages)
     except InputError:
         if out is not None and new and out.is_dir():
             out.rmdir()

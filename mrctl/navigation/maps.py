@@ -5,6 +5,7 @@ The format is that of the package `map_server` (wiki.ros.org/map_server), which 
 
 from __future__ import annotations
 
+import io
 import warnings
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -16,10 +17,11 @@ from PIL import Image
 from pydantic import Field
 
 from mrctl.kernel import Array
-from mrctl.record import InputError, Record
+from mrctl.record import InputError, Record, read_file
 from mrctl.theory.grid import check_size, rectangles
 from mrctl.theory.obstacles import MOST, Box, Obstacles, Pose, turned
 
+IMAGE = 64 * 2**20  # bytes of an image
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -82,9 +84,9 @@ def read_map(path: str | Path) -> Map:
         InputError: The file is no map, or its image is missing, no image, or larger than 20 million pixels.
     """
     try:
-        values = yaml.safe_load(Path(path).read_bytes())
-    except (OSError, yaml.YAMLError, ValueError) as error:
-        raise InputError(f"{path}: {' '.join(str(getattr(error, 'strerror', None) or error).split())}") from None
+        values = yaml.safe_load(read_file(path))
+    except (yaml.YAMLError, RecursionError) as error:
+        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
     if not isinstance(values, dict):
         raise InputError(f"{path}: no map: not a yaml file of fields such as image and resolution")
     values = {name: value for name, value in values.items() if name in MapFile.model_fields}  # tools add others
@@ -114,7 +116,7 @@ def _pixels(path: Path) -> Array:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as image:
+            with Image.open(io.BytesIO(read_file(path, IMAGE))) as image:
                 check_size(image.height, image.width, f"{path}: image")
                 if image.mode.startswith("I"):
                     return np.asarray(image, float)[..., None] / 257  # 16 bits

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.record import InputError
+from mrctl.record import InputError, read_file
 from mrctl.theory.obstacles import Obstacles, turned
 
 FLAT = 0.02  # m, height up to which a collision shape is ground
@@ -30,9 +30,9 @@ def read_sdf(path: str | Path) -> Obstacles:
         InputError: The file is no SDF world, or one of its shapes is a mesh or not upright.
     """
     try:
-        world = ElementTree.parse(path).getroot().find("world")
-    except (OSError, ElementTree.ParseError) as error:
-        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+        world = ElementTree.fromstring(read_file(path)).find("world")
+    except ElementTree.ParseError as error:
+        raise InputError(f"{path}: {error}") from None
     if world is None:
         raise InputError(f"{path}: no SDF file with a <world>")
     shapes = []

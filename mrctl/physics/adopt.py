@@ -187,7 +187,11 @@ class _Adoption:
                 caster = self._contact(g, body.name, self._roller(body.name))
                 casters.append(caster._replace(radius=centre[2] - floor))  # so that it touches the wheels' floor
         if not casters:
-            raise InputError("caster: beside the driven wheels nothing reaches the floor, and nothing is steered")
+            track = np.linalg.norm(self.rear[0].centre - self.rear[1].centre)
+            unit = f"; their radius is {self.radius:.4g} m: is it in mm or cm?" if self.radius > track else ""
+            raise InputError(
+                f"caster: beside the driven wheels nothing reaches the floor, and nothing is steered{unit}"
+            )
         distances = [(caster.centre - self.origin) @ self.ahead for caster in casters]
         if len(casters) > 2 or min(distances) * max(distances) < 0:
             names = _listed([caster.body for caster in casters])

@@ -21,6 +21,7 @@ from mrctl.physics.elements import (
     rolling_fronts,
     rounded,
 )
+from mrctl.physics.units import mistake
 from mrctl.record import InputError
 from mrctl.theory.robot import ANY_ANGLE, GRAVITY, Robot
 
@@ -64,10 +65,8 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
         rolling = losses / sum(load[wheel] for wheel in front_wheels)
     drives = [model.joint(wheel).frictionloss[0] - rolling * load[wheel] for wheel in REAR]
     gear_loss = np.mean(drives) - gear * constant * no_load
-    if gear_loss < -1e-9:
-        raise InputError("frictionloss: a rear wheel's is smaller than its rolling and no-load losses")
     limits = model.numeric("limits").data
-    return Robot.from_dict(
+    robot = Robot.from_dict(
         {
             "mass": masses.sum(),
             "yaw_inertia": inertia,
@@ -100,6 +99,11 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
         },
         "robot",
     )
+    if gear_loss < -1e-9:
+        wrong = mistake(model, robot)
+        reason = f"; {wrong.text}" if wrong else ""
+        raise InputError(f"frictionloss: a rear wheel's is smaller than its rolling and no-load losses{reason}")
+    return robot
 
 
 def at_rest(model: mujoco.MjModel, scratch: mujoco.MjData | None = None) -> tuple[mujoco.MjData, NDArray[np.float64]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import uuid
 from collections.abc import Iterable, Sequence
@@ -18,6 +19,9 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from mrctl import __version__
 from mrctl.record import InputError, reading
 from mrctl.scenario import Scenario
+
+SMALL = 2**30  # bytes of signals that any result may have
+EXPANSION = 1000  # bytes of signals for a byte in a file
 
 # Name: (unit, meaning). A sample at time t holds the state at t, the commands
 # computed from it, and the currents and power at the end of the control period during which these commands are held.
@@ -207,6 +211,21 @@ def save(result: xr.Dataset, path: str | Path) -> None:
         shutil.rmtree(partial, ignore_errors=True)
 
 
+def only_files(folder: Path) -> int:
+    """Returns the size of all files in a folder in bytes.
+
+    Raises:
+        InputError: There is a pipe or a device among them, which would never end.
+    """
+    total = 0
+    for inside, _, names in os.walk(folder):
+        for file in (Path(inside) / name for name in names):
+            if file.exists() and not file.is_file():
+                raise InputError(f"{file}: a pipe or a device, not a file")
+            total += file.stat().st_size if file.exists() else 0
+    return total
+
+
 def open_result(path: str | Path) -> xr.Dataset:
     """Opens a saved result, whichever version of mrctl wrote it: a result names its variables, with their units.
 
@@ -217,10 +236,14 @@ def open_result(path: str | Path) -> xr.Dataset:
     """
     if not (Path(path) / "zarr.json").is_file():
         raise InputError(f"{path}: not a saved result, nor a sweep's store: no zarr.json")
+    stored = only_files(Path(path))
     arrays: dict[Path, zarr.Array] = {}
     for folder in sorted(file.parent for file in Path(path).glob("*/zarr.json")):
         with reading(folder):
             arrays[folder] = zarr.open_array(folder, mode="r", zarr_format=3)
+    declared = sum(array.nbytes for array in arrays.values())
+    if declared > max(SMALL, EXPANSION * stored):
+        raise InputError(f"{path}: declares {declared / 1e9:,.0f} GB of signals and holds {stored / 1e6:,.3g} MB")
     with reading(f"{path}: not a saved result"):
         result = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
     for folder, array in arrays.items():

@@ -36,8 +36,11 @@ class Grid(Record):
     """Evenly spaced numbers from `start` to `stop`, both included."""
 
     start: float
+    """First value."""
     stop: float
+    """Last value."""
     count: Annotated[int, Field(ge=1, le=10_000)]
+    """Number of values."""
 
 
 class Axis(Record):

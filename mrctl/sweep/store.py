@@ -39,11 +39,12 @@ from pydantic import ConfigDict, Field
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from mrctl import __version__
-from mrctl.record import InputError, Record, reading
-from mrctl.results.dataset import SIGNALS, open_result
+from mrctl.record import InputError, Record, read_file, reading
+from mrctl.results.dataset import SIGNALS, only_files, open_result
 from mrctl.results.metrics import METRICS
 from mrctl.scenario import LONGEST
 
+LARGEST = 2**28  # bytes of sweep.json
 KIND, FORMAT = "mrctl sweep", 2
 ROW_GROUP = 16384  # rows of the table that are in memory at once
 INNER = 16  # runs that are compressed together, signal by signal
@@ -94,9 +95,9 @@ class Store:
         """
         self.path = Path(path).absolute()
         try:
-            self.manifest: dict[str, Any] = json.loads((self.path / "sweep.json").read_bytes())
+            self.manifest: dict[str, Any] = json.loads(read_file(self.path / "sweep.json", LARGEST))
             found, self.writer = self.manifest[KIND], str(self.manifest["versions"]["mrctl"])
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             raise InputError(f"{path}: not a sweep's store") from None
         _Manifest.from_dict(self.manifest, f"{path}/sweep.json")
         if found not in range(1, FORMAT + 1):
@@ -385,6 +386,7 @@ def open(path: str | Path) -> xr.Dataset:
     """
     path = Path(path)
     if (path / "sweep.json").is_file():
+        only_files(path)
         return Store(path).dataset()
     return open_result(path / "result.zarr" if (path / "result.zarr").exists() else path)
 

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from mrctl.kernel import Rows
+from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.results.dataset import blank
 from mrctl.viewer.looks import Colour, Look
-from mrctl.viewer.scene import EVENT_COLOUR, REFERENCE_COLOUR
+from mrctl.viewer.scene import EVENT_COLOUR
 from mrctl.viewer.score import table
 
 Array = NDArray[np.float64]

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mrctl.kernel import Rows
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
+from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.physics.stand import ground
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
@@ -31,7 +32,6 @@ from mrctl.viewer.server import Server
 from mrctl.viewer.shapes import bar, ribbons
 
 Array = NDArray[np.float64]
-REFERENCE_COLOUR: Colour = (110, 115, 122)
 EVENT_COLOUR: Colour = (217, 119, 6)
 # Of the cells and sections of the floor, and of the floor.
 LIGHT_FLOOR = (214, 217, 221), (190, 194, 200), (238, 240, 242)

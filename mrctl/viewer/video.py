@@ -18,11 +18,12 @@ from tqdm import tqdm
 
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
+from mrctl.physics.pictures import REFERENCE_COLOUR, draw_line
 from mrctl.record import InputError
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of, path
-from mrctl.viewer.scene import CAMERA_POSITION, CAMERA_TARGET, LEAST_VIEW, REFERENCE_COLOUR
+from mrctl.viewer.scene import CAMERA_POSITION, CAMERA_TARGET, LEAST_VIEW
 from mrctl.viewer.sensors import magnification
 
 Array = NDArray[np.float64]
@@ -126,7 +127,7 @@ def _pictures(
                 scene = renderer.scene
                 if row == 0:
                     renderer.update_scene(data, camera)
-                    _draw_line(scene, course + [0, 0, 0.004], 2 * WIDTH * view, REFERENCE_COLOUR)
+                    draw_line(scene, course + [0, 0, 0.004], 2 * WIDTH * view, REFERENCE_COLOUR)
                 else:
                     before = scene.ngeom
                     mujoco.mjv_addGeoms(model, data, option, nothing, mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
@@ -135,7 +136,7 @@ def _pictures(
                         geom.matid = -1
                 since, last = recording.index(time - TRAIL), recording.index(time)
                 rows = recording.log[np.linspace(since, last, TRAIL_POINTS).astype(int)]
-                _draw_line(
+                draw_line(
                     scene, path(rows, radius, data.body("chassis").xpos[2], magnified), WIDTH * view, robot.colour
                 )
             yield _labelled(renderer.render(), f"{time:.1f} s, deviation of trails {magnified} times", robots)
@@ -148,16 +149,3 @@ def _labelled(picture: Picture, text: str, robots: Sequence[Look]) -> Picture:
     for k, (line, colour) in enumerate([(text, (31, 41, 55)), *robots]):
         draw.text((size, size * (0.6 + 1.3 * k)), line, colour, font_size=size)
     return np.asarray(image)
-
-
-def _draw_line(scene: mujoco.MjvScene, points: Array, width: float, colour: Sequence[int]) -> None:
-    """Adds a line through points `(n, 3)` to a scene, with a width in m."""
-    rgba = np.array([*np.array(colour) / 255, 1.0], np.float32)
-    for start, end in zip(points[:-1], points[1:], strict=True):
-        if scene.ngeom >= scene.maxgeom or not np.isfinite([start, end]).all():
-            continue
-        geom = scene.geoms[scene.ngeom]
-        kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-        mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
-        mujoco.mjv_connector(geom, kind, width / 2, start, end)
-        scene.ngeom += 1

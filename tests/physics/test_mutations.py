@@ -148,6 +148,9 @@ def bumps(m, factor):
 
 # Each check, with changes that break its law.
 MUTATIONS = [
+    ("units", grip, 100.0),
+    ("units", mass, 1000.0),
+    ("units", motor_constant, 1e-3),
     ("stance", small_front, 0.9),
     ("stance", radius, 1.1),
     ("limits", gear, 2.2),

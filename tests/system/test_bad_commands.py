@@ -1,9 +1,12 @@
 """Bad command lines: status 2, one line on stderr without control characters, and nothing is left behind."""
 
 import os
+import struct
+import zipfile
 from pathlib import Path
 
 import pytest
+import zarr
 
 from mrctl import cli
 
@@ -33,6 +36,28 @@ FILES = {
     "file": "",
     "junk.safetensors": "junk",
 }
+WORLD = '<mujoco><asset>{}</asset><worldbody><geom type="plane" size="0 0 1"/>{}</worldbody></mujoco>'
+HOSTILE = {  # what small files ask for
+    "replicate.xml": WORLD.format("", '<replicate count="1000000"><geom size="1"/></replicate>'),
+    "nested.xml": WORLD.format("", 2 * '<replicate count="1000">' + '<geom size="1"/>' + 2 * "</replicate>"),
+    "included.xml": '<mujoco><include file="replicate.xml"/></mujoco>',
+    "composite.xml": WORLD.format("", '<body><composite type="cable" count="100000 1 1" size="1"/></body>'),
+    "hfield.xml": WORLD.format('<hfield name="h" nrow="30000" ncol="50000" size="1 1 1 1"/>', ""),
+    "texture.xml": WORLD.format('<texture name="t" type="2d" builtin="flat" width="60000" height="60000"/>', ""),
+    "pixels.xml": WORLD.format('<hfield name="h" file="huge.png" size="1 1 1 1"/>', ""),
+    "waits.xml": WORLD.format('<mesh name="m" file="pipe.toml"/>', ""),
+    "endless.xml": WORLD.format('<mesh name="m" file="zero.toml"/>', ""),
+    "pixels.yaml": "image: huge.png\nresolution: 0.05\norigin: [0, 0, 0]\noccupied_thresh: 0.6\nfree_thresh: 0.2",
+}
+ASKS = [
+    *(f"run --world {name}" for name in HOSTILE if name.endswith(".xml")), "check replicate.xml",
+    "run --robot.path nested.xml", "tune replicate.xml", "run zero.toml", "run loop.toml", "run large.toml",
+    "sweep zero.toml --out s", "sweep large.toml --out s", "sweep loop.toml --out s", "view zero.toml", "run loop.xml",
+    "run --world loop.xml", "run --robot.path zero.xml", "navigate zero.toml", "navigate pipe.yaml",
+    "navigate zero.yaml", "navigate loop.yaml", "navigate pixels.yaml", "navigate pipe.world", "navigate large.toml",
+    "run --fel.weights unpacks.pt", "run --learned unpacks.pt", "run --learned zero.pt", "export wide --to csv --out x",
+    "view wide", "export piped --to csv --out x",
+]  # fmt: skip
 LONG = "x" * 5000
 RUN = [
     "--laps 0", "--laps -1", "--laps x", "--laps 1.5", "--laps 99999999999", "--laps", "--seed -1", "--seed 4294967296",
@@ -89,11 +114,33 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (path / name).write_bytes(text.encode("latin-1"))
     for name, text in FILES.items():
         (path / name).write_text(text)
-    os.mkfifo(path / "pipe.toml")
+    for name, text in HOSTILE.items():
+        (path / name).write_text(text)
+    for name in ("pipe.toml", "pipe.yaml", "pipe.world"):
+        os.mkfifo(path / name)
+    for name in ("zero.toml", "zero.yaml", "zero.xml", "zero.pt"):
+        os.symlink("/dev/zero", path / name)
+    for name in ("loop.toml", "loop.yaml", "loop.xml"):
+        os.symlink(name, path / name)
+    with (path / "large.toml").open("wb") as file:
+        file.truncate(100_000_000)  # of zeros, which take no room on the disk
+    (path / "huge.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">IIBBBBBI", 50000, 50000, 8, 0, 0, 0, 0, 0)
+    )
+    with zipfile.ZipFile(path / "unpacks.pt", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data/0", bytes(100_000_000))
+    for name in ("wide", "piped"):
+        group = zarr.create_group(path / name, zarr_format=3)
+        shape = (1_000_000, 1_250_000) if name == "wide" else (1, 1)  # 10 TB
+        group.create_array("x", shape=shape, chunks=(1, shape[1]), dtype="f8", dimension_names=("run", "time"))
+    (path / "piped" / "x" / "c" / "0").mkdir(parents=True)
+    os.mkfifo(path / "piped" / "x" / "c" / "0" / "0")
     return path
 
 
-@pytest.mark.parametrize("line", [*(f"run {flags}" for flags in RUN), *OTHERS], ids=lambda line: ascii(line)[1:60])
+@pytest.mark.parametrize(
+    "line", [*(f"run {flags}" for flags in RUN), *OTHERS, *ASKS], ids=lambda line: ascii(line)[1:60]
+)
 def test_refused_in_one_line(
     line: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

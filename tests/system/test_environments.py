@@ -1,5 +1,6 @@
 """Environments: what their own makers' checkers ask for, and the very physics of `simulate`, bit for bit."""
 
+import os
 import subprocess
 import sys
 import warnings
@@ -11,11 +12,23 @@ from absl.testing import absltest
 from dm_env import StepType, test_utils
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import TransformObservation
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from mrctl import FEEDFORWARDS, PERTURBATIONS, Circle, Event, InputError, Line, Perturbation, Scenario
+from mrctl import (
+    FEEDFORWARDS,
+    PERTURBATIONS,
+    Circle,
+    Event,
+    InputError,
+    Line,
+    Perturbation,
+    Scenario,
+    replicates,
+    summary,
+)
 from mrctl.envs.dm_env import SUITE, Environment, Tracking, register
-from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Episodes
+from mrctl.envs.episodes import ACTION_KINDS, EPISODE_METRICS, OBSERVATIONS, Episodes
 from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
 from mrctl.loop.simulation import arranged, simulate
 from mrctl.results.dataset import SIGNALS
@@ -116,6 +129,136 @@ def test_vector_bits(feedforward):
             assert np.array_equal(found, expected(scenarios[row], seed)[: len(found)], equal_nan=True), (row, seed)
 
 
+def drive(env, **reset):
+    """Drives a single environment through an episode with zero actions; returns its signals and the last dictionary."""
+    env.reset(**reset)
+    found, over, info = [], False, {}
+    while not over:
+        assert not info
+        _, _, failed, over, info = env.step(np.zeros(2))
+        over |= failed
+        found.append(last(env.episodes))
+    return np.array(found), info
+
+
+def test_perturbation_of_a_reset():
+    """The option holds for one episode, whatever it is written as; the next one has the scenario's robot again."""
+    env = TrackingEnv(SHORT)
+    heavy = Perturbation(mass_factor=1.5, control_delay=0.02)
+    for given, meant in (
+        (None, Perturbation()),
+        (heavy, heavy),
+        (None, Perturbation()),
+        ({"mass_factor": 1.5, "control_delay": 0.02}, heavy),
+        ("all", PERTURBATIONS["all"]),
+    ):
+        found, _ = drive(env, seed=4, options={"perturbation": given} if given else None)
+        assert np.array_equal(found, expected(SHORT.replace(perturbation=meant), 4), equal_nan=True)
+
+
+def test_perturbations_of_a_vector():
+    """One for each robot, which the episodes after those of the reset do not have."""
+    env = TrackingVectorEnv(3, SHORT, threads=1)
+    given = ["all", None, {"payload": 5.0}]
+    meant = [SHORT.replace(perturbation=p or Perturbation()) for p in given]
+    env.reset(seed=7, options={"perturbation": given})
+    found = []
+    for _ in range(220 + 1 + 220):
+        env.step(np.zeros((3, 2)))
+        found.append([last(env.episodes, row) for row in range(3)])
+    for row, scenario in enumerate(meant):
+        one = np.array(found)[:, row]
+        assert np.array_equal(one[:220], expected(scenario, 7 + row), equal_nan=True)
+        assert np.array_equal(one[221:], expected(SHORT, env.episodes.scenarios[row].seed), equal_nan=True)
+
+
+def test_drawn_perturbations():
+    """An episode whose perturbation is drawn is the replicate of its seed; in a vector, the same robots."""
+    scenario = SHORT.replace(perturbation=PERTURBATIONS["all"])
+    env = TrackingEnv(scenario, draw=scenario.perturbation.drawn)
+    several = TrackingVectorEnv(2, scenario, draw=scenario.perturbation.drawn, threads=1)
+    other = SUITE["residual"](scenario.replace(seed=8), draw=scenario.perturbation.drawn)
+    several.reset(seed=[8, 9])
+    other.reset()
+    for row, seed in enumerate((8, 9)):
+        (replicate,) = replicates(scenario, 1, first=seed)
+        found, info = drive(env, seed=seed)
+        assert np.array_equal(found, expected(replicate, seed), equal_nan=True)
+        assert several.episodes.scenarios[row] == env.episodes.scenarios[0]
+        table = summary(simulate(replicate))
+        assert info == pytest.approx({name: table[name][0] for name in EPISODE_METRICS}, rel=1e-9)
+    assert other.task.episodes.scenarios[0].perturbation == replicates(scenario, 1, first=8)[0].perturbation
+    free = TrackingEnv(scenario, draw=lambda random: {"mass_factor": random.uniform(0.5, 2.0)})
+    factors = [(free.reset(), free.episodes.scenarios[0].perturbation.mass_factor)[1] for _ in range(4)]
+    assert len({*factors}) == 4 and 0.5 <= min(factors) and max(factors) <= 2.0
+
+
+def test_scale():
+    """A robot that drives at its limits sees numbers of about one; the wrapper is Gymnasium's own."""
+    env = TrackingEnv(Scenario(reference=Circle(period=4.0, radius=0.6), laps=1))
+    scaled = TransformObservation(env, lambda seen: seen / env.episodes.scale, env.observation_space)
+    scaled.reset(seed=0)
+    seen = np.array([scaled.step(np.zeros(2))[0] for _ in range(400)])
+    largest = np.abs(seen).max(axis=0)
+    assert (largest < 1.5).all() and (largest[[3, 4, 5, 6, 9, 10, 11, 12, 13]] > 0.1).all(), largest
+
+
+RENDER = """
+import gymnasium, numpy as np
+from gymnasium.utils.env_checker import check_env
+from mrctl import Circle, InputError, Scenario
+import mrctl.envs.gym
+
+make = lambda mode=None: gymnasium.make("mrctl/ResidualTracking-v0", scenario=Scenario(
+    reference=Circle(period=2.2, radius=0.3), laps=1), render_mode=mode).unwrapped
+one, other, pictures = make("rgb_array"), make(), []
+for env in (one, other):
+    env.reset(seed=3)
+for tick in range(60):
+    assert (one.step(np.zeros(2))[0] == other.step(np.zeros(2))[0]).all()
+    if tick in (0, 50):
+        pictures.append(one.render())
+assert all(p.shape == (480, 640, 3) and p.dtype == np.uint8 and p.std() > 10 for p in pictures)
+assert (pictures[0] != pictures[1]).any() and other.render() is None
+assert one.metadata["render_fps"] == 100
+"""
+
+
+def test_render():
+    """A picture shows the robot from a camera that follows it, and changes no bit of the episode."""
+    environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"}
+    done = subprocess.run(
+        [sys.executable, "-c", RENDER], capture_output=True, text=True, env=environment | {"MUJOCO_GL": "egl"}
+    )
+    if "EGL" in done.stderr:
+        pytest.skip("no EGL on this machine")
+    assert not done.returncode, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"pertubation": "all"}, "options: there is no 'pertubation', only perturbation"),
+        ({"perturbation": "heavy"}, "perturbation: no perturbation is called 'heavy'; there are nominal, "),
+        ({"perturbation": {"mass": 2.0}}, "perturbation.mass: "),
+        ({"perturbation": {"mass_factor": np.nan}}, "perturbation.mass_factor: "),
+        ({"perturbation": {"control_delay": 0.013}}, "perturbation.control_delay: 0.013 s is not a whole multiple"),
+        (
+            {"perturbation": {"payload": 50.0, "payload_x": -1.0}},
+            "perturbation.payload: the centre of mass",
+        ),
+        ({"perturbation": ["all"]}, "perturbation: 1 of them for 2 robots"),
+    ],
+)
+def test_bad_options(options, message):
+    """What a reset asks for is refused in one line before anything begins; the next reset is as ever."""
+    env = TrackingVectorEnv(2, SHORT, threads=1)
+    with pytest.raises(InputError) as error:
+        env.reset(seed=1, options=options)
+    assert str(error.value).startswith(message) and "\n" not in str(error.value)
+    assert np.array_equal(env.reset(seed=1)[0], TrackingVectorEnv(2, SHORT, threads=1).reset(seed=1)[0])
+
+
 @pytest.mark.parametrize("action", ACTION_KINDS)
 def test_vector_is_single(action):
     """Under any actions the vector environment is Gymnasium's own vector of single ones, autoreset and all."""
@@ -137,6 +280,8 @@ def test_vector_is_single(action):
         for a, b in zip(one[:4], other[:4], strict=True):
             assert a.dtype == b.dtype and np.array_equal(a, b)
         assert one[4].keys() == other[4].keys()
+        for name in set(EPISODE_METRICS) & one[4].keys():
+            np.testing.assert_allclose(one[4][name], other[4][name], rtol=1e-12)
         ended += one[2] | one[3]
     assert (ended >= 2).all()
 
@@ -298,6 +443,12 @@ def test_actions():
         (lambda: TrackingVectorEnv(2, SHORT.model_copy(update={"motion_period": 0.05})), "motion_period: "),
         (lambda: TrackingVectorEnv(3, [SHORT]), "num_envs: 3, but 1 scenarios"),
         (lambda: TrackingEnv("nowhere.toml"), "nowhere.toml: No such file"),
+        (lambda: TrackingEnv(SHORT, render_mode="human"), "render_mode: 'human' is not rgb_array"),
+        (lambda: TrackingEnv(SHORT, draw=lambda r: {"mass_factor": 99}).reset(), "perturbation.mass_factor: "),
+        (
+            lambda: TrackingEnv(SHORT, draw=lambda r: Perturbation(payload=-r.random())).reset(),
+            "perturbation.payload: ",
+        ),
     ],
 )
 def test_refused(make, message):

@@ -1,13 +1,19 @@
 """`mrctl check` on robots with a wrong unit: it ends in limited time, fails, and says what cannot be."""
 
+import math
+import re
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from mrctl import cli
 from mrctl.checks import examination
+from mrctl.checks.command import examination as examine
 from mrctl.physics.files import models_folder
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.units import LIMITS, bounds, mistake
 
 ROBOT = """<mujoco><compiler angle="degree"/><worldbody><body name="base" pos="0 0 0.1"><freejoint/>
   <geom type="box" size="0.2 0.1 0.05" pos="0.1 0 0.03" mass="10"/>
@@ -28,6 +34,81 @@ MISTAKES = {
     "resistance in mΩ": ('resistance="2"', 'resistance="2000"'),
     "frictionloss": ('frictionloss="0.1"', 'frictionloss="100"'),
 }
+
+
+def numbers(pattern: str, factor: float) -> Callable[[str], str]:
+    """Returns a change of a file: all numbers in what a pattern's last group matches, times a factor."""
+
+    def change(text: str) -> str:
+        def scaled(match: re.Match) -> str:
+            values = " ".join(f"{float(number) * factor:.9g}" for number in match[2].split())
+            return match[1] + values + match[3]
+
+        return re.sub(f'({pattern})([-+.e0-9 ]+)(")', scaled, text)
+
+    return change
+
+
+ELEMENT = r"<(?:geom|body|site|inertial|joint|camera)\b[^<>]*?\b"
+TYRES = r'<geom (?:name="wheel_\w+" class="contact"|type="cylinder") size="(?=0\.098"|0\.035 0\.0105|0\.0508 0\.01905)'
+UNITS = {
+    "masses in g": (numbers(' mass="', 1e3), "the mass of chassis is", "is it in g?"),
+    "mass of the chassis in g": (numbers(' mass="(?=17.2|6.06|3.26)', 1e3), "the mass of chassis is", "is it in g?"),
+    "mass of the wheels in g": (numbers(' mass="(?=0.8|0.12|0.11)', 1e3), "the mass of wheel_left is", "is it in g?"),
+    "constant in mN·m/A": (numbers('motorconst="', 1e3), "motor constant", "is it in mN·m/A?"),
+    "constant in V/rpm": (numbers('motorconst="', math.pi / 30), "motor constant", "is it in V/rpm?"),
+    "gear left at 1": (lambda text: re.sub('gear="[0-9.]+"', 'gear="1"', text), "gear", "limits need one of"),
+    "friction of the tyres": (
+        numbers('(?<= )friction="', 1e2),
+        "the friction of wheel_left",
+        "is it in %?",
+    ),
+    "friction of the drives": (
+        numbers('frictionloss="', 1e2),
+        "the frictionloss of wheel_left",
+        "is it in N·mm or N·cm?",
+    ),
+    "limits × 0.001": (numbers('"limits" data="', 1e-3), "the numeric limits are", "are they in km/s?"),
+    "limits in mm/s": (numbers('"limits" data="', 1e3), "the numeric limits are", "are they in mm/s?"),
+    "lengths in mm": (lambda text: lengths(1e3, text), "the lengths are", "are they in mm?"),
+    "lengths in cm": (lambda text: lengths(1e2, text), "the lengths are", "are they in cm?"),
+    "radius in mm": (numbers(TYRES, 1e3), "radius", "is it in mm"),
+    "resistance in mΩ": (numbers('resistance="', 1e3), "the resistance of motor_left", "is it in mΩ?"),
+    "armature in g·cm²": (numbers('armature="', 1e7), "the armature of motor_left", "is it in g·cm²?"),
+    "supply in mV": (numbers('ctrlrange="', 1e3), "the supply of motor_left", "is it in mV?"),
+}
+
+
+def lengths(factor: float, text: str) -> str:
+    """Returns the file with all positions and sizes of its robot times a factor."""
+    for attribute in ("pos", "size", "fromto"):
+        text = numbers(f'{ELEMENT}{attribute}="', factor)(text)
+    return text
+
+
+@pytest.mark.parametrize("robot", ["car", "turtlebot", "racecar"])
+@pytest.mark.parametrize("mistake", UNITS)
+def test_names_the_unit(mistake: str, robot: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A number in a wrong unit is named with its element and the unit, whether the robot can be loaded or not."""
+    change, *said = UNITS[mistake]
+    text = (models_folder() / f"{robot}.xml").read_text()
+    (tmp_path / "mine.xml").write_text(change(text))
+    assert change(text) != text
+    assert cli.main(["check", str(tmp_path / "mine.xml")]) in (1, 2)
+    out, err = capsys.readouterr()
+    (line,) = [line for line in (*out.splitlines(), *err.splitlines()) if said[1] in line]
+    assert said[0] in line and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("factor", [0.3, 1.0, 3.0])
+@pytest.mark.parametrize("robot", ["flat", "turtlebot", "racecar"])
+def test_other_robots_are_possible(robot: str, factor: float) -> None:
+    """Nothing is said of the shipped robots, nor of robots that differ from them by a factor of three in one number."""
+    model = examine(robot)._load(None)
+    true = read_robot(model)
+    for name in ("mass", "wheel_radius", "resistance", "torque_constant", "gear_ratio", "supply", "gear_loss", *LIMITS):
+        other = true.model_copy(update={name: factor * getattr(true, name)})
+        assert mistake(model, other) is None and min(bound.margin for bound in bounds(other)) > 0, name
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

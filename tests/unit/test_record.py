@@ -1,6 +1,10 @@
 """Input from outside: it makes a valid record, or is refused with one line that names the field."""
 
+import ast
+import inspect
+import pydoc
 import tomllib
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -133,6 +137,34 @@ def test_field_docs():
         """Turns per second."""
 
     assert Documented.model_fields["rate"].description == "Turns per second."
+
+
+def public_records():
+    """Returns the records among the public names, and those inside them."""
+    found = [thing for name in mrctl.__all__ if isinstance(thing := getattr(mrctl, name), type)]
+    found = [thing for thing in found if issubclass(thing, Record)]
+    for record in found:  # which grows
+        text = str([field.annotation for field in record.model_fields.values()])
+        found += [r for r in Record.__subclasses__() if f"{r.__module__}.{r.__name__}" in text and r not in found]
+    return found
+
+
+@pytest.mark.parametrize("record", public_records(), ids=lambda record: record.__name__)
+def test_help(record):
+    """`help` says of every field what its source says under it, with the unit."""
+    (tree,) = (
+        node
+        for node in ast.parse(Path(inspect.getfile(record)).read_text()).body
+        if isinstance(node, ast.ClassDef) and node.name == record.__name__
+    )
+    words = " ".join(pydoc.plain(pydoc.render_doc(record)).replace("|", " ").split())
+    fields = [n for n in tree.body if isinstance(n, ast.AnnAssign) and "ClassVar" not in ast.unparse(n.annotation)]
+    assert {node.target.id for node in fields} == set(record.model_fields)
+    for node in fields:
+        below = tree.body[tree.body.index(node) + 1]
+        assert isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant), node.target.id
+        assert f" {node.target.id}: {' '.join(below.value.value.replace('|', ' ').split())}" in words
+    assert " ".join(ast.get_docstring(tree).replace("|", " ").split()) in words
 
 
 TEXT = st.text(st.characters(codec="utf-8", exclude_characters="\x00"), max_size=30)

@@ -1,0 +1,209 @@
+"""Which number of a robot's file is in another unit than it should be?
+
+A robot with a number in the wrong unit breaks no law: it is the model of a robot that nobody could build. `possible`
+lists what every robot keeps to, with bounds that are wide enough for toys and for trucks. Where a robot does not,
+`mistake` converts one quantity after the other as people mistake them, and names the one with which it would.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco is compiled and ships no stubs)
+
+from __future__ import annotations
+
+import contextlib
+import math
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from mrctl.kernel import Array
+from mrctl.physics.elements import bodies_of
+from mrctl.record import InputError
+from mrctl.theory.robot import Robot
+
+RPM = 30 / math.pi  # rpm of 1 rad/s
+GYRATION = 0.05, 1.0  # radius of gyration over the size of a robot
+LENGTHS = (
+    "com_offset", "com_height", "wheel_radius", "front_wheel_radius", "half_track", "wheelbase", "trail",
+)  # fmt: skip
+LIMITS = "max_speed", "max_rotation", "max_acceleration", "max_rotation_acceleration"
+
+
+class Bound(NamedTuple):
+    """A quantity of a robot, and the interval in which it is for every robot."""
+
+    quantity: str
+    value: float
+    low: float
+    high: float
+    unit: str
+
+    @property
+    def margin(self) -> float:
+        """Distance to the nearer end in orders of magnitude, as a share of the interval; negative outside."""
+        low = max(self.low, 1e-6 * self.high)
+        if self.value <= low:
+            return 0.5 if self.low == 0 <= self.value else -1.0
+        inner = min(math.log(self.value / low), math.log(self.high / self.value)) / math.log(self.high / low)
+        return 0.5 if self.low == 0 and self.value < math.sqrt(low * self.high) else inner
+
+
+class Mistake(NamedTuple):
+    """A quantity that is in another unit than it should be."""
+
+    text: str
+    """Element and quantity with its number, and the question whether it is in that unit."""
+    robot: Robot
+    """The robot after the conversion."""
+
+
+def reach(robot: Robot) -> Array:
+    """Returns the largest V, θ̇, V̇ and θ̈ that the motors reach by equation (3), `(4,)`, in SI units."""
+    loss = robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2
+    stall = robot.motor_gain * robot.supply - loss
+    speed = robot.velocity_gain * stall / robot.motor_gain
+    force = 2 * stall / robot.wheel_radius
+    turning = force * robot.half_track / robot.effective_inertia
+    return np.array([speed, speed / robot.half_track, force / robot.effective_mass, turning])
+
+
+def bounds(robot: Robot) -> list[Bound]:
+    """Lists what no robot exceeds (chosen: a robot of the density of steel, a motor of 10⁶ rpm, tyres with μ = 3)."""
+    size = math.hypot(robot.wheelbase, 2 * robot.half_track)
+    stall = robot.motor_gain * robot.supply
+    loss = robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2
+    found = [
+        Bound("mass over the cube of the size", robot.mass / size**3, 0.5, 5000, "kg/m³"),
+        Bound("size, of wheelbase and track", size, 0.01, 15, "m"),
+        Bound("wheel radius over the size", robot.wheel_radius / size, 0.005, 1, ""),
+        Bound("friction of the tyres", robot.tyre_friction, 0.01, 3, ""),
+        Bound("rolling resistance over the load", robot.rolling_coefficient, 0, 0.5, ""),
+        Bound("no-load speed of the motors", robot.supply / robot.torque_constant * RPM, 10, 1e6, "rpm"),
+        Bound("stall current of the motors", robot.supply / robot.resistance, 0.01, 5000, "A"),
+        Bound("losses over the stall torque", loss / stall, 0, 0.9, ""),
+    ]
+    if found[-1].margin > 0:
+        shares = [getattr(robot, name) for name in LIMITS] / reach(robot)
+        names = ("V", "θ̇", "V̇", "θ̈")
+        found += [
+            Bound(f"limit on {name} over what the motors reach", float(share), 0.002, 10, "")
+            for name, share in zip(names, shares, strict=True)
+        ]
+    return found
+
+
+def mistake(model: mujoco.MjModel, robot: Robot) -> Mistake | None:
+    """Finds the quantity that would make an impossible robot possible, if it were in another unit.
+
+    Of several the one is taken whose robot keeps farthest from the ends of the `bounds`, in the sum.
+
+    Args:
+        model: The compiled model, for the names of its elements.
+        robot: Its parameters.
+
+    Returns:
+        The mistake; None if the robot is possible, or no conversion helps.
+    """
+    if _least(robot) > 0:
+        return None
+    able = [one for one in _candidates(model, robot) if _least(one.robot) > 0]
+    if robot.gear_ratio == 1 and able and able[0].robot.gear_ratio != 1:
+        return able[0]  # a gear that was left out
+    return max(able, key=lambda one: sum(bound.margin for bound in bounds(one.robot)), default=None)
+
+
+def _least(robot: Robot) -> float:
+    return min(bound.margin for bound in bounds(robot))
+
+
+def _candidates(model: mujoco.MjModel, robot: Robot) -> list[Mistake]:
+    """Lists the conversions of one quantity that people forget, where they give a valid robot."""
+    masses = model.body_mass[(bodies := bodies_of(model))]
+    heaviest, heavy = model.body(bodies[int(np.argmax(masses))]), masses[masses > masses.max() / 2].sum()
+    motors, wheels = "of motor_left and motor_right", "of wheel_left and wheel_right"
+    si = "m/s, rad/s, m/s² and rad/s²"
+    rows: list[tuple[str, str, str, dict[str, float]]] = []
+    found = []
+
+    k, of_constant = robot.torque_constant, f"the motor constant {motors} is {robot.torque_constant:,.4g} V·s/rad"
+    for unit, value in (
+        ("mN·m/A", k / 1e3), ("V/rpm", k * RPM), ("V/krpm", k * RPM / 1e3), ("rpm/V", RPM / k), ("kV·s/rad", k * 1e3),
+    ):  # fmt: skip
+        rows.append((of_constant, unit, "V·s/rad, which is N·m/A", {"torque_constant": value}))
+    of_mass = f"the mass of {heaviest.name or 'a body'} is {heaviest.mass[0]:,.6g} kg"
+    for unit, factor in (("g", 1e-3), ("t", 1e3)):
+        for share in (robot.mass, heavy):
+            rows.append((of_mass, unit, "kg", _of_mass(robot, robot.mass + (factor - 1) * share, factor)))
+    of_lengths = f"the lengths are those of a track of {2 * robot.half_track:,.4g} m"
+    of_radius = f"the radius {wheels} is {robot.wheel_radius:,.4g} m"
+    of_loss = f"the frictionloss {wheels} leaves {robot.drive_loss:,.4g} N·m of losses in each drive"
+    losses = ("gear_loss", "rolling_coefficient")
+    of_limits = f"the numeric limits are {', '.join(f'{getattr(robot, name):g}' for name in LIMITS)}"
+    of_resistance = f"the resistance {motors} is {robot.resistance:,.4g} Ω"
+    of_rotor = f"the armature {motors} is {robot.rotor_inertia:,.4g} kg·m²"
+    rows += [
+        (of_lengths, "mm", "m", _of_lengths(robot, 1e-3)),
+        (of_lengths, "cm", "m", _of_lengths(robot, 1e-2)),
+        (of_radius, "mm", "m", _scaled(robot, ("wheel_radius",), 1e-3)),
+        (of_radius, "cm", "m", _scaled(robot, ("wheel_radius",), 1e-2)),
+        (f"the friction {wheels} is {robot.tyre_friction:g}", "%", "N/N", _scaled(robot, ("tyre_friction",), 1e-2)),
+        (of_loss, "N·mm or N·cm", "N·m", _scaled(robot, losses, 1e-2)),
+        (of_loss, "N·mm or N·cm", "N·m", _scaled(robot, losses, 1e-3)),
+        (of_limits, "mm/s", si, _scaled(robot, LIMITS, 1e-3)),
+        (of_limits, "km/s", si, _scaled(robot, LIMITS, 1e3)),
+        (of_limits, "°/s", si, _scaled(robot, LIMITS[1::2], math.pi / 180)),
+        (of_resistance, "mΩ", "Ω", _scaled(robot, ("resistance",), 1e-3)),
+        (of_resistance, "kΩ", "Ω", _scaled(robot, ("resistance",), 1e3)),
+        (of_rotor, "g·cm²", "kg·m²", _scaled(robot, ("rotor_inertia",), 1e-7)),
+        (f"the supply {motors} is {robot.supply:,.6g} V", "mV", "V", _scaled(robot, ("supply",), 1e-3)),
+    ]
+    if robot.gear_ratio == 1 and (ends := sufficient_gears(robot)):
+        text = (
+            f"the gear {motors} is 1: was it left out? The declared limits need one of {ends[0]:.2g} to {ends[1]:.2g}"
+        )
+        found.append(Mistake(text, robot.model_copy(update={"gear_ratio": math.sqrt(ends[0] * ends[1])})))
+    for number, unit, right, changes in rows:
+        is_it, it = ("are they", "They") if number.startswith(("the lengths", "the numeric")) else ("is it", "It")
+        with contextlib.suppress(InputError):
+            text = f"{number}, as in no robot; {is_it} in {unit}? {it} must be in {right}"
+            found.append(Mistake(text, robot.replace(**changes)))
+    return found
+
+
+def _scaled(robot: Robot, names: tuple[str, ...], factor: float) -> dict[str, float]:
+    """Returns fields times a factor."""
+    return {name: getattr(robot, name) * factor for name in names}
+
+
+def _of_mass(robot: Robot, mass: float, factor: float) -> dict[str, float]:
+    """Returns what another mass changes: the losses of rolling stay, and inertias in the wrong unit go with it."""
+    changed = {"mass": mass, "rolling_coefficient": robot.rolling_coefficient * min(1.0, robot.mass / mass)}
+    return changed | _inertias(robot, mass, 1.0, factor)
+
+
+def _of_lengths(robot: Robot, factor: float) -> dict[str, float]:
+    """Returns all lengths times a factor, and the inertias times its square where they were in that unit as well."""
+    return _scaled(robot, LENGTHS, factor) | _inertias(robot, robot.mass, factor, factor**2)
+
+
+def _inertias(robot: Robot, mass: float, length: float, factor: float) -> dict[str, float]:
+    """Returns other inertias if the radius of gyration would not fit: those of wheels by a factor, and a usual one."""
+    size = length * math.hypot(robot.wheelbase, 2 * robot.half_track)
+    if GYRATION[0] <= math.sqrt(robot.yaw_inertia / mass) / size <= GYRATION[1]:
+        return {}
+    of_wheels = _scaled(robot, ("wheel_inertia", "front_wheel_inertia", "fork_inertia"), factor)
+    of_wheels["wheel_inertia"] = max(1e-9, of_wheels["wheel_inertia"])
+    return of_wheels | {"yaw_inertia": mass * (0.4 * size) ** 2}
+
+
+def sufficient_gears(robot: Robot) -> tuple[float, float] | None:
+    """Returns the lowest and the highest gear with which the motors reach the limits with 10 % to spare, or None."""
+    gears = robot.gear_ratio * np.geomspace(1e-3, 1e3, 601)
+    found = [float(gear) for gear in gears if reaches_limits(robot.model_copy(update={"gear_ratio": gear}))]
+    return (found[0], found[-1]) if found else None
+
+
+def reaches_limits(robot: Robot) -> bool:
+    """Tells whether the motors, by equation (3), reach the declared limits with 10 % to spare."""
+    return bool((reach(robot) > 1.1 * np.array([getattr(robot, name) for name in LIMITS])).all())
