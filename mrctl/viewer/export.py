@@ -69,7 +69,7 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
     """Returns the scene with its player, as a complete page in HTML."""
     server = Server(port=0)
     try:
-        scene = Scene(server, recordings[0].model, robots)
+        scene = Scene(server, recordings[0].model, robots, recordings[0].scenario.obstacles)
         _, log = joint_log(recordings)
         magnified = magnification(extent(log))
         scene.show_recordings(recordings, magnified)
@@ -79,6 +79,7 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
             for row, recording in enumerate(recordings):
                 scene.show(row, recording.qpos(recording.index(time)))
                 scene.show_payload(row, recording.perturbation(time))
+            scene.show_obstacles(recordings[0].start + time)
             scene.show_targets(np.stack([r.log[r.index(time)] for r in recordings]), magnified)
             scene.flush(follow=False)
             serializer.insert_sleep(1 / PICTURE_RATE)

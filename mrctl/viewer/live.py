@@ -106,7 +106,7 @@ class Live(Page):
         self._due = 0.0  # number of ticks that are due
         self._changed_inputs: dict[tuple[str, ...], Any] = {}
         self._rested = 0.0  # monotonic time in s at which the changed inputs are applied
-        self._shown_setup: tuple[object, ...] | None = None  # world, robot, steering and labels of the present scene
+        self._shown_setup: tuple[object, ...] | None = None  # what the present scene was drawn for
         self._shown_sensing: list[Sensing] | None = None
         self._drawn: tuple[object, ...] | None = None
         self._plotted: tuple[object, ...] | None = None
@@ -174,12 +174,12 @@ class Live(Page):
         session, first = self.session, self.session.start[0]
         self._labels = [s.name or title_of(s.feedforward) for s in session.start]
         robots = looks(self._labels, [s.feedforward for s in session.start])
-        setup = (first.world, first.robot, first.steering, robots)
+        setup = (first.world, first.obstacles, first.robot, first.steering, robots)
         if self._shown_setup != setup:
             if self._shown_setup is not None:
                 self._scene.remove()
             self._shown_setup = setup
-            self._scene = Scene(self.server, session.simulations[0][1].model, robots)
+            self._scene = Scene(self.server, session.simulations[0][1].model, robots, first.obstacles)
             self._plots.set_robots(robots, session.period)
         sensing = [s.sensing for s in session.start]
         if self._shown_sensing != sensing:
@@ -356,6 +356,7 @@ class Live(Page):
         with self.server.atomic():
             if session.tick:
                 self._scene.show_targets(session.log(session.tick - 1)[-1], self._deviation)
+            self._scene.show_obstacles(session.time)
             self._scene.show_sensors(logs, session.period, self._latencies, magnified)
             self._scene.flush(self._follow.value)
 

@@ -160,7 +160,8 @@ class Replay(Page):
         if self.recordings:
             self._scene.remove()
         self.runs, self.recordings = list(runs), recordings
-        self._scene = Scene(self.server, recordings[0].model, robots, fog=not self._board)
+        obstacles = recordings[0].scenario.obstacles
+        self._scene = Scene(self.server, recordings[0].model, robots, obstacles, fog=not self._board)
         self._plots.set_robots(robots, recordings[0].period)
         times, self._log = joint_log(recordings)
         self._deviation = self.magnified_deviation(self._log)
@@ -233,6 +234,7 @@ class Replay(Page):
         now = np.stack([recording.log[recording.index(self.time)] for recording in self.recordings])
         with self.server.atomic():
             self._scene.show_targets(now, self._deviation)
+            self._scene.show_obstacles(self.recordings[0].start + self.time)
             self._scene.show_sensors(logs, period, self._latencies, magnified)
             self._scene.flush(self._follow.value)
 

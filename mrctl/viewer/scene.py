@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from mrctl.kernel import Rows
 from mrctl.physics import mjcf
+from mrctl.physics.obstacles import quaternion
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.stand import ground
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
+from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.deviation import Target
 from mrctl.viewer.looks import Colour, Look
@@ -55,7 +57,7 @@ NEXT_TRAIL = 0.001  # m, from the height of the trails of one colour to that of 
 TRAIL_WIDTH = 0.004  # as a share of the width of the view; the reference is twice as wide
 LEAST_VIEW = 1.2  # m, least width of the view
 SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
-
+NONE = Obstacles()
 
 _NUMBERS = itertools.count()  # of scenes
 
@@ -71,13 +73,21 @@ class Scene:
     Everything is below the node `/world`: to follow a robot, that node moves instead of the cameras.
     """
 
-    def __init__(self, server: Server, model: mujoco.MjModel, robots: Sequence[Look], fog: bool = True) -> None:
+    def __init__(
+        self,
+        server: Server,
+        model: mujoco.MjModel,
+        robots: Sequence[Look],
+        obstacles: Obstacles = NONE,
+        fog: bool = True,
+    ) -> None:
         """Draws the world and its robots.
 
         Args:
             server: Server of the page.
             model: Compiled world; it is not changed.
             robots: Look of each robot.
+            obstacles: The obstacles that the world was compiled with, of which some may move.
             fog: Whether the horizon fades; viser cannot draw meshes that are clicked on in fog.
         """
         self.size, self._robots, self._fog = len(robots), list(robots), fog
@@ -94,6 +104,8 @@ class Scene:
         self._chassis = self._bodies.index(chassis)
         self._positions = np.zeros((self.size, len(self._bodies), 3))
         self._quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (self.size, len(self._bodies), 1))
+        self._surroundings = Surroundings(obstacles)
+        self._movers: list[viser.MeshHandle] = []  # in the order of `Surroundings.courses`
         self._draw_world()
         self._looks: list[tuple[viser.FrameHandle, viser.MeshHandle]] = []  # of each body, solid and translucent
         self._top = 0.0  # height of the robot in m
@@ -132,7 +144,9 @@ class Scene:
         self._floor = np.array([0.0, 0.0, 1.0]), np.zeros(3)  # its normal and a point of it
         self._floors: list[viser.GridHandle] = []
         for geom in range(model.ngeom):
-            if model.body_weldid[model.geom_bodyid[geom]] or model.geom_group[geom] > SEEN:
+            body = model.geom_bodyid[geom]
+            still = model.body_weldid[body] == 0 or model.body_mocapid[body] >= 0  # obstacles on courses, too
+            if not still or model.geom_group[geom] > SEEN:
                 continue
             # A page gives a node the pose of the one that it replaces, if both have the same name.
             name, turn = f"/world/fixed/{self._number}/{geom}", np.zeros(4)
@@ -148,10 +162,13 @@ class Scene:
             else:
                 mesh = merge_geoms(model, [geom])
                 colour = 255 * model.mat_rgba[model.geom_matid[geom], :3] if model.geom_matid[geom] >= 0 else 200
-                self._scene.add_mesh_simple(
+                drawn = self._scene.add_mesh_simple(
                     name, mesh.vertices, mesh.faces, color=np.broadcast_to(0.92 * colour, 3).astype(np.uint8),
                     flat_shading=True, cast_shadow=False, receive_shadow=False,
+                    wxyz=data.xquat[body], position=data.xpos[body],
                 )  # fmt: skip
+                if model.body_mocapid[body] >= 0:
+                    self._movers.append(drawn)
 
     def _draw_bodies(self) -> list[trimesh.Trimesh | None]:
         """Draws the bodies of the solid robot; returns the rough shape of each, which ghosts have."""
@@ -329,6 +346,12 @@ class Scene:
             mujoco.mju_negQuat(self._back, data.xquat[parent])
             mujoco.mju_rotVecQuat(self._positions[row, k], data.xpos[body] - data.xpos[parent], self._back)
             mujoco.mju_mulQuat(self._quaternions[row, k], self._back, data.xquat[body])
+
+    def show_obstacles(self, time: float) -> None:
+        """Moves the obstacles that move to where they are at a time in s of the run."""
+        poses = self._surroundings.poses(np.array([time]))[0]
+        for mover, (x, y, theta) in zip(self._movers, poses, strict=True):
+            mover.position, mover.wxyz = (x, y, 0.0), quaternion(theta)
 
     def flush(self, follow: bool) -> None:
         """Sends the positions of all robots to the browsers.

@@ -20,7 +20,7 @@ from mrctl.scenario import Event, Scenario
 from mrctl.theory.robot import Robot
 
 HOUR = 3600.0  # s of simulated time after which a session ends
-SHARED_FIELDS = ("world", "robot", "steering", "control_period", "physics_step")
+SHARED_FIELDS = ("world", "obstacles", "robot", "steering", "control_period", "physics_step")
 # Fields of a scenario that can change in the middle of a run; a change of another field needs a new run.
 CHANGEABLE = [name for name in ("perturbation", "kanayama", "pid") if name in Event.model_fields]
 
