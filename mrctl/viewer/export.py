@@ -20,6 +20,7 @@ from mrctl.viewer.recording import Recording, event_times, joint_log
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.sensors import magnification
 from mrctl.viewer.server import Server
+from mrctl.viewer.session import ends
 
 PICTURE_RATE = 25  # pictures for each second of the replay
 SAMPLES = 1200  # about the largest number of samples in a curve
@@ -70,7 +71,7 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
     server = Server(port=0)
     try:
         scene = Scene(server, recordings[0].model, robots, recordings[0].scenario.obstacles)
-        _, log = joint_log(recordings)
+        _, log, _ = joint_log(recordings)
         magnified = magnification(extent(log))
         scene.show_recordings(recordings, magnified)
         duration = max(r.duration for r in recordings)
@@ -80,6 +81,7 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
                 scene.show(row, recording.qpos(recording.index(time)))
                 scene.show_payload(row, recording.perturbation(time))
             scene.show_obstacles(recordings[0].start + time)
+            scene.show_ends(ends(recordings[0].scenario, recordings[0].start + time))
             scene.show_targets(np.stack([r.log[r.index(time)] for r in recordings]), magnified)
             scene.flush(follow=False)
             serializer.insert_sleep(1 / PICTURE_RATE)
@@ -90,10 +92,10 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
 
 def _curves(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
     """Returns the curves as JSON that is safe inside a script element."""
-    times, log = joint_log(recordings)
+    times, log, clearance = joint_log(recordings)
     step = max(1, len(log) // SAMPLES)
     drawn = []
-    for chart in charts(log, robots, recordings[0].period):
+    for chart in charts(log, robots, recordings[0].period, clearance):
         values = [curve.values[::step] for curve in chart.curves]
         known = np.concatenate([*values, chart.least])
         known = known[np.isfinite(known)]

@@ -26,15 +26,15 @@ from mrctl.theory.robot import Robot
 from mrctl.viewer.controls import Controls
 from mrctl.viewer.embed import LONGEST
 from mrctl.viewer.looks import looks
-from mrctl.viewer.page import SPEEDS, Page, block, warning, write
+from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
-from mrctl.viewer.scene import Scene
+from mrctl.viewer.scene import MAX_MARKED, Scene
 from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import CHANGEABLE, Session, changed, state
+from mrctl.viewer.session import CHANGEABLE, Session, changed, ends, state
 
 WINDOW = 12.0  # s, time span of the plots
 SAMPLES = 300  # about the largest number of samples in a curve
@@ -180,7 +180,7 @@ class Live(Page):
                 self._scene.remove()
             self._shown_setup = setup
             self._scene = Scene(self.server, session.simulations[0][1].model, robots, first.obstacles)
-            self._plots.set_robots(robots, session.period)
+            self._plots.set_robots(robots, session.period, bool(first.obstacles.shapes))
         sensing = [s.sensing for s in session.start]
         if self._shown_sensing != sensing:
             self._shown_sensing = sensing
@@ -349,8 +349,9 @@ class Live(Page):
         self._drawn = now
         for row in range(session.size):
             self._scene.show(row, session.qpos(row))
-        logs = []
+        logs, scans = [], []
         if marked:
+            scans = [session.scan(row) for row in range(min(session.size, MAX_MARKED))]
             ticks = round(FIX_AGE / session.period) + max(self._latencies)
             logs = list(session.log(max(0, session.tick - ticks)).T)
         with self.server.atomic():
@@ -358,6 +359,7 @@ class Live(Page):
                 self._scene.show_targets(session.log(session.tick - 1)[-1], self._deviation)
             self._scene.show_obstacles(session.time)
             self._scene.show_sensors(logs, session.period, self._latencies, magnified)
+            self._scene.show_scans(scans)
             self._scene.flush(self._follow.value)
 
     @override
@@ -377,6 +379,8 @@ class Live(Page):
         for row, label in enumerate(self._labels):
             if reason := session.failure(row):
                 lines.append(warning(f"{label} stopped: {reason}"))
+        if session.tick:
+            lines += arrivals(self._labels, session.log(session.tick - 1)[-1], self._ends)
         write(self._status, block("status", *lines))
         happened = sum(event.time <= session.time for start in session.start for event in start.events)
         if happened != self._happened:  # events that the scenarios brought along
@@ -404,7 +408,7 @@ class Live(Page):
         if len(log) < 2:
             return self._plots.clear(WINDOW)
         times = np.arange(first, first + len(log), dtype=float) * session.period
-        self._plots.show(times, log, step, self._event_times())
+        self._plots.show(times, log, session.clearance(first), step, self._event_times())
         self._plots_since_trail += 1
         if self._plots_since_trail >= PLOTS_PER_TRAIL or not self.playing:
             self._plots_since_trail = 0
@@ -431,6 +435,8 @@ class Live(Page):
         driven = self.session.driven()
         ticks = np.minimum(np.round(np.array(self._event_times()) / self.session.period).astype(int), len(driven) - 1)
         self._scene.show_events(driven[ticks[ticks >= 0]])
+        self._ends = ends(scenario, self.session.time)
+        self._scene.show_ends(self._ends)
         present = self._present(self.session.start[0])
         for row, saved in enumerate(self.session.saved()):
             self._scene.show_payload(row, state(saved, self.session.time)["perturbation"])

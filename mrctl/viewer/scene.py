@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mrctl.kernel import Rows
 from mrctl.physics import mjcf
-from mrctl.physics.obstacles import quaternion
+from mrctl.physics.obstacles import HEIGHT, quaternion
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.stand import ground
 from mrctl.record import InputError
@@ -28,7 +28,7 @@ from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.deviation import Target
 from mrctl.viewer.looks import Colour, Look
 from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, path
-from mrctl.viewer.sensors import Marks
+from mrctl.viewer.sensors import Marks, outline
 from mrctl.viewer.server import Server
 from mrctl.viewer.shapes import bar, ribbons
 
@@ -58,6 +58,10 @@ TRAIL_WIDTH = 0.004  # as a share of the width of the view; the reference is twi
 LEAST_VIEW = 1.2  # m, least width of the view
 SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
 NONE = Obstacles()
+GOAL_COLOUR: Colour = (22, 163, 74)
+OUTLINE = 0.02  # m, width of the outlines at start and goal
+SCAN_POINT, SCAN_HEIGHT = 0.03, HEIGHT + 0.01  # m, size of the points of a scan, which lie on top of the walls
+PARTICLE, MAX_PARTICLES = 0.015, 500  # m, size of a particle, and about the number that is drawn
 
 _NUMBERS = itertools.count()  # of scenes
 
@@ -133,6 +137,22 @@ class Scene:
             Target(self._scene, row, self._top + TARGET_ABOVE * self._length, THICK * self._length, robot.colour)
             for row, robot in enumerate(robots[:MAX_MARKED])
         ]
+        self._ends = [
+            self._scene.add_mesh_simple(
+                f"/world/{name}", *ribbons(outline(self._footprint), OUTLINE), color=colour, side="double",
+                cast_shadow=False, receive_shadow=False, visible=False,
+            )
+            for name, colour in (("start", REFERENCE_COLOUR), ("goal", GOAL_COLOUR))
+        ]  # fmt: skip
+        self._scans: list[viser.PointCloudHandle] = []
+        for row, robot in enumerate(robots[:MAX_MARKED]):
+            for kind, size in (("scan", SCAN_POINT), ("particles", PARTICLE)):
+                self._scans.append(
+                    self._scene.add_point_cloud(
+                        f"/world/{kind}/{row}", np.zeros((0, 3)), robot.colour, point_size=size, point_shape="circle",
+                        point_shading="flat", precision="float32", visible=False,
+                    )
+                )  # fmt: skip
         self._factor = self._scene.add_label("/world/deviation", "", visible=False, font_screen_scale=0.8)
         self._perturbations: list[Perturbation | None] = [None] * self.size  # as drawn
         self._ribbons: list[viser.MeshHandle] = []
@@ -318,7 +338,7 @@ class Scene:
         self.show_reference(recordings[0].scenario)
         for row, recording in enumerate(recordings):
             self.show(row, recording.qpos(len(recording.log) - 1))
-        _, log = joint_log(recordings)
+        _, log, _ = joint_log(recordings)
         self.show_trails(log[np.linspace(0, len(log) - 1, PATH_POINTS).astype(int)], magnified)
         self.show_events(log[[recordings[0].index(time) for time in event_times(recordings)], 0])
 
@@ -410,6 +430,29 @@ class Scene:
         ground = self._positions[:, self._chassis] - [0, 0, self._radius]
         for marks, here, log, latency in zip(self._marks, ground, logs, latencies, strict=False):
             marks.show(here, log, period, latency, magnified)
+
+    def show_ends(self, ends: Array | None) -> None:
+        """Draws outlines of a robot at its start and its goal, poses in m, m, rad, `(2, 3)`; None hides them."""
+        for k, mark in enumerate(self._ends):
+            if mark.visible != (ends is not None):
+                mark.visible = ends is not None
+            if ends is not None:
+                x, y, theta = ends[k]
+                place = np.array([x, y, self._height(x, y) + ABOVE])
+                if not np.array_equal(mark.position, place) or not np.allclose(mark.wxyz, quaternion(theta)):
+                    mark.position, mark.wxyz = place, quaternion(theta)
+
+    def show_scans(self, scans: Sequence[tuple[Array, Array] | None]) -> None:
+        """Draws what `Session.scan` returns, for each of the first robots; no scans hide all points."""
+        for row, (met, particles) in enumerate(zip(self._scans[::2], self._scans[1::2], strict=True)):
+            found = scans[row] if row < len(scans) else None
+            met.visible = particles.visible = found is not None
+            if found is not None:
+                places = np.pad(found[0], [(0, 0), (0, 1)], constant_values=SCAN_HEIGHT).astype(np.float32)
+                if not np.array_equal(met.points, places):  # scans are rarer than pictures
+                    some = found[1][:: max(1, len(found[1]) // MAX_PARTICLES), :2]
+                    met.points = places
+                    particles.points = np.pad(some, [(0, 0), (0, 1)], constant_values=ABOVE).astype(np.float32)
 
     @property
     def trail_points(self) -> int:

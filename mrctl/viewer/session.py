@@ -12,11 +12,15 @@ from numpy.typing import NDArray
 
 from mrctl.control.design import motion
 from mrctl.control.margins import Gains
-from mrctl.kernel import Rows
+from mrctl.kernel import Array, Rows
 from mrctl.loop.simulation import Simulation, arranged, uniform
+from mrctl.physics.hull import footprint
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank, combine, dataset
 from mrctl.scenario import Event, Scenario
+from mrctl.theory.clearance import clearances
+from mrctl.theory.obstacles import Surroundings, turned
+from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
 
 HOUR = 3600.0  # s of simulated time after which a session ends
@@ -56,6 +60,10 @@ class Session:
         self.simulations = [(rows, Simulation([long[row] for row in rows], threads=1)) for rows in uniform(long)]
         self._place = {row: (sim, k) for rows, sim in self.simulations for k, row in enumerate(rows)}
         self.tick = 0
+        self._surroundings = Surroundings(scenarios[0].obstacles)
+        self._footprint = footprint(self.simulations[0][1].model) if scenarios[0].obstacles.shapes else np.zeros((0, 2))
+        self._clearance = np.empty((max(sim.ticks for _, sim in self.simulations), len(scenarios)))
+        self._cleared = 0  # number of ticks whose clearances are known
 
     @property
     def size(self) -> int:
@@ -153,6 +161,39 @@ class Session:
             parts[: len(done), rows] = done
         return parts
 
+    def clearance(self, first: int = 0) -> Array | None:
+        """Returns the distances from the nearest obstacle in m from a tick on, `(T, B)`; None without obstacles.
+
+        They are NaN after a robot has stopped. Each is computed once, when it is asked for.
+        """
+        if not self.start[0].obstacles.shapes:
+            return None
+        known, now = self._cleared, self.tick
+        if known == now:
+            return self._clearance[first:now]
+        times, log = self.period * np.arange(known, now, dtype=float), self.log(known)
+        poses = np.stack([log[name] for name in ("x", "y", "theta")], axis=-1)
+        for row in range(self.size):
+            self._clearance[known:now, row] = clearances(self._footprint, poses[:, row], times, self._surroundings)
+        self._cleared = now
+        return self._clearance[first:now]
+
+    def scan(self, row: int) -> tuple[Array, Array] | None:
+        """Returns what the localisation of a robot has of the last scan; None where no lidar has scanned yet.
+
+        Returns:
+            Places in the world that the beams met, as seen from the true pose, in m, `(n, 2)`; and the particles, poses
+            in m, m, rad, `(k, 3)`, none with scan matching.
+        """
+        sim, k = self._place[row]
+        localiser = sim.estimator.localiser
+        if localiser is None or (ranges := localiser.scans[k]) is None or localiser.taken[k] >= sim.tick:
+            return None
+        then, particles = sim.log.ticks[localiser.taken[k], k], localiser.filters[k]
+        pose = np.array([then["x"], then["y"], then["theta"]])
+        met = turned(self.start[row].sensing.lidar.points(ranges), pose)
+        return met, np.zeros((0, 3)) if particles is None else particles.particles
+
     def result(self, longest: float) -> xr.Dataset:
         """Returns the signals of the last `longest` s, as a result of `simulate` without what was learned."""
         first = max(0, self.tick - round(longest / self.period))
@@ -160,6 +201,8 @@ class Session:
         nothing = np.full(self.size, np.nan)
         saved = self.saved()
         part = dataset(saved, names, names, self.log(first), failure, nothing, None)
+        if (clearance := self.clearance(first)) is not None:
+            part = part.assign(clearance=(("run", "time"), clearance.T))
         found = combine([(range(self.size), part)], saved)
         return found.assign_coords(time=found["time"] + first * self.period)
 
@@ -186,6 +229,30 @@ def state(scenario: Scenario, time: float) -> dict[str, Any]:
         if event.time <= time + 1e-9:
             now |= {name: value for name in now if (value := getattr(event, name)) is not None}
     return now
+
+
+def followed(scenario: Scenario, time: float) -> Reference:
+    """Returns the reference that a run follows at a time in s."""
+    brought = [e.reference for e in sorted(scenario.events, key=lambda e: e.time) if e.time <= time + 1e-9]
+    return next((reference for reference in reversed(brought) if reference), scenario.reference)
+
+
+def ends(scenario: Scenario, time: float) -> Array | None:
+    """Returns where the robot of a run comes from and goes to at a time in s; None on a course without end.
+
+    These are the ends of the open reference that it follows then; a goal of the scenario is in place of the end of its
+    own reference.
+
+    Returns:
+        Two poses, x and y in m and θ in rad, `(2, 3)`.
+    """
+    plan = followed(scenario, time)
+    found = plan.sample(np.array([0.0, plan.period])).pose
+    if plan is scenario.reference and scenario.goal is not None:
+        found[1] = scenario.goal
+    elif not isinstance(plan, Waypoints) or plan.closed:
+        return None
+    return found
 
 
 def changed(record: AnyRecord, path: Sequence[str], value: object) -> AnyRecord:
