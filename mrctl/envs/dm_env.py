@@ -84,7 +84,8 @@ class Tracking(control.Task):
 
     def get_termination(self, physics: Physics) -> float | None:
         """Returns discount 0 where the robot has failed, 1 at the end of the scenario, and None before."""
-        return 0.0 if self.episodes.plant.failed[0] else 1.0 if self.episodes.over()[0] else None
+        (terminated,), (truncated,) = self.episodes.ended()
+        return 0.0 if terminated else 1.0 if truncated else None
 
 
 class Environment(control.Environment):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mrctl.control.kanayama import posture_error
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.loop.courses import course, distinct_courses, start_pose
+from mrctl.loop.goals import arrived
 from mrctl.loop.log import Log
 from mrctl.loop.simulation import Simulation, group_of
 from mrctl.record import InputError
@@ -78,10 +79,10 @@ class EpisodeCourses:
 
     def __init__(self, scenarios: Sequence[Scenario], lead: int) -> None:
         """Samples every course once, to the end of the episode and one tick and the lead more."""
-        self._ticks = scenarios[0].ticks
-        self._last = self._ticks + lead
+        ticks = max(s.ticks for s in scenarios)
+        self._last = ticks + lead
         distinct, self._place = distinct_courses(scenarios)
-        whole, end = range(self._ticks), range(self._ticks, self._last + 1)
+        whole, end = range(ticks), range(ticks, self._last + 1)
         self._table = np.stack([np.append(course(s, whole), course(s, end)) for s in distinct], axis=1)
         self.start = np.zeros(len(scenarios), int)
 
@@ -101,6 +102,8 @@ class Episodes(Simulation):
 
     Attributes:
         bound: Largest action of each component, `(2,)`.
+        sizes: Names and sizes of the parts of an observation, in their order.
+        limits: Least and largest value of each number of an observation, `(n,)` each.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], action: Action, *, threads: int = 0) -> None:
@@ -131,8 +134,12 @@ class Episodes(Simulation):
         limits = robot.max_speed, robot.max_rotation
         share = RESIDUAL if action == "residual" else 1.0
         self.bound = np.array(limits if action == "twist" else [share * robot.supply] * 2)
-        self.courses: EpisodeCourses = EpisodeCourses(scenarios, self._lead)  # type: ignore[assignment]
+        self.courses: EpisodeCourses = EpisodeCourses(scenarios, self.lead)  # type: ignore[assignment]
         self.log = Log(1, len(scenarios))
+        self.sizes = dict(OBSERVATIONS)
+        self.limits = np.full(sum(OBSERVATIONS.values()), -np.inf), np.full(sum(OBSERVATIONS.values()), np.inf)
+        self._lengths = np.array([s.ticks for s in scenarios])
+        self._targets = np.array([(np.nan,) * 3 if s.goal is None else s.goal for s in scenarios])
 
     def _make_agent(self, robot: Robot, size: int) -> AgentMotion:
         self._agent = AgentMotion(robot, size)
@@ -195,9 +202,17 @@ class Episodes(Simulation):
         observe(self.plant.state, seen, wanted, self._goal, self.hierarchy.state, *constants, observation, reward)
         return observation, reward
 
-    def over(self) -> NDArray[np.bool]:
-        """Which robots have driven their scenario to the end, `(B,)`."""
-        return self.tick - self.courses.start >= self.ticks
+    def arrived(self) -> NDArray[np.bool]:
+        """Which robots stood at the goals of their scenarios in the last tick, `(B,)`."""
+        last = self.log.at(self.tick - 1)
+        return arrived(np.stack([last["x"], last["y"], last["theta"]], -1), last["v"], self._targets)
+
+    def ended(self) -> tuple[NDArray[np.bool], NDArray[np.bool]]:
+        """Which episodes have ended by a failure or at a goal, and which at the end of their scenario, `(B,)` each."""
+        over, reasons = self.tick - self.courses.start >= self._lengths, np.array(self.plant.failure)
+        late = over & (reasons == "") & ~self.arrived()  # in a group with longer episodes, the robot was stopped
+        terminated = self.plant.failed & ~late
+        return terminated, over & ~terminated
 
 
 def read(scenario: Scenario | str | Path | None) -> Scenario:

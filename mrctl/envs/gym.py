@@ -83,9 +83,9 @@ class TrackingEnv(gymnasium.Env):
         with np.errstate(invalid="ignore", over="ignore"):
             loop.step()
             (seen,), (reward,) = loop.observe()
-        failed = bool(loop.plant.failed[0])
-        info = {"failure": loop.plant.failure[0]} if failed else {}
-        return seen, float(reward), failed, bool(loop.over()[0]) and not failed, info
+        (terminated,), (truncated,) = loop.ended()
+        info = {"failure": loop.plant.failure[0]} if terminated else {}
+        return seen, float(reward), bool(terminated), bool(truncated), info
 
 
 class TrackingVectorEnv(VectorEnv):
@@ -174,8 +174,7 @@ class TrackingVectorEnv(VectorEnv):
                 loop.begin(int(row), self._draw(int(row)))
             seen, reward = loop.observe()
         reward[begun] = 0.0
-        terminated = loop.plant.failed.copy()
-        truncated = loop.over() & ~terminated
+        terminated, truncated = loop.ended()
         self._over = terminated | truncated
         info: dict[str, Any] = {}
         for row in np.flatnonzero(terminated):

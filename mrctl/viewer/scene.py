@@ -25,6 +25,7 @@ from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.references import Reference
 from mrctl.viewer.deviation import Target
 from mrctl.viewer.looks import Colour, Look
 from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, path
@@ -267,18 +268,29 @@ class Scene:
 
     def show_reference(self, scenario: Scenario) -> None:
         """Draws a lap of each reference of a scenario on the ground, and turns the cameras to show them."""
-        lines = []
-        for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
-            pose = reference.sample(np.linspace(0, reference.period, 401)).pose
-            heights = [self._height(x, y) + 0.006 for x, y in pose[:, :2]]
-            lines.append(np.column_stack([pose[:, :2], heights]))
+        references = [scenario.reference, *(e.reference for e in scenario.events if e.reference)]
+        lines = self._lines(references)
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
         self._view = max(LEAST_VIEW, *(high - low)) + self._length
-        self._draw_lines("/world/reference", np.stack(lines), 2 * TRAIL_WIDTH * self._view, REFERENCE_COLOUR)
+        self.draw_references(references)
         self._factor.position = [(low[0] + high[0]) / 2, high[1] + self._length / 2, high[2]]
         middle = (low + high) / 2
         self._look(middle + self._view * CAMERA_POSITION, middle + self._view * CAMERA_TARGET)
         self.paint(self._server.dark)
+
+    def draw_references(self, references: Sequence[Reference]) -> None:
+        """Draws a lap of each reference on the ground, in place of those before; the cameras stay."""
+        lines = self._lines(references)
+        self._draw_lines("/world/reference", lines, 2 * TRAIL_WIDTH * self._view, REFERENCE_COLOUR)
+
+    def _lines(self, references: Sequence[Reference]) -> Array:
+        """Returns a lap of each of n references, a little above the ground, in m, `(n, 401, 3)`."""
+        lines = []
+        for reference in references:
+            pose = reference.sample(np.linspace(0, reference.period, 401)).pose
+            heights = [self._height(x, y) + 0.006 for x, y in pose[:, :2]]
+            lines.append(np.column_stack([pose[:, :2], heights]))
+        return np.stack(lines)
 
     def _look(self, position: Array, target: Array) -> None:
         """Sets the camera of pages to come, and of open ones if it is another than before."""
@@ -325,6 +337,14 @@ class Scene:
         """Returns the nearest position to one in m, `(3,)`, from which a camera sees the floor from above."""
         normal, point = self._floor
         return position + normal * max(0.0, CLEARANCE - normal @ (position - point - self._root.position))
+
+    def on_floor(self, origin: Array, direction: Array) -> Array | None:
+        """Returns where a ray in a visitor's view meets the floor, x and y in m, `(2,)`; None where it does not."""
+        normal, point = self._floor
+        start, falls = origin - self._root.position, normal @ direction
+        if falls >= 0:
+            return None
+        return (start + direction * (normal @ (point - start)) / falls)[:2]
 
     def _draw_lines(self, name: str, lines: Array, width: float, colour: Colour) -> viser.MeshHandle:
         """Draws lines `(B, n, 3)` as one mesh; each segment of a thick line of viser's costs about as much."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import ceil, floor, sqrt
+from math import ceil, floor, pi, remainder, sqrt
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,12 +14,14 @@ from mrctl.control.design import motion
 from mrctl.control.margins import Gains
 from mrctl.kernel import Array, Rows
 from mrctl.loop.simulation import Simulation, arranged, uniform
+from mrctl.navigation.generators import Task
+from mrctl.navigation.mission import MARGIN, SLIM, prepared
 from mrctl.physics.hull import footprint
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank, combine, dataset
 from mrctl.scenario import Event, Scenario
-from mrctl.theory.clearance import clearances
-from mrctl.theory.obstacles import Surroundings, turned
+from mrctl.theory.clearance import clearance, clearances
+from mrctl.theory.obstacles import Pose, Surroundings, turned
 from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
 
@@ -38,6 +40,7 @@ class Session:
         start: Scenarios at the start of the session.
         simulations: Indices of the robots in each simulation, and the simulation.
         period: Control period in s.
+        lead: Number of control periods until a new reference is followed, the longest delay of a robot.
         tick: Number of control periods done.
     """
 
@@ -59,6 +62,7 @@ class Session:
         long = [s.model_copy(update={"laps": max(1, floor(HOUR / s.reference.period))}) for s in scenarios]
         self.simulations = [(rows, Simulation([long[row] for row in rows], threads=1)) for rows in uniform(long)]
         self._place = {row: (sim, k) for rows, sim in self.simulations for k, row in enumerate(rows)}
+        self.lead = max(sim.lead for _, sim in self.simulations)
         self.tick = 0
         self._surroundings = Surroundings(scenarios[0].obstacles)
         self._footprint = footprint(self.simulations[0][1].model) if scenarios[0].obstacles.shapes else np.zeros((0, 2))
@@ -94,7 +98,7 @@ class Session:
         self.tick += 1
 
     def apply(self, **change: Any) -> None:  # noqa: ANN401
-        """Applies an event to every robot at the coming tick.
+        """Applies an event to every robot at the coming tick, or a new reference as soon as a voltage can act on it.
 
         Args:
             change: Fields of `Event`, without the time.
@@ -102,10 +106,34 @@ class Session:
         Raises:
             InputError: The event is refused; then nothing changes.
         """
-        event = Event.from_dict({"time": self.time, **change})
+        lead = self.lead if "reference" in change else 0
+        event = Event.from_dict({"time": (self.tick + lead) * self.period, **change})
         for _, sim in self.simulations:
             if sim.tick == self.tick:  # the others have stopped
                 sim.add(event)
+
+    def head_for(self, goal: Pose) -> None:
+        """Plans a way for the first robot from where it is, and gives it to every robot as an event.
+
+        The plan keeps 5 cm from obstacles that stand still, or 2 cm where the robot is nearer than that now.
+
+        Args:
+            goal: x and y in m and θ in rad.
+
+        Raises:
+            InputError: The robot has stopped, the goal is in an obstacle, or there is no way.
+        """
+        sim, k = self._place[0]
+        if sim.plant.failed[k]:
+            raise InputError("goal: the first robot has stopped; a reset starts again")
+        x, y, theta = sim.plant.reading["pose"][k]
+        first = self.start[0]
+        task = {"obstacles": first.obstacles, "start": (x, y, remainder(theta, 2 * pi)), "goal": goal}
+        near = clearance(self._footprint, np.array([x, y, theta]), self._surroundings.at(self.time))
+        plan = followed(sim.scenarios[k], self.time)
+        speed = plan.speed if isinstance(plan, Waypoints) else None
+        _, found = prepared(Task.from_dict(task), first, speed, MARGIN if near > MARGIN else SLIM)
+        self.apply(reference=found.reference)
 
     def state(self) -> dict[str, Any]:
         """Returns the present values of the fields `CHANGEABLE`, and `learning`."""
