@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mrctl.control.kanayama import posture_error
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.loop.courses import course, distinct_courses, start_pose
-from mrctl.loop.goals import arrived
+from mrctl.loop.goals import Goals, arrived
 from mrctl.loop.log import Log
 from mrctl.loop.simulation import Simulation, group_of
 from mrctl.record import InputError
@@ -138,6 +138,7 @@ class Episodes(Simulation):
         self.log = Log(1, len(scenarios))
         self.sizes = dict(OBSERVATIONS)
         self.limits = np.full(sum(OBSERVATIONS.values()), -np.inf), np.full(sum(OBSERVATIONS.values()), np.inf)
+        self._goals = Goals(scenarios, timed=False)  # an episode that is over begins again
         self._lengths = np.array([s.ticks for s in scenarios])
         self._targets = np.array([(np.nan,) * 3 if s.goal is None else s.goal for s in scenarios])
 
@@ -209,10 +210,8 @@ class Episodes(Simulation):
 
     def ended(self) -> tuple[NDArray[np.bool], NDArray[np.bool]]:
         """Which episodes have ended by a failure or at a goal, and which at the end of their scenario, `(B,)` each."""
-        over, reasons = self.tick - self.courses.start >= self._lengths, np.array(self.plant.failure)
-        late = over & (reasons == "") & ~self.arrived()  # in a group with longer episodes, the robot was stopped
-        terminated = self.plant.failed & ~late
-        return terminated, over & ~terminated
+        terminated = self.plant.failed.copy()
+        return terminated, (self.tick - self.courses.start >= self._lengths) & ~terminated
 
 
 def read(scenario: Scenario | str | Path | None) -> Scenario:

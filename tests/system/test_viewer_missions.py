@@ -195,7 +195,8 @@ def test_flags(monkeypatch):
     assert (compare, export, host, port) == (("none",), None, "127.0.0.1", 8081)
     assert scenario.feedforward == "model+composite" and scenario.obstacles == task.obstacles
     assert scenario.reference.speed == 0.4 and scenario.initial_pose == task.start and scenario.goal is None
-    assert ends(scenario, 0.0)[:, :2] == pytest.approx(np.array([task.start, task.goal])[:, :2])
+    bound = ends(scenario, 0.0)
+    assert bound is not None and bound[:, :2] == pytest.approx(np.array([task.start, task.goal])[:, :2])
 
 
 @pytest.mark.parametrize(
