@@ -300,6 +300,8 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         avoid: Literal["none", "barrier", "window", "mppi"] = "none",
         out: Path | None = None,
         json: bool = False,
+        view: bool = False,
+        port: int = 8080,
         suite: bool = False,
         quick: bool = False,
     ) -> None:
@@ -322,6 +324,8 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
                 in the way (`window`, `mppi`).
             out: Folder for the result, the table in JSON and the figures.
             json: Print JSON instead of a table.
+            view: Instead of a table, show the mission live in the browser, where further goals can be set by clicks.
+            port: Number of the port to listen on, with --view.
             suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
                 model, fel and model+composite, on three plants; it prints first how long that takes. The tables are
                 written to the folder, by default navigate_suite.
@@ -332,12 +336,22 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
         if suite:
             taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _given(arguments)
-            if taken or world or goal or start or compare or speed or avoid != "none" or json:
+            if taken or world or goal or start or compare or speed or avoid != "none" or json or view:
                 raise InputError("suite: has worlds, controllers and speeds of its own; give only the robot's flags")
             print(mission_suite.suite(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
             return
         if quick or not world:
             raise InputError("quick: belongs to --suite" if quick else "world: none given; see mrctl navigate --help")
+        if port != 8080 and not view:
+            raise InputError("port: belongs to --view")
+        if view:
+            if avoid != "none" or out is not None or json:
+                raise InputError("view: a live session has no --avoid, --out and --json")
+            from mrctl.navigation.mission import task_of
+            from mrctl.viewer import view as viewing
+
+            task = task_of(world, chosen, start, goal)
+            return viewing.mission(task, chosen, compare, speed, margin, "127.0.0.1", port)
         text, outcome = mission.run(world, chosen, goal, start, compare, speed, margin, avoid, out, json)
         print(text)
         if outcome != "arrived":

@@ -1,4 +1,4 @@
-"""Tracking as `dm_env` environments, built on `dm_control.rl.control` like a domain of `dm_control.suite`.
+"""Tracking and navigation as `dm_env` environments, built on `dm_control.rl.control` like a domain of its suite.
 
 `SUITE["residual"]()` makes an environment; after `register()`, so does `dm_control.suite.load("mrctl", "residual")`.
 """
@@ -9,6 +9,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,8 @@ from dm_control.rl import control
 from dm_control.utils import containers
 from dm_env import specs
 
-from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Action, Array, Draw, Episodes, read
+from mrctl.envs.episodes import ACTION_KINDS, Action, Array, Draw, Episodes, read
+from mrctl.envs.navigation import Navigating, read_mission
 from mrctl.physics.plant import PhysicsPlant
 from mrctl.scenario import Scenario
 
@@ -54,7 +57,10 @@ class Tracking(control.Task):
         Raises:
             InputError: The scenario is invalid.
         """
-        self.episodes = Episodes([scenario], action, draw=draw)
+        self._drive(Episodes([scenario], action, draw=draw), random)
+
+    def _drive(self, episodes: Episodes, random: int | np.random.RandomState | None) -> None:
+        self.episodes, scenario = episodes, episodes.scenarios[0]
         seed = scenario.seed if random is None else random
         self._random = seed if isinstance(seed, np.random.RandomState) else np.random.RandomState(seed)
         self._next = scenario.seed
@@ -81,18 +87,37 @@ class Tracking(control.Task):
         return specs.BoundedArray((2,), float, -bound, bound, name="action")
 
     def get_observation(self, physics: Physics) -> dict[str, Array]:
-        """Returns the quantities of `mrctl.envs.episodes.OBSERVATIONS` by name."""
-        seen = self.episodes.observe()[0][0]
-        ends = np.cumsum(list(OBSERVATIONS.values()))
-        return dict(zip(OBSERVATIONS, np.split(seen, ends[:-1]), strict=True))
+        """Returns the quantities of the `sizes` of the episodes by name."""
+        seen, sizes = self.episodes.observe()[0][0], self.episodes.sizes
+        return dict(zip(sizes, np.split(seen, np.cumsum(list(sizes.values()))[:-1]), strict=True))
 
     def get_reward(self, physics: Physics) -> float:
-        """Returns the reward of the last control period, from 0 to 1; see `mrctl.envs.episodes.Episodes.observe`."""
+        """Returns the reward of the last control period, as the `observe` of the episodes says."""
         return float(self.episodes.observe()[1][0])
 
     def get_termination(self, physics: Physics) -> float | None:
-        """Returns discount 0 where the robot has failed, 1 at the end of the scenario, and None before."""
-        return 0.0 if self.episodes.plant.failed[0] else 1.0 if self.episodes.over()[0] else None
+        """Returns discount 0 where the robot has failed or arrived, 1 at the end of the scenario, and None before."""
+        (terminated,), (truncated,) = self.episodes.ended()
+        return 0.0 if terminated else 1.0 if truncated else None
+
+
+class Navigation(Tracking):
+    """A task in which one robot with a lidar is told a goal; its seeds are those of `Tracking`."""
+
+    def __init__(
+        self, scenario: Scenario, random: int | np.random.RandomState | None = None, draw: Draw | None = None
+    ) -> None:
+        """Stands the robot at its start.
+
+        Args:
+            scenario: The scenario, with a goal.
+            random: As for `Tracking`.
+            draw: As for `Tracking`.
+
+        Raises:
+            InputError: The scenario is invalid.
+        """
+        self._drive(Navigating([scenario], draw=draw), random)
 
 
 class Environment(control.Environment):
@@ -126,8 +151,8 @@ class Environment(control.Environment):
             return super().step(action)
 
 
-def _add(action: Action) -> None:
-    """Adds the task with this meaning of an action to the suite."""
+def _add(name: str, tag: str, make: Callable[..., Tracking], says: str) -> None:
+    """Adds a task to the suite, made from a scenario, its file or None, a source of seeds, and one of perturbations."""
 
     def task(
         scenario: Scenario | str | Path | None = None,
@@ -135,15 +160,19 @@ def _add(action: Action) -> None:
         environment_kwargs: dict[str, Any] | None = None,
         draw: Draw | None = None,
     ) -> Environment:
-        return Environment(Tracking(read(scenario), action, random, draw), **(environment_kwargs or {}))
+        return Environment(make(scenario, random, draw), **(environment_kwargs or {}))
 
-    task.__name__ = action
-    task.__doc__ = f"Makes an environment in which an action is a {action}; the scenario is one lap by default."
-    SUITE.add("tracking")(task)
+    task.__name__, task.__doc__ = name, f"Makes an environment in which {says}."
+    SUITE.add(tag)(task)
 
 
 for _action in ACTION_KINDS:
-    _add(_action)
+    _make = partial(lambda action, scenario, random, draw: Tracking(read(scenario), action, random, draw), _action)
+    _add(_action, "tracking", _make, f"an action is a {_action}; the scenario is one lap by default")
+_add(
+    "navigation", "navigation", lambda scenario, random, draw: Navigation(read_mission(scenario), random, draw),
+    "a robot is told a goal; the scenario is a mission through a door by default",
+)  # fmt: skip
 
 
 def register() -> None:

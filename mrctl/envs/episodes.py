@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from mrctl.control.kanayama import posture_error
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.loop.courses import course, distinct_courses, start_pose
+from mrctl.loop.goals import Goals, arrived
 from mrctl.loop.log import Log
 from mrctl.loop.simulation import Simulation, group_of
 from mrctl.record import InputError, describe
@@ -94,10 +95,10 @@ class EpisodeCourses:
 
     def __init__(self, scenarios: Sequence[Scenario], lead: int) -> None:
         """Samples every course once, to the end of the episode and one tick and the lead more."""
-        self._ticks = scenarios[0].ticks
-        self._last = self._ticks + lead
+        ticks = max(s.ticks for s in scenarios)
+        self._last = ticks + lead
         distinct, self._place = distinct_courses(scenarios)
-        whole, end = range(self._ticks), range(self._ticks, self._last + 1)
+        whole, end = range(ticks), range(ticks, self._last + 1)
         self._table = np.stack([np.append(course(s, whole), course(s, end)) for s in distinct], axis=1)
         self.start = np.zeros(len(scenarios), int)
 
@@ -117,8 +118,10 @@ class Episodes(Simulation):
 
     Attributes:
         bound: Largest action of each component, `(2,)`.
-        scale: Largest size of each number that a robot sees, `(14,)`: 5 cm for the posture error (of the rear wheels,
+        scale: Largest size of each number that a robot sees, `(n,)`: 5 cm for the posture error (of the rear wheels,
             where it turns), the robot's limits for twists, reference, wheels and steering, and its supply for voltages.
+        sizes: Names and sizes of the parts of an observation, in their order.
+        limits: Least and largest value of each number of an observation, `(n,)` each.
     """
 
     def __init__(
@@ -160,8 +163,13 @@ class Episodes(Simulation):
         )
         self._given, self._draw = [s.perturbation for s in self.scenarios], draw
         self._squares = np.zeros((len(scenarios), 3))
-        self.courses: EpisodeCourses = EpisodeCourses(scenarios, self._lead)  # type: ignore[assignment]
+        self.courses: EpisodeCourses = EpisodeCourses(scenarios, self.lead)  # type: ignore[assignment]
         self.log = Log(1, len(scenarios))
+        self.sizes = dict(OBSERVATIONS)
+        self.limits = np.full(sum(OBSERVATIONS.values()), -np.inf), np.full(sum(OBSERVATIONS.values()), np.inf)
+        self._goals = Goals(scenarios, timed=False)  # an episode that is over begins again
+        self._lengths = np.array([s.ticks for s in scenarios])
+        self._targets = np.array([(np.nan,) * 3 if s.goal is None else s.goal for s in scenarios])
 
     def _make_agent(self, robot: Robot, size: int) -> AgentMotion:
         self._agent = AgentMotion(robot, size)
@@ -258,9 +266,15 @@ class Episodes(Simulation):
         means = self._squares[row] / (self.tick - self.courses.start[row])
         return dict(zip(EPISODE_METRICS, np.sqrt(means).tolist(), strict=True))
 
-    def over(self) -> NDArray[np.bool]:
-        """Which robots have driven their scenario to the end, `(B,)`."""
-        return self.tick - self.courses.start >= self.ticks
+    def arrived(self) -> NDArray[np.bool]:
+        """Which robots stood at the goals of their scenarios in the last tick, `(B,)`."""
+        last = self.log.at(self.tick - 1)
+        return arrived(np.stack([last["x"], last["y"], last["theta"]], -1), last["v"], self._targets)
+
+    def ended(self) -> tuple[NDArray[np.bool], NDArray[np.bool]]:
+        """Which episodes have ended by a failure or at a goal, and which at the end of their scenario, `(B,)` each."""
+        terminated = self.plant.failed.copy()
+        return terminated, (self.tick - self.courses.start >= self._lengths) & ~terminated
 
 
 def read(scenario: Scenario | str | Path | None) -> Scenario:

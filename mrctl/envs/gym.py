@@ -1,15 +1,14 @@
-"""Tracking as Gymnasium environments, for one robot or for many in a batch; needs `pip install 'mrctl[env]'`.
+"""Tracking and navigation as Gymnasium environments, for one robot or a batch; needs `pip install 'mrctl[env]'`.
 
-The import of this module registers `mrctl/TwistTracking-v0`, `mrctl/VoltageTracking-v0` and
-`mrctl/ResidualTracking-v0`. An action is that of `mrctl.envs.episodes.Episodes` divided by its `bound`, so that it lies
-between -1 and 1. An observation holds the quantities of `OBSERVATIONS` one after another. The seed of a reset is the
+The import of this module registers `mrctl/TwistTracking-v0`, `mrctl/VoltageTracking-v0`, `mrctl/ResidualTracking-v0`
+and `mrctl/Navigation-v0`. An action is that of `mrctl.envs.episodes.Episodes` divided by its `bound`, so that it lies
+between -1 and 1. An observation holds the quantities of its `sizes` one after another. The seed of a reset is the
 seed of the scenario: the episode has the same bits as `simulate` with that seed.
 """
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +24,19 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mrctl.envs.episodes import ACTION_KINDS, OBSERVATIONS, Action, Array, Draw, Episodes, read
+from mrctl.envs.episodes import ACTION_KINDS, Action, Array, Draw, Episodes, read
+from mrctl.envs.navigation import Navigating, read_mission
 from mrctl.envs.pictures import picture
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
 SEEDS = 2**32  # number of seeds that a scenario can have
 
-OBSERVATION = Box(-np.inf, np.inf, (sum(OBSERVATIONS.values()),), np.float64)
-ACTION = Box(-1.0, 1.0, (2,), np.float64)
+
+def _spaces(episodes: Episodes) -> tuple[Box, Box]:
+    """Returns the spaces of observations and of actions; each environment has its own, which hold random numbers."""
+    low, high = episodes.limits
+    return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (2,), np.float64)
 
 
 def asked(options: dict[str, Any] | None) -> Any:  # noqa: ANN401
@@ -71,13 +74,14 @@ class TrackingEnv(gymnasium.Env):
         Raises:
             InputError: The file or the scenario is invalid, or there is no such `render_mode`.
         """
+        self._drive(Episodes([read(scenario)], action, draw=draw), render_mode)
+
+    def _drive(self, episodes: Episodes, render_mode: str | None) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(f"render_mode: {render_mode!r} is not rgb_array")
-        self.render_mode = render_mode
-        self.episodes = Episodes([read(scenario)], action, draw=draw)
-        self.metadata = {**self.metadata, "render_fps": round(1 / self.episodes.period)}
-        # Each environment has copies, because a space holds its own random numbers.
-        self.observation_space, self.action_space = copy.deepcopy((OBSERVATION, ACTION))
+        self.episodes, self.render_mode = episodes, render_mode
+        self.metadata = {**self.metadata, "render_fps": round(1 / episodes.period)}
+        self.observation_space, self.action_space = _spaces(episodes)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Begins an episode.
@@ -88,7 +92,7 @@ class TrackingEnv(gymnasium.Env):
                 in `PERTURBATIONS`; by default drawn, or that of the scenario.
 
         Returns:
-            The observation, `(14,)`, and an empty dictionary.
+            The observation, `(n,)`, and an empty dictionary.
 
         Raises:
             InputError: An option is unknown or invalid.
@@ -105,19 +109,20 @@ class TrackingEnv(gymnasium.Env):
             action: The action as a share of the bound, `(2,)`.
 
         Returns:
-            Observation `(14,)`, reward, whether the robot has failed, whether the scenario is at its end, and a
-            dictionary: at the end of the episode `EPISODE_METRICS`, and where the robot has failed why, as `failure`.
+            Observation `(n,)`, reward, whether the robot has failed or arrived, whether the scenario is at its end, and
+            a dictionary: at the end of the episode its `metrics`, and where the robot has failed why, as `failure`, ""
+            where it has arrived.
         """
         loop = self.episodes
         loop.act(action * loop.bound)
         with np.errstate(invalid="ignore", over="ignore"):
             loop.step()
             (seen,), (reward,) = loop.observe()
-        failed, over = bool(loop.plant.failed[0]), bool(loop.over()[0])
-        info: dict[str, Any] = {"failure": loop.plant.failure[0]} if failed else {}
-        if failed or over:
+        (terminated,), (truncated,) = loop.ended()
+        info: dict[str, Any] = {"failure": loop.plant.failure[0]} if terminated else {}
+        if terminated or truncated:
             info |= loop.metrics(0)
-        return seen, float(reward), failed, over and not failed, info
+        return seen, float(reward), bool(terminated), bool(truncated), info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Returns a picture of the robot in its world, `(480, 640, 3)`; None without `render_mode`.
@@ -126,6 +131,28 @@ class TrackingEnv(gymnasium.Env):
             InputError: MuJoCo cannot draw on this machine.
         """
         return picture(self.episodes) if self.render_mode else None
+
+
+class NavigationEnv(TrackingEnv):
+    """An environment in which one robot with a lidar is told a goal."""
+
+    def __init__(
+        self,
+        scenario: Scenario | str | Path | None = None,
+        draw: Draw | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Stands the robot at its start.
+
+        Args:
+            scenario: The scenario, with a goal, or the path of its file; by default a mission through a door.
+            draw: As for `TrackingEnv`.
+            render_mode: As for `TrackingEnv`.
+
+        Raises:
+            InputError: The file or the scenario is invalid.
+        """
+        self._drive(Navigating([read_mission(scenario)], draw=draw), render_mode)
 
 
 class TrackingVectorEnv(VectorEnv):
@@ -155,18 +182,15 @@ class TrackingVectorEnv(VectorEnv):
             InputError: The file or a scenario is invalid, or the scenarios cannot run together.
             ValueError: The number of scenarios is not B.
         """
-        if scenario is None or isinstance(scenario, Scenario | str | Path):
-            scenarios = [read(scenario)] * num_envs
-        else:
-            scenarios = list(scenario)
-        if len(scenarios) != num_envs:
-            raise ValueError(f"num_envs: {num_envs}, but {len(scenarios)} scenarios")
+        self._drive(Episodes(_several(num_envs, scenario, read), action, draw=draw, threads=threads))
+
+    def _drive(self, episodes: Episodes) -> None:
+        self.episodes, num_envs = episodes, len(episodes.scenarios)
         self.num_envs = num_envs
-        self.episodes = Episodes(scenarios, action, draw=draw, threads=threads)
-        self.single_observation_space, self.single_action_space = copy.deepcopy((OBSERVATION, ACTION))
+        self.single_observation_space, self.single_action_space = _spaces(episodes)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._randoms = [seeding.np_random()[0] for _ in scenarios]
+        self._randoms = [seeding.np_random()[0] for _ in episodes.scenarios]
         self._over = np.zeros(num_envs, bool)
 
     def reset(
@@ -179,7 +203,7 @@ class TrackingVectorEnv(VectorEnv):
             options: The `perturbation` of these episodes, as for `TrackingEnv`, or a list of B of them.
 
         Returns:
-            The observations, `(B, 14)`, and an empty dictionary.
+            The observations, `(B, n)`, and an empty dictionary.
 
         Raises:
             InputError: An option is unknown or invalid.
@@ -210,8 +234,8 @@ class TrackingVectorEnv(VectorEnv):
             actions: The actions as shares of the bound, `(B, 2)`.
 
         Returns:
-            Observations `(B, 14)`, rewards `(B,)`, which robots have failed `(B,)`, which are at the end of their
-            scenario `(B,)`, and a dictionary as that of `TrackingEnv`, of arrays `(B,)`.
+            Observations `(B, n)`, rewards `(B,)`, which robots have failed or arrived `(B,)`, which are at the end of
+            their scenario `(B,)`, and a dictionary as that of `TrackingEnv`, of arrays `(B,)`.
         """
         loop, begun = self.episodes, np.flatnonzero(self._over)
         loop.act(actions * loop.bound)
@@ -221,8 +245,7 @@ class TrackingVectorEnv(VectorEnv):
                 loop.begin(int(row), self._draw(int(row)))
             seen, reward = loop.observe()
         reward[begun] = 0.0
-        terminated = loop.plant.failed.copy()
-        truncated = loop.over() & ~terminated
+        terminated, truncated = loop.ended()
         self._over = terminated | truncated
         info: dict[str, Any] = {}
         for row in map(int, np.flatnonzero(self._over)):
@@ -231,6 +254,54 @@ class TrackingVectorEnv(VectorEnv):
         return seen, reward, terminated, truncated, info
 
 
+class NavigationVectorEnv(TrackingVectorEnv):
+    """Navigation of many robots in a batch, in one world."""
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: Scenario | str | Path | Sequence[Scenario] | None = None,
+        threads: int = 0,
+        draw: Draw | None = None,
+    ) -> None:
+        """Stands the robots at their starts.
+
+        Args:
+            num_envs: Number of robots B.
+            scenario: As for `NavigationEnv`, or a sequence of B scenarios, which may differ in start, goal and length.
+            threads: Number of threads of the batch engine; 0 for all cores.
+            draw: As for `TrackingEnv`.
+
+        Raises:
+            InputError: The file or a scenario is invalid, or the scenarios cannot run together.
+            ValueError: The number of scenarios is not B.
+        """
+        self._drive(Navigating(_several(num_envs, scenario, read_mission), draw=draw, threads=threads))
+
+
+def _several(
+    count: int,
+    scenario: Scenario | str | Path | Sequence[Scenario] | None,
+    read: Callable[[Scenario | str | Path | None], Scenario],
+) -> list[Scenario]:
+    """Returns a scenario for each of some robots.
+
+    Raises:
+        ValueError: As many scenarios were not given.
+    """
+    if scenario is None or isinstance(scenario, Scenario | str | Path):
+        return [read(scenario)] * count
+    scenarios = list(scenario)
+    if len(scenarios) != count:
+        raise ValueError(f"num_envs: {count}, but {len(scenarios)} scenarios")
+    return scenarios
+
+
+gymnasium.register(
+    id="mrctl/Navigation-v0",
+    entry_point="mrctl.envs.gym:NavigationEnv",
+    vector_entry_point="mrctl.envs.gym:NavigationVectorEnv",
+)
 for _action in ACTION_KINDS:
     gymnasium.register(
         id=f"mrctl/{_action.capitalize()}Tracking-v0",

@@ -30,13 +30,13 @@ def arrived(pose: Array, v: ArrayLike, goal: Array) -> NDArray[np.bool]:
 class Goals:
     """The goals of a group of runs."""
 
-    def __init__(self, scenarios: Sequence[Scenario]) -> None:
-        """Takes the scenario of each robot."""
+    def __init__(self, scenarios: Sequence[Scenario], timed: bool = True) -> None:
+        """Takes the scenario of each robot, and whether runs end that are shorter than the longest."""
         none = (np.nan, np.nan, np.nan)
         self._goals = np.array([none if s.goal is None else s.goal for s in scenarios])
         self.any = bool(np.isfinite(self._goals).any())
         ticks = np.array([s.ticks for s in scenarios])
-        self._ticks = np.where(ticks < ticks.max(), ticks, np.inf)  # of those that end before the group does
+        self._ticks = np.where(timed & (ticks < ticks.max()), ticks, np.inf)  # of those that end before the group does
         self._patience = round(STUCK / scenarios[0].control_period)
         self._place = np.full((len(scenarios), 2), np.inf)  # where each robot was when it last got farther
         self._start = np.zeros(len(scenarios), int)

@@ -196,6 +196,7 @@ class Simulation:
     Attributes:
         scenarios: Scenario of each run, with the events that were added.
         model: The compiled world with the nominal robot.
+        lead: Number of control periods until a voltage acts; the controllers are told the reference of that time.
         courses: The references that the robots follow.
         sensors: The sensors of the robots.
         estimator: The estimator of the posture and the twist that the controllers use.
@@ -233,8 +234,8 @@ class Simulation:
         self._feedforward = named(first.prior, names.pop("feedforward", first.learner))
         self._label = " + ".join([self._feedforward, *names.values()])
 
-        self._lead = first.sensing.periods("delay", self.period)
-        self.courses = Courses(scenarios, self._lead)
+        self.lead = first.sensing.periods("delay", self.period)
+        self.courses = Courses(scenarios, self.lead)
         self.plant: Plant = build(
             self.model, robot, size, round(self.period / first.physics_step), threads, first.obstacles
         )
@@ -281,13 +282,15 @@ class Simulation:
         """Adds an event to every run; `scenarios` then contain it, and a new run of them gives the same bits.
 
         Args:
-            event: The event, not before the coming tick.
+            event: The event, not before the coming tick; with a reference not before its voltage acts.
 
         Raises:
             InputError: The event is in the past, or a scenario with it is refused; then nothing is added.
         """
         if event.tick(self.period) < self.tick:
             raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self.period:g} s")
+        if event.reference is not None and event.tick(self.period) < self.tick + self.lead:
+            raise InputError(f"time: a reference must be known {self.lead * self.period:g} s before, the delay")
         if event.perturbation is not None:
             self.plant.check(event.perturbation)
         if event.reference is not None:
@@ -295,7 +298,7 @@ class Simulation:
         self.scenarios = [scenario.with_event(event) for scenario in self.scenarios]
         self.events.add(event)
         if event.reference is not None:
-            self.courses = Courses(self.scenarios, self._lead)
+            self.courses = Courses(self.scenarios, self.lead)
 
     def step(self) -> None:
         """Computes one control period, as in figure 3."""
@@ -313,7 +316,7 @@ class Simulation:
             self._sensed = self.tick
             self.events.apply(self.tick)
             self._goal = self.courses.at(self.tick)
-            self._wanted = self.courses.at(self.tick, self._lead) if self._lead else self._goal
+            self._wanted = self.courses.at(self.tick, self.lead) if self.lead else self._goal
             self.sensors.measure(self.tick, self.plant.state)
             self.estimator.estimate(self.tick, self.plant.state)
         return self.estimator.seen, self._wanted

@@ -54,6 +54,7 @@ TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the
 WIDER = 2.0  # times both, where a plan may reverse, for at a change of direction a spline is straight
 CELLS = 4  # of the search in the width of the robot
 PATIENCE, WAITING = 2, 4  # time of a mission over that of its plan; WAITING with `window` and `mppi`
+MARGIN = 0.05  # m, margin of a plan
 SLIM = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
 PERIOD = 0.05  # s, motion period of `window` and `mppi`
 BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
@@ -107,7 +108,7 @@ def navigate(
     scenario: Scenario,
     compare: Sequence[FeedforwardName] = (),
     speed: float | None = None,
-    margin: float = 0.05,
+    margin: float = MARGIN,
     avoid: Avoid = "none",
     progress: bool = False,
 ) -> Mission:
@@ -130,16 +131,7 @@ def navigate(
     Raises:
         InputError: Start or goal is in an obstacle, there is no way, or the robot cannot drive the plan.
     """
-    model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
-    try:
-        found, reference = planned(task, scenario, speed, margin)
-    except InputError:
-        if avoid not in ("none", "barrier") or not mjcf.reverses(model, scenario.steering):
-            raise
-        found, reference = planned(task, scenario, speed, margin, reverse=True)
-    own = scenario.replace(
-        obstacles=task.obstacles, reference=reference, laps=PATIENCE, initial_pose=task.start, goal=task.goal
-    )
+    found, own = prepared(task, scenario, speed, margin, forward=avoid in ("window", "mppi"))
     stage = avoiding(avoid, own)
     if avoid in ("window", "mppi"):
         own = own.replace(motion_period=PERIOD, laps=WAITING)
@@ -148,6 +140,29 @@ def navigate(
     driven = np.flatnonzero(np.isfinite(result["x"].values).any(axis=0))
     result = result.isel(time=slice(int(driven[-1]) + 1))
     return Mission(found, result, outcomes(result, task.goal, found))
+
+
+def prepared(
+    task: Task, scenario: Scenario, speed: float | None = None, margin: float = MARGIN, forward: bool = False
+) -> tuple[Plan, Scenario]:
+    """Returns a plan, and the scenario that drives it; arguments and errors are those of `navigate`.
+
+    Args:
+        task: World, start and goal.
+        scenario: The robot and all else.
+        speed: Largest speed in m/s.
+        margin: Clearance that the plan keeps in m.
+        forward: Whether the plan must not reverse, not even where there is no way forward.
+    """
+    model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
+    try:
+        found, reference = planned(task, scenario, speed, margin)
+    except InputError:
+        if forward or not mjcf.reverses(model, scenario.steering):
+            raise
+        found, reference = planned(task, scenario, speed, margin, reverse=True)
+    own = {"obstacles": task.obstacles, "reference": reference, "laps": PATIENCE}
+    return found, scenario.replace(**own, initial_pose=task.start, goal=task.goal)
 
 
 def avoiding(avoid: Avoid, scenario: Scenario) -> Callable[[Robot, int], Any] | None:

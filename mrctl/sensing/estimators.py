@@ -214,6 +214,7 @@ class Estimator:
         memory["mean"][:size] = np.append(reading["pose"], reading["twist"]) + deviation * random.standard_normal(size)
         if self.localiser:
             self.localiser.start(row, memory["mean"][:3], seed)
+            self._located = -1  # the tick may have been located before a robot of an environment began again in it
         if self._name == "ekf":
             offset = sensing["accelerometer_bias"] ** 2 + START_OFFSET**2
             count = sensor["quantum"] ** 2 / 12

@@ -27,6 +27,7 @@ class Localiser:
 
     Attributes:
         scans: Last scan of each robot, ranges in m, `(beams,)`; None for a robot without a lidar.
+        taken: Control tick at which it was taken, `(B,)`.
         filters: Particle filter of each robot, or None.
     """
 
@@ -51,6 +52,7 @@ class Localiser:
         cell = max(CELL, float(np.sqrt(np.prod(high - low) / MOST_CELLS)) * 1.01)
         self._map = field_of(Surroundings(still).at(0.0), low, high, cell)
         self.scans: list[Array | None] = [None] * len(sensing)
+        self.taken = np.zeros(len(sensing), int)
         self.filters: list[Particles | None] = [None] * len(sensing)
         self._random = [np.random.default_rng()] * len(sensing)
         self._odometry = np.zeros((len(sensing), 2))  # way in m and turn in rad since the last scan
@@ -87,7 +89,8 @@ class Localiser:
             lidar: Lidar = sensing.lidar
             around = self._surroundings.at(since * period)
             scan = lidar.scan(plant["reading"]["pose"][row], around, self._random[row])
-            self.scans[row], points = scan, lidar.points(scan, BEAMS[sensing.localisation])
+            self.scans[row], self.taken[row] = scan, tick
+            points = lidar.points(scan, BEAMS[sensing.localisation])
             if particles := self.filters[row]:
                 found = particles.update(float(self._odometry[row, 0]), float(self._odometry[row, 1]), points)
             elif since == 0:

@@ -20,6 +20,7 @@ from mrctl.viewer.recording import Recording, event_times, joint_log
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.sensors import magnification
 from mrctl.viewer.server import Server
+from mrctl.viewer.session import ends
 
 PICTURE_RATE = 25  # pictures for each second of the replay
 SAMPLES = 1200  # about the largest number of samples in a curve
@@ -69,8 +70,8 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
     """Returns the scene with its player, as a complete page in HTML."""
     server = Server(port=0)
     try:
-        scene = Scene(server, recordings[0].model, robots)
-        _, log = joint_log(recordings)
+        scene = Scene(server, recordings[0].model, robots, recordings[0].scenario.obstacles)
+        _, log, _ = joint_log(recordings)
         magnified = magnification(extent(log))
         scene.show_recordings(recordings, magnified)
         duration = max(r.duration for r in recordings)
@@ -79,6 +80,8 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
             for row, recording in enumerate(recordings):
                 scene.show(row, recording.qpos(recording.index(time)))
                 scene.show_payload(row, recording.perturbation(time))
+            scene.show_obstacles(recordings[0].start + time)
+            scene.show_ends(ends(recordings[0].scenario, recordings[0].start + time))
             scene.show_targets(np.stack([r.log[r.index(time)] for r in recordings]), magnified)
             scene.flush(follow=False)
             serializer.insert_sleep(1 / PICTURE_RATE)
@@ -89,10 +92,10 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
 
 def _curves(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
     """Returns the curves as JSON that is safe inside a script element."""
-    times, log = joint_log(recordings)
+    times, log, clearance = joint_log(recordings)
     step = max(1, len(log) // SAMPLES)
     drawn = []
-    for chart in charts(log, robots, recordings[0].period):
+    for chart in charts(log, robots, recordings[0].period, clearance):
         values = [curve.values[::step] for curve in chart.curves]
         known = np.concatenate([*values, chart.least])
         known = known[np.isfinite(known)]

@@ -16,25 +16,27 @@ import viser
 from typing_extensions import override
 from viser._messages import HotkeyKey
 
+from mrctl.kernel import Array
 from mrctl.loop.simulation import arranged
 from mrctl.record import InputError
 from mrctl.results.controllers import title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.references import Waypoints
 from mrctl.theory.robot import Robot
 from mrctl.viewer.controls import Controls
 from mrctl.viewer.embed import LONGEST
 from mrctl.viewer.looks import looks
-from mrctl.viewer.page import SPEEDS, Page, block, warning, write
+from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
-from mrctl.viewer.scene import Scene
+from mrctl.viewer.scene import MAX_MARKED, Scene
 from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import CHANGEABLE, Session, changed, state
+from mrctl.viewer.session import CHANGEABLE, Session, changed, ends, followed, state
 
 WINDOW = 12.0  # s, time span of the plots
 SAMPLES = 300  # about the largest number of samples in a curve
@@ -42,6 +44,7 @@ TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each 
 PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
 REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
 MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
+GOAL_HINT = "Two clicks on the floor: where the robots shall go, and towards where they shall look there."
 KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of each group
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
@@ -106,7 +109,7 @@ class Live(Page):
         self._due = 0.0  # number of ticks that are due
         self._changed_inputs: dict[tuple[str, ...], Any] = {}
         self._rested = 0.0  # monotonic time in s at which the changed inputs are applied
-        self._shown_setup: tuple[object, ...] | None = None  # world, robot, steering and labels of the present scene
+        self._shown_setup: tuple[object, ...] | None = None  # what the present scene was drawn for
         self._shown_sensing: list[Sensing] | None = None
         self._drawn: tuple[object, ...] | None = None
         self._plotted: tuple[object, ...] | None = None
@@ -132,6 +135,8 @@ class Live(Page):
             for label, choices in buttons(self.session.robot).items():
                 group = gui.add_button_group(label, tuple(choices))
                 self.on(group, partial(self._press, label))
+            self.on(gui.add_button("Set a goal", icon=viser.Icon.FLAG, hint=GOAL_HINT), lambda _: self._await_goal())
+            self._picking = gui.add_html("")
             self.add_drawing()
             self._timeline = gui.add_html("")
             save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
@@ -149,6 +154,7 @@ class Live(Page):
         for key, (group, choices) in zip(KEYS, buttons(self.session.robot).items(), strict=True):
             self.add_key(key, next(iter(choices)).capitalize(), partial(self._press, group, next(iter(choices))))
 
+        self.add_key("G", "Set a goal", self._await_goal)
         self._controls = Controls(gui, partial(self.ask, self._note_input))
         self._controls.designed = self.session.designed()
         first, changing = self.session.start[0], [name for name in Scenario.model_fields if name not in HIDDEN]
@@ -174,13 +180,13 @@ class Live(Page):
         session, first = self.session, self.session.start[0]
         self._labels = [s.name or title_of(s.feedforward) for s in session.start]
         robots = looks(self._labels, [s.feedforward for s in session.start])
-        setup = (first.world, first.robot, first.steering, robots)
+        setup = (first.world, first.obstacles, first.robot, first.steering, robots)
         if self._shown_setup != setup:
             if self._shown_setup is not None:
                 self._scene.remove()
             self._shown_setup = setup
-            self._scene = Scene(self.server, session.simulations[0][1].model, robots)
-            self._plots.set_robots(robots, session.period)
+            self._scene = Scene(self.server, session.simulations[0][1].model, robots, first.obstacles)
+            self._plots.set_robots(robots, session.period, bool(first.obstacles.shapes))
         sensing = [s.sensing for s in session.start]
         if self._shown_sensing != sensing:
             self._shown_sensing = sensing
@@ -188,6 +194,7 @@ class Live(Page):
             self.set_marks(any(s.source != "truth" for s in sensing), spread)
         told = [story.watch for story in STORIES.values() if [arranged(s) for s in story.scenarios] == session.start]
         write(self._story, block("story", *told) if told else "")
+        self._forget_goal()
         self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
         self._scene.show_reference(first)
         self._scene.forget_trails()
@@ -197,7 +204,7 @@ class Live(Page):
         self._deviation = 1  # factor on the deviations from the reference in the picture
         self._laps: list[dict[str, Any]] = []  # metrics of the whole laps until now
         self._counted = (time.monotonic(), session.tick)
-        self._happened = 0  # number of the scenarios' own events that have happened
+        self._happened = 0  # number of the scenarios' events that have happened
         self._describe()
 
     # -- requests of visitors, carried out by the loop --------------------------------------------------------------
@@ -223,6 +230,39 @@ class Live(Page):
             raise InputError(f"{name}: not one of the choices")
         self._restart(STORIES[name].scenarios)
         self.playing = True
+
+    def _await_goal(self) -> None:
+        """Waits for two clicks on the floor: the place of a goal, and a point towards which a robot there looks."""
+        self._forget_goal()
+        write(self._picking, block("picking", "Click on the floor where the robots shall go."))
+
+        @self.server.scene.on_click()
+        def _(event: viser.SceneClickEvent) -> None:
+            self.ask(self._click, np.array(event.ray_origin), np.array(event.ray_direction))
+
+    def _forget_goal(self) -> None:
+        self.server.scene.remove_click_callback()
+        self._picked: list[Array] = []
+        write(self._picking, "")
+
+    def _click(self, origin: Array, direction: Array) -> None:
+        """Takes a click, a ray from `origin` in m, `(3,)`."""
+        point = self._scene.on_floor(origin, direction)
+        if point is None:
+            raise InputError("goal: there is no floor where you clicked")
+        place, session = (self._picked[0] if self._picked else point), self.session
+        ahead = point - (place if self._picked else session.qpos(0)[:2])
+        goal = (float(place[0]), float(place[1]), float(np.arctan2(ahead[1], ahead[0])))
+        if not self._picked:
+            self._picked.append(point)
+            self._scene.show_ends(np.array([goal, goal]))
+            return write(self._picking, block("picking", "Click on the floor towards where they shall look there."))
+        self._forget_goal()
+        try:
+            session.head_for(goal)
+        finally:
+            self._describe()
+        self._scene.draw_references([followed(session.saved()[0], session.time + session.lead * session.period)])
 
     def _set_speed(self, speed: float) -> None:
         self.speed, self._due = speed, 0.0
@@ -349,14 +389,17 @@ class Live(Page):
         self._drawn = now
         for row in range(session.size):
             self._scene.show(row, session.qpos(row))
-        logs = []
+        logs, scans = [], []
         if marked:
+            scans = [session.scan(row) for row in range(min(session.size, MAX_MARKED))]
             ticks = round(FIX_AGE / session.period) + max(self._latencies)
             logs = list(session.log(max(0, session.tick - ticks)).T)
         with self.server.atomic():
             if session.tick:
                 self._scene.show_targets(session.log(session.tick - 1)[-1], self._deviation)
+            self._scene.show_obstacles(session.time)
             self._scene.show_sensors(logs, session.period, self._latencies, magnified)
+            self._scene.show_scans(scans)
             self._scene.flush(self._follow.value)
 
     @override
@@ -370,15 +413,17 @@ class Live(Page):
             self.factor = (session.tick - tick) * session.period / (now - since)
             self._counted = now, session.tick
         doing = "playing" if self.playing else "paused" if session.running else "finished; reset starts again"
-        lap = 1 + int(session.time / session.start[0].reference.period)
+        lap = "" if self._ends is not None else f" · lap {1 + int(session.time / session.start[0].reference.period)}"
         factor = f" · {self.factor:.2f}× real time" if self.playing else ""
-        lines = [f"<b>{session.time:.2f} s</b> · lap {lap} · {doing}{factor}"]
+        lines = [f"<b>{session.time:.2f} s</b>{lap} · {doing}{factor}"]
         for row, label in enumerate(self._labels):
             if reason := session.failure(row):
                 lines.append(warning(f"{label} stopped: {reason}"))
+        if session.tick:
+            lines += arrivals(self._labels, session.log(session.tick - 1)[-1], self._ends)
         write(self._status, block("status", *lines))
-        happened = sum(event.time <= session.time for start in session.start for event in start.events)
-        if happened != self._happened:  # events that the scenarios brought along
+        happened = sum(event.time <= session.time for scenario in session.saved() for event in scenario.events)
+        if happened != self._happened:  # such as those that the scenarios brought along
             self._happened = happened
             self._describe()
         past = session.tick, self.playing, self.deviation.value  # a pause draws what was left out before it
@@ -403,7 +448,7 @@ class Live(Page):
         if len(log) < 2:
             return self._plots.clear(WINDOW)
         times = np.arange(first, first + len(log), dtype=float) * session.period
-        self._plots.show(times, log, step, self._event_times())
+        self._plots.show(times, log, session.clearance(first), step, self._event_times())
         self._plots_since_trail += 1
         if self._plots_since_trail >= PLOTS_PER_TRAIL or not self.playing:
             self._plots_since_trail = 0
@@ -430,6 +475,8 @@ class Live(Page):
         driven = self.session.driven()
         ticks = np.minimum(np.round(np.array(self._event_times()) / self.session.period).astype(int), len(driven) - 1)
         self._scene.show_events(driven[ticks[ticks >= 0]])
+        self._ends = ends(scenario, self.session.time + self.session.lead * self.session.period)
+        self._scene.show_ends(self._ends)
         present = self._present(self.session.start[0])
         for row, saved in enumerate(self.session.saved()):
             self._scene.show_payload(row, state(saved, self.session.time)["perturbation"])
@@ -473,7 +520,9 @@ def _in_words(event: Event, before: dict[str, Any]) -> str:
                 for field in type(new).model_fields
                 if getattr(new, field) != getattr(before[name], field)
             ]
-    if event.reference is not None:
+    if isinstance(event.reference, Waypoints) and not event.reference.closed:
+        parts.append("way to ({:.2f}, {:.2f}) m".format(*event.reference.points[-1]))
+    elif event.reference is not None:
         parts.append(f"new reference: {event.reference.kind.replace('_', ' ')}")
     if event.push is not None:
         parts.append("push {:g} N, {:g} N, {:g} N·m".format(*event.push))

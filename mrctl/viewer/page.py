@@ -17,7 +17,8 @@ import numpy as np
 import viser
 from viser._messages import HotkeyKey
 
-from mrctl.kernel import Rows
+from mrctl.kernel import Array, Rows
+from mrctl.loop.goals import arrived
 from mrctl.record import InputError
 from mrctl.viewer import deviation, sensors
 from mrctl.viewer.recording import Recording, looks_of
@@ -262,6 +263,20 @@ class Page(ABC):
                 return
             self.message = ""
             self._report_errors(request)
+
+
+def arrivals(labels: Sequence[str], now: Rows, ends: Array | None) -> list[str]:
+    """Returns a line of HTML for each robot that stands at the goal.
+
+    Args:
+        labels: Label of each robot.
+        now: Record of `TICK` of each robot, `(B,)`.
+        ends: Start and goal, poses in m, m, rad, `(2, 3)`, or None.
+    """
+    if ends is None:
+        return []
+    there = arrived(np.stack([now["x"], now["y"], now["theta"]], -1), now["v"], ends[1])
+    return [f"{html.escape(label)} has arrived" for label, at in zip(labels, there, strict=True) if at]
 
 
 def warning(text: str) -> str:

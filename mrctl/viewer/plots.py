@@ -51,13 +51,14 @@ class Chart(NamedTuple):
     least: tuple[float, float]
 
 
-def charts(log: Rows, robots: Sequence[Look], period: float) -> list[Chart]:
+def charts(log: Rows, robots: Sequence[Look], period: float, clearance: Array | None = None) -> list[Chart]:
     """Returns the charts of a log.
 
     Args:
         log: Record of `results.dataset.TICK` for each sample and robot, `(T, B)`.
         robots: Look of each robot.
         period: Time between samples in s.
+        clearance: Distance of each robot from the nearest obstacle in m, `(T, B)`; None where there are no obstacles.
     """
     shown = range(min(len(robots), MAX_ROBOTS))
 
@@ -96,10 +97,12 @@ def charts(log: Rows, robots: Sequence[Look], period: float) -> list[Chart]:
     with np.errstate(invalid="ignore", divide="ignore"):
         shares = [np.sqrt(squares("feedback", r) / squares("voltage", r)) for r in shown]
     position = [1e3 * np.hypot(signal("longitudinal_error", r), signal("lateral_error", r)) for r in shown]
+    near = [] if clearance is None else [each("clearance", [clearance[:, r] for r in shown])]
     return [
         tracked("V, m/s", "v", (0.0, 0.1)),
         tracked("θ̇, rad/s", "omega", (-0.1, 0.1)),
         Chart("position error, mm", each("position error", position), (0.0, 1.0)),
+        *(Chart("clearance, m", curves, (0.0, 0.1)) for curves in near),
         Chart("share of the voltage that is feedback, last second", each("share", shares), (0.0, 1.0)),
         voltages("Σ: feedback (solid), feedforward (dashed), V", 1.0),
         voltages("Δ: feedback (solid), feedforward (dashed), V", -1.0),
@@ -134,50 +137,62 @@ def _moving_mean(values: Array, window: int) -> Array:
 class Plots:
     """The uPlot charts of a page.
 
-    There is a set of charts for each number of robots so far, of which one is visible; as in `Controls`, nothing is
-    removed.
+    There is a set of charts for each number of robots so far, with and without obstacles, of which one is visible; as
+    in `Controls`, nothing is removed.
     """
 
     def __init__(self, gui: viser.GuiApi, tab: viser.GuiTabHandle, zoom: bool = True) -> None:
         """Takes the GUI of the page and the tab for the charts; `zoom` lets a visitor zoom in along the time."""
         self._gui, self._tab, self._zoom = gui, tab, zoom
-        self._sets: dict[int, list[viser.GuiUplotHandle]] = {}
+        self._sets: dict[tuple[int, bool], list[viser.GuiUplotHandle]] = {}
         with tab:
             self._legend = gui.add_html("")
             self._score = gui.add_html("")
             self._cursor = gui.add_html("")
             gui.add_html(HOVER)
 
-    def set_robots(self, robots: Sequence[Look], period: float) -> None:
+    def set_robots(self, robots: Sequence[Look], period: float, obstacles: bool) -> None:
         """Sets the robots whose curves `show` will draw.
 
         Args:
             robots: Look of each robot.
             period: Time between samples in s.
+            obstacles: Whether there are obstacles, so that the clearance is drawn.
         """
-        self._robots, self._period = robots, period
+        self._robots, self._period, self._obstacles = robots, period, obstacles
         self._legend.content = legend(robots)
         size = min(len(robots), MAX_ROBOTS)
-        drawn = charts(blank(2, size), robots[:size], period)
-        if size not in self._sets:
+        drawn = charts(blank(2, size), robots[:size], period, self._nowhere())
+        if (size, obstacles) not in self._sets:
             with self._tab:
-                self._sets[size] = [_add(self._gui, chart, self._zoom) for chart in drawn]
-        for count, handles in self._sets.items():
+                self._sets[size, obstacles] = [_add(self._gui, chart, self._zoom) for chart in drawn]
+        for key, handles in self._sets.items():
             for handle in handles:
-                handle.visible = count == size
-        self._handles = self._sets[size]
+                handle.visible = key == (size, obstacles)
+        self._handles = self._sets[size, obstacles]
         for handle, chart in zip(self._handles, drawn, strict=True):
             if handle.series != (series := _series(chart)):
                 handle.series = series
 
+    def _nowhere(self) -> Array | None:
+        """Returns a clearance of two samples that is not drawn, `(2, B)`, or None without obstacles."""
+        return np.full((2, len(self._robots)), np.nan) if self._obstacles else None
+
     def show(
-        self, time: Array, log: Rows, step: int, events: Sequence[float] = (), within: slice = slice(None)
+        self,
+        time: Array,
+        log: Rows,
+        clearance: Array | None,
+        step: int,
+        events: Sequence[float] = (),
+        within: slice = slice(None),
     ) -> None:
         """Draws a log.
 
         Args:
             time: Times of the samples in s, `(T,)`.
             log: Record of `TICK` for each sample and robot, `(T, B)`.
+            clearance: As in `charts`, `(T, B)`.
             step: Number of samples from one drawn sample to the next.
             events: Times of events in s.
             within: Samples that are drawn.
@@ -187,7 +202,7 @@ class Plots:
         for first in np.searchsorted(drawn, events):
             if 0 < first < len(drawn):
                 marks[first] = 1.0
-        for handle, chart in zip(self._handles, charts(log, self._robots, self._period), strict=True):
+        for handle, chart in zip(self._handles, charts(log, self._robots, self._period, clearance), strict=True):
             values = [time, *(curve.values for curve in chart.curves)]
             handle.data = (*(np.ascontiguousarray(v[within][::step]) for v in values), marks)
 
@@ -197,7 +212,7 @@ class Plots:
 
     def clear(self, span: float) -> None:
         """Draws empty charts of `span` s."""
-        self.show(np.array([0.0, span]), blank(2, len(self._robots)), 1)
+        self.show(np.array([0.0, span]), blank(2, len(self._robots)), self._nowhere(), 1)
 
     def point(self, share: float) -> None:
         """Draws a vertical line in all charts at a share of their time; their data need not be sent again."""

@@ -48,6 +48,7 @@ class Recording:
         start: Time of the first sample since the start of the run in s; all methods count time from this sample.
         log: Record of `TICK` for each sample until the end or the failure, `(T,)`.
         failure: Reason of an early end, or "".
+        clearance: Distance from the nearest obstacle at each sample in m, `(T,)`; None where there are no obstacles.
     """
 
     def __init__(self, run: xr.Dataset) -> None:
@@ -65,6 +66,8 @@ class Recording:
         driven = np.flatnonzero(np.isfinite(log["x"]))
         self.log = log[: 1 + driven[-1]] if driven.size else log[:1]
         self.failure = str(run["failure"].values)
+        near = bool(self.scenario.obstacles.shapes) and "clearance" in run
+        self.clearance: Array | None = run["clearance"].values[: len(self.log)] if near else None
 
     @property
     def duration(self) -> float:
@@ -123,12 +126,21 @@ def path(rows: Rows, radius: float, height: float, magnified: int) -> Array:
     return np.concatenate([drawn(rows, magnified), (z - radius + ABOVE)[..., None]], axis=-1)
 
 
-def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows]:
-    """Returns times in s, `(T,)`, and a record of `TICK` for each sample and run, `(T, B)`; NaN after a run's end."""
+def joint_log(recordings: Sequence[Recording]) -> tuple[Array, Rows, Array | None]:
+    """Returns what several recordings hold, with NaN after the end of each.
+
+    Returns:
+        Times in s, `(T,)`; a record of `TICK` for each sample and run, `(T, B)`; and clearances in m, `(T, B)`, or None
+        where there are no obstacles.
+    """
     log = blank(max(len(r.log) for r in recordings), len(recordings))
+    clearance = np.full(log.shape, np.nan)
     for k, r in enumerate(recordings):
         log[: len(r.log), k] = r.log
-    return recordings[0].period * np.arange(len(log), dtype=float), log
+        if r.clearance is not None:
+            clearance[: len(r.log), k] = r.clearance
+    known = any(r.clearance is not None for r in recordings)
+    return recordings[0].period * np.arange(len(log), dtype=float), log, clearance if known else None
 
 
 def event_times(recordings: Sequence[Recording]) -> list[float]:

@@ -11,13 +11,14 @@ import viser
 from typing_extensions import override
 
 from mrctl.record import InputError
-from mrctl.viewer.page import SPEEDS, Page, block, warning, write
+from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
+from mrctl.viewer.session import ends
 
 SAMPLES = 800  # about the largest number of samples in a curve
 BOARD_SIZE = np.array([4.0, 0.0, 2.2])  # m, extent of the scatter plot in the scene along x, y and z
@@ -160,9 +161,10 @@ class Replay(Page):
         if self.recordings:
             self._scene.remove()
         self.runs, self.recordings = list(runs), recordings
-        self._scene = Scene(self.server, recordings[0].model, robots, fog=not self._board)
-        self._plots.set_robots(robots, recordings[0].period)
-        times, self._log = joint_log(recordings)
+        obstacles = recordings[0].scenario.obstacles
+        self._scene = Scene(self.server, recordings[0].model, robots, obstacles, fog=not self._board)
+        times, self._log, self._clearance = joint_log(recordings)
+        self._plots.set_robots(robots, recordings[0].period, self._clearance is not None)
         self._deviation = self.magnified_deviation(self._log)
         self._scene.show_recordings(recordings, self._deviation)
         self._times, self._events = times, event_times(recordings)
@@ -187,7 +189,8 @@ class Replay(Page):
         first, last = np.searchsorted(self._times, self._interval.value)
         within = slice(max(0, min(first, len(self._times) - 2)), max(last, first + 1) + 1)
         count = len(self._times[within])
-        self._plots.show(self._times, self._log, max(1, count // SAMPLES), self._events, within)
+        step = max(1, count // SAMPLES)
+        self._plots.show(self._times, self._log, self._clearance, step, self._events, within)
         self._plotted = None
 
     @override
@@ -224,6 +227,7 @@ class Replay(Page):
         for row, recording in enumerate(self.recordings):
             self._scene.show(row, recording.qpos(recording.index(self.time)))
             self._scene.show_payload(row, recording.perturbation(self.time))
+        self._scene.show_ends(ends(self.recordings[0].scenario, self.recordings[0].start + self.time))
         period, logs = self.recordings[0].period, []
         if marked:
             ticks = round(FIX_AGE / period)
@@ -233,6 +237,7 @@ class Replay(Page):
         now = np.stack([recording.log[recording.index(self.time)] for recording in self.recordings])
         with self.server.atomic():
             self._scene.show_targets(now, self._deviation)
+            self._scene.show_obstacles(self.recordings[0].start + self.time)
             self._scene.show_sensors(logs, period, self._latencies, magnified)
             self._scene.flush(self._follow.value)
 
@@ -243,13 +248,14 @@ class Replay(Page):
         for r in self.recordings:
             if r.failure:
                 lines.append(warning(f"{r.label} stopped after {r.duration:.2f} s: {r.failure}"))
+        last = np.stack([r.log[r.index(self.time)] for r in self.recordings])
+        lines += arrivals(self._labels, last, ends(self.recordings[0].scenario, self.recordings[0].start + self.time))
         row = self.library.table.loc[self.runs[0]]
         known = [f"{html.escape(str(k))} {v:.4g}" for k, v in row.items() if isinstance(v, int | float) and v == v]
         lines += known
         if self._kept:
             lines.append(f"kept as ghosts: runs {', '.join(map(str, sorted(self._kept)))}")
         write(self._status, block("status", *lines))
-        last = np.stack([r.log[r.index(self.time)] for r in self.recordings])
         self.describe_estimates(self._labels, last)
         if self.time != self._plotted:
             self._plotted = self.time

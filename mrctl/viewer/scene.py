@@ -18,16 +18,19 @@ from numpy.typing import NDArray
 
 from mrctl.kernel import Rows
 from mrctl.physics import mjcf
+from mrctl.physics.obstacles import HEIGHT, quaternion
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.physics.stand import ground
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
+from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.references import Reference
 from mrctl.viewer.deviation import Target
 from mrctl.viewer.looks import Colour, Look
 from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, path
-from mrctl.viewer.sensors import Marks
+from mrctl.viewer.sensors import Marks, outline
 from mrctl.viewer.server import Server
 from mrctl.viewer.shapes import bar, ribbons
 
@@ -55,7 +58,11 @@ NEXT_TRAIL = 0.001  # m, from the height of the trails of one colour to that of 
 TRAIL_WIDTH = 0.004  # as a share of the width of the view; the reference is twice as wide
 LEAST_VIEW = 1.2  # m, least width of the view
 SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
-
+NONE = Obstacles()
+GOAL_COLOUR: Colour = (22, 163, 74)
+OUTLINE = 0.02  # m, width of the outlines at start and goal
+SCAN_POINT, SCAN_HEIGHT = 0.03, HEIGHT + 0.01  # m, size of the points of a scan, which lie on top of the walls
+PARTICLE, MAX_PARTICLES = 0.015, 500  # m, size of a particle, and about the number that is drawn
 
 _NUMBERS = itertools.count()  # of scenes
 
@@ -71,13 +78,21 @@ class Scene:
     Everything is below the node `/world`: to follow a robot, that node moves instead of the cameras.
     """
 
-    def __init__(self, server: Server, model: mujoco.MjModel, robots: Sequence[Look], fog: bool = True) -> None:
+    def __init__(
+        self,
+        server: Server,
+        model: mujoco.MjModel,
+        robots: Sequence[Look],
+        obstacles: Obstacles = NONE,
+        fog: bool = True,
+    ) -> None:
         """Draws the world and its robots.
 
         Args:
             server: Server of the page.
             model: Compiled world; it is not changed.
             robots: Look of each robot.
+            obstacles: The obstacles that the world was compiled with, of which some may move.
             fog: Whether the horizon fades; viser cannot draw meshes that are clicked on in fog.
         """
         self.size, self._robots, self._fog = len(robots), list(robots), fog
@@ -94,6 +109,8 @@ class Scene:
         self._chassis = self._bodies.index(chassis)
         self._positions = np.zeros((self.size, len(self._bodies), 3))
         self._quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (self.size, len(self._bodies), 1))
+        self._surroundings = Surroundings(obstacles)
+        self._movers: list[viser.MeshHandle] = []  # in the order of `Surroundings.courses`
         self._draw_world()
         self._looks: list[tuple[viser.FrameHandle, viser.MeshHandle]] = []  # of each body, solid and translucent
         self._top = 0.0  # height of the robot in m
@@ -121,6 +138,22 @@ class Scene:
             Target(self._scene, row, self._top + TARGET_ABOVE * self._length, THICK * self._length, robot.colour)
             for row, robot in enumerate(robots[:MAX_MARKED])
         ]
+        self._ends = [
+            self._scene.add_mesh_simple(
+                f"/world/{name}", *ribbons(outline(self._footprint), OUTLINE), color=colour, side="double",
+                cast_shadow=False, receive_shadow=False, visible=False,
+            )
+            for name, colour in (("start", REFERENCE_COLOUR), ("goal", GOAL_COLOUR))
+        ]  # fmt: skip
+        self._scans: list[viser.PointCloudHandle] = []
+        for row, robot in enumerate(robots[:MAX_MARKED]):
+            for kind, size in (("scan", SCAN_POINT), ("particles", PARTICLE)):
+                self._scans.append(
+                    self._scene.add_point_cloud(
+                        f"/world/{kind}/{row}", np.zeros((0, 3)), robot.colour, point_size=size, point_shape="circle",
+                        point_shading="flat", precision="float32", visible=False,
+                    )
+                )  # fmt: skip
         self._factor = self._scene.add_label("/world/deviation", "", visible=False, font_screen_scale=0.8)
         self._perturbations: list[Perturbation | None] = [None] * self.size  # as drawn
         self._ribbons: list[viser.MeshHandle] = []
@@ -132,7 +165,9 @@ class Scene:
         self._floor = np.array([0.0, 0.0, 1.0]), np.zeros(3)  # its normal and a point of it
         self._floors: list[viser.GridHandle] = []
         for geom in range(model.ngeom):
-            if model.body_weldid[model.geom_bodyid[geom]] or model.geom_group[geom] > SEEN:
+            body = model.geom_bodyid[geom]
+            still = model.body_weldid[body] == 0 or model.body_mocapid[body] >= 0  # obstacles on courses, too
+            if not still or model.geom_group[geom] > SEEN:
                 continue
             # A page gives a node the pose of the one that it replaces, if both have the same name.
             name, turn = f"/world/fixed/{self._number}/{geom}", np.zeros(4)
@@ -148,10 +183,13 @@ class Scene:
             else:
                 mesh = merge_geoms(model, [geom])
                 colour = 255 * model.mat_rgba[model.geom_matid[geom], :3] if model.geom_matid[geom] >= 0 else 200
-                self._scene.add_mesh_simple(
+                drawn = self._scene.add_mesh_simple(
                     name, mesh.vertices, mesh.faces, color=np.broadcast_to(0.92 * colour, 3).astype(np.uint8),
                     flat_shading=True, cast_shadow=False, receive_shadow=False,
+                    wxyz=data.xquat[body], position=data.xpos[body],
                 )  # fmt: skip
+                if model.body_mocapid[body] >= 0:
+                    self._movers.append(drawn)
 
     def _draw_bodies(self) -> list[trimesh.Trimesh | None]:
         """Draws the bodies of the solid robot; returns the rough shape of each, which ghosts have."""
@@ -230,18 +268,29 @@ class Scene:
 
     def show_reference(self, scenario: Scenario) -> None:
         """Draws a lap of each reference of a scenario on the ground, and turns the cameras to show them."""
-        lines = []
-        for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
-            pose = reference.sample(np.linspace(0, reference.period, 401)).pose
-            heights = [self._height(x, y) + 0.006 for x, y in pose[:, :2]]
-            lines.append(np.column_stack([pose[:, :2], heights]))
+        references = [scenario.reference, *(e.reference for e in scenario.events if e.reference)]
+        lines = self._lines(references)
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
         self._view = max(LEAST_VIEW, *(high - low)) + self._length
-        self._draw_lines("/world/reference", np.stack(lines), 2 * TRAIL_WIDTH * self._view, REFERENCE_COLOUR)
+        self.draw_references(references)
         self._factor.position = [(low[0] + high[0]) / 2, high[1] + self._length / 2, high[2]]
         middle = (low + high) / 2
         self._look(middle + self._view * CAMERA_POSITION, middle + self._view * CAMERA_TARGET)
         self.paint(self._server.dark)
+
+    def draw_references(self, references: Sequence[Reference]) -> None:
+        """Draws a lap of each reference on the ground, in place of those before; the cameras stay."""
+        lines = self._lines(references)
+        self._draw_lines("/world/reference", lines, 2 * TRAIL_WIDTH * self._view, REFERENCE_COLOUR)
+
+    def _lines(self, references: Sequence[Reference]) -> Array:
+        """Returns a lap of each of n references, a little above the ground, in m, `(n, 401, 3)`."""
+        lines = []
+        for reference in references:
+            pose = reference.sample(np.linspace(0, reference.period, 401)).pose
+            heights = [self._height(x, y) + 0.006 for x, y in pose[:, :2]]
+            lines.append(np.column_stack([pose[:, :2], heights]))
+        return np.stack(lines)
 
     def _look(self, position: Array, target: Array) -> None:
         """Sets the camera of pages to come, and of open ones if it is another than before."""
@@ -289,6 +338,14 @@ class Scene:
         normal, point = self._floor
         return position + normal * max(0.0, CLEARANCE - normal @ (position - point - self._root.position))
 
+    def on_floor(self, origin: Array, direction: Array) -> Array | None:
+        """Returns where a ray in a visitor's view meets the floor, x and y in m, `(2,)`; None where it does not."""
+        normal, point = self._floor
+        start, falls = origin - self._root.position, normal @ direction
+        if falls >= 0:
+            return None
+        return (start + direction * (normal @ (point - start)) / falls)[:2]
+
     def _draw_lines(self, name: str, lines: Array, width: float, colour: Colour) -> viser.MeshHandle:
         """Draws lines `(B, n, 3)` as one mesh; each segment of a thick line of viser's costs about as much."""
         vertices, faces = ribbons(lines, width)
@@ -301,7 +358,7 @@ class Scene:
         self.show_reference(recordings[0].scenario)
         for row, recording in enumerate(recordings):
             self.show(row, recording.qpos(len(recording.log) - 1))
-        _, log = joint_log(recordings)
+        _, log, _ = joint_log(recordings)
         self.show_trails(log[np.linspace(0, len(log) - 1, PATH_POINTS).astype(int)], magnified)
         self.show_events(log[[recordings[0].index(time) for time in event_times(recordings)], 0])
 
@@ -329,6 +386,12 @@ class Scene:
             mujoco.mju_negQuat(self._back, data.xquat[parent])
             mujoco.mju_rotVecQuat(self._positions[row, k], data.xpos[body] - data.xpos[parent], self._back)
             mujoco.mju_mulQuat(self._quaternions[row, k], self._back, data.xquat[body])
+
+    def show_obstacles(self, time: float) -> None:
+        """Moves the obstacles that move to where they are at a time in s of the run."""
+        poses = self._surroundings.poses(np.array([time]))[0]
+        for mover, (x, y, theta) in zip(self._movers, poses, strict=True):
+            mover.position, mover.wxyz = (x, y, 0.0), quaternion(theta)
 
     def flush(self, follow: bool) -> None:
         """Sends the positions of all robots to the browsers.
@@ -387,6 +450,29 @@ class Scene:
         ground = self._positions[:, self._chassis] - [0, 0, self._radius]
         for marks, here, log, latency in zip(self._marks, ground, logs, latencies, strict=False):
             marks.show(here, log, period, latency, magnified)
+
+    def show_ends(self, ends: Array | None) -> None:
+        """Draws outlines of a robot at its start and its goal, poses in m, m, rad, `(2, 3)`; None hides them."""
+        for k, mark in enumerate(self._ends):
+            if mark.visible != (ends is not None):
+                mark.visible = ends is not None
+            if ends is not None:
+                x, y, theta = ends[k]
+                place = np.array([x, y, self._height(x, y) + ABOVE])
+                if not np.array_equal(mark.position, place) or not np.allclose(mark.wxyz, quaternion(theta)):
+                    mark.position, mark.wxyz = place, quaternion(theta)
+
+    def show_scans(self, scans: Sequence[tuple[Array, Array] | None]) -> None:
+        """Draws what `Session.scan` returns, for each of the first robots; no scans hide all points."""
+        for row, (met, particles) in enumerate(zip(self._scans[::2], self._scans[1::2], strict=True)):
+            found = scans[row] if row < len(scans) else None
+            met.visible = particles.visible = found is not None
+            if found is not None:
+                places = np.pad(found[0], [(0, 0), (0, 1)], constant_values=SCAN_HEIGHT).astype(np.float32)
+                if not np.array_equal(met.points, places):  # scans are rarer than pictures
+                    some = found[1][:: max(1, len(found[1]) // MAX_PARTICLES), :2]
+                    met.points = places
+                    particles.points = np.pad(some, [(0, 0), (0, 1)], constant_values=ABOVE).astype(np.float32)
 
     @property
     def trail_points(self) -> int:

@@ -70,7 +70,7 @@ class Marks:
         plain: dict[str, Any] = {"side": "double", "cast_shadow": False, "receive_shadow": False}
         self._root = scene.add_frame(name, show_axes=False, visible=False)
         self._estimate = scene.add_mesh_simple(
-            f"{name}/estimate", *ribbons(_outline(footprint), 0.014), color=colour, **plain
+            f"{name}/estimate", *ribbons(outline(footprint), 0.014), color=colour, **plain
         )
         circle = np.column_stack([np.cos(TURN), np.sin(TURN)])
         point = disc(0.016 * circle)
@@ -121,7 +121,7 @@ class Marks:
         self._fixes.batched_positions, self._fixes.batched_opacities = places.astype(np.float32), opacities
 
 
-def _outline(footprint: Array) -> Array:
+def outline(footprint: Array) -> Array:
     """Returns lines in a robot's frame, `(2, n, 3)`: its outline with a pointed front, and one from P to the point."""
     (back, right), (front, left) = footprint
     tip = [front + 0.25 * (left - right), 0.0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import ceil, floor, sqrt
+from math import ceil, floor, pi, remainder, sqrt
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,15 +12,21 @@ from numpy.typing import NDArray
 
 from mrctl.control.design import motion
 from mrctl.control.margins import Gains
-from mrctl.kernel import Rows
+from mrctl.kernel import Array, Rows
 from mrctl.loop.simulation import Simulation, arranged, uniform
+from mrctl.navigation.generators import Task
+from mrctl.navigation.mission import MARGIN, SLIM, prepared
+from mrctl.physics.hull import footprint
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank, combine, dataset
 from mrctl.scenario import Event, Scenario
+from mrctl.theory.clearance import clearance, clearances
+from mrctl.theory.obstacles import Pose, Surroundings, turned
+from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
 
 HOUR = 3600.0  # s of simulated time after which a session ends
-SHARED_FIELDS = ("world", "robot", "steering", "control_period", "physics_step")
+SHARED_FIELDS = ("world", "obstacles", "robot", "steering", "control_period", "physics_step")
 # Fields of a scenario that can change in the middle of a run; a change of another field needs a new run.
 CHANGEABLE = [name for name in ("perturbation", "kanayama", "pid") if name in Event.model_fields]
 
@@ -34,6 +40,7 @@ class Session:
         start: Scenarios at the start of the session.
         simulations: Indices of the robots in each simulation, and the simulation.
         period: Control period in s.
+        lead: Number of control periods until a new reference is followed, the longest delay of a robot.
         tick: Number of control periods done.
     """
 
@@ -55,7 +62,12 @@ class Session:
         long = [s.model_copy(update={"laps": max(1, floor(HOUR / s.reference.period))}) for s in scenarios]
         self.simulations = [(rows, Simulation([long[row] for row in rows], threads=1)) for rows in uniform(long)]
         self._place = {row: (sim, k) for rows, sim in self.simulations for k, row in enumerate(rows)}
+        self.lead = max(sim.lead for _, sim in self.simulations)
         self.tick = 0
+        self._surroundings = Surroundings(scenarios[0].obstacles)
+        self._footprint = footprint(self.simulations[0][1].model) if scenarios[0].obstacles.shapes else np.zeros((0, 2))
+        self._clearance = np.empty((max(sim.ticks for _, sim in self.simulations), len(scenarios)))
+        self._cleared = 0  # number of ticks whose clearances are known
 
     @property
     def size(self) -> int:
@@ -86,7 +98,7 @@ class Session:
         self.tick += 1
 
     def apply(self, **change: Any) -> None:  # noqa: ANN401
-        """Applies an event to every robot at the coming tick.
+        """Applies an event to every robot at the coming tick, or a new reference as soon as a voltage can act on it.
 
         Args:
             change: Fields of `Event`, without the time.
@@ -94,10 +106,34 @@ class Session:
         Raises:
             InputError: The event is refused; then nothing changes.
         """
-        event = Event.from_dict({"time": self.time, **change})
+        lead = self.lead if "reference" in change else 0
+        event = Event.from_dict({"time": (self.tick + lead) * self.period, **change})
         for _, sim in self.simulations:
             if sim.tick == self.tick:  # the others have stopped
                 sim.add(event)
+
+    def head_for(self, goal: Pose) -> None:
+        """Plans a way for the first robot from where it is, and gives it to every robot as an event.
+
+        The plan keeps 5 cm from obstacles that stand still, or 2 cm where the robot is nearer than that now.
+
+        Args:
+            goal: x and y in m and θ in rad.
+
+        Raises:
+            InputError: The robot has stopped, the goal is in an obstacle, or there is no way.
+        """
+        sim, k = self._place[0]
+        if sim.plant.failed[k]:
+            raise InputError("goal: the first robot has stopped; a reset starts again")
+        x, y, theta = sim.plant.reading["pose"][k]
+        first = self.start[0]
+        task = {"obstacles": first.obstacles, "start": (x, y, remainder(theta, 2 * pi)), "goal": goal}
+        near = clearance(self._footprint, np.array([x, y, theta]), self._surroundings.at(self.time))
+        plan = followed(sim.scenarios[k], self.time)
+        speed = plan.speed if isinstance(plan, Waypoints) else None
+        _, found = prepared(Task.from_dict(task), first, speed, MARGIN if near > MARGIN else SLIM)
+        self.apply(reference=found.reference)
 
     def state(self) -> dict[str, Any]:
         """Returns the present values of the fields `CHANGEABLE`, and `learning`."""
@@ -153,6 +189,39 @@ class Session:
             parts[: len(done), rows] = done
         return parts
 
+    def clearance(self, first: int = 0) -> Array | None:
+        """Returns the distances from the nearest obstacle in m from a tick on, `(T, B)`; None without obstacles.
+
+        They are NaN after a robot has stopped. Each is computed once, when it is asked for.
+        """
+        if not self.start[0].obstacles.shapes:
+            return None
+        known, now = self._cleared, self.tick
+        if known == now:
+            return self._clearance[first:now]
+        times, log = self.period * np.arange(known, now, dtype=float), self.log(known)
+        poses = np.stack([log[name] for name in ("x", "y", "theta")], axis=-1)
+        for row in range(self.size):
+            self._clearance[known:now, row] = clearances(self._footprint, poses[:, row], times, self._surroundings)
+        self._cleared = now
+        return self._clearance[first:now]
+
+    def scan(self, row: int) -> tuple[Array, Array] | None:
+        """Returns what the localisation of a robot has of the last scan; None where no lidar has scanned yet.
+
+        Returns:
+            Places in the world that the beams met, as seen from the true pose, in m, `(n, 2)`; and the particles, poses
+            in m, m, rad, `(k, 3)`, none with scan matching.
+        """
+        sim, k = self._place[row]
+        localiser = sim.estimator.localiser
+        if localiser is None or (ranges := localiser.scans[k]) is None or localiser.taken[k] >= sim.tick:
+            return None
+        then, particles = sim.log.ticks[localiser.taken[k], k], localiser.filters[k]
+        pose = np.array([then["x"], then["y"], then["theta"]])
+        met = turned(self.start[row].sensing.lidar.points(ranges), pose)
+        return met, np.zeros((0, 3)) if particles is None else particles.particles
+
     def result(self, longest: float) -> xr.Dataset:
         """Returns the signals of the last `longest` s, as a result of `simulate` without what was learned."""
         first = max(0, self.tick - round(longest / self.period))
@@ -160,6 +229,8 @@ class Session:
         nothing = np.full(self.size, np.nan)
         saved = self.saved()
         part = dataset(saved, names, names, self.log(first), failure, nothing, None)
+        if (clearance := self.clearance(first)) is not None:
+            part = part.assign(clearance=(("run", "time"), clearance.T))
         found = combine([(range(self.size), part)], saved)
         return found.assign_coords(time=found["time"] + first * self.period)
 
@@ -186,6 +257,30 @@ def state(scenario: Scenario, time: float) -> dict[str, Any]:
         if event.time <= time + 1e-9:
             now |= {name: value for name in now if (value := getattr(event, name)) is not None}
     return now
+
+
+def followed(scenario: Scenario, time: float) -> Reference:
+    """Returns the reference that a run follows at a time in s."""
+    brought = [e.reference for e in sorted(scenario.events, key=lambda e: e.time) if e.time <= time + 1e-9]
+    return next((reference for reference in reversed(brought) if reference), scenario.reference)
+
+
+def ends(scenario: Scenario, time: float) -> Array | None:
+    """Returns where the robot of a run comes from and goes to at a time in s; None on a course without end.
+
+    These are the ends of the open reference that it follows then; a goal of the scenario is in place of the end of its
+    own reference.
+
+    Returns:
+        Two poses, x and y in m and θ in rad, `(2, 3)`.
+    """
+    plan = followed(scenario, time)
+    found = plan.sample(np.array([0.0, plan.period])).pose
+    if plan is scenario.reference and scenario.goal is not None:
+        found[1] = scenario.goal
+    elif not isinstance(plan, Waypoints) or plan.closed:
+        return None
+    return found
 
 
 def changed(record: AnyRecord, path: Sequence[str], value: object) -> AnyRecord:

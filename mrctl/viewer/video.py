@@ -17,9 +17,11 @@ from PIL import Image, ImageDraw
 from tqdm import tqdm
 
 from mrctl.physics import mjcf
+from mrctl.physics.obstacles import quaternion
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.pictures import REFERENCE_COLOUR, draw_line
 from mrctl.record import InputError
+from mrctl.theory.obstacles import Surroundings
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of, path
@@ -119,8 +121,11 @@ def _pictures(
         camera.azimuth = np.degrees(np.arctan2(back[1], back[0]))
         camera.elevation = np.degrees(np.arcsin(back[2] / camera.distance))
         data, option, nothing = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb()
+        moving = Surroundings(recordings[0].scenario.obstacles)
         radius, magnified = read_robot(model).wheel_radius, magnification(extent(joint_log(recordings)[1]))
         for time in times:
+            for mover, (x, y, theta) in enumerate(moving.poses(np.array([recordings[0].start + time]))[0]):
+                data.mocap_pos[mover], data.mocap_quat[mover] = (x, y, 0.0), quaternion(theta)
             for row, (recording, robot) in enumerate(zip(recordings, robots, strict=True)):
                 data.qpos[:] = recording.qpos(recording.index(time))
                 mujoco.mj_forward(model, data)

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mrctl.loop.simulation import simulate
+from mrctl.navigation.generators import Task
+from mrctl.navigation.mission import prepared as prepare
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
@@ -41,6 +43,33 @@ def live(scenario: Scenario, compare: Sequence[FeedforwardName], export: Path | 
     result = simulate(scenarios, progress=True)
     recordings = [Recording(result.isel(run=k)) for k in range(result.sizes["run"])]
     write(recordings, looks_of(recordings, range(len(recordings))), export)
+
+
+def mission(
+    task: Task,
+    scenario: Scenario,
+    compare: Sequence[FeedforwardName],
+    speed: float | None,
+    margin: float,
+    host: str,
+    port: int,
+) -> None:
+    """Shows a mission live in the browser; at the goal the robots wait for another one.
+
+    Args:
+        task: World, start and goal.
+        scenario: As in `mrctl.navigation.mission.navigate`.
+        compare: Feedforwards of the ghosts.
+        speed: Largest speed in m/s; by default 0.9 of the robot's.
+        margin: Clearance that the plan keeps in m.
+        host: Address to listen on.
+        port: Port to listen on.
+
+    Raises:
+        InputError: As `mrctl.navigation.mission.navigate` and `live`.
+    """
+    _, prepared = prepare(task, scenario, speed, margin)
+    live(prepared.replace(goal=None), compare, None, host, port)
 
 
 def replay(

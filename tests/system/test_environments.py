@@ -360,7 +360,10 @@ def test_suite():
     )
     step = env.reset()
     assert step.step_type == StepType.FIRST and step.observation["observations"].shape == (14,)
-    assert sorted(SUITE) == sorted(ACTION_KINDS) == sorted(SUITE.tagged("tracking"))
+    assert sorted(SUITE) == sorted([*ACTION_KINDS, "navigation"]) and sorted(SUITE.tagged("navigation")) == [
+        "navigation"
+    ]
+    assert sorted(ACTION_KINDS) == sorted(SUITE.tagged("tracking"))
     limited = SUITE["voltage"](SHORT, environment_kwargs={"time_limit": 0.05})
     limited.reset()
     assert [limited.step(np.zeros(2)).last() for _ in range(5)] == [False] * 4 + [True]

@@ -55,6 +55,7 @@ ELSEWHERE = {
     r"mrctl view( --(?!export)\S+( \w+)*)*": (
         "tests/system/test_viewer_server.py::test_flags", "mrctl.viewer.view.live",
     ),
+    r"mrctl navigate .* --view": ("tests/system/test_viewer_missions.py::test_flags", "mrctl.viewer.view.mission"),
     r"mrctl record .*": ("tests/system/test_viewer_server.py::test_record", "mrctl.viewer.video.record"),
     r"mrctl view [\w./]+": ("tests/system/test_viewer.py::test_replay", "mrctl.viewer.view.replay"),
 }  # fmt: skip

@@ -6,6 +6,7 @@ import pytest
 from mrctl import FEEDFORWARDS, Circle, Event, InputError, Perturbation, RoundedSquare, Scenario
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
+from mrctl.sensing.tiers import Sensing
 from mrctl.viewer.session import Session, changed
 
 BASE = Scenario(reference=Circle(period=4, radius=0.5), seed=3)
@@ -122,6 +123,21 @@ def test_new_reference():
     same(session, [results.isel(run=k) for k in range(2)])
     assert abs(results.omega_ref.values[0, 240] - 2 * np.pi / 4) < 1e-9
     assert abs(results.omega_ref.values[0, 260] + 2 * np.pi / 5) < 1e-9
+
+
+def test_reference_within_the_delay():
+    """The controllers are told the reference of the time at which their voltage acts: it cannot change before that."""
+    session = Session([BASE, BASE.model_copy(update={"sensing": Sensing(tier="field")})])
+    drive(session, 10)
+    late, other = session.simulations[1][1], Circle(radius=0.6, period=5.0)
+    assert late.lead == session.lead > session.simulations[0][1].lead > 0
+    with pytest.raises(InputError, match=r"time: a reference must be known 0.0\d s before"):
+        late.add(Event(time=0.1, reference=other))
+    session.apply(reference=other)
+    assert [s.events[0].tick(0.01) for s in session.saved()] == [10 + session.lead] * 2
+    drive(session, 100)
+    results = simulate(session.saved())
+    same(session, [results.isel(run=k) for k in range(2)])
 
 
 def test_blocks(monkeypatch):

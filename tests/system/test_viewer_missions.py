@@ -1,0 +1,289 @@
+"""What the viewer shows of missions: obstacles that move, plans and goals, clearances, scans, and goals by click."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import shapely
+from test_viewer import CHROMIUM, PATIENCE, ROBOT, SOFTWARE, node, serving, until, visit
+
+from mrctl import Box, Circle, Disc, InputError, Line, Obstacles, Scenario, save, simulate
+from mrctl.cli import main
+from mrctl.loop.goals import arrived
+from mrctl.navigation.generators import Task
+from mrctl.navigation.mission import navigate, prepared, task_of
+from mrctl.physics import mjcf
+from mrctl.physics.hull import footprint
+from mrctl.results.dataset import SIGNALS
+from mrctl.viewer import view as viewing
+from mrctl.viewer.export import _curves
+from mrctl.viewer.live import Live
+from mrctl.viewer.page import arrivals
+from mrctl.viewer.recording import Library, looks_of
+from mrctl.viewer.replay import Replay
+from mrctl.viewer.server import Server
+from mrctl.viewer.session import Session, ends
+
+TURNING = Box(x=0.1, y=3.0, length=0.3, width=0.2, course=Circle(radius=0.5, period=6.0))
+PASSING = Disc(y=-2.0, radius=0.2, course=Line(speed=0.5, length=4.0))
+MOVING = Obstacles(shapes=(TURNING, Disc(x=3.0, y=1.5, radius=0.2), PASSING))
+DRIVE = Scenario(reference=Line(speed=0.5, length=1.0), laps=1, learner="none", obstacles=MOVING)
+PID = Scenario(learner="none")
+
+
+@pytest.fixture
+def server():
+    server = Server(port=0)
+    yield server
+    server.stop()
+
+
+def on_circle(time):
+    """Where the box's course is, by the formula of a circle that begins at the origin along +x."""
+    turn = 2 * np.pi * time / 6.0
+    return 0.5 * np.sin(turn), 0.5 * (1 - np.cos(turn)), turn
+
+
+def check_movers(scene, time):
+    """The nodes of both obstacles that move are where their courses are, by formula."""
+    (x, y, theta), (box, disc) = on_circle(time), scene._movers
+    assert box.position == pytest.approx([x, y, 0], abs=1e-9)
+    assert 2 * np.arctan2(box.wxyz[3], box.wxyz[0]) == pytest.approx(theta)
+    assert disc.position == pytest.approx([0.5 * time, 0, 0], abs=1e-9)
+
+
+def test_obstacles_move(server, tmp_path):
+    """Live and in a replay they are where the physics has them, at the start and later."""
+    live = Live([DRIVE], server)
+    for tick in (0, 130):
+        while live.session.tick < tick:
+            live.session.step()
+        live.draw()
+        check_movers(live._scene, 0.01 * tick)
+    positions, _ = live.session.simulations[0][1].plant.mocap
+    assert np.allclose([m.position for m in live._scene._movers], positions[0], atol=1e-12)
+    save(simulate(DRIVE), tmp_path / "result.zarr")
+    replay = Replay(Library(tmp_path / "result.zarr"), [0], server)
+    for time in (1.3, 0.0):
+        replay._scrub(time)
+        replay.draw()
+        check_movers(replay._scene, time)
+
+
+WALLS = Obstacles(shapes=(Box(x=1.0, y=0.8, length=4.0, width=0.2), Box(x=3.0, length=0.2, width=4.0)))
+SIDES = (1.0, -2.0, 4.2, 0.2), (-1.0, -0.5, 0.2, 3.0)  # x, y, length and width of two more, which close the room
+ROOM = Task(obstacles=WALLS, start=(0.0, 0.0, 0.0), goal=(1.5, -0.6, -0.5))
+
+
+def test_replay_of_a_mission(server, tmp_path):
+    """Its plan is the reference, the outlines stand at start and goal, and the clearance is that of the result."""
+    mission = navigate(ROOM, PID, compare=["model"])
+    save(mission.result, tmp_path / "result.zarr")
+    replay = Replay(Library(tmp_path / "result.zarr"), [0, 1], server)
+    for time, there in ((0.5, 0), (replay.duration, 2)):
+        replay._scrub(time)
+        replay.draw()
+        replay.refresh()
+        assert replay._status.content.count("has arrived") == there
+    start, goal = replay._scene._ends
+    assert start.visible and start.position[:2] == pytest.approx([0, 0], abs=1e-9)
+    assert goal.position[:2] == pytest.approx([1.5, -0.6]) and 2 * np.arcsin(goal.wxyz[3]) == pytest.approx(-0.5)
+    titles = {handle.title: handle for handle in replay._plots._handles}
+    _, *drawn, _ = titles["clearance, m"].data
+    for row, curve in enumerate(drawn):
+        known = curve[np.isfinite(curve)]
+        assert mission.table["clearance"].iloc[row] <= known.min() < mission.table["clearance"].iloc[row] + 0.01
+    written = json.loads(_curves(replay.recordings, looks_of(replay.recordings, [0, 1])))["charts"]
+    chart = next(chart for chart in written if chart["title"] == "clearance, m")
+    exported = [min(v for v in curve["values"] if v is not None) for curve in chart["curves"]]
+    assert exported == pytest.approx(mission.table["clearance"], abs=0.01)
+
+
+def test_clearance_live(server):
+    """Beside a wall it is the distance of the wall less half the robot, less the error; saved, it is the same bits."""
+    drive = DRIVE.replace(obstacles=WALLS, reference=Line(speed=0.5, length=1.0), initial_spread=(0, 0, 0))
+    live = Live([drive], server)
+    for tick in (100, 200):  # in parts, as the page asks for it
+        while live.session.tick < tick:
+            live.session.step()
+        live.draw()
+        live.refresh()
+    known = live.session.clearance()
+    assert known is not None
+    log, clearance = live.session.log()[:, 0], known[:, 0]
+    half = footprint(mjcf.load())[:, 1].max()
+    assert clearance == pytest.approx(0.7 - half - log["y"], abs=2e-3)  # the heading is off by milliradians
+    assert clearance.tobytes() == simulate(live.session.saved()[0])["clearance"].values.tobytes()
+    handle = next(handle for handle in live._plots._handles if handle.title == "clearance, m")
+    assert handle.data[1].size > 40 and set(handle.data[1]) <= set(clearance)
+    assert not live._scene._ends[0].visible  # a line has no end
+
+
+@pytest.mark.parametrize("localisation", ["scan", "particles"])
+def test_scan(server, localisation):
+    """The points of the last scan are on the walls, and so are those of the picture; the particles are at the robot."""
+    own = {"tier": "field", "localisation": localisation, "lidar": {"noise": 0.0, "beams": 60}}
+    live = Live([DRIVE.replace(obstacles=WALLS, sensing=own)], server)
+    assert live.session.scan(0) is None
+    for _ in range(25):
+        live.session.step()
+    live.draw()
+    points, particles = live._scene._scans
+    x, y, z = points.points.T
+    walls = shapely.union_all([shapely.Polygon(shape.vertices) for shape in WALLS.shapes])
+    assert len(x) > 15 and points.visible and (z > 0.5).all()
+    assert max(walls.boundary.distance(shapely.Point(*place)) for place in zip(x, y, strict=True)) < 1e-6
+    assert len(particles.points) == (500 if localisation == "particles" else 0)
+    if localisation == "particles":
+        assert particles.points[:, :2].mean(axis=0) == pytest.approx(live.session.qpos(0)[:2], abs=0.1)
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """A session in which the second goal was set on the way to the first one, and both robots drove on."""
+    _, first = prepared(ROOM, PID)
+    session = Session([first.replace(goal=None), first.replace(goal=None, prior="model")])
+    for goal in ((2.0, -1.0, 0.0), (-0.5, -1.0, np.pi)):
+        for _ in range(150):
+            session.step()
+        session.head_for(goal)
+    for _ in range(900):
+        session.step()
+    return session
+
+
+def test_goals_of_a_session(driven):
+    """Both robots get one plan, from where the first one was then, and stand at the last goal in the end."""
+    log, (first, other) = driven.log(), driven.saved()
+    assert [e.time for e in first.events] == pytest.approx([1.51, 3.01]) and first.events == other.events
+    for event in first.events:
+        start = event.reference.sample(np.zeros(1)).pose[0]
+        here = log[round(event.time / 0.01) - driven.lead, 0]
+        assert start[:2] == pytest.approx([here["x"], here["y"]], abs=1e-9)
+    goal = np.array([-0.5, -1.0, np.pi])
+    bound = ends(first, driven.time)
+    assert bound is not None
+    away = bound[1] - goal
+    assert away[:2] == pytest.approx([0, 0], abs=1e-9)
+    assert abs(np.angle(np.exp(1j * away[2]))) < 0.1  # the spline may turn a little at its end
+    now = log[-1]
+    assert arrived(np.stack([now["x"], now["y"], now["theta"]], -1), now["v"], goal).all()
+    assert arrivals(["PID", "model"], now, ends(first, driven.time)) == ["PID has arrived", "model has arrived"]
+    assert driven.clearance().min() > 0.0 and not driven.failure(0)
+
+
+def test_session_with_goals_runs_again(driven, tmp_path):
+    """Saved, through a file, it gives the same bits."""
+    again = []
+    for k, scenario in enumerate(driven.saved()):
+        (tmp_path / f"{k}.toml").write_text(scenario.to_toml())
+        again.append(Scenario.from_toml(tmp_path / f"{k}.toml"))
+    result, log = simulate(again), driven.log()
+    for name in SIGNALS:
+        assert result[name].values[:, : driven.tick].tobytes() == np.ascontiguousarray(log[name].T).tobytes(), name
+
+
+def test_flags(monkeypatch):
+    """`mrctl navigate --view` shows the mission's plan with robot and ghosts, and no run that ends at the goal."""
+    shown = []
+    monkeypatch.setattr(viewing, "live", lambda *arguments: shown.append(arguments))
+    flags = ["--view", "--compare", "none", "--speed", "0.4", "--port", "8081"]
+    assert main(["navigate", "doorway:3", *flags]) == 0
+    ((scenario, compare, export, host, port),) = shown
+    task = task_of("doorway:3", Scenario())
+    assert (compare, export, host, port) == (("none",), None, "127.0.0.1", 8081)
+    assert scenario.feedforward == "model+composite" and scenario.obstacles == task.obstacles
+    assert scenario.reference.speed == 0.4 and scenario.initial_pose == task.start and scenario.goal is None
+    bound = ends(scenario, 0.0)
+    assert bound is not None and bound[:, :2] == pytest.approx(np.array([task.start, task.goal])[:, :2])
+
+
+@pytest.mark.parametrize(
+    ("goal", "says"),
+    [
+        ((3.0, 0.0, 0.0), "goal: the robot is in an obstacle"),
+        ((2.0, 0.46, 0.0), "goal: the robot is 0.03"),
+        ((9.0, 0.0, 0.0), "goal: no way"),
+        ((2e4, 0.0, 0.0), "goal.0: "),
+    ],
+)
+def test_no_way(goal, says):
+    """What cannot be reached is said in one line, and the session goes on as it was."""
+    closed = Obstacles(shapes=(*WALLS.shapes, *(Box(x=x, y=y, length=a, width=b) for x, y, a, b in SIDES)))
+    session = Session([PID.replace(obstacles=closed, reference=Line(speed=0.2, length=1.0))])
+    session.step()
+    with pytest.raises(InputError, match=f"^{re.escape(says)}[^\n]*$"):
+        session.head_for(goal)
+    assert session.saved()[0].events == ()
+
+
+def test_clicks(server):
+    """Two clicks on the floor are place and direction of a goal, also where the camera follows; the sky is refused."""
+    live = Live([PID.replace(reference=Line(speed=0.2, length=1.0))], server)
+    live.session.step()
+    live._follow.value = True
+    live.draw()
+    live._await_goal()
+    with pytest.raises(InputError, match="no floor"):
+        live._click(np.array([0.0, 0, 1]), np.array([1.0, 0, 0.1]))
+    here = live._scene._root.position
+    for x, y in ((2.0, 1.0), (2.0, 2.0)):
+        live._click(np.array([x - 3, y, 3.0]) + here, np.array([1.0, 0, -1]))
+    (event,) = live.session.saved()[0].events
+    bound = ends(live.session.saved()[0], 1.0)
+    assert bound is not None and bound[1] == pytest.approx([2, 1, np.pi / 2], abs=0.1)
+    assert "way to (2.00, 1.00) m" in live._timeline.content and live._picking.content == ""
+    live.refresh()
+    goal = live._scene._ends[1]
+    assert goal.visible and goal.position[:2] == pytest.approx([2, 1])
+    assert event.time == 0.01 * (1 + live.session.lead)
+
+
+TO_SCREEN = """([x, y]) => {
+    const m = window.__viserMutable, point = new m.camera.position.constructor(x, y, 0);
+    m.nodeRefFromName['/world'].localToWorld(point).project(m.camera);
+    const r = m.canvas.getBoundingClientRect();
+    return [r.left + (point.x + 1) / 2 * r.width, r.top + (1 - point.y) / 2 * r.height];
+}"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_goal_by_click(tmp_path):
+    """A visitor clicks twice on the floor: robot and ghost go there and look there; a goal in a wall is refused."""
+    from playwright.sync_api import sync_playwright
+
+    _, first = prepared(ROOM, PID)
+    scenarios = [first.replace(goal=None), first.replace(goal=None, prior="model")]
+
+    def place(page, name):
+        found = node(page, name)
+        return None if found is None else found[:2]
+
+    def click(page, *places):
+        page.get_by_text("Set a goal", exact=True).click()
+        for place, says in zip(places, ("shall go", "shall look"), strict=True):
+            until(lambda says=says: says in page.inner_text("#mrctl-picking"), says)
+            page.mouse.click(*page.evaluate(TO_SCREEN, list(place)))
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        with serving(lambda server: Live(scenarios, server)) as (live, url), visit(browser, url) as page:
+            until(lambda: node(page, ROBOT) is not None, "the scene")
+            page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
+            click(page, (0.9, -0.5), (0.9, -1.2))
+            until(lambda: len(live.session.saved()[0].events) == 1, "the plan")
+            set_at = live.session.saved()[0].events[0].time
+            until(lambda: place(page, "/world/goal") == pytest.approx([0.9, -0.5], abs=0.03), "the goal in sight")
+            live.ask(live._set_speed, float("inf"))
+            until(lambda: live.session.time > set_at + 2, "the robots to drive")
+            until(lambda: page.inner_text("#mrctl-status").count("has arrived") == 2, "the robots at the goal")
+            live.ask(live._command, "pause")
+            until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
+            x, y, theta = (live.session.log()[-1][name] for name in ("x", "y", "theta"))
+            assert np.hypot(x - 0.9, y + 0.5).max() < 0.1 and np.abs(theta + np.pi / 2).max() < 0.2
+            click(page, (1.0, 0.72), (2.0, 0.72))
+            until(lambda: "in an obstacle" in page.inner_text("#mrctl-message"), "the refusal")
+            assert [len(saved.events) for saved in live.session.saved()] == [1, 1]
+            page.screenshot(path=tmp_path / "goal.png", timeout=PATIENCE)
+        browser.close()
