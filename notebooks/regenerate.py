@@ -1,0 +1,56 @@
+"""Runs notebooks from top to bottom and keeps their outputs in the files, for those who read them without running them.
+
+    python notebooks/regenerate.py [01_the_paper.ipynb …]
+
+Replays are left out, since they are programs of some megabytes, and so is what differs from run to run: progress bars,
+warnings, times of execution, and tables in HTML with random names.
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+
+FOLDER = Path(__file__).parent
+KEPT = "image/png", "text/plain"
+REPLAY = "(The replay is shown when the notebook runs.)"
+
+
+def executed(path: Path, folder: Path) -> nbformat.NotebookNode:
+    """Returns a notebook after a run in a folder, with all outputs; an exception in a cell is raised."""
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(notebook, timeout=600, record_timing=False, resources={"metadata": {"path": folder}}).execute()
+    return notebook
+
+
+def cleaned(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    """Returns a notebook with the outputs that are the same in every run, and without metadata of the machine."""
+    found = nbformat.from_dict({**notebook, "cells": [dict(cell) for cell in notebook.cells]})
+    kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    found.metadata = {"kernelspec": kernel, "language_info": {"name": "python"}}
+    for cell in found.cells:
+        cell.metadata = {}
+        if cell.cell_type == "code":
+            cell.outputs = [kept for output in cell.outputs if (kept := _cleaned(output))]
+    return found
+
+
+def _cleaned(output: nbformat.NotebookNode) -> nbformat.NotebookNode | None:
+    if output.output_type == "stream":
+        return output if output.name == "stdout" else None
+    if "mrctl-replay" in output.data.get("text/html", ""):
+        data = {"text/plain": REPLAY}
+    elif "text/html" in output.data and "<table" in output.data["text/html"] and "xr-" not in output.data["text/html"]:
+        data = {kind: output.data[kind] for kind in (*KEPT, "text/html") if kind in output.data}
+    else:
+        data = {kind: output.data[kind] for kind in KEPT if kind in output.data}
+    return nbformat.from_dict({**output, "data": data, "metadata": {}})
+
+
+if __name__ == "__main__":
+    for path in [FOLDER / name for name in sys.argv[1:]] or sorted(FOLDER.glob("*.ipynb")):
+        with tempfile.TemporaryDirectory() as folder:
+            nbformat.write(cleaned(executed(path, Path(folder))), path)
+        print(f"{path.name}: {path.stat().st_size / 1e6:.2f} MB")
