@@ -89,6 +89,11 @@ def cores() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
+def worthwhile(threads: int, size: int) -> int:
+    """Number of threads that pay for so many robots, of those that are allowed, 0 for all cores."""
+    return min(threads or cores(), max(1, size // LEAST))
+
+
 def uniform(scenarios: Sequence[Scenario]) -> list[list[int]]:
     """The scenarios that can run in one simulation, by their indices."""
     groups: dict[Hashable, list[int]] = defaultdict(list)
@@ -115,7 +120,7 @@ def split(
     """
     if any(stages.values()):
         return [(rows, Simulation([scenarios[row] for row in rows], threads=threads, **stages))]
-    count = min(threads or cores(), max(1, len(rows) // LEAST))
+    count = worthwhile(threads, len(rows))
     parts = [part.tolist() for part in np.array_split(rows, count)]
     return [(part, Simulation([scenarios[row] for row in part], threads=1)) for part in parts]
 
@@ -211,7 +216,7 @@ class Simulation:
 
         Args:
             scenarios: Scenarios of one group, see `group_of`.
-            threads: Number of threads of the batch engine; 0 for all cores. Control runs on one.
+            threads: Largest number of threads of the batch engine; 0 for all cores. Control runs on one.
             stages: As in `simulate`.
 
         Raises:
@@ -235,7 +240,7 @@ class Simulation:
         self._lead = first.sensing.periods("delay", self.period)
         self.courses = Courses(scenarios, self._lead)
         self.plant: Plant = build(
-            self.model, robot, size, round(self.period / first.physics_step), threads, first.obstacles
+            self.model, robot, size, round(self.period / first.physics_step), worthwhile(threads, size), first.obstacles
         )
         later = [event.perturbation for scenario in scenarios for event in scenario.events]
         for k, perturbation in enumerate(later):  # before anything is computed
