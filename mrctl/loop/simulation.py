@@ -378,13 +378,15 @@ class Simulation:
         names = [self._label] * size, [self._feedforward] * size
         log, failure = self.log.ticks[:length], self.plant.failure
         found = dataset.dataset(self.scenarios, *names, log, failure, self._failure_time, weights)
-        found = found.assign(self._parameters()).assign(self._clearance(length))
-        return found.assign(  # the constants that turn the commanded motion into features
-            half_track=("run", np.full(size, robot.half_track), {"units": "m"}),
-            estimator_fault=("run", np.array(getattr(self.estimator, "faults", [""] * size), object)),
-            feedforward_fault=("run", np.array(getattr(self.hierarchy, "feedforward_faults", [""] * size), object)),
-            feature_scale=(("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
-        )
+        faults = {
+            "estimator_fault": ("run", np.array(getattr(self.estimator, "faults", [""] * size), object)),
+            "feedforward_fault": ("run", np.array(getattr(self.hierarchy, "feedforward_faults", [""] * size), object)),
+        }
+        constants = {  # which turn the commanded motion into features
+            "half_track": ("run", np.full(size, robot.half_track), {"units": "m"}),
+            "feature_scale": (("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
+        }
+        return found.assign(self._parameters() | self._clearance(length) | faults | constants)
 
     def _clearance(self, length: int) -> dict[str, Any]:
         """Distance of each robot from the nearest obstacle at each tick, where there are some, and its footprint."""
