@@ -90,6 +90,11 @@ def cores() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
+def worthwhile(threads: int, size: int) -> int:
+    """Number of threads that pay for so many robots, of those that are allowed, 0 for all cores."""
+    return min(threads or cores(), max(1, size // LEAST))
+
+
 def uniform(scenarios: Sequence[Scenario]) -> list[list[int]]:
     """The scenarios that can run in one simulation, by their indices."""
     groups: dict[Hashable, list[int]] = defaultdict(list)
@@ -116,7 +121,7 @@ def split(
     """
     if any(stages.values()):
         return [(rows, Simulation([scenarios[row] for row in rows], threads=threads, **stages))]
-    count = min(threads or cores(), max(1, len(rows) // LEAST))
+    count = worthwhile(threads, len(rows))
     parts = [part.tolist() for part in np.array_split(rows, count)]
     return [(part, Simulation([scenarios[row] for row in part], threads=1)) for part in parts]
 
@@ -213,7 +218,7 @@ class Simulation:
 
         Args:
             scenarios: Scenarios of one group, see `group_of`.
-            threads: Number of threads of the batch engine; 0 for all cores. Control runs on one.
+            threads: Largest number of threads of the batch engine; 0 for all cores. Control runs on one.
             stages: As in `simulate`.
 
         Raises:
@@ -237,7 +242,7 @@ class Simulation:
         self.lead = first.sensing.periods("delay", self.period)
         self.courses = Courses(scenarios, self.lead)
         self.plant: Plant = build(
-            self.model, robot, size, round(self.period / first.physics_step), threads, first.obstacles
+            self.model, robot, size, round(self.period / first.physics_step), worthwhile(threads, size), first.obstacles
         )
         later = [event.perturbation for scenario in scenarios for event in scenario.events]
         for k, perturbation in enumerate(later):  # before anything is computed
@@ -386,13 +391,15 @@ class Simulation:
         names = [self._label] * size, [self._feedforward] * size
         log, failure = self.log.ticks[:length], self.plant.failure
         found = dataset.dataset(self.scenarios, *names, log, failure, self._failure_time, weights)
-        found = found.assign(self._parameters()).assign(self._clearance(length))
-        return found.assign(  # the constants that turn the commanded motion into features
-            half_track=("run", np.full(size, robot.half_track), {"units": "m"}),
-            estimator_fault=("run", np.array(getattr(self.estimator, "faults", [""] * size), object)),
-            feedforward_fault=("run", np.array(getattr(self.hierarchy, "feedforward_faults", [""] * size), object)),
-            feature_scale=(("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
-        )
+        faults = {
+            "estimator_fault": ("run", np.array(getattr(self.estimator, "faults", [""] * size), object)),
+            "feedforward_fault": ("run", np.array(getattr(self.hierarchy, "feedforward_faults", [""] * size), object)),
+        }
+        constants = {  # which turn the commanded motion into features
+            "half_track": ("run", np.full(size, robot.half_track), {"units": "m"}),
+            "feature_scale": (("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
+        }
+        return found.assign(self._parameters() | self._clearance(length) | faults | constants)
 
     def _clearance(self, length: int) -> dict[str, Any]:
         """Distance of each robot from the nearest obstacle at each tick, where there are some, and its footprint."""

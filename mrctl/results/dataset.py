@@ -7,6 +7,7 @@ import os
 import shutil
 import uuid
 from collections.abc import Iterable, Sequence
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -99,7 +100,13 @@ def blank(*shape: int) -> NDArray[np.void]:
 def versions() -> dict[str, str]:
     """Versions of all packages that can change a result."""
     others = ("mujoco", "dm-control", "numpy", "numba", "torch")
-    return {"mrctl": __version__} | {name: metadata.version(name) for name in others}
+    return {"mrctl": __version__} | {name: _installed(name) for name in others}
+
+
+@cache
+def _installed(name: str) -> str:
+    """Version of a package, which takes a millisecond to read."""
+    return metadata.version(name)
 
 
 def written_by(result: xr.Dataset) -> str:

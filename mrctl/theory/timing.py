@@ -408,12 +408,14 @@ def _bounds(rows: Array, start: Array, end: Array, path: Path) -> Array:
     first = np.maximum(np.searchsorted(s, start, side="right") - 1, 0)
     last = np.minimum(np.searchsorted(s, end), len(s) - 1)
     found = np.empty((len(first), 2, rows.shape[1]))
-    bounds(rows, first, np.minimum(last, first + len(rows) - 1), found)
+    # In one layout, so that it is compiled once.
+    bounds(np.ascontiguousarray(rows), first, np.minimum(last, first + len(rows) - 1), found)
     return found
 
 
 def _solved(path: Path, rows: Array, caps: Array) -> TimeLaw:
     """The law of least time under limits with bounds of their coefficients, (N, 2, R, 4), and caps on x, (N + 1,)."""
+    rows, caps = np.ascontiguousarray(rows), np.ascontiguousarray(caps)  # in one layout, as in `_bounds`
     if np.abs(rows[..., 3]).max() >= 1:
         raise InputError("limits.voltage: too low to overcome the friction of the drives")
     step, largest, x = np.diff(path.s[::2]), np.empty(len(caps)), np.empty(len(caps))

@@ -4,7 +4,6 @@ import base64
 import importlib.util
 import io
 import re
-import shutil
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,11 +12,10 @@ import numpy as np
 import pytest
 from nbconvert import HTMLExporter
 from PIL import Image
+from test_viewer import CHROMIUM, SLOWLY, SOFTWARE
 
 FOLDER = Path(__file__).resolve().parents[2] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-CHROMIUM = shutil.which("chromium")
-SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 PATIENCE = 60_000  # ms, on a machine that does other things too
 # What a page of nbconvert asks for by itself, for equations and for widgets that are not there.
 USUAL = re.compile(r"https://cdnjs\.cloudflare\.com/ajax/libs/(mathjax|require\.js)/")
@@ -118,6 +116,7 @@ def visit(file):
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
         page = browser.new_page(viewport={"width": 1000, "height": 560})
+        page.add_init_script(SLOWLY)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
         page.route(re.compile("^(https?|wss?):"), answer)

@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import mrctl
@@ -46,6 +47,7 @@ def floor(name: str) -> int:
     return found[0]
 
 
+@cache
 def imports(path: Path) -> set[str]:
     """Absolute names of all that a file imports, wherever it does so."""
     names = set()

@@ -48,9 +48,9 @@ def test_step(robot):
 def test_bandwidth(robot, ratio):
     """A disturbance that swings at ω is found with the gain and phase of 1/(1 + jωT)."""
     w = ratio / T
-    found = drive(robot, lambda t: np.array([np.sin(w * t), 0.0]), 40.0)[:, 0]
+    found = drive(robot, lambda t: np.array([np.sin(w * t), 0.0]), 14.0)[:, 0]
     t = PERIOD * np.arange(len(found))
-    late = t >= t[-1] - 2 * np.pi / w * np.floor(20 * w / (2 * np.pi))
+    late = t >= t[-1] - 2 * np.pi / w * np.floor(12 * w / (2 * np.pi))
     response = 2 * np.mean(found[late] * np.exp(-1j * w * t[late])) * 1j
     assert response == pytest.approx(1 / (1 + 1j * ratio), abs=0.06)
 
