@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from nbconvert import HTMLExporter
 from PIL import Image
-from test_viewer import CHROMIUM, SLOWLY, SOFTWARE
+from test_viewer import CHROMIUM, SOFTWARE
 
 FOLDER = Path(__file__).resolve().parents[2] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
@@ -116,7 +116,6 @@ def visit(file):
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
         page = browser.new_page(viewport={"width": 1000, "height": 560})
-        page.add_init_script(SLOWLY)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
         page.route(re.compile("^(https?|wss?):"), answer)

@@ -26,11 +26,6 @@ CHROMIUM = shutil.which("chromium")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
 # Chromium would also put the page together with the software that draws the scene, which takes 0.3 s a picture.
 SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing"]
-SLOWLY = """
-    const draw = requestAnimationFrame;
-    requestAnimationFrame = (callback) => setTimeout(() => draw(callback), 125);
-    cancelAnimationFrame = clearTimeout;
-"""  # 8 pictures a second instead of all that the processor can, which other tests want as well
 BASE = Scenario(reference=Circle(radius=0.8, period=6.0), laps=2)
 PATIENCE = 60_000  # ms, on a machine that does other things too
 ROBOT, GHOST = "/world/robot/chassis", "/world/ghosts/1/chassis"
@@ -50,7 +45,6 @@ def browser():
 def visit(browser, url, offline=False):
     """A page; no error on its console is tolerated."""
     context = browser.new_context(viewport={"width": 1280, "height": 800}, offline=offline)
-    context.add_init_script(SLOWLY)
     page = context.new_page()
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
