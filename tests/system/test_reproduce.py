@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 from mrctl import cli
 from mrctl.experiments import kanayama, paper
-from mrctl.scenario import COMPARED, FEEDFORWARDS
+from mrctl.scenario import COMPARED
 
 pytestmark = pytest.mark.xdist_group("reproduce")  # what its tests share is made once
 
@@ -20,20 +20,12 @@ FIGURES = (
     "learning_curve",
 )  # fmt: skip
 
-DRIVEN = "none", "fel", "model+composite"
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the command writes: of the paper's benchmark the rows that a test below asks for, and one with both parts.
-
-    Of the tables of the tiers it drives three laps of eight, which is harder for those that learn, and one replicate.
-    """
-    out, real = tmp_path_factory.mktemp("reproduction"), paper.real
+    out = tmp_path_factory.mktemp("reproduction")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paper, "PAPER", DRIVEN)
-        patch.setattr(paper, "DRAWS", 1)
-        patch.setattr(paper, "real", lambda tier: [one.replace(laps=3) for one in real(tier)])
+        patch.setattr(paper, "DRAWS", 1)  # replicates in the table of the tiers; one shows what its test asks for
         assert cli.main(["reproduce", "--out", str(out)]) == 0
     return out
 
@@ -77,17 +69,6 @@ def test_network_beats_pid_in_other_arrangements(table: dict, steering: str, pla
         assert found["v_rmse"] <= bare["v_rmse"]
         assert found["omega_rmse"] < bare["omega_rmse"]
         assert found["position_rmse"] < bare["position_rmse"]
-
-
-def test_benchmark(table: dict) -> None:
-    """Every feedforward that is given is driven on both plants, fast and slow, and in every arrangement."""
-    places = {(r["steering"], r["plant"], r["lap_time"], r["feedforward"]) for r in table["last_lap"]}
-    plants = "nominal", "all"
-    assert places == {
-        *product(("compliant",), plants, (12.0, 20.0), DRIVEN), *product(("caster", "rigid"), plants, (12.0,), DRIVEN)
-    }  # fmt: skip
-    assert len(table["last_lap"]) == len(places) and set(DRIVEN) < set(paper.PAPER) <= set(FEEDFORWARDS)
-    assert len(paper.benchmark()) == 8 * len(paper.PAPER)
 
 
 def test_tiers(table: dict) -> None:
