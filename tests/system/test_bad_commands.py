@@ -140,6 +140,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def listed(folder: Path) -> list[Path]:
+    """Everything in a folder, without what Python keeps of the files that it imports."""
+    return sorted(p for p in folder.rglob("*") if p.suffix != ".pyc" and p.name != "__pycache__")
+
+
 @pytest.mark.parametrize(
     "line", [*(f"run {flags}" for flags in RUN), *OTHERS, *ASKS], ids=lambda line: ascii(line)[1:60]
 )
@@ -148,9 +153,9 @@ def test_refused_in_one_line(
 ) -> None:
     """Nothing is driven, nothing is written, and the one line can be shown on any terminal."""
     monkeypatch.chdir(folder)
-    before = sorted(folder.rglob("*"))
+    before = listed(folder)
     assert cli.main(line.split(" ")) == 2
     said = capsys.readouterr().err
     assert said.startswith("mrctl: ") and said.count("\n") == 1, said
     assert said[:-1].isprintable() and len(said) < 2100 and "Error:" not in said.partition(":")[0]
-    assert sorted(p for p in folder.rglob("*") if p.suffix != ".pyc" and p.name != "__pycache__") == before
+    assert listed(folder) == before
