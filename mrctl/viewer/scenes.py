@@ -39,7 +39,7 @@ STORIES = {
     ),
     "sagging battery": _story(
         Scenario(laps=5, events=_SAG),
-        "From 14 s the battery loses 10 % every 2 s, down to 60 %: the error of PID alone grows to four times that of "
+        "From 14 s the battery loses 10 % every 2 s, down to 60 %: the error of PID alone grows to five times that of "
         "the learner, which stays as it is.",
     ),
     "ice": _story(

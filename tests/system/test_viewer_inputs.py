@@ -215,7 +215,7 @@ def test_stories(live):
         assert fails == ["", "lateral error over 1 m" if "load" in name else ""]
     load, battery, ice = error.values()
     assert 15 < load[0, -1] < 25 and (np.diff(load[1, :4]) > 0).all()
-    assert 3.5 < battery[1, -1] / battery[0, -1] < 4.5 and battery[0, 1:].max() < battery[0, 0]
+    assert 4.5 < battery[1, -1] / battery[0, -1] < 5.5 and battery[0, 1:].max() < battery[0, 0]
     assert 4 < ice[0, 1] < ice[1, 1] < 7 and ice[0, -1] < ice[0, 0]
     live._restart([Scenario()])
     assert live._story.content == ""
