@@ -43,7 +43,7 @@ def measure(model: mujoco.MjModel) -> Tyres:
     """
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
-    key = hashlib.sha256(buffer).digest()  # that of `mjcf.digest` takes fifty times as long
+    key = hashlib.sha256(buffer.tobytes()).digest()  # that of `mjcf.digest` takes fifty times as long
     if key not in _known:
         _known[key] = _measured(mjcf.clone(model))
     return _known[key]
