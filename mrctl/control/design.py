@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains, sampled_loop
@@ -89,6 +88,8 @@ def fastest(plants: list[Linear], period: float, delay: float, lag: float) -> Ga
         delay: Loop delay in s, without that of the hold.
         lag: Time constant of the measurement in s.
     """
+    from scipy.optimize import minimize_scalar  # here, for settings are read without scipy
+
     frequency = np.geomspace(1e-4, 1, 500) * np.pi / period * (1 - 1e-9)
     loops = [sampled_loop(frequency, plant, Gains(1.0, 0.0), period, delay, lag) for plant in plants]
     z = np.exp(1j * frequency * period)

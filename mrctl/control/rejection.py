@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from mrctl.control.design import SPEEDS, Motion, plants
 from mrctl.control.kanayama import Kanayama
@@ -125,10 +124,7 @@ class Loop:
         delay: float, period: float,
     ) -> None:  # fmt: skip
         """Wires it; see `rejection`, and `share` is that of the largest speed."""
-        n, late = len(plant.b), round(delay / period)
-        held = np.zeros((n + 1, n + 1))
-        held[:n, :n], held[:n, n] = plant.a, plant.b
-        held = expm(held * period)
+        n, late, held = len(plant.b), round(delay / period), plant.held(period)
         k, speed = motion.kanayama, share * robot.max_speed
         k_x, k_y, k_theta = float(k.k_x or 0), float(k.k_y or 0), float(k.k_theta or 0)
         time_constant = max(motion.prefilter, period)
@@ -150,7 +146,7 @@ class Loop:
             voltage = gains.k_p * new[e] + new[i] + forward + disturbance
             queue = np.append(s[u : u + late], voltage)
             new[u : u + late] = queue[1:]
-            new[:n] = held[:n, :n] @ s[:n] + held[:n, n] * queue[0]
+            new[:n] = held.a @ s[:n] + held.b * queue[0]
             moved = period * (s[0] + new[0]) / 2
             if channel == 0:
                 new[p], new[h] = s[p] - moved, 0.0

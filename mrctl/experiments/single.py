@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import xarray as xr
-from matplotlib.figure import Figure
 from numba.core.event import Event, Listener, install_listener
 
 from mrctl.control.stages import Stages
@@ -17,7 +15,7 @@ from mrctl.loop import user_files
 from mrctl.loop.learned import save_learned
 from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
-from mrctl.results import metrics, plots
+from mrctl.results import metrics
 from mrctl.results.dataset import save, versions
 from mrctl.scenario import Scenario
 
@@ -34,12 +32,12 @@ COLUMNS = {
     "guard_actions": ("guard acted", 1.0),
 }
 
-FIGURES: dict[str, Callable[[xr.Dataset], Figure]] = {
-    "path": plots.path,
-    "velocities": plots.velocities,
-    "errors": plots.errors,
-    "voltages": plots.voltages,
-    "learning": plots.learning_curve,
+FIGURES = {  # file: function of `results.plots`
+    "path": "path",
+    "velocities": "velocities",
+    "errors": "errors",
+    "voltages": "voltages",
+    "learning": "learning_curve",
 }
 
 
@@ -73,12 +71,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     Raises:
         InputError: The scenario or a stage is bad, or the folder cannot be written or holds a result already.
     """
-    written = (
-        "result.zarr",
-        "learned.safetensors",
-        *(f"{name}.{suffix}" for name in FIGURES for suffix in plots.FORMATS),
-    )
-    if out is not None and (held := [name for name in written if (out / name).exists()]):
+    if out is not None and (held := [name for name in _written() if (out / name).exists()]):
         raise InputError(f"out: {out} holds {held[0]} already; nothing was overwritten")
     stages: Stages = user_files.load(own) if own else {}
     new = out is not None and not out.exists()
@@ -96,8 +89,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         save(result, out / "result.zarr")
         if "weights" in result and not result["failed"].any():
             save_learned(out / "learned.safetensors", result)
-        for name, draw in FIGURES.items():
-            plots.save(draw(laps if name == "learning" else result), out, name)
+        _draw(result, laps, out)
     failure = str(result["failure"].values[0])
     row = laps.isel(run=0)
     events = metrics.guard_events(result).drop(columns="run")
@@ -128,6 +120,20 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         lines.append(f"failed after {float(row['failure_time']):.2f} s: {failure}")
     acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]
     return "\n".join([*lines, markdown(header, rows), *(text.removesuffix(", ") for text in acted)]), failure
+
+
+def _written() -> list[str]:
+    from mrctl.results import plots  # here, for a run that draws nothing needs no matplotlib
+
+    figures = (f"{name}.{suffix}" for name in FIGURES for suffix in plots.FORMATS)
+    return ["result.zarr", "learned.safetensors", *figures]
+
+
+def _draw(result: xr.Dataset, laps: xr.Dataset, out: Path) -> None:
+    from mrctl.results import plots
+
+    for name, function in FIGURES.items():
+        plots.save(getattr(plots, function)(laps if name == "learning" else result), out, name)
 
 
 def _number(value: float) -> float | None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from mrctl.kernel import Array
 from mrctl.physics.elements import REAR, bodies_of, fronts, has
@@ -45,7 +44,14 @@ def footprint(model: mujoco.MjModel) -> Array:
         for geom in geoms:
             points.append((_extremes(model, data, geom) - chassis.xpos) @ chassis.xmat.reshape(3, 3))
     plane = np.concatenate(points)[:, :2].round(9)
-    return plane[ConvexHull(plane).vertices]
+    return convex(plane)
+
+
+def convex(points: Array) -> Array:
+    """Vertices of the convex hull of points in the plane, in m, `(n, 2)`, counterclockwise."""
+    from scipy.spatial import ConvexHull  # here, for robots without obstacles need no scipy
+
+    return points[ConvexHull(points).vertices]
 
 
 def _extremes(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Array:

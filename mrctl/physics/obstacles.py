@@ -14,10 +14,10 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from mrctl.kernel import Array
 from mrctl.physics.elements import COLLISION
+from mrctl.physics.hull import convex
 from mrctl.record import InputError
 from mrctl.theory.obstacles import Box, Disc, Obstacles
 
@@ -154,8 +154,7 @@ def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | No
             (points - data.body(body).xpos) @ turn,
         )
     if mesh is not None:
-        plane = points[:, :2].round(6)
-        return {"kind": "polygon", "points": plane[ConvexHull(plane).vertices].tolist()}
+        return {"kind": "polygon", "points": convex(points[:, :2].round(6)).tolist()}
     if abs(frame[2, 2]) < 1 - 1e-9 or not (kind == shape.mjGEOM_BOX or kind == shape.mjGEOM_CYLINDER):
         raise InputError(f"geom {name}: is no upright box, cylinder or mesh")
     values = {"x": float(place[0]), "y": float(place[1])}

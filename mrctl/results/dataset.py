@@ -13,9 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-import zarr
 from numpy.typing import NDArray
-from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from mrctl import __version__
 from mrctl.record import InputError, reading
@@ -202,6 +200,8 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     Raises:
         InputError: The path exists or cannot be written.
     """
+    from zarr.codecs import Crc32cCodec, ZstdCodec  # here, for a run that saves nothing needs no zarr
+
     path = Path(path)
     if path.exists():
         raise InputError(f"{path}: exists already, nothing was overwritten")
@@ -241,6 +241,8 @@ def open_result(path: str | Path) -> xr.Dataset:
     Raises:
         InputError: There is no result at this path, or a file of it is damaged or missing.
     """
+    import zarr
+
     if not (Path(path) / "zarr.json").is_file():
         raise InputError(f"{path}: not a saved result, nor a sweep's store: no zarr.json")
     stored = only_files(Path(path))

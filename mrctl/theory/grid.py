@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from mrctl.kernel import Array, kernel
 from mrctl.record import InputError
@@ -146,6 +145,8 @@ def measure(outlines: Outlines, field: Field) -> None:
 
 def _transform(cells: NDArray[np.bool]) -> Array:
     """Returns the distance of each cell that is set from the nearest one that is not, in cells, and 0 elsewhere."""
+    from scipy.ndimage import distance_transform_edt  # here, for robots without a map need no scipy
+
     return np.asarray(distance_transform_edt(cells), float)
 
 

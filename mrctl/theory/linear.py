@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from mrctl.theory.robot import Robot
 
@@ -55,6 +54,16 @@ class Linear(NamedTuple):
         """Whether every eigenvalue of A has a negative real part."""
         return bool((np.linalg.eigvals(self.a).real < 0).all())
 
+    def held(self, period: float) -> Linear:
+        """The plant behind a zero-order hold of this period in s, x⁺ = A x + b u from one sample to the next; exact."""
+        from scipy.linalg import expm  # here, for settings are read without scipy
+
+        n = len(self.b)
+        both = np.zeros((n + 1, n + 1))
+        both[:n, :n], both[:n, n] = self.a, self.b
+        both = np.asarray(expm(both * period), float)
+        return Linear(both[:n, :n], both[:n, n])
+
     def response(self, frequency: NDArray[np.float64], period: float) -> NDArray[np.complex128]:
         """Frequency response behind a zero-order hold, from sample to sample; exact.
 
@@ -65,12 +74,9 @@ class Linear(NamedTuple):
         Returns:
             The response at z = e^(jω period), `(F,)`.
         """
-        n = len(self.b)
-        held = np.zeros((n + 1, n + 1))
-        held[:n, :n], held[:n, n] = self.a, self.b
-        held = expm(held * period)
+        held = self.held(period)
         z = np.exp(1j * frequency * period)[:, None, None]
-        return np.asarray(np.linalg.solve(z * np.eye(n) - held[:n, :n], held[:n, n:])[:, 0, 0], complex)
+        return np.asarray(np.linalg.solve(z * np.eye(len(held.b)) - held.a, held.b[:, None])[:, 0, 0], complex)
 
 
 def first_order(gain: float, time_constant: float) -> Linear:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import cmath
 import contextlib
+from collections.abc import Callable
 from functools import cached_property, lru_cache
 from itertools import pairwise, product
 from typing import Annotated, Literal, NamedTuple
@@ -20,7 +21,6 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
-from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 
 from mrctl.record import InputError, Record
 from mrctl.theory.robot import GRAVITY, Robot
@@ -400,6 +400,8 @@ class _Spline:
     """A planar quintic spline by arc length s; its own parameter u is the accumulated chord length, both in m."""
 
     def __init__(self, points: tuple[tuple[float, float], ...], closed: bool) -> None:
+        from scipy.interpolate import make_interp_spline  # here, for settings are read without scipy
+
         p = _plane(points, closed)
         knots = np.append(0, np.cumsum(np.abs(np.diff(p))))
         straight = [(2, np.zeros(2)), (3, np.zeros(2))]
@@ -413,8 +415,10 @@ class _Spline:
         self.closed = closed
 
     @cached_property
-    def parameter(self) -> CubicHermiteSpline:
+    def parameter(self) -> Callable[[Array], Array]:
         """Approximation of u(s), whose error falls with the fourth power of the length of a piece."""
+        from scipy.interpolate import CubicHermiteSpline
+
         return CubicHermiteSpline(self.s, self.u, 1 / np.abs(self.derivative(self.u, 1)))
 
     def derivative(self, u: Array, n: int) -> Plane:

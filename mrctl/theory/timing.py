@@ -23,7 +23,6 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.optimize import brentq
 
 from mrctl.kernel import Array, kernel
 from mrctl.record import InputError, Record
@@ -335,6 +334,8 @@ class SmoothLaw:
         self.law, self._window, self._start = law, window, -window / 2
         self.duration = law.duration
         if law.path.closed:
+            from scipy.optimize import brentq  # here, for settings are read without scipy
+
             root = brentq(lambda t: law.average(np.array([t]), window)[0].item(), -window / 2, window / 2)
             self._start = float(root)  # type: ignore[arg-type]
         else:

@@ -130,14 +130,14 @@ def test_light() -> None:
     assert not loaded("import mrctl", ("numpy", "numba", "mujoco", "xarray", "torch"))
     assert not loaded(
         "import mrctl; mrctl.Simulation, mrctl.simulate, mrctl.summary",
-        ("torch", "matplotlib", "scipy.stats", "tyro", "viser", "gymnasium", "dask"),
+        ("torch", "matplotlib", "scipy", "zarr", "tyro", "viser", "gymnasium", "dask"),
     )
 
 
 def test_settings_are_data() -> None:
     """A scenario is read where there is neither Numba, MuJoCo nor torch."""
     code = "import mrctl; mrctl.Scenario(); mrctl.Sweep"
-    assert not loaded(code, ("mujoco", "dm_control", "torch"))
+    assert not loaded(code, ("numba", "mujoco", "dm_control", "torch", "scipy"))
 
 
 def test_laws_without_physics() -> None:
