@@ -447,7 +447,7 @@ def suite(
             are fitted to each run itself. By default those of the tables, with --full all.
         controller: Controllers of your own to compare, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion.
         seeds: Number of replicates of each case; by default 20, or 3 with --quick.
-        random: Number of random scenarios; by default 30, with --quick 6, with --full 1,000.
+        random: Number of random scenarios; by default 30, with --quick 6, with --full 1,000 in each tier.
         quick: Run a few cases with few laps, in two minutes; the tables support no claim.
         full: Run all cases, in every tier, in hours.
         held_out: Instead of all that, drive this one feedforward, or my_file.py:MyFeedforward, through 40 cells on

@@ -48,6 +48,7 @@ LAP_TIMES = (8.0, 10.0, 12.0, 16.0, 20.0, 24.0, 30.0)  # s, of random splines; f
 RANDOM_LAPS = 4
 MARGIN = 0.8  # share of the robot's limits that a random spline may ask for
 GRIP = 0.3  # tyre friction that a random spline relies on
+NO_WORSE = 1.02  # ratio to the error of PID alone up to which a feedforward does no harm
 BAND = 1.2  # ratio to the error before a step, or to the final error, that counts as recovered or converged
 
 
@@ -126,7 +127,7 @@ def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
             adds the other uncertainties, tiers and steering arrangements, and drives 8 laps.
         seeds: Number of replicates of each case; all cases have the same draws. After a step and its return the robot
             is not quite the one before, but another draw.
-        random: Number of random scenarios.
+        random: Number of random scenarios in `lab`; `full` has the same in the other tiers.
     """
     quick, full = mode == "quick", mode == "full"
     leading, laps, third = {"quick": (3, 3, 2), "core": (5, 4, 3), "full": (8, 8, 4)}[mode]
@@ -189,7 +190,11 @@ def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
             for name in LADDER:
                 add("steering", f"{steering}, {name}", steering=steering, perturbation=PERTURBATIONS[name])
     if random:
-        found.append(Case("random", "random", tuple(random_scenarios(random))))
+        worlds = random_scenarios(random)
+        found.append(Case("random", "random", tuple(worlds)))
+        for tier in ("ideal", "field") if full else ():
+            sensed = (world.model_copy(update={"sensing": Sensing(tier=tier)}) for world in worlds)
+            found.append(Case(f"random, {tier}", "random", tuple(sensed)))
     return sorted(found, key=lambda case: -case.scenarios[-1].ticks)
 
 

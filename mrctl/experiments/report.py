@@ -141,7 +141,7 @@ def page(
         images: Each figure as base64 of a PNG, and its caption, by file name.
     """
     fixed = [case for case in outcome.cases if case.part != "random"]
-    random = sum(len(case.scenarios) for case in outcome.cases if case.part == "random")
+    random = _worlds(outcome)
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(TEMPLATE.read_text()).render(
         runs=sum(len(case.scenarios) for case in outcome.cases) * len(choices),
@@ -172,8 +172,13 @@ def command(outcome: Outcome, choices: Choices) -> str:
     own = [one["controller"] for one in choices.values() if "controller" in one]
     words += ["--controller", *own] if own else []
     words += ["--seeds", str(len(next(case for case in outcome.cases if case.part != "random").scenarios))]
-    words += ["--random", str(sum(len(case.scenarios) for case in outcome.cases if case.part == "random"))]
+    words += ["--random", str(_worlds(outcome))]
     return shlex.join(words)
+
+
+def _worlds(outcome: Outcome) -> int:
+    """Number of random scenarios in each tier."""
+    return max((len(case.scenarios) for case in outcome.cases if case.part == "random"), default=0)
 
 
 def scorecard(outcome: Outcome) -> str:
@@ -209,7 +214,7 @@ def recoveries(outcome: Outcome) -> str:
 
 def duels(outcome: Outcome) -> str:
     """Probabilities that one feedforward beats another in the random scenarios."""
-    rows = {row["feedforward"]: row for row in outcome.rows if row["part"] == "random"}
+    rows = {row["feedforward"]: row for row in outcome.rows if row["case"] == "random"}
     cells: dict[str, dict[str, Cell]] = {}
     for name, row in rows.items():
         cells[name] = {}

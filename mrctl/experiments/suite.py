@@ -20,6 +20,7 @@ from mrctl.experiments.cases import (
     FLOOR,
     HALF,
     HINDSIGHT,
+    NO_WORSE,
     PARTS,
     SUITE_SEEDS,
     UNCHANGED,
@@ -37,7 +38,7 @@ from mrctl.loop import user_files
 from mrctl.loop.simulation import cores, simulate
 from mrctl.record import InputError
 from mrctl.results import metrics
-from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority
+from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority, wilson
 from mrctl.results.dataset import versions
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.sweep import jobs, store
@@ -217,6 +218,8 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
                 }
                 row[metric] |= row[metric].pop("last")
                 last = {one: e["last"] for one, e in errors[metric].items()}
+                if case.part == "random" and "none" in ends and name != "none":
+                    row[metric]["no_worse"] = no_worse(last[name], last["none"])
                 row[metric]["worst"] = cvar(last[name])
                 for rival in YARDSTICKS:
                     if rival in ends and rival != name:
@@ -252,6 +255,16 @@ def standing(name: str, errors: Mapping[str, NDArray[np.float64]], floor: Floor,
                 centre = np.median if median else np.mean
                 found[f"less_{titled(rival)}"] = float(centre(apart)) if len(apart) else np.nan
     return found
+
+
+def no_worse(error: NDArray[np.float64], pid: NDArray[np.float64]) -> dict[str, float]:
+    """Share of runs whose error is at most `NO_WORSE` times that of PID alone, with Wilson's 95 % interval.
+
+    A failed run, whose error is NaN, counts as worse, unless PID alone failed too.
+    """
+    share = float(np.mean((error <= NO_WORSE * pid) | np.isnan(pid)))
+    low, high = wilson(share, len(error))
+    return {"value": share, "low": low, "high": high}
 
 
 def titled(name: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from mrctl.experiments.cases import BAND, FLOOR, HALF, HINDSIGHT, PARTS, REFERENCES, UNCHANGED
+from mrctl.experiments.cases import BAND, FLOOR, HALF, HINDSIGHT, NO_WORSE, PARTS, REFERENCES, UNCHANGED
 from mrctl.experiments.tables import markdown, number
 
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
@@ -139,16 +139,20 @@ def _both_steps(rows: Sequence[Row]) -> Iterator[tuple[int, int]]:
 
 
 def last_laps(rows: Sequence[Row]) -> pd.DataFrame:
-    """The errors of the last lap, and how often each feedforward beats PID and `model`."""
+    """The errors of the last lap, and how often each feedforward beats PID and `model`.
+
+    For random scenarios also the share of them in which it does no harm, compared with PID alone.
+    """
     header = ["case", "feedforward", "failed", *(f"{title}; worst 5 %" for title in COLUMNS.values())]
     header += ["beats PID in V / θ̇ / position", "beats model", "guard acted"]
-    unchanged = rows[0]["part"] in UNCHANGED
+    unchanged, random = rows[0]["part"] in UNCHANGED, any("no_worse" in row["position_rmse"] for row in rows)
+    header += [f"at most {NO_WORSE:g}× PID in V / θ̇ / position"] if random else []
     header += [f"laps to {BAND:g}× the final V / θ̇ / position"] if unchanged else []
     cells = [
         [
             row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", *(_mean(row[m]) for m in COLUMNS),
             *(_wins(row, TITLES.get(one, one)) for one in YARDSTICKS), number(row["guard_events"]),
-            *([_converged(row)] if unchanged else []),
+            *([_harmless(row)] if random else []), *([_converged(row)] if unchanged else []),
         ]
         for row in rows
     ]  # fmt: skip
@@ -270,6 +274,13 @@ def _mean(error: Row) -> str:
 def _converged(row: Row) -> str:
     laps = [row[metric]["laps_to_converge"] for metric in COLUMNS]
     return " / ".join(f"{one['value']:.1f}" if one["samples"] else "–" for one in laps)
+
+
+def _harmless(row: Row) -> str:
+    if "no_worse" not in row["position_rmse"]:
+        return ""
+    shares = [row[metric]["no_worse"] for metric in COLUMNS]
+    return " / ".join(f"{one['value']:.3f}" for one in shares) + f" [{shares[-1]['low']:.3f}, {shares[-1]['high']:.3f}]"
 
 
 def _wins(row: Row, rival: str) -> str:

@@ -129,6 +129,8 @@ def test_table(whole: Path) -> None:
         assert row["value"] == pytest.approx(centre(own), rel=1e-12) and row["worst"] == pytest.approx(own.max())
         assert row["to_PID"]["value"] == pytest.approx(np.exp(np.log(own / bare).mean()), rel=1e-12)
         assert row["beats_PID"]["wins"] == (own < bare).sum() and found[case, "rls"]["failed"] == 0
+        if case == "random":
+            assert row["no_worse"]["value"] == pytest.approx((own <= 1.02 * bare).mean())
         assert ("laps_to_converge" in row) == (case != "random")
         if case != "random":
             laps = alone["rls"]["laps_to_converge"].mean()
