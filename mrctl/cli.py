@@ -666,7 +666,7 @@ def record(
 
     Args:
         file: Result of `mrctl run --out` or `mrctl sweep`.
-        out: File to write, which ends in .gif, or in .mp4, which needs the program ffmpeg.
+        out: File to write, which ends in .gif, or in .mp4, which needs pip install 'mrctl[video]'.
         number: Number of the run to show; by default all if there are at most four, the first one solid and the others
             as ghosts, else the first one.
     """

@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
+from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 
 import mujoco
@@ -47,18 +48,18 @@ def record(folder: Path, run: int | None, out: Path) -> None:
     Args:
         folder: Folder of a result or a sweep.
         run: Number of the one run to show; by default those that `mrctl view` shows first.
-        out: File to write, whose name ends in `.mp4` or `.gif`; MP4 needs the program ffmpeg.
+        out: File to write, whose name ends in `.mp4` or `.gif`; MP4 needs the extra `video`.
 
     Raises:
         InputError: The file exists, has another ending or cannot be written; there is no such run; MuJoCo cannot draw
-            on this machine; or ffmpeg is missing or fails.
+            on this machine; or the extra `video` is missing, or its ffmpeg fails.
     """
     if out.suffix not in SIZES:
         raise InputError(f"out: {out} ends neither in .mp4 nor in .gif")
     if out.exists():
         raise InputError(f"out: {out} exists already; nothing was overwritten")
-    if out.suffix == ".mp4" and shutil.which("ffmpeg") is None:
-        raise InputError("out: an MP4 needs the program ffmpeg, which is not installed; a name in .gif needs nothing")
+    if out.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
+        raise InputError("out: an MP4 needs pip install 'mrctl[video]'; a name in .gif needs nothing")
     library = Library(folder)
     shown = [int(k) for k in library.table.index] if run is None else [run]
     recordings = [library.recording(k) for k in (shown if len(shown) <= MAX_SHOWN else shown[:1])]
@@ -77,20 +78,17 @@ def _write_gif(pictures: Iterable[Picture], out: Path) -> None:
 
 
 def _write_mp4(pictures: Iterable[Picture], out: Path) -> None:
-    width, height = SIZES[".mp4"]
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(RATES[".mp4"]), "-i", "-"]
-    command = ["ffmpeg", "-loglevel", "error", *raw, "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(out)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdin is not None and process.stderr is not None
-        try:
-            for picture in pictures:
-                process.stdin.write(picture.tobytes())
-            process.stdin.close()
-        except BrokenPipeError:
-            pass  # ffmpeg says why
-        said = process.stderr.read().decode(errors="replace")
-    if process.returncode:
-        raise InputError(f"out: ffmpeg: {' '.join(said.split()) or process.returncode}")
+    import imageio_ffmpeg  # here, for it comes with the extra `video`
+
+    pictures = iter(pictures)
+    first = next(pictures)  # before the file is made, which stays away where MuJoCo cannot draw
+    writer = imageio_ffmpeg.write_frames(
+        str(out), SIZES[".mp4"], fps=RATES[".mp4"], ffmpeg_log_level="error", output_params=["-movflags", "+faststart"]
+    )
+    with closing(writer):
+        writer.send(None)
+        for picture in chain([first], pictures):
+            writer.send(picture)
 
 
 def _pictures(

@@ -11,6 +11,7 @@ import time
 import urllib.error
 import urllib.request
 
+import imageio_ffmpeg
 import msgspec
 import numpy as np
 import pytest
@@ -245,11 +246,13 @@ def _random_value(handle, rng):
 
 
 def test_record(tmp_path, capsys):
-    """A GIF of a result shows the robot on its way; where MuJoCo cannot draw, one line says so."""
+    """GIF and MP4 of a result show the robot on its way; where MuJoCo cannot draw, one line says so."""
     result = tmp_path / "result.zarr"
     save(simulate([Scenario(reference=Line(length=0.8), laps=1, learner="none")]), result)
-    command = [sys.executable, "-m", "mrctl.cli", "record", str(result), "--out", str(tmp_path / "run.gif")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    gif, mp4 = (["record", str(result), "--out", str(tmp_path / name)] for name in ("run.gif", "run.mp4"))
+    few = "from mrctl.viewer import video; video.RATES['.mp4'] = 5.0"  # pictures a second, for they take long to draw
+    code = f"from mrctl.cli import main; gif = main({gif}); {few}; raise SystemExit(gif or main({mp4}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
     if done.returncode:
         assert done.returncode == 2 and done.stderr.count("\n") == 1 and "EGL" in done.stderr
     else:
@@ -258,6 +261,10 @@ def test_record(tmp_path, capsys):
             first = np.asarray(video.convert("RGB"), float)
             video.seek(12)
             assert (np.abs(np.asarray(video.convert("RGB"), float) - first).max(axis=-1) > 60).sum() > 500
+        about, *pictures = imageio_ffmpeg.read_frames(tmp_path / "run.mp4")
+        assert (about["size"], about["fps"], len(pictures)) == ((1280, 720), 5, 5)
+        first, last = (np.frombuffer(pictures[k], np.uint8).reshape(-1, 3).astype(float) for k in (0, -1))
+        assert (np.abs(last - first).max(axis=-1) > 60).sum() > 2000
     (tmp_path / "there.gif").touch()
     for name in ("run.avi", "there.gif", "none/run.gif"):
         assert main(["record", str(tmp_path / "no.zarr"), "--out", str(tmp_path / name)]) == 2
