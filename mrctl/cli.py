@@ -1,4 +1,4 @@
-"""The commands of `mrctl`, whose flags tyro derives from the functions below and from the records that they take.
+"""The commands of `mrctl`; tyro derives their flags from the functions below and from the records that these take.
 
 The docstring of a field or argument is the help text of its flag.
 """
@@ -37,10 +37,13 @@ FIRST = ("name", "world", "steering", "reference", "laps", "prior", "learner", "
 FROM_FILES = ("events", "obstacles")
 """Fields of `Scenario` that have no flags, because they come from a scenario file."""
 GIVEN = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
-"""Fields of `Scenario` that are no flags of `mrctl navigate`, because the mission gives them."""
+"""Fields of `Scenario` that `mrctl navigate` has no flags for, since they come from files or from the mission."""
 
 BEST: FeedforwardName = "model+composite"
-"""Feedforward with the least errors in the README; `navigate` drives with it, and `view` shows it beside PID alone."""
+"""Feedforward with the least error under `all` in `lab` and `field`, of those in the README that do not know the plant.
+
+`navigate` drives with it, and `view` shows it beside PID alone.
+"""
 
 LAB = Sensing(tier="lab")
 DELAYS = 0.0, 0.01, 0.02  # s
@@ -53,9 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The command line without the program's name; `sys.argv` by default.
 
     Returns:
-        The exit status: 0 on success; 1 where a single run fails, jobs of a sweep were set aside, a repeated run
-        differs from its store or a robot fails a check; 2 on bad input; 130 after Ctrl-C. Except on success, one line
-        on stderr says why.
+        The exit status: 0 on success; 1 if a single run fails, a robot does not arrive or fails a check, jobs of a
+        sweep were set aside, or a repeated run differs from its store; 2 on bad input; 130 after Ctrl-C. Except on
+        success, one line on stderr says why.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if arguments == ["--version"]:
@@ -65,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         try:
             command = _parse(_written_out(arguments))
-            logging.getLogger("absl").addFilter(lambda _: False)  # warnings of failing runs, which say why they failed
+            logging.getLogger("absl").addFilter(lambda _: False)  # it warns of failing runs, whose own message says why
             try:
                 command()
             except SystemExit as stop:
@@ -146,11 +149,11 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
                 "mrctl COMMAND --help explains a command, mrctl --version prints the version.",
                 args=["--help" if argument == "--help-all" else argument for argument in arguments],
             )
-    except ValidationError as error:  # of a field of the scenario itself, which tyro lets through
+    except ValidationError as error:  # raised by the scenario itself, and passed on by tyro
         raise InputError(describe(error)) from None
     except SystemExit as stop:
         if stop.code:
-            for name in Scenario.moved:  # whose successors are known
+            for name in Scenario.moved:  # the error names what to set in its place
                 if arguments[0] == "run" and f"--{name}" in arguments:
                     Scenario.from_dict({name: ""})
             raise InputError(_one_line(complaints.getvalue())) from None
@@ -160,7 +163,7 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
 
 
 def _deferred(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
-    """Wraps a command so that its call returns the call itself, and stderr is caught only while tyro parses."""
+    """Wraps a command so that tyro, while stderr is captured, only binds its arguments; the result then runs it."""
 
     @wraps(function)
     def inner(*args: object, **kwargs: object) -> Callable[[], Any]:
@@ -188,7 +191,7 @@ def _one_line(box: str) -> str:
 
 
 def _is_short_help(arguments: Sequence[str]) -> bool:
-    """Tells whether a command line asks for the short help of a scenario; that of a reference is short in itself."""
+    """Tells whether a command line asks for the short help of a scenario; the help of a reference is always short."""
     asked = bool({"-h", "--help"} & set(arguments))
     return (
         arguments[0] in ("run", "navigate", "view") and asked and not any(a.startswith("reference:") for a in arguments)
@@ -196,12 +199,12 @@ def _is_short_help(arguments: Sequence[str]) -> bool:
 
 
 def _given(arguments: Sequence[str]) -> set[str]:
-    """Names of what a command line sets, of fields within fields the first one: `robot` of --robot.path."""
+    """Returns the fields that a command line sets; of nested ones the outermost, such as `robot` for --robot.path."""
     return {re.split("[.:=]", argument.removeprefix("--"))[0] for argument in arguments[1:]}
 
 
 def _suited(scenario: Scenario, arguments: Sequence[str], scenario_file: str | None) -> Scenario:
-    """Returns the scenario, whose reference suits the robot where a command line names a robot and no reference."""
+    """Adapts the reference of a scenario to its robot, if the command line names a robot and no reference."""
     given = _given(arguments)
     if scenario_file or "robot" not in given or "reference" in given:
         return scenario
@@ -221,7 +224,7 @@ def _part(scenario: Scenario, names: Sequence[str]) -> Record:
 
 
 def _further_flags(command: str) -> str:
-    """Lists the flags that the short help of a command leaves out, a field or group of fields each, explained."""
+    """Lists and explains the fields, or groups of fields, whose flags the short help of a command leaves out."""
     never = GIVEN if command == "navigate" else FROM_FILES
     left_out = [name for name in Scenario.model_fields if name not in (*FIRST, *never)]
     # Perturbations are what people change most.
@@ -259,7 +262,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             out: Folder for the result, the figures and the learned weights.
             json: Print JSON instead of a table.
             controller: Stages of your own, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion,feedback=...
-            number: Number of a run in the store, which is run again and compared with what is stored.
+            number: Number of a run in the store, to run again and compare with what is stored.
             code: Whether a store may run the Python files of the controller that it names.
         """
         if number is not None:
@@ -283,7 +286,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
 
 
 def _navigate_with(arguments: list[str]) -> Callable[..., None]:
-    """Returns the `navigate` command, whose short help leaves out what that of `run` does."""
+    """Returns the `navigate` command, whose short help leaves out the same fields as that of `run`."""
     names = FIRST if _is_short_help(arguments) else Scenario.model_fields
     default = Scenario() if {"prior", "learner"} & _given(arguments) else Scenario(**FEEDFORWARDS[BEST])
     part = _part(default, [name for name in names if name not in GIVEN])
@@ -305,7 +308,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         suite: bool = False,
         quick: bool = False,
     ) -> None:
-        """Plans a way among obstacles, drives it, and prints how that ended.
+        """Plans a way among obstacles, drives it, and prints how the drive ended.
 
         The exit status is 1 if the first robot does not arrive. Its controller is that of --prior and --learner, with
         the defaults of `mrctl run` where one of them is given, and model+composite where none is.
@@ -317,19 +320,19 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             goal: Pose of the goal, as x and y in m and θ in rad; by default that of the generator.
             start: Pose of the start, as x and y in m and θ in rad; by default that of the generator, or the origin.
             compare: Feedforwards of further robots, such as none or model, which drive the same plan.
-            speed: Largest speed in m/s; by default 0.9 of what the robot can.
-            margin: Clearance that the plan keeps in m.
-            avoid: What keeps the robot from obstacles that move, which the first plan does not know: nothing, a filter
-                that brakes (`barrier`), or a controller that follows the plan at its own pace and goes around what is
+            speed: Largest speed in m/s; by default 0.9 of the robot's.
+            margin: Clearance in m that the plan keeps.
+            avoid: Law that keeps the robot from obstacles that move, which the first plan does not know: none, a filter
+                that brakes (`barrier`), or a controller that follows the plan at its own pace and drives around what is
                 in the way (`window`, `mppi`).
             out: Folder for the result, the table in JSON and the figures.
             json: Print JSON instead of a table.
             view: Instead of a table, show the mission live in the browser, where further goals can be set by clicks.
             port: Number of the port to listen on, with --view.
-            suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
-                model, fel and model+composite, on three plants; it prints first how long that takes. The tables are
-                written to the folder, by default navigate_suite.
-            quick: With --suite, drive fewer draws, so few that some intervals have no end.
+            suite: Instead of one mission, find how narrow a corridor, and how fast, the robot can drive with PID,
+                model, fel and model+composite, on three plants; how long this takes is printed first. The tables are
+                written to --out, by default navigate_suite.
+            quick: With --suite, drive fewer draws; some confidence intervals then have no upper end.
         """
         from mrctl.experiments import mission, mission_suite
 
@@ -337,7 +340,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         if suite:
             taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _given(arguments)
             if taken or world or goal or start or compare or speed or avoid != "none" or json or view:
-                raise InputError("suite: has worlds, controllers and speeds of its own; give only the robot's flags")
+                raise InputError("suite: has its own worlds, controllers and speeds; give only flags of the robot")
             print(mission_suite.suite(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
             return
         if quick or not world:
@@ -450,8 +453,8 @@ def suite(
         random: Number of random scenarios; by default 30, with --quick 6, with --full 1,000 in each tier.
         quick: Run a few cases with few laps, in two minutes; the tables support no claim.
         full: Run all cases, in every tier, in hours.
-        held_out: Instead of all that, drive this one feedforward, or my_file.py:MyFeedforward, through 40 cells on
-            which nothing was ever chosen, beside model, true_model and model+observer.
+        held_out: Instead, drive this one feedforward, or my_file.py:MyFeedforward, through 40 cells that no setting was
+            chosen on, beside model, true_model and model+observer.
         workers: Number of processes on this machine; by default one for each core.
         out: Folder for report.html, the tables in Markdown and JSON, the figures and the runs; by default suite,
             suite_quick, suite_full or held_out.
@@ -507,13 +510,14 @@ def tune(
         steering: Joints of the steered wheels, at most two; by default the upright joints with an actuator.
         chassis: Body that carries the wheels; by default the one at their root.
         world: World to measure in: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file.
-        delay: Delays of the loop in s beside the sample and hold, each a multiple of the control period.
-        lag: Time constant in s of the measured velocities behind the true ones that the design assumes.
+        delay: Delays of the loop in s in addition to sample and hold, each a multiple of the control period.
+        lag: Time constant in s by which, as the design assumes, the measured velocities lag behind the true ones.
         time_constant: Time constant of the closed loop in s, for the IMC rule in place of the design.
-        search: Feedforward whose settings to search, such as model+rls, or none for the PID, or one of your own, such
-            as my_file.py:MyController, whose class says search = {"gain": (0.01, 1.0)}.
-        tier: Sensing tiers to search in, each for itself.
-        out: Folder for the table, and the measured responses and their figure or, by default under search, the runs.
+        search: Feedforward whose settings to search, such as model+rls; none for the PID; or one of your own, such as
+            my_file.py:MyController, whose class has an attribute such as search = {"gain": (0.01, 1.0)}.
+        tier: Sensing tiers to search in, each separately.
+        out: Folder for the table, the measured responses and their figure; with --search for the table and the runs, by
+            default a folder in search.
         json: Print JSON instead of a table.
     """
     from mrctl.experiments import tuning
@@ -524,7 +528,7 @@ def tune(
         given = robot, wheels, steering, chassis, world, delay, lag, time_constant
         if given != (CAR.path, (), (), "", "flat", DELAYS, 0.0, None):
             raise InputError(
-                "search: it drives the default car in worlds of its own; the flags of the design do not apply"
+                "search: drives the default car in worlds of its own; the flags of the design do not apply"
             )
         print(find(search, tier, out, json))
         return
@@ -628,8 +632,8 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
             file: Scenario file, whose values flags override, or result of `mrctl run --out` or `mrctl sweep`; by
                 default the best learner and PID alone, live.
             scenario: The scenario. A robot brings the steering and the reference that suit it, unless they are given.
-                Without --prior, --learner and --compare it is model+composite beside PID alone; with one of them the
-                defaults are those of `mrctl run`. A live session goes on after the last lap.
+                Without --prior, --learner and --compare, model+composite drives beside PID alone; with one of them,
+                the defaults are those of `mrctl run`. A live session goes on after the last lap.
             compare: Feedforwards of further robots, such as none or model+composite, which are shown as ghosts with the
                 same seed and events.
             number: Number of the run to show first, in a result or sweep.
@@ -645,7 +649,7 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
                 raise InputError(f"view: {file} has its own scenarios; flags of a scenario need a live session")
             return viewing.replay(file, compare, number, export, host, port, code)
         if number is not None:
-            raise InputError("run: only a result or a sweep has several")
+            raise InputError("run: chooses a run of a result or a sweep; a live session has none")
         scenario = _suited(scenario, arguments, scenario_file)
         viewing.live(scenario, compare if chosen else ("none",), export, host, port)
 
@@ -666,9 +670,9 @@ def record(
 
     Args:
         file: Result of `mrctl run --out` or `mrctl sweep`.
-        out: File to write, which ends in .gif, or in .mp4, which needs pip install 'mrctl[video]'.
-        number: Number of the run to show; by default all if there are at most four, the first one solid and the others
-            as ghosts, else the first one.
+        out: File to write, whose name ends in .gif, or in .mp4, which needs pip install 'mrctl[video]'.
+        number: Number of the run to show; by default up to four runs are shown together, the first one solid and the
+            others as ghosts, and of more runs only the first one.
     """
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # which mujoco reads when it is imported

@@ -39,13 +39,13 @@ class Kernel(Generic[P, T]):
     """
 
     def __init__(self, law: Callable[P, T], laws: dict[str, Kernel] | None = None) -> None:
-        """Takes the function, and kernels to call in place of the global names that it uses."""
+        """Takes the function, and kernels by the global names in it that they replace."""
         self.law, self._laws = law, laws or {}
         update_wrapper(self, law)
 
     @cached_property
     def compiled(self) -> Callable[P, T]:
-        """The compiled function; calling it saves the 0.2 µs that a call of the kernel costs more."""
+        """The compiled function; a call of it is 0.2 µs faster than a call of the kernel."""
         from numba import njit
 
         _known_to_numba()
@@ -60,7 +60,7 @@ class Kernel(Generic[P, T]):
         return njit(cache=True, nogil=True)(versioned)
 
     def _names(self) -> tuple[Any, ...]:
-        """Names of the function, and of the kernels that it calls in place of others."""
+        """Names of the function and, recursively, of the kernels that replace its global names."""
         called = sorted((name, law._names()) for name, law in self._laws.items())
         return self.law.__module__, self.law.__qualname__, called
 
@@ -105,7 +105,7 @@ def over_rows(law: Kernel, *arguments: Array | float) -> None:
 
     Args:
         law: A law that writes its results into its arguments.
-        arguments: Arrays with a leading axis of common length B; whatever has none is the same for every row.
+        arguments: Arrays with a leading axis of common length B, or scalars, which every row gets unchanged.
     """
     size = max(np.shape(a)[0] for a in arguments if np.ndim(a))
     for i in range(size):

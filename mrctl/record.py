@@ -16,8 +16,8 @@ from typing_extensions import override
 
 from mrctl import __version__
 
-LARGEST = 4 * 2**20  # bytes of a text file of settings, which takes some seconds to read
-WRITTEN_BY = "# written by mrctl "  # first line of a TOML file that `to_toml` made
+LARGEST = 4 * 2**20  # bytes, largest text file of settings; one of this size takes some seconds to read
+WRITTEN_BY = "# written by mrctl "  # how a TOML file begins that `to_toml` made
 
 
 class InputError(ValueError):
@@ -26,7 +26,7 @@ class InputError(ValueError):
 
 @contextlib.contextmanager
 def reading(path: str | Path) -> Iterator[None]:
-    """Turns whatever a library raises over a damaged file into one line that names the file.
+    """Turns any error that a library raises on a damaged file into one line that names the file.
 
     Raises:
         InputError: The file cannot be read.
@@ -35,16 +35,20 @@ def reading(path: str | Path) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except Exception as error:  # noqa: BLE001 (readers of damaged files raise errors of every kind)
+    except Exception as error:  # noqa: BLE001 (readers raise errors of every kind on damaged files)
         text = printable(f"{type(error).__name__}: {error}")
         raise InputError(f"{path}: damaged or missing: {text[:300]}") from None
 
 
 def read_file(path: str | Path, largest: int = LARGEST) -> bytes:
-    """Reads a file, which neither a pipe nor a device nor its size can make endless.
+    """Reads a regular file of limited size, so that no pipe, device or huge file blocks the program.
+
+    Args:
+        path: The file.
+        largest: Largest size in bytes.
 
     Raises:
-        InputError: It cannot be read, is no regular file, or is larger.
+        InputError: The file cannot be read, is a pipe or a device, or is too large.
     """
     try:
         found = Path(path).stat()
@@ -60,7 +64,7 @@ def read_file(path: str | Path, largest: int = LARGEST) -> bytes:
 
 
 def printable(text: str) -> str:
-    """Returns a text of somebody else as one line of at most 2,000 characters without control characters."""
+    """Returns a text from outside as one line of at most 2,000 characters without control characters."""
     words = " ".join(
         "".join(c if c.isprintable() else " " if c.isspace() else "\N{REPLACEMENT CHARACTER}" for c in text).split()
     )
@@ -75,7 +79,7 @@ class Record(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
     moved: ClassVar[dict[str, str]] = {}
-    """Fields of earlier versions, each with what takes its place."""
+    """Fields of earlier versions, each with the advice what to set in its place."""
 
     @classmethod
     @override
@@ -104,7 +108,7 @@ class Record(BaseModel):
 
     @override
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """As pydantic's, which does not validate the values; but it refuses unknown fields, as `replace` does.
+        """Copies as pydantic does, without validating values, but refuses unknown fields as `replace` does.
 
         Raises:
             InputError: A field is unknown.
@@ -128,7 +132,7 @@ class Record(BaseModel):
             return cls.model_validate(values)
         except ValidationError as error:
             raise InputError(describe(error, source)) from None
-        except OSError as error:  # of a field that names a file
+        except OSError as error:  # raised by a field that names a file
             raise InputError(printable(f"{source}: {error.filename}: {error.strerror}".removeprefix(": "))) from None
 
     @classmethod
@@ -163,7 +167,7 @@ class Record(BaseModel):
 
 
 def _toml(value: Any, nested: bool = True) -> str:  # noqa: ANN401
-    """Returns a value as TOML; numbers, booleans and strings are written as in JSON, except for one character."""
+    """Returns a value as TOML; numbers, booleans and strings are written as in JSON, and DEL is escaped."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, list) and not nested and any(isinstance(item, dict) for item in value):

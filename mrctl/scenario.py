@@ -31,7 +31,7 @@ from mrctl.theory.robot import CAR, RobotFile, Steering
 PriorName = Literal["none", "model", "true_model"]
 LearnerName = Literal["none", "observer", "indi", "l1", "fel", "rls", "mrac", "composite"]
 MODEL_BASED = ("observer", "indi", "l1")
-"""Learners that compare the robot with a model, which the prior must be."""
+"""Learners that compare the robot with a model, so that the prior must be a model."""
 
 
 def named(prior: str, learner: str) -> str:
@@ -49,9 +49,9 @@ FEEDFORWARDS: dict[FeedforwardName, dict[str, Any]] = {name: _PAIRS[name] for na
 COMPARED: tuple[FeedforwardName, ...] = tuple(
     name for name, pair in FEEDFORWARDS.items() if pair["prior"] != "none" or name in ("none", "fel")
 )
-"""Those that the tables compare: every learner from the model, and the paper's from nothing."""
+"""Feedforwards that the tables compare: all with a prior and, without one, PID alone and the paper's network."""
 LONGEST = 10_000_000
-"""Largest number of control periods in a run; the record of one takes 456 bytes."""
+"""Largest number of control periods in a run; the log takes 456 bytes for each."""
 
 Spread = Annotated[float, Field(ge=0, le=0.2)]
 
@@ -62,7 +62,7 @@ class Event(Record):
     time: Annotated[float, Field(ge=0, le=1e8)]
     """Time of the event in s; it takes effect at the first control tick that is not earlier."""
     perturbation: Perturbation | None = None
-    """Perturbation of the plant from then on, which replaces the one before."""
+    """Perturbation of the plant from then on, which replaces the previous one."""
     push: tuple[float, float, float] | None = None
     """Push on the chassis: forces along the world's x and y in N, and a torque about z in N·m."""
     push_duration: Annotated[float, Field(gt=0, le=10)] = 0.1
@@ -94,7 +94,7 @@ class Scenario(Record):
     world: str = "flat"
     """World to drive in: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file."""
     obstacles: Obstacles = Obstacles()
-    """Obstacles that stand in the world or move in it, or the path of a TOML file of them; a run ends where the robot
+    """Obstacles that stand in the world or move in it, or the path of a TOML file of them; a run ends when the robot
     touches one."""
     robot: RobotFile = CAR
     """Robot that drives; by default the world's own."""
@@ -110,7 +110,7 @@ class Scenario(Record):
     learner: LearnerName = "fel"
     """Law that adapts the feedforward, added to the prior; with `none` and prior `none` the PID is alone."""
     sensing: Sensing = Sensing()
-    """Sensors, estimator, motor driver, battery, steering servo and delay, by a tier."""
+    """Sensors, estimator, motor driver, battery, steering servo and delay, which a tier sets."""
     kanayama: Kanayama = Kanayama()
     """Gains of the motion controller, by default designed for the velocity loops."""
     pid: Pid = Pid()
@@ -122,7 +122,7 @@ class Scenario(Record):
     observer: Observer = Observer()
     """Settings of the learner `observer`."""
     learned: str | None = None
-    """File of `save_learned`, from which the learner starts; by default it has learned nothing."""
+    """File of `save_learned`, from which the learner starts; by default it starts from nothing."""
     indi: Indi = Indi()
     """Settings of the learner `indi`."""
     l1: L1 = L1()
@@ -134,15 +134,15 @@ class Scenario(Record):
     guard: Guard = Guard()
     """Settings of the guard, which limits or stops a learner that makes the loop worse."""
     perturbation: Perturbation = Perturbation()
-    """Differences of the plant from its model from the start, such as a mass factor or a payload; or the name of one of
+    """Initial differences of the plant from its model, such as a mass factor or a payload; or the name of one of
     `PERTURBATIONS`, such as `all`."""
     events: tuple[Event, ...] = ()
     """Changes during the run."""
     initial_pose: tuple[float, float, float] | None = None
     """Pose at the start: x and y in m, θ in rad; by default that of the reference."""
     goal: tuple[float, float, float] | None = None
-    """Pose at which the run ends, x and y in m, θ in rad; by default only the laps end it. It fails as `stuck`
-    where the robot moves less than 5 cm in 5 s."""
+    """Pose at which the run ends, x and y in m, θ in rad; by default only the laps end it. The run fails
+    as `stuck` if the robot moves less than 5 cm in 5 s."""
     initial_spread: tuple[Spread, Spread, Annotated[float, Field(ge=0, le=0.5)]] = (0.02, 0.02, 0.03)
     """Standard deviations of a random offset from the initial pose: x and y in m, θ in rad."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
@@ -166,9 +166,9 @@ class Scenario(Record):
         for name, perturbation in changes:
             whole(perturbation.control_delay, self.control_period, f"{name}.control_delay", "control_period")
         if self.learner in MODEL_BASED and self.prior == "none":
-            raise ValueError(f"prior: the learner {self.learner} compares the robot with a model; set model")
+            raise ValueError(f"prior: the learner {self.learner} compares the robot with a model; set prior to model")
         if self.learned and self.learner in ("none", "indi"):
-            raise ValueError(f"learned: the learner {self.learner} has nothing that a run could keep")
+            raise ValueError(f"learned: the learner {self.learner} keeps nothing that a run could start from")
         if not 1 <= self.duration / self.control_period <= LONGEST:
             raise ValueError(f"laps: a run of {self.duration:g} s is not between 1 and {LONGEST:,} control periods")
         self.sensing.check(self.control_period, self.duration)
@@ -201,14 +201,14 @@ class Scenario(Record):
 def replicates(scenario: Scenario, count: int, first: int = 0) -> list[Scenario]:
     """Returns independent repetitions of a run: each is another robot of the kind, on another day.
 
-    Two runs that differ in their noise alone are nearly copies, and say little about robots. Replicate k
-    has the seed first + k, and perturbations drawn with that seed (`Perturbation.drawn`), those of its events with the
-    same draw. The draw does not depend on the scenario, so that replicates of two scenarios are pairs.
+    Runs that differ in their noise alone are nearly copies, and say little about robots. Replicate k therefore has the
+    seed first + k, and that seed draws its perturbation and, alike, those of its events (`Perturbation.drawn`). The
+    draw does not depend on the scenario, so that replicates of two scenarios are pairs.
 
     Args:
         scenario: The run; its seed is replaced.
         count: Number of replicates.
-        first: Number of the first one, which is its seed.
+        first: Seed of the first replicate.
 
     Raises:
         InputError: A drawn perturbation is beyond its limits.

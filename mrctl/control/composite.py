@@ -50,8 +50,8 @@ SLOW = 0.1  # m/s of the faster wheel; below it the voltage depends on stiction,
 BRIEF, LASTING = 0.25, 4.0  # s over which squared innovations are averaged, to detect a change of the plant
 CHANGE = 5.0  # ratio of the brief to the lasting mean square of the innovations that shows a changed plant
 NOTHING = 1e-9  # V² or (rad/s)²; features whose φᵀ P φ is smaller explain no feedback
-# V of noise in a sample for each m/s of noise in the measured wheel speed; tuned with sensor noise of 10 mm/s and
-# 20 mrad/s behind filters of 0.03 s, at a control period of 10 ms.
+# V of noise in a sample for each m/s of noise in the measured wheel speed; tuned with noise of 10 mm/s in V and
+# 20 mrad/s in θ̇, behind filters of 0.03 s, at a control period of 10 ms.
 SCATTER = 300.0
 UNKNOWN = 6.0  # V, standard deviation of the weights of the eight features without a model
 SETTLED = 6.0  # time constants until the two filters have forgotten their initial state
@@ -79,7 +79,8 @@ class Composite(Record):
     filter: Annotated[float, Field(ge=0.01, le=2)] = 0.03
     """Time constant in s of each of the two filters on voltage and motion."""
     step: Annotated[float, Field(ge=0, le=1)] = 0.025
-    """Share of the feedback that the tracking term moves into the feedforward in each control period."""
+    """Share of the feedback that the tracking term moves into the feedforward in each control period; on a steering
+    channel a tenth of this number."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
     """Feedback in V below which the tracking term is zero; on a steering channel, a tenth of this number in rad/s."""
 
@@ -319,8 +320,8 @@ def stationary(settings: Composite, robot: Robot, rigid: bool, prior: bool) -> A
 
         P₀ = gain² c cᵀ + spread² I
 
-    A supply, a motor constant or a resistance that is not as modelled changes all coefficients in one proportion, so
-    that a few samples tell much about all of them; the second term is for all else.
+    A supply, motor constant or resistance that differs from the model changes all coefficients in one proportion, so
+    that a few samples tell much about all of them; the second term covers all other differences.
 
     Args:
         settings: The settings.
@@ -385,7 +386,7 @@ class CompositeAdaptation(Learner):
         return self.rows["a"][:, :, :INPUTS].swapaxes(1, 2).copy()
 
     def adopt(self, row: int, learned: Array) -> None:
-        """As `Learner.adopt`, without the slope and the disturbance: they belong to another place and moment."""
+        """Does as `Learner.adopt`, but leaves out slope and disturbance, which belong to another place and moment."""
         super().adopt(row, learned)
         s = self.rows[row]
         local = [*range(INPUTS, FEATURES + 1)]

@@ -88,14 +88,14 @@ def fastest(plants: list[Linear], period: float, delay: float, lag: float) -> Ga
         delay: Loop delay in s, without that of the hold.
         lag: Time constant of the measurement in s.
     """
-    from scipy.optimize import minimize_scalar  # here, for settings are read without scipy
+    from scipy.optimize import minimize_scalar  # imported here, so that settings are read without scipy
 
     frequency = np.geomspace(1e-4, 1, 500) * np.pi / period * (1 - 1e-9)
     loops = [sampled_loop(frequency, plant, Gains(1.0, 0.0), period, delay, lag) for plant in plants]
     z = np.exp(1j * frequency * period)
 
     def k_p(logarithm: float) -> float:
-        """The largest K_p where T_i has this natural logarithm."""
+        """Returns the largest K_p for the T_i with this natural logarithm."""
         control = 1 + period * z / (z - 1) / np.exp(logarithm)
         return min(_largest_gain(control * loop) for loop in loops)
 
@@ -130,8 +130,8 @@ class Motion(NamedTuple):
 
     Attributes:
         kanayama: Its gains.
-        prefilter: Time constant in s of the filter on what it adds to the reference.
-        lag: Lags in s of V and of θ̇ behind what it requests, without the prefilter.
+        prefilter: Time constant in s of the filter on the velocities that it adds to the reference.
+        lag: Lags in s of V and θ̇ behind the velocities that it requests, without the prefilter.
     """
 
     kanayama: Kanayama

@@ -9,9 +9,9 @@ from mrctl.kernel import Array, kernel
 from mrctl.theory.robot import Robot
 
 NAMES = ("V", "ω", "V̇", "ω̇", "Vω", "ω²", "sgn V_l", "sgn V_r")
-# Kernels are compiled with these sizes, so they stand in a file that holds one; see `mrctl.kernel`.
+# Kernels are compiled with these sizes, so they must stand in a file that holds kernels; see `mrctl.kernel`.
 INPUTS, OUTPUTS = 8, 2  # of the network of `fel`: the physical features, and channels
-SIGN_SPEED = 0.05  # m/s over which the smooth sign function of the friction turns
+SIGN_SPEED = 0.05  # m/s, width of the smooth sign function of the friction
 
 
 @kernel
@@ -71,8 +71,8 @@ def linear(x: Array, coefficients: Array, voltage: Array) -> None:
 def feature_scale(robot: Robot) -> Array:
     """Scales of the 8 features, `(8,)`, chosen so that each feature varies by about one on an ordinary lap.
 
-    Speeds are divided by the robot's limits, accelerations and products by a third of theirs, which is where a robot
-    spends its time, and the signs, which hardly vary, by three.
+    Speeds are divided by the robot's limits, accelerations and products by a third of theirs, because a robot is seldom
+    near them, and the signs, which hardly vary, by three.
     """
     v, omega = robot.max_speed, robot.max_rotation
     products = np.array([robot.max_acceleration, robot.max_rotation_acceleration, v * omega, omega**2]) / 3

@@ -85,7 +85,7 @@ def inverse_dynamics(command: Array, derivative: Array, prior: Row, voltage: Arr
         command: V in m/s and θ̇ in rad/s, `(2,)`.
         derivative: V̇ in m/s² and θ̈ in rad/s², `(2,)`.
         prior: A record of `PRIOR`.
-        voltage: Out: U_Σ and U_Δ in V, `(2,)`; the second is 0 under `rigid` steering, where the angle makes θ̇.
+        voltage: Out: U_Σ and U_Δ in V, `(2,)`; the second is 0 under `rigid` steering, where the fork makes θ̇.
     """
     features(command, derivative, prior.half_track, prior.ones, prior.x)
     linear(prior.x, prior.c, voltage)
@@ -93,9 +93,9 @@ def inverse_dynamics(command: Array, derivative: Array, prior: Row, voltage: Arr
 
 @kernel
 def explained(twist: Array, acceleration: Array, rigid: bool, prior: Row, voltage: Array) -> None:
-    """Writes the voltage that the prior needs for a motion of the robot, `(2,)`; a rigid fork makes θ̇ without any.
+    """Writes the voltages that, by the prior, make the robot move like this, `(2,)` in V.
 
-    What was sent to a steering channel is then compared with θ̇ itself, in rad/s.
+    Under `rigid` steering the second channel is θ̇ itself, in rad/s: the fork makes it without a voltage.
     """
     inverse_dynamics(twist, acceleration, prior, voltage)
     if rigid:
@@ -117,7 +117,7 @@ class Prior:
     """
 
     def __init__(self, robots: Sequence[Robot | None], rigid: bool) -> None:
-        """Takes for each robot that whose inverse dynamics it starts from, or None, and whether the fork makes θ̇."""
+        """Takes for each robot the model that its feedforward starts from, or None; `rigid` is as for `nominal`."""
         self._rigid = rigid
         self.rows = np.zeros(len(robots), PRIOR)
         self.rows["ones"] = 1.0
@@ -147,10 +147,10 @@ class Learner(ABC):
     Attributes:
         respond: `(i, command, derivative, robot, arrays, voltage)` writes the output of robot i to `voltage`, `(2,)`.
         learn_one: `(i, command, feedback, frozen, twist, voltage, period, robot, prior, arrays, added)` learns, writes
-            what that added to the output of robot i to `added`, `(2,)`, and returns the norm of the weights. `prior` is
+            the change of the output of robot i to `added`, `(2,)`, and returns the norm of the weights. `prior` is
             the record of `PRIOR` of robot i.
         arrays: Memory and constants of the kernels, a tuple of arrays.
-        prior: What is added to its output; at first nothing.
+        prior: The prior that is added to its output; at first nothing.
         guarded: Whether the guard watches it.
         learned: Fields of `rows` that hold what it has adapted, from which another run can start.
         weight_norm: Norm of the weights, `(B,)`.
@@ -185,7 +185,7 @@ class Learner(ABC):
         return np.concatenate([np.zeros((size, 0)), *(self.rows[name].reshape(size, -1) for name in self.learned)], 1)
 
     def adopt(self, row: int, learned: Array) -> None:
-        """Lets one robot start from what another has learned, a row of `adapted`."""
+        """Lets one robot start from what another one has learned, a row of its `adapted`."""
         start = 0
         for name in self.learned:
             place = self.rows[name][row]
@@ -193,7 +193,7 @@ class Learner(ABC):
             start += place.size
 
     def take(self, row: int, other: Learner) -> None:
-        """Copies the memory of the same stage for one robot into a row of this stage."""
+        """Copies the memory of a learner of the same kind, for one robot, into a row of this one."""
         size = len(self.weight_norm)
         self.weight_norm[row] = other.weight_norm[0]
         for mine, theirs in zip(_flat(self.arrays), _flat(other.arrays), strict=True):
@@ -274,7 +274,7 @@ def learn_all(
 
 
 class NoLearner(Learner):
-    """The learner `none`: the prior alone, or with no prior PID alone, the paper's baseline."""
+    """The learner `none`: the prior alone or, with the prior `none`, PID alone, which is the paper's baseline."""
 
     respond, learn_one, guarded = nothing, learn_nothing, False
     arrays = ()

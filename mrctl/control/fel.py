@@ -35,18 +35,20 @@ class Fel(Record):
     hidden: Annotated[int, Field(ge=1, le=256)] = 24
     """Number of hidden tanh units."""
     step: Annotated[float, Field(ge=0, le=1)] = 0.01
-    """Normalised step μ: share of the feedback voltage that one control period moves into the feedforward. The default
-    is what `mrctl tune --search` found in `lab`, with and without the model as prior."""
+    """Normalised step μ: share of the feedback voltage that one control period moves into the feedforward; on a
+    steering channel a tenth of this number. The default is what `mrctl tune --search` found in `lab`, with and without
+    the model as prior."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.03
     """Feedback in V below which nothing is learned; on a steering channel, a tenth of this number in rad/s."""
     leak: Annotated[float, Field(ge=0, le=0.1)] = 1e-6
-    """Share of the distance to the initial weights that the weights go back in each control period."""
+    """Share of the distance to the initial weights that the weights go back with each step of learning."""
     weight_bound: Annotated[float, Field(gt=0, le=1e4)] = 30.0
-    """Largest Euclidean distance of the weights from the initial ones, dimensionless; it is kept by projection."""
+    """Largest Euclidean distance of the weights from the initial ones, dimensionless; a projection keeps it."""
     output_scale: Annotated[float, Field(gt=0, le=100)] = 6.0
     """Feedforward in V for a network output of one; on a steering channel, a tenth of this number in rad/s."""
     weights: str | None = None
-    """File of initial weights, `.safetensors` or a torch state dict; by default only the hidden layer is not zero."""
+    """File of initial weights, `.safetensors` or a torch state dict; by default the hidden layer is random, the rest
+    zero."""
     frozen: bool = False
     """Whether the weights stay as they are, so that nothing is learned."""
 
@@ -57,7 +59,7 @@ FEL = np.dtype(
         ("dead_zone", "f8", OUTPUTS),  # feedback below which nothing is learned, V (rad/s)
         ("share", "f8", OUTPUTS),  # factor on the step in the two channels; a steering channel learns more slowly
         ("step", "f8"),  # μ; 0 keeps the weights as they are
-        ("leak", "f8"),  # share of W − W₀ that is subtracted each period
+        ("leak", "f8"),  # share of W − W₀ that is subtracted with each step
         ("bound", "f8"),  # largest ‖W − W₀‖
         ("x", "f8", INPUTS),  # scaled features of the commanded motion
         ("output", "f8", OUTPUTS),  # feedforward at x, V (rad/s)

@@ -17,7 +17,7 @@ from mrctl.theory.robot import Robot
 
 
 class Network(nn.Module):
-    """The network of `fel` in torch, with the same weights: 8 scaled features in, 2 channels without scale out."""
+    """The network of `fel` in torch, with the same weights: it maps 8 scaled features to 2 unscaled channels."""
 
     def __init__(self, hidden: int = 24) -> None:
         """Takes the number of hidden units; the layers behind them start at zero."""

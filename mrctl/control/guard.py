@@ -3,8 +3,8 @@
 This is the simplex architecture (Seto, Krogh, Sha and Chutinan 1998): a controller that may be wrong has full authority
 as long as the state is one from which a trusted one, here PID and nominal model, recovers. Let d be the deviation of a
 channel, d = authority · (learner − model), e the error of its velocity, and ρ the posture error. The region of recovery
-is |e| ≤ ē, ρ ≤ ρ̄ = 0.15 m. A learner is to blame for an error if its |d| exceeded D in the last second, and for an
-oscillation if it exceeded a quarter of D:
+is |e| ≤ ē, ρ ≤ ρ̄ = 0.15 m. A learner is to blame for an error if the peak of its |d|, which decays with a time constant
+of 1 s, exceeds D, and for an oscillation if it exceeds a quarter of D:
 
     D = min(ē/‖G_e‖₁, ρ̄/‖G_ρ‖₁)        ‖G‖₁: peak-to-peak gains of the designed loops from a voltage (`rejection`)
 
@@ -16,7 +16,7 @@ oscillation if it exceeded a quarter of D:
 
 After a hold of 1 s the learner, reset to its initial weights, resumes, and its authority grows from 0 again in 5 s.
 Each further time the hold is three times as long. After an oscillation, and from the second time on, the gain of
-learning is a third and that growth three times as long.
+learning is a third of the one before, and the authority grows three times as slowly.
 
 **What it guarantees.**
 
@@ -24,8 +24,8 @@ learning is a third and that growth three times as long.
    The guard leaves such a learner alone, unless the loop oscillates.
 2. |d| > D: it ends in the tick in which an error leaves the region. Until then the errors are inside.
 3. From then on PID and model act alone; the PID's integral starts within D of the model, and the rest of the step in
-   voltage, which fades, is within D too. From any such state the position error stays below a bound that the loops
-   give (`recovery`, which takes that rest for a part of the integral): 0.16 to 0.19 m for the default robot.
+   voltage, which fades, is within D too. From any such state the position error stays below a bound that the loops give
+   (`recovery`, which counts the rest of the step as a part of the integral): 0.16 to 0.19 m for the default robot.
 
 The bounds are those of the linear loops that the PID was designed for; the limits of voltage and acceleration, and what
 happens within the loop's delay, add to them. `tests/system/test_adversaries.py` drives against the worst learners.
@@ -55,7 +55,7 @@ SMOOTH, DRIFT = 0.01, 0.3  # s, time constants of the filters that remove noise 
 SLOWEST = 1.0  # s, longest half-wave
 SUSTAINED = 16  # half-waves in a row
 
-RECENT = 1.0  # s for which a deviation may be to blame for an error
+RECENT = 1.0  # s, time constant with which the peak of a deviation decays
 MEAN = 0.5  # s over which voltages are averaged before the integral takes them over; a few periods of an oscillation
 RETURN = 5.0  # s in which a learner that resumes at full gain gets its authority back
 APART = 0.15  # m of posture error that are always tolerated; a run fails at 1 m
@@ -79,9 +79,9 @@ class Guard(Record):
     """Largest errors of V and θ̇, as a share of the robot's largest ones, with which a learner may go on; at least
     0.27 m/s and 0.75 rad/s."""
     oscillation: Annotated[float, Field(gt=0, le=1)] = 0.25
-    """Amplitude of the PID's output, as a share of D, below which an oscillation is ignored."""
+    """Share of D by which the PID's output must swing, and the learner deviate, for an oscillation to count."""
     growth: Annotated[float, Field(ge=1, le=100)] = 3.0
-    """Factor by which the posture error may exceed the smallest one so far, if that is more than 0.15 m."""
+    """Factor by which the posture error may exceed the smallest one so far; 0.15 m are tolerated in any case."""
     hold: Annotated[float, Field(gt=0, le=100)] = 1.0
     """Shortest duration of the first fallback in s; each later one lasts three times as long as the last."""
     retries: Annotated[int, Field(ge=0, le=20)] = 4
@@ -114,7 +114,7 @@ GUARD = np.dtype(
         ("half_wave_time", "f8", 2),  # its duration so far, s
         ("waves", "f8", 2),  # consecutive half-waves above the threshold
         # What is compared with a bound
-        ("deviation", "f8", 2),  # largest deviation from the fallback in the recent past, V
+        ("deviation", "f8", 2),  # peak of the deviation from the fallback, which decays, V (rad/s)
         ("nearest", "f8"),  # smallest posture error so far, m
         ("model_error", "f8", 2),  # mean of the voltage sent less that of the nominal model, V
         # Decisions
@@ -175,7 +175,7 @@ def guard(
     """One tick of the guard of one robot, between the feedforward stage and the allocation.
 
     - fallback: the nominal inverse dynamics replaces the learner. The integral starts from the mean error of the model,
-      so that the step in voltage is small; what is left of it fades. The learner is reset to its initial weights.
+      so that the step in voltage is small; the rest of the step fades. The learner is reset to its initial weights.
     - resume: the learner returns after the hold, once nothing is wrong, each time with less gain and after a longer
       hold. Its share of the output, the authority, grows from 0 to 1 as slowly as it learns; the rest is the
       fallback's. After `retries` the fallback stays.
@@ -203,8 +203,8 @@ def guard(
     broken, g.broken = g.broken, False
     for k in range(2):
         broken |= not np.isfinite(feedforward[k])
-    if not broken:  # otherwise the last output remains, from which the fallback starts
-        for k in range(2):  # as the voltage is limited; U_r,l = U_Σ ± U_Δ
+    if not broken:  # otherwise `limited` keeps its last values, from which the fallback starts
+        for k in range(2):  # as the voltage of each motor is limited; U_r,l = U_Σ ± U_Δ
             demand = abs(feedforward[k]) if rigid else abs(feedforward[0]) + abs(feedforward[1])
             g.limited[k] = feedforward[k] * (g.range[k] / max(g.range[k], demand))
     for k in range(2):
@@ -253,7 +253,7 @@ def count_half_waves(g: Row, k: int, value: float, period: float) -> None:
 def worst_trouble(g: Row, broken: bool, error: Array, command: Array, twist: Array) -> int:
     """Returns the reason of the worst trouble now, an index into `REASONS`; 0 if nothing is wrong.
 
-    It is the learner's only if the learner has deviated so much that it can have caused it.
+    While the learner acts, trouble counts only if the learner deviated so far that it may have caused it.
     """
     posture = np.hypot(np.hypot(error[0], error[1]), ARM * error[2])
     g.nearest = min(g.nearest, posture)

@@ -20,10 +20,10 @@ the prior says about f at the commanded motion by what was measured,
     U = [M ẋ_c + f̂(x_c)] + PID + [H (U − M ẋ) − f̂(x_c)]
 
 The first bracket is the prior, the last one is this stage. `observer` keeps f̂ of the model and adds the measured
-difference from it; INDI drops f̂, so that a wrong model of back-EMF, friction or coupling has no effect, and pays with
-a lag of about 2 T + L' in f, which the PID must correct. With a slow PID (λ = 0.15 s, `lab`, nominal robot) the
-position error is 13 mm with INDI and 2.5 mm with the model alone. The PID stays as it is: for a plant ẋ = ν, PI
-control gives e a second-order response, M ë + K_p ė + K_i e = 0, whose integral holds what a wrong M leaves.
+difference from it; INDI drops f̂, so that a wrong model of back-EMF, friction or coupling has no effect, and its price
+is a lag of about 2 T + L' in f, which the PID must correct. With a slow PID (λ = 0.15 s, `lab`, nominal robot) the
+position error is 13 mm with INDI and 2.5 mm with the model alone. The PID stays as it is: for a plant ẋ = ν, PI control
+gives e a second-order response, M ë + K_p ė + K_i e = 0, whose integral holds what a wrong M leaves.
 
 For P = 1/(M s), a plant without f, and a PID C that acts L later, the loop opened at the voltage is
 
@@ -156,7 +156,7 @@ class IncrementalInversion(Learner):
         self.arrays = self.rows, queues(len(settings), delay)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Forgets what was measured of the robots with these indices."""
+        """Resets the filters and queues of the robots with these indices."""
         for name in ("matched", "once", "twice", "started"):
             self.rows[name][rows] = np.zeros((), INDI[name])
         self.arrays[1][rows] = 0.0

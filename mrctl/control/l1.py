@@ -43,8 +43,8 @@ class L1(Record):
     """Settings of the learner `l1`."""
 
     bandwidth: Annotated[float, Field(gt=0, le=200)] = 4.0
-    """Bandwidth of the low-pass C in rad/s. `mrctl tune --search` found that in `lab` all up to 4 rad/s are equal
-    within 1 %; the default is the fastest of them."""
+    """Bandwidth of the low-pass C in rad/s. `mrctl tune --search` found that in `lab` all bandwidths up to 4 rad/s are
+    equal within 1 %; the default is the largest of them."""
     predictor: Annotated[float, Field(gt=0, le=200)] = 5.0
     """Rate a in 1/s with which the predictor's error decays by itself."""
 
@@ -162,7 +162,7 @@ class L1Adaptive(Learner):
         self.arrays = rows, queues(len(settings), delay)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
-        """Forgets what was estimated of the robots with these indices."""
+        """Resets predictor, adaptation and queues of the robots with these indices."""
         for name in ("matched", "predicted", "sigma", "filtered"):
             self.rows[name][rows] = np.zeros((), PREDICTOR[name])
         self.arrays[1][rows] = 0.0

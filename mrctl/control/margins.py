@@ -44,14 +44,14 @@ def sampled_loop(
 
 
 class Margins(NamedTuple):
-    """Bandwidth and margins of one loop; NaN where the loop gain is below one from the lowest frequency on.
+    """Bandwidth and margins of one loop.
 
     Attributes:
-        crossover: Gain crossover in rad/s.
+        crossover: Gain crossover in rad/s; NaN, as phase and delay, where the loop gain does not fall through one.
         phase: Phase margin in degrees.
         gain: Gain margin as a factor; infinite if the phase never reaches −180°.
         delay: Delay margin in s.
-        bandwidth: Frequency in rad/s above which the closed loop passes less than 1/√2.
+        bandwidth: Frequency in rad/s at which the gain of the closed loop falls through 1/√2; NaN where it does not.
         sensitivity: M_s = max |S| with S = 1/(1 + L), the reciprocal of the least distance of L from −1.
     """
 

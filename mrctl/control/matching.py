@@ -1,4 +1,4 @@
-"""The voltage and the motion that belong together: laws that compare the two must know which voltage made which motion.
+"""Matching of voltage and motion: a law that compares the two must know which voltage made which motion.
 
 A voltage acts d control periods after it was computed, d being the delay of the sensing tier, and it is held for one
 period. The controllers receive the motion predicted to the moment when the coming voltage acts (`mrctl.sensing`):
@@ -30,7 +30,7 @@ MATCHED = np.dtype(
 
 
 def queues(size: int, delay: int) -> Array:
-    """Returns room for what `match` keeps of each robot, `(B, delay + 1, 4)`; the delay is in control periods."""
+    """Returns empty queues for `match`, `(B, delay + 1, 4)`; the delay is in control periods."""
     return np.zeros((size, delay + 1, 4))
 
 
@@ -47,7 +47,7 @@ def match(twist: Array, derivative: Array, sent: Array, period: float, queue: Ar
         s: In and out: a record of `MATCHED`, whose `twist`, `last`, `rate` and `acted` are the result.
 
     Returns:
-        Whether a voltage is known that acted in that period; it is not in the first d + 1 ticks.
+        Whether the voltage that acted in that period is known; in the first d + 1 ticks it is not.
     """
     size = len(queue)
     oldest = s.tick % size

@@ -43,8 +43,8 @@ in U_Σ. Forward, the feedback is stronger where l |ω_c| < 2 √(K_V D K_ω); f
 s < 29 V s at the most.
 
 The law is sampled; one period changes V by O(h²) beyond the theorem, which the test measures. As the theorem demands,
-learning hands nothing over to the PID's integral. `hand_over` does so as in the other learners: then the first lap from
-the prior `none` is better, and V may grow.
+learning takes nothing over from the PID's integral; with `hand_over` it does, as the other learners do: the first lap
+from the prior `none` is then better, and V may grow.
 
 Beyond the theorem there are noise, delay, the fork and slip. `match` gives the prediction error the voltage that acted.
 Nothing is learned while a limit acts or a wheel slips (`frozen`), or near rest, where stiction is no function of the
@@ -77,8 +77,8 @@ class Mrac(Record):
     """Settings of the learner `mrac`; one setting serves every robot, steering and perturbation.
 
     They were chosen on a circle, a rounded square, the lemniscate and three random splines, in `lab`. The position
-    error of the last of three laps changes by at most 4 % when any one of the first four, or the filter, is changed by
-    a factor of 2 to 5.
+    error of the last of three laps changes by at most 4 % when one of `noise`, `memory`, `spread`, `tracking` and
+    `filter` is changed by a factor of 2 to 5.
     """
 
     noise: Annotated[float, Field(gt=0, le=10)] = 0.02
@@ -91,7 +91,8 @@ class Mrac(Record):
     """Weight η of the tracking error in 1/(V² s), per volt of back-EMF of that error."""
     radius: Annotated[float, Field(gt=0, le=10)] = 1.0
     """Distance R of the scaled parameters of a channel from those of the prior, beyond which they leak back, as a share
-    of the supply (of a tenth of that number in rad/s on a steering channel); the projection acts at twice of it."""
+    of the supply (of a tenth of that number in rad/s on a steering channel); the projection acts at twice that
+    distance."""
     leak: Annotated[float, Field(ge=0, le=1e3)] = 0.1
     """Leak σ₀ in 1/(V² s) at twice that distance."""
     filter: Annotated[float, Field(ge=0.005, le=2)] = 0.03

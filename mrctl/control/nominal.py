@@ -1,4 +1,4 @@
-"""The nominal robot as the laws read it: one record of the parameters of equations (1) to (3)."""
+"""The nominal robot for the compiled laws: one record of parameters of equations (1) to (3)."""
 
 from __future__ import annotations
 

@@ -34,9 +34,9 @@ class Observer(Record):
     """Settings of the learner `observer`."""
 
     time_constant: Annotated[float, Field(ge=0.02, le=10)] = 0.35
-    """Time constant T of the filter Q in s. `mrctl tune --search` found that in `lab` all from 0.35 s on are equal
-    within 1 %; the default is the shortest of them. With λ = 0.15 s and exact measurements 0.055 s would do: that keeps
-    the sensitivity below 2 with a delay of 20 ms."""
+    """Time constant T of the filter Q in s. `mrctl tune --search` found that in `lab` all values from 0.35 s on are
+    equal within 1 %; the default is the shortest of them. With λ = 0.15 s and exact measurements 0.055 s would do: that
+    keeps the sensitivity below 2 with a delay of 20 ms."""
 
 
 OBSERVER = np.dtype(

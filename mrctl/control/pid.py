@@ -60,7 +60,7 @@ def pid(command: Array, twist: Array, excess: Array, period: float, s: Row, feed
 
 
 class Pid(Record):
-    """Settings of the velocity PID: gains as large as its delay allows, or by the IMC rule where λ is given."""
+    """Settings of the velocity PID; its gains are as large as the delay allows, or follow the IMC rule with a λ."""
 
     time_constant: Annotated[float, Field(ge=0.03, le=2)] | None = None
     """Closed-loop time constant λ of both channels in s, with which the IMC rule sets K_p = τ/(K λ) and K_i = 1/(K λ)
@@ -68,7 +68,7 @@ class Pid(Record):
     delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] | None = None
     """Delay from measurement to voltage in s that the design of the gains assumes; by default that of `sensing`."""
     lag: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """Time constant in s of the measured velocities behind the true ones that the design of the gains assumes."""
+    """Time constant in s by which, as the design assumes, the measured velocities lag behind the true ones."""
     derivative_time: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Derivative time K_d/K_p in s; none by default, as the gains are designed for PI control."""
     derivative_filter: Annotated[float, Field(ge=0.005, le=1)] = 0.03
@@ -88,7 +88,7 @@ class Pid(Record):
         Args:
             robot: The nominal robot in its steering arrangement.
             rigid: Whether the second channel is steering.
-            delay: Delay from measurement to voltage in s, unless `delay` is set.
+            delay: Delay from measurement to voltage in s, for a record whose field `delay` is not set.
             period: Control period in s.
         """
         common, second = self.channels(robot, rigid, delay, period)

@@ -1,4 +1,4 @@
-"""What the feedback rejects: peak-to-peak gains from a voltage to the errors of the closed loops.
+"""Disturbance rejection of the feedback: peak-to-peak gains from a voltage to the errors of the closed loops.
 
 A disturbance d of a channel's voltage that never exceeds D causes an error e that never exceeds ‖G‖₁ D, where ‖G‖₁ is
 the sum of |g| over the response g of the error to a pulse of one period. No smaller bound holds for all d: sign(g),
@@ -30,9 +30,10 @@ class Peaks(NamedTuple):
     """Peak-to-peak gains of a channel, or the largest errors that follow from given initial errors.
 
     Attributes:
-        velocity: From V (rad/s on a steering channel) to the error of the velocity for the same command, in m/s or
-            rad/s.
-        position: From the same to the longitudinal or lateral error in m; infinite where the loop is unstable.
+        velocity: From a disturbance in V (rad/s on a steering channel) to the error of the velocity for the same
+            command, in m/s or rad/s.
+        position: From that disturbance to the longitudinal or lateral error in m. Both are infinite where the loop is
+            unstable.
     """
 
     velocity: float
@@ -113,8 +114,8 @@ class Loop:
 
     Attributes:
         step: Matrix from the state of one tick to that of the next; the state is that of the plant, the integral, the
-            filtered correction, one or two posture errors, and the voltages under way.
-        pulse: State after a disturbance of one for one period.
+            filtered correction, one or two posture errors, and the queue of delayed voltages.
+        pulse: State after a disturbance of one unit that lasts one period.
         errors: Rows that give the velocity error and the position error of a state.
         state: Index of the velocity, the integral, the position error and the heading error in the state, by name.
     """
@@ -123,7 +124,7 @@ class Loop:
         self, robot: Robot, rigid: bool, channel: int, plant: Linear, gains: Gains, motion: Motion, share: float,
         delay: float, period: float,
     ) -> None:  # fmt: skip
-        """Wires it; see `rejection`, and `share` is that of the largest speed."""
+        """Wires the loop of one channel; the arguments are as for `rejection`, at a share of the largest speed."""
         n, late, held = len(plant.b), round(delay / period), plant.held(period)
         k, speed = motion.kanayama, share * robot.max_speed
         k_x, k_y, k_theta = float(k.k_x or 0), float(k.k_y or 0), float(k.k_theta or 0)
@@ -132,7 +133,7 @@ class Loop:
             (robot.velocity_gain, robot.velocity_time_constant),
             (robot.rotation_gain, robot.rotation_time_constant),
         )[channel]
-        size = n + 5 + late  # plant, integral, correction, velocity error, position, heading, voltages under way
+        size = n + 5 + late  # plant, integral, correction, velocity error, position, heading, queued voltages
         i, c, e, p, h, u = n, n + 1, n + 2, n + 3, n + 4, n + 5
 
         def after(s: NDArray[np.float64], disturbance: float) -> NDArray[np.float64]:

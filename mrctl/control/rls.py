@@ -17,7 +17,7 @@ from mrctl.theory.robot import Robot
 RLS = np.dtype(
     [
         ("step", "f8"),  # largest share of the feedback that one period moves into the feedforward
-        ("drift", "f8"),  # variance that a coefficient gains each period
+        ("drift", "f8"),  # variance that a coefficient gains with each step
         ("bound", "f8"),  # diagonal element of P above which it gains no more
         ("dead_zone", "f8"),  # feedback below which nothing is learned, V (rad/s on a steering channel)
         ("share", "f8", 2),  # factor on the gain in the two channels; a steering channel learns more slowly
@@ -70,12 +70,12 @@ class Rls(Record):
     """Settings of the learner `rls`."""
 
     step: Annotated[float, Field(gt=0, le=1)] = 0.02
-    """Largest share of the feedback that one control period moves into the feedforward. With a larger one, the
+    """Largest share of the feedback that one control period moves into the feedforward. With a larger share, the
     adaptation is a second integral action that is fast enough to make the loop oscillate."""
     initial_covariance: Annotated[float, Field(gt=0, le=1e3)] = 0.2
     """Diagonal of the initial covariance of the coefficients, as a ratio to the variance of the feedback."""
     drift: Annotated[float, Field(ge=0, le=1)] = 3e-5
-    """Variance that every coefficient gains in each control period, as a ratio to the variance of the feedback; it
+    """Variance that every coefficient gains with each step of learning, as a ratio to the variance of the feedback; it
     states how fast the true coefficients wander."""
     covariance_bound: Annotated[float, Field(gt=0, le=1e3)] = 0.2
     """Ratio of a diagonal element of the covariance to the variance of the feedback, above which that element gains no

@@ -1,9 +1,9 @@
 """The stages of figure 3 that a user can replace, with the estimator before them, and the methods that each needs.
 
-A stage serves B robots: arrays have a leading axis B, one row for each robot. A factory makes it, which is called with
-the nominal robot and B. Its two methods receive copies, NumPy arrays of float64, and may return NumPy arrays or torch
-tensors. `mrctl.simulate(…, motion=, feedback=, feedforward=, steering=, estimator=)` takes the factories. The limits
-and the prefilter of the command, the limits of voltage and steering angle, and the guard on the feedforward still act.
+A stage serves B robots: arrays have a leading axis B, one row for each robot. A factory, called with the nominal robot
+and B, makes it. Its two methods receive copies, NumPy arrays of float64, and may return NumPy arrays or torch tensors.
+`mrctl.simulate(…, motion=, feedback=, feedforward=, steering=, estimator=)` takes the factories. The limits and the
+prefilter of the command, the limits of voltage and steering angle, and the guard on the feedforward still act.
 
 Estimated posture and twist are predicted over the delay of the sensing tier, to the time at which the voltage of the
 tick reaches the motors; the reference is that of the same time.
@@ -55,7 +55,7 @@ class Motion(Protocol):
 
 
 class Feedback(Protocol):
-    """The velocity controller without its feedforward, which is called once in a control period.
+    """The velocity controller without its feedforward; it is called once in a control period.
 
     It may have a member `integral`, a float64 array `(B, 2)`. The hierarchy then subtracts from it a share of what a
     learner adds to the feedforward, and the guard sets it at the beginning of a fallback.
@@ -76,8 +76,8 @@ class Feedback(Protocol):
         Args:
             command: Commanded V in m/s and θ̇ in rad/s, after limits and prefilter, `(B, 2)`.
             twist: Estimated V in m/s and θ̇ in rad/s, `(B, 2)`.
-            excess: Last sum of feedback and feedforward after the limits less that before them, for anti-windup, in the
-                units of the output, `(B, 2)`.
+            excess: Sum of feedback and feedforward in the last period after the limits less that before them, for
+                anti-windup, in the units of the output, `(B, 2)`.
 
         Returns:
             U_Σ and U_Δ in V, `(B, 2)`; under `rigid` steering the second channel is a correction of θ̇ in rad/s.
@@ -114,8 +114,8 @@ class Steering(Protocol):
 class Estimator(Protocol):
     """The estimator of posture and twist, which is called once in a control period.
 
-    Its estimate is predicted to the time at which the voltage of the period acts. Where it returns a number that is not
-    finite, odometry continues from the last estimate of that robot; `estimator_fault` of the result names the first
+    Its estimate is predicted to the time at which the voltage of the period acts. If the estimate of a robot is not
+    finite, odometry continues from its last estimate; `estimator_fault` of the result names the first
     such tick.
     """
 
@@ -150,7 +150,7 @@ Factory = Callable[[Robot, int], Stage]
 
 
 class Stages(TypedDict, total=False):
-    """Factories of a user's own stages, by the name of the stage that they replace."""
+    """Factories of a user's own stages, by the names of the stages that they replace."""
 
     motion: Factory[Motion] | None
     feedback: Factory[Feedback] | None

@@ -17,7 +17,7 @@ ALLOCATION = np.dtype(
         ("feedforward", "f8", 2),  # part from feedforward, V; it includes the differential of `rigid` steering
         ("command", "f8", 4),  # voltages left and right in V, steering angle in rad, steering rate in rad/s
         ("excess", "f8", 2),  # the two channels after the limits less before them, V (rad/s on a steering channel)
-        ("saturated", "?"),  # whether a limit acted
+        ("saturated", "?"),  # whether a limit of voltage or current acted, or under `rigid` steering one of the angle
     ],
     align=True,
 )
@@ -116,7 +116,7 @@ def allocate(
 
 @kernel
 def take_loss(lost: Array, rigid: bool, s: Row) -> None:
-    """Counts what the drivers' current limits took in the last period as excess, as if it were taken in this one too.
+    """Adds the voltage that the drivers' current limits took in the last period to the excess of this one.
 
     A driver reports its limit one period late. Back-calculation then unwinds the integral of the PID, and a learner
     does not learn.

@@ -1,4 +1,4 @@
 """The closed loop of figure 3: the hierarchy of controllers, a user's own stages, and the simulation.
 
-Imports everything below it: theory, control, sensing, physics, `mrctl.scenario` and results.
+Imports theory, control, sensing, physics, `mrctl.scenario` and results.
 """

@@ -1,4 +1,4 @@
-"""The references that the robots follow: those of a group of scenarios, sampled at each control tick."""
+"""The references of a group of scenarios, sampled at each control tick."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Courses:
     """The references of a uniform group of scenarios; robots with the same reference share its samples."""
 
     def __init__(self, scenarios: Sequence[Scenario], lead: int = 0) -> None:
-        """Takes the scenario of each robot, and the largest number of control ticks `ahead` of `at`."""
+        """Takes the scenario of each robot, and the largest argument `ahead` of `at`, in control ticks."""
         self._ticks, self._lead = max(s.ticks for s in scenarios), lead
         self._courses, self._place = distinct_courses(scenarios)
         self._own = len(self._courses) == len(scenarios)  # whether no two robots share a course

@@ -17,7 +17,7 @@ class Events:
     """The events of a group of runs, by control tick; changes of the reference are in `Courses` instead."""
 
     def __init__(self, scenarios: Sequence[Scenario], plant: Plant, hierarchy: Hierarchy, period: float) -> None:
-        """Perturbs the robots as their scenarios say, and schedules their events.
+        """Perturbs the robots as their scenarios demand, and schedules their events.
 
         Args:
             scenarios: Scenario of each robot.
@@ -41,7 +41,10 @@ class Events:
         self._schedule[event.tick(self._period)] += enumerate([event] * self._plant.size)
 
     def restart(self, row: int, scenario: Scenario, tick: int) -> None:
-        """Schedules the events of a new scenario for one robot, whose time begins at this tick."""
+        """Schedules the events of a new scenario for one robot, whose time begins at this tick.
+
+        If some of them perturb the plant, the perturbation of the scenario itself is applied anew.
+        """
         coming = {t: [e for e in entries if e[0] != row] for t, entries in self._schedule.items() if t >= tick}
         self._schedule = defaultdict(list, coming)
         self._enter(row, scenario, tick)

@@ -11,7 +11,7 @@ from mrctl.kernel import Array, Rows
 from mrctl.scenario import Scenario
 
 NEAR, TURNED, RESTING = 0.1, 0.2, 0.05  # m, rad and m/s, within which a robot has arrived
-HEADWAY, STUCK = 0.05, 5.0  # m by which a robot gets away, in any direction, within so many s, or it is stuck
+HEADWAY, STUCK = 0.05, 5.0  # m and s: a robot that moves no farther than that within this time is stuck
 
 
 def arrived(pose: Array, v: ArrayLike, goal: Array) -> NDArray[np.bool]:
@@ -31,14 +31,14 @@ class Goals:
     """The goals of a group of runs."""
 
     def __init__(self, scenarios: Sequence[Scenario], timed: bool = True) -> None:
-        """Takes the scenario of each robot, and whether runs end that are shorter than the longest."""
+        """Takes the scenario of each robot, and whether a run that is shorter than the longest one ends by itself."""
         none = (np.nan, np.nan, np.nan)
         self._goals = np.array([none if s.goal is None else s.goal for s in scenarios])
         self.any = bool(np.isfinite(self._goals).any())
         ticks = np.array([s.ticks for s in scenarios])
-        self._ticks = np.where(timed & (ticks < ticks.max()), ticks, np.inf)  # of those that end before the group does
+        self._ticks = np.where(timed & (ticks < ticks.max()), ticks, np.inf)  # of runs that end before the group does
         self._patience = round(STUCK / scenarios[0].control_period)
-        self._place = np.full((len(scenarios), 2), np.inf)  # where each robot was when it last got farther
+        self._place = np.full((len(scenarios), 2), np.inf)  # m, where each robot last made headway
         self._start = np.zeros(len(scenarios), int)
         self._since = np.zeros(len(scenarios), int)
 
@@ -47,11 +47,11 @@ class Goals:
         self._place[row], self._start[row] = np.inf, tick
 
     def ended(self, tick: int, now: Rows) -> dict[int, str]:
-        """Returns the robots whose runs end, each with why it failed: `stuck`, or "" at a goal or after a last tick.
+        """Returns the robots whose runs end, each with the reason of its failure: `stuck`, or "" where it did not fail.
 
         Args:
             tick: The control tick.
-            now: Record of `TICK` of each robot at it, `(B,)`; NaN for one whose run has ended.
+            now: Record of `TICK` of each robot at this tick, `(B,)`; NaN for a robot whose run has ended.
         """
         x, y = now["x"], now["y"]
         farther = np.hypot(x - self._place[:, 0], y - self._place[:, 1]) > HEADWAY

@@ -1,4 +1,4 @@
-"""The paper's figure 3: motion controller over velocity controller, wired for B robots.
+"""The hierarchy of the paper's figure 3: motion controller over velocity controller, for B robots.
 
     reference, posture → Kanayama → limiter, prefilter → PID + feedforward → guard → allocation → voltages, steering
 
@@ -142,7 +142,7 @@ def update(
         control: In and out: record of `CONTROL` of each robot.
 
     Returns:
-        Whether all voltages are finite, and whether a guard wants a learner to be reset.
+        Whether all voltages are finite, and whether a guard demands that a learner is reset.
     """
     finite, forget = True, False
     for i in range(len(control)):
@@ -203,7 +203,7 @@ class Hierarchy:
 
     Attributes:
         learner: The learner, or a user's feedforward stage in its place.
-        prior: What the feedforward starts from, beside the learner.
+        prior: The prior of the feedforward, whose output is added to that of the learner.
         state: Record of `CONTROL` of each robot, `(B,)`; the following arrays are views of it.
         command: Commanded V in m/s and θ̇ in rad/s, after prefilter and limits, `(B, 2)`.
         derivative: Its derivative in m/s² and rad/s², `(B, 2)`.
@@ -225,14 +225,14 @@ class Hierarchy:
         first, size = scenarios[0], len(scenarios)
         self._robot, self._rigid = robot, first.steering == "rigid"
         self.learner: Learner | Feedforward = learner_of(scenarios, robot) if feedforward is None else feedforward
-        self.prior = Prior([None if first.prior == "none" else robot] * size, self._rigid)  # events tell the truth
-        self._told = first.prior == "true_model"
+        self.prior = Prior([None if first.prior == "none" else robot] * size, self._rigid)  # `set_truth` follows
+        self._knows_truth = first.prior == "true_model"
         self._learned = {row: load_learned(s) for row, s in enumerate(scenarios) if s.learned}
         if isinstance(self.learner, Learner):
             self.learner.prior = self.prior
             self._adopt(range(size))
         elif self._learned:
-            raise InputError("learned: a feedforward of one's own keeps what it learned itself")
+            raise InputError("learned: a feedforward of your own has to load what it learned itself")
         self._period = first.control_period
         self._every = round(first.motion_period / first.control_period)
         self._tick = 0
@@ -268,7 +268,7 @@ class Hierarchy:
         self.state["kanayama"][row] = chosen["k_x"], chosen["k_y"], chosen["k_theta"]
 
     def set_pid(self, row: int, design: Pid) -> None:
-        """Changes the velocity feedback of one robot."""
+        """Changes the PID of one robot, and the deviation D that its guard tolerates."""
         for name, value in design.gains(self._robot, self._rigid, self._delays[row], self._period).items():
             self.state["pid"][name][row] = value
         guard = self.state["guard"]
@@ -288,8 +288,8 @@ class Hierarchy:
         self.state["learning_off"][row] = not on
 
     def set_truth(self, row: int, robot: Robot) -> None:
-        """Tells the prior `true_model` the true parameters of one robot; other priors ignore them."""
-        if self._told:
+        """Gives the prior `true_model` the true parameters of one robot; other priors ignore them."""
+        if self._knows_truth:
             self.prior.set_robot(row, robot)
 
     def renew(self, row: int, scenario: Scenario) -> None:
@@ -327,7 +327,7 @@ class Hierarchy:
         self.state["pid"]["integral"][rows] = self._steady(twist, acceleration)[rows]
 
     def _steady(self, twist: Array, acceleration: Array) -> Array:
-        """Returns what the nominal robot needs for a motion beyond what the feedforward gives already, `(B, 2)`."""
+        """Returns the voltage that the nominal robot needs for a motion, less that of the feedforward, `(B, 2)`."""
         return self._model.output(twist, acceleration) - self.feedforward(twist, acceleration)
 
     def feedforward(self, command: Array, derivative: Array) -> Array:
@@ -362,7 +362,7 @@ class Hierarchy:
         return np.flatnonzero(~finite).tolist()
 
     def _forget(self) -> None:
-        """Resets learners that failed to their initial weights; one that cannot be reset learns more slowly instead."""
+        """Resets the learners that their guards stopped; one that cannot be reset learns more slowly instead."""
         rows = np.flatnonzero(self.state["guard"]["forget"])
         if not self._restore(rows):
             self.state["guard"]["gain"][rows] *= UNSURE

@@ -25,19 +25,19 @@ KEPT = {
     "mrac": {name: MRAC[name].shape for name in ModelReferenceAdaptive.learned},
     "composite": {name: COMPOSITE[name].shape for name in CompositeAdaptation.learned},
 }
-"""Names and shapes of what each learner keeps, but for `fel`, whose network has the size that its settings say."""
+"""Names and shapes of what each learner keeps, except for `fel`, whose settings determine them."""
 
 
 def kept(scenario: Scenario) -> dict[str, tuple[int, ...]]:
     """Names and shapes of what the learner of a scenario keeps, in the order of `weights` of a result.
 
     Raises:
-        InputError: It keeps nothing.
+        InputError: The learner keeps nothing.
     """
     if scenario.learner == "fel":
         return shapes(scenario.fel.hidden)
     if scenario.learner not in KEPT:
-        raise InputError(f"learned: the learner {scenario.learner} has nothing that a run could keep")
+        raise InputError(f"learned: the learner {scenario.learner} keeps nothing that a run could start from")
     return KEPT[scenario.learner]
 
 
@@ -55,7 +55,7 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
         raise InputError(f"run: {run.sizes['run']} runs; choose one with isel(run=…)")
     one = run.squeeze("run") if "run" in run.dims else run
     if bool(one.failed):
-        raise InputError(f"learned: the run failed ({one.failure.item()}), and what it learned is not to be trusted")
+        raise InputError(f"learned: the run failed ({one.failure.item()}), and what it learned cannot be trusted")
     if "weights" not in one:
         raise InputError("learned: the run has no learner of mrctl that keeps anything")
     (scenario,) = scenarios_of(one)

@@ -70,7 +70,7 @@ class Log:
     """
 
     def __init__(self, length: int, size: int) -> None:
-        """Takes the number of ticks that are kept and the number of robots."""
+        """Takes the number of ticks to keep, and the number of robots."""
         # The records of a tick lie side by side, so that the loop writes one block of memory for any number of robots.
         self.ticks = np.empty((length, size), TICK)
         self._error = np.zeros(3)

@@ -36,8 +36,8 @@ from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.references import check, enlarged
 from mrctl.theory.robot import Tyres
 
-LEAST = 8  # robots in a thread, for fewer do not pay for it
-RESERVE = 0.9  # share of the robot's limits that a suited reference takes
+LEAST = 8  # smallest number of robots for which a thread pays
+RESERVE = 0.9  # share of the robot's limits that an adapted reference uses
 LIMITS = ("max_speed", "max_rotation", "max_acceleration", "max_rotation_acceleration", "steering_limit")
 
 
@@ -49,10 +49,10 @@ def simulate(
     One scenario runs through dm_control, several run together on MuJoCo's batch engine, with the same bits.
 
     Args:
-        scenarios: One scenario, or several; those that differ in world, obstacles, laws, steering, length or
-            rates run in batches of their own.
+        scenarios: One scenario, or several; those that differ in world, obstacles, robot, laws, steering, delay, length
+            or rates run in batches of their own.
         progress: Whether to show a progress bar.
-        threads: Number of threads that control and physics run on, which changes no bit; 0 for all cores.
+        threads: Number of threads for control and physics, which does not change the result; 0 for all cores.
         stages: The user's stages `motion`, `feedback`, `feedforward`, `steering` or `estimator` in place of the
             scenario's: a factory, called with the nominal robot and the number of robots, which returns an object with
             the two methods of that stage in `mrctl.control.stages`. One that raises, or returns an array of the wrong
@@ -61,19 +61,18 @@ def simulate(
 
     Returns:
         The signals of `results.dataset.SIGNALS` with dimensions run and time (time alone for one scenario), with units;
-        `failed`, `failure` and `failure_time` of each run; `weights`, flat, where
-        something was learned.
+        `failed`, `failure` and `failure_time` of each run; `weights`, flat, where something was learned.
 
     Raises:
         InputError: A scenario asks for something that does not exist or that the robot cannot do, and the message names
-            the field; or a stage of the user cannot be made.
+            the field; or the factory of a user's stage fails.
     """
     given = [s.replace() for s in ([scenarios] if isinstance(scenarios, Scenario) else scenarios)]  # validated
     several = [arranged(s) for s in given]
     if not several:
         raise InputError("scenarios: none given")
     if len({s.control_period for s in several}) > 1:
-        raise InputError("control_period: runs of one result share their time axis, so also their control period")
+        raise InputError("control_period: differs between the scenarios, but runs of one result share their time axis")
     # Built first, so that bad input is refused before anything is computed.
     parts = [part for rows in uniform(several) for part in split(several, rows, threads, **stages)]
     total = sum(simulation.ticks * len(rows) for rows, simulation in parts)
@@ -85,18 +84,18 @@ def simulate(
 
 
 def cores() -> int:
-    """Number of processor cores that this process may use."""
+    """Returns the number of processor cores that this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)  # only Linux has it
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def worthwhile(threads: int, size: int) -> int:
-    """Number of threads that pay for so many robots, of those that are allowed, 0 for all cores."""
+    """Returns how many of the allowed threads (0 for all cores) pay for a number of robots."""
     return min(threads or cores(), max(1, size // LEAST))
 
 
 def uniform(scenarios: Sequence[Scenario]) -> list[list[int]]:
-    """The scenarios that can run in one simulation, by their indices."""
+    """Returns the groups of scenarios that can run in one simulation, as lists of their indices."""
     groups: dict[Hashable, list[int]] = defaultdict(list)
     for row, s in enumerate(scenarios):
         groups[group_of(s)].append(row)
@@ -106,13 +105,13 @@ def uniform(scenarios: Sequence[Scenario]) -> list[list[int]]:
 def split(
     scenarios: Sequence[Scenario], rows: list[int], threads: int, **stages: Unpack[Stages]
 ) -> list[tuple[list[int], Simulation]]:
-    """Splits a uniform group into simulations that run at the same time, a thread each.
+    """Splits a uniform group into simulations that run at the same time, one in each thread.
 
-    With stages of the user the group stays whole: these see all robots at once, and the engine alone has threads.
+    With stages of the user the group stays whole: a stage serves all robots at once, and only the engine has threads.
 
     Args:
         scenarios: All scenarios.
-        rows: Those of the group.
+        rows: Indices of those in the group.
         threads: Number of threads; 0 for all cores.
         stages: As in `simulate`.
 
@@ -174,9 +173,10 @@ def arranged(scenario: Scenario) -> Scenario:
 
 
 def suited(scenario: Scenario) -> Scenario:
-    """Returns the scenario with the steering of its robot, and with a lemniscate that the robot can follow.
+    """Returns the scenario with the steering of its robot, and with a circle or lemniscate that the robot can follow.
 
-    It is that of the scenario where possible, else it is slower, and larger where no period would be enough.
+    The reference of the scenario is slowed where necessary, and enlarged where no period is enough; one of another kind
+    stays as it is.
 
     Raises:
         InputError: The robot cannot be driven.
@@ -189,7 +189,7 @@ def suited(scenario: Scenario) -> Scenario:
 
 
 def group_of(s: Scenario) -> Hashable:
-    """Returns what the runs of one simulation must share; those with goals end one by one, and need not be as long."""
+    """Returns what the runs of one simulation must share; runs with goals end one by one, and may differ in length."""
     rates = s.ticks if s.goal is None else None, s.physics_step, s.control_period, s.motion_period
     chain = s.sensing.source, s.sensing.periods("delay", s.control_period)
     return s.world, s.obstacles, s.robot, s.steering, s.prior, s.learner, s.fel.hidden, *rates, *chain
@@ -201,7 +201,7 @@ class Simulation:
     Attributes:
         scenarios: Scenario of each run, with the events that were added.
         model: The compiled world with the nominal robot.
-        lead: Number of control periods until a voltage acts; the controllers are told the reference of that time.
+        lead: Number of control periods until a voltage acts; the controllers receive the reference of that time.
         courses: The references that the robots follow.
         sensors: The sensors of the robots.
         estimator: The estimator of the posture and the twist that the controllers use.
@@ -260,8 +260,8 @@ class Simulation:
         self.log = Log(self.ticks, size)
         self._failure_time = np.full(size, np.nan)
         self._goals = Goals(scenarios)
-        self._learned: dict[int, Array] = {}  # what robots that arrived or got stuck had adapted then, flat
-        self._sensed = -1  # the last tick that was measured
+        self._learned: dict[int, Array] = {}  # what each robot had adapted when it arrived or got stuck, flat
+        self._sensed = -1  # last tick whose sensors were read
 
         goal = self.courses.at(0)
         poses = np.stack([start_pose(s, goal["pose"][row]) for row, s in enumerate(scenarios)])
@@ -280,14 +280,15 @@ class Simulation:
 
     @property
     def running(self) -> bool:
-        """Whether the run goes on: ticks are left, and a robot has neither failed nor arrived."""
+        """Whether the run goes on: ticks are left, and at least one robot has neither failed nor arrived."""
         return self.tick < self.ticks and self.plant.running > 0
 
     def add(self, event: Event) -> None:
         """Adds an event to every run; `scenarios` then contain it, and a new run of them gives the same bits.
 
         Args:
-            event: The event, not before the coming tick; with a reference not before its voltage acts.
+            event: The event, not before the coming tick; if it has a reference, not before the voltage of that tick
+                acts.
 
         Raises:
             InputError: The event is in the past, or a scenario with it is refused; then nothing is added.
@@ -295,7 +296,7 @@ class Simulation:
         if event.tick(self.period) < self.tick:
             raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self.period:g} s")
         if event.reference is not None and event.tick(self.period) < self.tick + self.lead:
-            raise InputError(f"time: a reference must be known {self.lead * self.period:g} s before, the delay")
+            raise InputError(f"time: a reference must be known {self.lead * self.period:g} s before it begins")
         if event.perturbation is not None:
             self.plant.check(event.perturbation)
         if event.reference is not None:
@@ -357,7 +358,7 @@ class Simulation:
         near = self.log.record(tick, plant.state, self.estimator.seen, self._goal, self.hierarchy.state)
         if not near:
             for row in np.flatnonzero(np.abs(self.log.at(tick)["lateral_error"]) > DIVERGED):
-                if self.scenarios[row].goal is None:  # else it may wait, and go its own way
+                if self.scenarios[row].goal is None:  # a robot with a goal may wait, or leave its reference
                     plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
         self.tick += 1
         if plant.running < plant.size:
@@ -378,7 +379,7 @@ class Simulation:
                 self._failure_time[row] = self.tick * self.period
 
     def result(self) -> xr.Dataset:
-        """Returns the signals so far; if every run has ended, of the whole time, with NaN at the end."""
+        """Returns the signals so far or, once every run has ended, those of the whole time, with NaN after the ends."""
         stage = self.hierarchy.learner
         learned = stage.adapted() if isinstance(stage, Learner) else np.zeros((0, 0))
         for row, kept in self._learned.items() if learned.size else ():
@@ -395,7 +396,7 @@ class Simulation:
             "estimator_fault": ("run", np.array(getattr(self.estimator, "faults", [""] * size), object)),
             "feedforward_fault": ("run", np.array(getattr(self.hierarchy, "feedforward_faults", [""] * size), object)),
         }
-        constants = {  # which turn the commanded motion into features
+        constants = {  # with which the features of a commanded motion are computed
             "half_track": ("run", np.full(size, robot.half_track), {"units": "m"}),
             "feature_scale": (("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         }
@@ -416,7 +417,7 @@ class Simulation:
         return {"clearance": (("run", "time"), found, attributes)}
 
     def _parameters(self) -> dict[str, Any]:
-        """Coefficients of the scaled features at the end, those of prior and learner and the true ones, in V."""
+        """Coefficients of the scaled features at the end, in V: the sum of prior and learner, and the true ones."""
         learner, hierarchy = self.hierarchy.learner, self.hierarchy
         learned = learner.parameters if isinstance(learner, Learner) else None
         if learned is None:

@@ -33,7 +33,7 @@ class Part(NamedTuple):
 
     @property
     def title(self) -> str:
-        """The attribute, with its settings as in a call."""
+        """Name of the factory, with its settings as in a call."""
         settings = ", ".join(f"{name}={value!r}" for name, value in self.settings.items())
         return f"{self.attribute}({settings})" if settings else self.attribute
 
@@ -42,7 +42,7 @@ def parts(name: str) -> list[Part]:
     """Splits a name into its parts.
 
     Raises:
-        InputError: The name is not of the form above, names an unknown stage or one twice, or a file is missing.
+        InputError: The name is not of the form above, names an unknown stage or a stage twice, or a file is missing.
     """
     found: list[Part] = []
     for part in re.split(r",(?![^(]*\))", name):
@@ -53,9 +53,9 @@ def parts(name: str) -> list[Part]:
         if not file.endswith(".py") or not attribute:
             raise InputError(f"controller: {part!r} is not of the form my_file.py:MyController")
         if stage not in METHODS:
-            raise InputError(f"controller: {stage!r} is no stage; there are {', '.join(METHODS)}")
+            raise InputError(f"controller: {stage!r} is not a stage; there are {', '.join(METHODS)}")
         if stage in {known.stage for known in found}:
-            raise InputError(f"controller: {stage} is there twice")
+            raise InputError(f"controller: {stage} is given twice")
         if not Path(file).is_file():
             raise InputError(f"controller: no file {file}")
         found.append(Part(stage, Path(file).absolute(), attribute, settings))
@@ -81,7 +81,7 @@ def absolute(name: str) -> str:
 
 
 def digest(name: str) -> str:
-    """Returns a digest of the contents of the files, which is the same for the same controller.
+    """Returns a digest of the contents of the files that a name names, without the settings.
 
     Raises:
         InputError: The name is refused, as by `parts`.
@@ -94,7 +94,7 @@ def load(name: str) -> Stages:
     """Runs the files and returns the factories by stage, as keywords for `simulate`.
 
     Raises:
-        InputError: The name is refused, as by `parts`; a file raises; or it has no such name that can be called.
+        InputError: The name is refused, as by `parts`; a file raises; or a file has no such attribute to call.
     """
     factories: Any = {part.stage: _factory(part) for part in parts(name)}
     return factories
@@ -105,7 +105,7 @@ def _factory(part: Part) -> Any:  # noqa: ANN401
     module_name = f"mrctl_controller_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     assert spec and spec.loader
-    module = sys.modules[module_name] = importlib.util.module_from_spec(spec)  # where dataclasses look the module up
+    module = sys.modules[module_name] = importlib.util.module_from_spec(spec)  # dataclasses look the module up there
     sys.path.insert(0, str(path.parent))  # as for a script, so that the file can import its neighbours
     try:
         spec.loader.exec_module(module)
@@ -123,7 +123,7 @@ def _factory(part: Part) -> Any:  # noqa: ANN401
 
 
 def trial(name: str, scenario: Scenario) -> None:
-    """Tries factories and stages on two robots for three ticks, before anything long is computed.
+    """Tries factories and stages on two robots for three ticks, before a long computation.
 
     Raises:
         InputError: The name is refused, as by `load`; the scenario is refused; or the controller fails.

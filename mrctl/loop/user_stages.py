@@ -34,7 +34,7 @@ class UserStage:
     """
 
     def __init__(self, name: str, factory: Factory[Any], robot: Robot, size: int) -> None:
-        """Makes the stage.
+        """Calls the factory and checks the methods of its object.
 
         Args:
             name: Name of the stage, such as `feedforward`.
@@ -58,7 +58,7 @@ class UserStage:
                 raise StageError(f"{self.title}: has no method {method}")
 
     def call(self, method: str, *values: Any) -> Any:  # noqa: ANN401
-        """Calls a method with copies of the arrays, in which numbers that are not finite are zero.
+        """Calls a method with copies of the arrays, in which zeros replace numbers that are not finite.
 
         Raises:
             StageError: The method raised.
@@ -134,16 +134,16 @@ def hand_over_all(control: Rows) -> None:
 
 
 class UserHierarchy(Hierarchy):
-    """The hierarchy with some of a user's stages; a tick calls them between compiled loops over the built-in laws.
+    """The hierarchy with stages of a user; a tick calls them between compiled loops over the built-in laws.
 
     Attributes:
-        faults: Robots for which a stage returned a number that is not finite in the last tick, with the message; not
-            those whose guard takes the place of a feedforward.
-        feedforward_faults: For each robot the message of the first tick at which the guard did that, or "".
+        faults: Message for each robot for which a stage returned a number that is not finite in the last tick, except
+            for those whose guard replaces the feedforward.
+        feedforward_faults: For each robot the message of the first tick at which its guard did so, or "".
     """
 
     def __init__(self, scenarios: Sequence[Scenario], robot: Robot, stages: dict[str, UserStage]) -> None:
-        """Wires the user's stages, by name, and the scenarios' stages for the rest."""
+        """Wires the user's stages, by name, and for the others those of the scenarios."""
         self._stages = stages
         self._feedforward_stage = stages.get("feedforward")
         super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
@@ -217,7 +217,7 @@ class UserHierarchy(Hierarchy):
         return self.prior.output(command, derivative) + learned
 
     def _left_to_guard(self, stage: UserStage, answer: Array) -> Array:
-        """Returns an answer of the feedforward, and tells each guard that is on if its row is not finite."""
+        """Returns an answer of the feedforward, and leaves each row that is not finite to its guard, if that is on."""
         guard = self.state["guard"]
         broken = ~np.isfinite(answer).all(axis=1) & guard["on"]
         if not broken.any():
@@ -294,7 +294,7 @@ class UserEstimator(Estimator):
     """
 
     def __init__(self, stage: UserStage, *arguments: Any) -> None:  # noqa: ANN401
-        """Takes the user's stage, and the arguments of `Estimator` behind the name."""
+        """Takes the user's stage, and the arguments of `Estimator` after the name."""
         super().__init__("user", *arguments)
         self._stage = stage
         self._started = False

@@ -1,4 +1,4 @@
 """Sensors, a lidar, and the estimators that compute posture, twist and slip from their samples; the sensing tiers.
 
-Imports `mrctl.kernel` and `mrctl.theory`.
+Imports `mrctl.record`, `mrctl.kernel` and `mrctl.theory`.
 """

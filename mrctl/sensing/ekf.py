@@ -2,7 +2,7 @@
 
     x = (x, y, θ, V, θ̇, b, o, λ_l, λ_r, s_l, s_r)
 
-    (ẋ, ẏ) = V (cos θ, sin θ) + v_y (−sin θ, cos θ),    v_y = −c V θ̇
+    (ẋ, ẏ) = V (cos θ, sin θ) + v_y (−sin θ, cos θ),    v_y = −c V θ̇,  c = `SIDE`
     V̇ = a − o,    θ̈ = θ̈_c,    λ̇_l,r = (u_l,r − κ u̇_l,r)/(r (1 + s_l,r ± ρ a_y)),    u_l,r = V ∓ D θ̇
     b, o and s constant;    each plus noise
 
@@ -11,10 +11,10 @@
 b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii. The accelerometer a, corrected for its
 place ahead of the axle, is an input; its offset o is the sum of its bias and a component of gravity. θ̈_c is the
 commanded acceleration that acts in the period. κ and ρ are `lag` and `load` of the tyres (`theory.robot.Tyres`), and
-a_y is measured, too. The wheel angles λ are part of the state, so that the error of an encoder stays bounded in angle;
-modelled as noise on V, it would become a random walk of the position. The noise of a and θ̈ moves the positions of the
-same period, so that an encoder sees it at once. A fix corrects the state at the time when it was taken: the filter
-stores that state, and repeats the periods since then.
+the accelerometer measures a_y, too. The wheel angles λ are part of the state, so that the error of an encoder stays
+bounded in angle; modelled as noise on V, it would become a random walk of the position. The noise of a and θ̈ moves the
+positions of the same period, so that an encoder sees it at once. A fix corrects the state at the time when it was
+taken: the filter stores that state, and repeats the periods since then.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ KEPT = 5  # largest number of states that are stored for fixes that have not arr
 # Process noise. All values but JOLT are chosen, and tests check them by the filter's error (NEES, chi-square).
 TURN = 0.1  # deviation from the commanded θ̈, rad/s²/√Hz
 SETTLE = 1.5  # s, time in which o follows the faster offset of `find_grip`
-LOOSE_V = 0.5  # of V̇ while no wheel grips, m/s²/√Hz
+LOOSE_V = 0.5  # further noise of V̇ while no wheel grips, m/s²/√Hz
 INCLINE = 0.012  # random walk of the component of gravity in the accelerometer, m/s²/√s
 SIDE_SLIP, SKID = 3e-5, 0.02  # lateral motion of the rear axle beyond v_y, while both wheels grip and otherwise, m/√s
 JOLT = 1e-3  # slip of a tyre while its force jumps, rad/(m/s²); measured where a motor's current jumps by 4.7 A
-SLIDE = 7e-4  # slip of the wheel that grips while the other one does not, and it carries all of the force, m/√s
-JUMP = 3.0  # a change of the acceleration is a jump as far as it is larger than this number of its deviations
-LOADING, LOAD = 0.1, 2.0  # s at the start in which the tyres take up their load, as if such jolts acted, m/s²
+SLIDE = 7e-4  # slip of a wheel that grips and carries all of the force, because the other one slips, m/√s
+JUMP = 3.0  # standard deviations; a jump is the part of a change of the acceleration that exceeds them
+LOADING, LOAD = 0.1, 2.0  # s at the start in which the tyres take up their load, and the jolt that it counts as, m/s²
 RADIUS = 0.01  # standard deviation of the relative error of a wheel's radius at the start
 RADIUS_WALK = 5e-6  # random walk of that error, 1/√s
 START_OFFSET = 0.2  # standard deviation of the component of gravity in the accelerometer at the start, m/s²
@@ -47,8 +47,8 @@ START_TWIST = 0.02, 0.02  # standard deviations of V in m/s and θ̇ in rad/s at
 # lateral velocity, less half the physics step (`physics.mjcf` says why); measured on the models of this package.
 SIDE = 0.94e-3
 FIX_GATE = 16.27  # 99.9 % of chi-square with 3 degrees of freedom
-LOST = 10  # number of a rejected fix in a row at which the filter accepts it
-LOOSE = 0.5  # m and rad, standard deviation that is then added to the posture
+LOST = 10  # the tenth fix in a row outside the gate is accepted
+LOOSE = 0.5  # m and rad, standard deviation that is added to the posture before
 GRIP = 0.08  # m/s, difference of encoder and inertial speed of a wheel above which it slips
 TWIST = 2e-3  # m/s, difference of the slip of two wheels that grip
 INERTIAL = 5.0  # rad/s, bandwidth of the observer that compares encoders with the accelerometer
@@ -68,7 +68,7 @@ EKF = np.dtype(
         ("offset_walk", "f8"),  # of o, m/s²/√s
         ("fix_variance", "f8", 3),  # m², m², rad²
         ("inertial", "f8"),  # V from accelerometer and the wheels that grip, m/s
-        ("offset", "f8"),  # offset o of the accelerometer by the observer of `find_grip`, m/s²
+        ("offset", "f8"),  # offset o of the accelerometer as the observer of `find_grip` estimates it, m/s²
         ("refused", "i8"),  # number of fixes rejected in a row
         ("nis", "f8"),  # normalised innovation squared of the last fix, chi-square with 3 degrees of freedom
         ("innovations", "f8", 3),  # normalised innovations of the last encoder samples and gyro sample
@@ -107,13 +107,13 @@ def propagate(
     """
     m, P, T = s.mean, s.P, period
     r, D = geometry[0], geometry[1]
-    middle = T / 2 + geometry[3]  # of the period of positions, behind which velocities lag
+    middle = T / 2 + geometry[3]  # of the period as positions count it; velocities lag behind them
     v, omega = m[V] + v_dot * middle, m[OMEGA] + omega_dot * middle
-    heading = m[THETA] + omega * (T / 2 - SIDE)  # of the motion, which v_y turns outwards
+    heading = m[THETA] + omega * (T / 2 - SIDE)  # direction of the motion, which v_y turns outwards
     c, sn = T * np.cos(heading), T * np.sin(heading)
     grow_left, grow_right = 1 + m[SCALE_LEFT] + growth, 1 + m[SCALE_RIGHT] - growth
     b_left, b_right = T / (r * grow_left), T / (r * grow_right)
-    rolled = middle - geometry[4]  # of the wheels, which lag behind the way
+    rolled = middle - geometry[4]  # the same for the wheels, which lag behind their axles
     v_wheel, omega_wheel = m[V] + v_dot * rolled, m[OMEGA] + omega_dot * rolled
     turn_left, turn_right = b_left * (v_wheel - D * omega_wheel), b_right * (v_wheel + D * omega_wheel)
     m[X] += v * c
@@ -291,7 +291,7 @@ def step(t: int, ring: Rows, i: int, geometry: Array, period: float, delay: int,
     jolt = max(0.0, jolt - JUMP * np.sqrt(2 * s.acceleration_variance))
     if (t - start) * period < LOADING:
         jolt = max(jolt, LOAD)
-    if now.grip[0] + now.grip[1] == 0:  # nothing shows o, and what the encoders last did to it would be integrated
+    if now.grip[0] + now.grip[1] == 0:  # o is not observed, and its last correction would be integrated
         for i in range(N):
             s.P[OFFSET, i] = s.P[i, OFFSET] = 0.0
         s.mean[OFFSET], s.P[OFFSET, OFFSET] = s.offset, START_OFFSET**2

@@ -1,4 +1,4 @@
-"""Estimators of posture and twist: the truth, odometry, an extended Kalman filter, or one of the user.
+"""Estimators of posture and twist: the truth, odometry, an extended Kalman filter, or the user's.
 
 An estimator receives the samples of the sensors and estimates posture and twist at a control tick. `predict` then
 predicts the estimate to the time at which the voltage that is computed in that tick reaches the motors; the controllers
@@ -49,7 +49,7 @@ def truth(
             of the tyres, `(6,)`.
         period: Control period in s.
         memory: In and out: state of the estimator for this robot.
-        s: Out: its record of `SEEN`, of which an estimator writes `estimate` and `variance`.
+        s: In and out: its record of `SEEN`, of which an estimator writes `estimate` and `variance`.
     """
     for k in range(3):
         s.estimate[k] = true.reading.pose[k]
@@ -138,12 +138,12 @@ ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
     "ekf": (ekf, EKF),
     "user": (user, MOTION),
 }
-"""Law and state of each estimator; `user` passes on the estimate of a user's estimator."""
+"""Kernel and state of each estimator; `user` passes on the estimate of a user's estimator."""
 
 
 @cache
 def estimate_with(name: str) -> Kernel:
-    """Returns the kernel `estimate` with the law of an estimator, the same for all runs: each takes memory for good."""
+    """Returns the kernel `estimate` with the law of an estimator, cached because compiled code is never freed."""
     return estimate.calling(observe=ESTIMATORS[name][0])
 
 
@@ -151,9 +151,9 @@ class Estimator:
     """An estimator for B robots.
 
     Attributes:
-        seen: What the controllers are told, a record of `SEEN` of each robot, `(B,)`.
+        seen: Estimates and samples that the controllers receive, a record of `SEEN` of each robot, `(B,)`.
         memory: State of the estimator, a record of each robot, `(B,)`.
-        localiser: What makes posture fixes from a lidar, or None.
+        localiser: Localisation that makes posture fixes from a lidar, or None.
     """
 
     def __init__(
@@ -178,10 +178,10 @@ class Estimator:
             skew: Time in s by which velocities lag behind positions: half a physics step, because the engine integrates
                 positions with the velocities at the end of the step.
             tyres: The tyres of the nominal robot.
-            obstacles: What a lidar sees; those that stand still are on the map.
+            obstacles: Obstacles that a lidar sees; those that stand still are on its map.
 
         Raises:
-            InputError: There is nothing on the map that localisation needs.
+            InputError: Localisation needs a map, and no obstacle stands still, or the map is too large.
         """
         self._law, memory = estimate_with(name), ESTIMATORS[name][1]
         self._name, self._sensing, self._sensors = name, list(sensing), sensors
@@ -198,7 +198,7 @@ class Estimator:
         Args:
             row: Index of the robot.
             reading: Its true state, a record of `READING`.
-            seed: Seed of the errors of the start.
+            seed: Seed of the errors of the first fix and twist.
             tick: The coming control tick.
         """
         sensing, sensor, period = self._sensing[row], self._sensors.sensors[row], self._sensors.period

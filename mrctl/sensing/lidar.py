@@ -14,10 +14,10 @@ from mrctl.theory.rays import cast
 
 
 class Lidar(Record):
-    """A planar lidar; the values are about those of an RPLIDAR A1."""
+    """A planar lidar; the defaults are about the values of an RPLIDAR A1."""
 
     rate: Annotated[float, Field(gt=0, le=1000)] = 10.0
-    """Rate of the scans in Hz; a scan is taken at once."""
+    """Rate of the scans in Hz; all beams of a scan are taken at the same time."""
     beams: Annotated[int, Field(ge=1, le=10_000)] = 360
     """Number of beams of a scan."""
     view: Annotated[float, Field(ge=0.01, le=2 * np.pi)] = 2 * np.pi
@@ -29,7 +29,7 @@ class Lidar(Record):
     lost: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Share of the beams that return nothing though they meet an obstacle."""
     x: Annotated[float, Field(ge=-10, le=10)] = 0.0
-    """Place of the lidar ahead of P in m."""
+    """Distance of the lidar ahead of P in m."""
 
     @property
     def step(self) -> float:
@@ -47,7 +47,7 @@ class Lidar(Record):
         Args:
             pose: x and y of P in m and θ in rad, `(3,)`.
             outlines: The obstacles.
-            random: Source of noise and lost beams, which always takes the same number of values from it.
+            random: Source of noise and lost beams; each scan takes the same number of values from it.
 
         Returns:
             Ranges in m, `(beams,)`; infinite where nothing returns, as in ROS (REP 117).
@@ -60,11 +60,11 @@ class Lidar(Record):
         return np.maximum(ranges + self.noise * noise, 0.0)
 
     def points(self, ranges: Array, most: int = 10_000) -> Array:
-        """Returns the places that beams of a scan met.
+        """Returns the points that beams of a scan met.
 
         Args:
             ranges: Ranges of a scan in m, `(beams,)`.
-            most: Number of beams, evenly spread over the view, that are used at most.
+            most: Largest number of beams to use, evenly spread over the view.
 
         Returns:
             x and y in the robot's frame in m, `(n, 2)`; beams that returned nothing are left out.

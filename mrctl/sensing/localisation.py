@@ -1,4 +1,4 @@
-"""Localisation on a map: posture fixes from a lidar, by scan matching or by particles, in place of the tier's."""
+"""Localisation on a map: posture fixes by scan matching or particles, from a lidar, replace the fixes of the tier."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from mrctl.sensing.tiers import Sensing
 from mrctl.theory.grid import MOST_CELLS, field_of
 from mrctl.theory.obstacles import Obstacles, Surroundings
 
-CELL = 0.05  # m, of the map
-MARGIN = 1.0  # m, of the map around the obstacles
-BEAMS = {"scan": 120, "particles": 60}  # that are used of a scan
+CELL = 0.05  # m, side of a cell of the map
+MARGIN = 1.0  # m, by which the map extends beyond the obstacles
+BEAMS = {"scan": 120, "particles": 60}  # largest number of beams of a scan that are used
 AGREES = 0.5  # share of the points of a scan that must lie on the map for a fix
 
 
@@ -26,8 +26,8 @@ class Localiser:
     """Lidar and localisation of B robots, which share a map.
 
     Attributes:
-        scans: Last scan of each robot, ranges in m, `(beams,)`; None for a robot without a lidar.
-        taken: Control tick at which it was taken, `(B,)`.
+        scans: Last scan of each robot, ranges in m, `(beams,)`; None before the first one, and without a lidar.
+        taken: Control tick at which each of them was taken, `(B,)`.
         filters: Particle filter of each robot, or None.
     """
 
@@ -36,12 +36,12 @@ class Localiser:
 
         Args:
             sensing: Sensing of each robot.
-            sensors: The sensors, whose samples of the odometry are read and whose fixes are replaced.
+            sensors: The sensors, whose encoders and gyros are read and whose fixes are replaced.
             wheel_radius: Nominal radius of the driven wheels in m.
             obstacles: The obstacles.
 
         Raises:
-            InputError: Nothing stands still, or the map is too large.
+            InputError: No obstacle stands still, or the map is too large.
         """
         self._sensing, self._sensors, self._radius = list(sensing), sensors, wheel_radius
         self._surroundings = Surroundings(obstacles)
@@ -55,7 +55,7 @@ class Localiser:
         self.taken = np.zeros(len(sensing), int)
         self.filters: list[Particles | None] = [None] * len(sensing)
         self._random = [np.random.default_rng()] * len(sensing)
-        self._odometry = np.zeros((len(sensing), 2))  # way in m and turn in rad since the last scan
+        self._odometry = np.zeros((len(sensing), 2))  # distance in m and turn in rad since the last scan
 
     def start(self, row: int, pose: Array, seed: int) -> None:
         """Starts one robot at an estimate of its pose.
@@ -70,12 +70,12 @@ class Localiser:
             self.filters[row] = Particles(self._map, seed, pose.copy())
 
     def locate(self, tick: int, plant: Rows, estimate: Array) -> None:
-        """Adds up the odometry, and takes scans and makes fixes of them in the ticks in which fixes are taken.
+        """Adds up the odometry and, in the ticks in which fixes are taken, takes scans and makes the fixes from them.
 
         Args:
             tick: Control tick.
-            plant: Record of `PLANT` of each robot, `(B,)`; its true pose is where the lidar is.
-            estimate: Estimated x, y in m, θ in rad, V in m/s and θ̇ in rad/s of a period ago, `(B, 5)`.
+            plant: Record of `PLANT` of each robot, `(B,)`; the lidar scans from its true pose.
+            estimate: Estimate of a period ago, x, y in m, θ in rad, V in m/s and θ̇ in rad/s, `(B, 5)`.
         """
         sensors, period = self._sensors, self._sensors.period
         now, last = sensors.ring[tick % len(sensors.ring)], sensors.ring[(tick - 1) % len(sensors.ring)]

@@ -2,7 +2,7 @@
 
 Thrun, Burgard and Fox, Probabilistic Robotics, 2005: the motion model of section 5.4, the likelihood field of 6.4. The
 number of particles adapts (Fox, "Adapting the sample size in particle filters through KLD-sampling", IJRR 22(12),
-2003). A scan has many beams whose errors are not independent, so that its log likelihood counts `TRUST` times. Where
+2003). The errors of the beams of a scan are not independent, so that its log likelihood is multiplied by `TRUST`. Where
 the scan contradicts the estimate, a share of the particles is drawn from the scan (Lenser and Veloso, "Sensor resetting
 localization for poorly modelled mobile robots", IEEE ICRA 2000): of many random poses the best are matched with it.
 """
@@ -20,12 +20,12 @@ HIT, RANDOM = 0.05, 0.05  # m, deviation of a point from the map; likelihood of 
 TRUST = 0.6
 ALONG, TURN, DRIFT = 0.05, 0.05, 0.05  # deviations of way and turn as shares of them, and of the turn in rad per m
 STILL = 2e-3, 2e-3  # m and rad, deviations of an update without motion
-BIN = 0.1, 0.1, 0.2  # m, m and rad, sides of the bins that adapt the number
+BIN = 0.1, 0.1, 0.2  # m, m and rad, sides of the bins from whose number that of the particles follows
 ERROR, QUANTILE = 0.05, 2.326  # bound on the Kullback-Leibler distance, kept with probability 99 %
 CLUSTER = 0.5  # m and rad, distance from the best particle within which particles are averaged
 AGREE = 0.8  # share of a scan's points that lie on the map, below which the filter is taken for lost
 RESET = 0.2  # share of the particles that are then drawn from the scan
-TRIALS, SEEDS, KEPT = 4000, 40, 5  # random poses, those matched with the scan, and those that become particles
+TRIALS, SEEDS, KEPT = 4000, 40, 5  # random poses, those matched with the scan, and the best, which seed particles
 
 
 class Particles:
@@ -82,7 +82,7 @@ class Particles:
         found = np.empty((MOST, 3))
         count = resample.compiled(
             self.particles, weights, random.uniform(size=(MOST, 2)), random.standard_normal((MOST, 3)), fresh,
-            RESET * lost,             found,
+            RESET * lost, found,
         )  # fmt: skip
         self.particles = found[:count].copy()
         return self.pose
@@ -98,7 +98,7 @@ class Particles:
 
 @kernel
 def move(particles: Array, way: float, turn: float, noise: Array) -> None:
-    """Moves particles by a way in m and a turn in rad, with noise that grows with both; arrays are `(n, 3)`."""
+    """Moves particles by a distance in m and a turn in rad, with noise that grows with both; arrays are `(n, 3)`."""
     along, across, about = STILL[0] + ALONG * abs(way), STILL[0], STILL[1] + TURN * abs(turn) + DRIFT * abs(way)
     for i in range(len(particles)):
         turned = turn + about * noise[i, 0]
@@ -193,7 +193,7 @@ def resample(
         chance: Uniform random numbers, `(MOST, 2)`.
         noise: Normal random numbers, `(MOST, 3)`.
         fresh: Poses for a lost filter in m, m, rad, `(m, 3)`.
-        lost: Share of the particles that are drawn about those.
+        lost: Share of the particles that are drawn about these poses.
         found: Out: the new particles, `(MOST, 3)`.
 
     Returns:

@@ -10,7 +10,7 @@ SEEN = np.dtype(
     [
         ("pose", "f8", 3),  # x and y in m, θ in rad, when the voltage of this tick acts
         ("twist", "f8", 2),  # V in m/s and θ̇ in rad/s, when the voltage of this tick acts
-        ("slip", "f8"),  # slip ratio of the driven wheel that slips more
+        ("slip", "f8"),  # low-passed slip ratio of the driven wheel that slips more
         ("wheel_speeds", "f8", 2),  # wheel speeds left and right, from encoders and nominal wheel radius, m/s
         ("lost", "f8", 2),  # change of the voltage by the driver's current limit in the last period, left and right, V
         ("encoder", "f8", 2),  # angles of the rear wheels that arrived last, left and right, rad

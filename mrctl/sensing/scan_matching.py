@@ -3,11 +3,11 @@
     minimise  Σ ρ(d(T p))  + (ξ − ξ₀)ᵀ Λ₀ (ξ − ξ₀)
 
 over the pose ξ, where d is the distance field of the map, T p a point of the scan in the world, and ρ the function of
-Geman and McClure, which ignores what the map does not have. Its width shrinks from `WIDE` to `NARROW`, so that a guess
-may be some decimetres wrong; where the result explains too little of the scan, the search starts again beside it. The
-prior Λ₀ about the guess ξ₀ holds what the scan does not tell, such as the place along a corridor. (Kohlbrecher, von
-Stryk, Meyer and Klingauf, "A flexible and scalable SLAM system with full 3D motion estimation", IEEE SSRR 2011, for the
-method on a map; Yang et al., IEEE RA-L 5(2), 2020, for the width that shrinks.)
+Geman and McClure, which discounts points that the map does not explain. Its width shrinks from `WIDE` to `NARROW`, so
+that a guess may be some decimetres wrong; where the result explains too little of the scan, the search starts again
+beside it. The prior Λ₀ about the guess ξ₀ holds what the scan does not determine, such as the position along a
+corridor. (Kohlbrecher, von Stryk, Meyer and Klingauf, "A flexible and scalable SLAM system with full 3D motion
+estimation", IEEE SSRR 2011, for the method on a map; Yang et al., IEEE RA-L 5(2), 2020, for the width that shrinks.)
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def match(points: Array, guess: Array, field: Field) -> tuple[Array, float]:
 
 @kernel
 def fit(points: Array, pose: Array, field: Field) -> float:
-    """Does what `match` says: improves the pose, and returns the share."""
+    """Improves the pose in place from one start, and returns the share of the points on the map; see `match`."""
     guess = pose.copy()
     H, g = np.empty((3, 3)), np.empty(3)
     width = WIDE

@@ -16,8 +16,8 @@ SENSOR = np.dtype(
     [
         ("quantum", "f8"),  # angle of one encoder count, rad; 0 for an exact encoder
         ("phase", "f8", 2),  # angle of each encoder at which a count begins, in counts from 0 to 1
-        ("encoder_every", "i8"),  # control periods from one sample to the next; so for the other sensors
-        ("encoder_latency", "i8"),  # age of a sample at its arrival, control periods; so for the other sensors
+        ("encoder_every", "i8"),  # control periods from one sample to the next; likewise for the other sensors
+        ("encoder_latency", "i8"),  # age of a sample at its arrival, control periods; likewise for the other sensors
         ("gyro_sigma", "f8"),  # standard deviation of the noise of a sample, rad/s
         ("gyro_bias", "f8"),  # bias now, rad/s
         ("gyro_step", "f8"),  # standard deviation of the change of the bias in a control period, rad/s
@@ -45,7 +45,7 @@ NOISE = np.dtype([("gyro", "f8", 2), ("accelerometer", "f8", 4), ("fix", "f8", 3
 SAMPLE = np.dtype(
     [
         ("encoder", "f8", 2),  # measured angles of the rear wheels, left and right, rad
-        ("rate", "f8", 2),  # their measured rates, rad/s; of an encoder that counts, the difference of two samples
+        ("rate", "f8", 2),  # their measured rates, rad/s; of an encoder that counts, a difference quotient
         ("encoder_new", "?"),  # whether the encoders were sampled in this tick; else the last sample is repeated
         ("gyro", "f8"),  # measured θ̇, rad/s
         ("gyro_new", "?"),
@@ -66,7 +66,7 @@ def sample(tick: int, true: Row, noise: Row, period: float, s: Row, last: Row, n
 
         encoder   q ⌊φ/q + phase⌋ with the angle q of one count, so that the error is bounded in angle
         gyro      θ̇ + b + n,    b ← b + w          accelerometer likewise
-        fix       (x, y, θ) + n, or with an outlier in x and y
+        fix       (x, y, θ) + n; an outlier is up to 1 m off in x and in y
 
     Args:
         tick: Control tick.
@@ -178,7 +178,7 @@ class Sensors:
             self._draw(row, tick % BLOCK, tick)
 
     def _draw(self, row: int, first: int, tick: int) -> None:
-        """Draws the noise of one robot for the rest of a block, which the tick `tick` begins at index `first`."""
+        """Draws the noise of one robot for the rest of a block, from index `first` on, which belongs to `tick`."""
         s, random, noise = self.sensors[row], self._random[row], self._noise
         if not any(s[name] for name in ("gyro_sigma", "gyro_step", "accelerometer_sigma", "accelerometer_step")) and (
             not s["fix_sigma"].any() and not s["fix_lost"] and not s["fix_outliers"]
@@ -207,5 +207,5 @@ class Sensors:
         sample_all.compiled(tick, plant, self._noise[tick % len(self._noise)], self.period, self.sensors, self.ring)
 
     def command(self, tick: int, derivative: Array) -> None:
-        """Takes the derivative of the commanded twist that was computed in a tick, m/s² and rad/s², `(B, 2)`."""
+        """Stores the derivative of the commanded twist that was computed in a tick, in m/s² and rad/s², `(B, 2)`."""
         self.ring["command"][tick % len(self.ring)] = derivative

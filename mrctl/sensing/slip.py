@@ -5,7 +5,7 @@ from __future__ import annotations
 from mrctl.kernel import Array, kernel
 
 SLIP_FILTER = 0.1  # s, time constant of the low-pass
-SLIP_SPEED = 0.3  # m/s, least speed by which a slip is divided, so that noise is no slip of a wheel at rest
+SLIP_SPEED = 0.3  # m/s, least divisor of a slip, so that noise does not count as slip at rest
 
 
 @kernel
@@ -15,10 +15,10 @@ def slip_ratio(wheel_speeds: Array, v: float, omega: float, half_track: float, p
         |v_i − u_i| / max(|v_i|, |u_i|, 0.3 m/s),    u_l,r = V ∓ D θ̇
 
     where v_i is the circumferential speed of a wheel from its encoder, and u_i the speed of its axle over the floor by
-    the estimated motion. The low-pass prevents a jolt from counting as slip, and prolongs a slip until the filters of a
-    learner have forgotten it. Odometry, whose V is the mean of the encoders, shows about half of the slip of one wheel.
-    A relative error of the wheel radius appears as a slip ratio of the same size, and noise as one of 0.8 of its
-    standard deviation over the speed.
+    the estimated motion. The low-pass prevents a jolt from counting as slip, and prolongs a slip until it has left the
+    filters of a learner. Odometry, whose V is the mean of the encoders, shows about half of the slip of one wheel. A
+    relative error of the wheel radius appears as a slip ratio of the same size, and noise as one of 0.8 of its standard
+    deviation over the speed.
 
     Args:
         wheel_speeds: v left and right, from encoders and nominal wheel radius, in m/s, `(2,)`.

@@ -29,7 +29,7 @@ Localisation = Literal["fixes", "scan", "particles"]
 IN_FLIGHT = KEPT - 1
 """Largest number of fixes that have been taken and have not arrived."""
 
-DEGREE = 3.141592653589793 / 180
+DEGREE = 3.141592653589793 / 180  # rad
 VALUES: dict[str, tuple[float, float, float]] = {
     # Lab: 512 pulses on the motor's shaft, four edges each, behind a gear of 43 (Maxon RE25 with an encoder MR 512).
     # Field: Kobuki's 2578.33 ticks a wheel turn (Yujin Robot, Kobuki user guide).
@@ -68,7 +68,7 @@ LOCALISED: dict[str, dict[str, float]] = {
     "scan": {"fix_position_noise": 0.01, "fix_heading_noise": 0.005, "fix_lost": 0, "fix_outliers": 0},
     "particles": {"fix_position_noise": 0.02, "fix_heading_noise": 0.01, "fix_lost": 0, "fix_outliers": 0},
 }
-"""Values in place of the tier's where fixes come from a lidar: about twice the errors that the tests find."""
+"""Values that replace the tier's where fixes come from a lidar: about twice the errors that the tests find."""
 
 Rate = Annotated[float, Field(ge=0, le=10_000)]
 Latency = Annotated[float, Field(ge=0, le=LONGEST_DELAY)]
@@ -83,16 +83,16 @@ class Sensing(Record):
     """Source of posture and twist: the `truth`, `odometry` from encoders and gyro, or an extended Kalman filter, `ekf`;
     by default the truth in the ideal tier and the filter in the others."""
     localisation: Localisation = "fixes"
-    """Source of posture fixes: the `fixes` below, or a lidar on the map of the obstacles that stand still, by matching
+    """Source of posture fixes: the `fixes` below, or a lidar and a map of the obstacles that stand still, by matching
     each `scan` with the map or by a filter of `particles`."""
     lidar: Lidar = Lidar()
-    """Lidar, which is used where `localisation` asks for it."""
+    """Lidar, which only `scan` and `particles` of `localisation` use."""
     encoder_counts: Annotated[int, Field(ge=0, le=10**9)] | None = None
     """Counts of a wheel's encoder in one turn; 0 reads exact angles and rates."""
     encoder_rate: Rate | None = None
     """Rate of the encoders in Hz, a whole fraction of the control rate; 0 is the control rate."""
     encoder_latency: Latency | None = None
-    """Age of the encoders' samples when they arrive in s, a multiple of the control period."""
+    """Age in s of the encoders' samples when they arrive, a multiple of the control period."""
     gyro_noise: Annotated[float, Field(ge=0, le=1)] | None = None
     """Noise density of the gyro in rad/s/√Hz."""
     gyro_bias: Annotated[float, Field(ge=0, le=1)] | None = None
@@ -102,7 +102,7 @@ class Sensing(Record):
     gyro_rate: Rate | None = None
     """Rate of the gyro in Hz, a whole fraction of the control rate; 0 is the control rate."""
     gyro_latency: Latency | None = None
-    """Age of the gyro's samples when they arrive in s, a multiple of the control period."""
+    """Age in s of the gyro's samples when they arrive, a multiple of the control period."""
     accelerometer_noise: Annotated[float, Field(ge=0, le=10)] | None = None
     """Noise density of the accelerometer in m/s²/√Hz."""
     accelerometer_bias: Annotated[float, Field(ge=0, le=10)] | None = None
@@ -112,7 +112,7 @@ class Sensing(Record):
     accelerometer_rate: Rate | None = None
     """Rate of the accelerometer in Hz, a whole fraction of the control rate; 0 is the control rate."""
     accelerometer_latency: Latency | None = None
-    """Age of the accelerometer's samples when they arrive in s, a multiple of the control period."""
+    """Age in s of the accelerometer's samples when they arrive, a multiple of the control period."""
     fix_rate: Rate | None = None
     """Rate of the posture fixes in Hz, a whole fraction of the control rate; 0 is the control rate."""
     fix_position_noise: Annotated[float, Field(ge=0, le=10)] | None = None
@@ -120,7 +120,7 @@ class Sensing(Record):
     fix_heading_noise: Annotated[float, Field(ge=0, le=3)] | None = None
     """Standard deviation of the heading of a fix in rad."""
     fix_latency: Latency | None = None
-    """Age of a fix when it arrives in s, a multiple of the control period."""
+    """Age in s of a fix when it arrives, a multiple of the control period."""
     fix_lost: Annotated[float, Field(ge=0, le=1)] | None = None
     """Share of the fixes that never arrive."""
     fix_outliers: Annotated[float, Field(ge=0, le=1)] | None = None
@@ -141,7 +141,7 @@ class Sensing(Record):
     """Backlash between the steering servo and the fork in rad, the full width of the play."""
 
     def __getitem__(self, name: str) -> float:
-        """Returns the value that a field has, its own or the tier's, in the unit of the field."""
+        """Returns the value of a field or, if it is None, that of the lidar or the tier, in the unit of the field."""
         own = getattr(self, name)
         if self.localisation != "fixes" and own is None:
             if name == "fix_rate":
@@ -166,9 +166,9 @@ class Sensing(Record):
         return SteeringServo(offset=self["steering_offset"], backlash=self["steering_backlash"])
 
     def periods(self, name: str, control_period: float) -> int:
-        """Returns the period of a rate, or a latency or delay, in control periods; a value of the tier is rounded.
+        """Returns a latency, a delay, or the period of a rate, in control periods.
 
-        A value of the tier that is not zero is rounded to at least one period.
+        A value of the tier is rounded, and to at least one period if it is not zero.
 
         Args:
             name: Name of a field, such as `fix_rate` or `delay`.
@@ -198,7 +198,7 @@ class Sensing(Record):
 
         Raises:
             ValueError: A time is no whole number of control periods, more than four fixes are on their way at the same
-                time, or fixes are older than the run.
+                time, fixes are older than the run, or `fix_rate` is set though fixes come from a lidar.
         """
         if self.localisation != "fixes":
             if self.fix_rate is not None:

@@ -1,4 +1,4 @@
-"""How far a robot is from what stands in its way: footprints as convex polygons or as discs, and their clearance."""
+"""Clearance: the distance between a footprint, as a convex polygon or as discs, and the obstacles."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def cover(footprint: Array, count: int = 3) -> Array:
 def clearance(footprint: Array, pose: Array, outlines: Outlines) -> float:
     """Returns the distance in m between a footprint and the nearest obstacle.
 
-    Where they overlap it is minus the depth, the least translation that separates them; it is infinite where there is
-    no obstacle.
+    Where they overlap it is minus the penetration depth, the least translation that separates them; it is infinite
+    where there is no obstacle.
 
     Args:
         footprint: Corners in the robot's frame, counter-clockwise, in m, `(n, 2)`.
@@ -63,7 +63,7 @@ def clearances(footprint: Array, poses: Array, times: Array, surroundings: Surro
 
 @kernel
 def gap(footprint: Array, pose: Array, sides: Array, outlines: Outlines) -> float:
-    """Returns what `clearance` does; `sides` is scratch, `(n, 4)`."""
+    """Returns the distance in m that `clearance` describes; `sides` is scratch, `(n, 4)`."""
     discs, edges, first, rings = outlines
     n, nearest, reach = len(footprint), np.inf, 0.0
     for k in range(n):
@@ -93,7 +93,7 @@ def point_to_segment(x: float, y: float, side: Array) -> float:
 
 @kernel
 def outside(x: float, y: float, side: Array) -> float:
-    """Returns how far a point is to the right of the line through a side, `(4,)`; all in m."""
+    """Returns the signed distance of a point to the right of the line through a side, `(4,)`; all in m."""
     dx, dy = side[2] - side[0], side[3] - side[1]
     return ((x - side[0]) * dy - (y - side[1]) * dx) / np.hypot(dx, dy)
 

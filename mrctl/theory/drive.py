@@ -156,7 +156,7 @@ def chop(voltage: float, emf: float, resistance: float, limit: float) -> float:
 
 @kernel
 def turn(angle: float, rate: float, s: Row) -> tuple[float, float]:
-    """Set-point of the fork behind a servo with backlash and offset: the play operator.
+    """Set-point of the fork behind a servo with backlash and offset, by the play operator.
 
         w ← min(max(w, φ − b/2), φ + b/2),    φ_fork = w + offset
 
@@ -165,7 +165,7 @@ def turn(angle: float, rate: float, s: Row) -> tuple[float, float]:
 
     Args:
         angle: Set-point φ in rad.
-        rate: Its rate in rad/s.
+        rate: Rate of the set-point in rad/s.
         s: In and out: a record of `SERVO`.
 
     Returns:

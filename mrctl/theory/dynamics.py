@@ -10,12 +10,13 @@ The corrected model, with the centre of mass c ahead of P and the front wheel fr
     J_e θ̈ = (D/r)(P_d − P_s) − m c V θ̇ − τ_f,     τ_f = D (1 − f) F_roll (s_d − s_s)/2
     P_i   = (N k_M/R_a)(g U_i − k_E N ω_i) − τ_loss s_i,     ω_i = V_i/r,  V_d,s = V ± D θ̇
 
-where g is `drive_gain` and U is limited to ±`supply`. The losses are modelled so that the inverse is linear in its
-parameters. s_i is the sign of the speed V_i of a rear wheel, and sgn 0 = 0, so that no loss drives a robot at rest. A
-rear wheel bears (1 − f)/2 of the load, and its rolling loss acts on it as the gearbox loss does. The front wheel bears
-the share f, and its sign is taken as the mean of the two others. F_roll is therefore the full force where both wheels
-turn the same way, and the turning resistance τ_f, the rolling loss of wheels that turn against each other, needs no
-parameter of its own. The scrub of the contact patches, which would need one, is left out.
+where the subscripts d and s are the right and the left wheel, g is `drive_gain` and U is limited to ±`supply`. The
+losses are modelled so that the inverse is linear in its parameters. s_i is the sign of the speed V_i of a rear wheel,
+and sgn 0 = 0, so that no loss drives a robot at rest. A rear wheel bears (1 − f)/2 of the load, and its rolling loss
+acts on it as the gearbox loss does. The front wheel bears the share f, and its sign is taken as the mean of the two
+others. The rolling force is therefore F_roll where both wheels turn the same way, and the turning resistance τ_f, the
+rolling loss of wheels that turn against each other, needs no parameter of its own. The scrub of the contact patches,
+which would need one, is left out.
 
 A controller near rest needs the signs smoothed to tanh(V_i/`sign_speed`).
 """
@@ -32,13 +33,13 @@ RPM = 2 * np.pi / 60  # rad/s
 
 
 def common_differential(voltage: ArrayLike) -> NDArray[np.float64]:
-    """Common and differential voltage (U_Σ, U_Δ) of (left, right), with U_r,l = U_Σ ± U_Δ; both in V, shape (…, 2)."""
+    """Common and differential voltage (U_Σ, U_Δ) from (left, right), by U_r,l = U_Σ ± U_Δ; both in V, shape (…, 2)."""
     left, right = split(voltage)
     return stack((right + left) / 2, (right - left) / 2)
 
 
 def left_right(mixed: ArrayLike) -> NDArray[np.float64]:
-    """Voltages (left, right) of (U_Σ, U_Δ), the inverse of `common_differential`; both in V, shape (…, 2)."""
+    """Voltages (left, right) from (U_Σ, U_Δ), the inverse of `common_differential`; both in V, shape (…, 2)."""
     common, differential = split(mixed)
     return stack(common - differential, common + differential)
 
@@ -114,7 +115,7 @@ def accelerations(twist: ArrayLike, voltage: ArrayLike, robot: Robot, sign_speed
 def inverse_dynamics(
     twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_speed: float = 0.0
 ) -> NDArray[np.float64]:
-    """Commanded voltages that give an acceleration: `accelerations` solved for them, without the supply limit.
+    """Commanded voltages that give an acceleration: `accelerations` solved for the voltages, without the supply limit.
 
     Args:
         twist: (V, θ̇), shape (…, 2).
@@ -192,7 +193,7 @@ def wheel_torques_as_printed(
 
 
 def accelerations_as_printed(twist: ArrayLike, voltage: ArrayLike, robot: Robot) -> NDArray[np.float64]:
-    """Equation (3) as printed, solved for its two left-hand derivatives, and kept for comparison. It has seven errors.
+    """Equation (3) as printed, solved for its two derivatives and kept for comparison. It has seven errors.
 
     1. The first derivative is printed V̈, but (P_d + P_s)/(2r) has the dimension of M V̇; the value is an acceleration.
     2. The factor 1/(2r) of the force is half of the right one, 1/r.

@@ -1,4 +1,4 @@
-"""Space as cells: occupancy, and the distance of every cell from what occupies others."""
+"""Grids: which cells obstacles occupy, and the distance of every cell from the obstacles."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Grid(NamedTuple):
     """Which cells of a rectangle are occupied."""
 
     occupied: NDArray[np.bool]
-    """Whether an obstacle touches the cell, `(rows, columns)`: rows go up y, columns along x."""
+    """Whether an obstacle may touch the cell, `(rows, columns)`; y grows with the row, x with the column."""
     origin: Array
     """Lower left corner of the first cell in m, `(2,)`."""
     resolution: float
@@ -27,10 +27,10 @@ class Grid(NamedTuple):
 
 
 class Field(NamedTuple):
-    """Distance from the nearest occupied cell; `at` interpolates it."""
+    """Signed distance from the nearest obstacle or occupied cell; `at` interpolates it."""
 
     distance: Array
-    """Distance of each cell's centre in m, negative in occupied cells, `(rows, columns)`."""
+    """Distance of each cell's centre in m, negative inside, `(rows, columns)`."""
     origin: Array
     """Lower left corner of the first cell in m, `(2,)`."""
     resolution: float
@@ -77,7 +77,7 @@ def _empty(low: Array, high: Array, resolution: float) -> Grid:
 
 @kernel
 def occupy(outlines: Outlines, grid: Grid) -> None:
-    """Marks the cells of a grid that obstacles touch."""
+    """Marks the cells of a grid that obstacles may touch; see `occupancy`."""
     discs, edges, first, rings = outlines
     occupied, origin, resolution = grid
     rows, columns = occupied.shape
@@ -145,7 +145,7 @@ def measure(outlines: Outlines, field: Field) -> None:
 
 def _transform(cells: NDArray[np.bool]) -> Array:
     """Returns the distance of each cell that is set from the nearest one that is not, in cells, and 0 elsewhere."""
-    from scipy.ndimage import distance_transform_edt  # here, for robots without a map need no scipy
+    from scipy.ndimage import distance_transform_edt  # imported here, since robots without a map need no scipy
 
     return np.asarray(distance_transform_edt(cells), float)
 
@@ -154,7 +154,7 @@ def _transform(cells: NDArray[np.bool]) -> Array:
 def at(field: Field, x: float, y: float) -> tuple[float, float, float]:
     """Returns the distance in m at a point and its gradient, interpolated between the centres of four cells.
 
-    Outside the grid it is that of the nearest cell, and the gradient is 0.
+    Beyond the outermost centres the distance is that of the nearest point between them, and the gradient is 0.
 
     Args:
         field: The field.
@@ -177,15 +177,15 @@ def at(field: Field, x: float, y: float) -> tuple[float, float, float]:
 
 
 def rectangles(occupied: NDArray[np.bool]) -> NDArray[np.int64]:
-    """Covers the occupied cells with rectangles, none of which could be larger; they may overlap.
+    """Covers the occupied cells with rectangles, none of which can grow; they may overlap.
 
-    Each begins at the first cell that none covers yet, row by row, and grows to the right, up, to the left and down.
+    Each begins at the first cell that is not covered yet, row by row, and grows right, up, left and down.
 
     Args:
         occupied: Whether each cell is occupied, `(rows, columns)`.
 
     Returns:
-        First column, first row, and the column and row after the last ones of each, `(n, 4)`.
+        First column, first row, and the column and row after the last ones of each rectangle, `(n, 4)`.
     """
     found = np.empty((int(np.count_nonzero(occupied)), 4), np.int64)
     return found[: cover_cells.compiled(occupied, np.zeros(occupied.shape, np.bool_), found)].copy()
@@ -193,7 +193,7 @@ def rectangles(occupied: NDArray[np.bool]) -> NDArray[np.int64]:
 
 @kernel
 def cover_cells(occupied: NDArray[np.bool], covered: NDArray[np.bool], found: NDArray[np.int64]) -> int:
-    """Does what `rectangles` says; `covered` is scratch, and `found` has a row for each occupied cell. Returns n."""
+    """Writes the rectangles to `found`, one row for each occupied cell, and returns n; `covered` is scratch."""
     rows, columns = occupied.shape
     n = 0
     for i in range(rows):

@@ -25,9 +25,9 @@ def stack(*components: ArrayLike) -> NDArray[np.float64]:
 def state_rates(state: ArrayLike, u: ArrayLike, robot: Robot) -> NDArray[np.float64]:
     """Equation (1), corrected: the rate of the kinematic state.
 
-    The printed equation is corrected in three places: ẏ and the two rear wheels take counter-clockwise angles, and the
-    front wheel has its own radius. The equation holds for a front wheel without trail, whose contact point lies below
-    the steering axis.
+    The printed equation is corrected in two respects: ẏ and the two rear wheels take counter-clockwise angles, and the
+    front wheel has its own radius. It holds for a front wheel without trail, whose contact point lies below the
+    steering axis.
 
     Args:
         state: (x, y, θ, φ, φ_c, φ_s, φ_d), shape (…, 7): pose, steering angle, and rotation angles of the front, left

@@ -6,13 +6,14 @@ the speed V, the yaw rate θ̇ and the fork's angle φ, the yaw model is
 
     J_e θ̈ + J_c φ̈ = (2 D N k_M/(r R_a)) U_Δ − (2 D² N² k_M k_E/(r² R_a) + m c V) θ̇ + (L − t) F
     J_c θ̈ + J_f φ̈ = m_f e V θ̇ − k_s φ − d_s φ̇ − t F
-    u̇ = −u/T,    u = (L − t) θ̇ − t φ̇ − V φ
+    (L − t) θ̈ − t φ̈ = −u/T,    u = (L − t) θ̇ − t φ̇ − V φ
 
-F is the side force of the ground on the tyre and u the side slip of its contact. J_f is the inertia of fork and wheel
-about the steering axis, m_f e their mass times the distance of their centre behind it, J_c = J_f − m_f e L their
-coupling to the yaw, k_s and d_s the servo's stiffness and damping. The servo holds the commanded angle, which does not
-depend on the feedback. At rates far below V/t the fork follows, φ = (L − t) θ̇/V, and its stiffness acts as a damping
-k_s (L − t)²/(t V) of the yaw: at 0.75 m/s it leaves a fifth of the static gain of the default robot's second channel.
+F is the side force of the ground on the tyre and u the side slip of its contact, which decays with T; V φ̇, a small part
+of u̇, is left out. J_f is the inertia of fork and wheel about the steering axis, m_f e their mass times the distance of
+their centre behind it, J_c = J_f − m_f e L their coupling to the yaw, k_s and d_s the servo's stiffness and damping.
+The servo holds the commanded angle, which does not depend on the feedback. At rates far below V/t the fork follows, φ =
+(L − t) θ̇/V, and its stiffness acts as a damping k_s (L − t)²/(t V) of the yaw: at 0.75 m/s it leaves a fifth of the
+static gain of the default robot's second channel.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ class Linear(NamedTuple):
         return bool((np.linalg.eigvals(self.a).real < 0).all())
 
     def held(self, period: float) -> Linear:
-        """The plant behind a zero-order hold of this period in s, x⁺ = A x + b u from one sample to the next; exact."""
-        from scipy.linalg import expm  # here, for settings are read without scipy
+        """The plant behind a zero-order hold, x⁺ = A x + b u from one sample to the next; exact. The period is in s."""
+        from scipy.linalg import expm  # imported here, so that settings are read without scipy
 
         n = len(self.b)
         both = np.zeros((n + 1, n + 1))
@@ -85,12 +86,12 @@ def first_order(gain: float, time_constant: float) -> Linear:
 
 
 def common(robot: Robot) -> Linear:
-    """V in m/s under U_Σ in V, by equation (3) without the losses."""
+    """The plant from U_Σ in V to V in m/s, equation (3) without the losses."""
     return first_order(robot.velocity_gain, robot.velocity_time_constant)
 
 
 def yaw(robot: Robot, speed: float) -> Linear:
-    """θ̇ in rad/s under U_Δ in V, at a speed V in m/s; states θ̇ and, with a steered wheel, φ in rad and φ̇."""
+    """The plant from U_Δ in V to θ̇ in rad/s at a speed V in m/s; its states are θ̇ and, with a steered wheel, φ, φ̇."""
     damping = robot.effective_inertia / robot.rotation_time_constant
     force = damping * robot.rotation_gain
     damping += robot.mass * robot.com_offset * speed
@@ -117,7 +118,7 @@ def yaw(robot: Robot, speed: float) -> Linear:
 
 
 def steering(robot: Robot) -> Linear:
-    """θ̇ in rad/s under a correction u of the θ̇ that determines the angle of a stiff servo, also in rad/s.
+    """The plant from u in rad/s, the θ̇ for which a stiff servo is set, to θ̇ in rad/s.
 
         T θ̈ = δ − θ̇,    J_f δ̈ + d_s δ̇ + k_s δ = k_s u
 

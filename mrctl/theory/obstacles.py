@@ -17,7 +17,7 @@ from mrctl.kernel import Array, kernel
 from mrctl.record import InputError, Record
 from mrctl.theory.references import Reference
 
-MOST = 20_000  # obstacles in one world; a map with more has a resolution that no robot needs
+MOST = 20_000  # obstacles in one world; a map with more has a finer resolution than a robot needs
 
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 Size = Annotated[float, Field(ge=1e-3, le=1e4)]
@@ -38,11 +38,11 @@ class Disc(Record):
     radius: Size = 0.1
     """Radius in m."""
     course: Reference | None = None
-    """Course on which the obstacle moves; its own coordinates, in m and rad, then count from the pose of the course."""
+    """Course on which the obstacle moves; its own coordinates are then relative to the pose of the course."""
 
     @property
     def vertices(self) -> Array:
-        """A disc has none, `(0, 2)`."""
+        """Corners, of which a disc has none, `(0, 2)`."""
         return np.zeros((0, 2))
 
 
@@ -62,7 +62,7 @@ class Box(Record):
     width: Size = 1.0
     """Width in m, across the length."""
     course: Reference | None = None
-    """Course on which the obstacle moves; its own coordinates, in m and rad, then count from the pose of the course."""
+    """Course on which the obstacle moves; its own coordinates are then relative to the pose of the course."""
 
     @property
     def vertices(self) -> Array:
@@ -79,7 +79,7 @@ class Polygon(Record):
     points: Annotated[tuple[tuple[Coordinate, Coordinate], ...], Field(min_length=3, max_length=64)]
     """Corners in order, as x and y in m; the polygon must be convex."""
     course: Reference | None = None
-    """Course on which the obstacle moves; its own coordinates, in m and rad, then count from the pose of the course."""
+    """Course on which the obstacle moves; its own coordinates are then relative to the pose of the course."""
 
     @model_validator(mode="after")
     def _convex(self) -> Polygon:
@@ -100,7 +100,7 @@ Obstacle = Annotated[Disc | Box | Polygon, Field(discriminator="kind")]
 
 
 class Obstacles(Record):
-    """The obstacles of a world; where a scenario is read, the path of a TOML file stands for its content."""
+    """The obstacles of a world; a scenario may give the path of a TOML file in place of its content."""
 
     shapes: Annotated[tuple[Obstacle, ...], Field(max_length=MOST)] = ()
     """Obstacles, each with its `kind`: disc, box or polygon."""
@@ -116,15 +116,15 @@ class Obstacles(Record):
 
     @property
     def moving(self) -> tuple[Disc | Box | Polygon, ...]:
-        """Those that move."""
+        """Obstacles that move."""
         return tuple(shape for shape in self.shapes if shape.course is not None)
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Lower left and upper right corner of the still ones in m, `(2,)` each.
+        """Lower left and upper right corner of the box around the obstacles that stand still, in m, `(2,)` each.
 
         Raises:
-            InputError: No obstacle is still.
+            InputError: No obstacle stands still.
         """
         outlines = Surroundings(Obstacles(shapes=tuple(s for s in self.shapes if s.course is None))).at(0.0)
         points = [outlines.edges[:, :2], *(outlines.discs[:, :2] + s * outlines.discs[:, 2:] for s in (-1, 1))]
@@ -140,11 +140,11 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def turned(points: Array, pose: Array) -> Array:
-    """Returns points of a body in the world.
+    """Transforms points from the frame of a body to the world.
 
     Args:
         points: Points in the body's frame in m, `(n, 2)`.
-        pose: Pose of the body in m, m, rad, `(3,)`.
+        pose: x and y of the body in m and θ in rad, `(3,)`.
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return points @ np.array([[c, s], [-s, c]]) + pose[:2]
@@ -175,7 +175,7 @@ class Movers(NamedTuple):
 
 
 class Surroundings:
-    """Obstacles as arrays, those that move last.
+    """Obstacles as arrays; those that move come last.
 
     Attributes:
         courses: Course of each of the M obstacles that move.
@@ -196,7 +196,7 @@ class Surroundings:
             np.cumsum([0, *map(len, edges)]),
             np.array(rings).reshape(-1, 3),
         )
-        still = len(shapes) - len(self.courses)  # the index of an obstacle less this is that of its course
+        still = len(shapes) - len(self.courses)  # obstacle k moves on course k − still
         of_discs = np.array([k - still for k, _ in discs], int)
         of_rings = np.array([k - still for k, _ in corners], int)
         self._movers = Movers(of_discs, np.repeat(of_rings, np.diff(self._own.first)), of_rings)
@@ -223,11 +223,11 @@ class Surroundings:
 
 @kernel
 def place(own: Outlines, movers: Movers, poses: Array, found: Outlines) -> None:
-    """Places the outlines of moving obstacles; those of others, whose mover is below 0, stay.
+    """Places the outlines of the obstacles that move; the others, whose mover is below 0, stay.
 
     Args:
         own: Outlines relative to the courses.
-        movers: Course of each of them.
+        movers: Index of the course of each part of the outlines.
         poses: Pose of each course in m, m, rad, `(M, 3)`.
         found: In and out: the outlines in the world.
     """
@@ -248,6 +248,6 @@ def place(own: Outlines, movers: Movers, poses: Array, found: Outlines) -> None:
 
 @kernel
 def moved(pose: Array, x: float, y: float) -> tuple[float, float]:
-    """Returns a point of a body, x and y in m in its frame, in the world; the pose is in m, m, rad, `(3,)`."""
+    """Transforms a point, x and y in m, from the frame of a body at a pose in m, m, rad, `(3,)`, to the world."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return pose[0] + c * x - s * y, pose[1] + s * x + c * y

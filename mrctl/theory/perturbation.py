@@ -24,13 +24,13 @@ from mrctl.theory.drive import (
 )
 
 LONGEST_DELAY = 0.5
-"""Longest delay of a command on its way to the motors in s."""
+"""Longest delay in s of a command on its way to the motors."""
 
 Factor = Annotated[float, Field(ge=0.05, le=20)]
 
 
 class Perturbation(Record):
-    """Differences of the plant from the model that the controller knows; the default changes nothing."""
+    """Differences of the plant from the model that the controller knows; by default there are none."""
 
     moved = {
         "velocity_noise": "the noise of the wheel speeds follows from sensing.encoder_counts",
@@ -76,9 +76,9 @@ class Perturbation(Record):
     dead_zone: DeadZone = 0.0
     """Voltage in V that is added to the dead zone of the motor driver, below which a command has no effect."""
     pwm_steps: PwmSteps = 0
-    """Number of steps of the pulse width to the full supply, where the driver has more or none; 0 for no change."""
+    """Number of steps of the pulse width to the full supply, if the driver has more steps or none; 0 for no change."""
     current_limit: CurrentLimit = NO_LIMIT
-    """Current limit of each motor in A, where that of the driver is higher; 1000 A, the default, stands for none."""
+    """Current limit of each motor in A, if that of the driver is higher; 1000 A, the default, stands for no limit."""
     battery_resistance: BatteryResistance = 0.0
     """Resistance in Ω that is added to that of the battery, so that the motors' currents lower its voltage further."""
     steering_offset: Offset = 0.0
@@ -86,7 +86,7 @@ class Perturbation(Record):
     steering_backlash: Backlash = 0.0
     """Width in rad that is added to the backlash between the steering servo and the fork."""
     supply_factor: Annotated[float, Field(gt=0, le=2)] = 1.0
-    """Factor on the supply voltage, and by the PWM driver on every applied voltage."""
+    """Factor on the supply voltage and, since the driver works by PWM, on every applied voltage."""
     tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
     """Factor on the friction of every tyre on the floor."""
     left_tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
@@ -99,7 +99,7 @@ class Perturbation(Record):
     @model_validator(mode="before")
     @classmethod
     def _named(cls, values: Any) -> Any:  # noqa: ANN401
-        """A name stands for one of `PERTURBATIONS`."""
+        """Replaces a name in `PERTURBATIONS` by the fields of that perturbation."""
         if not isinstance(values, str):
             return values
         if values not in PERTURBATIONS:
@@ -107,13 +107,13 @@ class Perturbation(Record):
         return PERTURBATIONS[values].model_dump()
 
     def drawn(self, random: np.random.Generator) -> Perturbation:
-        """Returns the perturbation of one robot on one day, with what nobody knows of it drawn at random.
+        """Returns the perturbation of one robot on one day, with its unknown differences drawn at random.
 
         Each factor in `UNKNOWN` is multiplied by a uniform draw from 1 ± w; to the slope a uniform draw from
         ± `UNKNOWN_SLOPE` is added.
 
         Args:
-            random: Source of the draw, which always takes the same number of values from it.
+            random: Source of random numbers; each draw takes the same number of values from it.
         """
         changed = {name: getattr(self, name) * (1 + random.uniform(-w, w)) for name, w in UNKNOWN.items()}
         changed["slope"] = self.slope + random.uniform(-UNKNOWN_SLOPE, UNKNOWN_SLOPE)

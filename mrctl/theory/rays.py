@@ -7,15 +7,15 @@ import numpy as np
 from mrctl.kernel import Array, kernel
 from mrctl.theory.obstacles import Outlines
 
-SLACK = 1e-9  # rad, by which a beam may miss the end of an edge and still meet it; two edges meet there
+SLACK = 1e-9  # rad, by which a beam may miss the end of an edge and still meet it, so that none slips through
 
 
 @kernel
 def cast(pose: Array, first: float, step: float, reach: float, outlines: Outlines, ranges: Array) -> None:
     """Casts the beams of a planar lidar at obstacles.
 
-    Beam k leaves in the direction θ + first + k step. Each obstacle is cut only with the beams within the angle that it
-    covers, as seen from the sensor, so that the effort is that of the obstacles plus that of the beams that meet them.
+    Beam k leaves in the direction θ + first + k step. Each obstacle is intersected only with the beams within the angle
+    that it covers as seen from the sensor, so that the cost grows with the obstacles and the beams that meet them.
 
     Args:
         pose: x and y of the sensor in m and θ in rad, `(3,)`.
@@ -37,7 +37,7 @@ def cast(pose: Array, first: float, step: float, reach: float, outlines: Outline
         half = np.pi if distance <= radius else np.arcsin(radius / distance)
         towards = np.arctan2(dy, dx) - half - turn
         towards -= 2 * np.pi * np.floor(towards / (2 * np.pi))
-        for lap in range(2):  # an angle that crosses the first beam's is also below it
+        for lap in range(2):  # an interval that contains the direction of the first beam also begins a turn before it
             start = towards - 2 * np.pi * lap
             for beam in range(max(0, int(np.ceil((start - SLACK) / step))), n):
                 angle = beam * step

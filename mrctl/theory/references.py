@@ -1,11 +1,12 @@
 """Analytic reference trajectories: pose, twist and acceleration of the robot at every time.
 
 A position is a complex number p = x + i y. A path with heading θ then has the tangent e^{iθ}, a rotation is a product,
-and the logarithmic derivative p''/p' = v̇/v + i θ̇ gives acceleration and rotation at once. Nothing is differenced
-numerically, and every sample depends on its own time alone, headings included.
+and the logarithmic derivative p''/p' = v̇/v + i θ̇ gives acceleration and rotation at once. No derivative is numerical,
+and every sample, its heading included, depends on its own time alone.
 
-A reference starts at the origin along +x; a line starts along its heading, and waypoints at the first one. A new kind
-is a `Record` with `kind`, `period` and the method `sample`, and is added to the union `Reference`.
+A reference starts at the origin along +x, except that a line starts along its heading, a lemniscate at 45°, and a
+spline at its first waypoint. A new kind is a `Record` with `kind`, `period` and the method `sample`, and is added to
+the union `Reference`.
 """
 
 from __future__ import annotations
@@ -126,7 +127,7 @@ class Circle(Record):
     period: Duration = 8.0
     """Time of one lap in s."""
     clockwise: bool = False
-    """Drive clockwise, to the right of the start."""
+    """Drive clockwise, to the right."""
 
     def sample(self, t: Array) -> Motion:
         """Samples the circle at the times t in s, shape (T,)."""
@@ -287,9 +288,10 @@ class Waypoints(Record):
     closed: bool = True
     """Close the curve from the last point to the first."""
     stop_time: Duration = 2.0
-    """Duration of the braking at the end of an open curve in s, at constant speed before."""
+    """Duration in s of the braking at the end of an open curve, whose speed is constant before."""
     timing: Literal["constant", "limits"] = "constant"
-    """Keep the speed all along the path (`constant`), or drive as fast as the `limits` allow, an open one from rest."""
+    """Keep the speed all along the path (`constant`), or drive as fast as the `limits` allow, from rest on an open
+    curve."""
     limits: Limits = Limits()
     """Limits that `timing` = `limits` keeps, besides the speed."""
     cusps: tuple[Annotated[int, Field(ge=0)], ...] = ()
@@ -314,7 +316,7 @@ class Waypoints(Record):
             where = path.derivative(path.u, 0)[slow.argmin()]
             raise ValueError(f"points: the curve turns on the spot near ({where.real:.2f}, {where.imag:.2f})")
         if self.timing == "limits":
-            _ = self._law  # refuses limits with which the robot cannot move
+            _ = self._law  # raises for limits with which the robot cannot move
         elif not self.closed and self.speed * self.stop_time / 2 > path.length:
             raise ValueError(f"stop_time: too long to stop from {self.speed:g} m/s within {path.length:.2f} m")
         return self
@@ -329,7 +331,7 @@ class Waypoints(Record):
         for part, back in self._parts:
             ends = _spline(part.points, False).heading[[0, -1]] + np.pi * back
             if heading is not None and abs(cmath.phase(cmath.exp(1j * (ends[0] - heading)))) > KINK:
-                raise ValueError(f"cusps: the curve turns by more than {KINK:g} rad at one")
+                raise ValueError(f"cusps: the curve turns by more than {KINK:g} rad at a cusp")
             heading = ends[1]
         return self
 
@@ -400,7 +402,7 @@ class _Spline:
     """A planar quintic spline by arc length s; its own parameter u is the accumulated chord length, both in m."""
 
     def __init__(self, points: tuple[tuple[float, float], ...], closed: bool) -> None:
-        from scipy.interpolate import make_interp_spline  # here, for settings are read without scipy
+        from scipy.interpolate import make_interp_spline  # imported here, so that settings are read without scipy
 
         p = _plane(points, closed)
         knots = np.append(0, np.cumsum(np.abs(np.diff(p))))
@@ -453,7 +455,7 @@ class _Spline:
 _spline = lru_cache(maxsize=512)(_Spline)
 
 
-@lru_cache(maxsize=512)  # a comparison has hundreds of plans, and their scenarios ask for the time again and again
+@lru_cache(maxsize=512)  # a comparison has hundreds of plans, whose scenarios ask for their durations repeatedly
 def _law(points: tuple[tuple[float, float], ...], closed: bool, speed: float, limits: Limits) -> SmoothLaw:
     """The time law along the spline through the points."""
     spline = _spline(points, closed)
@@ -466,8 +468,8 @@ def random_spline(
 ) -> Waypoints:
     """A random closed spline around the origin, driven at changing speed under the limits of a robot.
 
-    The lateral acceleration is limited further, so that the robot takes the tightest curve at 0.3 to 0.8 of its top
-    speed; a robot whose other limits do not slow it down would drive at constant speed otherwise.
+    The lateral acceleration is limited further, so that the robot takes the tightest curve at 0.3 to 0.8 of its largest
+    speed; otherwise a robot that no other limit slows down would drive at constant speed.
 
     Args:
         random: Source of the draws.
@@ -499,11 +501,11 @@ Reference = Annotated[
 
 
 def check(reference: Reference, robot: Robot, reverse: bool) -> None:
-    """Refuses a reference that the robot cannot follow; a reference that was fine is not sampled again.
+    """Refuses a reference that the robot cannot follow; one that passed is not sampled again.
 
     Args:
         reference: The reference.
-        robot: The robot, whose limits on speed, acceleration, steering angle and grip are held against the reference.
+        robot: The robot, whose limits on speed, acceleration, steering angle and grip the reference must keep.
         reverse: Whether the robot can drive backwards with its steering.
 
     Raises:
@@ -527,7 +529,7 @@ def _fault(reference: Reference, robot: Robot, reverse: bool) -> str:
     if not reverse and v.min() < -1e-9:
         when = t[np.argmax(v < -1e-9)]
         return f"reverses at t = {when:.2f} s, which compliant and caster steering cannot do; use rigid"
-    # atan2 keeps the ratio θ̇/V as the robot comes to rest, and is zero at rest, which needs no steering angle.
+    # atan2 depends on θ̇/V alone as the robot comes to rest, and is zero at rest, which needs no steering angle.
     steering = np.arctan2(abs(robot.wheelbase) * np.abs(omega), np.abs(v))
     for name, values, unit, limit, bound in (
         ("speed", v, "m/s", "max_speed", robot.max_speed),
@@ -549,17 +551,17 @@ def enlarged(reference: Reference, robot: Robot, reverse: bool) -> Circle | Lemn
     Args:
         reference: The reference.
         robot: The robot.
-        reverse: Whether the robot can be driven backwards.
+        reverse: Whether the robot can drive backwards with its steering.
 
     Returns:
-        The reference, or None if there is none, or for a reference of another kind.
+        The reference; None if no such reference is found, or for one of another kind.
     """
     if not isinstance(reference, (Circle, Lemniscate)):
         return None
     name = "radius" if isinstance(reference, Circle) else "size"
     for larger, slower in product(range(12), range(12)):
         size, period = getattr(reference, name) * 2 ** (larger / 4), reference.period * 2 ** (slower / 4)
-        with contextlib.suppress(InputError):  # beyond what a reference may be
+        with contextlib.suppress(InputError):  # beyond the bounds of the fields
             found = reference.replace(**{name: round(size, 2), "period": round(period, 1)})
             if not _fault(found, robot, reverse):
                 return found
@@ -567,7 +569,7 @@ def enlarged(reference: Reference, robot: Robot, reverse: bool) -> Circle | Lemn
 
 
 def _remedy(reference: Reference, robot: Robot, reverse: bool) -> str:
-    """Names the circle or lemniscate that a robot can follow, or returns ""."""
+    """Returns the end of an error message, a circle or lemniscate that the robot can follow, or ""."""
     found = enlarged(reference, robot, reverse)
     if found is None:
         return ""

@@ -42,7 +42,7 @@ class Robot(Record):
     half_track: Positive
     """Half the distance between the rear wheels [D] in m."""
     wheelbase: float
-    """Distance of the steering axis ahead of the rear axle [L] in m; without one, of the caster, negative if behind."""
+    """Distance of the steering axis ahead of the rear axle [L] in m; without it, of a caster, negative if behind."""
     trail: NonNegative
     """Distance of the front contact point behind the steering axis [t] in m."""
     steering_limit: Annotated[float, Field(gt=0, le=ANY_ANGLE)]
@@ -132,7 +132,7 @@ class Robot(Record):
 
     @property
     def effective_mass(self) -> float:
-        """Effective mass M_e in kg: the robot's mass, and the spin inertias of its drives and front wheel."""
+        """Effective mass M_e in kg: the robot's mass plus the spin inertias of its drives and front wheel."""
         return (
             self.mass
             + 2 * self.drive_inertia / self.wheel_radius**2
@@ -141,7 +141,7 @@ class Robot(Record):
 
     @property
     def effective_inertia(self) -> float:
-        """Effective yaw inertia about P, J_e, in kg·m²: the robot's, and the spin inertias of its drives."""
+        """Effective yaw inertia about P, J_e, in kg·m²: the robot's plus the spin inertias of its drives."""
         return (
             self.yaw_inertia
             + self.mass * self.com_offset**2
@@ -171,15 +171,15 @@ class Robot(Record):
 
 
 class Tyres(NamedTuple):
-    """What the driven wheels of the nominal robot do beside rolling: λ̇_l,r r (1 ± load a_y) = u_l,r − lag u̇_l,r.
+    """Deviation of the nominal robot's driven wheels from pure rolling: λ̇_l,r r (1 ± load a_y) = u_l,r − lag u̇_l,r.
 
-    u_l,r = V ∓ D θ̇ is the speed of a wheel's axle, and a_y the specific force to the left.
+    λ̇ is the rate of a wheel, u_l,r = V ∓ D θ̇ the speed of its axle, and a_y the specific force to the left.
     """
 
     lag: float = 0.0
-    """Slip of the driven tyres over their acceleration, in s; positive where the wheels turn less than they roll."""
+    """Slip of the driven tyres over their acceleration, in s; positive where a wheel turns less than its axle moves."""
     load: float = 0.0
-    """Relative growth of the left rolling radius, and shrinking of the right one, over a_y, in s²/m."""
+    """Relative growth of the left rolling radius, and relative loss of the right one, over a_y, in s²/m."""
 
 
 class RobotFile(Record):
@@ -196,4 +196,4 @@ class RobotFile(Record):
 
 
 CAR = RobotFile()
-"""The robot of the world itself."""
+"""The default: the robot that the world itself has, which is `car` unless the world's file has another."""

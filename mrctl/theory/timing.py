@@ -32,9 +32,9 @@ from mrctl.theory.robot import GRAVITY, Robot
 RESERVE = 0.9
 """Share of the robot's limits that a reference may use; the rest is for the feedback. Chosen."""
 
-PER_TURN = 40  # intervals for each rad of a curve, at least; chosen
+PER_TURN = 40  # least number of intervals for each rad of a curve; chosen
 MOST_INTERVALS = 20_000
-LAPS = 1000  # at most, until the speed at the end of a closed path is that at its start
+LAPS = 1000  # largest number of passes, until the speed at the end of a closed path is that at its start
 
 Limit = Annotated[float, Field(ge=1e-3, le=1e4)]
 Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -64,7 +64,7 @@ class Limits(Record):
     @model_validator(mode="after")
     def _complete(self) -> Limits:
         if len(self.inverse) not in (0, 8):
-            raise ValueError(f"inverse: has {len(self.inverse)} rows, but the features are 8")
+            raise ValueError(f"inverse: has {len(self.inverse)} rows, but there are 8 features")
         return self
 
     @classmethod
@@ -95,7 +95,7 @@ class Path(NamedTuple):
     sharpness: Array
     """κ' in 1/m², shape (2N + 1,)."""
     closed: bool
-    """Whether the end is the start; the law is then periodic, and else it starts and ends at rest."""
+    """Whether the end is the start; the law is then periodic, otherwise it starts and ends at rest."""
 
     @property
     def length(self) -> float:
@@ -171,7 +171,7 @@ def speed_caps(path: Path, limits: Limits, speed: float) -> Array:
 
 @kernel
 def acceleration_range(rows: Array, x: float) -> tuple[float, float]:
-    """Smallest and largest u = s̈ in m/s² that keep all limits at x = ṡ²; the smallest is larger where none does.
+    """Smallest and largest u = s̈ in m/s² that keep all limits at x = ṡ²; the first is the larger one where none does.
 
     A limit is −1 ≤ a u + b x + c √x + d ≤ 1 for all coefficients between a lower and an upper bound. As x and √x are
     not negative, the upper bounds of b, c and d determine the upper limit and their lower bounds the lower limit; u
@@ -184,8 +184,8 @@ def acceleration_range(rows: Array, x: float) -> tuple[float, float]:
     low, high, v = -np.inf, np.inf, np.sqrt(x)
     for i in range(rows.shape[1]):
         least, most = rows[0, i], rows[1, i]
-        above = 1 - most[1] * x - most[2] * v - most[3]  # a u must not be larger
-        below = -1 - least[1] * x - least[2] * v - least[3]  # nor smaller
+        above = 1 - most[1] * x - most[2] * v - most[3]  # upper limit on a u
+        below = -1 - least[1] * x - least[2] * v - least[3]  # lower limit on a u
         for a in (least[0], most[0]):
             if a > 0:
                 low, high = max(low, below / a), min(high, above / a)
@@ -261,7 +261,7 @@ def bounds(rows: Array, first: Array, last: Array, found: Array) -> None:
 
     Args:
         rows: Coefficients, shape (N, C).
-        first: First sample of each range, shape (M,); sample N is sample 0 again.
+        first: First sample of each range, shape (M,); samples from N on are those from 0 on again.
         last: Last sample of each range, shape (M,).
         found: Out: smallest and largest coefficients, shape (M, 2, C).
     """
@@ -321,8 +321,8 @@ class TimeLaw:
 class SmoothLaw:
     """The moving average of a time law; it begins where the path begins.
 
-    Its acceleration is continuous, and changes in a second by at most twice its limit over the window. A closed path
-    takes as long as by the law itself, and an open one takes a window longer.
+    Its acceleration is continuous, and its jerk is at most twice the limit on the acceleration over the window. A
+    closed path takes as long as by the law itself, and an open one takes a window longer.
 
     Attributes:
         law: The law that is averaged.
@@ -334,7 +334,7 @@ class SmoothLaw:
         self.law, self._window, self._start = law, window, -window / 2
         self.duration = law.duration
         if law.path.closed:
-            from scipy.optimize import brentq  # here, for settings are read without scipy
+            from scipy.optimize import brentq  # imported here, so that settings are read without scipy
 
             root = brentq(lambda t: law.average(np.array([t]), window)[0].item(), -window / 2, window / 2)
             self._start = float(root)  # type: ignore[arg-type]

@@ -60,7 +60,7 @@ def test_transfer(name, files):
 
 def test_refused(files, tmp_path):
     """A learner that keeps nothing, another learner's file, several runs, a user's stage: one line that says which."""
-    with pytest.raises(InputError, match="^learned: the learner indi has nothing that a run could keep$"):
+    with pytest.raises(InputError, match="^learned: the learner indi keeps nothing that a run could start from$"):
         Scenario.from_dict({"prior": "model", "learner": "indi", "learned": "x.safetensors"})
     with pytest.raises(InputError, match=r"^learned: .*fel\.safetensors: theta is missing, it must have"):
         Simulation([BASE.model_copy(update={"learner": "rls", "learned": files["fel"][0]})])

@@ -322,9 +322,9 @@ def test_command_line(tmp_path, capsys):
         (f"{file}:Mine", "feedforward Mine: has no method learn"),
         (
             f"motor={file}:Mine",
-            "controller: 'motor' is no stage; there are motion, feedback, feedforward, steering, estimator",
+            "controller: 'motor' is not a stage; there are motion, feedback, feedforward, steering, estimator",
         ),
-        (f"motion={file}:Mine,motion={file}:Mine", "controller: motion is there twice"),
+        (f"motion={file}:Mine,motion={file}:Mine", "controller: motion is given twice"),
         (f"motion={file}:Other", "controller: mine.py has no Other"),
         ("motion=nowhere.py:Mine", "controller: no file nowhere.py"),
     ):

@@ -91,7 +91,9 @@ def test_names():
     """Each name of a pair is that of its scenario; an observer without a model is refused in one line."""
     for name, pair in FEEDFORWARDS.items():
         assert Scenario(**pair).feedforward == name
-    with pytest.raises(InputError, match="^prior: the learner observer compares the robot with a model; set model$"):
+    with pytest.raises(
+        InputError, match="^prior: the learner observer compares the robot with a model; set prior to model$"
+    ):
         Scenario.from_dict({"learner": "observer"})
 
 

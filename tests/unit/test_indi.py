@@ -192,5 +192,5 @@ def test_rows(robot):
 
 
 def test_needs_a_model():
-    with pytest.raises(InputError, match="prior: the learner indi compares the robot with a model; set model"):
+    with pytest.raises(InputError, match="prior: the learner indi compares the robot with a model; set prior to model"):
         Scenario.from_dict({"prior": "none", "learner": "indi"})

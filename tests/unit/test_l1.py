@@ -152,5 +152,5 @@ def test_rows(robot):
 
 
 def test_needs_a_model():
-    with pytest.raises(InputError, match="prior: the learner l1 compares the robot with a model; set model"):
+    with pytest.raises(InputError, match="prior: the learner l1 compares the robot with a model; set prior to model"):
         Scenario.from_dict({"prior": "none", "learner": "l1"})
