@@ -119,6 +119,6 @@ def read_mission(scenario: Scenario | str | Path | None) -> Scenario:
     """Returns a scenario, that in a file, or by default a mission through a door.
 
     Raises:
-        InputError: The file is bad.
+        InputError: The file is not a valid scenario.
     """
     return prepared(task_of(WORLD, Scenario()), Scenario())[1] if scenario is None else read(scenario)
