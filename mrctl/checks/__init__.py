@@ -1,5 +1,5 @@
-"""Is the physics right, and if not, why? The checks, the examination of a robot by them, and the pytest plugin.
+"""Whether the physics of a robot is right, and if not, why: the checks, the diagnosis of failures, the pytest plugin.
 
 `tests/physics`, `mrctl check` and `pytest --mrctl-robot` all run the same checks. README.md explains them.
-Imports `mrctl.record`, theory and physics.
+Imports `mrctl.record`, `mrctl.kernel`, theory and physics.
 """

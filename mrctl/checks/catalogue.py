@@ -1,9 +1,9 @@
 """The list of all physics checks, and how one of them is applied to a robot.
 
-A check takes a compiled model and the robot that it ought to be, drives it, and returns measured values beside expected
-ones. The expected values follow from that `Robot` and from the laws of `mrctl.theory`, never from the model, so a model
-with another gear, mass or friction than it claims fails. Voltages, speeds and times scale with the robot: any robot
-that `mrctl.physics.mjcf.load` accepts can be checked.
+A check takes a compiled model and the parameters that it ought to have, usually drives it, and returns measured values
+beside expected ones. The expected values follow from those parameters, a `Robot`, and from the laws of `mrctl.theory`,
+never from the model, so a model with another gear, mass or friction than it claims fails. Voltages, speeds and times
+scale with the robot: any robot that `mrctl.physics.mjcf.load` accepts can be checked.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -26,13 +26,13 @@ from mrctl.theory.robot import Robot, Steering
 
 
 class Check(NamedTuple):
-    """A check, and the robots that it is for.
+    """A check, and the robots that it suits.
 
     Attributes:
         function: Measures a model against a robot's parameters.
         world: World that it needs; `flat` stands for any level floor.
-        steering: Steering arrangement that it needs, of a robot that offers several.
-        front: Kind of front that it needs.
+        steering: Steering arrangement in which it drives a robot that offers several.
+        front: Kind of front wheel or caster that it needs.
     """
 
     function: Callable[[mujoco.MjModel, Robot], Report]
@@ -46,7 +46,7 @@ class Check(NamedTuple):
         return getattr(self.function, "__name__", str(self.function))
 
     def unsuited(self, model: mujoco.MjModel) -> str:
-        """Reason why the check is not for a robot; empty if it is."""
+        """Returns why the check does not suit a robot, or "" if it does."""
         if self.front in ("steered", "without trail") and not is_steered(model):
             return "nothing is steered"
         if self.front == "without trail" and read_robot(model).trail > 1e-6:
@@ -111,4 +111,4 @@ CHECKS = (
     Check(worlds.patch, "patch", "compliant"),
     Check(worlds.rough, "rough", "compliant"),
 )
-"""All checks. Those of the world `flat` suit any robot on a level floor, the others need the shipped worlds."""
+"""All checks. Those with the world `flat` run on any level floor; the others need the shipped worlds."""

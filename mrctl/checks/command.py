@@ -1,4 +1,4 @@
-"""The text of `mrctl check`: the checks of a robot and the causes of failures, as a table or as JSON."""
+"""`mrctl check`: runs the checks on a robot, and reports values and causes of failures as a table or as JSON."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -45,7 +45,7 @@ def examination(
 
 
 def _is_world(path: str) -> bool:
-    """Whether a file has a floor of its own, and on it a robot with the names of `mrctl.physics.elements`."""
+    """Tells whether a file has its own floor, and on it a robot with the names of `mrctl.physics.elements`."""
     if path in SHIPPED:
         return False
     try:
@@ -72,7 +72,7 @@ def run(
         json: Whether the report is JSON instead of a table.
 
     Returns:
-        The report, and a verdict such as "3 of 23 checks failed", which is empty if none failed.
+        The report, and a verdict such as "3 of 24 checks failed", or "" if none failed.
 
     Raises:
         InputError: The robot cannot be loaded.
@@ -88,7 +88,7 @@ def run(
 
 
 def as_data(finding: Finding) -> dict[str, object]:
-    """A finding as JSON data; NaN and infinity become null."""
+    """Returns a finding as JSON data, in which NaN and infinity become null."""
 
     def number(value: float) -> float | None:
         return value if math.isfinite(value) else None
@@ -106,7 +106,7 @@ def as_data(finding: Finding) -> dict[str, object]:
 
 
 def table(findings: list[Finding]) -> str:
-    """A table with the tightest value of each passed check, all failed values of the others, and their causes."""
+    """Returns a table: the tightest value of each passed check, all failed values of the others, and their causes."""
     rows = [("check", "value", "measured", "expected", "")]
     for finding in (f for f in findings if not f.reason):
         name = finding.check.name
@@ -128,14 +128,14 @@ def table(findings: list[Finding]) -> str:
 
 
 def cause_line(finding: Finding) -> str:
-    """The causes of a failed check, and its worst value after their repair, in one line."""
+    """Returns the causes of a failed check, and its worst value after their repair, in one line."""
     if not finding.causes:
         return UNEXPLAINED
     return f"cause: {', '.join(c.cause for c in finding.causes)}; once repaired, {finding.causes[0].evidence}"
 
 
 def _width(cell: str) -> int:
-    """Width of a cell in characters on the screen; the dot of θ̇ takes none."""
+    """Returns the width of a cell in characters on the screen; the dot of θ̇ takes none."""
     return sum(not unicodedata.combining(letter) for letter in cell)
 
 

@@ -1,4 +1,4 @@
-"""What a check returns: measured values, each beside the expected one and its tolerance."""
+"""The result of a check: measured values, each with the expected value and its tolerance."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Comparison(NamedTuple):
-    """A measured value and the expected one.
+    """A measured value beside the expected one.
 
     Attributes:
         quantity: Name of the quantity.
@@ -28,7 +28,7 @@ class Comparison(NamedTuple):
         return abs(self.measured - self.expected) <= self.tolerance
 
     def __str__(self) -> str:
-        """The comparison in one line of text."""
+        """Returns the comparison as one line of text."""
         bounds = f"{self.expected:.5g} ± {self.tolerance:.2g}"
         return f"{self.quantity}: {self.measured:.5g}, expected {bounds} {self.unit}".strip()
 

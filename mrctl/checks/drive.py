@@ -34,11 +34,11 @@ from mrctl.theory.robot import GRAVITY, Robot
 
 
 def hold_on_slope(model: mujoco.MjModel, robot: Robot) -> Report:
-    """Shorted motors do not hold a robot on a slope, Coulomb friction does: up to m g sin α = 2 τ_loss/r + F_roll.
+    """Coulomb friction, not its shorted motors, holds a robot on a slope, up to m g sin α = 2 τ_loss/r + F_roll.
 
-    With half of that force it stands, but MuJoCo's friction is soft and creeps in proportion to its load: the tolerance
-    is a tenth of the speed without friction. With twice the force, or less if the tyres would slip, it rolls, and
-    back-EMF brakes it to (m g sin α − losses)/B with B = 2 N² k²/(R_a r²). The tolerance is 0.25 % of the force, of
+    At half of that force the robot stands, but MuJoCo's friction is soft and creeps in proportion to its load: the
+    tolerance is a tenth of the speed without friction. At twice the force, or less if the tyres would slip, it rolls,
+    and back-EMF brakes it to (m g sin α − losses)/B with B = 2 N² k²/(R_a r²). The tolerance is 0.25 % of the force, of
     which slip and sinking tyres take 0.05 % each.
     """
     force, weight = holding_force(robot), robot.mass * GRAVITY
@@ -54,7 +54,7 @@ def hold_on_slope(model: mujoco.MjModel, robot: Robot) -> Report:
 
 
 def _steepest(robot: Robot) -> float:
-    """Largest ratio, up to 2, of downhill force to holding force that uses at most half of the driven tyres' grip."""
+    """Returns the largest ratio, up to 2, of downhill to holding force that takes at most half of the rear grip."""
     for ratio in np.linspace(2.0, 1.1, 10):
         sine = ratio * holding_force(robot) / (robot.mass * GRAVITY)
         cosine, base = np.sqrt(max(0.0, 1 - sine**2)), robot.wheelbase - robot.trail
@@ -115,10 +115,11 @@ def stall(model: mujoco.MjModel, robot: Robot) -> Report:
 
 
 def velocity_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
-    """A step of U_Σ on a robot that already moves: gain r/(k_E N), time constant M_e r² R_a/(2 N² k²).
+    """V answers a step of U_Σ with the gain r/(k_E N) and the time constant M_e r² R_a/(2 N² k²).
 
-    While it moves, the Coulomb losses are constant and drop out. The tolerance of 0.5 % is well under the 1.9 % that
-    the rotors contribute to M_e: at 2 ms the time step adds 0.1 %, and the tyres, which sink in and give, take 0.05 %.
+    The robot already moves, so the Coulomb losses are constant and drop out. The tolerance of 0.5 % is well under the
+    1.9 % that the rotors contribute to M_e: at 2 ms the time step adds 0.1 %, and the tyres, which sink in and give,
+    take 0.05 %.
     """
     volts = robot.supply / 3
     step = robot.supply / 24
@@ -133,7 +134,7 @@ def velocity_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
 
 
 def rotation_time_constant(model: mujoco.MjModel, robot: Robot) -> Report:
-    """A small step of U_Δ while driving straight on: J_e θ̈ = 2 (D/r) (N k_M/R_a) U_Δ − (B + m c V) θ̇.
+    """A small step of U_Δ while driving straight on gives J_e θ̈ = 2 (D/r) (N k_M/R_a) U_Δ − (B + m c V) θ̇.
 
     B = 2 (D/r)² N² k²/R_a is the braking of both motors. Both wheels turn forwards, so the Coulomb losses are
     constant and drop out, and to first order V does not change. The front tyre carries no force, so that equation (3)
@@ -175,11 +176,11 @@ def coast_down(model: mujoco.MjModel, robot: Robot) -> Report:
 def centre_of_mass(model: mujoco.MjModel, robot: Robot) -> Report:
     """An offset centre of mass pushes forward with m c θ̇² and resists turning with m c V θ̇.
 
-    In a steady turn both are the part of the motors' torques, known from voltages and speeds, that nothing else takes:
-    m c θ̇² = F_loss − (P_d + P_s)/r − m v θ̇ and m c V θ̇ = (D/r)(P_d − P_s), with v the sideways drift of the rear
-    tyres (see `scrub_free`). The front tyre carries no force. Then a payload behind the axle leaves a tenth of c, and
-    of both terms. The tolerance is 2 % of the whole term: both are differences of voltage and back-EMF, which are ten
-    times larger, and to which the sinking of the tyres adds 0.05 %.
+    In a steady turn both balance the part of the motors' torques, known from voltages and speeds, that nothing else
+    takes: m c θ̇² = F_loss − (P_d + P_s)/r − m v θ̇ and m c V θ̇ = (D/r)(P_d − P_s), with v the sideways drift of the
+    rear tyres (see `scrub_free`). The front tyre carries no force. Then a payload behind the axle leaves a tenth of c,
+    and of both terms. The tolerance is 2 % of the whole term: both are differences of voltage and back-EMF, which are
+    ten times larger, and to which the sinking of the tyres adds 0.05 %.
     """
     back, remaining = 0.5, 0.1  # m behind P, and the share of c that remains
     ballast = robot.mass * robot.com_offset * (1 - remaining) / (back + remaining * robot.com_offset)

@@ -1,14 +1,15 @@
 """Runs the checks on a robot, and finds the cause of a failure by experiment.
 
-Inspection lists what may be wrong with the model (see `mrctl.checks.inspections`). Where a check fails, these suspects
-are repaired in a copy and the check runs again. A suspect is named as a cause only if the check passes with all of them
-repaired and fails with this one left as it was, so a model may be odd in many ways and only those that matter for what
-was measured are named. Where no repair helps, a shorter time step is tried; any other failure stays unexplained. A
-number in a wrong unit is found by arithmetic before anything is driven (see `mrctl.physics.units`).
+Inspections list what may be wrong with the model (see `mrctl.checks.inspections`). Where a check fails, these suspects
+are repaired in a copy and the check runs again. A suspect is named as a cause if the check passes with all of them
+repaired and fails with this one left as it was; where each of several repairs is enough, all of these are named. So a
+model may be odd in many ways, and only the oddities that change the measurement are named. Where the repairs are not
+enough, a shorter time step is tried, too; any other failure stays unexplained. A number in a wrong unit is found by
+arithmetic before anything is driven (see `mrctl.physics.units`).
 
 The parameters that a check expects are read from the same model, so three kinds of mistakes show: parts of a model
 that contradict each other (left and right, geom and axle), physics that departs from equations (1) and (3), and numbers
-that are consistent but belong to no robot (no rotor inertia behind a gear, limits that no voltage reaches).
+that are consistent but that no robot has (no rotor inertia behind a gear, limits that no voltage reaches).
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -35,14 +36,14 @@ from mrctl.theory.robot import Steering
 
 Load = Callable[[Steering | None], mujoco.MjModel]  # None: the robot's own arrangement
 
-# Checks that have to be explained before others run, because a robot that fails them fails others for the same cause.
+# Checks that run before others: the others are skipped if one fails with a known cause, as they would fail for it too.
 PREREQUISITES = {
     "units": (), "stance": ("units",), "inertias": ("units",), "motors": ("units",), "limits": ("units", "stance"),
     "turning_limits": ("units", "stance"),
 }  # fmt: skip
 PREREQUISITES_OF_OTHERS = ("units", "stance", "limits", "inertias")
 SECONDS = 20.0  # s of processor time for all checks and explanations of a robot; the default robot takes 4
-SECONDS_OF_ONE = 5.0  # s of processor time for one check
+SECONDS_OF_ONE = 5.0  # s of processor time for one run of a check
 STEP_DIVISOR = 8  # by which the time step is divided where no repair explains a failure
 
 
@@ -52,7 +53,7 @@ class Explanation(NamedTuple):
     Attributes:
         cause: Name of the fault.
         text: What is odd in the model, and what to do about it.
-        evidence: The worst value of the check, with all faults repaired.
+        evidence: The quantity that was farthest out of tolerance, with all faults repaired.
     """
 
     cause: str
@@ -67,8 +68,8 @@ class Finding:
     Attributes:
         check: The check.
         report: Its values, empty if it is skipped.
-        causes: Why it fails, as far as that is explained.
-        reason: Why it is skipped, empty if it is not.
+        causes: Causes of its failure, empty if it passes or nothing explains the failure.
+        reason: Why it is skipped, or "" if it is not.
     """
 
     check: Check
@@ -125,7 +126,7 @@ class Examination:
         return Finding(check, report, _wrong_unit(model) if check.name == "units" else self._explain(check, report))
 
     def _measure(self, check: Check, model: mujoco.MjModel) -> Report:
-        """Values of a check, for which there is a limited time."""
+        """Measures the values of a check within the time that is left."""
         start = time.process_time()
         try:
             with limited(min(SECONDS_OF_ONE, self._left)):
@@ -134,7 +135,7 @@ class Examination:
             self._left -= time.process_time() - start
 
     def _explain(self, check: Check, report: Report) -> tuple[Explanation, ...]:
-        """Names the suspects without whose repair the check still fails when all others are repaired."""
+        """Returns the suspects whose repair is necessary, or else those whose repair alone is enough."""
         if self._left <= 0:
             return ()
         worst = max((c for c in report if not c.passed), key=excess)
@@ -154,7 +155,7 @@ class Examination:
         return tuple(Explanation(suspect.cause, suspect.text, str(evidence)) for suspect in causes)
 
     def _repaired(self, check: Check, repairs: list[Suspect]) -> Report:
-        """Values of a check after some repairs; empty if the repaired model is no robot."""
+        """Measures a check after some repairs; returns nothing if the repaired model is not a valid robot."""
         model = self._load(check.steering)
         for suspect in repairs:
             suspect.repair(model)
@@ -175,13 +176,13 @@ def _wrong_unit(model: mujoco.MjModel) -> tuple[Explanation, ...]:
 
 
 def excess(comparison: Comparison) -> float:
-    """Departure from the expected value in tolerances."""
+    """Returns the departure from the expected value as a multiple of the tolerance."""
     excess = abs(comparison.measured - comparison.expected) / max(comparison.tolerance, 1e-12)
     return excess if np.isfinite(excess) else np.inf
 
 
 def _excess_of(comparison: Comparison, report: Report) -> float:
-    """Excess of the same quantity in another report."""
+    """Returns the excess of the same quantity in another report."""
     return next((excess(c) for c in report if c.quantity == comparison.quantity), np.inf)
 
 
@@ -190,7 +191,7 @@ def _passes(report: Report) -> bool:
 
 
 def _long_step(model: mujoco.MjModel, divisor: float) -> Suspect:
-    """Suspects the time step, which no inspection can see to be too long."""
+    """Makes a suspect of a time step that is too long, which no inspection can see."""
     h = 1e3 * model.opt.timestep
 
     def repair(faulty: mujoco.MjModel) -> None:

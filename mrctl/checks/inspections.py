@@ -1,8 +1,8 @@
 """Inspections of a robot's model: each finds one fault that a model can have, and knows how to repair it.
 
-An inspection takes a compiled model and its parameters. It lists the parts that are out of tolerance, with a clause
-that gives the numbers, and the fields that repair such a part; `_suspect` makes a `Suspect` of them. Whether that is
-the cause of a failed check is found out by `mrctl.checks.examination`. `INSPECTIONS` lists them all.
+An inspection takes a compiled model and its parameters. It lists the parts that are out of tolerance, each with a
+clause that gives the numbers, and the fields that repair such a part; most inspections let `_suspect` make a `Suspect`
+of these. `mrctl.checks.examination` finds out whether a suspect is the cause of a failed check.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -58,9 +58,9 @@ def _suspect(
 
     Args:
         cause: Name of the fault.
-        odd: Parts that are out of tolerance; says of each, in a clause, how it is.
+        odd: Parts that are out of tolerance, each with a clause that describes it.
         advice: What is expected, or what to do.
-        repair: Fields of a model that repair a part, with their new values.
+        repair: Returns the fields of a model that repair a part, with their new values.
     """
 
     def assign(model: mujoco.MjModel) -> None:
@@ -72,7 +72,7 @@ def _suspect(
 
 
 def _differ(left: float, right: float, tolerance: float = 1e-6) -> bool:
-    """Whether two numbers differ by more than a relative tolerance."""
+    """Tells whether two numbers differ by more than a relative tolerance."""
     return abs(left - right) > tolerance * abs(right)
 
 
@@ -108,7 +108,7 @@ def _centres(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 def _axis(model: mujoco.MjModel, joint: Part) -> NDArray[np.float64]:
-    """Axis of a joint in the frame of its body's parent, `(3,)`."""
+    """Returns the axis of a joint in the frame of its body's parent, a unit vector `(3,)`."""
     rotated = np.zeros(3)
     mujoco.mju_rotVecQuat(rotated, model.joint(joint).axis, model.body(model.jnt_bodyid[model.joint(joint).id]).quat)
     return rotated
@@ -226,7 +226,7 @@ def _armature(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 def _no_load_rpm(robot: Robot) -> float:
-    """No-load speed of a motor at its own shaft in rpm."""
+    """Returns the no-load speed of a motor at its own shaft in rpm."""
     return robot.supply / robot.torque_constant * 30 / np.pi
 
 
@@ -303,7 +303,7 @@ def _creep(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 def _sideways(model: mujoco.MjModel) -> float:
-    """Centre of mass of the whole robot to the left of its axis in m."""
+    """Returns the distance of the whole robot's centre of mass to the left of its axis in m."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
@@ -348,7 +348,7 @@ def _gravity(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 def _tyres(model: mujoco.MjModel) -> dict[int, str]:
-    """Contact pairs of the wheels that roll, with the name of the wheel."""
+    """Returns the contact pairs of the wheels that roll, by index, with the name of the wheel."""
     wheels = {model.geom(w).id: w for w in rolling_wheels(model)}
     pairs = ((p, {model.pair_geom1[p], model.pair_geom2[p]} & wheels.keys()) for p in range(model.npair))
     return {p: wheels[geoms.pop()] for p, geoms in pairs if geoms}
@@ -416,7 +416,7 @@ def _grip(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 def _slip_times(model: mujoco.MjModel) -> NDArray[np.float64]:
-    """Time constants with which the tyres' contacts damp slip, in s; 0 in solreffriction stands for that of solref."""
+    """Returns the time constants with which the tyres' contacts damp slip, in s; a solreffriction of 0 means solref."""
     pairs = list(_tyres(model))
     own = model.pair_solreffriction[pairs, 0]
     return np.where(own > 0, own, model.pair_solref[pairs, 0])

@@ -1,4 +1,4 @@
-"""What holds for any robot: energy balance, mirror symmetry, invariance of place, convergence with the time step."""
+"""Laws that hold for any robot: energy balance, mirror symmetry, invariance of place, convergence in the time step."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -17,11 +17,11 @@ from mrctl.theory.robot import GRAVITY, Robot
 
 
 def winding(robot: Robot) -> Callable[[float], tuple[float, ...]]:
-    """Control that speeds up and slows down, turns both ways, and steers as it turns."""
+    """Returns a control law that speeds up and slows down, turns both ways, and steers as it turns."""
     lock = min(0.3, 0.6 * robot.steering_limit)
     grip = np.sqrt(
         0.1 * robot.tyre_friction * GRAVITY * abs(robot.wheelbase) / np.tan(lock)
-    )  # the speed in m/s that uses a tenth of it
+    )  # the speed in m/s that uses a tenth of the grip
     volts = min(0.4 * robot.supply, grip / robot.velocity_gain + loss_voltage(robot))
 
     def law(t: float) -> tuple[float, ...]:
@@ -38,10 +38,10 @@ def winding(robot: Robot) -> Callable[[float], tuple[float, ...]]:
 
 
 def _energy_balance(model: mujoco.MjModel, robot: Robot, seconds: float) -> tuple[float, float]:
-    """Drives `winding`; returns the energy that the balance lacks and the energy from the supply, in J.
+    """Drives `winding`; returns the energy that is missing in the balance and the energy from the supply, in J.
 
-    The supply gives U I, with the current of the nominal motor, of which R_a I² is heat. Floor and bearings take tyre
-    slip, by the contact forces, the work on linkages and bearings of the steering, and the nominal Coulomb torques.
+    The supply gives U I, with the current of the nominal motor, of which R_a I² is heat. The contact forces do work on
+    slipping tyres, the linkages and bearings of the steering take work, and so do the nominal Coulomb torques.
     MuJoCo's mechanical energy accounts for the rest.
     """
     model = clone(model)
@@ -63,7 +63,7 @@ def _energy_balance(model: mujoco.MjModel, robot: Robot, seconds: float) -> tupl
         for _ in range(substeps):
             velocity = data.qvel.copy()
             mujoco.mj_step(model, data)
-            velocity = (velocity + data.qvel) / 2  # force times this is the work of a step, exactly
+            velocity = (velocity + data.qvel) / 2  # mean over the step: force times it is power, exactly
             current = (control[:2] - robot.back_emf * velocity[dofs[:2]]) / robot.resistance
             rows = np.zeros(data.nefc)
             mujoco.mj_mulJacVec(model, data, rows, velocity)
@@ -102,7 +102,8 @@ def energy(model: mujoco.MjModel, robot: Robot) -> Report:
 def mirror(model: mujoco.MjModel, robot: Robot) -> Report:
     """With left and right exchanged the robot drives the mirrored path.
 
-    The tolerance of 1e-9 m and rad after 4 s is for rounding, as sums run in another order; no motion amplifies it.
+    The tolerance of 1e-9 m and rad after 4 s is for rounding, as sums run in another order; the motion does not amplify
+    it.
     """
     law = winding(robot)
     other = Car(model).drive(4.0, lambda t: np.array(law(t))[[1, 0, 2, 3]] * (1, 1, -1, -1))

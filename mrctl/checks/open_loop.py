@@ -1,7 +1,7 @@
 """The test bench of the checks: a robot in MuJoCo that is driven open loop, with voltages and without a controller.
 
-`Car` drives and records. Functions of a `Robot` give the times, voltages and forces by which a check scales its
-experiment; functions of a model return variants of it in which one law shows alone.
+`Car` drives and records. Functions of a `Robot` return the times, voltages and forces by which a check scales its
+experiment; functions of a model return variants of it that isolate one law.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -48,7 +48,7 @@ class Unstable(Exception):
 
 
 class TooLong(Exception):
-    """A check would simulate for too long, or has computed for too long; the message says which."""
+    """A check would simulate for too long, or its processor time is up; the message says which."""
 
 
 _deadline: ContextVar[float] = ContextVar("deadline", default=math.inf)
@@ -56,7 +56,7 @@ _deadline: ContextVar[float] = ContextVar("deadline", default=math.inf)
 
 @contextlib.contextmanager
 def limited(seconds: float) -> Iterator[None]:
-    """Limits the processor time, in s, within which the drives of a check must be done."""
+    """Limits the processor time that the drives of a check may take, in s."""
     token = _deadline.set(time.process_time() + seconds)
     try:
         yield
@@ -81,7 +81,7 @@ class Log:
     reading: Rows
 
     def __getitem__(self, signal: str) -> Array:
-        """A signal by the name that it has in results, or `upright`, `(T,)`."""
+        """Returns a signal by its name in results, or `upright`, `(T,)`."""
         if signal in COMPONENTS:
             field, k = COMPONENTS[signal]
             return self.reading[field][:, k]
@@ -112,8 +112,8 @@ class Car:
         """Drives with a constant control, or with a function of the time since the call that is held for `hold` s.
 
         Raises:
-            Unstable: The simulation has diverged.
-            TooLong: The drive would last longer than `LONGEST`, or take more than `MOST` steps, or time is up.
+            Unstable: The simulation has diverged. TooLong: The drive would last longer than `LONGEST`, or take more
+            than `MOST` steps, or the processor time is up.
         """
         if not (0 <= seconds <= LONGEST and seconds <= MOST * self.model.opt.timestep):
             step = self.model.opt.timestep
@@ -145,7 +145,7 @@ class Car:
             raise Unstable
 
     def tyre_forces(self) -> Array:
-        """Forces of the ground on left wheel, right wheel and front in the world frame, `(3, 3)` in N."""
+        """Returns the forces of the ground on left wheel, right wheel and front, in N in the world frame, `(3, 3)`."""
         mujoco.mj_forward(self.model, self.data)
         forces, force = np.zeros((3, 3)), np.zeros(6)
         row = {self.model.geom(name).id: k for k, name in enumerate(REAR)}
@@ -166,7 +166,7 @@ def cruise(model: mujoco.MjModel, robot: Robot, volts: float) -> tuple[Car, Log]
 
 
 def fitted_time_constant(log: Log, signal: str, tau: float) -> float:
-    """Time constant in s of an exponential that settles within the log, from its values near τ/2 and 2 τ.
+    """Returns the time constant in s of an exponential that settles within the log, from values near τ/2 and 2 τ.
 
     The start is left out: the tyres, springs with a time constant of 10 ms, first have to take up their load.
     """
@@ -179,27 +179,27 @@ def fitted_time_constant(log: Log, signal: str, tau: float) -> float:
 
 
 def settling_time(robot: Robot) -> float:
-    """Time after which e^−12 of a transient of equation (3) remains, in s."""
+    """Returns the time in s after which e^−12 of a transient of equation (3) remains."""
     return 12 * max(robot.velocity_time_constant, robot.rotation_time_constant)
 
 
 def loss_voltage(robot: Robot) -> float:
-    """Voltage that overcomes all Coulomb losses while driving straight on, in V."""
+    """Returns the voltage in V that overcomes all Coulomb losses while the robot drives straight on."""
     return (robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2) / robot.motor_gain
 
 
 def holding_force(robot: Robot) -> float:
-    """All Coulomb losses as a force on the robot, 2 τ_loss/r + F_roll, in N."""
+    """Returns all Coulomb losses as a force on the robot, 2 τ_loss/r + F_roll, in N."""
     return 2 * robot.drive_loss / robot.wheel_radius + robot.rolling_force
 
 
 def braking(robot: Robot) -> float:
-    """Force per speed with which the back-EMF of both motors brakes, 2 N² k²/(R_a r²), in N·s/m."""
+    """Returns the braking force of the back-EMF of both motors per speed, 2 N² k²/(R_a r²), in N·s/m."""
     return 2 * robot.motor_gain * robot.back_emf / robot.wheel_radius**2
 
 
 def on_skid_robot(robot: Robot) -> Robot:
-    """Parameters of the robot `on_skid`: the rear wheels' rolling loss counts as gear loss, the front has none."""
+    """Returns the parameters of a robot `on_skid`: rear rolling loss counts as gear loss, and the front has none."""
     rear = robot.rolling_force * (1 - robot.front_load) / 2 * robot.wheel_radius
     return robot.model_copy(
         update={"gear_loss": robot.gear_loss + rear, "rolling_coefficient": 0.0, "front_wheel_inertia": 0.0}
@@ -210,24 +210,24 @@ def on_skid_robot(robot: Robot) -> Robot:
 
 
 def is_steered(model: mujoco.MjModel) -> bool:
-    """Whether the robot has a steered wheel."""
+    """Tells whether the robot has a steered wheel."""
     return has(model, "joint", "steering")
 
 
 def rolling_wheels(model: mujoco.MjModel) -> list[str]:
-    """Names of all wheels that turn on a joint: the two driven ones, and those in front that do not merely slide."""
+    """Returns the names of all wheels that turn on a joint: the two driven ones, and those in front that roll."""
     return [*REAR, *rolling_fronts(model)]
 
 
 def open_circuit(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy with disconnected motors: without current there is neither torque nor braking; rotors and losses stay."""
+    """Returns a copy with disconnected motors, which give neither torque nor braking; rotors and losses stay."""
     model = clone(model)
     model.actuator_gainprm[[model.actuator(name).id for name in MOTORS], 1] = 1e-9
     return model
 
 
 def on_skid(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A copy whose front tyre has no friction: it follows wherever equation (3) sends it, and brakes nothing."""
+    """Returns a copy whose front tyre has no friction: it follows where equation (3) sends it, and brakes nothing."""
     model = clone(model)
     for wheel in (model.geom(name).id for name in fronts(model)):
         model.pair_friction[(model.pair_geom1 == wheel) | (model.pair_geom2 == wheel)] = 1e-5
@@ -235,9 +235,9 @@ def on_skid(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def crisp(model: mujoco.MjModel, robot: Robot, tau: float) -> mujoco.MjModel:
-    """A copy whose contacts and time step are as short against τ and the wheel radius as the default robot's.
+    """Returns a copy whose contacts and time step are as short against τ and the wheel radius as the default robot's.
 
-    Slip grows with a contact's time constant and the sinking of a tyre with its square: in such a copy they weigh no
+    Slip grows with a contact's time constant, and the sinking of a tyre with its square: in such a copy both matter no
     more than in the default robot, for which the tolerances are stated.
     """
     factor = min(1.0, tau / 0.18, np.sqrt(robot.wheel_radius / 0.098))
@@ -249,14 +249,14 @@ def crisp(model: mujoco.MjModel, robot: Robot, tau: float) -> mujoco.MjModel:
 
 
 def with_finer_step(model: mujoco.MjModel, halvings: int) -> mujoco.MjModel:
-    """A copy whose time step is halved a number of times."""
+    """Returns a copy whose time step is halved a number of times."""
     model = clone(model)
     model.opt.timestep /= 2**halvings
     return model
 
 
 def towing(model: mujoco.MjModel, damping: float) -> mujoco.MjModel:
-    """A copy that tows a load of `damping` N·s/m at P, on a rail that keeps it from turning and moving sideways."""
+    """Returns a copy that tows a load of `damping` N·s/m at P, on a rail that keeps it from turning and side-slip."""
     model = clone(model)
     dof = model.joint("chassis").dofadr[0]
     model.dof_damping[[dof, dof + 1, dof + 5]] = damping, 1e6, 1e6
@@ -264,7 +264,7 @@ def towing(model: mujoco.MjModel, damping: float) -> mujoco.MjModel:
 
 
 def perturbed(model: mujoco.MjModel, perturbation: Perturbation) -> mujoco.MjModel:
-    """A copy to which a perturbation is applied."""
+    """Returns a copy to which a perturbation is applied."""
     copy = clone(model)
     perturb(model, copy, perturbation)
     return copy

@@ -1,7 +1,7 @@
-"""Could such a robot exist? It stands level, its motors and inertias are possible, and it reaches its declared limits.
+"""Checks whether such a robot could exist: stance, units, motors and inertias, and the declared limits.
 
 The parameters that the other checks expect are read from the robot's own file, so a wrong number that is used
-consistently breaks no law. These checks find the numbers that belong to no robot.
+consistently breaks no law. These checks find numbers that no robot has.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -65,7 +65,7 @@ def _to_its_limit(
 
 
 def limits(model: mujoco.MjModel, robot: Robot) -> Report:
-    """Motors, gear, supply and grip reach the declared limits on V and V̇, and the fork has room to steer.
+    """Motors, gear, supply and grip reach the declared limits on V and V̇, and the steering limit is plausible.
 
     The tolerance is 10 %: the voltages are those of equation (3), and nothing corrects slip.
     """
@@ -77,7 +77,7 @@ def limits(model: mujoco.MjModel, robot: Robot) -> Report:
 
 
 def turning_limits(model: mujoco.MjModel, robot: Robot) -> Report:
-    """The same for the limits on θ̇ and θ̈, turning on the spot with a front tyre without friction."""
+    """Turning on the spot, with a front tyre without friction, the robot reaches the declared limits on θ̇ and θ̈."""
     log = _to_its_limit(on_skid(model), robot, (0, 1), robot.max_rotation, robot.max_rotation_acceleration)
     return [compare("θ̇ at its limit", log["omega"][-1], robot.max_rotation, "rad/s", relative=0.1)]
 
@@ -85,8 +85,9 @@ def turning_limits(model: mujoco.MjModel, robot: Robot) -> Report:
 def motors(model: mujoco.MjModel, robot: Robot) -> Report:
     """The no-load speed U/k_E and time constant J_m R_a/k² of each motor, at its own shaft, are those of real motors.
 
-    Hub motors turn at some 100 rpm, model racing motors at 50,000. Coreless motors take 0.5 ms, cheap ones up to 200.
-    The rotor's inertia may also be written at the wheel's joint; without a gear it may be part of the wheel's.
+    Hub motors turn at some 100 rpm, model racing motors at 50,000. Coreless motors have time constants of 0.5 ms, cheap
+    ones up to 200 ms. The rotor's inertia may also be written at the wheel's joint; without a gear it may be part of
+    the wheel's.
     """
     report = []
     for motor, wheel in zip(MOTORS, REAR, strict=True):

@@ -26,7 +26,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Adds the robot's file to the files that pytest collects from, or replaces the default ones by it."""
+    """Adds the robot's file to the paths on the command line; without any, pytest collects that file alone."""
     if robot := _robot(config):
         if config.args_source is not pytest.Config.ArgsSource.ARGS:
             config.args = []
@@ -40,7 +40,7 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 
 def _robot(config: pytest.Config) -> Path | None:
-    """The robot's file, if the option is given."""
+    """Returns the robot's file, if the option is given."""
     name = config.getoption("mrctl_robot")
     return (config.invocation_params.dir / name).resolve() if name else None
 
@@ -90,11 +90,11 @@ class PhysicsCheck(pytest.Item):
             raise _Failed("\n".join([*values, cause_line(finding), *causes]))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException]) -> str:  # pyright: ignore
-        """Measured values and causes, without a traceback."""
+        """Returns measured values and causes, without a traceback."""
         return str(excinfo.value) if isinstance(excinfo.value, _Failed) else str(super().repr_failure(excinfo))
 
     def reportinfo(self) -> tuple[Path, None, str]:
-        """The file and the name of the check, for pytest's report."""
+        """Returns the file and the name of the check, for pytest's report."""
         return self.path, None, f"{self.path.name}: {self.name}"
 
 

@@ -41,12 +41,12 @@ def rest(model: mujoco.MjModel, robot: Robot) -> Report:
 
 
 def _curvature(robot: Robot, angle: float) -> float:
-    """Curvature of the circle on which a front wheel at an angle rolls without scrub, sin φ/(L cos φ − t), in 1/m."""
+    """Returns the curvature in 1/m of the circle on which a front wheel at φ does not scrub, sin φ/(L cos φ − t)."""
     return np.sin(angle) / (robot.wheelbase * np.cos(angle) - robot.trail)
 
 
 def _electronic_differential(robot: Robot, volts: float, angle: float, rate: float = 0.0) -> tuple[float, ...]:
-    """Control of a rigidly steered robot whose rear wheels turn as fast as the circle of its front wheel demands."""
+    """Returns a control whose rear wheels turn as fast as the circle of a rigidly steered front wheel demands."""
     v = robot.velocity_gain * (volts - loss_voltage(robot))
     omega = v * _curvature(robot, angle)
     differential = robot.back_emf * robot.half_track * omega / robot.wheel_radius
@@ -115,10 +115,16 @@ def rolling(model: mujoco.MjModel, robot: Robot) -> Report:
 
 
 def spinning_wheels(model: mujoco.MjModel, robot: Robot, friction: float, x: float = 0.0) -> Report:
-    """Applies full voltage at rest at x in m, where the wheels spin on a floor of the friction coefficient μ.
+    """At full voltage from rest the wheels spin on a floor of friction coefficient μ, which sets the acceleration.
 
     The acceleration a solves N_f (L − t) = m g c − m a h and (m + J_f/r_f²) a = μ (m g − N_f) − front rolling loss.
     `traction` explains the tolerance.
+
+    Args:
+        model: Compiled world with the robot.
+        robot: The parameters that it should have.
+        friction: Friction coefficient μ of driven tyres and floor.
+        x: Position at which the robot starts along the world's x axis, in m.
     """
     front = robot.front_load
     inert = robot.mass + robot.front_wheel_inertia / robot.front_wheel_radius**2
@@ -140,18 +146,18 @@ def traction(model: mujoco.MjModel, robot: Robot) -> Report:
     """On a slippery floor full voltage spins the rear wheels, and only μ times their load accelerates the robot.
 
     Their load includes the transfer m a h/(L − t), which is 6 % of the acceleration. The tolerance is 2 %: MuJoCo's
-    soft friction cone lifts a tyre that slides at 1 m/s by some 0.2 mm, where it hops, so the acceleration is averaged.
+    soft friction cone lifts a tyre that slides at 1 m/s by some 0.2 mm, so that it hops; the acceleration is averaged.
     """
     slippery = perturbed(model, Perturbation(tyre_friction_factor=0.2))
     return spinning_wheels(slippery, robot, 0.2 * robot.tyre_friction)
 
 
 def cornering(model: mujoco.MjModel, robot: Robot) -> Report:
-    """All tyres together bend the path with μ g at most: a robot keeps to its circle at half of that, and not at twice.
+    """All tyres together bend the path with μ g at most: a robot keeps its circle at half of that, and slides at twice.
 
     The robot, rigidly steered on a slippery floor, starts on the circle. The tolerance of the radius is 0.5 %, as in
     `circle`. That of the limit is 3 %: sliding tyres hop, so the acceleration, and its peak with it, is averaged over
-    0.1 s; measured 1.1 % below the limit, over 0.04 s 0.3 %.
+    0.1 s; it was measured 1.1 % below the limit, and 0.3 % with averages over 0.04 s.
     """
     angle = 0.3
     limit = 0.2 * robot.tyre_friction * GRAVITY
@@ -178,11 +184,11 @@ def cornering(model: mujoco.MjModel, robot: Robot) -> Report:
 def scrub_free(model: mujoco.MjModel, robot: Robot) -> Report:
     """A fork without stiffness takes the angle at which its wheel rolls without scrub.
 
-    In a steady turn φ = atan(L θ̇/V) − asin(t θ̇/√(V² + L² θ̇²)), in a changing one
-    sin(direction − φ) = t (θ̇ + φ̇)/speed, with direction and speed of the fork's axis. The tolerance of the steady
-    angle is 5 mrad; measured 0.03, as P and the fork drift alike. That of the changing one is a sideslip of 7 ms · θ̇:
-    MuJoCo's contacts (time constant T, impedance d) damp the slip velocity in a frame that turns, which they do not
-    take into account, so a tyre drifts outwards with V θ̇ d T/2 whatever its friction; here d T/2 = 4.75 ms.
+    In a steady turn φ = atan(L θ̇/V) − asin(t θ̇/√(V² + L² θ̇²)); in a changing one sin(direction − φ) = t (θ̇ +
+    φ̇)/speed, with the direction and the speed at which the fork's axis moves. The tolerance of the steady angle is 5
+    mrad; measured 0.03, as P and the fork drift alike. That of the changing one is a sideslip of 7 ms · θ̇: MuJoCo's
+    contacts (time constant T, impedance d) damp the slip velocity in a frame that turns, which they do not take into
+    account, so a tyre drifts outwards with V θ̇ d T/2 whatever its friction; here d T/2 = 4.75 ms.
     """
     common, differential = robot.supply / 3, robot.supply / 12
     car = Car(model)

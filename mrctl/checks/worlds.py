@@ -1,4 +1,4 @@
-"""The shipped worlds `slope`, `patch` and `rough`: their ground acts on a robot as its geometry and friction say."""
+"""Checks whether the ground of the worlds `slope`, `patch` and `rough` acts on a robot by its geometry and friction."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -20,7 +20,8 @@ from mrctl.theory.robot import GRAVITY, Robot
 def slope(model: mujoco.MjModel, robot: Robot) -> Report:
     """On the 10° slope a robot with its motors disconnected rolls down with (m g sin 10° − losses)/M_e.
 
-    The tolerance is 0.3 %, as in `coast_down`; the Coulomb losses stay although the load on a slope is 1.5 % smaller.
+    The tolerance is 0.3 %, as in `coast_down`; the Coulomb losses do not change, although the load is 1.5 % smaller on
+    the slope.
     """
     expected = (robot.mass * GRAVITY * np.sin(np.radians(10)) - holding_force(robot)) / robot.effective_mass
     log = Car(open_circuit(model)).drive(1.0, OFF)

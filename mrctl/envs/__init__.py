@@ -1,4 +1,4 @@
 """The closed loop as environments for reinforcement learning, for `dm_env` and for Gymnasium.
 
-Imports the floors up to `mrctl.loop`.
+Imports the rooms up to `mrctl.navigation`.
 """

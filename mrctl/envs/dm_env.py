@@ -4,7 +4,7 @@
 """
 
 # pyright: reportIncompatibleMethodOverride=false
-# (the methods of dm_control's Task have no return types, which pyright takes for None)
+# (the methods of dm_control's Task have no return types, and pyright infers None)
 
 from __future__ import annotations
 
@@ -50,16 +50,18 @@ class Tracking(control.Task):
         Args:
             scenario: The scenario.
             action: Meaning of an action, as for `mrctl.envs.episodes.Episodes`.
-            random: Seed or generator that the seeds of the later episodes are drawn from; by default the scenario's.
-            draw: Draws the perturbation of every episode from a `numpy.random.Generator`, which the seed of the episode
-                determines.
+            random: Seed or generator from which the seeds of the later episodes are drawn; by default the scenario's
+                seed.
+            draw: Draws the perturbation of every episode from a `numpy.random.Generator`, which the episode's seed
+                determines; by default every episode has that of the scenario.
 
         Raises:
             InputError: The scenario is invalid.
         """
-        self._drive(Episodes([scenario], action, draw=draw), random)
+        self._set_up(Episodes([scenario], action, draw=draw), random)
 
-    def _drive(self, episodes: Episodes, random: int | np.random.RandomState | None) -> None:
+    def _set_up(self, episodes: Episodes, random: int | np.random.RandomState | None) -> None:
+        """Takes the closed loop and the source of seeds."""
         self.episodes, scenario = episodes, episodes.scenarios[0]
         seed = scenario.seed if random is None else random
         self._random = seed if isinstance(seed, np.random.RandomState) else np.random.RandomState(seed)
@@ -87,12 +89,12 @@ class Tracking(control.Task):
         return specs.BoundedArray((2,), float, -bound, bound, name="action")
 
     def get_observation(self, physics: Physics) -> dict[str, Array]:
-        """Returns the quantities of the `sizes` of the episodes by name."""
+        """Returns the parts of an observation by name, with the sizes in `episodes.sizes`."""
         seen, sizes = self.episodes.observe()[0][0], self.episodes.sizes
         return dict(zip(sizes, np.split(seen, np.cumsum(list(sizes.values()))[:-1]), strict=True))
 
     def get_reward(self, physics: Physics) -> float:
-        """Returns the reward of the last control period, as the `observe` of the episodes says."""
+        """Returns the reward of the last control period; see `observe` of the episodes."""
         return float(self.episodes.observe()[1][0])
 
     def get_termination(self, physics: Physics) -> float | None:
@@ -117,11 +119,11 @@ class Navigation(Tracking):
         Raises:
             InputError: The scenario is invalid.
         """
-        self._drive(Navigating([scenario], draw=draw), random)
+        self._set_up(Navigating([scenario], draw=draw), random)
 
 
 class Environment(control.Environment):
-    """The environment of `dm_control` around a `Tracking` task, which itself places the robot and finds failures."""
+    """The environment of `dm_control` for a `Tracking` task; the task places the robot and detects failures."""
 
     def __init__(self, task: Tracking, **settings: Any) -> None:  # noqa: ANN401
         """Builds the environment of a task.
@@ -137,7 +139,7 @@ class Environment(control.Environment):
     def reset(self) -> dm_env.TimeStep:
         """Begins an episode.
 
-        The method of the base class is not used, because it would leave forces of the last episode in the solver.
+        It replaces the method of the base class, which would leave forces of the last episode in the solver.
         """
         self._reset_next_step = False
         self._step_count = 0
@@ -146,13 +148,13 @@ class Environment(control.Environment):
         return dm_env.restart(control.flatten_observation(observation) if self._flat_observation else observation)
 
     def step(self, action: Array) -> dm_env.TimeStep:
-        """Runs one control period; a state that blows up ends the episode instead of raising an error."""
+        """Runs one control period; a state that diverges ends the episode instead of raising an error."""
         with self._physics.suppress_physics_errors():
             return super().step(action)
 
 
-def _add(name: str, tag: str, make: Callable[..., Tracking], says: str) -> None:
-    """Adds a task to the suite, made from a scenario, its file or None, a source of seeds, and one of perturbations."""
+def _add(name: str, tag: str, make: Callable[..., Tracking], description: str) -> None:
+    """Adds a task to the suite; `make` takes a scenario, its file or None, a source of seeds, and a `Draw` or None."""
 
     def task(
         scenario: Scenario | str | Path | None = None,
@@ -162,7 +164,7 @@ def _add(name: str, tag: str, make: Callable[..., Tracking], says: str) -> None:
     ) -> Environment:
         return Environment(make(scenario, random, draw), **(environment_kwargs or {}))
 
-    task.__name__, task.__doc__ = name, f"Makes an environment in which {says}."
+    task.__name__, task.__doc__ = name, f"Makes an environment in which {description}."
     SUITE.add(tag)(task)
 
 

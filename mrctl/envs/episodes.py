@@ -1,4 +1,4 @@
-"""The closed loop as episodes for environments: an agent acts, and robots begin again one by one."""
+"""The closed loop as episodes for environments: an agent acts, and each robot begins new episodes on its own."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from mrctl.theory.robot import Robot
 
 Action = Literal["twist", "voltage", "residual"]
 Draw = Callable[[np.random.Generator], Perturbation | Mapping[str, Any]]
-"""The perturbation of an episode, drawn at random, such as `PERTURBATIONS["all"].drawn`."""
+"""Function that draws the perturbation of an episode at random, such as `PERTURBATIONS["all"].drawn`."""
 ACTION_KINDS: tuple[Action, ...] = ("twist", "voltage", "residual")
 
 OBSERVATIONS: dict[str, int] = {
     "error": 3, "twist": 2, "reference": 4, "wheel_rates": 2, "steering_angle": 1, "voltage": 2,
 }  # fmt: skip
-"""Names and sizes: estimated posture error in the robot's frame (m, m, rad); estimated V and θ̇ (m/s, rad/s); those of
-the reference and their derivatives; rates of the rear wheels from the encoders (rad/s); commanded angle of the fork
-(rad); voltages sent last (V)."""
+"""Parts of an observation with their sizes: estimated posture error in the robot's frame (m, m, rad); estimated V and
+θ̇ (m/s, rad/s); V and θ̇ of the reference with their derivatives; rates of the rear wheels from the encoders (rad/s);
+commanded angle of the fork (rad); voltages sent last (V)."""
 EPISODE_METRICS = ("v_rmse", "omega_rmse", "position_rmse")
-"""What is said of an episode at its end: root mean squares as in `mrctl.results.metrics`, in m/s, rad/s and m."""
-RESIDUAL = 0.25  # of the supply, what a residual may add
-NEAR = 0.05  # m off the reference at which the reward is a half
+"""Metrics at the end of an episode, root mean squares as in `mrctl.results.metrics`, in m/s, rad/s and m."""
+RESIDUAL = 0.25  # largest residual, as a share of the supply
+NEAR = 0.05  # distance from the reference in m at which the reward is a half
 
 
 @kernel
@@ -43,9 +43,9 @@ def observe(
     plant: Rows, seen: Rows, wanted: Rows, goal: Rows, control: Rows, radius: float, half_track: float,
     observation: Array, reward: Array,
 ) -> None:  # fmt: skip
-    """What `Episodes.observe` returns, from one record of `PLANT`, `SEEN`, `GOAL` and `CONTROL` a robot.
+    """Computes what `Episodes.observe` returns, from records of `PLANT`, `SEEN`, `GOAL` and `CONTROL` of each robot.
 
-    The robot is told the reference `wanted` of the moment when its voltage acts, and judged by that of now, `goal`.
+    The observation uses the reference `wanted` at the time when the voltage acts, the reward the present one, `goal`.
     """
     error = np.empty(3)
     for i in range(len(plant)):
@@ -60,7 +60,7 @@ def observe(
         reward[i] = 1 / (1 + (x * x + y * y + theta * theta) / NEAR**2)
         if p.failed:
             reward[i] = 0.0
-            for k in range(len(out)):  # the robot may have blown up
+            for k in range(len(out)):  # the state may have diverged
                 if not np.isfinite(out[k]):
                     out[k] = 0.0
 
@@ -79,14 +79,14 @@ class AgentMotion:
     """A motion controller whose request is the agent's action."""
 
     def __init__(self, robot: Robot, size: int) -> None:
-        """Takes the number of robots."""
+        """Takes the robot and the number of robots B."""
         self.request = np.zeros((size, 2))
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
-        """Has nothing to begin."""
+        """Does nothing, because this controller has no state."""
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
-        """The action."""
+        """Returns the action as the requested twist, `(B, 2)` in m/s and rad/s."""
         return self.request
 
 
@@ -94,7 +94,7 @@ class EpisodeCourses:
     """The references of robots whose clocks start at different ticks."""
 
     def __init__(self, scenarios: Sequence[Scenario], lead: int) -> None:
-        """Samples every course once, to the end of the episode and one tick and the lead more."""
+        """Samples every course once, to the end of the longest episode and `lead` ticks beyond."""
         ticks = max(s.ticks for s in scenarios)
         self._last = ticks + lead
         distinct, self._place = distinct_courses(scenarios)
@@ -103,23 +103,24 @@ class EpisodeCourses:
         self.start = np.zeros(len(scenarios), int)
 
     def at(self, tick: int, ahead: int = 0) -> Rows:
-        """The references `ahead` ticks after a tick of the simulation, one record of `GOAL` a robot, `(B,)`."""
+        """Returns the references `ahead` ticks after a tick of the simulation, records of `GOAL`, `(B,)`."""
         return self._table[np.minimum(tick + ahead - self.start, self._last), self._place]
 
 
 class Episodes(Simulation):
-    """`Simulation` with an action a tick; each robot's clock runs from its own start, and only the last tick is kept.
+    """A `Simulation` with an action in each tick; each robot's clock has its own start, and only one tick is logged.
 
-    An episode has the bits of the same scenario under `simulate`, whatever its neighbours do and whenever it begins.
+    An episode has the same bits as its scenario under `simulate`, whatever its neighbours do and whenever it begins.
 
     - `twist`: the action is the requested twist, m/s and rad/s, in place of the motion controller.
     - `voltage`: the voltages left and right in V, in place of both controllers; the fork follows the reference.
-    - `residual`: volts left and right on top of what the controllers command.
+    - `residual`: voltages left and right in V that are added to those of the controllers.
 
     Attributes:
         bound: Largest action of each component, `(2,)`.
-        scale: Largest size of each number that a robot sees, `(n,)`: 5 cm for the posture error (of the rear wheels,
-            where it turns), the robot's limits for twists, reference, wheels and steering, and its supply for voltages.
+        scale: Divisors that bring the numbers of an observation to about 1, `(n,)`: 5 cm for the posture error (of the
+            rear wheels, for its angle), the robot's limits for twists, reference, wheels and steering, and its supply
+            for voltages.
         sizes: Names and sizes of the parts of an observation, in their order.
         limits: Least and largest value of each number of an observation, `(n,)` each.
     """
@@ -130,14 +131,15 @@ class Episodes(Simulation):
         """Stands the robots on their references.
 
         Args:
-            scenarios: One a robot, which may differ in what `simulate` may run together.
-            action: What an action is.
-            draw: Draws the perturbation of every episode, in place of the scenario's, from a generator that its seed
-                determines: with `scenario.perturbation.drawn` the episode of seed k is replicate k of `replicates`.
-            threads: Of the batch engine; 0 for all cores.
+            scenarios: One for each robot; they must fit one batch.
+            action: Meaning of an action, as above.
+            draw: Draws the perturbation of every episode, in place of the scenario's, from a generator that the
+                episode's seed determines; with `scenario.perturbation.drawn` the episode of seed k is replicate k of
+                `replicates`.
+            threads: Number of threads of the batch engine; 0 for all cores.
 
         Raises:
-            InputError: As `simulate`, an unknown action, or scenarios that cannot run together.
+            InputError: As `simulate`; or the action is unknown, or the scenarios cannot run together.
         """
         first = scenarios[0]
         if action not in ACTION_KINDS:
@@ -146,7 +148,7 @@ class Episodes(Simulation):
             raise InputError("scenarios: differ in world, steering, prior, learner, length or rates")
         if len(scenarios) > 1 and first.motion_period != first.control_period:
             raise InputError("motion_period: robots that begin at different times need that of control_period")
-        if action == "voltage":  # nobody shall learn from feedback that does not act
+        if action == "voltage":  # a learner must not learn from feedback that does not act
             scenarios = [s.model_copy(update={"prior": "none", "learner": "none"}) for s in scenarios]
         self._agent: AgentMotion | None = None
         super().__init__(scenarios, threads=threads, motion=self._make_agent if action == "twist" else None)
@@ -167,7 +169,7 @@ class Episodes(Simulation):
         self.log = Log(1, len(scenarios))
         self.sizes = dict(OBSERVATIONS)
         self.limits = np.full(sum(OBSERVATIONS.values()), -np.inf), np.full(sum(OBSERVATIONS.values()), np.inf)
-        self._goals = Goals(scenarios, timed=False)  # an episode that is over begins again
+        self._goals = Goals(scenarios, timed=False)  # episodes that end early begin again instead of stopping
         self._lengths = np.array([s.ticks for s in scenarios])
         self._targets = np.array([(np.nan,) * 3 if s.goal is None else s.goal for s in scenarios])
 
@@ -192,10 +194,10 @@ class Episodes(Simulation):
         """Begins another episode of one robot at the coming tick, which must not be sensed yet.
 
         Args:
-            row: Which robot.
+            row: Index of the robot.
             seed: Seed of its scenario from now on.
             perturbation: Perturbation of this episode, a mapping of its fields or one of the names in `PERTURBATIONS`;
-                by default drawn, or that of the scenario.
+                by default `draw` draws it, or it is that of the scenario.
 
         Raises:
             InputError: The perturbation is invalid, or the robot could not stand.
@@ -233,7 +235,7 @@ class Episodes(Simulation):
         self._action[:] = action
 
     def decide(self) -> Array:
-        """As `Simulation.decide`, with the action in place of the commanded voltages or on top of them."""
+        """Decides as `Simulation.decide`, with the action in place of the commanded voltages or added to them."""
         command, supply = super().decide(), self.plant.robot.supply
         if self._kind == "voltage":
             command[:, :2] = np.clip(self._action, -supply, supply)
@@ -242,12 +244,12 @@ class Episodes(Simulation):
         return command
 
     def observe(self) -> tuple[Array, Array]:
-        """What the robots see at the coming tick, and what the last one was worth.
+        """Returns the observations for the coming tick, and the rewards for the present state.
 
         Returns:
-            The numbers that `OBSERVATIONS` names side by side, `(B, 14)`. And the reward, `(B,)`: one on the reference,
-            a half where the rear wheels are 5 cm off, zero where a robot has failed. That distance is the root mean
-            square of the two wheels', √(e_x² + e_y² + (D e_θ)²), of the true posture.
+            Observations, `(B, 14)`, with the parts in `OBSERVATIONS` side by side. Rewards, `(B,)`: one on the
+            reference, a half where the rear wheels are 5 cm off it, zero where a robot has failed. That distance is the
+            root mean square over the two wheels, √(e_x² + e_y² + (D e_θ)²), of the true posture.
         """
         seen, wanted = self.sense()
         size, robot = len(self.scenarios), self.plant.robot
@@ -257,31 +259,31 @@ class Episodes(Simulation):
         return observation, reward
 
     def settle(self) -> None:
-        """As `Simulation.settle`, with the squared errors summed up."""
+        """Settles as `Simulation.settle`, and adds up the squared errors."""
         super().settle()
         add_squares.compiled(self.log.at(self.tick - 1), self._squares)
 
     def metrics(self, row: int) -> dict[str, float]:
-        """Returns the `METRICS` in `EPISODE_METRICS` over a robot's episode so far; NaN where it has failed."""
+        """Returns the `EPISODE_METRICS` of a robot's episode so far, by name; NaN if the robot has failed."""
         means = self._squares[row] / (self.tick - self.courses.start[row])
         return dict(zip(EPISODE_METRICS, np.sqrt(means).tolist(), strict=True))
 
     def arrived(self) -> NDArray[np.bool]:
-        """Which robots stood at the goals of their scenarios in the last tick, `(B,)`."""
+        """Tells which robots stood at the goals of their scenarios in the last tick, `(B,)`."""
         last = self.log.at(self.tick - 1)
         return arrived(np.stack([last["x"], last["y"], last["theta"]], -1), last["v"], self._targets)
 
     def ended(self) -> tuple[NDArray[np.bool], NDArray[np.bool]]:
-        """Which episodes have ended by a failure or at a goal, and which at the end of their scenario, `(B,)` each."""
+        """Tells which episodes ended by a failure or at a goal, and which at the end of their scenario, `(B,)` each."""
         terminated = self.plant.failed.copy()
         return terminated, (self.tick - self.courses.start >= self._lengths) & ~terminated
 
 
 def read(scenario: Scenario | str | Path | None) -> Scenario:
-    """A scenario as environments take it: itself, its file, or by default one lap.
+    """Returns a scenario, that in a file, or by default one lap.
 
     Raises:
-        InputError: The file is bad.
+        InputError: The file is not a valid scenario.
     """
     if isinstance(scenario, Scenario):
         return scenario

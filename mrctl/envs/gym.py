@@ -1,9 +1,9 @@
 """Tracking and navigation as Gymnasium environments, for one robot or a batch; needs `pip install 'mrctl[env]'`.
 
 The import of this module registers `mrctl/TwistTracking-v0`, `mrctl/VoltageTracking-v0`, `mrctl/ResidualTracking-v0`
-and `mrctl/Navigation-v0`. An action is that of `mrctl.envs.episodes.Episodes` divided by its `bound`, so that it lies
-between -1 and 1. An observation holds the quantities of its `sizes` one after another. The seed of a reset is the
-seed of the scenario: the episode has the same bits as `simulate` with that seed.
+and `mrctl/Navigation-v0`. An action is that of `mrctl.envs.episodes.Episodes` divided by `bound`, so that it lies
+between −1 and 1. An observation holds the parts in `sizes` one after another. The seed of a reset becomes the seed of
+the scenario: the episode has the same bits as `simulate` with that seed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SEEDS = 2**32  # number of seeds that a scenario can have
 
 
 def _spaces(episodes: Episodes) -> tuple[Box, Box]:
-    """Returns the spaces of observations and of actions; each environment has its own, which hold random numbers."""
+    """Makes the spaces of observations and actions; each environment needs its own, as they hold random generators."""
     low, high = episodes.limits
     return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (2,), np.float64)
 
@@ -67,16 +67,17 @@ class TrackingEnv(gymnasium.Env):
         Args:
             scenario: The scenario or the path of its file; by default one lap of the default scenario.
             action: Meaning of an action, as for `mrctl.envs.episodes.Episodes`.
-            draw: Draws the perturbation of every episode from a `numpy.random.Generator`, which the seed of the episode
-                determines.
-            render_mode: `rgb_array`, for pictures.
+            draw: Draws the perturbation of every episode from a `numpy.random.Generator`, which the episode's seed
+                determines; by default every episode has that of the scenario.
+            render_mode: `rgb_array` for pictures, or None.
 
         Raises:
             InputError: The file or the scenario is invalid, or there is no such `render_mode`.
         """
-        self._drive(Episodes([read(scenario)], action, draw=draw), render_mode)
+        self._set_up(Episodes([read(scenario)], action, draw=draw), render_mode)
 
-    def _drive(self, episodes: Episodes, render_mode: str | None) -> None:
+    def _set_up(self, episodes: Episodes, render_mode: str | None) -> None:
+        """Takes the closed loop and the way to draw."""
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(f"render_mode: {render_mode!r} is not rgb_array")
         self.episodes, self.render_mode = episodes, render_mode
@@ -89,7 +90,7 @@ class TrackingEnv(gymnasium.Env):
         Args:
             seed: Seed of the scenario; by default the environment's own generator draws one.
             options: The `perturbation` of this episode: a `Perturbation`, a mapping of its fields, or one of the names
-                in `PERTURBATIONS`; by default drawn, or that of the scenario.
+                in `PERTURBATIONS`; by default `draw` draws it, or it is that of the scenario.
 
         Returns:
             The observation, `(n,)`, and an empty dictionary.
@@ -110,8 +111,8 @@ class TrackingEnv(gymnasium.Env):
 
         Returns:
             Observation `(n,)`, reward, whether the robot has failed or arrived, whether the scenario is at its end, and
-            a dictionary: at the end of the episode its `metrics`, and where the robot has failed why, as `failure`, ""
-            where it has arrived.
+            a dictionary, which is empty before the end of the episode. Then it holds the `metrics`, and `failure` if
+            the robot has failed or arrived: the reason, or "" for an arrival.
         """
         loop = self.episodes
         loop.act(action * loop.bound)
@@ -152,11 +153,11 @@ class NavigationEnv(TrackingEnv):
         Raises:
             InputError: The file or the scenario is invalid.
         """
-        self._drive(Navigating([read_mission(scenario)], draw=draw), render_mode)
+        self._set_up(Navigating([read_mission(scenario)], draw=draw), render_mode)
 
 
 class TrackingVectorEnv(VectorEnv):
-    """An environment of many robots in a batch; where an episode is over, the next step begins another."""
+    """An environment of many robots in a batch; the step after the end of an episode begins another."""
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
 
@@ -182,9 +183,10 @@ class TrackingVectorEnv(VectorEnv):
             InputError: The file or a scenario is invalid, or the scenarios cannot run together.
             ValueError: The number of scenarios is not B.
         """
-        self._drive(Episodes(_several(num_envs, scenario, read), action, draw=draw, threads=threads))
+        self._set_up(Episodes(_several(num_envs, scenario, read), action, draw=draw, threads=threads))
 
-    def _drive(self, episodes: Episodes) -> None:
+    def _set_up(self, episodes: Episodes) -> None:
+        """Takes the closed loop."""
         self.episodes, num_envs = episodes, len(episodes.scenarios)
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = _spaces(episodes)
@@ -235,7 +237,7 @@ class TrackingVectorEnv(VectorEnv):
 
         Returns:
             Observations `(B, n)`, rewards `(B,)`, which robots have failed or arrived `(B,)`, which are at the end of
-            their scenario `(B,)`, and a dictionary as that of `TrackingEnv`, of arrays `(B,)`.
+            their scenario `(B,)`, and a dictionary like that of `TrackingEnv`, of arrays `(B,)`.
         """
         loop, begun = self.episodes, np.flatnonzero(self._over)
         loop.act(actions * loop.bound)
@@ -276,7 +278,7 @@ class NavigationVectorEnv(TrackingVectorEnv):
             InputError: The file or a scenario is invalid, or the scenarios cannot run together.
             ValueError: The number of scenarios is not B.
         """
-        self._drive(Navigating(_several(num_envs, scenario, read_mission), draw=draw, threads=threads))
+        self._set_up(Navigating(_several(num_envs, scenario, read_mission), draw=draw, threads=threads))
 
 
 def _several(
@@ -284,10 +286,10 @@ def _several(
     scenario: Scenario | str | Path | Sequence[Scenario] | None,
     read: Callable[[Scenario | str | Path | None], Scenario],
 ) -> list[Scenario]:
-    """Returns a scenario for each of some robots.
+    """Returns a scenario for each of `count` robots.
 
     Raises:
-        ValueError: As many scenarios were not given.
+        ValueError: The number of given scenarios is another one.
     """
     if scenario is None or isinstance(scenario, Scenario | str | Path):
         return [read(scenario)] * count

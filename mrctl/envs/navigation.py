@@ -22,27 +22,28 @@ WORLD = "doorway:3"  # of the default mission
 class Navigating(Episodes):
     """Episodes in which an action is a requested twist, and which end at the goal of the scenario.
 
-    The reference of the scenario says only how long an episode may last, and with what twist it begins. The lidar is
-    that of `sensing`. It scans from the true pose at the first tick of an episode and then at its rate, with the random
-    numbers of the localisation: where `sensing.localisation` uses the lidar, the agent sees the same scans.
+    The reference of the scenario determines only how long an episode may last, and with what twist it begins. The lidar
+    is `sensing.lidar`. It scans from the true pose at the first tick of an episode and then at its rate, with the
+    random numbers of the localisation: where `sensing.localisation` uses the lidar, the agent gets the same scans.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], *, draw: Draw | None = None, threads: int = 0) -> None:
         """Stands the robots at their starts.
 
         Args:
-            scenarios: One a robot, in one world and with one lidar.
+            scenarios: One for each robot, in one world and with one lidar.
             draw: As for `Episodes`.
-            threads: Of the batch engine; 0 for all cores.
+            threads: Number of threads of the batch engine; 0 for all cores.
 
         Raises:
-            InputError: As `Episodes`; a scenario has no goal; or lidars differ, or scan at no tick.
+            InputError: As `Episodes`; or a scenario has no goal, the lidars differ, or the time between two scans is
+                not a whole number of control periods.
         """
         first, self._lidar = scenarios[0], scenarios[0].sensing.lidar
         if any(s.goal is None for s in scenarios):
             raise InputError("goal: navigation needs one")
         if any(s.sensing.lidar != self._lidar for s in scenarios):
-            raise InputError("sensing.lidar: the robots of one environment have the same")
+            raise InputError("sensing.lidar: the robots of one environment must have the same lidar")
         try:
             self._every = whole(1 / self._lidar.rate, first.control_period, "sensing.lidar.rate", "control_period")
         except ValueError as error:
@@ -55,7 +56,7 @@ class Navigating(Episodes):
         self.scale = np.array([far, far, np.pi, *self.bound, *[far] * beams])
         self._surroundings = Surroundings(first.obstacles)
         self._random = [np.random.default_rng([s.seed, 6]) for s in scenarios]
-        self._scans, self._scanned = np.zeros((len(scenarios), beams)), -1  # ranges in m, and the tick they are of
+        self._scans, self._scanned = np.zeros((len(scenarios), beams)), -1  # ranges in m, and the tick of the last scan
         self._away, self._drives = self._distance(), np.ones(len(scenarios), bool)
         self._reward = np.zeros(len(scenarios))
 
@@ -66,7 +67,7 @@ class Navigating(Episodes):
         self._away[row], self._reward[row] = self._distance()[row], 0.0
 
     def sense(self) -> tuple[Rows, Rows]:
-        """Measures, and scans where a scan is due; returns what `Simulation.sense` does."""
+        """Measures as `Simulation.sense`, and scans with the lidars that are due."""
         found = super().sense()
         if self._scanned != self.tick:
             self._scanned, since = self.tick, self.tick - self.courses.start
@@ -77,48 +78,47 @@ class Navigating(Episodes):
         return found
 
     def decide(self) -> Array:
-        """As `Episodes.decide`."""
+        """Decides as `Episodes.decide`, and notes which robots still drive."""
         self._drives = ~self.plant.failed
         return super().decide()
 
     def settle(self) -> None:
-        """As `Simulation.settle`, and finds what the tick was worth."""
+        """Settles as `Simulation.settle`, and computes the reward of the tick."""
         super().settle()
         before, self._away = self._away, self._distance()
         end = np.where(self.arrived(), END, -END) * self.ended()[0]
         self._reward = np.where(self._drives, np.nan_to_num(before - self._away) + end, 0.0)
 
     def metrics(self, row: int) -> dict[str, float]:
-        """Returns nothing, since a robot that is told a goal follows no reference."""
+        """Returns no metrics, since a robot that is told a goal follows no reference."""
         return {}
 
     def _distance(self) -> Array:
-        """Returns how far the robots are from their goals as the crow flies in m, `(B,)`."""
+        """Returns the straight-line distances of the robots from their goals in m, `(B,)`."""
         return np.hypot(*(self.plant.reading["pose"][:, :2] - self._targets[:, :2]).T)
 
     def observe(self) -> tuple[Array, Array]:
-        """What the robots see at the coming tick, and what the last one was worth.
+        """Returns the observations for the coming tick, and the rewards of the last one.
 
         Returns:
-            The numbers that `sizes` names side by side, `(B, n)`: the estimated posture error from the goal in the
-            robot's frame in m, m, rad, and the estimated V and θ̇ in m/s and rad/s, both of the moment at which the
-            twist acts; and the ranges of the last scan in m, the largest one where nothing returned. And the reward,
-            `(B,)`: by how many metres the true position came nearer to the goal, plus one on arrival, minus one on a
-            failure.
+            Observations, `(B, n)`, with the parts in `sizes` side by side: the estimated posture error from the goal in
+            the robot's frame in m, m, rad, and the estimated V and θ̇ in m/s and rad/s, both at the time when the twist
+            acts; and the ranges of the last scan in m, with the largest range where nothing returned. Rewards, `(B,)`:
+            the decrease of the true distance to the goal in m, plus one on arrival, minus one on a failure.
         """
         seen, _ = self.sense()
         found = np.empty((len(self.scenarios), len(self.limits[0])))
         for row, own in enumerate(found):
             posture_error.compiled(seen["pose"][row], self._targets[row], own[:3])
         found[:, 3:5], found[:, 5:] = seen["twist"], self._scans
-        found[self.plant.failed] = np.nan_to_num(found[self.plant.failed], posinf=0, neginf=0)  # may have blown up
+        found[self.plant.failed] = np.nan_to_num(found[self.plant.failed], posinf=0, neginf=0)  # may have diverged
         return found, self._reward.copy()
 
 
 def read_mission(scenario: Scenario | str | Path | None) -> Scenario:
-    """A scenario as navigation takes it: itself, its file, or by default a mission through a door.
+    """Returns a scenario, that in a file, or by default a mission through a door.
 
     Raises:
-        InputError: The file is bad.
+        InputError: The file is not a valid scenario.
     """
     return prepared(task_of(WORLD, Scenario()), Scenario())[1] if scenario is None else read(scenario)

@@ -16,8 +16,8 @@ from mrctl.physics.plant import PhysicsPlant
 from mrctl.record import InputError
 
 WIDTH, HEIGHT = 640, 480  # pixels
-SHADOW = 1024  # pixels of the map of shadows
-POINTS = 200  # of the reference
+SHADOW = 1024  # pixels along each side of the shadow map
+POINTS = 200  # number of points of the reference
 VIEW = 5.0  # distance of the camera as a multiple of the size of the robot
 AZIMUTH, ELEVATION = 60.0, -35.0  # of the camera's view, in degrees
 
@@ -29,7 +29,7 @@ def picture(episodes: Episodes) -> NDArray[np.uint8]:
         The picture, `(480, 640, 3)`.
 
     Raises:
-        InputError: There is no OpenGL on this machine that draws without a display.
+        InputError: MuJoCo cannot draw, because this machine has neither a display nor OpenGL without one.
     """
     (scenario,), plant = episodes.scenarios, episodes.plant
     assert isinstance(plant, PhysicsPlant)
@@ -39,10 +39,10 @@ def picture(episodes: Episodes) -> NDArray[np.uint8]:
     course = scenario.reference.sample(times).pose * [1, 1, 0] + [0, 0, 0.004]
     looks = plant.physics.model.ptr.vis
     looks.global_.offwidth, looks.global_.offheight = WIDTH, HEIGHT
-    looks.quality.shadowsize, looks.quality.offsamples = SHADOW, 0  # without a GPU these take most of the time
+    looks.quality.shadowsize, looks.quality.offsamples = SHADOW, 0  # larger values take most of the time without a GPU
 
     try:
-        _ = plant.physics.contexts  # which dm_control makes when they are first read
+        _ = plant.physics.contexts  # dm_control makes them when they are first read
     except Exception as error:  # noqa: BLE001 (each backend has errors of its own)
         reason = str(error).split("\n")[0] or type(error).__name__
         advice = "without a display it needs EGL (libegl1) and the variable MUJOCO_GL=egl"

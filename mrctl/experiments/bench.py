@@ -1,4 +1,4 @@
-"""`mrctl bench`: the speed of the closed loop, beside the engine alone and beside a loop as people write it today."""
+"""`mrctl bench`: the speed of the closed loop, compared with the engine alone and with a loop in NumPy and torch."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from mrctl.sensing.tiers import Sensing, Tier
 from mrctl.theory.kinematics import steering_angle
 
 SIZES = (1, 16, 64, 256, 1024)
-REPETITIONS = 41  # many short turns: neighbours share what else the machine does
-CHUNK = 1500  # control periods of one turn, summed over the robots: a twentieth of a second
-WARM = 20  # control periods before the clock starts
+REPETITIONS = 41  # many short turns, so that neighbouring turns share the load of the machine
+CHUNK = 1500  # control periods of one turn, summed over the robots; a turn takes a twentieth of a second
+WARM = 20  # control periods before the measurement begins
 CONTROLS = ["voltage_left", "voltage_right", "steering_command", "steering_rate_command"]
 PARTS: dict[str, tuple[Any, str]] = {
     "physics": (BatchPlant, "_advance"),
@@ -55,22 +55,22 @@ PARTS: dict[str, tuple[Any, str]] = {
 
 
 def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int = CHUNK) -> dict[str, Any]:
-    """Measures everything; below two minutes on two cores.
+    """Measures the speed of the closed loop and of its parts, in less than two minutes on two cores.
 
-    Closed loop (Kanayama, PID, `fel` learning in every robot, record) and limit (open-loop `Batch.rollout` of the
-    controls just recorded, from the same state, recording nothing) take turns in one process on one model. A ratio is
-    the median of the ratios of neighbours, so that a machine with other work on it slows both.
+    The closed loop (Kanayama, PID, `fel` learning in every robot, record) and its limit (open-loop `Batch.rollout` of
+    the controls just recorded, from the same state, recording nothing) take turns in one process on one model. A ratio
+    is the median of the ratios of neighbouring turns, because other work on the machine slows both.
 
     Args:
         sizes: Numbers of robots.
-        repetitions: Turns of each.
+        repetitions: Number of turns of each.
         chunk: Control periods of one turn, summed over the robots.
 
     Returns:
-        `machine`; `robots`, a row a size on one thread; `threads`, rows on one and on two; `lab`, such a row with the
-        sensors, the filter and the motor driver of that tier, whose rollouts have other bits; `parts`, µs a control
-        period in that tier by component for the smallest and the largest size; `sensing_share`, the share that sensors
-        and estimator have in it; `today`, the dm_control and autograd loop.
+        `machine`; `robots`, a row for each size on one thread; `threads`, rows for one thread and for two; `lab`, such
+        a row with the sensors, the filter and the motor driver of that tier, whose rollouts have other bits; `parts`,
+        µs per control period in that tier by component, for the smallest and the largest size; `sensing_share`, the
+        share of sensors and estimator in it; `today`, the dm_control and autograd loop.
     """
     threads = [1, 2] if (os.cpu_count() or 1) > 1 else [1]
     middle = sizes[len(sizes) // 2]
@@ -88,7 +88,7 @@ def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int
 
 
 def text(figures: dict[str, Any]) -> str:
-    """The figures of `run` as Markdown."""
+    """Returns the figures of `run` as Markdown."""
     machine, today = figures["machine"], figures["today"]
 
     def table(rows: list[dict[str, Any]]) -> str:
@@ -129,11 +129,11 @@ def text(figures: dict[str, Any]) -> str:
 
 
 def build(size: int, ticks: int, threads: int = 1, tier: Tier = "ideal") -> list[Simulation]:
-    """Closed loops with `fel` in every robot on the batch engine, also for one robot, past their first moments.
+    """Builds closed loops with `fel` in every robot on the batch engine, also for one robot, and warms them up.
 
     Args:
         size: Number of robots, which differ in their seeds.
-        ticks: Control periods that will be asked of them.
+        ticks: Number of control periods that they will be driven after that.
         threads: Number of threads, each of which gets a simulation with its share of the robots, as in `simulate`.
         tier: Sensing tier; the record of `ideal` alone holds the voltages that act.
     """
@@ -153,7 +153,7 @@ def turn(simulations: Sequence[Simulation], ticks: int) -> tuple[float, float, b
         ticks: Control periods.
 
     Returns:
-        Seconds in closed loop, seconds of the rollout, and whether it came to the same bits of `qpos`.
+        Seconds in closed loop, seconds of the rollout, and whether the rollout ended with the same bits of `qpos`.
     """
     plants = [simulation.plant for simulation in simulations if isinstance(simulation.plant, BatchPlant)]
     first = simulations[0].tick
@@ -210,7 +210,7 @@ def _compare(size: int, threads: int, repetitions: int, chunk: int, tier: Tier =
 
 
 def _today(repetitions: int, chunk: int) -> dict[str, float]:
-    """The closed loop with one robot and the autograd loop, taking turns."""
+    """Measures the closed loop with one robot and the autograd loop, which take turns."""
     ticks = max(chunk // 15, 20)
     simulations = build(1, ticks * repetitions)
     threads = torch.get_num_threads()
@@ -229,7 +229,7 @@ def _today(repetitions: int, chunk: int) -> dict[str, float]:
 
 
 def _parts(size: int, chunk: int) -> dict[str, float]:
-    """µs a control period by component, as they run in the loop."""
+    """Measures the µs per control period of each component while the loop runs."""
     ticks = max(2, chunk // size)
     (simulation,) = build(size, ticks, tier="lab")
     whole = []
@@ -263,17 +263,18 @@ def _stopwatches() -> Iterator[dict[str, list[float]]]:
 
 
 def autograd_loop(ticks: int, stretches: int) -> Iterator[tuple[float, float]]:
-    """What people write today: one dm_control physics, laws in NumPy, a torch network trained by autograd each tick.
+    """Drives a loop as people write it today: one dm_control physics, laws in NumPy, a torch network trained each tick.
 
-    The same robot, reference, rates and laws (without the limits on acceleration, which never act here), the same
-    network of 8, 24 and 2 units, plain gradient descent on the feedback voltage; dm_control at its defaults.
+    Robot, reference, rates and laws are the same (without the limits on acceleration, which never act here), and so is
+    the network of 8, 24 and 2 units. Autograd does plain gradient descent on the feedback voltage; dm_control has its
+    defaults.
 
     Args:
-        ticks: Control periods of a stretch.
-        stretches: How many follow one another.
+        ticks: Number of control periods of a stretch.
+        stretches: Number of stretches, which follow one another.
 
     Yields:
-        Seconds that a stretch took, and its position RMSE in m.
+        Seconds that a stretch took, and its RMS position error in m.
     """
     scenario = Scenario(**paper.IDEAL)
     period, substeps = scenario.control_period, round(scenario.control_period / scenario.physics_step)
@@ -342,7 +343,7 @@ def autograd_loop(ticks: int, stretches: int) -> Iterator[tuple[float, float]]:
 
 
 def _resident() -> float:
-    """Memory of this process in bytes: what it holds now on Linux, elsewhere the most it held."""
+    """Returns the resident memory of this process in bytes: its present value on Linux, elsewhere its peak."""
     try:
         with open("/proc/self/statm") as file:
             return int(file.read().split()[1]) * resource.getpagesize()

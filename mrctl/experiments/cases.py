@@ -20,10 +20,10 @@ from mrctl.theory.robot import STEERINGS, Robot
 from mrctl.theory.timing import Limits
 
 SUITE_SEEDS, TUNING_SEEDS, HELD_OUT_SEEDS = range(100_000), range(100_000, 200_000), range(200_000, 300_000)
-"""Seeds of the suite's draws, of those that settings are chosen on, and of those that nothing is ever chosen on."""
-HINDSIGHT = "hindsight"  # the best fixed feedforward, which is found by repeating the run
-REFERENCES = ("true_model", HINDSIGHT)  # feedforwards that know the plant, and compete with nobody
-LADDER = ("nominal", "mass +50 %", "supply -20 %", "all")  # plants of every steering arrangement
+"""Seeds of the suite, of the worlds in which settings are tuned, and of the held-out cells, on which none is chosen."""
+HINDSIGHT = "hindsight"  # the best fixed feedforward, found by repeating the run
+REFERENCES = ("true_model", HINDSIGHT)  # feedforwards that know the plant or the run, and so are no competitors
+LADDER = ("nominal", "mass +50 %", "supply -20 %", "all")  # plants that every steering arrangement drives
 UNCERTAIN = (
     "mass +50 %", "mass -50 %", "payload ahead", "payload aside", "left wheel +5 %", "drive friction x3",
     "resistance +30 %", "motor constant -15 %", "supply -20 %", "delay 20 ms", "left tyre on ice", "slope 10°",
@@ -38,28 +38,28 @@ HARD = {
     "current limit 1.5 A": Perturbation(current_limit=1.5),
     "sagging battery": Perturbation(supply_factor=0.8, battery_resistance=1.0),
 }
-"""Plants that a lap of 12 s, with at most 0.17 g to the side and 1 A a motor, does not tell from the nominal one."""
+"""Plants that behave like the nominal one on a lap of 12 s, with at most 0.17 g to the side and 1 A per motor."""
 STEPS = (*(name for name in UNCERTAIN if name != "mass -50 %"), "all")
-LASTING = ("left_radius_factor", "right_radius_factor", "slope")  # what does not change while a robot drives
+LASTING = ("left_radius_factor", "right_radius_factor", "slope")  # fields that do not change while a robot drives
 FLOOR, HALF = ("nominal", "all"), ", half the step"  # plants that are also driven with half the physics step
-NO_SPREAD = (0.0, 0.0, 0.0)  # an initial offset, the same for all, would hide what learning costs in lap 1
-FAST, SHORT, LONG = 9.0, 12.0, 18.0  # s, lap times: near the robot's limits, of the benchmark, slow to learn on
+NO_SPREAD = (0.0, 0.0, 0.0)  # no initial offset, which would hide what learning costs in lap 1
+FAST, SHORT, LONG = 9.0, 12.0, 18.0  # s, lap times: near the robot's limits, the benchmark's, a slow one to learn on
 LAP_TIMES = (8.0, 10.0, 12.0, 16.0, 20.0, 24.0, 30.0)  # s, of random splines; few, so that runs share a batch
 RANDOM_LAPS = 4
 MARGIN = 0.8  # share of the robot's limits that a random spline may ask for
 GRIP = 0.3  # tyre friction that a random spline relies on
 NO_WORSE = 1.02  # ratio to the error of PID alone up to which a feedforward does no harm
-BAND = 1.2  # ratio to the error before a step, or to the final error, that counts as recovered or converged
+BAND = 1.2  # largest ratio to the error before a step, or to the final one, that counts as recovered or converged
 
 
 class Case(NamedTuple):
-    """Replicates of one run, which differ in their draws, or the random scenarios."""
+    """A case of the suite: replicates of one run, which differ in their draws, or the random scenarios."""
 
     name: str
     part: str
-    """One of `PARTS`."""
+    """One of `PARTS`, or `held-out`."""
     scenarios: tuple[Scenario, ...]
-    """The runs; the suite sets their feedforward."""
+    """The runs, whose feedforwards are set later."""
     change: int = 0
     """Number, from 1, of the lap at whose beginning something changes; 0 if nothing does."""
     back: int = 0
@@ -67,7 +67,7 @@ class Case(NamedTuple):
 
 
 Choices = Mapping[str, dict[str, Any]]
-"""By name what each run is driven with: a `feedforward` of mrctl or a `controller` of the user."""
+"""What drives the runs, by name: a `feedforward` of mrctl or a `controller` of the user."""
 
 Laps = Mapping[str, xr.Dataset]
 """Metrics lap by lap of all runs, `(run, lap)`, by feedforward."""
@@ -77,7 +77,7 @@ class Outcome(NamedTuple):
     """The results of a suite."""
 
     mode: Mode
-    """Which of the suites it was."""
+    """Size of the suite."""
     cases: Sequence[Case]
     laps: Laps
     runs: Mapping[str, Laps]
@@ -89,7 +89,7 @@ class Outcome(NamedTuple):
 
 
 SLOW = Pid(time_constant=0.15)
-"""A PID that leaves more for a feedforward to gain than the default."""
+"""A PID that is slower than the default, so that a feedforward can gain more."""
 
 LOOP = Waypoints(
     points=(
@@ -120,14 +120,14 @@ UNCHANGED = ("steady", "fault", "course", "tier", "steering")  # parts in whose 
 
 
 def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
-    """The cases of the suite, the longest runs first.
+    """Lists the cases of the suite, the longest runs first.
 
     Args:
-        mode: What to take: `core`, the cases of the default; `quick`, a few of them with fewer laps; or `full`, which
-            adds the other uncertainties, tiers and steering arrangements, and drives 8 laps.
-        seeds: Number of replicates of each case; all cases have the same draws. After a step and its return the robot
-            is not quite the one before, but another draw.
-        random: Number of random scenarios in `lab`; `full` has the same in the other tiers.
+        mode: Size of the suite: `core`, the default; `quick`, a few of its cases with fewer laps; or `full`, which adds
+            the other uncertainties, tiers and steering arrangements, and drives 8 laps.
+        seeds: Number of replicates of each case; all cases have the same draws. The return after a step does not bring
+            back the same robot, but another draw.
+        random: Number of random scenarios in `lab`; `full` has the same ones in the other tiers.
     """
     quick, full = mode == "quick", mode == "full"
     leading, laps, third = {"quick": (3, 3, 2), "core": (5, 4, 3), "full": (8, 8, 4)}[mode]
@@ -199,7 +199,7 @@ def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
 
 
 def _another_on_return(run: Scenario) -> Scenario:
-    """The run whose last event brings back a robot of another draw; its wheels and the floor stay what they were."""
+    """Returns a run whose last event brings back another draw of the robot, with the same wheels on the same floor."""
     *before, last = run.events
     back = Perturbation().drawn(np.random.default_rng([run.seed, 6]))
     back = back.model_copy(update={name: getattr(run.perturbation, name) for name in LASTING})
@@ -207,17 +207,17 @@ def _another_on_return(run: Scenario) -> Scenario:
 
 
 def random_scenarios(count: int) -> list[Scenario]:
-    """The first `count` random scenarios, the shortest runs first; each is a pure function of its seed."""
+    """Returns the first `count` random scenarios, the shortest runs first; each is a pure function of its seed."""
     robot = read_robot(mjcf.load())
     return sorted((random_scenario(seed, robot) for seed in range(count)), key=lambda s: s.ticks)
 
 
 def random_scenario(seed: int, robot: Robot) -> Scenario:
-    """A random robot on a random closed spline with a random perturbation, from the start or as a step.
+    """Draws a random robot on a random closed spline with a random perturbation, from the start or as a step.
 
     Args:
-        seed: Seed of every draw; the scenario has it too.
-        robot: The nominal robot, whose limits the spline keeps.
+        seed: Seed of every draw, and of the scenario.
+        robot: The nominal robot, whose limits the spline respects.
     """
     random = np.random.default_rng([seed, 3])
     body = {
@@ -252,7 +252,7 @@ _KINDS = {
 
 
 def _spline(random: np.random.Generator, robot: Robot) -> Waypoints:
-    """A random spline at changing speed, driven in the shortest lap time that keeps the margins, or in the next."""
+    """Draws a spline at changing speed; its lap time is the least of `LAP_TIMES` within the margins, or the next."""
     careful = robot.model_copy(update={"tyre_friction": GRIP / MARGIN})
     while True:
         course = random_spline(random, careful, MARGIN, MARGIN)
@@ -262,7 +262,7 @@ def _spline(random: np.random.Generator, robot: Robot) -> Waypoints:
 
 
 def slowed(course: Waypoints, period: float) -> Waypoints:
-    """The same course in a longer lap time in s, with velocities in one proportion, accelerations in its square."""
+    """Slows a course to a lap time in s: velocities shrink by one factor, accelerations by its square."""
 
     def at(share: float) -> Waypoints:
         linear = {"rotation": course.limits.rotation * share}

@@ -1,8 +1,8 @@
 """The held-out cells: courses and plants on which one learner is judged, and on which nothing is ever chosen.
 
 A setting that was chosen on some runs looks better on them than it is (selection bias). These cells were written down
-before any tuning; no course, no plant and no seed of theirs is used anywhere else. A learner is named, with its
-settings, before it is driven through them, and every time that one is driven is kept.
+before any tuning; their courses, plants and seeds are used nowhere else. A learner is named, with its settings, before
+it is driven through them, and a log keeps every such drive.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LAPS = 6
 RIVALS: tuple[FeedforwardName, ...] = ("model", "true_model", "model+observer")
 RESOLVED = 5  # replicates of each cell that are also driven with half the physics step
 LOG = "held_out.jsonl"
-"""File with a line for each time that the cells were begun, and for each time that they were finished."""
+"""Name of the log, with a line for each time that the cells were begun, and for each time that they were finished."""
 
 COURSES: dict[str, Reference] = {
     "circle": Circle(radius=1.3, period=9.0, clockwise=True),
@@ -64,11 +64,11 @@ PLANTS: dict[str, Perturbation] = {
     "delay 10 ms, inertia +40 %": Perturbation(control_delay=0.01, inertia_factor=1.4),
     "right wheel -3 %, right friction x3": Perturbation(right_radius_factor=0.97, right_drive_friction_factor=3.0),
 }
-"""Eight robots that differ from the model in more than one way, none of them in `PERTURBATIONS`."""
+"""Eight plants that differ from the model, none of them in `PERTURBATIONS`."""
 
 
 def cells(count: int) -> list[Case]:
-    """The 40 cells, each course with each plant, course by course.
+    """Returns the 40 cells, each course with each plant, course by course.
 
     Args:
         count: Number of replicates of each cell; all cells have the same draws.
@@ -134,29 +134,29 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
 
 
 def _log(out: Path, values: Mapping[str, Any]) -> None:
-    """Adds a line, so that a drive that was begun is known even if its result is not."""
+    """Adds a line to the log, so that a drive that was begun is on record even without a result."""
     with (out / LOG).open("a") as file:
         file.write(json.dumps({"time": datetime.now(UTC).isoformat(timespec="seconds"), **values}) + "\n")
 
 
 def _half(cell: Case) -> Case:
-    """The first replicates of a cell with half the physics step."""
+    """Returns the first replicates of a cell with half the physics step."""
     halved = {"physics_step": Scenario().physics_step / 2, "name": cell.name + HALF}
     return Case(cell.name + HALF, cell.part, tuple(s.model_copy(update=halved) for s in cell.scenarios[:RESOLVED]))
 
 
 def _settings(name: str) -> dict[str, Any]:
-    """The settings of a learner that comes with mrctl."""
+    """Returns the settings of a learner that comes with mrctl."""
     learner = FEEDFORWARDS[name]["learner"]  # type: ignore[index]
     return getattr(Scenario(), learner).model_dump(mode="json") if learner != "none" else {}
 
 
 def compare(name: str, found: Mapping[str, Laps]) -> list[dict[str, Any]]:
-    """How a feedforward stands to each rival in each cell, metric and window: a row for each.
+    """Compares a feedforward with each rival in each cell, metric and window: a row for each.
 
-    It is at or below a rival if it lost no more runs, and its mean over those that both finished is no more than that
-    of the rival and the floor. The floor is that of the course: the largest change of a difference between two of the
-    means on any of its plants when the physics step is halved.
+    It is at or below a rival if it lost fewer runs; or as many, and its mean over the runs that both finished exceeds
+    the rival's by no more than the floor. The floor is that of the course: the largest change of a difference between
+    two means, on any of its plants, when the physics step is halved.
     """
     rows = []
     for course in COURSES:
@@ -191,7 +191,7 @@ def _standing(mine: NDArray[np.float64], theirs: NDArray[np.float64], floor: sui
 
 
 def summarised(name: str, rows: Sequence[dict[str, Any]], count: int) -> Table:
-    """In how many cells a feedforward is at or below each rival, and the cells where its position is not."""
+    """Counts the cells in which a feedforward is at or below each rival, and lists those where its position is not."""
     size = len(COURSES) * len(PLANTS)
     cells, least = [], size
     for metric, title in COLUMNS.items():

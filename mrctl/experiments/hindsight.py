@@ -1,12 +1,12 @@
-"""A fixed feedforward in hindsight: what a learner would have used that knew the whole run at its start.
+"""A fixed feedforward in hindsight: the one of a learner that had known the whole run at its start.
 
     U_ff = cᵀ φ_c,    c ← c + argmin_Δ Σ |U_fb − Δᵀ φ_c|²,    φ_c = the 8 features of equation (3) at the command
 
 The inverse dynamics of the nominal robot is the first guess. A run shows which voltage the feedback had to add; least
-squares finds the coefficients that would have given it, and the run is repeated with them. Ticks in which nothing
-may be learned do not count. After one repetition the coefficients hardly change any more. By analogy with the regret of
-on-line learning (Cesa-Bianchi and Lugosi, 2006), that of a learner is its RMS error over all laps less that of the last
-repetition. It can be negative, since the feedback voltage is minimised, not the error.
+squares finds the coefficients that would have given this voltage, and the run is repeated with them. Ticks in which
+learning is frozen do not count. After one repetition the coefficients hardly change any more. By analogy with on-line
+learning (Cesa-Bianchi and Lugosi, 2006), the regret of a learner is its RMS error over all laps less that of the last
+repetition. It can be negative, because the feedback voltage is minimised, not the error.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mrctl.results import dataset
 from mrctl.scenario import FEEDFORWARDS, Scenario
 
 REPETITIONS = 2
-RIDGE = 1e-6  # share of a feature's mean square; keeps what was never excited at its first guess
+RIDGE = 1e-6  # share of a feature's sum of squares; keeps coefficients that were never excited at their first guess
 
 
 def best_fixed(scenarios: Sequence[Scenario], *, threads: int = 0) -> xr.Dataset:
@@ -55,7 +55,8 @@ def drive(scenarios: Sequence[Scenario], coefficients: Array | None, threads: in
     if coefficients is not None:
         prior["c"] = coefficients
         motion = hierarchy.command.copy(), hierarchy.derivative.copy()
-        hierarchy.reset(*motion, simulation.plant.reading["steering_angle"])  # the integral holds less now
+        # Starts anew, because these coefficients leave another voltage to the PID's integral.
+        hierarchy.reset(*motion, simulation.plant.reading["steering_angle"])
     gram, seen = np.zeros((len(scenarios), 8, 8)), np.zeros((len(scenarios), 8, 2))
     while simulation.running:
         simulation.step()

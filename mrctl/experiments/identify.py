@@ -1,4 +1,4 @@
-"""`mrctl identify`: the constants of equation (3) from two drives, from voltages, currents, encoders and gyro.
+"""`mrctl identify`: estimates the constants of equation (3) from voltages, currents, encoders and gyro of two drives.
 
 Robots drive open loop under periodic multisines, always forwards, so that Coulomb friction is constant. They drive
 straight on first, then in turns with the front wheel held straight and without grip, as on a sheet of ice, because a
@@ -9,18 +9,18 @@ front wheel that steers or trails makes a part of the torque that equation (3) a
     turning                  θ̈ = [ (N k D/r) (i_d − i_s) − m c V θ̇ ] / J_e + constant
 
 with F_c = 2 τ_loss/r + F_roll are fitted by least squares to the lowest harmonics of the signals. An encoder's error is
-bounded in its angle φ and that of a gyro is white in θ̇, so a line at the frequency ω is weighted by 1/ω for each
-derivative that was taken of the sample; this is the equation, integrated as often. The noisy signal stands alone on the
-left, where noise does not bias the estimate: when the robot turns, the gyro gives θ̈, and the encoders V θ̇. The gyro's
-bias is the constant, and its drift is removed as a linear trend.
+bounded in its angle φ and that of a gyro is white in θ̇, so a spectral line at the frequency ω is weighted by 1/ω for
+each derivative that was taken of the sample, which amounts to integrating the equation as often. The noisy signal
+stands alone on the left, where noise does not bias the estimate: when the robot turns, the gyro gives θ̈, and the
+encoders give V θ̇. The gyro's bias is the constant, and its drift is removed as a linear trend.
 
-The motor driver is assumed to measure voltages and currents exactly, and every sample to have its time. The currents
-give torques, so masses are identified in kg; without current sensors only ratios such as M_e/(N k) are.
+The motor driver is assumed to measure voltages and currents exactly, and the time of every sample to be known. The
+currents give torques, so masses are identified in kg; without current sensors only ratios such as M_e/(N k) would be.
 
-Each robot drives its own signal with its own sensors and gives one estimate. The interval around their mean is that of
-Student's t for sensors and signals, and in quadrature 1.5 % for effects that equation (3) leaves out and repetition
-does not show: creep and sinkage of the tyres, and the engine's time step. A constant can be told if half of its
-interval is at most a tenth of it.
+Each robot drives its own signal with its own sensors and gives one estimate. The interval around the mean of all
+estimates adds in quadrature Student's t interval, for sensors and signals, and 1.5 % for effects that equation (3)
+leaves out and repetition does not show: creep and sinkage of the tyres, and the engine's time step. A constant counts
+as identifiable if half of its interval is at most a tenth of its value.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ PERIOD = 10.0  # s of the excitation
 PERIODS = 2  # periods that are averaged, after one in which the robot settles
 REPEATS = 8  # number of robots, each under its own signal
 TICK = 0.005  # s, for which a voltage is held
-FINE = 100  # physics steps in a time constant; the first-order engine adds the damping over half a step to the mass
+FINE = 100  # physics steps per time constant; the first-order engine adds damping times half a step to the mass
 MODEL = 0.015  # relative error that effects outside equation (3) may cause
-TOLD = 0.1  # of the value, largest half of the interval of a constant that can be told; chosen
+TOLD = 0.1  # largest half of the interval of an identifiable constant, as a share of its value; chosen
 LAB, NOMINAL = Sensing(tier="lab"), Perturbation()
 NOT_IDENTIFIABLE = """\
 For c, the mass m is taken from a scale. These drives do not identify m, J_w and J_m, which enter only M_e and J_e;
@@ -77,14 +77,14 @@ class Constant(NamedTuple):
 
     @property
     def told(self) -> bool:
-        """Whether the interval is narrow enough to tell the constant."""
+        """Whether the interval is narrow enough for the constant to be identifiable."""
         return self.high - self.low <= 2 * TOLD * abs(self.estimate)
 
 
 class Drive(NamedTuple):
     """Measured signals of one robot: their mean and their harmonics 1 to K, as complex amplitudes.
 
-    A signal has its value at the end of a tick, with the time of that end.
+    Signals are sampled at the ends of ticks.
     """
 
     wheels: Lines
@@ -98,7 +98,7 @@ class Drive(NamedTuple):
 
 
 def run(world: str, robot: RobotFile, perturbation: Perturbation, sensing: Sensing, seed: int, json: bool) -> str:
-    """The command: drives, identifies, and prints a table or JSON.
+    """Runs the command: drives, identifies, and returns a table or JSON.
 
     Args:
         world: World to drive in; its ground must be level.
@@ -120,7 +120,7 @@ def run(world: str, robot: RobotFile, perturbation: Perturbation, sensing: Sensi
 
 
 def text(constants: Sequence[Constant]) -> str:
-    """The constants as a Markdown table, and which others such drives do not show."""
+    """Returns the constants as a Markdown table, and which others such drives do not show."""
     header = ["constant", "unit", "estimate", "95 % interval", "true", "error", "can be told"]
     numbers = [[f"{x:.4g}" for x in (c.estimate, c.low, c.high, c.true)] for c in constants]
     cells = [
@@ -194,23 +194,23 @@ def _constant(name: str, values: Array, unit: str, true: float) -> Constant:
 
 
 def scatter(values: Array) -> Array:
-    """Half of the 95 % interval of a mean by Student's t, for values along the last axis."""
+    """Returns half of the 95 % interval of the mean along the last axis, by Student's t."""
     count = values.shape[-1]
     return stats.t.ppf(0.975, count - 1) * values.std(ddof=1, axis=-1) / np.sqrt(count)
 
 
 def _bandwidth(robot: Robot) -> float:
-    """Highest frequency of the excitation in Hz: twice the corner of the slower channel, from 1 to 4."""
+    """Returns the highest frequency of the excitation in Hz: twice the corner of the slower channel, from 1 to 4 Hz."""
     slower = max(robot.velocity_time_constant, robot.rotation_time_constant)
     return float(np.clip(2 / (2 * np.pi * slower), 1.0, 4.0))
 
 
 def signals(robot: Robot, random: np.random.Generator, turns: bool) -> Array:
-    """One period of U_Σ and U_Δ in V, `(N, 2)`, with random phases and the largest amplitudes that the limits allow.
+    """Draws one period of U_Σ and U_Δ in V, `(N, 2)`, with random phases and the largest amplitudes that are safe.
 
-    The common channel has the even harmonics, the differential one the odd ones. Predicted from the nominal robot, V
-    stays within half of its mean, which is half of the limit, and θ̇ within half of its limit and of what keeps both
-    wheels turning forwards; accelerations stay within two thirds of their limits.
+    The common channel has the even harmonics, the differential one the odd ones. As predicted for the nominal robot, V
+    differs from its mean, half of its limit, by at most half of this mean; θ̇ stays within half of its limit and low
+    enough that both wheels turn forwards; accelerations stay within two thirds of their limits.
     """
     samples = round(PERIOD / TICK)
     lines = np.arange(1, round(PERIOD * _bandwidth(robot)) + 1)
@@ -274,7 +274,7 @@ def excite(plant: Plant, robot: Robot, sensing: Sensing, random: np.random.Gener
 
 
 def lines(time: NDArray, values: NDArray, highest: int) -> tuple[Lines, Array]:
-    """Mean and harmonics of signals that are periodic but for a linear trend, by least squares.
+    """Fits mean and harmonics to signals that are periodic but for a linear trend, by least squares.
 
     Args:
         time: Times of the samples in s, over whole periods, `(n,)`.
@@ -282,7 +282,7 @@ def lines(time: NDArray, values: NDArray, highest: int) -> tuple[Lines, Array]:
         highest: Highest harmonic K, below half of the number of samples in a period.
 
     Returns:
-        Mean and complex amplitudes c of c e^{jωt} + conjugate, `(K + 1, …)`, and the trend in a second, `(…)`.
+        Mean and complex amplitudes c of c e^{jωt} + conjugate, `(K + 1, …)`, and the trend per second, `(…)`.
     """
     angle = 2 * np.pi / PERIOD * np.outer(time, np.arange(1, highest + 1))
     slope = (time - time.mean()) / PERIOD
@@ -295,14 +295,14 @@ def lines(time: NDArray, values: NDArray, highest: int) -> tuple[Lines, Array]:
 
 
 def derivative(of: Lines, trend: Array | float = 0.0) -> Lines:
-    """Derivative of a signal with these lines and this trend in a second."""
+    """Returns the lines of the derivative of a signal with these lines and this trend per second."""
     found = _shaped(1j * frequencies(len(of)), of) * of
     found[0] = trend
     return found
 
 
 def frequencies(count: int) -> Array:
-    """Angular frequencies of the mean and the harmonics in rad/s, `(count,)`."""
+    """Returns the angular frequencies of the mean and the harmonics in rad/s, `(count,)`."""
     return np.asarray(2 * np.pi / PERIOD * np.arange(count), float)
 
 
@@ -311,20 +311,20 @@ def _shaped(factors: NDArray, like: Lines) -> NDArray:
 
 
 def average(of: Lines) -> Lines:
-    """Lines of the mean over the tick that ends, for a signal with these lines at the ends of ticks."""
+    """Returns the lines of a signal's mean over each tick, from its lines at the ends of ticks."""
     shift = 1j * TICK * frequencies(len(of))[1:]
     return _shaped(np.append(1.0, (1 - np.exp(-shift)) / shift), of) * of
 
 
 def product(first: Lines, second: Lines) -> Lines:
-    """Lines of the product of two signals, `(K + 1,)`; harmonics beyond K, which the two lack, do not count."""
+    """Returns the lines of the product of two signals up to harmonic K, `(K + 1,)`."""
     count = 4 * len(first)
     values = [np.fft.irfft(one, count) * count for one in (first, second)]
     return np.fft.rfft(values[0] * values[1])[: len(first)] / count
 
 
 def drive_constants(drive: Drive, wheel_radius: float) -> dict[str, float]:
-    """R_a, N k, M_e and F_c from a drive straight on.
+    """Estimates R_a, N k, M_e and F_c from a drive straight on.
 
     Args:
         drive: Measured signals.
@@ -342,13 +342,13 @@ def drive_constants(drive: Drive, wheel_radius: float) -> dict[str, float]:
 
 
 def turn_constants(drive: Drive, resistance: float, constant: float, robot: Robot) -> dict[str, float]:
-    """J_e and m c from a drive in turns.
+    """Estimates J_e and m c from a drive in turns.
 
     Args:
         drive: Measured signals.
         resistance: R_a in Ω.
         constant: N k in N·m/A.
-        robot: Robot whose wheel radius and half track are used, which a ruler measures.
+        robot: Robot whose wheel radius and half track are taken as known.
     """
     current = _mean_current(drive, resistance)
     torque = constant * robot.half_track / robot.wheel_radius * (current[:, 1] - current[:, 0])
@@ -359,14 +359,14 @@ def turn_constants(drive: Drive, resistance: float, constant: float, robot: Robo
 
 
 def _mean_current(drive: Drive, resistance: float) -> Lines:
-    """Mean current of each tick: at its beginning the current jumps with the voltage, then it runs on to its end."""
+    """Returns lines of the mean current of each tick, which jumps with the voltage and then changes linearly."""
     before = np.exp(-1j * TICK * frequencies(len(drive.current)))[:, None]
     jump = (1 - before) * drive.voltage / resistance
     return (before * drive.current + jump + drive.current) / 2
 
 
 def _fit(weight: Array, left: Lines, *right: Lines) -> Array:
-    """Real least-squares coefficients of lines `(…, n)` with weights `(n,)`."""
+    """Returns real least-squares coefficients of lines `(…, n)` with weights `(n,)`."""
 
     def real(of: Lines) -> Array:
         return (of * weight).ravel().view(float)

@@ -1,9 +1,9 @@
-"""Kanayama's table: his motion controller on the kinematic plant, compared with target values.
+"""Kanayama's table: his motion controller on the kinematic plant, with target values to compare.
 
 The plant is equation (2) with ideal velocity tracking, integrated at 0.1 ms with a second-order step. The reference
-runs along the x axis at v_r = 0.30 m/s, the robot starts beside it with v(0) = v_r. Gains and limits are those of
-Kanayama et al. (1990); the limiter clips each of v, ω, v̇, ω̇ by itself. A residual is y over Δy when the robot has
-come 50 cm along x, an overshoot the largest excursion to the other side over Δy.
+runs along the x axis at v_r = 0.30 m/s; the robot starts beside it with v(0) = v_r. Gains and limits are those of
+Kanayama et al. (1990); the limiter clips each of v, ω, v̇ and ω̇ separately. A residual is y over Δy when the robot has
+come 50 cm along x, and an overshoot is the largest excursion to the other side over Δy.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Case(NamedTuple):
     Attributes:
         name: What is measured.
         unit: `%` of Δy, or `cm`.
-        target: Computed independently by the authors of `physics.md` at 0.1 ms, not printed in the 1990 paper.
+        target: Expected value, computed independently at 0.1 ms; the 1990 paper does not print it.
         offset: Initial Δy in m.
         turn: Initial Δθ in rad.
         k_theta: K_θ in 1/m.
@@ -80,7 +80,7 @@ def control(
     pose: Array, reference: Array, twist: Array, zero: Array, max_twist: Array, max_acceleration: Array, period: float,
     rows: Rows,
 ) -> None:  # fmt: skip
-    """The motion controller and, on its request, the limiter, for all cases."""
+    """Applies the motion controller, and the limiter to its request, in all cases."""
     for i in range(len(rows)):
         s = rows[i]
         posture_error(pose[i], reference, s.error)
@@ -89,7 +89,7 @@ def control(
 
 
 def paths(cases: list[Case], period: float = STEP) -> NDArray[np.float64]:
-    """Postures over time in every case.
+    """Simulates every case; returns the postures over time.
 
     Args:
         cases: The B cases.
@@ -120,7 +120,7 @@ def paths(cases: list[Case], period: float = STEP) -> NDArray[np.float64]:
 
 
 def measure(case: Case, path: NDArray[np.float64]) -> float:
-    """The value of one case in its unit, from its postures `(steps, 3)` in m, m, rad."""
+    """Returns the value of one case in its unit, from its postures `(steps, 3)` in m, m, rad."""
     x, y = path[:, 0], path[:, 1]
     if case.measure == "residual":
         k = int(np.argmax(x >= DISTANCE))
@@ -132,7 +132,7 @@ def measure(case: Case, path: NDArray[np.float64]) -> float:
 
 
 def table() -> list[dict[str, float | str]]:
-    """Every case with its target, the value at 0.1 ms (the stated convention), and the value at T_s = 10 ms."""
+    """Returns every case with its target, its value at 0.1 ms (the convention of the targets), and at T_s = 10 ms."""
     fine, coarse = paths(CASES), paths(CASES, 0.01)
     return [
         {

@@ -38,8 +38,8 @@ def run(
     """Drives a mission.
 
     Args:
-        world: As in `mrctl.navigation.mission.task_of`, which also explains start and goal.
-        scenario: As in `mrctl.navigation.mission.navigate`, which also explains what follows the start.
+        world: World of the mission; see `mrctl.navigation.mission.task_of`, also for start and goal.
+        scenario: Scenario of the robots; see `mrctl.navigation.mission.navigate`, also for `compare` to `avoid`.
         goal: Pose of the goal in m, m, rad, or None.
         start: Pose of the start in m, m, rad, or None.
         compare: Further feedforwards.
@@ -50,7 +50,7 @@ def run(
         as_json: Whether to return JSON instead of a table.
 
     Returns:
-        The outcomes, a row for each robot; and the outcome of the first robot.
+        The report, with a row for each robot; and the outcome of the first robot.
 
     Raises:
         InputError: As `task_of` and `navigate`, or the folder cannot be written or holds a result already.

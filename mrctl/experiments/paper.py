@@ -28,13 +28,13 @@ from mrctl.sensing.tiers import TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS
 from mrctl.theory.references import Lemniscate
 
-CASE = "all"  # the plant of the figures, which differs from the model in everything
+CASE = "all"  # plant of the figures, with another mass, supply, drive friction and resistance than the model
 PAPER: tuple[FeedforwardName, ...] = (
     "none", "model", "true_model", "model+observer", "fel", "model+fel", "model+rls", "model+composite",
 )  # fmt: skip
 FAST, SLOW = 12.0, 20.0  # s a lap
-DRAWS = 4  # replicates in each sensing tier
-LONG = 60  # laps that show whether learning stays stable
+DRAWS = 4  # number of replicates in each sensing tier
+LONG = 60  # number of laps that shows whether learning stays stable
 IDEAL: dict[str, Any] = {
     "sensing": Sensing(tier="ideal"),
     "pid": Pid(time_constant=0.15),
@@ -45,24 +45,24 @@ IDEAL: dict[str, Any] = {
 }
 """The world of the paper: exact measurements without delay, ideal motors, and a PID that is not tuned to its limit.
 
-Learner and observer have the settings for that PID; their defaults are for a PID ten times as fast.
+Learner and observer have settings for that PID; their defaults are for a PID that is ten times as fast.
 """
 METRICS = ("v_rmse", "omega_rmse", "position_rmse")
 
 
 def scenario(feedforward: FeedforwardName, case: str, period: float = FAST, **changes: Any) -> Scenario:  # noqa: ANN401
-    """A run of the benchmark in the world of the paper: the lemniscate, on the plant of a named perturbation.
+    """Returns a run of the benchmark in the world of the paper: the lemniscate, on the plant of a named perturbation.
 
-    The name of the run is that of its plant.
+    The run has the name of its plant.
     """
     fields: dict[str, Any] = FEEDFORWARDS[feedforward] | {"perturbation": PERTURBATIONS[case]}
     return Scenario(name=case, reference=Lemniscate(period=period), **fields | IDEAL | changes)
 
 
 def real(tier: Tier) -> list[Scenario]:
-    """The runs of eight laps with sensors and motors of a tier, and with the controllers that are designed for it.
+    """Returns runs of eight laps with the sensors and motors of a tier and the controllers designed for it.
 
-    Each feedforward has the same replicates. The name of a run is that of its plant.
+    Every feedforward drives the same replicates. A run has the name of its plant.
     """
     found = []
     for case in ("nominal", CASE):
@@ -73,7 +73,7 @@ def real(tier: Tier) -> list[Scenario]:
 
 
 def benchmark() -> list[Scenario]:
-    """The runs of eight laps: every feedforward, fast and slow, and under the other steering arrangements."""
+    """Returns runs of eight laps: every feedforward, fast and slow, and in the other steering arrangements."""
     compliant = [scenario(f, case, period) for period in (FAST, SLOW) for case in ("nominal", CASE) for f in PAPER]
     others = [
         scenario(f, case, steering=steering)
@@ -152,12 +152,12 @@ def figures(result: xr.Dataset, scenarios: Sequence[Scenario], out: Path) -> Non
 
 
 def summary(result: xr.Dataset) -> pd.DataFrame:
-    """The metrics of the last lap of every run, and why it failed, or ""."""
+    """Returns the metrics of the last lap of every run, and why it failed, or ""."""
     return metrics.summary(result).assign(failure=result["failure"].values)
 
 
 def compare(table: pd.DataFrame, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
-    """RMSE in the last lap of every run, and its ratio to PID alone on the same plant, reference and seed.
+    """Computes the RMSE in the last lap of every run, and its ratio to PID alone on the same plant, reference and seed.
 
     Args:
         table: What `summary` returns, a row for each scenario.
@@ -184,7 +184,7 @@ def compare(table: pd.DataFrame, scenarios: Sequence[Scenario]) -> list[dict[str
 
 
 def endure(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
-    """RMSE in lap 8 and in the last lap of the long runs, which agree if learning stays stable."""
+    """Returns the RMSE of the long runs in lap 8 and in the last lap; the two agree if learning stays stable."""
     laps = metrics.per_lap(result)
     rows = []
     for k, one in enumerate(scenarios):
@@ -197,7 +197,7 @@ def endure(result: xr.Dataset, scenarios: Sequence[Scenario]) -> list[dict[str, 
 
 
 def endurance_text(rows: Sequence[dict[str, Any]]) -> str:
-    """The long runs as Markdown."""
+    """Returns the table of the long runs as Markdown."""
     header = ["run", *(f"{name}, lap 8 → {LONG}" for name in ("V, mm/s", "θ̇, mrad/s", "position, mm"))]
     cells = [
         [r["run"], *(" → ".join(number(1e3 * r[m][lap]) for lap in ("lap_8", "last")) for m in METRICS)] for r in rows
@@ -206,7 +206,7 @@ def endurance_text(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def text(rows: Sequence[dict[str, Any]]) -> str:
-    """The comparison as Markdown."""
+    """Returns the comparison as Markdown."""
     header = ["steering", "plant", "lap", "feedforward", "V, mm/s", "θ̇, mrad/s", "position, mm"]
     header += ["to PID: V", "θ̇", "position"]
     cells = []
@@ -223,7 +223,7 @@ def text(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def tiers_text(rows: Sequence[dict[str, Any]]) -> str:
-    """The runs with sensors and motors of each tier as Markdown: means over the draws."""
+    """Returns the table of the runs in each tier as Markdown: means over the replicates."""
     header = ["sensing", "plant", "feedforward", "V, mm/s", "θ̇, mrad/s", "position, mm", "position to PID"]
     groups: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
@@ -242,7 +242,7 @@ def tiers_text(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def kanayama_text(rows: Sequence[dict[str, Any]]) -> str:
-    """Kanayama's table as Markdown."""
+    """Returns Kanayama's table as Markdown."""
     cells = [
         [str(r["case"]), f"{r['target']:.4g} {r['unit']}", f"{r['value']:.2f}", f"{r['value_10ms']:.2f}"] for r in rows
     ]

@@ -1,4 +1,4 @@
-"""The figures of the suite and its report, an HTML page that holds its figures and needs no server."""
+"""The figures of the suite and its report, an HTML page that contains the figures and needs no server."""
 
 from __future__ import annotations
 
@@ -55,21 +55,21 @@ def write(outcome: Outcome, choices: Choices, tables: Sequence[Table], out: Path
 
 
 def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
-    """The figures and their captions, by file name."""
+    """Draws the figures; returns them with their captions, by file name."""
     runs = {case.name: case for case in outcome.cases}
     found = outcome.runs
     drawn: dict[str, tuple[Any, str]] = {}
-    mean = "Mean over the seeds; the band is their range. Laps are counted from 1."
+    mean = "Mean over the replicates; the band is their range. Laps are counted from 1."
     steady = {name: _labelled(found[name]) for name in ("nominal", "all") if name in found}
     drawn["error_per_lap"] = (
         plots.laps_by_case(steady, "position_rmse"),
-        f"Position error lap by lap, on the nominal robot and with everything wrong at once. {mean}",
+        f"Position error lap by lap, on the nominal robot and with four things wrong at once (all). {mean}",
     )
     stepped = [case for case in outcome.cases if case.part == "step"]
     steps = {case.name: _labelled(found[case.name]) for case in stepped}
     drawn["recovery"] = (
         plots.laps_by_case(steps, "position_rmse", (stepped[0].change, stepped[0].back)),
-        f"A change at the first dotted line, taken back at the second: position error lap by lap. {mean}",
+        f"Position error lap by lap; the plant changes at the first dotted line and back at the second. {mean}",
     )
     share = {**steady, stepped[-1].name: steps[stepped[-1].name]}
     drawn["feedback_share"] = (
@@ -80,7 +80,7 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
     panels = {case.name: _labelled(found[case.name]) for case in switched}
     drawn["learning"] = (
         plots.laps_by_case(panels, "position_rmse", (switched[0].change,)),
-        "Learning off until the dotted line and on from there; or on until there, then frozen on another course. "
+        "Learning is off until the dotted line and then on; or it is on until there, then frozen on another course. "
         f"{mean}",
     )
     if "random" in found and "none" in found["random"]:
@@ -95,21 +95,21 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
     if learners:
         drawn["inverse_dynamics"] = (
             plots.inverse_dynamics({name: learned(choices[name], runs["all"].scenarios[0]) for name in learners}),
-            "What the feedforwards that learn a map learned with everything wrong at once, beside the true inverse "
-            "dynamics, in steady motion: the voltage that the motors share and the one in which they differ, over V "
-            "and θ̇. The line shows where the robot drove.",
+            "Maps that the feedforwards learned with four things wrong at once (all), beside the true inverse dynamics "
+            "in steady motion: the common and the differential voltage of the motors over V and θ̇. The line shows "
+            "where the robot drove.",
         )
     return drawn
 
 
 def _labelled(runs: Mapping[str, xr.Dataset]) -> xr.Dataset:
-    """The runs of one case in one dataset, labelled with their feedforwards."""
+    """Returns the runs of one case in one dataset, labelled with their feedforwards."""
     own = [one.assign_coords(label=("run", [name] * one.sizes["run"])) for name, one in runs.items()]
     return xr.concat([one.drop_vars("scenario", errors="ignore") for one in own], "run")
 
 
 def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
-    """Drives a scenario again and evaluates the feedforward in steady motion, beside the true inverse dynamics."""
+    """Drives a scenario again; evaluates the learned feedforward and the true inverse dynamics in steady motion."""
     stages: Stages = user_files.load(choice["controller"]) if "controller" in choice else {}
     scenario = scenario.model_copy(update=FEEDFORWARDS[choice.get("feedforward", "none")])
     simulation = Simulation([scenario], **stages)
@@ -132,13 +132,13 @@ def page(
     tables: Sequence[Table],
     images: Mapping[str, tuple[str, str]],
 ) -> str:
-    """The report as HTML.
+    """Returns the report as HTML.
 
     Args:
         outcome: Results of the suite.
         choices: The feedforwards, by name.
         tables: The tables of all numbers.
-        images: Each figure as base64 of a PNG, and its caption, by file name.
+        images: Figures by file name, each as PNG in base64, with its caption.
     """
     fixed = [case for case in outcome.cases if case.part != "random"]
     random = _worlds(outcome)
@@ -166,7 +166,7 @@ def page(
 
 
 def command(outcome: Outcome, choices: Choices) -> str:
-    """The command that repeats the suite."""
+    """Returns the command that repeats the suite."""
     words = ["mrctl", "suite", *([f"--{outcome.mode}"] if outcome.mode != "core" else [])]
     words += ["--feedforward", *(name for name, one in choices.items() if "feedforward" in one)]
     own = [one["controller"] for one in choices.values() if "controller" in one]
@@ -182,7 +182,7 @@ def _worlds(outcome: Outcome) -> int:
 
 
 def scorecard(outcome: Outcome) -> str:
-    """The position error of every case under every feedforward, coloured by its ratio to that of PID alone."""
+    """Makes the table of position errors by case and feedforward, coloured by the ratio to that of PID alone."""
     cells: dict[str, dict[str, Cell]] = {}
     for case, rows in _by_case(outcome, steps=False).items():
         rivals = [row for row in rows if row["feedforward"] not in REFERENCES]
@@ -198,7 +198,7 @@ def scorecard(outcome: Outcome) -> str:
 
 
 def recoveries(outcome: Outcome) -> str:
-    """Position error at the end of a step, and one lap after change and return over that before the change."""
+    """Makes the table of position errors at the end of a step, and one lap after change and return over that before."""
     cells: dict[str, dict[str, Cell]] = {}
     for case, rows in _by_case(outcome, steps=True).items():
         for row in rows:
@@ -213,7 +213,7 @@ def recoveries(outcome: Outcome) -> str:
 
 
 def duels(outcome: Outcome) -> str:
-    """Probabilities that one feedforward beats another in the random scenarios."""
+    """Makes the table of probabilities that one feedforward beats another in the random scenarios."""
     rows = {row["feedforward"]: row for row in outcome.rows if row["case"] == "random"}
     cells: dict[str, dict[str, Cell]] = {}
     for name, row in rows.items():
@@ -235,7 +235,7 @@ class Cell(NamedTuple):
 
     text: str
     ratio: float = 1.0
-    """Colour of the cell: green below one, red above."""
+    """Number that determines the colour of the cell: green below one, red above."""
     bold: bool = False
 
     @property
@@ -245,7 +245,7 @@ class Cell(NamedTuple):
 
 
 def _coloured(name: str, cells: dict[str, dict[str, Cell]], corner: str = "case") -> str:
-    """An HTML table of cells by row and column, whose `name` no other table of the page has."""
+    """Makes an HTML table of cells by row and column; `name` must be unique on the page."""
     frame = pd.DataFrame.from_dict(cells, orient="index").rename_axis(columns=corner)
     styler = Styler(frame.map(lambda cell: cell.text), uuid=name)
     styler.format(escape="html")
@@ -256,13 +256,13 @@ def _coloured(name: str, cells: dict[str, dict[str, Cell]], corner: str = "case"
 
 
 def _plain(table: pd.DataFrame) -> str:
-    """An HTML table of text."""
+    """Makes an HTML table of text."""
     with pd.option_context("display.max_colwidth", None):  # pandas cuts longer text
         return table.to_html(index=False, border=0, classes="text")
 
 
 def _by_case(outcome: Outcome, steps: bool) -> dict[str, list[dict[str, Any]]]:
-    """The rows of the cases that are steps, or of those that are not."""
+    """Returns the rows of the cases that are steps, or of those that are not, by case."""
     found: dict[str, list[dict[str, Any]]] = {}
     for row in outcome.rows:
         if (row["part"] == "step") == steps:
@@ -271,7 +271,7 @@ def _by_case(outcome: Outcome, steps: bool) -> dict[str, list[dict[str, Any]]]:
 
 
 def _shade(ratio: float) -> str:
-    """The colour of a ratio in CSS: green below one, deepest at 1/30; red above one, deepest at 3."""
+    """Returns the colour of a ratio in CSS: green below one, deepest at 1/30; red above one, deepest at 3."""
     if not np.isfinite(ratio) or ratio <= 0:
         return "#fff"
     depth = np.log(ratio) / np.log(3 if ratio > 1 else 30)

@@ -1,7 +1,7 @@
 """The complementary sensitivity of a velocity loop, measured on the physics, and where learning is safe in it.
 
-Feedback-error learning lowers U_fb by adding to U_ff, so it depends on the response of one to the other:
-∂U_fb/∂U_ff = −T with T = L/(1 + L) of the loop broken at the voltage. Learning converges at frequencies where
+Feedback-error learning lowers U_fb by adding to U_ff, so it depends on the response of U_fb to U_ff:
+∂U_fb/∂U_ff = −T with T = L/(1 + L), where L is the loop opened at the voltage. Learning converges at frequencies where
 Re T(jω) > 0, whatever the regressor (Gomi and Kawato 1993). T is measured in the complete loop by a feedforward that
 does not learn and adds a multisine to the voltage.
 """
@@ -27,16 +27,16 @@ Array = NDArray[np.float64]
 Response = NDArray[np.complex128]
 
 SAMPLES = 1000  # control periods in a period of the excitation
-AMPLITUDE = 0.03  # V at each frequency, or a tenth of it in rad/s for steering: no tyre slides, no wheel reverses
+AMPLITUDE = 0.03  # V at each frequency, times `STEERING_SCALE` in rad/s for steering: no tyre slides, no wheel reverses
 
 
 def lines(samples: int) -> NDArray[np.intp]:
-    """The odd harmonics below the Nyquist frequency; a quadratic nonlinearity responds at the even ones alone."""
+    """Returns the odd harmonics below the Nyquist frequency; a quadratic nonlinearity responds only at even ones."""
     return np.arange(1, samples // 2, 2)
 
 
 def multisine(samples: int, harmonics: NDArray[np.intp]) -> Array:
-    """One period of a sum of harmonics of amplitude 1 with Schroeder's phases (1970), which keep its peak low.
+    """Returns one period of a sum of harmonics of amplitude 1 with Schroeder's phases (1970), which keep its peak low.
 
     Args:
         samples: Number of samples in the period.
@@ -51,7 +51,7 @@ def multisine(samples: int, harmonics: NDArray[np.intp]) -> Array:
 
 
 def estimate(excitation: Array, answer: Array, harmonics: NDArray[np.intp]) -> Response:
-    """Frequency response of a system in its periodic steady state, exact if it is linear.
+    """Estimates the frequency response of a system in periodic steady state, exactly if it is linear.
 
     Args:
         excitation: One period of the input, `(N,)`.
@@ -78,7 +78,7 @@ class Shaker:
         self.feedback = np.zeros((ticks, size, 2))
 
     def output(self, command: Array, derivative: Array) -> Array:
-        """The signal at this tick, `(B, 2)`."""
+        """Returns the signal at this tick, `(B, 2)`."""
         return self._signal[self._tick % len(self._signal)]
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> None:
@@ -90,11 +90,11 @@ class Shaker:
 def measure(scenarios: Sequence[Scenario], channel: int, speed: float = Line().speed) -> tuple[Array, Response]:
     """Measures T of one channel on robots that drive straight on, in the complete loop with hold, delay and tyres.
 
-    With the gains of the motion controller at zero this is the velocity loop; with its own gains it is the loop that
-    learning works in.
+    With zero gains of the motion controller this is T of the velocity loop alone; with its usual gains it is T of the
+    loop in which learning takes place.
 
     Args:
-        scenarios: Runs that fit one batch; their references, feedforwards and events are replaced.
+        scenarios: Runs that fit one batch; their references, feedforwards, events and guards are replaced.
         channel: 0 for the common channel, 1 for the differential or the steering channel.
         speed: Speed of the robots in m/s.
 
@@ -125,7 +125,7 @@ def measure(scenarios: Sequence[Scenario], channel: int, speed: float = Line().s
 
 
 def refine(frequency: Array, response: Response) -> tuple[Array, Response]:
-    """A response interpolated by cubic splines on a fine grid, which is even on a logarithmic scale."""
+    """Interpolates a response by cubic splines on a fine grid that is evenly spaced in the logarithm of frequency."""
     fine = np.geomspace(frequency[0], frequency[-1], 4000)
     real, imaginary = CubicSpline(frequency, np.stack([response.real, response.imag]), axis=1)(fine)
     return fine, real + 1j * imaginary
@@ -139,10 +139,10 @@ class Safety(NamedTuple):
     a + (1 − a) T; the condition is then Re T > −a/(1 − a).
 
     Attributes:
-        positive_to: Frequency in rad/s up to which Re T(jω) > 0; infinite if it is positive everywhere.
+        positive_to: Frequency in rad/s up to which Re T(jω) > 0; infinite if Re T is positive everywhere.
         lowest: Least Re T.
-        step: Largest μ at which the integrator is stable without this hand-over.
-        step_handed_over: Largest μ at which it is stable with the hand-over.
+        step: Largest μ at which the loop is stable without this hand-over.
+        step_handed_over: Largest μ at which the loop is stable with the hand-over.
     """
 
     positive_to: float
@@ -152,7 +152,7 @@ class Safety(NamedTuple):
 
 
 def safety(frequency: Array, response: Response, period: float) -> Safety:
-    """Frequencies and steps at which learning is safe, from T on a fine grid.
+    """Computes the frequencies and steps at which learning is safe, from T on a fine grid.
 
     Args:
         frequency: ω in rad/s, `(F,)`.
@@ -170,7 +170,7 @@ def safety(frequency: Array, response: Response, period: float) -> Safety:
 
 
 def _largest_step(frequency: Array, response: Response, period: float) -> float:
-    """The largest stable step: the gain margin of T/(z − 1)."""
+    """Returns the largest stable step, which is the gain margin of T/(z − 1)."""
     loop = response / (np.exp(1j * frequency * period) - 1)
     crossing = (loop.imag[:-1] * loop.imag[1:] < 0) & (loop.real[:-1] < 0)
     return float((1 / np.abs(loop[:-1][crossing])).min(initial=np.inf))

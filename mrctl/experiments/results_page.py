@@ -1,10 +1,10 @@
-"""The developers' command that writes `RESULTS.md` from what the commands of mrctl leave behind.
+"""The developers' command that writes `RESULTS.md` from the output of the commands of mrctl.
 
     python -m mrctl.experiments.results_page --suite suite --bench bench.json --out mrctl/experiments/RESULTS.md
 
-The page is a list of sections, each under a heading of the second level. A section whose input is named is written
-anew; every other section of a page that exists already stays as it is. So one table can be renewed without the half
-hour of the suite, and the paragraphs that people wrote about the tables survive.
+The page is a list of sections, each under a heading of the second level. A section whose input is given is rewritten;
+every other section of an existing page stays as it is. So one table can be renewed without the half hour of the suite,
+and the paragraphs that people wrote about the tables survive.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ BEGINNING = """# Results
 
 `python -m mrctl.experiments.results_page` writes the tables of this page from what the commands leave behind."""
 BENCHMARK = ("nominal", "all")
-"""Cases of the suite in the short table at the head of its section."""
+"""Cases of the suite in the short table at the beginning of its section."""
 
 Table = Mapping[str, Any]
 
@@ -47,7 +47,7 @@ def main(
     bench: Path | None = None,
     out: Path = Path("RESULTS.md"),
 ) -> None:
-    """Writes the sections whose inputs are named into the page of results; the other sections stay as they are.
+    """Writes the sections whose inputs are given into the page of results; the other sections stay as they are.
 
     Args:
         reproduce: Folder that `mrctl reproduce --out` wrote.
@@ -61,7 +61,7 @@ def main(
         out: The page to write.
 
     Raises:
-        InputError: No input is named, or one cannot be read or was not written by its command.
+        InputError: No input is given, or one cannot be read or was not written by its command.
     """
     written: dict[str, str] = {}
     if reproduce is not None:
@@ -111,20 +111,20 @@ def main(
 
 
 def sections(page: str) -> dict[str, str]:
-    """The sections of a page by their headings, in order; what stands before the first heading has the name ""."""
+    """Returns the sections of a page by heading, in order; the text before the first heading has the name ""."""
     beginning, *others = f"\n{page}".split("\n## ")
     parts = [part.partition("\n") for part in others]
     return {"": beginning.strip()} | {title.strip(): text.strip() for title, _, text in parts}
 
 
 def paper_text(table: Table) -> str:
-    """The tables of `mrctl reproduce`: the last lap, the long runs, the sensing tiers, and Kanayama's table."""
+    """Returns the tables of `mrctl reproduce`: the last lap, the long runs, the sensing tiers, and Kanayama's table."""
     last_lap, long_runs = paper.text(table["last_lap"]), paper.endurance_text(table["endurance"])
     return "\n\n".join([last_lap, long_runs, paper.tiers_text(table["tiers"]), paper.kanayama_text(table["kanayama"])])
 
 
 def suite_text(table: Table, everything: str) -> str:
-    """What the tables of `mrctl suite` say, a short one with the benchmark's cases, and all of them folded away.
+    """Returns the statements of the tables of `mrctl suite`, a short table of the benchmark, and all tables folded.
 
     Args:
         table: The content of `table.json`.
@@ -149,7 +149,7 @@ def suite_text(table: Table, everything: str) -> str:
 
 
 def held_out_text(table: str, log: str) -> str:
-    """The table of `mrctl suite --held-out`, and every time that the cells were driven.
+    """Returns the table of `mrctl suite --held-out`, and a list of all times that the cells were driven.
 
     Args:
         table: The content of `table.md`.
@@ -162,13 +162,13 @@ def held_out_text(table: str, log: str) -> str:
 
 
 def tune_text(table: Table) -> str:
-    """The design, the table and the advice of `mrctl tune`."""
+    """Returns the design, the tables and the advice of `mrctl tune`."""
     design, _, rest = tuning.text(dict(table)).partition("\n\n")
     return f"```text\n{design}\n```\n\n{rest}"
 
 
 def search_text(tables: Sequence[Table]) -> str:
-    """What each search began with and found, in its own worlds and in fresh ones: a row for each entry and tier."""
+    """Returns a table of settings before and after each search, with their errors: a row for each entry and tier."""
     header = [
         "entry",
         "tier",
@@ -198,13 +198,13 @@ def search_text(tables: Sequence[Table]) -> str:
 
 
 def identify_text(table: Table) -> str:
-    """The table of `mrctl identify`."""
+    """Returns the table of `mrctl identify`."""
     fields = identification.Constant._fields
     return identification.text([identification.Constant(*(row[f] for f in fields)) for row in table["constants"]])
 
 
 def _section(command: str, table: Table, text: str) -> str:
-    """A section, or a part of one, that says where its numbers come from."""
+    """Returns a section, or a part of one, which begins with the origin of its numbers."""
     versions = ", ".join(f"{name} {version}" for name, version in table["versions"].items())
     machine = table["machine"]
     source = f"`{command}` made this with {versions}, on {machine['processor']} with {machine['cores']} cores."
@@ -219,7 +219,7 @@ def _text(path: Path) -> str:
 
 
 def _read(path: Path, *keys: str) -> Table:
-    """The JSON that a command wrote, with NaN where it wrote null.
+    """Reads the JSON that a command wrote, with NaN in place of null.
 
     Raises:
         InputError: The file cannot be read, is not JSON, or lacks one of the keys.

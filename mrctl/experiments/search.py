@@ -1,27 +1,27 @@
-"""`mrctl tune --search`: settings of any controller, found with the same budget, worlds and objective for all.
+"""`mrctl tune --search`: finds settings of a controller; budget, worlds and objective are the same for all.
 
-**Worlds.** A world is a random spline, driven twice, and a plant with one thing wrong: see `KINDS`. Its draws, like
-those of `replicates`, have seeds from `cases.TUNING_SEEDS`, which neither the suite nor the held-out set has. The robot
+**Worlds.** A world is a random spline, driven twice, and a plant of one of the `KINDS`. Its draws, and those of
+`replicates`, have seeds from `cases.TUNING_SEEDS`, which neither the suite nor the held-out set uses. The robot
 starts on the reference, as a random offset would hide the first seconds of learning. The guard is off: it would hide
-that a setting makes the loop oscillate, and settings must do without it.
+that a setting makes the loop oscillate, and settings must be stable without it.
 
 **Objective.** With the errors e of a run over all its laps, and those of the feedforward `model` in the same world,
 
     J = mean over worlds of ½ log(e/e_model of position) + ¼ log(… of V) + ¼ log(… of θ̇)
 
-exp J is a weighted geometric mean of ratios. A mean of logarithms gives every world and every metric its weight,
-whatever its size; in a mean of errors the hardest world would decide alone. Position counts as much as both velocities:
-it is what a user sees, and the velocities are what a learner acts on. All laps count, so that a setting pays for
-learning slowly. To each error a floor is added, below which a difference means nothing to a user (`FLOORS`). A run that
-fails counts as `LOST` times the error of `model`, and none counts as more: one loss among 16 worlds costs as much as
-15 % of the error in all of them. In two of the eight kinds of worlds the motors lag by one period more than the
-controller knows, in one of them with a light robot, which keeps settings off the edge of stability. More would tell
-nothing about settings: with half the mass and one period, `model` itself nearly oscillates in `lab`, and with two
-periods nothing is left to a search but to slow the learner down. That is the guard's task.
+exp J is a weighted geometric mean of ratios. In a mean of logarithms every world and every metric has its weight,
+whatever the size of the error; in a mean of errors the hardest world would decide alone. Position counts as much as
+both velocities: it is what a user sees, and the velocities are what a learner acts on. All laps count, so that a
+setting pays for learning slowly. To each error a floor is added, below which a difference means nothing to a user
+(`FLOORS`). A run that fails counts as `LOST` times the error of `model`, and none counts as more: one loss among 16
+worlds costs as much as 15 % of the error in all of them. In two of the eight kinds of worlds commands are one period
+later than the controller knows, in one of these with a light robot; this keeps settings off the edge of stability. A
+harder world would say nothing about settings: with half the mass and one period, `model` itself nearly oscillates in
+`lab`, and with two periods a search can only slow the learner down, which is the task of the guard.
 
-**Search.** CMA-ES (Hansen 2016, arXiv:1604.00772) in the logarithm of the settings, from those that mrctl ships, on the
-same worlds in each generation. The shipped settings are a candidate too, so that what is found is never worse on these
-worlds. Whether it is better elsewhere is measured in fresh ones.
+**Search.** CMA-ES (Hansen 2016, arXiv:1604.00772) searches in the logarithm of the settings, from the shipped ones on,
+in the same worlds in each generation. The shipped settings are a candidate too, so that the result is never worse
+in these worlds. Whether it is better elsewhere is measured in fresh worlds.
 """
 
 from __future__ import annotations
@@ -57,20 +57,20 @@ from mrctl.theory.references import Waypoints, random_spline
 
 Bounds = dict[str, tuple[float, float]]
 SEARCHED: dict[str, Bounds] = {
-    # The PID's design keeps its margins for the plant that these two assume.
+    # Parameters of the plant for which the design of the PID keeps its margins.
     "none": {"pid.lag": (1e-3, 0.1), "pid.derivative_time": (1e-3, 0.1)},
-    # The bandwidth of what is measured of the disturbance, against noise and delay.
+    # Bandwidth of the estimated disturbance, a compromise with noise and delay.
     "observer": {"observer.time_constant": (0.02, 5.0)},
     "indi": {"indi.time_constant": (0.005, 0.5)},
     "l1": {"l1.bandwidth": (1.0, 100.0), "l1.predictor": (0.5, 100.0)},
-    # How fast it learns, forgets, and from which feedback on.
+    # Speed of learning, speed of forgetting, and least feedback that teaches.
     "fel": {"fel.step": (0.001, 0.5), "fel.leak": (1e-7, 1e-2), "fel.dead_zone": (0.003, 0.3)},
-    # The share that moves at once, what is known at the start, and what is forgotten.
+    # Immediate share of a correction, initial uncertainty, and forgetting.
     "rls": {
         "rls.step": (0.001, 0.2), "rls.initial_covariance": (2e-3, 20.0), "rls.drift": (1e-7, 1e-2),
         "rls.covariance_bound": (2e-3, 20.0),
     },
-    # Trust in the prediction error, memory or spread of plants, and weight of the tracking error.
+    # Trust in the prediction error, memory, spread of plants, and weight of the tracking error.
     "mrac": {
         "mrac.noise": (1e-3, 0.5), "mrac.memory": (1.0, 1000.0), "mrac.spread": (0.1, 30.0),
         "mrac.tracking": (0.05, 100.0),
@@ -80,15 +80,15 @@ SEARCHED: dict[str, Bounds] = {
         "composite.step": (1e-3, 0.3),
     },
 }  # fmt: skip
-"""Settings to search, with their bounds, by learner: those that set how fast and how far it follows an error. Sizes
-that change no dynamics (units, scales, bounds of weights) and filters that several laws share stay as they are."""
-METRICS = {"position_rmse": 0.5, "v_rmse": 0.25, "omega_rmse": 0.25}  # with their weights in the objective
-FLOORS = 1e-4, 5e-5, 1e-4  # m, m/s, rad/s; half the physics step changes the errors by less
-LOST = 10.0
-PERIOD, LAPS = 12.0, 2  # s; of the splines, which all robots of a batch share
+"""Settings to search, with their bounds, by learner: those that determine how fast and how far it follows an error.
+Constants that change no dynamics (units, scales, bounds of weights) and filters that several laws share stay fixed."""
+METRICS = {"position_rmse": 0.5, "v_rmse": 0.25, "omega_rmse": 0.25}  # weights in the objective
+FLOORS = 1e-4, 5e-5, 1e-4  # m, m/s, rad/s, added to the errors; half the physics step changes these by less
+LOST = 10.0  # largest ratio of an error to that of `model`, and that of a failed run
+PERIOD, LAPS = 12.0, 2  # lap time of the splines in s and number of laps, which all robots of a batch share
 SPREAD = 0.2  # standard deviation of the first generation, as a share of the logarithmic range
 TUNING = TUNING_SEEDS.start  # first seed of the worlds that the search sees
-FRESH = TUNING + 50_000  # and of those that the search does not see
+FRESH = TUNING + 50_000  # first seed of the worlds that it does not see
 NOISY = {"encoder_counts": 0.5, "gyro_noise": 4.0, "fix_position_noise": 2.0, "fix_heading_noise": 2.0}  # factors
 KINDS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
     "as built": lambda r: {},
@@ -109,11 +109,11 @@ KINDS: dict[str, Callable[[np.random.Generator], dict[str, Any]]] = {
     "noise": lambda r: {"sensing": NOISY},
     "late": lambda r: {"perturbation": {"control_delay": 0.01}},
 }  # fmt: skip
-"""What is wrong with a plant, as fields of a scenario; the values of `sensing` are factors on those of the tier."""
+"""Kinds of plants, as fields of a scenario to draw; the values of `sensing` are factors on those of the tier."""
 
 
 class Budget(NamedTuple):
-    """Effort of a search."""
+    """Effort of a search: numbers of worlds, generations, settings in a generation, and fresh worlds."""
 
     worlds: int = 2 * len(KINDS)
     generations: int = 15
@@ -123,17 +123,17 @@ class Budget(NamedTuple):
 
 
 BUDGET = Budget()
-"""The same for every controller: 2 to 3 minutes for a tier on two cores."""
+"""Budget for every controller, which takes 2 to 3 minutes per tier on two cores."""
 
 
 class Entry(NamedTuple):
     """A controller with settings to search."""
 
     name: str
-    """One of `FEEDFORWARDS`, or the absolute name of the user's; see `mrctl.loop.user_files`."""
+    """One of `FEEDFORWARDS`, or the absolute path and name of a user's controller; see `mrctl.loop.user_files`."""
     bounds: Bounds
     shipped: dict[str, float]
-    """Values that the search begins with."""
+    """Values with which the search begins."""
 
     def tried(self, settings: dict[str, float], worlds: Sequence[Scenario]) -> tuple[list[Scenario], Stages]:
         """Returns the worlds with these settings, and the factories of the user's stages."""
@@ -150,7 +150,7 @@ class Entry(NamedTuple):
         return [world.model_copy(update=FEEDFORWARDS["none"]) for world in worlds], stages
 
     def flags(self, settings: dict[str, float]) -> str:
-        """The flags of `mrctl run` with these settings, to four digits."""
+        """Returns the flags of `mrctl run` for these settings, to four digits."""
         if self.name in FEEDFORWARDS:
             chosen = [f"{name} {value}" for name, value in FEEDFORWARDS[self.name].items()]
             chosen += [f"{field.replace('_', '-')} {value:.4g}" for field, value in settings.items()]
@@ -168,13 +168,13 @@ class Entry(NamedTuple):
 
 
 def entry(name: str) -> Entry:
-    """The controller of a name: one of `FEEDFORWARDS`, or the user's as `my_file.py:MyController`.
+    """Finds a controller by name: one of `FEEDFORWARDS`, or the user's as `my_file.py:MyController`.
 
-    A user's class says what may be searched, `search = {"gain": (0.01, 1.0)}`: names of keyword arguments of its
-    constructor, whose defaults are the start, with their bounds.
+    A user's class declares what may be searched, as in `search = {"gain": (0.01, 1.0)}`: names of keyword arguments of
+    its constructor, with their bounds; the search begins at their defaults.
 
     Raises:
-        InputError: There is no such controller, or it says nothing, or nothing sensible, about what may be searched.
+        InputError: There is no such controller, or it declares nothing to search, or invalid bounds.
     """
     if name in FEEDFORWARDS and (name == "none" or FEEDFORWARDS[name]["learner"] != "none"):
         bounds = SEARCHED[FEEDFORWARDS[name]["learner"]]
@@ -207,7 +207,7 @@ def entry(name: str) -> Entry:
 
 
 def _declared(factory: Any) -> dict[str, Any]:  # noqa: ANN401
-    """What a user's class says may be searched."""
+    """Returns what a user's class declares as searchable: bounds by argument."""
     return dict(getattr(getattr(factory, "func", factory), "search", {}))
 
 
@@ -215,19 +215,19 @@ class Worlds(NamedTuple):
     """The worlds of a tier."""
 
     seen: Sequence[Scenario]
-    """Those of the search."""
+    """Worlds in which the search takes place."""
     fresh: Sequence[Scenario]
-    """Those in which its result is measured."""
+    """Worlds in which its result is measured."""
 
 
 def worlds(tier: Tier, budget: Budget) -> Worlds:
-    """The worlds of a tier; each is a pure function of tier and seed."""
+    """Draws the worlds of a tier; each is a pure function of tier and seed."""
     first = {TUNING: budget.worlds, FRESH: budget.fresh}
     return Worlds(*([world(tier, seed) for seed in range(start, start + count)] for start, count in first.items()))
 
 
 def world(tier: Tier, seed: int) -> Scenario:
-    """The world of a seed: its kind follows from the seed, everything else is drawn with it."""
+    """Draws the world of a seed; its kind follows from the seed, everything else is drawn with it."""
     random = np.random.default_rng([seed, 7])
     kind = list(KINDS)[seed % len(KINDS)]
     fields = KINDS[kind](random)
@@ -246,7 +246,7 @@ def world(tier: Tier, seed: int) -> Scenario:
 
 @cache
 def _course(seed: int) -> Waypoints:
-    """A random spline with the margins of the suite's, slowed down to the lap time."""
+    """Draws a random spline with the margins of those in the suite, slowed down to the lap time."""
     random, robot = np.random.default_rng([seed, 8]), read_robot(mjcf.load())
     careful = robot.model_copy(update={"tyre_friction": GRIP / MARGIN})
     while (course := random_spline(random, careful, MARGIN, MARGIN)).period > PERIOD:
@@ -255,25 +255,25 @@ def _course(seed: int) -> Waypoints:
 
 
 def score(errors: Array, yardstick: Array) -> Array:
-    """Weighted logarithm of the ratio to `model` in each world, `(worlds,)`, whose mean is the objective.
+    """Returns the weighted logarithm of the ratio to `model` in each world, `(worlds,)`; the objective is its mean.
 
     Args:
         errors: Errors by world and metric of `METRICS`, `(worlds, 3)`; NaN where the run failed.
-        yardstick: Those of `model`, `(worlds, 3)`.
+        yardstick: Errors of `model`, `(worlds, 3)`.
     """
     ratio = np.nan_to_num((errors + FLOORS) / (yardstick + np.array(FLOORS)), nan=LOST, posinf=LOST)
     return np.log(np.minimum(ratio, LOST)) @ np.array(list(METRICS.values()))
 
 
 class Memory:
-    """What has been driven already: a file with a line for each setting in each set of worlds."""
+    """A file with the errors of settings that were driven already: a line for each setting in each set of worlds."""
 
     def __init__(self, file: Path, head: dict[str, Any], threads: int = 0) -> None:
         """Opens the file of a search or begins it.
 
         Args:
-            file: The file; a line that was not finished is dropped.
-            head: What the search depends on, its first line.
+            file: The file; an unfinished last line is dropped.
+            head: Everything that the search depends on, which is the first line of the file.
             threads: Number of threads; 0 for all cores.
 
         Raises:
@@ -291,7 +291,7 @@ class Memory:
         self._known = {_key(line): np.array(line["errors"]) for line in lines[1:]}
 
     def drive(self, entry: Entry, settings: Sequence[dict[str, float]], among: Sequence[Scenario]) -> list[Array]:
-        """Returns the errors of each of the settings in the worlds, `(worlds, 3)`, which are driven if need be."""
+        """Returns the errors of each of the settings in the worlds, `(worlds, 3)`; drives settings that are new."""
         lines = [{"entry": entry.title, "settings": one, "first": among[0].seed} for one in settings]
         missing = {_key(line): line for line in lines if _key(line) not in self._known}
         simulations = []
@@ -315,18 +315,18 @@ def _key(line: dict[str, Any]) -> str:
 def search(
     name: str, tiers: Sequence[Tier], out: Path | None, json: bool, budget: Budget = BUDGET, threads: int = 0
 ) -> str:
-    """The command: searches settings for each tier, and drives all that were found in fresh worlds of each tier.
+    """Runs the command: searches settings for each tier, and drives all that were found in fresh worlds of each tier.
 
     Args:
         name: The controller, as for `entry`.
         tiers: Sensing tiers.
-        out: Folder for `table.json` and what was driven; by default `search/NAME`. The same command continues there.
+        out: Folder for `table.json` and the runs; by default `search/NAME`. The same command continues there.
         json: Whether to return JSON instead of a table.
         budget: Effort of the search.
         threads: Number of threads, which changes no bit; 0 for all cores.
 
     Raises:
-        InputError: The controller is bad, or the folder cannot be written or holds another search.
+        InputError: The controller is invalid, or the folder cannot be written or holds another search.
     """
     searched = entry(name)
     out = output_folder(out or Path("search") / searched.title)
@@ -345,7 +345,7 @@ def search(
 
 
 def _head(searched: Entry, drawn: Worlds, budget: Budget) -> dict[str, Any]:
-    """What the errors depend on beside the settings, and the proposals on beside the errors."""
+    """Returns everything but the settings that determines the errors, and the budget and bounds of the search."""
     own = {} if searched.name in FEEDFORWARDS else {"file": user_files.digest(searched.name)}
     written = "".join(world.model_dump_json() for world in (*drawn.seen, *drawn.fresh))
     digest = hashlib.sha256(written.encode()).hexdigest()
@@ -382,7 +382,7 @@ def find(searched: Entry, tier: Tier, memory: Memory, among: Sequence[Scenario],
             optimiser.tell(list(zip(points, values, strict=True)))
             bar.update(budget.population)
             bar.set_postfix(error=f"{np.exp(min(tried, key=_value)[0]):.4f} of model's")
-    best, found = min(tried, key=_value)  # the first one of several
+    best, found = min(tried, key=_value)  # the first of equal ones
     origin = f"mrctl {versions()['mrctl']}, tune --search {searched.title}, {tier}: best of {len(tried)} settings "
     origin += f"in {budget.worlds} worlds with seeds from {TUNING}"
     return {"found": found, "objective": {"shipped": tried[0][0], "found": best}, "origin": origin}
@@ -415,7 +415,7 @@ def compare(
 
 
 def text(table: dict[str, Any]) -> str:
-    """The settings and what they are worth, as text."""
+    """Returns the settings and their errors as text."""
     tiers = table["tiers"]
     settings = [
         [name, number(shipped), *(number(tiers[tier]["found"][name]) for tier in tiers)]

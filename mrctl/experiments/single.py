@@ -42,18 +42,18 @@ FIGURES = {  # file: function of `results.plots`
 
 
 class _Announcement(Listener):
-    """Says that laws are compiled, which takes most of a first run before its progress bar appears."""
+    """Tells the user that laws are being compiled, which delays the progress bar of a first run."""
 
     said = False
 
     def on_start(self, event: Event) -> None:
-        """Says it once."""
+        """Prints the message at the first compilation."""
         if not self.said:
             self.said = True
             print("mrctl: compiling the laws, which takes half a minute, once", file=sys.stderr)
 
     def on_end(self, event: Event) -> None:
-        """Says nothing."""
+        """Prints nothing."""
 
 
 def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = None) -> tuple[str, str]:
@@ -66,10 +66,10 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         own: Stages of the user; see `mrctl.loop.user_files`.
 
     Returns:
-        The metrics, a row for each lap; and why the run failed, or "".
+        The report, with a row of metrics for each lap; and why the run failed, or "".
 
     Raises:
-        InputError: The scenario or a stage is bad, or the folder cannot be written or holds a result already.
+        InputError: The scenario or a stage is invalid, or the folder cannot be written or holds a result already.
     """
     if out is not None and (held := [name for name in _written() if (out / name).exists()]):
         raise InputError(f"out: {out} holds {held[0]} already; nothing was overwritten")
@@ -123,7 +123,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
 
 
 def _written() -> list[str]:
-    from mrctl.results import plots  # here, for a run that draws nothing needs no matplotlib
+    from mrctl.results import plots  # imported here because a run that draws nothing needs no matplotlib
 
     figures = (f"{name}.{suffix}" for name in FIGURES for suffix in plots.FORMATS)
     return ["result.zarr", "learned.safetensors", *figures]

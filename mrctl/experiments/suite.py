@@ -1,4 +1,4 @@
-"""`mrctl suite`: every feedforward over every case, with paired seeds; tables, figures and a report of it."""
+"""`mrctl suite`: drives every feedforward through every case with paired seeds, and writes tables and a report."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from mrctl.theory.references import Circle
 
 Entry = FeedforwardName | Literal["hindsight"]
 CHUNK = 40  # runs in a job: enough for a fast batch, and few enough that no worker idles for long at the end
-STARTING, STATISTICS = 3.0, 0.15  # s, to start workers for a feedforward, and for a row of the tables; measured
+STARTING, STATISTICS = 3.0, 0.15  # s for the start of a feedforward's workers, and for a row of the tables; measured
 
 
 def suite(
@@ -60,19 +60,19 @@ def suite(
     workers: int | None,
     out: Path,
 ) -> Outcome:
-    """Runs those runs of the suite that are not done yet; writes `table.md`, `table.json`, figures and `report.html`.
+    """Drives the runs of the suite that are not done yet; writes `table.md`, `table.json`, figures and `report.html`.
 
     Args:
-        mode: Which cases to run; see `cases`.
+        mode: Size of the suite; see `cases`.
         feedforwards: Names of the feedforwards to compare; `hindsight` is the best fixed one for each run.
         controllers: Feedforwards of the user, each as `my_file.py:MyController`; see `mrctl.loop.user_files`.
-        seeds: Number of replicates of each case; every feedforward drives the same.
+        seeds: Number of replicates of each case, which are the same for every feedforward.
         random: Number of random scenarios.
         workers: Number of processes; by default one for each core.
-        out: Folder for the results; the runs of each feedforward are a store under `runs` in it.
+        out: Folder for the results; its folder `runs` holds a store for each feedforward.
 
     Returns:
-        What was run and measured.
+        The results.
 
     Raises:
         InputError: There is no feedforward or no seed, a controller is bad, or the folder cannot be written or holds
@@ -98,7 +98,7 @@ def suite(
 
 
 def by_name(feedforwards: Sequence[str], controllers: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """What drives the runs, by the name of the feedforward or of the user's class.
+    """Returns what drives the runs, by the name of the feedforward or of the user's class.
 
     Raises:
         InputError: A controller is bad, or its name is taken.
@@ -114,9 +114,9 @@ def by_name(feedforwards: Sequence[str], controllers: Sequence[str]) -> dict[str
 
 
 def run(chosen: Sequence[Case], choices: Choices, workers: int | None, out: Path) -> tuple[Laps, str]:
-    """Runs every case under every feedforward, as far as it is not done yet; each feedforward has a store of its own.
+    """Drives every case with every feedforward, unless that is done already; each feedforward has its own store.
 
-    It prints how long that will take before it starts.
+    Before it starts, it prints how long that will take.
 
     Returns:
         Metrics lap by lap, by feedforward; and a sentence on the runs that could not be done, or "".
@@ -139,7 +139,7 @@ def run(chosen: Sequence[Case], choices: Choices, workers: int | None, out: Path
 
 
 def expectation(chosen: Sequence[Case], choices: Choices, workers: int, out: Path) -> str:
-    """A sentence on how long the runs that are not done yet will take, from a drive of a second on this machine."""
+    """Returns a sentence on how long the remaining runs will take, from a short drive on this machine."""
     scenarios = [s for case in chosen for s in case.scenarios]
     usual = Scenario().physics_step
     seconds = sum(s.duration * usual / s.physics_step for s in scenarios)
@@ -155,7 +155,7 @@ def expectation(chosen: Sequence[Case], choices: Choices, workers: int, out: Pat
 
 
 def left(path: Path) -> float:
-    """Share of the jobs of a store that are not done yet; 1 where there is no store."""
+    """Returns the share of the jobs of a store that are not done yet; 1 if there is no store."""
     try:
         kept = Store(path)
     except InputError:
@@ -164,7 +164,7 @@ def left(path: Path) -> float:
 
 
 def pace() -> float:
-    """Simulated seconds that one core drives in a second, metrics included, measured on a short drive."""
+    """Measures the simulated seconds that one core drives in a second, metrics included, on a short drive."""
     batch = replicates(Scenario(laps=1, reference=Circle(period=4.0, radius=0.5), prior="model"), CHUNK)
     simulate(batch[:1], threads=1)  # compiles or loads the kernels
     began = time.perf_counter()
@@ -173,7 +173,7 @@ def pace() -> float:
 
 
 def runs_of(chosen: Sequence[Case], laps: Laps) -> dict[str, Laps]:
-    """The runs of each case, by feedforward; the laps of a run that could not be done are NaN."""
+    """Returns the runs of each case, by feedforward; the laps of a run that could not be done are NaN."""
     found: dict[str, Laps] = {}
     end = 0
     for case in chosen:
@@ -185,16 +185,16 @@ def runs_of(chosen: Sequence[Case], laps: Laps) -> dict[str, Laps]:
 
 
 def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str, Any]]:
-    """Statistics that the tables show: a row for each case and feedforward, in the order of `PARTS`.
+    """Computes the statistics of the tables: a row for each case and feedforward, in the order of `PARTS`.
 
     A row holds for lap 1, all laps and the last lap: the mean with its 95 % bootstrap interval; the floor; the mean
     difference from PID and from `model` in the same run; and the probability of beating each of the others in the same
     run, where two errors that differ by no more than the floor of differences are a tie. In `random`, where one world
-    would rule the means, they are medians. For the last lap a row also holds the mean of the worst 5 % (infinite where
-    a run failed) and the ratios to PID and to `model`. `excess` is the error beyond that of the last lap (after a step:
-    of the lap before the return), integrated from the start or the step on; it has no meaning where the course changes.
-    Where nothing changes on the way, a row holds the laps until the error stays within `BAND` times its final value;
-    for a step it holds what `_step` returns.
+    would dominate a mean, medians replace the means. For the last lap a row also holds the mean of the worst 5 %
+    (infinite where a run failed) and the ratios to PID and to `model`. `excess` is the error beyond that of the last
+    lap (after a step: of the lap before the return), integrated from the start or the step on; it has no meaning where
+    the course changes. Where nothing changes during a run, a row holds the number of laps until the error stays within
+    `BAND` times its final value; for a step it holds what `_step` returns.
     """
     pairs = [(found[plant], found[plant + HALF]) for plant in FLOOR if {plant, plant + HALF} <= found.keys()]
     limits = {metric: floors(pairs, metric) for metric in COLUMNS}
@@ -238,13 +238,13 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
 
 
 def windows(laps: xr.Dataset, metric: str) -> dict[str, NDArray[np.float64]]:
-    """Errors of each run in lap 1, over all laps as a root mean square, and in the last lap; NaN where it failed."""
+    """Returns the errors of each run in lap 1, over all laps (RMS), and in the last lap; NaN if the run failed."""
     error = laps[metric].transpose("run", "lap").values
     return {"first": error[:, 0], "all": np.sqrt(np.mean(error**2, axis=1)), "last": error[:, -1]}
 
 
 def standing(name: str, errors: Mapping[str, NDArray[np.float64]], floor: Floor, median: bool) -> dict[str, Any]:
-    """The mean or median of one feedforward in a case, and how it stands to the others in the same runs."""
+    """Returns the mean or median of one feedforward in a case, and compares it with the others in the same runs."""
     found: dict[str, Any] = bootstrap_interval(errors[name], median=median)._asdict() | {"floor": floor._asdict()}
     for rival, theirs in errors.items():
         if rival != name:
@@ -268,25 +268,25 @@ def no_worse(error: NDArray[np.float64], pid: NDArray[np.float64]) -> dict[str, 
 
 
 def titled(name: str) -> str:
-    """Name of a feedforward in tables."""
+    """Returns the name of a feedforward in tables."""
     return TITLES.get(name, name)
 
 
 class Floor(NamedTuple):
-    """What the integrator does not resolve."""
+    """Differences that the integrator does not resolve."""
 
     mean: float
     """Largest change of a mean when the physics step is halved."""
     difference: float
-    """Largest change of a difference between two means: what moves all of them alike decides nothing."""
+    """Largest change of a difference between two means, in which a change that all means share cancels."""
 
 
 def floors(pairs: Sequence[tuple[Laps, Laps]], metric: str) -> dict[str, Floor]:
-    """The floor of lap 1, of all laps and of the last lap.
+    """Returns the floors of lap 1, of all laps and of the last lap.
 
     Args:
-        pairs: The same runs with the physics step and with half of it, by feedforward; those of one that lost a run do
-            not count.
+        pairs: The same runs with the physics step and with half of it, by feedforward; a feedforward that lost a run
+            does not count.
         metric: Name of the metric.
 
     Returns:
@@ -305,7 +305,7 @@ def floors(pairs: Sequence[tuple[Laps, Laps]], metric: str) -> dict[str, Floor]:
 
 
 def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:
-    """Recovery and forgetting: errors run by run over that in the lap before the change, and the error that settles."""
+    """Measures recovery and forgetting: errors over that before the change, run by run, and the settled error."""
     error = laps[metric].values
     before, settled = error[:, case.change - 2], error[:, case.back - 2]
     after = {"in_first_lap": case.change, "after_one_lap": case.change + 1}
@@ -319,7 +319,7 @@ def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:
 
 
 def each_run(found: Mapping[str, Laps]) -> list[dict[str, Any]]:
-    """How each run ended, and its errors lap by lap: a row for each run, for statistics of the user."""
+    """Lists how each run ended, and its errors lap by lap: a row for each run, for the user's own statistics."""
     rows = []
     for case, runs in found.items():
         for name, own in runs.items():

@@ -13,7 +13,7 @@ from mrctl.experiments.cases import BAND, FLOOR, HALF, HINDSIGHT, NO_WORSE, PART
 from mrctl.experiments.tables import markdown, number
 
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
-TITLES = {"none": "PID"}  # names of feedforwards in the tables, where they differ
+TITLES = {"none": "PID"}  # names of feedforwards in the tables, where these differ
 YARDSTICKS = ("none", "model")  # feedforwards that the tables compare all others with
 WINDOWS = {"first": "lap 1", "all": "all laps", "last": "the last lap"}
 LEADING = {
@@ -24,18 +24,18 @@ LEADING = {
     "position in all laps": ("position_rmse", "all"),
 }
 NO_CLAIM = "So few draws tell nothing apart: this table supports no claim."
-LEAST = 4  # pairs without which even a feedforward that always wins does so with less than 95 % confidence
+LEAST = 4  # pairs that a feedforward which always wins needs for 95 % confidence
 
 Row = dict[str, Any]
 
 
 class Table(NamedTuple):
-    """A table of text."""
+    """A table of text, with a title and a statement."""
 
     title: str
-    """What it shows, and which suite made it."""
+    """Content of the table, and the size of the suite that made it."""
     says: str
-    """The sentence that it supports, which follows from paired tests."""
+    """Statement that the table supports, from paired tests."""
     cells: pd.DataFrame
 
     @property
@@ -45,11 +45,11 @@ class Table(NamedTuple):
 
 
 def tables(rows: Sequence[Row], mode: str) -> list[Table]:
-    """The last lap of each part, then lap 1 and all laps, who is best, and the recovery after the steps.
+    """Makes the tables of the last lap by part, of lap 1 and all laps, of the best, and of the recovery after steps.
 
     Args:
         rows: What `suite.compare` returns.
-        mode: Which suite made them.
+        mode: Size of the suite.
     """
     found = []
     few = mode == "quick" or all(row["runs"] < LEAST for row in rows)
@@ -71,9 +71,9 @@ def tables(rows: Sequence[Row], mode: str) -> list[Table]:
 
 
 def verdict(row: Row, rival: str, metric: str = "position_rmse", window: str = "last") -> int:
-    """How a feedforward stands to another in one case: −1 below it with 95 % confidence, 1 above it, 0 level.
+    """Compares two feedforwards in one case: −1 is below the rival with 95 % confidence, 1 is above it, 0 is level.
 
-    The test pairs the runs (sign test with Wilson's interval); what the integrator does not resolve is a tie.
+    The test pairs the runs (sign test with Wilson's interval); differences that the integrator cannot resolve are ties.
     """
     stated = row[metric] if window == "last" else row[metric][window]
     beats = stated[f"beats_{TITLES.get(rival, rival)}"]
@@ -81,7 +81,7 @@ def verdict(row: Row, rival: str, metric: str = "position_rmse", window: str = "
 
 
 def against(rows: Sequence[Row], window: str) -> str:
-    """A sentence on who is below and above `model`, or PID where there is no model, in how many cases."""
+    """Returns a sentence on who is below and above `model`, or PID if there is no model, in how many cases."""
     names = list(dict.fromkeys(row["feedforward"] for row in rows))
     rival = next((name for name in reversed(YARDSTICKS) if name in names and len(names) > 1), None)
     if rival is None:
@@ -103,13 +103,13 @@ def against(rows: Sequence[Row], window: str) -> str:
 
 
 def _counted(counts: dict[str, int]) -> str:
-    """Names with their counts, the largest first, without those that have none."""
+    """Lists names with their counts as text, the largest first, without zeros."""
     ordered = sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
     return ", ".join(f"`{TITLES.get(name, name)}` in {counts[name]}" for name in ordered)
 
 
 def resolution(rows: Sequence[Row]) -> str:
-    """A sentence on what half the physics step moves, and on the ranks that it reverses."""
+    """Returns a sentence on how far half the physics step moves the means, and on the ranks that it reverses."""
     stated = rows[0]
     floor = {metric: [_window(stated[metric], w)["floor"] for w in WINDOWS] for metric in COLUMNS}
     moved = ", ".join(
@@ -126,7 +126,7 @@ def resolution(rows: Sequence[Row]) -> str:
 
 
 def _both_steps(rows: Sequence[Row]) -> Iterator[tuple[int, int]]:
-    """Every verdict on the plants of `FLOOR`, with the physics step and with half of it."""
+    """Yields every verdict on the plants of `FLOOR`, with the physics step and with half of it."""
     by = {(row["case"], row["feedforward"]): row for row in rows}
     names = list(dict.fromkeys(row["feedforward"] for row in rows))
     for plant in FLOOR:
@@ -139,9 +139,9 @@ def _both_steps(rows: Sequence[Row]) -> Iterator[tuple[int, int]]:
 
 
 def last_laps(rows: Sequence[Row]) -> pd.DataFrame:
-    """The errors of the last lap, and how often each feedforward beats PID and `model`.
+    """Makes the table of errors in the last lap, with how often each feedforward beats PID and `model`.
 
-    For random scenarios also the share of them in which it does no harm, compared with PID alone.
+    For random scenarios it also has the share of them in which the feedforward does no harm, compared with PID alone.
     """
     header = ["case", "feedforward", "failed", *(f"{title}; worst 5 %" for title in COLUMNS.values())]
     header += ["beats PID in V / θ̇ / position", "beats model", "guard acted"]
@@ -160,7 +160,7 @@ def last_laps(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def positions(rows: Sequence[Row]) -> pd.DataFrame:
-    """The position error in lap 1, all laps and the last lap, less that of the model, and what it costs to learn.
+    """Makes the table of position errors in lap 1, all laps and the last lap, less those of `model`, and of regret.
 
     Regret is the error over all laps less that of `hindsight`.
     """
@@ -181,10 +181,10 @@ def positions(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def leaders(rows: Sequence[Row]) -> list[list[str]]:
-    """For each case and column of `LEADING` the feedforward with the least mean, and those that are level with it.
+    """Finds, for each case and column of `LEADING`, the feedforward with the least mean, and those level with it.
 
     A feedforward is level if the best does not beat it with 95 % confidence in the same runs. One with a failed run is
-    left out, and so are `REFERENCES`, which know the plant. Where all are level, none is the best: it is a tie.
+    left out, unless all have one; so are `REFERENCES`, which know the plant. Where all are level, it is a tie.
     """
     lines = []
     for case in dict.fromkeys(row["case"] for row in rows):
@@ -201,7 +201,7 @@ def leaders(rows: Sequence[Row]) -> list[list[str]]:
 
 
 def leading(best: pd.DataFrame) -> str:
-    """A sentence on who is best, or level with the best, in how many cases."""
+    """Returns a sentence on who is best, or level with the best, in how many cases."""
     column = best["position"]
     told = [cell.split(", ") for cell in column if cell != "tie"]
     counts = {name: sum(name in names for names in told) for name in dict.fromkeys(sum(told, []))}
@@ -211,7 +211,7 @@ def leading(best: pd.DataFrame) -> str:
 
 
 def recovery(rows: Sequence[Row]) -> pd.DataFrame:
-    """The position error after a step and after the return, over that before the step."""
+    """Makes the table of position errors after a step and after the return, over that before the step."""
     header = ["case", "feedforward", "failed", "first lap", "one lap later; worst 5 %", "recovered in V / θ̇ / position"]
     header += ["one lap later over settled", "return: first lap", "one lap later; worst 5 %"]
     cells = []
@@ -229,7 +229,7 @@ def recovery(rows: Sequence[Row]) -> pd.DataFrame:
 
 
 def recovered(rows: Sequence[Row]) -> str:
-    """A sentence on whose position error is back one lap after the change, in every run."""
+    """Returns a sentence on whose position error is back one lap after the change, in every run."""
     counts: dict[str, int] = {}
     for row in rows:
         whole = row["position_rmse"]["recovered_within_one_lap"] == 1
@@ -243,7 +243,7 @@ def recovered(rows: Sequence[Row]) -> str:
 
 
 def interval(error: Row) -> str:
-    """A mean in thousandths with its interval, in as many digits as tell the ends of the interval apart."""
+    """Returns a mean in thousandths with its interval, with enough digits to tell the ends of the interval apart."""
     if not error["samples"]:
         return "–"
     value, low, high = (1e3 * error[key] for key in ("value", "low", "high"))
@@ -258,7 +258,7 @@ def _window(error: Row, window: str) -> Row:
 
 
 def _less(row: Row, window: str) -> str:
-    """The difference from the model in mm, or `tie`."""
+    """Returns the difference from `model` in mm, or `tie`."""
     tied = verdict(row, "model", window=window) == 0
     return "tie" if tied else _signed(1e3 * _window(row["position_rmse"], window)["less_model"])
 

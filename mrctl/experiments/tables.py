@@ -1,4 +1,4 @@
-"""Tables for terminals and Markdown, and the folders they are written to."""
+"""Tables for terminals and Markdown, JSON without NaN, and output folders."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mrctl.record import InputError
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table whose columns line up in a terminal too."""
+    """Returns a Markdown table whose columns line up in a terminal too."""
     widths = [max(len(cells[i]) for cells in (header, *rows)) for i in range(len(header))]
     lines = [[cell.ljust(width) for cell, width in zip(cells, widths, strict=True)] for cells in (header, *rows)]
     lines.insert(1, ["-" * width for width in widths])
@@ -21,7 +21,7 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number as text with so many significant digits."""
+    """Returns a number as text with a number of significant digits."""
     return f"{value:#.{digits}g}".rstrip(".")
 
 
@@ -42,7 +42,7 @@ def output_folder(path: Path) -> Path:
 
 
 def machine() -> dict[str, Any]:
-    """The processor's name and the number of cores of this machine, to stand beside what was measured on it."""
+    """Returns the processor's name and the number of cores of this machine, which go with what was measured on it."""
     try:
         with open("/proc/cpuinfo") as file:
             name = next(line.partition(":")[2].strip() for line in file if line.startswith("model name"))
@@ -52,7 +52,7 @@ def machine() -> dict[str, Any]:
 
 
 def json_text(values: object) -> str:
-    """JSON with NaN and infinity as null."""
+    """Returns JSON with NaN and infinity as null."""
     return json.dumps(_finite(values), indent=1, ensure_ascii=False)
 
 

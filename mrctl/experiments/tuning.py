@@ -63,9 +63,9 @@ def tune(
     out: Path | None,
     json: bool,
 ) -> str:
-    """The command: designs and measures; writes `table.json` and the figure `sensitivity` to `out` unless it is None.
+    """Runs the command: designs and measures; writes `table.json` and the figure `sensitivity` to `out` if given.
 
-    Without a time constant the gains are designed, else they follow the IMC rule.
+    Without a time constant the gains are designed; with one they follow the IMC rule.
 
     Raises:
         InputError: As `design`, or the folder cannot be written.
@@ -80,11 +80,11 @@ def tune(
 
 
 def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR) -> dict[str, Any]:
-    """Gains, margins and safety of every velocity loop of a robot, as designed and as measured on the physics.
+    """Computes gains, margins and safety of every velocity loop of a robot, as designed and as measured on the physics.
 
     The common channel is measured in the robot's first steering arrangement, since it is the same in all of them, and
-    the second channel in each, at half of the largest speed. The measured twist is the true one, so that a lag for
-    which the PID is designed is headroom in both columns.
+    the second channel in each, at half of the largest speed. The loop is measured with the true twist, so a lag for
+    which the PID is designed shows as an additional margin, in the computed and in the measured columns.
 
     Args:
         world: World or MJCF file.
@@ -94,11 +94,11 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
 
     Returns:
         `loops`, a row for each loop and delay with the plant's static gain and lag, the PI gains, the ratio of the
-        learning condition, and `Margins` and `Safety` for each of `RESPONSES`; `motion`, the motion controller that
-        suits the loops of each arrangement and delay; `frequency` in rad/s and `responses`, T of the rows of `loops`.
+        learning condition, and `Margins` and `Safety` for each of `RESPONSES`; `motion`, the motion controller designed
+        for the loops of each arrangement and delay; `frequency` in rad/s and `responses`, T of the rows of `loops`.
 
     Raises:
-        InputError: The world, the robot or a delay is bad, or the robot fails with that delay.
+        InputError: The world, the robot or a delay is invalid, or the robot fails with that delay.
     """
     if not delays:
         raise InputError("delay: at least one delay is needed")
@@ -155,7 +155,7 @@ def _judge(frequency: Array, response: Response, period: float) -> dict[str, flo
 
 
 def text(table: dict[str, Any]) -> str:
-    """The design as text."""
+    """Returns the design as text."""
     gains = [
         [
             _name(row),
@@ -205,7 +205,7 @@ def _rule(table: dict[str, Any]) -> str:
 
 
 def statement(table: dict[str, Any]) -> str:
-    """Measured bandwidth and margins without delay, in one line for the report of a comparison."""
+    """Returns measured bandwidth and margins without delay as one line for the report of a comparison."""
     loops = [
         f"{_name(row)} {' / '.join(_cell(row['measured'][name]) for name in ('bandwidth', 'phase', 'gain'))}"
         for row in table["loops"]
@@ -224,7 +224,7 @@ def _cell(value: float) -> str:
 
 @plots.styled
 def figure(table: dict[str, Any]) -> Figure:
-    """Re T(jω) as designed, measured, and in the whole hierarchy; below zero, learning is not safe."""
+    """Draws Re T(jω) as designed, as measured, and in the whole hierarchy; learning is unsafe where it is negative."""
     frequency = table["frequency"]
     marks = np.unique(np.geomspace(1, len(frequency), 30).astype(int) - 1).tolist()  # dots evenly spread
     rows, loops = table["responses"], list(dict.fromkeys(map(_name, table["responses"])))

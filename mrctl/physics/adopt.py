@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 PREFIX = "robot/"  # put before each name of the robot's file that is not replaced
 UP = np.array([0.0, 0.0, 1.0])
-LEVEL = 0.1  # tolerance, as a share of the wheel radius, within which a caster is on the floor or two are one
+LEVEL = 0.1  # share of the wheel radius: a caster this near to the floor touches it, and two this close are one
 HINGE = mujoco.mjtJoint.mjJNT_HINGE
 DCMOTOR = '<dcmotor joint="{}" gear="N" motorconst="k k" resistance="R" armature="J" ctrlrange="-U U"/>'
 
@@ -43,13 +43,13 @@ class Wheel(NamedTuple):
     centre: Array
     """Its centre in the file's world in m, `(3,)`."""
     radius: float
-    """Distance of the centre from the floor in m."""
+    """Height of the centre above the floor in m."""
     friction: float
     """Coulomb coefficient of its geom."""
 
 
 def adopted(robot: RobotFile, world: Path) -> mujoco.MjSpec:
-    """Brings the robot of another file into a world in place of its own.
+    """Returns a world in which the robot of another file replaces the world's own.
 
     Args:
         robot: The robot's file, and the names of those parts that are ambiguous in it.
@@ -127,13 +127,13 @@ class _Adoption:
         if any(chassis not in self._lineage(joint) for joint in wheels):
             raise InputError(f"chassis: the body {chassis!r} does not carry both wheels, {_listed(wheels)}")
         if chassis in (self._lineage(joint)[0] for joint in wheels):
-            raise InputError(f"chassis: the body {chassis!r} is moved by a wheel joint, of {_listed(wheels)}, itself")
+            raise InputError(f"chassis: the body {chassis!r} is itself moved by one of {_listed(wheels)}")
         return chassis
 
     def _directions(self, wheels: Sequence[str], steered: Sequence[str]) -> tuple[Array, Array]:
         """Returns the level unit vectors ahead and to the left in the file's world, `(3,)` each.
 
-        Ahead is where the steered wheels are, or the side of the chassis' x axis where none is steered.
+        Ahead is the side of the steered wheels, or that of the chassis' x axis where nothing is steered.
         """
         axle = self._axis(wheels[0])
         if abs(axle @ self._axis(wheels[1])) < 0.99 or abs(axle[2]) > 0.1:
@@ -208,7 +208,7 @@ class _Adoption:
         return self.model.joint(joints[0]).name if ball or (kind == HINGE and level) else ""
 
     def _contact(self, geom: int, body: str, joint: str) -> Wheel:
-        """Describes a wheel by one of its geoms, whose height above its lowest point is the radius."""
+        """Describes a wheel by one of its geoms; the radius is the height of its centre above its lowest point."""
         centre = self.data.geom_xpos[geom].copy()
         return Wheel(body, joint, centre, centre[2] - self._bottom(geom), float(self.model.geom_friction[geom, 0]))
 
@@ -249,7 +249,7 @@ class _Adoption:
         return self.data.joint(joint).xaxis
 
     def _side(self, joint: str) -> float:
-        """Returns how far a joint is to the right of P in m, by which joints are sorted from left to right."""
+        """Returns the distance of a joint to the right of P in m, a key that sorts joints from left to right."""
         return -float((self.data.joint(joint).xanchor - self.origin) @ self.left)
 
     def _ancestry(self, body: int) -> list[str]:
@@ -287,10 +287,10 @@ class _Adoption:
     # -- changes -------------------------------------------------------------------------------------------------------
 
     def into(self, world: Path) -> mujoco.MjSpec:
-        """Returns a world with this robot in place of its own, which compiles."""
+        """Returns a world in which this robot replaces the world's own, ready to compile."""
         spec = mujoco.MjSpec.from_file(str(world))
         if (own := spec.body("chassis")) is None:
-            raise InputError(f"world: {world} has no body 'chassis', which another robot could replace")
+            raise InputError(f"world: {world} has no body 'chassis' that another robot could replace")
         floors = [(p.geomname1, p.name, np.array(p.friction)) for p in spec.pairs if p.geomname2 == "wheel_left"]
         pair = next(p for p in spec.pairs if p.geomname2 == "wheel_left")
         solver = {n: np.array(getattr(pair, n)) for n in ("solref", "solreffriction", "solimp")}
@@ -310,7 +310,7 @@ class _Adoption:
         spec.body("chassis").add_freejoint(name="chassis")
         if self.steered:
             self._add_steering(spec)
-        # A tyre has its own friction on the ordinary floor, and less in proportion where the world is slippery.
+        # A tyre has its file's friction on the ordinary floor, and proportionally less on a slippery one.
         for geom, wheel in (*zip(REAR, self.rear, strict=True), *zip(self._front_names(), self.front, strict=True)):
             for floor, name, friction in floors:
                 mu = wheel.friction * friction[0] / ordinary
@@ -334,7 +334,7 @@ class _Adoption:
         coupled = [e for e in spec.equalities if {e.name1, e.name2} & {*self.steered, *self.wheels}]
         for element in [*spec.sensors, *spec.keys, *spec.pairs, *spec.excludes, *steering, *coupled]:
             spec.delete(element)
-        spec.compiler.inertiafromgeom = 2  # auto: an inertial that is written, as that of the moved chassis, is kept
+        spec.compiler.inertiafromgeom = 2  # auto: keeps the explicit inertials, such as that of the moved chassis
         for geom in spec.geoms:
             geom.contype = geom.conaffinity = 0
             geom.group = geom.group or 1  # rays that look for the ground see only group 0
@@ -355,7 +355,7 @@ class _Adoption:
             motor.gear = np.abs(motor.gear)
         rotation = self._rotation()
         body, data = model.body(self.chassis), self.data.body(self.chassis)
-        shift = rotation @ (data.xpos - self.origin)  # of the old frame in the new one
+        shift = rotation @ (data.xpos - self.origin)  # origin of the old frame in the new one
         turned = rotation @ data.xmat.reshape(3, 3)
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, turned.ravel())
@@ -400,7 +400,7 @@ class _Adoption:
         return FRONTS[3 : 3 + len(self.front)]
 
     def _renamed(self) -> Iterable[tuple[str, str, str]]:
-        """Lists the elements that get another name: kind, old name, new name."""
+        """Yields kind, old name and new name of each element that is renamed."""
         yield "body", self.chassis, "chassis"
         if has(self.model, "site", "imu") and self.model.site("imu").bodyid[0] == self.model.body(self.chassis).id:
             yield "site", "imu", "imu"
@@ -462,7 +462,7 @@ class _Adoption:
         spec.add_text(name=RIGID, data="the wheels go where the servo says")
 
     def _in_degrees(self, steered: int) -> bool:
-        """Tells whether the joint `steering` is one of the file's own and its file gives angles in degrees."""
+        """Tells whether the joint `steering` comes from the file and the file gives angles in degrees."""
         return steered == 1 and bool(self.spec.compiler.degree)
 
     def _turns_steering(self, actuator: int) -> bool:

@@ -15,7 +15,7 @@ from mrctl.physics import mjcf
 from mrctl.physics.readout import READING, addresses, inputs, motor_current, motor_parameters, read
 from mrctl.theory.robot import CAR, RobotFile, Steering
 
-with warnings.catch_warnings():  # on a machine without a display dm_control tries GLFW first, which complains
+with warnings.catch_warnings():  # without a display dm_control tries GLFW first, which warns
     warnings.simplefilter("ignore")
     from dm_control import mujoco as dm_mujoco
     from dm_control.mujoco import wrapper
@@ -34,39 +34,42 @@ class CarPhysics(dm_mujoco.Physics):
 
     @classmethod
     def from_compiled(cls, model: mujoco.MjModel) -> CarPhysics:
-        """Wraps a compiled model that stays the caller's to edit."""
+        """Wraps a compiled model without copying it, so that the caller may still edit it."""
         physics = cls.from_model(wrapper.MjModel(model))
         physics.legacy_step = False  # plain mj_step, as the batch does
         return physics
 
     def reading(self) -> Row:
-        """All readouts at once, a record of `READING`."""
+        """Returns all readouts at once, as a record of `READING`."""
         reading = np.zeros(1, READING)[0]
         read(self.data.qpos, self.data.qvel, addresses(self.model.ptr), reading)
         return reading
 
     def pose(self) -> Array:
-        """Posture of P: x, y in m and heading in rad, `(3,)`."""
+        """Returns the pose of P: x, y in m and heading in rad, `(3,)`."""
         return self.reading()["pose"]
 
     def twist(self) -> Array:
-        """V in m/s and θ̇ in rad/s in the body frame, `(2,)`."""
+        """Returns V in m/s and θ̇ in rad/s in the body frame, `(2,)`."""
         return self.reading()["twist"]
 
     def wheel_rates(self) -> Array:
-        """Rates of the left and right rear wheel in rad/s, `(2,)`."""
+        """Returns the rates of the left and right rear wheel in rad/s, `(2,)`."""
         return self.reading()["wheel_rates"]
 
     def steering_angle(self) -> float:
-        """Angle of the fork in rad, positive to the left."""
+        """Returns the angle of the fork in rad, positive to the left."""
         return float(self.reading()["steering_angle"])
 
     def upright(self) -> float:
-        """Cosine of the tilt from the vertical."""
+        """Returns the cosine of the tilt from the vertical; NaN once the state has blown up."""
         return float(self.reading()["upright"])
 
     def motor_current(self) -> Array:
-        """Armature currents left and right in A, `(2,)`: (U − k_E N ω)/R_a, or the current state with inductance."""
+        """Returns the armature currents left and right in A, `(2,)`.
+
+        They are (U − k_E N ω)/R_a, or the current states of motors with inductance.
+        """
         model = self.model.ptr
         return motor_current(
             self.data.ctrl[None, inputs(model)[:2]],

@@ -18,14 +18,14 @@ MOTORS = ("motor_left", "motor_right")
 """Names of the actuators of the driven wheels."""
 
 FRONTS = ("front_wheel", "front_left", "front_right", "caster_left", "caster_right")
-"""Geoms on which a robot may stand beside the driven wheels: one steered wheel, two of them, or casters."""
+"""Names of the geoms on which a robot may stand beside its driven wheels: one or two steered wheels, or casters."""
 
 NUMERICS = {"no_load_current": 1, "limits": 4}
 """Numerics that every model holds, with their lengths: the no-load current in A, and the robot's limits on V in m/s, on
 θ̇ in rad/s, on V̇ in m/s² and on θ̈ in rad/s²."""
 
 COLLISION = "collision"
-"""Name of the sensor that counts the contacts of a robot's hull with obstacles, where a world has some."""
+"""Name of the sensor that counts the contacts of a robot's hull with obstacles; only worlds with obstacles have it."""
 
 RIGID = "servo_steering"
 """Name of the text element in an adopted model whose steered wheels are held by servos."""
@@ -52,13 +52,13 @@ def knuckles(model: mujoco.MjModel) -> list[str]:
 
 
 def bodies_of(model: mujoco.MjModel) -> list[int]:
-    """Lists the indices of the robot's bodies, which are the chassis and all that it carries."""
+    """Lists the indices of the robot's bodies: the chassis and all that it carries."""
     chassis = model.body("chassis").id
     return [body for body in range(model.nbody) if model.body_rootid[body] == chassis]
 
 
 def centres(model: mujoco.MjModel, data: mujoco.MjData, wheels: Sequence[str]) -> NDArray[np.float64]:
-    """Returns the centres of wheels from P in the chassis' frame, to the picometre.
+    """Returns the positions of wheel centres relative to P in the chassis' frame, rounded to the picometre.
 
     Args:
         model: Compiled model.
@@ -73,7 +73,7 @@ def centres(model: mujoco.MjModel, data: mujoco.MjData, wheels: Sequence[str]) -
 
 
 def rounded(length: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rounds lengths in m, of any shape, to the picometre: an MJCF's 0.40 − 0.37 is to be 0.03."""
+    """Rounds lengths in m, of any shape, to the picometre, so that an MJCF's 0.40 − 0.37 gives 0.03."""
     return np.round(length, 12)
 
 

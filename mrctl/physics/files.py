@@ -69,8 +69,9 @@ def world_path(world: str) -> Path:
 def bounded(path: Path) -> None:
     """Refuses an MJCF file that would take MuJoCo minutes or gigabytes, before MuJoCo reads it.
 
-    MuJoCo expands a `<replicate>` or `<composite>` of any count, and makes height fields and textures of any size. It
-    waits for ever for a pipe. What the file includes and the meshes and images that it names are judged as well.
+    MuJoCo expands a `<replicate>` or `<composite>` of any count, makes height fields and textures of any size, and
+    waits for ever on a pipe. The files that this one includes, and the meshes and images that it names, are checked as
+    well.
 
     Raises:
         InputError: A count, a size or a file is beyond what a robot needs; the message names the element.
@@ -80,7 +81,7 @@ def bounded(path: Path) -> None:
         file = left.pop()
         seen.add(file)
         text = COMMENT.sub("", read_file(file, LARGEST).decode(errors="replace"))
-        copies = [1.0]  # of what stands inside the elements <replicate> that are open
+        copies = [1.0]  # number of copies of what the open <replicate> elements contain, by depth
         folders = {path.parent}
         tags = [(closing, name, dict(ATTRIBUTE.findall(rest)), rest) for closing, name, rest in TAG.findall(text)]
         for _, name, values, _ in tags:
@@ -110,7 +111,7 @@ def bounded(path: Path) -> None:
 
 
 def _product(text: str) -> float:
-    """Returns the product of the numbers in an attribute; 1 if there are none, for MuJoCo to refuse."""
+    """Returns the product of the numbers in an attribute; 1 where it holds no numbers, which MuJoCo then refuses."""
     try:
         return math.prod(min(max(float(number), 0.0), 1e9) for number in text.split())
     except ValueError:
@@ -118,7 +119,7 @@ def _product(text: str) -> float:
 
 
 def _check_asset(file: Path) -> None:
-    """Refuses a mesh or image that is no regular file, or large, or a PNG of many pixels."""
+    """Refuses a mesh or image that is not a regular file, is too large, or is a PNG of too many pixels."""
     head = read_file(file, LARGEST)[:24] if not file.is_dir() else b""
     if head.startswith(b"\x89PNG") and len(head) == 24:
         width, height = struct.unpack(">II", head[16:])

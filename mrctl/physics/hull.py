@@ -13,13 +13,13 @@ from mrctl.physics.elements import REAR, bodies_of, fronts, has
 from mrctl.physics.stand import steer
 from mrctl.record import InputError
 
-DIRECTIONS = np.arange(32) * (2 * np.pi / 32)  # in which round parts are looked at; a disc loses half a per cent
+DIRECTIONS = np.arange(32) * (2 * np.pi / 32)  # rad, in which supports are taken; a disc loses half a per cent
 
 
 def footprint(model: mujoco.MjModel) -> Array:
     """Finds the footprint of a compiled robot in its frame, with its wheels steered to either side and straight on.
 
-    The spheres on which the wheels roll are left out, because the tyres that one sees are narrower.
+    The spheres on which the wheels roll are left out, because the tyres that they stand for are narrower.
 
     Args:
         model: Compiled world with the robot.
@@ -48,8 +48,8 @@ def footprint(model: mujoco.MjModel) -> Array:
 
 
 def convex(points: Array) -> Array:
-    """Vertices of the convex hull of points in the plane, in m, `(n, 2)`, counterclockwise."""
-    from scipy.spatial import ConvexHull  # here, for robots without obstacles need no scipy
+    """Returns the vertices of the convex hull of points in the plane, in m, `(n, 2)`, counter-clockwise."""
+    from scipy.spatial import ConvexHull  # imported here because robots without obstacles need no scipy
 
     return points[ConvexHull(points).vertices]
 

@@ -39,7 +39,7 @@ REQUIRED = {
     "geom": ("wheel_left", "wheel_right", "front_wheel"),
     "actuator": (*MOTORS, "steering"),
 }
-"""Names that the parts of a world's own robot must have, by kind; `mrctl.physics.adopt` gives them to any other."""
+"""Names that the parts of a world's own robot must have, by kind; `mrctl.physics.adopt` renames those of others."""
 
 
 def build(
@@ -54,12 +54,11 @@ def build(
     Args:
         world: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file.
         steering: Steering arrangement, one of `steerings`, by default the first. The default robot is `compliant` as
-            its MJCF stands;
-            `caster` and `rigid` take stiffness (N·m/rad), damping (N·m·s/rad) and trail (m) of the fork from the
-            numerics `steering_caster` and `steering_rigid`.
+            its MJCF stands; `caster` and `rigid` take stiffness (N·m/rad), damping (N·m·s/rad) and trail (m) of the
+            fork from the numerics `steering_caster` and `steering_rigid`.
         timestep: Time step of the physics in s; by default the file's own.
         robot: The robot that drives there; by default the world's own.
-        obstacles: What stands in the robot's way. Where there is something, the robot has a massless hull.
+        obstacles: Obstacles in the world. With any, the robot gets a massless hull that collides with them.
 
     Returns:
         The compiled model, and the parameters of its robot.
@@ -87,10 +86,10 @@ def build(
 
 
 def _assembled(world: Path, robot: RobotFile) -> mujoco.MjSpec:
-    """Returns a world with a robot, which compiles.
+    """Returns a world with a robot, ready to compile.
 
-    A copy of the default robot's file keeps its names, and so its servo and its steering arrangements: it takes the
-    place of that file in a world that includes it. The robot of any other file is adopted.
+    A file with the names of the default robot's parts takes the place of `car.xml` in a world that includes it, and so
+    keeps its servo and its steering arrangements. The robot of any other file is adopted.
     """
     if robot != CAR and robot == RobotFile(path=robot.path) and INCLUDED in world.read_text():
         text = robot_path(robot).read_bytes()
@@ -134,7 +133,7 @@ def load(
     robot: RobotFile = CAR,
     obstacles: Obstacles = NONE,
 ) -> mujoco.MjModel:
-    """The compiled model alone; see `build` for the arguments and errors."""
+    """Returns the compiled model alone; see `build` for the arguments and errors."""
     return build(world, steering, timestep, robot, obstacles)[0]
 
 
@@ -176,7 +175,7 @@ def arrangement(robot: RobotFile) -> Steering:
 def steerings(model: mujoco.MjModel) -> tuple[Steering, ...]:
     """Lists the steering arrangements that a compiled robot can be driven with, the default one first.
 
-    A differential drive is `caster`, because the torque difference alone makes θ̇. An adopted robot whose wheels are
+    A differential drive is `caster`, because the torque difference alone turns it. An adopted robot whose wheels are
     steered by servos is `rigid`. The default robot has all three.
     """
     if not has(model, "joint", "steering"):
@@ -185,14 +184,14 @@ def steerings(model: mujoco.MjModel) -> tuple[Steering, ...]:
 
 
 def reverses(model: mujoco.MjModel, steering: Steering | None) -> bool:
-    """Tells whether a robot can be driven backwards; a fork that trails would jackknife."""
+    """Tells whether a robot can be driven backwards; a trailing fork would jackknife."""
     return (steering or steerings(model)[0]) == "rigid" or not has(model, "joint", "steering")
 
 
 def _set_timestep(model: mujoco.MjModel, timestep: float) -> None:
-    """Sets the physics step h, and keeps the tyres' side-slip in a curve, which would change with it.
+    """Sets the physics step h in s, and adapts the contacts so that the tyres' side-slip in a curve stays the same.
 
-    MuJoCo's contacts decelerate a side-slip v_y by v_y/c, with c = d τ/2 (impedance d, time constant τ), and leave out
+    MuJoCo's contacts decelerate a side-slip v_y by v_y/c, with c = d τ/2 (impedance d, time constant τ), and neglect
     that they turn with the robot: a tyre slips by v_y = −c V θ̇. The integrator, semi-implicit Euler, moves the robot
     along its heading at the end of a step, which is a slip of (h/2) V θ̇ against the heading in the middle. The path
     shows the sum, −(c − h/2) V θ̇. With the τ of the file at every step, errors of 0.3 mm would double as h → 0.
@@ -273,14 +272,14 @@ def clone(model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def digest(model: mujoco.MjModel) -> str:
-    """Returns a SHA-256 digest of a compiled model, equal where two models hold the same bytes.
+    """Returns a SHA-256 digest of a compiled model; models that hold the same bytes have the same digest.
 
     Names and paths of the files that the model was compiled from are left out.
     """
     sha256 = hashlib.sha256()
     for part in (model, model.opt, model.stat):
         for name, value in getmembers(part):
-            # Paths of files, their lengths and addresses, and private attributes, which differ between equal models.
+            # Skips private attributes, and file paths with their lengths and addresses: equal models differ in them.
             if name.startswith("_") or name in ("paths", "npaths") or name.endswith("pathadr"):
                 continue
             if isinstance(value, (np.ndarray, int, float, bytes)):

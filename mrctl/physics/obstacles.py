@@ -1,7 +1,7 @@
-"""Obstacles in MuJoCo: walls that a robot collides with, the hull that collides with them, and the way back.
+"""Obstacles in MuJoCo: walls, the hull of a robot that collides with them, and obstacles read back from MJCF.
 
-The hull and the walls have a bit of `contype` and `conaffinity` to themselves, so that a hull meets walls alone: no
-floor, no wheel and no other hull.
+The hull and the walls have a bit of `contype` and `conaffinity` to themselves, so that a hull collides with walls only,
+and with no floor, wheel or other hull.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -24,8 +24,8 @@ from mrctl.theory.obstacles import Box, Disc, Obstacles
 HULL = "hull"  # name of the hull's geom
 BIT = 2  # of contype and conaffinity; MuJoCo's default, which floors have, is 1
 GROUP = 2  # of walls: rays that look for the ground see only group 0
-HEIGHT = 0.5  # m, by which walls rise above the origin and reach below it, for floors that are not level
-TALL = 0.1  # m, height of the hull, which begins at the height of the axle
+HEIGHT = 0.5  # m, by which walls reach above and below the origin, because floors need not be level
+TALL = 0.1  # m, height of the hull above the axle
 
 
 def add(spec: mujoco.MjSpec, obstacles: Obstacles, footprint: Array) -> None:
@@ -50,7 +50,7 @@ def add(spec: mujoco.MjSpec, obstacles: Obstacles, footprint: Array) -> None:
 
 
 def add_walls(spec: mujoco.MjSpec, obstacles: Obstacles) -> None:
-    """Puts obstacles into a world; those that move are mocap bodies at the start of their courses, in order."""
+    """Puts obstacles into a world in order; those that move are mocap bodies at the start of their courses."""
     for k, shape in enumerate(obstacles.shapes):
         body, name = spec.worldbody, f"obstacle {k}"
         if shape.course is not None:
@@ -94,8 +94,8 @@ def to_mjcf(obstacles: Obstacles) -> str:
 def read_mjcf(path: str | Path) -> Obstacles:
     """Reads the obstacles of an MJCF file: fixed upright boxes and cylinders, and the outlines of meshes from above.
 
-    What moves on a course in a file of `to_mjcf` has its course again. Floors, whose tops are at most 2 cm high, are
-    no obstacles; neither are planes, height fields, and geoms that collide with nothing.
+    Obstacles that `to_mjcf` wrote with a course keep it. Geoms whose tops are at most 2 cm high are floors, not
+    obstacles; planes, height fields, and geoms that collide with nothing are no obstacles either.
 
     Args:
         path: The MJCF file.
@@ -126,10 +126,10 @@ def read_mjcf(path: str | Path) -> Obstacles:
 
 
 def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | None:
-    """Returns the fields of the obstacle that a geom is, in the frame of its body if that moves; None for a floor.
+    """Returns the fields of a geom's obstacle, in the frame of its body if that moves; None for a floor.
 
     Raises:
-        InputError: The geom is not upright, or its shape is another one.
+        InputError: The geom is not upright, or is no box, cylinder or mesh.
     """
     kind, size, shape = model.geom_type[geom], model.geom_size[geom], mujoco.mjtGeom
     if kind == shape.mjGEOM_PLANE or kind == shape.mjGEOM_HFIELD:
@@ -156,7 +156,7 @@ def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | No
     if mesh is not None:
         return {"kind": "polygon", "points": convex(points[:, :2].round(6)).tolist()}
     if abs(frame[2, 2]) < 1 - 1e-9 or not (kind == shape.mjGEOM_BOX or kind == shape.mjGEOM_CYLINDER):
-        raise InputError(f"geom {name}: is no upright box, cylinder or mesh")
+        raise InputError(f"geom {name}: not an upright box or cylinder, nor a mesh")
     values = {"x": float(place[0]), "y": float(place[1])}
     if kind == shape.mjGEOM_CYLINDER:
         return {"kind": "disc", "radius": float(size[0]), **values}

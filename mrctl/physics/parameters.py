@@ -30,12 +30,13 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
     """Reads the parameters of equations (1) to (3) out of a compiled model, by element name; it takes a millisecond.
 
     The front wheel's frictionloss is rolling loss alone and gives the rolling coefficient, which is 0 for a caster that
-    slides. A rear wheel's frictionloss is the sum of rolling loss, no-load loss and gearbox loss, which gives the last.
-    Equation (3) has one motor: where the two differ, their mean constant, resistance and loss stand for both.
+    slides. A rear wheel's frictionloss is the sum of rolling loss, no-load loss and gearbox loss, and gives the gearbox
+    loss. Equation (3) has one motor: where the two differ, their mean constant, resistance and loss stand for both, as
+    do the left one's gear, rotor inertia, inductance and supply, and the left wheel's inertia.
 
     Args:
         model: Compiled model.
-        drive_gain: Applied volt per commanded volt, which no model holds.
+        drive_gain: Applied volts per commanded volt; a model does not hold this number.
         scratch: As for `at_rest`.
 
     Raises:
@@ -111,10 +112,10 @@ def at_rest(model: mujoco.MjModel, scratch: mujoco.MjData | None = None) -> tupl
 
     Args:
         model: Compiled model.
-        scratch: Data of a model of this size, which is overwritten; to make new data takes longer than all the rest.
+        scratch: Data of a model of the same size, which is overwritten; new data would take longer than all the rest.
 
     Returns:
-        The model's data at that state, and the robot's centre of mass from P in the chassis' frame, `(3,)` in m.
+        The model's data at that state, and the robot's centre of mass relative to P in the chassis' frame in m, `(3,)`.
     """
     data = scratch or mujoco.MjData(model)
     data.qpos[:] = model.qpos0
@@ -138,7 +139,8 @@ def _layout(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[float, float, f
 def _steering(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, float]:
     """Returns those parameters of a `Robot` that describe its steering; the data holds the kinematics at rest.
 
-    Two steered wheels turn as the linkage turns them near straight on, and their inertias add to that of the rack.
+    Two steered wheels are referred to the rack by the ratios of the linkage near straight on, and their inertias add to
+    its own.
     """
     if not has(model, "joint", "steering"):
         return {}
@@ -190,6 +192,6 @@ def _spin_inertia(model: mujoco.MjModel, wheel: str) -> float:
 
 
 def _inductance(model: mujoco.MjModel) -> float:
-    """Returns the armature inductance in H; MuJoCo keeps L/R in s as a motor's first dynamics parameter."""
+    """Returns the armature inductance in H; MuJoCo stores L/R in s as a motor's first dynamics parameter."""
     motor = model.actuator("motor_left")
     return float(model.actuator_dynprm[motor.id, 0] * motor.gainprm[0])

@@ -50,18 +50,20 @@ def perturb(
     """Writes the nominal model, changed by a perturbation, into another model, and recomputes its constants.
 
     What an earlier perturbation changed in that model is undone. The rolling loss in a wheel's frictionloss grows with
-    the static load on the wheel. `limit_current` writes the current limit. The rest of the driver, the steering servo,
-    delay and noise are no fields of a model: `mrctl.physics.plant` and `mrctl.sensing.sensors` apply them.
+    the static load on the wheel. `limit_current` writes the current limit. A model has no
+    fields for the rest of the driver, the steering servo, delay and noise: `mrctl.physics.plant` and
+    `mrctl.sensing.sensors` apply them.
 
     Args:
         nominal: The nominal model, which is only read.
         model: A copy of it, which is written.
         perturbation: The complete perturbation.
-        robot: The parameters of the nominal model, where they are known; by default they are read from it.
+        robot: The parameters of the nominal model, if known; by default they are read from it.
         scratch: As for `at_rest`.
 
     Raises:
-        InputError: The perturbed robot could not stand: its centre of mass lies outside its wheels or below the ground.
+        InputError: The perturbed robot could not stand, because its centre of mass lies outside its wheels or below the
+            ground.
     """
     p = perturbation
     scratch = scratch or mujoco.MjData(nominal)
@@ -106,7 +108,7 @@ def perturb(
     model.opt.gravity[:] = c * gx + s * gz, gy, c * gz - s * gx
     before, after = load_torques(nominal, scratch), load_torques(model, scratch)
     if min(after.values()) <= 0:
-        raise InputError("perturbation.payload: the centre of mass lies outside the wheels, the robot would tip over")
+        raise InputError("perturbation.payload: the centre of mass lies outside the wheels; the robot would tip over")
     height = at_rest(model, scratch)[1][2] + np.mean([model.geom(wheel).size[0] for wheel in REAR])
     if height < 0:
         raise InputError("perturbation.payload_z: the centre of mass lies below the ground")
@@ -120,12 +122,12 @@ def perturb(
 
 
 def limit_current(nominal: mujoco.MjModel, model: mujoco.MjModel, limit: float) -> None:
-    """Limits the currents of both motors, which is the limit k_M I on the torque of a `<dcmotor>`.
+    """Limits the currents of both motors, by the limit k_M I on the torque of each `<dcmotor>`.
 
     Args:
-        nominal: The nominal model; a limit in its file counts if it is lower.
+        nominal: The nominal model; the lower of its own limit and `limit` holds.
         model: The perturbed model, which is written.
-        limit: Largest current I in A; `NO_LIMIT` for none but that of the file.
+        limit: Largest current I in A; with `NO_LIMIT` only the model's own limit holds.
     """
     motors = [nominal.actuator(name).id for name in MOTORS]
     currents = np.minimum(current_limits(nominal), limit if limit < NO_LIMIT else np.inf)
@@ -174,7 +176,7 @@ def fields(model: mujoco.MjModel) -> dict[str, NDArray]:
 
 
 def _get(model: mujoco.MjModel, name: str) -> NDArray:
-    """Returns a view of a field, whose name begins with `opt.` where it belongs to the options."""
+    """Returns a view of a field; the names of fields of the options begin with `opt.`."""
     return getattr(model.opt, name[4:]) if name.startswith("opt.") else getattr(model, name)
 
 

@@ -1,4 +1,4 @@
-"""What MuJoCo's pictures show beside the bodies of a model."""
+"""Draws lines, such as the reference, into MuJoCo's pictures."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)

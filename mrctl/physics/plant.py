@@ -1,7 +1,7 @@
-"""The physics boundary: one robot through dm_control, many through `mujoco.batch`, behind one interface.
+"""The boundary to MuJoCo: one robot through dm_control, or many through `mujoco.batch`, behind one interface.
 
-Every array has a leading batch dimension. Both plants share the code below but for a few methods, so robot i of a batch
-is the same scenario run alone, bit for bit. The readouts use `qpos`, `qvel` and `act` only, because the sensor data of
+Every array has a leading batch dimension. Both plants share all code but a few methods, so robot i of a batch gives the
+same bits as its scenario alone. The readouts use `qpos`, `qvel` and `act` only, because the sensor data of
 a batch is a substep old.
 """
 
@@ -31,7 +31,7 @@ from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.theory.perturbation import LONGEST_DELAY, Perturbation
 from mrctl.theory.robot import Robot
 
-TILT = float(np.cos(np.radians(30)))
+TILT = float(np.cos(np.radians(30)))  # least cosine of the tilt; a robot that tilts further has failed
 IDEAL_DRIVER, IDEAL_SERVO = Driver(), SteeringServo()
 NONE = Obstacles()
 
@@ -47,8 +47,8 @@ PLANT = np.dtype(
         ("reading", READING),  # now
         ("sent", "f8", 2),  # voltages of the driver without its current limit, left and right, V
         ("applied", "f8", 2),  # voltages at the terminals, left and right, at the end of the period, V
-        ("lost", "f8", 2),  # applied less sent voltage, the change by the current limit, at the nominal supply, V
-        ("current", "f8", 2),  # armature currents, A
+        ("lost", "f8", 2),  # applied less sent voltage, due to the current limit, as if at the nominal supply, V
+        ("current", "f8", 2),  # armature currents, left and right, A
         ("wheel_angles", "f8", 2),  # of the rear wheels, left and right, from the zero of the model, rad
         ("imu_velocity", "f8", 3),  # velocity of the inertial sensor in the world, m/s
         ("imu_axes", "f8", (2, 3)),  # its axes forward and to the left, in the world
@@ -62,7 +62,7 @@ PLANT = np.dtype(
 
 @kernel
 def send(command: Array, tick: int, queue: Array, inputs: NDArray[np.int64], plant: Rows, ctrl: Array) -> bool:
-    """Sends each robot the command of `delay` periods ago through its driver; returns whether all are finite."""
+    """Sends each robot the command of `delay` periods ago; returns whether those of all running robots are finite."""
     finite = True
     for i in range(len(plant)):
         p = plant[i]
@@ -83,7 +83,7 @@ def send(command: Array, tick: int, queue: Array, inputs: NDArray[np.int64], pla
 
 @kernel
 def back_emf(p: Row) -> None:
-    """Back-EMF of the motors of one robot: k_E N ω."""
+    """Computes the back-EMF of the motors of one robot, k_E N ω."""
     for k in range(2):
         p.emf[k] = p.back_emf[k] * p.reading.wheel_rates[k]
 
@@ -93,7 +93,7 @@ def look(
     qpos: Array, qvel: Array, act: Array, address: NDArray[np.int64], acts: NDArray[np.int64], imu: Array,
     period: float, plant: Rows,
 ) -> bool:  # fmt: skip
-    """Readings, terminal voltages and currents after a period; returns whether all robots are upright and finite.
+    """Updates the readouts after a period; returns whether all running robots are upright and finite.
 
     The specific force is the mean acceleration in the period less gravity.
     """
@@ -124,16 +124,16 @@ def look(
 
 
 class Plant(ABC):
-    """B robots in physics. A robot that fails stops alone, and its state stays as it was.
+    """B robots in physics. A robot that fails stops, and keeps its last state, while the others go on.
 
     Attributes:
-        state: One record of `PLANT` a robot; `reading`, `applied` and `failed` are views of it.
+        state: One record of `PLANT` for each robot; `reading`, `applied` and `failed` are views of it.
         robot: The nominal robot, which is all that a controller may know.
-        truth: The robots as perturbed, for the prior `true_model`.
-        reading: One record of `READING` a robot, current after `reset` and `step`.
+        truth: The perturbed robots, for the prior `true_model`.
+        reading: One record of `READING` for each robot, current after `reset` and `step`.
         applied: Voltages at the terminals, left and right, `(B, 2)` in V.
-        failed: Which robots have stopped, `(B,)`.
-        failure: Reason of the failure of each robot, or "".
+        failed: Whether each robot has stopped, `(B,)`.
+        failure: Why each robot failed, or "".
         running: Number of robots that have not failed.
         imu: Position of the inertial sensor in the frame of the chassis in m, `(3,)`.
     """
@@ -150,7 +150,7 @@ class Plant(ABC):
     def __init__(
         self, model: mujoco.MjModel, robot: Robot, size: int, substeps: int, obstacles: Obstacles = NONE
     ) -> None:
-        """Takes the compiled nominal model, its robot and obstacles, the number of robots, and steps in a period."""
+        """Takes the nominal model, its robot, the number of robots, physics steps per control period, and obstacles."""
         self.size, self.substeps = size, substeps
         self.robot = robot
         self.truth = [robot] * size
@@ -170,15 +170,15 @@ class Plant(ABC):
         state["resistance"], state["back_emf"], state["gravity"] = resistance, back_emf, model.opt.gravity
         state["driver"]["supply"], state["driver"]["gain"], state["driver"]["scale"] = robot.supply, 1.0, 1.0
         state["driver"]["current_limit"] = current_limits(model)
-        # Long enough for the largest delays of sensing and perturbation, whatever those of this batch are.
+        # Long enough for the largest possible delays of sensing and perturbation, because those may change.
         self._queue = np.zeros((1 + round(2 * LONGEST_DELAY / self._period), size, 4))
         self._tick = 0
         self._pushes: dict[int, int] = {}
         self._chassis = model.body("chassis").id
         self._collision = model.sensor(COLLISION).adr[0] if has(model, "sensor", COLLISION) else -1
         self._surroundings = Surroundings(obstacles)
-        self._began = np.zeros(size, int)  # tick at which each robot was stood on the ground
-        self._poses = self._surroundings.poses(np.zeros(0))  # of the moving obstacles, by ticks since then
+        self._began = np.zeros(size, int)  # tick at which each robot was placed on the ground
+        self._poses = self._surroundings.poses(np.zeros(0))  # of the moving obstacles, by the ticks since then
 
     @abstractmethod
     def _write(self, robot: int, model: mujoco.MjModel) -> None:
@@ -186,7 +186,7 @@ class Plant(ABC):
 
     @abstractmethod
     def _advance(self) -> dict[int, str]:
-        """Runs the physics steps of one control period; returns the engine's errors by robot."""
+        """Runs the physics steps of one control period; returns error messages of the engine by robot."""
 
     def perturb(
         self,
@@ -232,16 +232,16 @@ class Plant(ABC):
         """Refuses a perturbation with which a robot could not stand.
 
         Raises:
-            InputError: Why.
+            InputError: The robot could not stand; the message says why.
         """
         perturb(self._nominal, self._scratch, perturbation, self.robot, self._scratch_data)
 
     def reset(self, pose: Array, twist: Array) -> None:
-        """Stands every robot on the ground, rolling.
+        """Places every robot on the ground, rolling.
 
         Args:
-            pose: `(B, 3)` in m, m, rad.
-            twist: `(B, 2)` in m/s, rad/s.
+            pose: x and y of P and heading, `(B, 3)` in m, m, rad.
+            twist: V and θ̇, `(B, 2)` in m/s, rad/s.
 
         Raises:
             InputError: There is no ground below a pose.
@@ -251,12 +251,12 @@ class Plant(ABC):
         self._begin(slice(None))
 
     def restart(self, robot: int, pose: Array, twist: Array) -> None:
-        """Stands one robot on the ground again, as `reset` does all of them; what happened to it is forgotten.
+        """Places one robot on the ground again, as `reset` does with all; clears its failure, push and commands.
 
         Args:
             robot: Index of the robot.
-            pose: `(3,)` in m, m, rad.
-            twist: `(2,)` in m/s, rad/s.
+            pose: x and y of P and heading, `(3,)` in m, m, rad.
+            twist: V and θ̇, `(2,)` in m/s, rad/s.
 
         Raises:
             InputError: There is no ground below the pose.
@@ -273,11 +273,11 @@ class Plant(ABC):
 
     @abstractmethod
     def _clear(self, robot: int) -> None:
-        """Takes the engine's state of one robot back to the model's default."""
+        """Resets the engine's state of one robot to the model's default."""
 
     @abstractmethod
     def _model_of(self, robot: int) -> mujoco.MjModel:
-        """The compiled model of one robot, for `stand`."""
+        """Returns the compiled model of one robot, for `stand`."""
 
     def push(self, robot: int, force: Array, periods: int) -> None:
         """Pushes the chassis of one robot.
@@ -285,7 +285,7 @@ class Plant(ABC):
         Args:
             robot: Index of the robot.
             force: Forces along the world's x and y in N at the chassis' centre of mass, torque about z in N·m, `(3,)`.
-            periods: For how many control periods.
+            periods: Duration in control periods.
         """
         self.wrench[robot, self._chassis] = force[0], force[1], 0.0, 0.0, 0.0, force[2]
         self._pushes[robot] = self._tick + periods
@@ -297,21 +297,21 @@ class Plant(ABC):
         self.look()
 
     def send(self, command: Array) -> None:
-        """Hands a command to the actuators, or to the queue where it is delayed.
+        """Queues a command, and sends the actuators the one whose delay is over.
 
         Args:
             command: Commanded voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
         """
         if command.shape != (self.size, 4):
             raise ValueError(f"command: shape {command.shape}, expected {(self.size, 4)}")
-        # The engine would silently replace NaN by zero volts.
+        # The engine would silently replace NaN by 0 V.
         if not send.compiled(command, self._tick, self._queue, self._inputs, self.state, self.ctrl):
             sent = self._queue[(self._tick - self.state["delay"]) % len(self._queue), np.arange(self.size)]
             for robot in np.flatnonzero(~np.isfinite(sent).all(axis=1)):
                 self.fail(int(robot), "non-finite command")
 
     def advance(self) -> None:
-        """The physics of one control period; moving obstacles are where they are at its end."""
+        """Advances physics by one control period, with obstacles where they are at its end; fails on collisions."""
         if self.running:
             self._move(1)
             for robot, reason in self._advance().items():
@@ -321,7 +321,7 @@ class Plant(ABC):
                     self.fail(int(robot), "collision")
 
     def _move(self, ahead: int) -> None:
-        """Moves the obstacles that move to where they are this number of ticks from now."""
+        """Moves the moving obstacles to their poses `ahead` ticks from now."""
         if not self._surroundings.courses:
             return
         since = self._tick + ahead - self._began
@@ -332,7 +332,7 @@ class Plant(ABC):
         turn[..., 0], turn[..., 3] = np.cos(now[..., 2] / 2), np.sin(now[..., 2] / 2)
 
     def look(self) -> None:
-        """Readouts after the physics; fails robots that have tilted or whose state is not finite."""
+        """Updates the readouts after the physics; fails robots that have tilted or whose state is not finite."""
         self._tick += 1
         if self._pushes:
             for robot in [r for r, end in self._pushes.items() if end == self._tick]:
@@ -344,17 +344,17 @@ class Plant(ABC):
                 self.fail(int(robot), "tilt over 30°" if np.isfinite(upright[robot]) else "non-finite state")
 
     def fail(self, robot: int, reason: str) -> None:
-        """Stops one robot for good; the first reason counts."""
+        """Stops one robot until it restarts; the first reason counts."""
         if not self.failed[robot]:
             self.failed[robot], self.failure[robot] = True, reason
             self.running -= 1
 
     def current(self) -> Array:
-        """Armature currents left and right at the end of the last control period in A, `(B, 2)`."""
+        """Returns the armature currents left and right at the end of the last control period in A, `(B, 2)`."""
         return self.state["current"]
 
     def _begin(self, rows: slice) -> None:
-        """Reads robots that were just stood on the ground; the second look finds that they do not accelerate.
+        """Reads robots that were just placed on the ground; the second look makes their initial acceleration zero.
 
         Until the first command of a delayed robot arrives, its motors get their nominal back-EMF, and the robot coasts.
         At 0 V they would brake it hard.
@@ -380,7 +380,7 @@ class PhysicsPlant(Plant):
     """
 
     def __init__(self, model: mujoco.MjModel, robot: Robot, substeps: int, obstacles: Obstacles = NONE) -> None:
-        """Takes a compiled world, its robot and obstacles, and the physics steps in a control period."""
+        """Takes a compiled world, its robot, physics steps in a control period, and obstacles."""
         super().__init__(model, robot, 1, substeps, obstacles)
         self.physics = CarPhysics.from_compiled(mjcf.clone(model))
         data = self.physics.data
@@ -402,14 +402,14 @@ class PhysicsPlant(Plant):
         try:
             self.physics.step(self.substeps)
         except PhysicsError:
-            pass  # raised after the steps, on a warning; `step` judges the state itself, as it does for a batch
+            pass  # raised after the steps, on a warning; `look` judges the state itself, as it does for a batch
         except mujoco.FatalError as error:
             return {0: str(error)}
         return {}
 
 
 class BatchPlant(Plant):
-    """Many robots on MuJoCo's own batch engine; parameters differ per robot through `expand` and `set_const`."""
+    """Many robots on MuJoCo's batch engine, each with its own parameters through `expand` and `set_const`."""
 
     def __init__(
         self,
@@ -420,13 +420,13 @@ class BatchPlant(Plant):
         threads: int = 0,
         obstacles: Obstacles = NONE,
     ) -> None:
-        """Takes what `build` takes."""
+        """Takes the arguments of `build`."""
         super().__init__(model, robot, size, substeps, obstacles)
         quiet = mjcf.clone(model)
         if self._collision < 0:
-            quiet.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nobody reads them here
+            quiet.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nothing reads them without obstacles
         self.batch = mujoco_batch.Batch(quiet, size, threads)
-        self._held = mjcf.clone(quiet)  # for `_model_of` to write into
+        self._held = mjcf.clone(quiet)  # overwritten by `_model_of`
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.act, self.ctrl = self.batch.bind("act"), self.batch.bind("ctrl")
         self.wrench, self.sensors = self.batch.bind("xfrc_applied"), self.batch.bind("sensordata")
@@ -459,7 +459,7 @@ class BatchPlant(Plant):
 def build(
     model: mujoco.MjModel, robot: Robot, size: int, substeps: int, threads: int = 0, obstacles: Obstacles = NONE
 ) -> Plant:
-    """The plant for a number of robots: dm_control for one, the batch engine for more.
+    """Builds the plant for a number of robots: dm_control for one, the batch engine for more.
 
     Args:
         model: Compiled world with the nominal robot.
@@ -467,7 +467,7 @@ def build(
         size: Number of robots.
         substeps: Physics steps in a control period.
         threads: Number of threads of the batch engine; 0 for all cores.
-        obstacles: The obstacles that the model was compiled with.
+        obstacles: The obstacles with which the model was compiled.
     """
     if size == 1:
         return PhysicsPlant(model, robot, substeps, obstacles)

@@ -1,4 +1,4 @@
-"""What is read off a robot in physics: posture, twist, wheel rates, steering, tilt; from `qpos` and `qvel` alone."""
+"""Readouts of a robot in physics, from `qpos` and `qvel` alone: posture, twist, wheel rates, steering and tilt."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco is compiled and ships no stubs)
@@ -13,7 +13,7 @@ from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.physics.elements import MOTORS, has
 
 JOINTS = ("chassis", "wheel_left", "wheel_right")
-HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) on a sane state
+HUGE = 1e10  # MuJoCo's own bound (mjMAXVAL) on a valid state
 
 READING = np.dtype(
     [
@@ -24,7 +24,7 @@ READING = np.dtype(
         ("steering_angle", "f8"),  # rad, positive to the left; 0 where nothing is steered
         ("steering_rate", "f8"),  # rad/s
         ("z", "f8"),  # height of the middle between the driven wheels, m
-        ("roll", "f8"),  # rad, positive to the right; heading, pitch and roll are angles about z, y and x in this order
+        ("roll", "f8"),  # rad, positive to the right; heading, pitch and roll turn about z, y and x in this order
         ("pitch", "f8"),  # rad, positive nose down
         ("upright", "f8"),  # cosine of the tilt from the vertical; NaN once the state has blown up
     ]
@@ -33,7 +33,7 @@ READING = np.dtype(
 
 @kernel
 def read(qpos: Array, qvel: Array, address: NDArray[np.int64], r: Row) -> None:
-    """Reads the state of one robot.
+    """Reads a robot from its state.
 
     Args:
         qpos: Generalised positions, `(nq,)`.
@@ -66,7 +66,7 @@ def read(qpos: Array, qvel: Array, address: NDArray[np.int64], r: Row) -> None:
 
 @kernel
 def imu_motion(qpos: Array, qvel: Array, address: NDArray[np.int64], imu: Array, velocity: Array, axes: Array) -> None:
-    """Velocity of the inertial sensor, and the axes along which it measures.
+    """Computes the velocity of the inertial sensor, and the axes along which it measures.
 
     Args:
         qpos: Generalised positions, `(nq,)`.
@@ -89,19 +89,19 @@ def imu_motion(qpos: Array, qvel: Array, address: NDArray[np.int64], imu: Array,
 
 @kernel
 def read_all(qpos: Array, qvel: Array, address: NDArray[np.int64], rows: Rows) -> None:
-    """`read` for a trajectory or a batch: `(n, nq)`, `(n, nv)` and one record of `READING` each."""
+    """Reads a trajectory or a batch: `qpos` `(n, nq)` and `qvel` `(n, nv)` into n records of `READING`."""
     for i in range(len(rows)):
         read(qpos[i], qvel[i], address, rows[i])
 
 
 def addresses(model: mujoco.MjModel) -> NDArray[np.int64]:
-    """Addresses in qpos and qvel of each joint in `JOINTS` and of `steering`, if there is one, alternating, `(8,)`."""
+    """Returns the addresses in qpos and qvel, alternating, of `JOINTS` `(6,)`, or of these and `steering` `(8,)`."""
     joints = (*JOINTS, "steering") if has(model, "joint", "steering") else JOINTS
     return np.array([a for name in joints for a in (model.joint(name).qposadr[0], model.joint(name).dofadr[0])], int)
 
 
 def inputs(model: mujoco.MjModel) -> list[int]:
-    """Positions in ctrl of left voltage, right voltage and, unless nothing is steered, steering angle and rate."""
+    """Returns the indices in ctrl of left and right voltage and, of a steered robot, of steering angle and rate."""
     found = [int(model.actuator_ctrladr[model.actuator(name).id]) for name in MOTORS]
     if has(model, "actuator", "steering"):
         steering = int(model.actuator_ctrladr[model.actuator("steering").id])
@@ -110,7 +110,7 @@ def inputs(model: mujoco.MjModel) -> list[int]:
 
 
 def motor_parameters(model: mujoco.MjModel) -> tuple[Array, Array, list[int]]:
-    """Resistance `(1, 2)` in Ω, back-EMF per wheel rate `(1, 2)` in V·s/rad, addresses of the current states if any."""
+    """Returns resistance `(1, 2)` in Ω, back-EMF per wheel rate `(1, 2)` in V·s/rad, addresses of current states."""
     motors = [model.actuator(name).id for name in MOTORS]
     resistance = model.actuator_gainprm[motors, 0]
     back_emf = model.actuator_gainprm[motors, 1] * model.actuator_gear[motors, 0]
@@ -119,7 +119,7 @@ def motor_parameters(model: mujoco.MjModel) -> tuple[Array, Array, list[int]]:
 
 
 def current_limits(model: mujoco.MjModel) -> Array:
-    """Largest currents left and right in A, `(2,)`, which limit the torques of the motors; infinite where none do."""
+    """Returns the current limits left and right in A, `(2,)`, from the motors' torque limits; infinite without one."""
     motors = [model.actuator(name).id for name in MOTORS]
     torque = np.where(model.actuator_forcelimited[motors], model.actuator_forcerange[motors, 1], np.inf)
     return torque / model.actuator_gainprm[motors, 1]
@@ -128,5 +128,5 @@ def current_limits(model: mujoco.MjModel) -> Array:
 def motor_current(
     voltage: Array, rates: Array, act: Array, resistance: Array, back_emf: Array, acts: list[int]
 ) -> Array:
-    """Armature currents `(B, 2)` in A from applied voltages, wheel rates and activations."""
+    """Computes armature currents `(B, 2)` in A from applied voltages, wheel rates and activations."""
     return act[:, acts] if acts else (voltage - back_emf * rates) / resistance

@@ -1,6 +1,6 @@
 """Computes the state of a robot that stands on the ground and rolls, with its steered wheels turned.
 
-The plant starts a run from that state, and the viewer draws robots in it.
+The plant starts a run in that state, and the viewer draws robots in it.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -38,7 +38,7 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | N
         model: Compiled world with the robot.
         pose: x and y of P in m, and θ in rad, `(3,)`.
         twist: V in m/s and θ̇ in rad/s, `(2,)`.
-        robot: The parameters of the model, where they are known; by default they are read from it.
+        robot: The parameters of the model, if known; by default they are read from it.
 
     Returns:
         The state, in which no wheel is below the ground.
@@ -51,7 +51,7 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | N
     x, y, theta = pose
     ahead, left = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
     steering = float(np.clip(scrub_free_angle(twist, robot), -robot.steering_limit, robot.steering_limit))
-    # The front contact point from P: along the body's x axis and along its y axis.
+    # Position of the front contact point relative to P, along the body's x and y axes.
     contact_x = robot.wheelbase - robot.trail * np.cos(steering)
     contact_y = -robot.trail * np.sin(steering)
     floor = np.array(
@@ -72,7 +72,8 @@ def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | N
     for _ in range(8):
         up[2] = np.sqrt(1 - up[0] ** 2 - up[1] ** 2)
         up[0] = (robot.front_wheel_radius - height - up[1:] @ centre[1:]) / centre[0]
-    # The rotation from body to world takes `up` to `normal`, and the body's x axis to one above the heading.
+    # The rotation from body to world takes `up` to `normal`, and the body's x axis into the vertical plane of the
+    # heading.
     slope = normal[:2] @ ahead
     rise = np.arcsin(up[0] / np.hypot(slope, normal[2])) - np.arctan2(slope, normal[2])
     body_x = np.append(np.cos(rise) * ahead, np.sin(rise))
@@ -129,12 +130,13 @@ def front_rates(
         return {}
     along = v * np.cos(steering) + robot.wheelbase * omega * np.sin(steering)  # speed of the middle of the front axle
     rates = {wheel: along / robot.front_wheel_radius for wheel in fronts(model)}
-    # A wheel's speed is proportional to its distance from the turning point, which is L/sin of its angle.
+    # A wheel's speed is proportional to its distance from the instantaneous centre, which is L over the sine of its
+    # angle.
     for knuckle in knuckles(model):
         angle, wheel = _linkage(model, knuckle, steering), knuckle.removeprefix("steering_")
         distance = np.where(np.abs(steering) > 1e-6, np.sin(steering), 1.0) / np.where(
             np.abs(angle) > 1e-6, np.sin(angle), 1.0
-        )  # as a ratio to the middle's
+        )  # relative to that of the middle of the axle
         rates[wheel] = rates[wheel] * distance
     return rates
 

@@ -1,8 +1,8 @@
-"""Measures what the tyres of the nominal robot add to rolling without slip, as one would on a test bench.
+"""Measures how the tyres of the nominal robot depart from rolling without slip, as one would on a test bench.
 
-MuJoCo's tyres are soft and creep a little, so that the wheels of a robot turn otherwise than its way divided by the
-radius: by 0.05 % of the radius at rest, which a filter finds by itself, and by what depends on the motion. An estimator
-that knows the latter, too, is wrong by a quarter less, and knows how wrong it is.
+MuJoCo's tyres are soft and creep a little, so the wheels do not turn by exactly the distance over the radius. A
+constant part, 0.05 % of the radius, a filter finds by itself. The rest depends on the motion; an estimator that knows
+it has a quarter less error, and a consistent covariance.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -23,34 +23,34 @@ from mrctl.physics.stand import stand
 from mrctl.theory.robot import Tyres
 
 PUSH = 1.0  # m/s², specific force to the left while the load of the wheels is measured
-REST = 0.5  # s, duration of that, after which nothing moves
-START, GAIN = 0.3, 0.2  # speed at which the measured acceleration begins and what is gained, in the largest speed
-RAMP = 1.0  # s, duration of the acceleration, whose first third lets the motors settle
-_known: dict[bytes, Tyres] = {}  # by the hash of the model
+REST = 0.5  # s, duration of the push, after which nothing moves any more
+START, GAIN = 0.3, 0.2  # initial speed of the measured acceleration and gain of speed, as shares of the largest speed
+RAMP = 1.0  # s, duration of the acceleration; the first third, in which the motors settle, is left out
+_known: dict[bytes, Tyres] = {}  # measured tyres by the hash of the model
 
 
 def measure(model: mujoco.MjModel) -> Tyres:
     """Measures the tyres of a robot that stands and drives on a level floor, without obstacles.
 
-    Two experiments: gravity is tilted to the side, and both contacts are read at rest; the voltage of both motors rises
-    linearly, and the lag of the wheels behind the way is regressed on the way and the speed.
+    It takes two experiments. Gravity is tilted to the side, and the depths of both contacts are read at rest. Then the
+    voltage of both motors rises linearly, and the lag of the wheels is regressed on the distance and the speed.
 
     Args:
         model: Compiled world with the nominal robot, whose floor is level.
 
     Returns:
-        The two constants. The same model gives the same numbers, and is measured once.
+        The two constants; a model that was measured before is not measured again.
     """
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
-    key = hashlib.sha256(buffer.tobytes()).digest()  # that of `mjcf.digest` takes fifty times as long
+    key = hashlib.sha256(buffer.tobytes()).digest()  # `mjcf.digest` takes fifty times as long
     if key not in _known:
         _known[key] = _measured(mjcf.clone(model))
     return _known[key]
 
 
 def _measured(model: mujoco.MjModel) -> Tyres:
-    """Does both experiments with a model, which it changes."""
+    """Performs both experiments on a model, which is changed."""
     robot = read_robot(model)
     step = model.opt.timestep
 
@@ -66,7 +66,7 @@ def _measured(model: mujoco.MjModel) -> Tyres:
     model.opt.gravity[1] = 0.0
     wheels = [model.geom(wheel).id for wheel in REAR]
     left, right = (data.contact.dist[(data.contact.geom == wheel).any(axis=1)].min(initial=0.0) for wheel in wheels)
-    # A tyre of depth d rolls on the radius r − d/2, as contacts are in the middle of the overlap.
+    # A tyre that has sunk in by d rolls on the radius r − d/2, because the contact is in the middle of the overlap.
     load = (left - right) / 4 / robot.wheel_radius / PUSH
 
     data, motors = begin(START * robot.max_speed), inputs(model)[:2]

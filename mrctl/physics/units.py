@@ -1,8 +1,9 @@
-"""Which number of a robot's file is in another unit than it should be?
+"""Finds a number in a robot's file that is in the wrong unit.
 
-A robot with a number in the wrong unit breaks no law: it is the model of a robot that nobody could build. `possible`
-lists what every robot keeps to, with bounds that are wide enough for toys and for trucks. Where a robot does not,
-`mistake` converts one quantity after the other as people mistake them, and names the one with which it would.
+A robot with a number in the wrong unit breaks no law, but nobody could build it. `bounds` lists quantities with the
+intervals in which they lie for every robot, wide enough for toys and for trucks. Where a robot is outside, `mistake`
+tries the usual unit errors on one quantity after the other, and names the one whose conversion makes the robot
+possible.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -23,7 +24,7 @@ from mrctl.record import InputError
 from mrctl.theory.robot import Robot
 
 RPM = 30 / math.pi  # rpm of 1 rad/s
-GYRATION = 0.05, 1.0  # radius of gyration over the size of a robot
+GYRATION = 0.05, 1.0  # least and largest radius of gyration over the size of a robot
 LENGTHS = (
     "com_offset", "com_height", "wheel_radius", "front_wheel_radius", "half_track", "wheelbase", "trail",
 )  # fmt: skip
@@ -31,7 +32,7 @@ LIMITS = "max_speed", "max_rotation", "max_acceleration", "max_rotation_accelera
 
 
 class Bound(NamedTuple):
-    """A quantity of a robot, and the interval in which it is for every robot."""
+    """A quantity of a robot, and the interval in which it lies for every robot."""
 
     quantity: str
     value: float
@@ -41,7 +42,7 @@ class Bound(NamedTuple):
 
     @property
     def margin(self) -> float:
-        """Distance to the nearer end in orders of magnitude, as a share of the interval; negative outside."""
+        """Logarithmic distance to the nearer end, as a share of the interval; negative outside."""
         low = max(self.low, 1e-6 * self.high)
         if self.value <= low:
             return 0.5 if self.low == 0 <= self.value else -1.0
@@ -50,10 +51,10 @@ class Bound(NamedTuple):
 
 
 class Mistake(NamedTuple):
-    """A quantity that is in another unit than it should be."""
+    """A quantity that is probably in the wrong unit."""
 
     text: str
-    """Element and quantity with its number, and the question whether it is in that unit."""
+    """Element, quantity and number, the unit in which the number probably is, and the right unit."""
     robot: Robot
     """The robot after the conversion."""
 
@@ -69,7 +70,7 @@ def reach(robot: Robot) -> Array:
 
 
 def bounds(robot: Robot) -> list[Bound]:
-    """Lists what no robot exceeds (chosen: a robot of the density of steel, a motor of 10⁶ rpm, tyres with μ = 3)."""
+    """Lists quantities and their bounds, which are chosen: density of steel, motors of 10⁶ rpm, tyres with μ = 3."""
     size = math.hypot(robot.wheelbase, 2 * robot.half_track)
     stall = robot.motor_gain * robot.supply
     loss = robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2
@@ -94,31 +95,33 @@ def bounds(robot: Robot) -> list[Bound]:
 
 
 def mistake(model: mujoco.MjModel, robot: Robot) -> Mistake | None:
-    """Finds the quantity that would make an impossible robot possible, if it were in another unit.
+    """Finds the quantity whose conversion to another unit makes an impossible robot possible.
 
-    Of several the one is taken whose robot keeps farthest from the ends of the `bounds`, in the sum.
+    Of several candidates a gear of 1 that was left out comes first, then the one with the largest sum of margins in the
+    `bounds`.
 
     Args:
         model: The compiled model, for the names of its elements.
         robot: Its parameters.
 
     Returns:
-        The mistake; None if the robot is possible, or no conversion helps.
+        The mistake; None if the robot is possible, or if no conversion makes it so.
     """
     if _least(robot) > 0:
         return None
     able = [one for one in _candidates(model, robot) if _least(one.robot) > 0]
     if robot.gear_ratio == 1 and able and able[0].robot.gear_ratio != 1:
-        return able[0]  # a gear that was left out
+        return able[0]  # the gear that was left out
     return max(able, key=lambda one: sum(bound.margin for bound in bounds(one.robot)), default=None)
 
 
 def _least(robot: Robot) -> float:
+    """Returns the least margin of a robot in the `bounds`."""
     return min(bound.margin for bound in bounds(robot))
 
 
 def _candidates(model: mujoco.MjModel, robot: Robot) -> list[Mistake]:
-    """Lists the conversions of one quantity that people forget, where they give a valid robot."""
+    """Lists the usual unit errors of one quantity each, where the corrected robot is valid."""
     masses = model.body_mass[(bodies := bodies_of(model))]
     heaviest, heavy = model.body(bodies[int(np.argmax(masses))]), masses[masses > masses.max() / 2].sum()
     motors, wheels = "of motor_left and motor_right", "of wheel_left and wheel_right"
@@ -166,7 +169,7 @@ def _candidates(model: mujoco.MjModel, robot: Robot) -> list[Mistake]:
     for number, unit, right, changes in rows:
         is_it, it = ("are they", "They") if number.startswith(("the lengths", "the numeric")) else ("is it", "It")
         with contextlib.suppress(InputError):
-            text = f"{number}, as in no robot; {is_it} in {unit}? {it} must be in {right}"
+            text = f"{number}, which no robot has; {is_it} in {unit}? {it} must be in {right}"
             found.append(Mistake(text, robot.replace(**changes)))
     return found
 
@@ -177,18 +180,18 @@ def _scaled(robot: Robot, names: tuple[str, ...], factor: float) -> dict[str, fl
 
 
 def _of_mass(robot: Robot, mass: float, factor: float) -> dict[str, float]:
-    """Returns what another mass changes: the losses of rolling stay, and inertias in the wrong unit go with it."""
+    """Returns the fields for another mass: rolling loss does not grow, and inertias in the wrong unit change too."""
     changed = {"mass": mass, "rolling_coefficient": robot.rolling_coefficient * min(1.0, robot.mass / mass)}
     return changed | _inertias(robot, mass, 1.0, factor)
 
 
 def _of_lengths(robot: Robot, factor: float) -> dict[str, float]:
-    """Returns all lengths times a factor, and the inertias times its square where they were in that unit as well."""
+    """Returns all lengths times a factor, and the inertias times its square where they were in the wrong unit too."""
     return _scaled(robot, LENGTHS, factor) | _inertias(robot, robot.mass, factor, factor**2)
 
 
 def _inertias(robot: Robot, mass: float, length: float, factor: float) -> dict[str, float]:
-    """Returns other inertias if the radius of gyration would not fit: those of wheels by a factor, and a usual one."""
+    """Returns wheel inertias times a factor and a typical yaw inertia, if the radius of gyration is out of bounds."""
     size = length * math.hypot(robot.wheelbase, 2 * robot.half_track)
     if GYRATION[0] <= math.sqrt(robot.yaw_inertia / mass) / size <= GYRATION[1]:
         return {}

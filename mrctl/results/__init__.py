@@ -1,8 +1,8 @@
 """Results of runs: labelled datasets, metrics, comparisons, figures and exports.
 
-They import theory, control (for names and features) and `mrctl.scenario`, but neither physics nor the loop.
+Imports theory, control (for names and features) and `mrctl.scenario`, but neither physics nor the loop.
 """
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, submodules=["plots"])  # which draws only when asked
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, submodules=["plots"])  # imports matplotlib on use

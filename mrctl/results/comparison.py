@@ -1,7 +1,7 @@
 """Statistics over runs: means with bootstrap intervals, paired comparisons, the worst runs.
 
-A sample is an error, of which smaller is better; NaN or infinite stands for a run that failed. Failed runs are counted,
-and lose every comparison.
+A sample is an error, so the smaller one is better; NaN or infinite stands for a run that failed. Failed runs are
+counted and lose every comparison.
 """
 
 from __future__ import annotations
@@ -55,17 +55,18 @@ class Superiority(NamedTuple):
 def bootstrap_interval(
     samples: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0, *, median: bool = False
 ) -> Interval:
-    """Mean of the finite samples with its bias-corrected, accelerated bootstrap interval (Efron, 1987).
+    """Returns the mean of the finite samples with its bias-corrected, accelerated bootstrap interval (Efron, 1987).
 
     Args:
         samples: One number a run (n,); NaN or infinite where it failed.
         level: Confidence level, between 0 and 1.
         n: Number of resamples.
         seed: Seed of the resampling.
-        median: Takes the median instead, over which no single sample rules.
+        median: Whether to take the median instead, which no single sample dominates.
 
     Returns:
-        The interval; its ends are NaN where fewer than two samples are finite, for one run does not show the spread.
+        The interval; its ends are NaN where fewer than two samples are finite, because one run does not show the
+        spread.
     """
     values = np.asarray(samples, float).ravel()
     finite = values[np.isfinite(values)]
@@ -76,7 +77,7 @@ def bootstrap_interval(
 
 
 def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0) -> Ratio:
-    """Geometric mean of a / b over pairs (same seed, same perturbation), with its bootstrap interval.
+    """Returns the geometric mean of a / b over pairs (same seed, same perturbation), with its bootstrap interval.
 
     Every pair has the same weight, however large its errors, and the ratio of b to a is the inverse of that of a to b.
 
@@ -100,7 +101,7 @@ def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_00
 
 
 def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 0.0) -> Superiority:
-    """Probability that the error of A is below that of B in the same run, ties counting half, failures as infinite.
+    """Estimates the probability that A has a smaller error than B in the same run; ties count half, failures as inf.
 
     The interval is Wilson's (1927) score interval, which keeps its width where all pairs agree; a bootstrap would not.
 
@@ -108,7 +109,7 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 
         a: One number a run (n,); NaN or infinite where it failed.
         b: The same runs under the other controller (n,).
         level: Confidence level, between 0 and 1.
-        floor: Difference up to which two errors are a tie, in their unit: what the integrator does not resolve.
+        floor: Largest difference that counts as a tie, in the unit of the errors: what the integrator cannot resolve.
 
     Raises:
         InputError: `a` and `b` differ in length.
@@ -117,7 +118,7 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 
         raise InputError(f"level: {level} is not between 0 and 1")
     first, second = (np.where(np.isfinite(one), one, np.inf) for one in _pairs(a, b))
     tied = first == second
-    with np.errstate(invalid="ignore"):  # two failures, which tie already
+    with np.errstate(invalid="ignore"):  # inf − inf of two failures, which tie already
         tied |= np.abs(first - second) <= floor
     wins, ties, n = int(((first < second) & ~tied).sum()), int(tied.sum()), len(first)
     if not n:
@@ -127,7 +128,7 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 
 
 
 def wilson(share: float, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Wilson's (1927) score interval of a share of n trials."""
+    """Returns Wilson's (1927) score interval of a share of n trials."""
     z = NormalDist().inv_cdf((1 + level) / 2)
     centre, half = share + z * z / (2 * n), z * np.sqrt(share * (1 - share) / n + (z / (2 * n)) ** 2)
     low, high = (float(np.clip((centre + sign * half) / (1 + z * z / n), 0, 1)) for sign in (-1, 1))
@@ -135,7 +136,7 @@ def wilson(share: float, n: int, level: float = 0.95) -> tuple[float, float]:
 
 
 def quantile_interval(samples: ArrayLike, share: float, level: float = 0.95) -> Interval:
-    """Quantile with the interval between two order statistics, which holds for any distribution (Conover 1999, 3.2).
+    """Returns a quantile and the interval between two order statistics, valid for any distribution (Conover 1999, 3.2).
 
     Args:
         samples: One number a run (n,); NaN or infinite where it failed, which counts as infinite.
@@ -143,8 +144,8 @@ def quantile_interval(samples: ArrayLike, share: float, level: float = 0.95) -> 
         level: Confidence level, between 0 and 1.
 
     Returns:
-        The least sample that this share of the samples do not exceed; an end of the interval is infinite where the
-        samples are too few for it. `samples` are all that are finite.
+        The least sample that is not exceeded by this share of the samples. An end of the interval is infinite where
+        there are too few samples for it. `samples` counts the finite ones.
     """
     from scipy.stats import binom  # the import takes 0.4 s
 
@@ -158,7 +159,7 @@ def quantile_interval(samples: ArrayLike, share: float, level: float = 0.95) -> 
 
 
 def cvar(samples: ArrayLike, share: float = 0.05) -> float:
-    """Conditional value at risk: the mean of the worst share of the runs; infinite where one of them failed.
+    """Returns the conditional value at risk: the mean of the worst share of the runs, infinite if one of them failed.
 
     Rockafellar and Uryasev (2002): of n samples the worst `share` · n count, the last of them in part. With fewer than
     1 / `share` samples it is the worst sample.
@@ -184,7 +185,7 @@ def cvar(samples: ArrayLike, share: float = 0.05) -> float:
 
 
 def _pairs(a: ArrayLike, b: ArrayLike) -> tuple[Array, Array]:
-    """Both sequences of samples as vectors of the same length.
+    """Returns both sequences of samples as vectors of the same length.
 
     Raises:
         InputError: They differ in length.
@@ -198,7 +199,7 @@ def _pairs(a: ArrayLike, b: ArrayLike) -> tuple[Array, Array]:
 def _interval(
     data: tuple[Array, ...], statistic: Callable[..., ArrayLike], level: float, n: int, seed: int
 ) -> tuple[float, float]:
-    """BCa bootstrap interval of a paired statistic; percentiles where the data are too alike for BCa."""
+    """Returns the BCa bootstrap interval of a paired statistic; percentiles where the data are too alike for BCa."""
     from scipy.stats import bootstrap  # the import takes 0.4 s
 
     if not 0 < level < 1:

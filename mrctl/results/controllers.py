@@ -1,12 +1,12 @@
-"""Colours and names for people of the controllers: the same in figures, scenes and curves."""
+"""Display names and colours of the controllers, which are the same in figures, scenes and curves."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import count
 
-# By the name in tables: the name for people and the colour, which are those of Okabe and Ito, 2008, for the seven that
-# tables compare; the others are darker.
+# Display name and colour, by the name in tables. The seven that tables compare have the colours of Okabe and Ito
+# (2008); the others have darker ones.
 CONTROLLERS: dict[str, tuple[str, str]] = {
     "none": ("PID alone", "#D55E00"),
     "fel": ("PID + network (paper)", "#0072B2"),
@@ -26,15 +26,15 @@ CONTROLLERS: dict[str, tuple[str, str]] = {
 
 
 def title_of(controller: str) -> str:
-    """Returns the name for people; a controller of the user keeps its own."""
+    """Returns the display name of a controller; a user's own controller keeps its name."""
     return CONTROLLERS[controller][0] if controller in CONTROLLERS else controller
 
 
 def colours_of(controllers: Iterable[str]) -> list[str]:
     """Returns a colour for each of several curves or robots, such as `#0072B2`.
 
-    The first one of a controller has its colour. Further ones, and those of the user, have the free colours in order;
-    where there are none, colours repeat.
+    The first curve of a controller has the controller's colour. Further ones, and those of the user's own controllers,
+    take the free colours in order; when these run out, colours repeat.
     """
     controllers = list(controllers)
     palette = [colour for _, colour in CONTROLLERS.values()]

@@ -1,4 +1,4 @@
-"""Labelled results: the signals of runs with their units; saving and opening them."""
+"""Labelled results: datasets of signals with their units, and how they are saved and opened."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mrctl.record import InputError, reading
 from mrctl.scenario import Scenario
 
 SMALL = 2**30  # bytes of signals that any result may have
-EXPANSION = 1000  # bytes of signals for a byte in a file
+EXPANSION = 1000  # bytes of signals that a larger result may have for each byte in its files
 
 # Name: (unit, meaning). A sample at time t holds the state at t, the commands
 # computed from it, and the currents and power at the end of the control period during which these commands are held.
@@ -84,31 +84,31 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "pitch_angle": ("rad", "pitch, positive nose down; after the heading"),
 }
 
-WHOLE = "all_chunks"  # attribute of a saved result whose files hold all chunks, also those of NaN alone
+WHOLE = "all_chunks"  # attribute of a saved result whose files hold all chunks, even those with only NaN
 SINCE_0_4_2 = ("z", "roll_angle", "pitch_angle")  # signals that older results lack
 
 TICK = np.dtype([(name, "f8") for name in SIGNALS])  # the signals of one robot at one control tick
 
 
 def blank(*shape: int) -> NDArray[np.void]:
-    """Records of `TICK` that are all NaN."""
+    """Returns records of `TICK` in which everything is NaN."""
     return np.full((*shape, len(SIGNALS)), np.nan).view(TICK)[..., 0]
 
 
 def versions() -> dict[str, str]:
-    """Versions of all packages that can change a result."""
+    """Returns the versions of all packages that can change a result."""
     others = ("mujoco", "dm-control", "numpy", "numba", "torch")
     return {"mrctl": __version__} | {name: _installed(name) for name in others}
 
 
 @cache
 def _installed(name: str) -> str:
-    """Version of a package, which takes a millisecond to read."""
+    """Returns the version of a package; it is cached, because reading it takes a millisecond."""
     return metadata.version(name)
 
 
 def written_by(result: xr.Dataset) -> str:
-    """The version of mrctl that made a result, such as `0.2.0`; "" for a dataset that does not say."""
+    """Returns the version of mrctl that made a result, such as `0.2.0`; "" if the dataset does not say."""
     return json.loads(result.attrs.get("versions", "{}")).get("mrctl", "")
 
 
@@ -116,7 +116,7 @@ def require(result: xr.Dataset, names: Iterable[str]) -> None:
     """Checks that a result has the variables that are about to be read.
 
     Raises:
-        InputError: One is missing, as it may be in a result of an older mrctl, which the message then names.
+        InputError: One is missing, as may happen with a result of an older mrctl; the message names that version.
     """
     for name in names:
         if name not in result.variables:
@@ -142,7 +142,7 @@ def dataset(
         log: One record of `TICK` for each tick and run, `(ticks, B)`.
         failure: For each run why it stopped early, or "".
         failure_time: For each run when it stopped in s, or NaN, `(B,)`.
-        weights: What the learner of each run has adapted, flat, `(B, n)`, or None.
+        weights: Flattened weights of each run's learner at the end, `(B, n)`, or None.
 
     Returns:
         Variables (run, time) by signal, `failed`, `failure`, `failure_time` and `weights`; coordinates label,
@@ -184,7 +184,7 @@ def combine(groups: Sequence[tuple[Sequence[int], xr.Dataset]], scenarios: Seque
 
 
 def scenarios_of(result: xr.Dataset) -> list[Scenario]:
-    """The resolved scenarios of the runs in a result, or in a selection of them, to run again.
+    """Returns the resolved scenarios of the runs in a result, or in a selection of them, to run again.
 
     Raises:
         InputError: Another version of mrctl, which the message names, wrote a scenario that this one does not know.
@@ -200,7 +200,7 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     Raises:
         InputError: The path exists or cannot be written.
     """
-    from zarr.codecs import Crc32cCodec, ZstdCodec  # here, for a run that saves nothing needs no zarr
+    from zarr.codecs import Crc32cCodec, ZstdCodec  # imported here because a run that saves nothing needs no zarr
 
     path = Path(path)
     if path.exists():
@@ -222,7 +222,7 @@ def only_files(folder: Path) -> int:
     """Returns the size of all files in a folder in bytes.
 
     Raises:
-        InputError: There is a pipe or a device among them, which would never end.
+        InputError: One of them is a pipe or a device, whose reading would never end.
     """
     total = 0
     for inside, _, names in os.walk(folder):
@@ -236,7 +236,8 @@ def only_files(folder: Path) -> int:
 def open_result(path: str | Path) -> xr.Dataset:
     """Opens a saved result, whichever version of mrctl wrote it: a result names its variables, with their units.
 
-    What needs a variable or a field of a scenario that the result lacks says so, and names the version that wrote it.
+    A function that needs a variable or a field of a scenario that the result lacks raises an `InputError`, which names
+    the version that wrote it.
 
     Raises:
         InputError: There is no result at this path, or a file of it is damaged or missing.

@@ -5,9 +5,9 @@ a window is far from singular (persistency of excitation: Ioannou and Sun 1996, 
 
     G(t) = 1/n Σ x xᵀ over the last n samples,    λ_min(G) ≥ α > 0 for all t
 
-The eigenvalues say how much is known about each combination of parameters; 1/(G⁻¹)_ii says how much is known about each
-parameter alone. It is the mean square of what feature i has beyond the best combination of the other seven, so that it
-is zero where they can replace it.
+The eigenvalues say how much is known about each combination of parameters, and 1/(G⁻¹)_ii how much is known about each
+parameter alone. This is the mean square of the residual of feature i after least squares on the other seven, and so
+zero where they can replace it.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from mrctl.results.metrics import as_runs, control_period
 
 Array = NDArray[np.float64]
 
-ROUNDING = 1e-14  # eigenvalues below this share of the largest are due to rounding, at least
+ROUNDING = 1e-14  # eigenvalues below this share of the largest are due to rounding; long runs have a larger share
 MOTIONS = {"commanded": ("v_command", "omega_command"), "true": ("v", "omega")}
-"""Motions whose features count, and their signals."""
+"""Signals of V and θ̇ of the motions whose features can be examined."""
 
 
 def gram(x: Array, samples: int) -> Array:
-    """Gram matrices of the last samples at each sample.
+    """Returns the Gram matrix of the last samples at each sample.
 
     Args:
         x: Features, `(…, n, m)`.
@@ -47,14 +47,14 @@ def gram(x: Array, samples: int) -> Array:
 
 
 def strength(matrices: Array, rounding: float = ROUNDING) -> tuple[Array, Array]:
-    """Eigenvalues of Gram matrices, ascending, and 1/(G⁻¹)_ii of each feature.
+    """Returns the eigenvalues of Gram matrices, ascending, and 1/(G⁻¹)_ii of each feature.
 
     Args:
         matrices: Symmetric positive semidefinite matrices `(…, m, m)`.
-        rounding: Share of the largest eigenvalue below which another one is due to rounding.
+        rounding: Eigenvalues below this share of the largest are due to rounding.
 
     Returns:
-        Two arrays `(…, m)`; NaN where the matrix is not finite. What rounding leaves of a zero is zero.
+        Two arrays `(…, m)`; 0 where only rounding is left, NaN where the matrix is not finite.
     """
     finite = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
     values, vectors = np.linalg.eigh(np.where(finite[..., None, None], matrices, 0.0))
@@ -67,12 +67,12 @@ def strength(matrices: Array, rounding: float = ROUNDING) -> tuple[Array, Array]
 
 
 def excitation(result: xr.Dataset, window: float = 4.0, motion: str = "commanded") -> xr.Dataset:
-    """How well the motion of the last seconds determines the parameters of each physical feature.
+    """Measures how well the motion of the last seconds determines the parameters of the physical features.
 
     Args:
         result: What `simulate` returns, or one run of it.
         window: Length of the sliding window in s.
-        motion: Whose features count: the `commanded` motion, which most learners read, or the `true` one.
+        motion: Motion whose features are examined: `commanded`, which most learners read, or `true`.
 
     Returns:
         Variables (run, time, …): `least`, the smallest eigenvalue of G; `eigenvalues`, all of them, ascending, over
@@ -101,7 +101,7 @@ def excitation(result: xr.Dataset, window: float = 4.0, motion: str = "commanded
             continue
         part = twist[row, :alive]
         x = feature_matrix(part, np.gradient(part, period, axis=0), half_track, scale)
-        rounding = max(ROUNDING, np.finfo(float).eps * alive / samples)  # that of the sums grows with the run
+        rounding = max(ROUNDING, np.finfo(float).eps * alive / samples)  # rounding of the sums grows with the run
         values[row, :alive], alone[row, :alive] = strength(gram(x, samples), rounding)
         least[row] = values[row, :, :1]
     spans = {"units": "1", "window": window}
@@ -121,11 +121,11 @@ def excitation(result: xr.Dataset, window: float = 4.0, motion: str = "commanded
 
 
 def parameter_error(result: xr.Dataset) -> xr.DataArray:
-    """Parameters at the end of a run, of prior and learner together, less those of the true robot.
+    """Returns the parameters at the end of a run, of prior and learner together, less those of the true robot.
 
     The parameters are those of equation (3) and of the scaled features. The equation leaves out fork and slip, so that
-    the parameters which drive best are not quite the true ones. With tanh units beside the features (`composite`), what
-    the units have learned is not counted.
+    the parameters which drive best are not quite the true ones. What `composite` learns in its tanh units is not
+    counted.
 
     Args:
         result: What `simulate` returns, or one run of it.

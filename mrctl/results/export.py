@@ -1,7 +1,7 @@
 """Results for other tools: MCAP with ROS 2 messages, CSV, Parquet, NumPy.
 
-Tables hold every signal of `results.dataset.SIGNALS`; where a run has failed, they end. With several runs there is a
-column `run`, or in MCAP a name `/runK` before each topic.
+Tables hold every signal of `results.dataset.SIGNALS` and end where a run failed. With several runs a table has a column
+`run`, and in MCAP the name of each topic begins with `/runK`.
 
 | topic            | message                                 | content                                              |
 | ---------------- | --------------------------------------- | ---------------------------------------------------- |
@@ -13,14 +13,15 @@ column `run`, or in MCAP a name `/runK` before each topic.
 | `fix`            | geometry_msgs/PoseWithCovarianceStamped | posture fixes                                        |
 | `imu`            | sensor_msgs/Imu                         | gyro and accelerometer                               |
 | `encoders`       | sensor_msgs/JointState                  | angles of the rear wheels by their encoders          |
-| `encoder_counts` | std_msgs/Int64MultiArray                | the same in counts, left and right; no exact encoder |
+| `encoder_counts` | std_msgs/Int64MultiArray                | the same angles in counts; exact encoders have none  |
 
-Times are simulated, from zero. A sample of a sensor is logged when it arrives, and its header has the time when it was
-taken. Covariances of sensors are those of their white noise; in those of the estimate and of a fix, which are planar,
-the entries of z, roll and pitch are 0. The gyro measures θ̇ alone and the accelerometer two axes: the variances of the
-other axes are `UNMEASURED`, and z shows gravity. Each `imu` message is a sample of the gyro with the last one of the
-accelerometer; the covariance of its orientation begins with −1, which says that there is none. In `joint_states`, wheel
-angles are integrated by the trapezoid rule, and the fork's rate is a central difference.
+Times are simulated and start at zero. A sample of a sensor is logged when it arrives, and its header has the time when
+it was taken. Covariances of sensors are those of their white noise; in those of the estimate and of a fix, which are
+planar, the entries of z, roll and pitch are 0. The gyro measures θ̇ alone and the accelerometer two axes: the variances
+of the other axes are `UNMEASURED`, and the z axis of the accelerometer reads gravity. Each `imu` message is a sample of
+the gyro with the last one of the accelerometer; the covariance of its orientation begins with −1, which says that there
+is none. In `joint_states`, wheel angles are integrated by the trapezoid rule, and the fork's rate is a central
+difference.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ Message = dict[str, Any]
 
 UNMEASURED = 1e6  # variance of what a sensor does not measure, as in diff_drive_controller of ros2_controllers
 
-# The definitions of ROS 2, without their comments.
+# Message definitions of ROS 2, without their comments.
 TIME = "int32 sec\nuint32 nanosec"
 HEADER = "builtin_interfaces/Time stamp\nstring frame_id"
 VECTOR = "float64 x\nfloat64 y\nfloat64 z"
@@ -117,8 +118,8 @@ def export(
         to: Format of the file.
         out: The file to write.
         run: Number of the run to write; by default all runs.
-        scenario: Returns the scenario of a run from its number, which `mcap` needs for the sensors; by default it is
-            that which the result holds. The dataset of a sweep holds none.
+        scenario: Returns the scenario of a run from its number, which `mcap` needs for the sensors; by default the
+            scenario in the result is used. The dataset of a sweep holds none.
 
     Returns:
         The number of runs that were written.
@@ -156,7 +157,7 @@ def export(
 
 
 def _runs(whole: xr.Dataset) -> Iterator[tuple[int, Columns]]:
-    """Number and signals of each run, with their times, until it ended; one run is in memory at a time."""
+    """Yields number and signals of each run, with their times, until it ended; only one run at a time is in memory."""
     for k, number in enumerate(whole["run"].values):
         with reading(f"signals of run {int(number)}"):
             one = whole.isel(run=k).load()
@@ -169,7 +170,7 @@ def _unit(name: str) -> str:
 
 
 def _table(whole: xr.Dataset) -> Iterator[pa.Table]:
-    """A table for each run, with units and meanings in its fields' metadata, scenarios and versions in its schema's."""
+    """Yields a table for each run, with units and meanings in its fields, and scenarios and versions in its schema."""
     numbered = whole.sizes["run"] > 1
     about = {name: str(value) for name, value in whole.attrs.items()}
     for number, columns in _runs(whole):
@@ -214,7 +215,7 @@ def _npz(whole: xr.Dataset, path: Path) -> None:
 
 
 def _definition(name: str) -> str:
-    """The definition of a message followed by those of its parts, as MCAP requires."""
+    """Returns the definition of a message followed by those of its parts, as MCAP requires."""
     own, parts = MESSAGES[name]
     parts = parts | {"std_msgs/Header": HEADER, "builtin_interfaces/Time": TIME}
     return own + "".join(f"\n{'=' * 80}\nMSG: {part}\n{text}" for part, text in parts.items())
@@ -225,7 +226,7 @@ def _mcap(scenario: Callable[[int], Scenario] | None, whole: xr.Dataset, path: P
         from mcap_ros2.writer import Writer
     except ImportError:
         raise InputError("to: mcap needs a library, pip install 'mrctl[mcap]'") from None
-    require(whole, [name for name in SIGNALS if name not in SINCE_0_4_2])  # of which no message has any
+    require(whole, [name for name in SIGNALS if name not in SINCE_0_4_2])  # no message needs these
     if scenario is None and "scenarios" not in whole.attrs:
         raise InputError("result: does not hold its scenarios; mrctl export STORE --to mcap finds those of a sweep")
     held = dict(zip(whole["run"].values.tolist(), scenarios_of(whole), strict=True)) if scenario is None else {}
@@ -241,7 +242,7 @@ def _mcap(scenario: Callable[[int], Scenario] | None, whole: xr.Dataset, path: P
 
 
 def _messages(columns: Columns, scenario: Scenario) -> Iterator[tuple[int, str, str, Message]]:
-    """When a message is logged in ns, its topic, its type and itself, for all samples of a run."""
+    """Yields the log time in ns, topic, type and content of each message of a run."""
     t, sensing, period = columns["time"], scenario.sensing, scenario.control_period
     turned = {side: cumulative_trapezoid(columns[f"wheel_rate_{side}"], t, initial=0) for side in ("left", "right")}
     c = {name: values.tolist() for name, values in columns.items()}
@@ -313,7 +314,7 @@ def _messages(columns: Columns, scenario: Scenario) -> Iterator[tuple[int, str, 
 
 
 def _taken(scenario: Scenario, sensor: str, t: NDArray) -> NDArray[np.int64]:
-    """When the sample of a sensor was taken that had arrived last at each time `t`, in ns."""
+    """Returns when the last sample of a sensor that had arrived at each time `t` (s) was taken, in ns."""
     sensing, period = scenario.sensing, scenario.control_period
     every, latency = (sensing.periods(f"{sensor}_{name}", period) for name in ("rate", "latency"))
     ticks = np.maximum(np.rint(t / period).astype(int) - latency, 0)
@@ -330,7 +331,7 @@ def _xyz(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Message:
 
 
 def _heading(theta: float) -> Message:
-    """A rotation about z as a quaternion."""
+    """Returns the quaternion of a rotation about z."""
     return {"x": 0.0, "y": 0.0, "z": float(np.sin(theta / 2)), "w": float(np.cos(theta / 2))}
 
 
@@ -339,7 +340,7 @@ def _posture(x: float, y: float, theta: float, covariance: list[float]) -> Messa
 
 
 def _planar(x: float, xy: float, y: float, turn: float) -> list[float]:
-    """A covariance of x, y, z, roll, pitch and yaw, 6 by 6, of which the entries of the plane are given."""
+    """Returns the covariance of x, y, z, roll, pitch and yaw, 6 by 6, row by row, zero but for the planar entries."""
     found = np.zeros((6, 6))
     found[0, :2], found[1, :2], found[5, 5] = (x, xy), (xy, y), turn
     return found.ravel().tolist()

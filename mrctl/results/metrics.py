@@ -40,10 +40,10 @@ METRICS: dict[str, tuple[str, str]] = {
     "saturation_time": ("s", "time in saturation"),
     "energy": ("J", "electrical energy"),
     "weight_norm": ("1", "norm of the learner's weights at the end of the lap"),
-    "guard_actions": ("1", "times the guard on the learner stepped in, or took a stronger measure"),
+    "guard_actions": ("1", "times the guard on the learner stepped in"),
     "excitation": ("1", "smallest eigenvalue of the Gram matrix of the physical features at the commanded motion"),
 }
-"""Name of a metric -> (unit, description)."""
+"""Unit and description of each metric, by name."""
 
 ROUNDING = 1e-10  # singular values of the features below this share of the largest are due to rounding
 PER_RUN = ("label", "feedforward", "steering", "seed", "lap_time")
@@ -64,7 +64,7 @@ class Laps(NamedTuple):
 
 
 def as_runs(result: xr.Dataset) -> xr.Dataset:
-    """The dataset with a `run` dimension and per-run coordinates, also for a single run that was squeezed."""
+    """Returns the dataset with a `run` dimension and per-run coordinates, also for a single run that was squeezed."""
     if "run" not in result.dims:
         single = result.expand_dims("run" if "run" in result.coords else {"run": [0]})
         result = single.assign_coords(
@@ -76,7 +76,7 @@ def as_runs(result: xr.Dataset) -> xr.Dataset:
 
 
 def control_period(result: xr.Dataset) -> float:
-    """Time between the samples of a result in s.
+    """Returns the time between the samples of a result in s.
 
     Raises:
         InputError: The result has neither two samples nor the attribute `control_period`.
@@ -115,18 +115,18 @@ def laps_of(run: xr.Dataset) -> Laps:
 
 
 def _failed(run: xr.Dataset) -> bool:
-    """Whether one run failed."""
+    """Tells whether one run failed."""
     return bool(run["failed"]) if "failed" in run else not bool(np.isfinite(run["x"]).all())
 
 
 def _end(run: xr.Dataset) -> int:
-    """Number of samples of one run: the NaN that pad a shorter run are not counted, those after a failure are."""
+    """Returns the number of samples of one run: NaN that pad a shorter run do not count, NaN after a failure do."""
     alive = np.flatnonzero(np.isfinite(run["x"].values))
     return len(run["time"]) if _failed(run) or not len(alive) else int(alive[-1]) + 1
 
 
 def per_lap(result: xr.Dataset) -> xr.Dataset:
-    """The metrics of every lap of every run.
+    """Computes the metrics of every lap of every run.
 
     Args:
         result: What `simulate` returns, variables (run, time), or one run of it.
@@ -184,7 +184,7 @@ def lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float) 
 
     Args:
         data: Signals of the lap by name, `(rows, n)`.
-        steps: The voltages and `guard`, with the sample before the lap if there is one.
+        steps: The signals of voltages and `guard`, preceded by the sample before the lap if there is one.
         period: Seconds between the samples.
 
     Returns:
@@ -216,7 +216,7 @@ def lap_metrics(data: dict[str, Array], steps: dict[str, Array], period: float) 
 
 
 def excitation(command: Array, period: float, half_track: Array, scale: Array) -> Array:
-    """Smallest eigenvalue of the Gram matrix XᵀX/n of the 8 physical features X `(n, 8)` over n samples of motion.
+    """Computes the smallest eigenvalue of the Gram matrix XᵀX/n of the 8 physical features X `(n, 8)` of n samples.
 
     It says how well the motion determines the least excited combination of coefficients: where it is zero, the motion
     says nothing about that combination (persistency of excitation; Ioannou and Sun 1996, section 4.3).
@@ -242,12 +242,12 @@ def excitation(command: Array, period: float, half_track: Array, scale: Array) -
 
 
 def _rms(signal: Array) -> Array:
-    """Root of the mean square along the last axis."""
+    """Returns the root mean square along the last axis."""
     return np.sqrt(np.mean(np.square(signal), axis=-1))
 
 
 def guard_events(result: xr.Dataset) -> pd.DataFrame:
-    """The actions of the guard on the learner, run by run in order of time.
+    """Lists the actions of the guard on the learner, run by run in order of time.
 
     Args:
         result: What `simulate` returns, or one run of it.
@@ -265,14 +265,14 @@ def guard_events(result: xr.Dataset) -> pd.DataFrame:
         action, reason = (np.nan_to_num(runs[name].values[row]).astype(int) for name in ("guard", "guard_reason"))
         for k in np.flatnonzero(np.diff(action, prepend=0)):
             if np.isnan(runs["guard"].values[row, k]):
-                continue  # a run that failed has no guard
+                continue  # the NaN after a failure are no actions
             name = GUARD_ACTIONS[action[k]] if action[k] != NONE else "resume"
             rows.append((number, float(runs["time"][k]), name, REASONS[reason[k]]))
     return pd.DataFrame(rows, columns=["run", "time", "action", "reason"])
 
 
 def laps_to_converge(laps: xr.Dataset, metric: str, factor: float = 1.2) -> xr.DataArray:
-    """The first lap from which on the metric stays within `factor` of its value in the run's last lap.
+    """Finds the first lap from which on the metric stays within `factor` times its value in the run's last lap.
 
     Args:
         laps: What `per_lap` returns.
@@ -280,7 +280,7 @@ def laps_to_converge(laps: xr.Dataset, metric: str, factor: float = 1.2) -> xr.D
         factor: Largest ratio to the final value that counts as converged, at least 1.
 
     Returns:
-        The lap's number (run,), from 1; NaN for a run that failed.
+        Number of the lap, counted from 1, `(run,)`; NaN for a run that failed.
 
     Raises:
         InputError: There is no such metric, or the factor is below 1.
@@ -299,7 +299,7 @@ def laps_to_converge(laps: xr.Dataset, metric: str, factor: float = 1.2) -> xr.D
 
 
 def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor: float = 1.2) -> xr.DataArray:
-    """Laps after a change until the metric of whole laps is back, to stay, within `factor` of the lap before it.
+    """Counts the laps after a change until the metric is back, to stay, within `factor` times its value before it.
 
     Args:
         laps: What `per_lap` returns.
@@ -309,7 +309,7 @@ def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor
         factor: Largest ratio to the lap before the change that counts as recovered.
 
     Returns:
-        Laps (run,): 0 if the lap of the change itself is within, infinite if the last one is not, NaN if it failed.
+        Number of laps `(run,)`: 0 if no lap is outside, infinite if the last lap is, NaN if the run failed.
 
     Raises:
         InputError: There is no such metric, or no such lap.
@@ -327,10 +327,10 @@ def recovery_laps(laps: xr.Dataset, metric: str, change: int, until: int, factor
 
 
 def over_laps(laps: xr.Dataset, metric: str) -> xr.DataArray:
-    """Returns a root mean square over all laps of each run, such as that of `position_rmse`; NaN if the run failed.
+    """Returns an RMS metric, such as `position_rmse`, over all laps of each run together; NaN if the run failed.
 
     Args:
-        laps: What `per_lap` returns; all laps of a run last as long.
+        laps: What `per_lap` returns; all laps of a run have the same duration.
         metric: Name of an RMS metric.
 
     Raises:
@@ -347,7 +347,7 @@ def over_laps(laps: xr.Dataset, metric: str) -> xr.DataArray:
 
 
 def excess(laps: xr.Dataset, metric: str, change: int, until: int) -> xr.DataArray:
-    """Returns the integral over time of the error beyond the settled one, from a change on: T Σ (e_k − e_until).
+    """Returns the error above its settled value, integrated over time from a change on: T Σ (e_k − e_until).
 
     Args:
         laps: What `per_lap` returns, with the lap time T.
@@ -356,7 +356,7 @@ def excess(laps: xr.Dataset, metric: str, change: int, until: int) -> xr.DataArr
         until: Number of the lap whose error counts as settled.
 
     Returns:
-        Integral in the metric's unit times s, (run,); NaN if the run failed before.
+        Integral in the metric's unit times s, `(run,)`; NaN if the run failed by then.
 
     Raises:
         InputError: There is no such metric or lap.
@@ -371,7 +371,7 @@ def excess(laps: xr.Dataset, metric: str, change: int, until: int) -> xr.DataArr
 
 
 def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
-    """A row for each run: its description, whether it failed, and its metrics in one lap.
+    """Makes a table with a row for each run: its description, whether it failed, and its metrics in one lap.
 
     Args:
         result: What `simulate` or `per_lap` returns.

@@ -1,7 +1,7 @@
-"""Figures of a result for print: they are 88 mm or 180 mm wide, with Okabe and Ito's colours and units on every axis.
+"""Figures of a result for print, 88 mm or 180 mm wide, with Okabe and Ito's (2008) colours and units on every axis.
 
 Each function returns a matplotlib `Figure` and shows nothing. Results may hold several runs or one that was squeezed;
-runs with the same `label` share a colour and one entry in the legend, which counts those that failed. A cross marks
+runs with the same `label` share a colour and one entry in the legend, which says how many of them failed. A cross marks
 where a run failed. `window` is a pair of times in s; `lap` is the number of a lap, counted from 1, or from −1 backwards
 from the end of the run.
 """
@@ -90,7 +90,7 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def _literal(value: Any) -> Any:  # noqa: ANN401
-    """Returns a result with labels in which a dollar begins no formula; other values stay as they are."""
+    """Escapes the dollars in the labels of a result, so that none begins a formula; returns other values unchanged."""
     if not isinstance(value, xr.Dataset) or "label" not in value:
         return value
     labels = np.array([str(label).replace("$", r"\$") for label in value["label"].values.flat], object)
@@ -124,7 +124,7 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
 
 @styled
 def path(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
-    """The path of P over that of the reference; a dot marks the start. Obstacles that stand still are grey."""
+    """Draws the path of P over that of the reference; a dot marks the start. Obstacles that stand still are grey."""
     figure, (axes,) = _figure(COLUMN, COLUMN * 0.95)
     for shape in scenarios_of(as_runs(result))[0].obstacles.shapes if "clearance" in result else ():
         if shape.course is None:
@@ -151,7 +151,7 @@ def velocities(
     window: tuple[float, float] | None = None,
     lap: int | None = None,
 ) -> Figure:
-    """Linear and rotation velocity over time, or one of them, with the original reference (the paper's figure 4)."""
+    """Draws linear and rotation velocity, or one of them, over time with the original reference (paper's figure 4)."""
     figure, axes = _figure(COLUMN, (0.1 + 0.4 * len(signals)) * COLUMN, rows=len(signals))
     curves = _curves(result, window, lap)
     texts = {"v": r"$V_{AV}$ (m/s)", "omega": r"$\dot\theta$ (rad/s)"}
@@ -164,7 +164,7 @@ def velocities(
 
 @styled
 def errors(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
-    """Longitudinal, lateral and heading error over time."""
+    """Draws longitudinal, lateral and heading error over time."""
     return _errors(_curves(result, window, lap))
 
 
@@ -176,14 +176,14 @@ def compare_errors(
     window: tuple[float, float] | None = None,
     lap: int | None = None,
 ) -> Figure:
-    """Tracking errors of two controllers in the same axes, with their RMS values (the paper's figure 5).
+    """Draws tracking errors of two controllers in the same axes, with their RMS values (the paper's figure 5).
 
     Args:
         result_pid: Runs of the first controller, in the paper conventional PID.
         result_nn: Runs of the second controller, in the paper PID with neural feedforward.
         labels: Names of the two controllers in the legend.
         window: Times to show in s.
-        lap: Lap to show instead of a window.
+        lap: Number of the lap to show instead of a window.
     """
     curves = []
     colours = colours_of(("none", "fel"))
@@ -203,12 +203,12 @@ def compare_errors(
 
 @styled
 def voltages(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
-    """Feedback, feedforward and total voltage of each wheel over time, in a column for each run."""
+    """Draws feedback, feedforward and total voltage of each wheel over time, in a column for each run."""
     curves = _curves(result, window, lap)
     count = len(curves)
     width = COLUMN if count == 1 else max(PAGE, 60 / 25.4 * count)
     figure, axes = _figure(width, 0.95 * COLUMN, rows=2, columns=count, sharey=True)
-    # The total lies wide and pale under whichever part makes it up.
+    # The total is wide and pale, and lies under its parts.
     parts = (("voltage", "0.75", 3.0), ("feedback", COLOURS[1], 1.0), ("feedforward", COLOURS[2], 1.0))
     for column, (data, label, _) in enumerate(curves):
         for row, wheel in enumerate(("left", "right")):
@@ -232,7 +232,7 @@ def voltages(result: xr.Dataset, window: tuple[float, float] | None = None, lap:
 def feedforward_outputs(
     result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None
 ) -> Figure:
-    """Feedforward voltage of the left and the right motor over time (the paper's figure 6)."""
+    """Draws the feedforward voltage of the left and the right motor over time (the paper's figure 6)."""
     figure, axes = _figure(COLUMN, 0.9 * COLUMN, rows=2, sharey=True)
     curves = _curves(result, window, lap)
     for one, wheel in zip(axes, ("left", "right"), strict=True):
@@ -243,7 +243,7 @@ def feedforward_outputs(
 
 @styled
 def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omega_rmse")) -> Figure:
-    """Metrics lap by lap on a log axis, with a thin line for each run and a thick one for the mean of each label.
+    """Draws metrics lap by lap on a log axis, with a thin line for each run and a thick one for the mean of each label.
 
     Args:
         result: What `simulate` or `metrics.per_lap` returns.
@@ -286,7 +286,7 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
 
 @styled
 def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence[int] = ()) -> Figure:
-    """A metric lap by lap on a log axis, in a panel for each case: mean and range of the runs that share a label.
+    """Draws a metric lap by lap on a log axis, in a panel for each case: mean and range of the runs that share a label.
 
     Args:
         cases: Datasets as `metrics.per_lap` returns them, by title.
@@ -332,7 +332,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
 
 @styled
 def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
-    """The share of runs below each value, on a log axis; a run that failed, which is not finite, is below none.
+    """Draws the share of runs below each value, on a log axis; a failed run, whose value is not finite, is below none.
 
     Args:
         samples: A positive number for each run, by name.
@@ -351,13 +351,13 @@ def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
 
 @styled
 def excitation(result: xr.Dataset, span: float = 4.0, motion: str = "commanded", run: int = 0) -> Figure:
-    """Persistency of excitation over time on log axes: the least eigenvalue of every run, and the features of one.
+    """Draws persistency of excitation over time on log axes: the least eigenvalue of each run, and the features of one.
 
     Args:
         result: What `simulate` returns, or one run of it.
         span: Length of the sliding window in s.
         motion: As for `mrctl.results.excitation.excitation`.
-        run: Index of the run whose features have a line each.
+        run: Index of the run whose features are drawn, one line each.
     """
     found = exciting.excitation(result, span, motion)
     figure, axes = _figure(COLUMN, 1.2 * COLUMN, rows=2)
@@ -368,7 +368,7 @@ def excitation(result: xr.Dataset, span: float = 4.0, motion: str = "commanded",
         axes[1].plot(found["time"].values, signal, label=PARAMETERS[order], **_line(order))
     axes[1].set(xlabel="time (s)", ylabel="excitation alone (1)")
     for one in axes:
-        if any((np.asarray(line.get_ydata(), float) > 0).any() for line in one.lines):  # a circle excites nothing
+        if any((np.asarray(line.get_ydata(), float) > 0).any() for line in one.lines):  # on a circle every value is 0
             one.set_yscale("log", nonpositive="mask")
     axes[1].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
     _legend(figure, curves)
@@ -379,11 +379,11 @@ PARAMETERS = (
     "$V$", r"$\dot\theta$", r"$\dot V$", r"$\ddot\theta$", r"$V\dot\theta$", r"$\dot\theta^2$", r"sgn $V_l$",
     r"sgn $V_r$",
 )  # fmt: skip
-"""The 8 physical features in figures."""
+"""Symbols of the 8 physical features in figures."""
 
 
 class InverseMap(NamedTuple):
-    """The output of a feedforward in steady motion, beside the true inverse dynamics."""
+    """The output of a feedforward in steady motion, with the true inverse dynamics to compare."""
 
     v: np.ndarray
     """Speeds in m/s (n,)."""
@@ -392,14 +392,14 @@ class InverseMap(NamedTuple):
     learned: np.ndarray
     """U_Σ and U_Δ in V (m, n, 2)."""
     true: np.ndarray
-    """The same of the true inverse dynamics."""
+    """The same for the true inverse dynamics."""
     path: np.ndarray
-    """Where it was trained: commanded twists (T, 2)."""
+    """Commanded twists of the lap in which it was trained last, in m/s and rad/s, (T, 2)."""
 
 
 @styled
 def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
-    """Heat maps of the inverse dynamics over the twist, in a row for each learner: true, learned, and the error, in V.
+    """Draws heat maps of the inverse dynamics over the twist, a row for each learner: true, learned, and error, in V.
 
     The white line shows where the robot drove while it learned.
 
@@ -435,20 +435,20 @@ def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
 
 
 def _line(order: int) -> dict[str, Any]:
-    """Colour and dashes of the label in a place of the legend; colours repeat with other dashes."""
+    """Returns colour and dashes of the label at a position in the legend; colours repeat with other dashes."""
     again, colour = divmod(order, len(COLOURS))
     return {"color": COLOURS[colour], "ls": ("-", "--", ":")[again % 3]}
 
 
 def _figure(width: float, height: float, rows: int = 1, columns: int = 1, sharey: bool = False) -> tuple[Figure, list]:
-    """A figure and its axes, row by row; made without pyplot, it need not be closed and a notebook shows it once."""
+    """Makes a figure and its axes, row by row; without pyplot it need not be closed, and a notebook shows it once."""
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots(rows, columns, sharex=rows > 1, sharey=sharey, squeeze=False)
     return figure, list(axes.flat)
 
 
 def _curves(result: xr.Dataset, window: tuple[float, float] | None, lap: int | None) -> list[Curve]:
-    """The runs of a result, cut to a window or a lap, with their labels and colours."""
+    """Returns the runs of a result, cut to a window or a lap, with their labels and colours."""
     if window is not None and lap is not None:
         raise InputError("window: give a window or a lap, not both")
     runs = as_runs(result)
@@ -466,7 +466,7 @@ def _curves(result: xr.Dataset, window: tuple[float, float] | None, lap: int | N
 
 
 def _colours(runs: xr.Dataset) -> dict[str, str]:
-    """Colour of each label, that of the controller of its first run where no other label has it."""
+    """Returns the colour of each label: that of its first run's controller, unless an earlier label has it."""
     labels = [str(label) for label in runs["label"].values]
     controllers = runs["feedforward"].values if "feedforward" in runs.coords else labels
     first = dict(zip(reversed(labels), reversed([str(name) for name in controllers]), strict=True))
@@ -475,7 +475,7 @@ def _colours(runs: xr.Dataset) -> dict[str, str]:
 
 
 def _cut(run: xr.Dataset, window: tuple[float, float] | None, lap: int | None) -> xr.Dataset:
-    """The samples of one run within a window or a lap."""
+    """Returns the samples of one run within a window or a lap."""
     if window is not None:
         start, end = window
         if not start < end:
@@ -504,7 +504,7 @@ def _signals(axes: Axes, curves: Iterable[Curve], name: str, label: str) -> None
 
 
 def _references(axes: Axes, curves: Iterable[Curve], x: str, y: str) -> None:
-    """Draws the references; one that runs share is drawn once."""
+    """Draws the references; one that several runs share is drawn once."""
     seen = set()
     for data, _, _ in curves:
         points = np.column_stack([data[x].values, data[y].values])
@@ -522,14 +522,14 @@ def _cross(axes: Axes, data: xr.Dataset, x: np.ndarray, y: np.ndarray) -> None:
 
 
 def _counted(label: str, failed: int, count: int) -> str:
-    """A label that says how many of its runs failed."""
+    """Returns a label that says how many of its runs failed."""
     if not failed:
         return label
     return f"{label} (failed)" if count == 1 else f"{label} ({failed} of {count} failed)"
 
 
 def _legend(figure: Figure, curves: Sequence[Curve], reference: bool = False) -> None:
-    """Draws an entry for each label above the axes, with the number of failures."""
+    """Draws a legend above the axes, with an entry for each label and its number of failures."""
     entries: dict[str, list[Curve]] = {}
     for curve in curves:
         entries.setdefault(curve.label, []).append(curve)
@@ -582,7 +582,7 @@ def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> No
 
 
 def _canvas(width: float, height: float, limits: tuple[float, float, float, float]) -> tuple[Figure, Axes]:
-    """An empty sheet with equal axes and the given limits (x0, x1, y0, y1)."""
+    """Makes an empty figure with equal axes and the given limits (x0, x1, y0, y1); its size is in inches."""
     figure = Figure(figsize=(width, height))
     axes = figure.add_axes((0, 0, 1, 1))
     axes.set(xlim=limits[:2], ylim=limits[2:], aspect="equal")
@@ -591,14 +591,14 @@ def _canvas(width: float, height: float, limits: tuple[float, float, float, floa
 
 
 def _arrow(axes: Axes, start: Point, end: Point, style: str = "-|>", **options: object) -> None:
-    """An arrow between two points."""
+    """Draws an arrow between two points."""
     look: dict[str, Any] = {"mutation_scale": 8, "lw": 0.8, "color": "black", "shrinkA": 0, "shrinkB": 0, **options}
     axes.add_patch(FancyArrowPatch((start[0], start[1]), (end[0], end[1]), arrowstyle=style, **look))
 
 
 @styled
 def posture_definition() -> Figure:
-    """Posture of the car-like robot in the world frame, drawn (the paper's figure 2)."""
+    """Draws the definition of the car-like robot's posture in the world frame (the paper's figure 2)."""
     figure, axes = _canvas(COLUMN, 0.82 * COLUMN, (-0.75, 6.35, -0.7, 5.122))
     theta, phi, wheelbase, half_track = np.deg2rad(28), np.deg2rad(30), 2.4, 0.8
     p = np.array([1.9, 1.75])
@@ -674,7 +674,7 @@ def posture_definition() -> Figure:
 
 @styled
 def control_structure() -> Figure:
-    """The two-level hierarchy of motion and velocity control, drawn (the paper's figure 3)."""
+    """Draws the two-level hierarchy of motion and velocity control (the paper's figure 3)."""
     figure, axes = _canvas(PAGE, PAGE * 82 / 180, (0, 180, 2, 84))  # data in mm
     middle, top = 40, 66
 
@@ -698,7 +698,7 @@ def control_structure() -> Figure:
         axes.text(x, y, string, **look)
 
     def wire(*points: tuple[float, float], **options: object) -> None:
-        """A line through the points, with an arrow head at its end."""
+        """Draws a line through the points, with an arrow head at its end."""
         xs, ys = zip(*points, strict=True)
         look: dict[str, Any] = {"color": "black", "lw": 0.9, **options}
         axes.plot(xs, ys, solid_joinstyle="miter", zorder=2, **look)

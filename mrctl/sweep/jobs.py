@@ -66,21 +66,22 @@ def run(
         workers: Number of processes on this machine, one core each; by default the number of cores.
         scheduler: Address of a Dask scheduler to use instead.
         progress: Whether to show a progress bar.
-        work: Function that a worker calls for a job; by default `compute`.
+        work: Function that a worker calls to compute a job; by default `compute`.
 
     Raises:
-        InputError: The sweep is bad; the folder belongs to another sweep or version of mrctl, is in use or cannot be
+        InputError: The sweep is invalid; the folder belongs to another sweep or version of mrctl, is in use or cannot
+        be
             written; or no scheduler answers.
     """
     if workers is not None and (scheduler or workers < 1):
         raise InputError("workers: not together with a scheduler" if scheduler else f"workers: {workers} is below 1")
     if scheduler is not None and not re.fullmatch(r"\w+://.+:\d+", scheduler):
         raise InputError(f"scheduler: {scheduler!r} is no address such as tcp://127.0.0.1:8786")
-    if sweep.controller:  # so that the store finds its files from every folder
+    if sweep.controller:  # absolute, so that the user's files are found from every folder
         sweep = sweep.model_copy(update={"controller": user_files.absolute(sweep.controller)})
     work, path = work or compute, Path(out).absolute()
     try:
-        manifest = _manifest(sweep)  # first, so that a sweep that is refused leaves nothing behind
+        manifest = _manifest(sweep)  # first, so that a refused sweep leaves nothing behind
         Store.prepare(path)
         with Store.locked(path):
             store = Store.begin(path, manifest)
@@ -104,7 +105,10 @@ def run(
 
 
 def _drive(store: Store, pending: Sequence[int], pool: Pool, progress: bool) -> dict[int, str]:
-    """Has jobs computed. One that kills its worker or raises is tried again after the others, alone, then set aside."""
+    """Lets the pool compute jobs; returns why some were set aside, by job.
+
+    A job that kills its worker or raises an error is tried again after the others, alone, before it is set aside.
+    """
     fresh, again = deque(pending), deque[int]()
     tries, aside, flying = Counter[int](), dict[int, str](), 0
     kept = store.size - sum(len(store.runs(job)) for job in pending)
@@ -139,12 +143,12 @@ def _drive(store: Store, pending: Sequence[int], pool: Pool, progress: bool) -> 
 
 
 def _failed(tables: Iterable[Path]) -> int:
-    """Number of runs that failed."""
+    """Counts the runs in tables that failed."""
     return sum(pq.read_table(table, columns=["failed"])["failed"].to_numpy().sum() for table in tables)
 
 
 def _manifest(sweep: Sweep) -> dict[str, Any]:
-    """The description that a store and a sweep must agree on.
+    """Describes a sweep; a store can only continue a sweep with the same description.
 
     Raises:
         InputError: A world does not compile, or the robot cannot follow the reference.
@@ -154,7 +158,7 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
     for scenario in filter(None, map(sweep.valid, range(min(sweep.size, TRIED)))):
         try:
             Simulation([scenario])
-        except InputError as error:  # what was drawn for one run says nothing about the others
+        except InputError as error:  # the draws of one run say nothing about the others
             refusals.append(error)
             continue
         if sweep.controller:
@@ -177,7 +181,7 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
 
 
 def _models(sweep: Sweep) -> dict[str, str]:
-    """Digests of the compiled worlds with their robots, and of the files of the user's stages."""
+    """Returns digests of the compiled worlds with their robots, and of the files of the user's stages, by name."""
     worlds = {
         ", ".join(filter(None, (world, steering))) + (f", {robot.path}" if robot != CAR else ""): mjcf.digest(
             mjcf.load(world, steering, robot=robot)
@@ -193,7 +197,7 @@ def compute(path: str, job: int, drive: Callable[..., xr.Dataset] = simulate) ->
     Args:
         path: Folder of the store.
         job: Number of the job.
-        drive: What drives scenarios, with the arguments and the result of `simulate`.
+        drive: Function that drives scenarios, with the arguments and the result of `simulate`.
     """
     try:
         store = Store(path)
@@ -211,7 +215,7 @@ def compute(path: str, job: int, drive: Callable[..., xr.Dataset] = simulate) ->
 
 @lru_cache(1)
 def _agreed(manifest: str) -> Sweep:
-    """The sweep of a store.
+    """Returns the sweep of a store, after a check that this worker computes the same.
 
     Raises:
         InputError: This worker has other versions or other worlds than the process that began the store.
@@ -230,7 +234,7 @@ def _agreed(manifest: str) -> Sweep:
 def _compute(
     sweep: Sweep, runs: Sequence[int], samples: int, drive: Callable[..., xr.Dataset] = simulate
 ) -> tuple[list[dict[str, Any]], NDArray | None]:
-    """Rows of the table, and signals `(runs, samples, signals)` if the store keeps them."""
+    """Drives runs; returns their rows of the table, and signals `(runs, samples, signals)` if the store keeps them."""
     rows: dict[int, dict[str, Any]] = {}
     signals = np.full((len(runs), samples, len(SIGNALS)), np.nan) if samples else None
     batches: dict[float, dict[int, Scenario]] = {}
@@ -238,7 +242,7 @@ def _compute(
         try:
             scenario = sweep.scenario(run)
             batches.setdefault(scenario.control_period, {})[run] = scenario
-        except InputError as error:  # a value that was drawn is out of range
+        except InputError as error:  # a drawn value is out of range
             rows[run] = _row(sweep, run, str(error).removeprefix(f"run {run}: "))
     stages: Stages = user_files.load(sweep.controller) if sweep.controller else {}
     queue = list(batches.values())
@@ -269,7 +273,7 @@ def _compute(
 
 
 def _row(sweep: Sweep, run: int, failure: str = "", **found: object) -> dict[str, Any]:
-    """A row of the table: the description of the run and its metrics, which are NaN unless they are `found`."""
+    """Makes a row of the table: the description of a run, and its metrics, which are NaN unless they are `found`."""
     values, valid = sweep.values(run), sweep.valid(run)
     scenario = valid or sweep.base
     row: dict[str, Any] = {name: np.nan for name in (*metrics.METRICS, "lap_time")}
@@ -289,16 +293,16 @@ def _table(sweep: Sweep, rows: Sequence[dict[str, Any]]) -> pa.Table:
 
 
 class Repeat(NamedTuple):
-    """The comparison of a run that was computed again with the store."""
+    """The comparison of a repeated run with the store."""
 
     verdict: str
-    """`bit-identical`, `within tolerance`, or `departs`, and where; then the versions of mrctl, where they differ."""
+    """`bit-identical`, `within tolerance`, or `departs` and where, with the versions of mrctl if they differ."""
     same: bool
     """Whether the run agrees with the store."""
 
 
 def scenario_of(out: str | Path, run: int) -> Scenario:
-    """The scenario of one run of a stored sweep.
+    """Returns the scenario of one run of a stored sweep.
 
     Raises:
         InputError: There is no store or no such run, a value that was drawn for it is out of range, or another version
@@ -308,20 +312,20 @@ def scenario_of(out: str | Path, run: int) -> Scenario:
 
 
 def stages_of(out: str | Path, code: bool = True) -> Stages:
-    """The user's stages that a stored sweep was driven with, as arguments of `simulate`; says which files it runs.
+    """Loads the user's stages of a stored sweep, as arguments of `simulate`; names on stderr the files that it runs.
 
     Args:
         out: The store.
         code: Whether the store may run the Python files that it names.
 
     Raises:
-        InputError: It names some and may not run them, or they are missing or have changed since.
+        InputError: The store names files that it may not run, or that are missing or have changed since.
     """
     store = Store(out)
     if not (controller := store.manifest["sweep"].get("controller")):
         return {}
     if not code:
-        raise InputError(f"code: {out} names {printable(controller)}, which --no-code forbids to run")
+        raise InputError(f"code: {out} names {printable(controller)}, which --no-code does not allow")
     if user_files.digest(controller) != store.manifest["models"].get(controller):
         raise InputError(f"controller: {printable(controller)} is not the file that {out} was computed with")
     print(f"mrctl: runs {printable(controller)}, which {out} names", file=sys.stderr)
@@ -329,15 +333,15 @@ def stages_of(out: str | Path, code: bool = True) -> Stages:
 
 
 def _sweep(store: Store) -> Sweep:
-    """The sweep of a store that any version of mrctl may have written."""
+    """Returns the sweep of a store that any version of mrctl may have written."""
     return Sweep.from_dict(store.manifest["sweep"], f"{store.path} (written by mrctl {store.writer})")
 
 
 def repeat(out: str | Path, run: int) -> Repeat:
-    """Runs one run of a sweep alone and compares it with what the store has.
+    """Repeats one run of a sweep alone and compares it with the store.
 
     Raises:
-        InputError: As `scenario_of`, or the run is not done yet.
+        InputError: As `scenario_of`, or the run is not done yet or was set aside.
     """
     store = Store(out)
     sweep = _sweep(store)

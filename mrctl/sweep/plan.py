@@ -1,10 +1,10 @@
 """Sweeps as data: turns a sweep file into the scenarios of its runs. `sweep.jobs` runs them, `sweep.store` keeps them.
 
-Run i is a pure function of the sweep and i. The runs are the product of the axes that list their values, in the order
-of the file, with the first axis slowest; each combination is drawn `runs` times, and the number of the draw changes
-fastest. A draw takes the seed of the scenario and the value of every distribution from a random stream of its own, so
-neither the order in which runs are computed nor the other runs of a batch change it. Combinations that differ only in
-`paired` axes share their draws.
+Run i is a pure function of the sweep and i. The runs are the Cartesian product of the axes that list their values, in
+the order of the file, with the first axis slowest; each combination is drawn `runs` times, and the number of the draw
+changes fastest. A draw takes the seed of the scenario and the value of every distribution from a random stream of its
+own, so neither the order in which runs are computed nor the other runs of a batch change it. Combinations that differ
+only in `paired` axes share their draws.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from mrctl.scenario import Scenario
 from mrctl.theory.robot import RobotFile
 
 CHUNK_BYTES = 2**27  # largest size of the signals of a job in memory
-LARGEST = 2**43  # bytes of the signals of all runs, before they are compressed
-TRIED = 20  # first runs, of which at least one must have a valid scenario
+LARGEST = 2**43  # largest size of the signals of all runs in bytes, before compression
+TRIED = 20  # number of first runs, at least one of which must have a valid scenario
 WHOLE = "scenario"  # the field of an axis whose values are tables of changes to the scenario
 
 
@@ -62,7 +62,7 @@ class Axis(Record):
     paired: bool = False
     """Whether every value gets the same seeds and the same draws, for a paired comparison."""
     zip: str = ""
-    """Name of a group of axes that change together, value by value; "" for an axis on its own."""
+    """Name of a group of axes that change together, value by value; "" for an axis that changes on its own."""
 
     @model_validator(mode="after")
     def _one_kind(self) -> Axis:
@@ -78,20 +78,20 @@ class Axis(Record):
 
     @cached_property
     def listed(self) -> tuple[Any, ...]:
-        """The values of a list or grid; a distribution has none."""
+        """Values of a list or grid; a distribution has none."""
         if self.grid is not None:
             return tuple(np.linspace(self.grid.start, self.grid.stop, self.grid.count).tolist())
         return self.values or ()
 
     @property
     def middle(self) -> float:
-        """A value in the middle of the distribution."""
+        """Mean of a normal distribution, or the middle of the range of another."""
         if self.normal is not None:
             return self.normal[0]
         return sum(self.uniform or self.loguniform or ()) / 2
 
     def draw(self, random: np.random.Generator) -> float:
-        """A number from the distribution."""
+        """Draws a number from the distribution."""
         if self.uniform is not None:
             return float(random.uniform(*self.uniform))
         if self.normal is not None:
@@ -110,7 +110,7 @@ class Axis(Record):
         return pa.string() if kinds else pa.float64()
 
     def cell(self, value: object) -> object:
-        """The value as it stands in the table of runs."""
+        """Returns a value as the table of runs holds it."""
         return json.dumps(value) if self.type == pa.string() and not isinstance(value, str) else value
 
 
@@ -120,13 +120,13 @@ class Sweep(Record):
     base: Scenario = Scenario()
     """Scenario that the runs have in common; each run has a seed of its own unless `seed` is an axis."""
     axes: tuple[Axis, ...] = ()
-    """Axes that vary. Put first those that split batches (feedforward, steering, world), for large batches are fast."""
+    """Axes that vary. Put those that split batches (feedforward, steering, world) first: large batches are fast."""
     runs: Annotated[int, Field(ge=1, le=100_000_000)] = 1
     """Number of draws of seed and distributions for each combination of the listed values."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of all draws."""
     record: Literal["metrics", "laps", "decimated", "full"] = "metrics"
-    """Record to keep. `metrics`: metrics of the last lap. `laps`: the same, and metrics of every lap as lists in the
+    """Record to keep. `metrics`: metrics of the last lap. `laps`: these, and metrics of every lap as lists in the
     table. `decimated`: metrics of the last lap and every `every`-th sample of the signals. `full`: all samples."""
     every: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Control periods between samples of a decimated record; by default 10."""
@@ -138,7 +138,7 @@ class Sweep(Record):
 
     @classmethod
     def of(cls, scenarios: Sequence[Scenario], **settings: Any) -> Self:  # noqa: ANN401
-        """A sweep whose run i is `scenarios[i]`; `settings` are fields of the sweep other than `base` and `axes`."""
+        """Makes a sweep whose run i is `scenarios[i]`; `settings` are further fields, all but `base` and `axes`."""
         default = Scenario().model_dump(mode="json")
         every = [s.model_dump(mode="json") for s in scenarios]
         changes = [{k: v for k, v in one.items() if k == "seed" or v != default[k]} for one in every]
@@ -165,7 +165,10 @@ class Sweep(Record):
         return self
 
     def _check_values(self) -> None:
-        """Checks that each listed value and each end of a range gives a valid scenario (other axes in the middle)."""
+        """Checks that each listed value and each end of a range gives a valid scenario.
+
+        The other axes are at their first listed value, or in the middle of their distribution.
+        """
         middle = {"seed": 0} | {axis.field: axis.listed[0] if axis.listed else axis.middle for axis in self.axes}
         trials = [{}]
         for group in self._dimensions:
@@ -189,7 +192,7 @@ class Sweep(Record):
 
     @cached_property
     def _shape(self) -> tuple[int, ...]:
-        """Number of values in each dimension, then of draws."""
+        """Number of values in each dimension, followed by the number of draws."""
         return (*map(self._length, self._dimensions), self.runs)
 
     def _length(self, group: list[int]) -> int:
@@ -207,12 +210,12 @@ class Sweep(Record):
 
     @property
     def stride(self) -> int:
-        """Control periods between samples that are kept."""
+        """Number of control periods between samples that are kept."""
         return self.every or 10 if self.record == "decimated" else 1
 
     @cached_property
     def samples(self) -> int:
-        """Number of samples that the store keeps of the longest run; 0 where it keeps metrics only."""
+        """Number of samples that the store keeps of the longest run; 0 if it keeps metrics only."""
         if self.record in ("metrics", "laps"):
             return 0
         ticks = self.base.ticks
@@ -221,7 +224,7 @@ class Sweep(Record):
         return -(-ticks // self.stride)
 
     def values(self, run: int) -> dict[str, Any]:
-        """The value of each axis in one run, by field, and the seed.
+        """Returns the value of each axis in one run, by field, and the seed.
 
         Raises:
             InputError: There is no such run.
@@ -243,7 +246,7 @@ class Sweep(Record):
         return values
 
     def scenario(self, run: int) -> Scenario:
-        """The scenario of one run.
+        """Returns the scenario of one run.
 
         Raises:
             InputError: There is no such run, or a value that was drawn for it is out of range.
@@ -251,7 +254,7 @@ class Sweep(Record):
         return self._assemble(self.values(run), f"run {run}")
 
     def valid(self, run: int) -> Scenario | None:
-        """The scenario of one run, or None where a value that was drawn for it is out of range."""
+        """Returns the scenario of one run, or None if a value that was drawn for it is out of range."""
         try:
             return self.scenario(run)
         except InputError:

@@ -1,4 +1,4 @@
-"""Pools of workers that compute jobs: processes on this machine, or a Dask cluster. A pool survives its workers."""
+"""Pools of workers that compute jobs: processes on this machine, or a Dask cluster. A pool outlives its workers."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Outcome(NamedTuple):
     error: str = ""
     """Why the job has no result, or ""."""
     fatal: bool = False
-    """Whether every other job would end the same way, as with a full disk or other versions."""
+    """Whether every other job would end the same way, because the disk is full or the versions differ."""
 
 
 Work = Callable[[str, int], Outcome]
-"""Function that computes a job of the store at a path, in a worker."""
+"""Function that computes a job in a worker, from the path of the store and the number of the job."""
 
 
 class Pool(Protocol):
@@ -47,7 +47,7 @@ class Pool(Protocol):
     tries: int
 
     def room(self) -> int:
-        """Number of jobs that keep all workers busy."""
+        """Returns the number of jobs that keep all workers busy."""
         ...
 
     def submit(self, job: int) -> None:
@@ -55,7 +55,7 @@ class Pool(Protocol):
         ...
 
     def wait(self) -> list[Outcome]:
-        """Waits until at least one job has ended; returns how."""
+        """Waits until at least one job has ended; returns the outcomes."""
         ...
 
     def close(self) -> None:
@@ -78,7 +78,7 @@ class Processes:
         self._busy: dict[Connection, tuple[BaseProcess, int]] = {}
 
     def room(self) -> int:
-        """The number of processes."""
+        """Returns the number of processes."""
         return self._workers
 
     def submit(self, job: int) -> None:
@@ -89,7 +89,7 @@ class Processes:
             pipe.send(job)
 
     def _start(self) -> tuple[BaseProcess, Connection]:
-        resource_tracker.ensure_running()  # which unblocks Ctrl-C when it has started
+        resource_tracker.ensure_running()  # here, because its start unblocks Ctrl-C
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_serve, args=(self._work, self._path, theirs), daemon=True)
         with _uninterrupted():
@@ -125,7 +125,7 @@ class Processes:
 
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Defers Ctrl-C, which would leave half a process behind, and keeps it from children, which inherit the mask.
+    """Defers Ctrl-C, which would leave a half-started process, and blocks it in children, which inherit the mask.
 
     Blocking the signal is not enough: the system may deliver it to another thread, and Python then raises it here.
     """
@@ -144,7 +144,7 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def _serve(work: Work, path: str, pipe: Connection) -> None:
-    """The loop of a worker: receives jobs and sends their outcomes until the pipe is closed."""
+    """Runs the loop of a worker: receives jobs and sends their outcomes until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     multiprocessing.set_start_method("fork", force=True)  # locks of this method do not outlive a kill
     if parent := multiprocessing.parent_process():
@@ -163,7 +163,7 @@ def _follow(sentinel: int) -> None:
 class Cluster:
     """A Dask cluster that is running already; every machine must see the store at the same path."""
 
-    tries = 2  # in each try the scheduler itself lets a job kill four workers
+    tries = 2  # in each of which the scheduler lets a job kill four workers
 
     def __init__(self, work: Work, path: str, address: str) -> None:
         """Connects to a scheduler and waits for its first worker.
@@ -204,7 +204,7 @@ class Cluster:
             raise InputError(f"scheduler: {self._address}: the connection is lost; what was done is kept") from None
 
     def room(self) -> int:
-        """Number of threads of all workers at present."""
+        """Returns the number of threads that all workers have at present."""
         return max(1, sum(self._call(self._client.nthreads).values()))
 
     def submit(self, job: int) -> None:
@@ -214,7 +214,7 @@ class Cluster:
         future.add_done_callback(self._ended.put)
 
     def wait(self) -> list[Outcome]:
-        """Waits until a job has ended; returns how."""
+        """Waits until a job has ended; returns its outcome."""
         while True:
             with contextlib.suppress(Empty):
                 future = self._ended.get(timeout=5)
@@ -228,7 +228,7 @@ class Cluster:
         if error is None:
             return future.result()
         if isinstance(error, self._distributed.KilledWorker):
-            return Outcome(job, error="its worker died, again and again")
+            return Outcome(job, error="its worker died repeatedly")
         return Outcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))
 
     def close(self) -> None:

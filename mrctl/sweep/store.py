@@ -1,4 +1,4 @@
-"""Where a sweep is kept: a folder that survives being killed at any moment.
+"""The store of a sweep: a folder that stays valid when its process is killed at any moment.
 
     STORE/sweep.json        the sweep, versions, digests of the compiled worlds; written first, whole or not at all
     STORE/runs.parquet      the table of runs, one row each, in order; written when no job is left
@@ -6,11 +6,11 @@
     STORE/signals.zarr      (run, time, signal), NaN where nothing was recorded; shard 12 is the record of job 12
     STORE/lock              held, through the operating system, by the one process that runs the sweep
 
-`mrctl.open` reads a store that another version of mrctl wrote, in this format or an older one: a metric that was not
-computed then is NaN. Only the version that began a sweep goes on with it. Format 1 did not list its signals.
+`mrctl.open` reads a store that another version of mrctl wrote, in this format or an older one: a metric that the
+old version did not compute is NaN. Only the version that began a sweep continues it. Format 1 did not list its signals.
 
-One job owns one shard and one part. Each file is written under another name, synchronised and renamed, the part last:
-the existence of a part says that its job is done. A job that is computed twice writes the same bytes twice.
+One job owns one shard and one part. Each file is written under a temporary name, synchronised and renamed, the part
+last: the existence of a part says that its job is done. A job that is computed twice writes the same bytes twice.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ from mrctl.results.dataset import SIGNALS, only_files, open_result
 from mrctl.results.metrics import METRICS
 from mrctl.scenario import LONGEST
 
-LARGEST = 2**28  # bytes of sweep.json
+LARGEST = 2**28  # largest size of sweep.json in bytes
 KIND, FORMAT = "mrctl sweep", 2
-ROW_GROUP = 16384  # rows of the table that are in memory at once
+ROW_GROUP = 16384  # number of rows of the table that are written at once
 INNER = 16  # runs that are compressed together, signal by signal
-COMPLETE = b"complete"  # key in the metadata of the table: whether it holds every job
+COMPLETE = b"complete"  # key in the metadata of the table; b"1" if it holds every job
 
 
 class _Axis(Record):
@@ -64,7 +64,7 @@ class _Described(Record):
 
 
 class _Manifest(Record):
-    """What a manifest must hold, whichever version wrote it."""
+    """Fields that every manifest must hold, whichever version wrote it."""
 
     model_config = ConfigDict(extra="ignore")
     sweep: _Described
@@ -84,14 +84,14 @@ class Store:
         path: The folder.
         writer: The version of mrctl that began it.
         manifest: What `sweep.json` holds: `sweep`, `versions`, `models`, `size`, `chunk`, `samples`,
-            `stride` (control periods between samples), `control_period`, `signals` (names of those kept).
+            `stride` (control periods between samples), `control_period` in s, `signals` (names of the signals kept).
     """
 
     def __init__(self, path: str | Path) -> None:
         """Opens a store that exists.
 
         Raises:
-            InputError: There is none, or its format is newer than this version of mrctl.
+            InputError: There is none, or its format is newer than this version of mrctl knows.
         """
         self.path = Path(path).absolute()
         try:
@@ -111,7 +111,7 @@ class Store:
         """Makes the folder of a store unless it exists.
 
         Raises:
-            InputError: There is something else at this path, which is left as it was.
+            InputError: There is something else at this path; it is left untouched.
         """
         if not path.exists():
             path.mkdir(parents=True)
@@ -129,7 +129,7 @@ class Store:
         """Starts or continues a sweep in a folder whose lock is held.
 
         Raises:
-            InputError: The folder belongs to another sweep, or other versions began it.
+            InputError: The folder belongs to another sweep, or was begun with other versions.
         """
         manifest = json.loads(json.dumps({KIND: FORMAT, **manifest}))
         if not (path / "sweep.json").exists():
@@ -186,7 +186,7 @@ class Store:
         """Names of the signals, in the order of the record.
 
         Raises:
-            InputError: An older version of mrctl kept other signals and did not say their names.
+            InputError: An older version of mrctl kept another number of signals without their names.
         """
         if "signals" not in self.manifest and (count := self._signals.shape[2]) != len(SIGNALS):
             raise InputError(
@@ -206,7 +206,7 @@ class Store:
         return math.ceil(self.size / self.manifest["chunk"])
 
     def runs(self, job: int) -> range:
-        """The runs of a job."""
+        """Returns the numbers of the runs of a job."""
         chunk = self.manifest["chunk"]
         return range(job * chunk, min((job + 1) * chunk, self.size))
 
@@ -222,7 +222,7 @@ class Store:
             return self.table.exists() and pq.read_schema(self.table).metadata.get(COMPLETE) == b"1"
 
     def done(self) -> set[int]:
-        """Numbers of the jobs that are done."""
+        """Returns the numbers of the jobs that are done."""
         if self.complete:
             return set(range(self.jobs))
         return {int(part.stem) for part in (self.path / "parts").glob("[0-9]*.parquet")}
@@ -247,7 +247,7 @@ class Store:
         return self.path / "signals.zarr" / "signals" / "c" / str(job) / "0" / "0"
 
     def lost(self, frame: pd.DataFrame) -> dict[Path, list[int]]:
-        """Shards that are missing although a run of theirs drove, with their runs of the table."""
+        """Returns the missing shards of jobs with a run that drove, each with the runs of its job in the table."""
         if not self.samples:
             return {}
         _ = self._signals  # raises an error where there are none at all
@@ -257,12 +257,12 @@ class Store:
         return {shard: frame["run"][jobs == job].tolist() for job, shard in found if not shard.exists()}
 
     def rows(self, job: int) -> pa.Table:
-        """Rows of a job that is done."""
+        """Returns the rows of a job that is done."""
         with reading(self._part(job)):
             return pq.read_table(self._part(job))
 
     def row(self, run: int) -> dict[str, Any] | None:
-        """Row of one run, or None if it is not done."""
+        """Returns the row of one run, or None if the run is not done."""
         job = run // self.manifest["chunk"]
         source = self._part(job) if self._part(job).exists() else self.table
         with reading(source):
@@ -270,17 +270,17 @@ class Store:
         return found[0] if found else None
 
     def signals(self, run: int) -> NDArray[np.float64]:
-        """Signals of one run `(samples, signals)`, if the store keeps them."""
+        """Returns the signals of one run `(samples, signals)`, if the store keeps them."""
         with reading(self._shard(run // self.manifest["chunk"])):
             return np.asarray(self._signals[run])
 
     def finish(self, schema: pa.Schema, rows: Iterable[pa.Table], complete: bool) -> None:
-        """Writes the rows of all jobs to the table; only a bounded number of rows is in memory.
+        """Writes the rows of all jobs to the table, with a bounded number of rows in memory.
 
         Args:
             schema: Columns of the table.
             rows: Rows of each job in turn.
-            complete: Whether all jobs are done, so that their parts can be removed.
+            complete: Whether all jobs are done; their parts are then removed.
         """
         schema = schema.with_metadata({COMPLETE: b"1" if complete else b"0"})
         with _whole(self.table) as file, pq.ParquetWriter(file, schema) as writer:
@@ -308,7 +308,7 @@ class Store:
         )
 
     def frame(self) -> pd.DataFrame:
-        """The table of the runs that are done.
+        """Reads the table of the runs that are done.
 
         Raises:
             InputError: No run is done.
@@ -321,13 +321,14 @@ class Store:
         return pa.concat_tables(self.rows(job) for job in jobs).to_pandas()
 
     def dataset(self) -> xr.Dataset:
-        """The runs that are done as one dataset, labelled as `mrctl.simulate` does; signals are read when used.
+        """Opens the runs that are done as one dataset, labelled as by `mrctl.simulate`; signals are read when used.
 
         Runs whose signals are missing are left out, with a warning.
 
         Raises:
-            InputError: No run is done, or an older version kept signals of which the store does not say the names; or
-                a file is damaged, which the message names.
+            InputError: No run is done, an older version kept signals without their names, or a file is damaged; the
+            message
+                names it.
         """
         with reading(self.path):
             return self._dataset(self.frame())
@@ -392,14 +393,14 @@ def open(path: str | Path) -> xr.Dataset:
 
 
 def _plain(frame: pd.DataFrame, name: str) -> NDArray:
-    """A column as a NumPy array, in which text is objects."""
+    """Returns a column as a NumPy array, with text as objects."""
     column = frame[name].to_numpy()
     return column if column.dtype.kind in "bif" else column.astype(object)
 
 
 @contextlib.contextmanager
 def _whole(path: Path) -> Iterator[BinaryIO]:
-    """Opens a file that appears on the disk whole or not at all."""
+    """Opens a file for writing that appears on the disk whole or not at all."""
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         with partial.open("xb") as file:
@@ -426,7 +427,7 @@ def _temporary(path: Path) -> bool:
 
 
 def _regroup(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
-    """The same rows in tables of `ROW_GROUP` rows."""
+    """Yields the same rows in tables of `ROW_GROUP` rows."""
     held: list[pa.Table] = []
     for table in tables:
         held.append(table)
@@ -439,7 +440,7 @@ def _regroup(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
 
 
 def _difference(old: object, new: object, where: str = "") -> str:
-    """The first place where two trees of plain data differ, with both values, or ""."""
+    """Returns the first place where two trees of plain data differ, with both values, or "" if they are equal."""
     if isinstance(old, dict) and isinstance(new, dict):
         pairs = [(str(key), old.get(key), new.get(key)) for key in {**old, **new}]
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):

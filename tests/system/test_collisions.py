@@ -132,7 +132,7 @@ def test_mjcf(tmp_path):
     (tmp_path / "b.xml").write_text(
         '<mujoco><worldbody><geom name="log" type="capsule" size="1 1" zaxis="1 0 0"/></worldbody></mujoco>'
     )
-    with pytest.raises(InputError, match="geom log: is no upright box, cylinder or mesh"):
+    with pytest.raises(InputError, match="geom log: not an upright box or cylinder, nor a mesh"):
         read_mjcf(tmp_path / "b.xml")
 
 

@@ -108,7 +108,7 @@ def test_poison(cluster, tmp_path):
     address, _ = cluster
     sweep = Sweep.from_dict(tomllib.loads(FILE))
     report = jobs.run(sweep, tmp_path / "store", scheduler=address, work=poisoned)
-    assert report.aside == {range(5, 10): "its worker died, again and again"}
+    assert report.aside == {range(5, 10): "its worker died repeatedly"}
     assert report.failed == len({*failures(sweep), *range(5, 10)})
 
 
