@@ -112,8 +112,8 @@ class Car:
         """Drives with a constant control, or with a function of the time since the call that is held for `hold` s.
 
         Raises:
-            Unstable: The simulation has diverged. TooLong: The drive would last longer than `LONGEST`, or take more
-            than `MOST` steps, or the processor time is up.
+            Unstable: The simulation has diverged.
+            TooLong: The drive would last longer than `LONGEST` or take more than `MOST` steps, or the time is up.
         """
         if not (0 <= seconds <= LONGEST and seconds <= MOST * self.model.opt.timestep):
             step = self.model.opt.timestep

@@ -70,8 +70,7 @@ def run(
 
     Raises:
         InputError: The sweep is invalid; the folder belongs to another sweep or version of mrctl, is in use or cannot
-        be
-            written; or no scheduler answers.
+            be written; or no scheduler answers.
     """
     if workers is not None and (scheduler or workers < 1):
         raise InputError("workers: not together with a scheduler" if scheduler else f"workers: {workers} is below 1")

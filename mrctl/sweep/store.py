@@ -327,8 +327,7 @@ class Store:
 
         Raises:
             InputError: No run is done, an older version kept signals without their names, or a file is damaged; the
-            message
-                names it.
+                message names it.
         """
         with reading(self.path):
             return self._dataset(self.frame())
