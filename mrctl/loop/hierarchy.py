@@ -240,6 +240,7 @@ class Hierarchy:
         self._model = Prior([robot] * size, self._rigid)
         self.state = state = np.zeros(size, CONTROL)
         self._delays = [s.sensing.periods("delay", self._period) * self._period for s in scenarios]
+        self._pids = [s.pid for s in scenarios]
         self._motions: list[Motion] = []
         for row, scenario in enumerate(scenarios):
             gains = scenario.pid.channels(robot, self._rigid, self._delays[row], self._period)
@@ -249,7 +250,7 @@ class Hierarchy:
             state["limiter"]["time_constant"][row] = max(prefilter, self._period)
             self.set_kanayama(row, scenario.kanayama)
             self.set_pid(row, scenario.pid)
-        rejected = np.array([self._rejection(row, scenario.pid) for row, scenario in enumerate(scenarios)])
+        rejected = np.array([self._rejection(row) for row in range(size)])
         state["guard"] = guarding.fresh([s.guard for s in scenarios], self._record, rejected)
         if not getattr(self.learner, "guarded", True):
             state["guard"]["on"] = False
@@ -266,21 +267,27 @@ class Hierarchy:
         if gains.k_y is not None and gains.k_theta is None:
             chosen["k_theta"] = 2 * np.sqrt(gains.k_y)
         self.state["kanayama"][row] = chosen["k_x"], chosen["k_y"], chosen["k_theta"]
+        self._tolerate(row)
 
     def set_pid(self, row: int, design: Pid) -> None:
-        """Changes the PID of one robot, and the deviation D that its guard tolerates."""
+        """Changes the PID of one robot."""
+        self._pids[row] = design
         for name, value in design.gains(self._robot, self._rigid, self._delays[row], self._period).items():
             self.state["pid"][name][row] = value
-        guard = self.state["guard"]
-        guard["harmless"][row] = guarding.harmless(guard["region"][row], np.array(self._rejection(row, design)))
+        self._tolerate(row)
 
-    def _rejection(self, row: int, design: Pid) -> tuple[Peaks, Peaks]:
-        """Peak-to-peak gains from a voltage to the errors of one robot under this feedback."""
+    def _tolerate(self, row: int) -> None:
+        """Computes anew the deviation D that the guard of one robot tolerates, which depends on both controllers."""
+        guard = self.state["guard"]
+        guard["harmless"][row] = guarding.harmless(guard["region"][row], np.array(self._rejection(row)))
+
+    def _rejection(self, row: int) -> tuple[Peaks, Peaks]:
+        """Peak-to-peak gains from a voltage to the errors of one robot under its controllers."""
         delay, k = self._delays[row], self.state["kanayama"][row]
         kanayama = Kanayama(k_x=k["k_x"], k_y=k["k_y"], k_theta=k["k_theta"])
         prefilter = float(self.state["limiter"]["time_constant"][row])
         around = Motion(kanayama, prefilter, self._motions[row].lag)
-        gains = design.channels(self._robot, self._rigid, delay, self._period)
+        gains = self._pids[row].channels(self._robot, self._rigid, delay, self._period)
         return rejection(self._robot, self._rigid, gains, around, delay, self._period)
 
     def set_learning(self, row: int, on: bool) -> None:
@@ -302,6 +309,7 @@ class Hierarchy:
         renewed = Hierarchy([scenario], self._robot)
         self.state[row] = renewed.state[0]
         self.prior.rows[row] = renewed.prior.rows[0]
+        self._pids[row], self._motions[row], self._delays[row] = scenario.pid, renewed._motions[0], renewed._delays[0]
         self._learned.pop(row, None)
         if 0 in renewed._learned:
             self._learned[row] = renewed._learned[0]

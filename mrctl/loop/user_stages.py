@@ -5,7 +5,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -272,10 +272,9 @@ class UserHierarchy(Hierarchy):
     def _restore(self, rows: NDArray[np.intp]) -> bool:
         if not getattr(self.learner, "restore", None):
             return False
-        if self._feedforward_stage:
-            self._feedforward_stage.call("restore", rows)
-        else:
-            cast(Any, self.learner).restore(rows)
+        if self._feedforward_stage is None:
+            return super()._restore(rows)
+        self._feedforward_stage.call("restore", rows)
         return True
 
     def _finite_rows(self, stage: UserStage, answer: Array) -> Array:

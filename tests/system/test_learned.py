@@ -16,6 +16,19 @@ FROZEN = (Event(time=0.0, learning=False),)
 LEARNERS = ("fel", "model+fel", "model+rls", "model+mrac", "model+composite", "model+observer", "model+l1")
 
 
+class Still:
+    """A motion controller of the user, which wants every robot to stand."""
+
+    def __init__(self, robot, size):
+        self.twist = np.zeros((size, 2))
+
+    def reset(self, pose, reference, period):
+        pass
+
+    def output(self, pose, twist, reference):
+        return self.twist
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     """A file of what each learner has adapted in two laps."""
@@ -80,5 +93,8 @@ def test_renewed(files):
     hierarchy._restore(np.arange(2))
     kept, fresh = hierarchy.learner.adapted()
     assert np.array_equal(kept, load_learned(start)) and not fresh[:16].any()
+    own = Simulation([start], motion=Still).hierarchy  # with a stage of the user beside it
+    own._restore(np.arange(1))
+    assert np.array_equal(own.learner.adapted()[0], load_learned(start))
     with pytest.raises(InputError, match="theta is missing"):
         hierarchy.renew(0, start.model_copy(update={"learned": second}))

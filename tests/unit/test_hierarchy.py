@@ -238,6 +238,30 @@ def test_switching_one_robot(robot):
     assert (slower[1:, 1, 11:] != plain[1:, 1, 11:]).all()
 
 
+def test_guard_knows_both_controllers(robot):
+    """What the guard of a robot tolerates after new gains is what it tolerates of a robot that has had them always."""
+    gains, design = Kanayama(k_x=0.02, k_y=0.02, k_theta=0.1), Pid(time_constant=0.4)  # so slow that the posture counts
+
+    def tolerated(hierarchy):
+        return hierarchy.state["guard"]["harmless"]
+
+    start = build(robot)
+    prefilter = float(start.state["limiter"]["time_constant"][0])  # which an event does not change
+    for changes in ({"kanayama": gains}, {"kanayama": gains, "pid": design}):
+        switched, renewed = build(robot, 2), build(robot, 2)
+        switched.set_kanayama(1, gains)
+        if "pid" in changes:
+            switched.set_pid(1, design)
+        always = Scenario(**changes)
+        renewed.renew(1, always)
+        for hierarchy, expected in ((switched, Scenario(**changes, prefilter=prefilter)), (renewed, always)):
+            np.testing.assert_array_equal(tolerated(hierarchy)[0], tolerated(start)[0])
+            np.testing.assert_allclose(tolerated(hierarchy)[1], tolerated(Hierarchy([expected], robot))[0], rtol=1e-12)
+            assert not np.allclose(*tolerated(hierarchy), rtol=0.01)
+        renewed.set_kanayama(1, Kanayama())  # the design for its own PID, not for that of the robot before
+        np.testing.assert_array_equal(renewed.state["kanayama"][1], build(robot, pid=always.pid).state["kanayama"][0])
+
+
 @pytest.mark.parametrize("name", FEEDFORWARDS)
 def test_rolling_start(robot, name):
     """Reset to a motion that goes on, the first command is that motion and the voltage what the model takes for it."""
