@@ -83,8 +83,9 @@ def _write_mp4(pictures: Iterable[Picture], out: Path) -> None:
     pictures = iter(pictures)
     first = next(pictures)  # before the file is made, which stays away where MuJoCo cannot draw
     writer = imageio_ffmpeg.write_frames(
-        str(out), SIZES[".mp4"], fps=RATES[".mp4"], ffmpeg_log_level="error", output_params=["-movflags", "+faststart"]
-    )
+        str(out), SIZES[".mp4"], fps=round(RATES[".mp4"]), ffmpeg_log_level="error",
+        output_params=["-movflags", "+faststart"],
+    )  # fmt: skip
     with closing(writer):
         writer.send(None)
         for picture in chain([first], pictures):
