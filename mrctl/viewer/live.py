@@ -17,15 +17,16 @@ from typing_extensions import override
 from viser._messages import HotkeyKey
 
 from mrctl.kernel import Array
-from mrctl.loop.simulation import arranged
+from mrctl.loop.simulation import arranged, suited
+from mrctl.physics.files import SHIPPED
 from mrctl.record import InputError
 from mrctl.results.controllers import title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Waypoints
-from mrctl.theory.robot import Robot
-from mrctl.viewer.controls import Controls
+from mrctl.theory.robot import Robot, RobotFile
+from mrctl.viewer.controls import WORLDS, Controls
 from mrctl.viewer.embed import LONGEST
 from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
@@ -49,6 +50,7 @@ KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of eac
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
 DRIVER = ("prior", "learner")  # what the ghosts differ in
+KEPT = ("prior", "learner", "seed")  # by another robot, and the tier of the sensors
 NEW_RUN = ("world", "steering", "sensing", "reference", "seed", "prefilter")
 HIDDEN = (
     "name",
@@ -173,6 +175,10 @@ class Live(Page):
             self._gains = gui.add_html("")
             self._controls.add(first, only=[n for n in changing if n not in (*NEW_RUN, "perturbation", *DRIVER)])
         with tabs.add_tab("Run"):
+            self._robots = {robot.path: robot for robot in (*(RobotFile(path=p) for p in SHIPPED), first.robot)}
+            hint = "Another robot begins another run, with the steering and a reference that suit it."
+            self._robot = gui.add_dropdown("robot", tuple(self._robots), initial_value=first.robot.path, hint=hint)
+            self.on(self._robot, self._choose_robot)
             self._controls.add(first, only=NEW_RUN)
 
     def _show_session(self) -> None:
@@ -200,6 +206,7 @@ class Live(Page):
         self._scene.forget_trails()
         for name, ghost in self._ghosts.items():
             ghost.value = any(s.feedforward == name for s in session.start[1:])
+        self._robot.value = first.robot.path
         self._drawn = self._plotted = None
         self._deviation = 1  # factor on the deviations from the reference in the picture
         self._laps: list[dict[str, Any]] = []  # metrics of the whole laps until now
@@ -332,6 +339,15 @@ class Live(Page):
         if wanted:
             ghosts.append(first.model_copy(update=FEEDFORWARDS[name] | {"name": ""}))
         self._restart([first, *ghosts])
+
+    def _choose_robot(self, name: str) -> None:
+        """Begins another run with another robot, in its steering and on a reference that suit it."""
+        if name not in self._robots:
+            raise InputError(f"{name}: not one of the choices")
+        try:
+            self._restart([_with_robot(s, self._robots[name]) for s in self.session.start])
+        finally:
+            self._robot.value = self.session.start[0].robot.path
 
     def _restart(self, scenarios: Sequence[Scenario]) -> None:
         self.session = Session(scenarios)
@@ -496,6 +512,13 @@ def _in_periods(name: str, value: Any, period: float) -> Any:  # noqa: ANN401
     if name.endswith("_rate") and value > 0:
         return 1 / (max(1, round(1 / (value * period))) * period)
     return value
+
+
+def _with_robot(scenario: Scenario, robot: RobotFile) -> Scenario:
+    """Returns a scenario for another robot: with the same controller, seed and tier, and a reference that suits it."""
+    kept: dict[str, Any] = {name: getattr(scenario, name) for name in KEPT}
+    world = scenario.world if scenario.world in WORLDS else "flat"
+    return suited(Scenario(**kept, world=world, robot=robot, sensing=Sensing(tier=scenario.sensing.tier)))
 
 
 def _tidy() -> None:

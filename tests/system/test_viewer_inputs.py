@@ -10,8 +10,11 @@ import viser
 
 from mrctl import Event, Kanayama, Perturbation, Pid, Scenario, per_lap, simulate
 from mrctl.loop.simulation import arranged
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.references import Reference
+from mrctl.theory.robot import RobotFile
 from mrctl.viewer import live as module
 from mrctl.viewer.live import Live
 from mrctl.viewer.scenes import STORIES
@@ -219,6 +222,30 @@ def test_stories(live):
     assert 4 < ice[0, 1] < ice[1, 1] < 7 and ice[0, -1] < ice[0, 0]
     live._restart([Scenario()])
     assert live._story.content == ""
+
+
+def test_robots(live):
+    """Another robot begins another run, in which the controllers of before follow what it can; no other name does."""
+    live._restart([Scenario(prior="model", learner="rls", seed=3), Scenario(learner="none", seed=3)])
+    live._press("Payload", "drop payload")
+    for name, steering in (("racecar", "rigid"), ("turtlebot", "caster"), ("car", "compliant")):
+        visitor_sets(live, live._robot, name)
+        live._run_requests()
+        first, other = live.session.start
+        assert (first.robot.path, first.steering, first.seed, live.session.tick) == (name, steering, 3, 0)
+        assert (first.feedforward, other.feedforward, first.perturbation) == ("model+rls", "none", Perturbation())
+        mass = read_robot(mjcf.load(robot=RobotFile(path=name))).mass
+        live._press("Payload", "drop payload")
+        assert live.session.state()["perturbation"].payload == pytest.approx(mass / 2, rel=0.05)
+        for _ in range(100):
+            live.session.step()
+        log = live.session.log()
+        assert np.hypot(log["longitudinal_error"], log["lateral_error"]).max() < 0.1 and live.message == ""
+        live.draw()
+        live.refresh()
+    live.ask(live._choose_robot, "nosuch")
+    live._run_requests()
+    assert "not one of the choices" in live.message and live._robot.value == "car"
 
 
 def test_order(live):
