@@ -16,7 +16,7 @@ import viser
 from typing_extensions import override
 from viser._messages import HotkeyKey
 
-from mrctl.kernel import Array
+from mrctl.kernel import Array, Rows
 from mrctl.loop.simulation import arranged, suited
 from mrctl.physics.files import SHIPPED
 from mrctl.record import InputError
@@ -24,9 +24,10 @@ from mrctl.results.controllers import title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import Perturbation
-from mrctl.theory.references import Waypoints
+from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot, RobotFile
 from mrctl.viewer.controls import WORLDS, Controls
+from mrctl.viewer.deviation import drawn
 from mrctl.viewer.embed import LONGEST
 from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
@@ -107,6 +108,7 @@ class Live(Page):
         super().__init__(server)
         self.session = Session(scenarios)
         self.factor = 0.0  # ratio of simulated to wall time in the last second
+        self._back: int | None = None  # tick that is shown, while a visitor looks back
         self.late = self.ticks = 0  # ticks that began more than a period too late, and all ticks, at a finite speed
         self._due = 0.0  # number of ticks that are due
         self._changed_inputs: dict[tuple[str, ...], Any] = {}
@@ -125,12 +127,15 @@ class Live(Page):
     def _build(self) -> None:
         gui, tabs = self.server.gui, self.server.gui.add_tab_group()
         self._plots = Plots(gui, self.curves)
+        self.on(self._plots.time, self._look_back)
         with tabs.add_tab("Drive"):
             self.on(gui.add_button_group("Watch", tuple(STORIES)), self._tell)
             self._story = gui.add_html("")
             self._status = gui.add_html("")
             self._play = gui.add_button_group("", ("play", "pause", "step", "reset"))
             self.on(self._play, self._command)
+            self._return = gui.add_button("Return to the present", visible=False)
+            self.on(self._return, lambda _: self._look_back(self.session.time))
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
             self.on(speed, lambda name: self._set_speed(SPEEDS[name]))
             self._follow = gui.add_checkbox("Camera follows", False, hint="The first robot stays in the middle.")
@@ -157,6 +162,11 @@ class Live(Page):
             self.add_key(key, next(iter(choices)).capitalize(), partial(self._press, group, next(iter(choices))))
 
         self.add_key("G", "Set a goal", self._await_goal)
+
+        @self.server.scene.on_click()
+        def _(event: viser.SceneClickEvent) -> None:
+            self.ask(self._click, np.array(event.ray_origin), np.array(event.ray_direction))
+
         self._controls = Controls(gui, partial(self.ask, self._note_input))
         self._controls.designed = self.session.designed()
         first, changing = self.session.start[0], [name for name in Scenario.model_fields if name not in HIDDEN]
@@ -208,6 +218,8 @@ class Live(Page):
             ghost.value = any(s.feedforward == name for s in session.start[1:])
         self._robot.value = first.robot.path
         self._drawn = self._plotted = None
+        self._trail = np.zeros(0, int), np.zeros((0, session.size, 2))  # ticks of its points, and where they are drawn
+        self._way: Reference | None = None  # that a visitor has brought, as drawn
         self._deviation = 1  # factor on the deviations from the reference in the picture
         self._laps: list[dict[str, Any]] = []  # metrics of the whole laps until now
         self._counted = (time.monotonic(), session.tick)
@@ -225,38 +237,68 @@ class Live(Page):
 
     def _command(self, name: str) -> None:
         if name == "reset":
+            self._back = None
             self._restart(self.session.start)
         elif name == "step":
+            self._go_on()
             self.playing = False
             self.session.step()
+        elif name == "play":
+            self._go_on()
+            self.playing = self.session.running
         else:
-            self.playing = name == "play" and self.session.running
+            self.playing = False
+
+    @property
+    def tick(self) -> int:
+        """Number of control periods before the moment that is shown."""
+        return self.session.tick if self._back is None else self._back
+
+    @property
+    def time(self) -> float:
+        """Time that is shown in s."""
+        return self.tick * self.session.period
+
+    def _look_back(self, time: float) -> None:
+        """Shows the session at an earlier time in s and pauses; at the present time, or later, shows the present."""
+        tick = max(0, round(time / self.session.period))
+        self._back = tick if tick < self.session.tick else None
+        self._return.visible = self._back is not None
+        self._plots.time.value = self.time  # else a second click there would change nothing
+        self.playing = False
+        self._describe()
+
+    def _go_on(self) -> None:
+        """Lets the session go on from where a visitor looks back to, as if nothing had happened since."""
+        if self._back is not None:
+            self._restart(self.session.start)
 
     def _tell(self, name: str) -> None:
         if name not in STORIES:
             raise InputError(f"{name}: not one of the choices")
+        self._back = None
         self._restart(STORIES[name].scenarios)
         self.playing = True
 
     def _await_goal(self) -> None:
         """Waits for two clicks on the floor: the place of a goal, and a point towards which a robot there looks."""
         self._forget_goal()
+        self._picks = True
         write(self._picking, block("picking", "Click on the floor where the robots shall go."))
 
-        @self.server.scene.on_click()
-        def _(event: viser.SceneClickEvent) -> None:
-            self.ask(self._click, np.array(event.ray_origin), np.array(event.ray_direction))
-
     def _forget_goal(self) -> None:
-        self.server.scene.remove_click_callback()
+        self._picks = False
         self._picked: list[Array] = []
         write(self._picking, "")
 
     def _click(self, origin: Array, direction: Array) -> None:
-        """Takes a click, a ray from `origin` in m, `(3,)`."""
+        """Takes a click, a ray from `origin` in m, `(3,)`: for a goal, or on a trail, to look back to that moment."""
         point = self._scene.on_floor(origin, direction)
+        if not self._picks:
+            return self._click_on_trail(point)
         if point is None:
             raise InputError("goal: there is no floor where you clicked")
+        self._go_on()
         place, session = (self._picked[0] if self._picked else point), self.session
         ahead = point - (place if self._picked else session.qpos(0)[:2])
         goal = (float(place[0]), float(place[1]), float(np.arctan2(ahead[1], ahead[0])))
@@ -269,7 +311,15 @@ class Live(Page):
             session.head_for(goal)
         finally:
             self._describe()
-        self._scene.draw_references([followed(session.saved()[0], session.time + session.lead * session.period)])
+
+    def _click_on_trail(self, point: Array | None) -> None:
+        """Looks back to when a robot was at a point of the floor in m, `(2,)`, if a trail is there."""
+        ticks, drawn = self._trail
+        if point is None or not drawn.size:
+            return
+        away = np.nan_to_num(np.hypot(*np.moveaxis(drawn - point, -1, 0)), nan=np.inf).min(axis=1)
+        if away.min() < self._scene.reach:
+            self._look_back(int(ticks[away.argmin()]) * self.session.period)
 
     def _set_speed(self, speed: float) -> None:
         self.speed, self._due = speed, 0.0
@@ -278,6 +328,7 @@ class Live(Page):
         choices = buttons(self.session.robot)[group]
         if name not in choices:
             raise InputError(f"{name}: not one of the choices")
+        self._go_on()
         change = choices[name]
         if "push" in change:
             return self._apply_event(**change)
@@ -285,6 +336,7 @@ class Live(Page):
         self._apply_event(perturbation=now.model_copy(update=change))
 
     def _apply_event(self, **change: Any) -> None:  # noqa: ANN401
+        self._go_on()
         self.session.apply(**change)
         self._describe()
 
@@ -301,7 +353,7 @@ class Live(Page):
                 self._apply(path, value)
             except InputError as error:
                 self.complain(error)
-                self._controls.show(self._present(self.session.start[0]))
+                self._controls.show(self._now())
 
     def _apply(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
         name, *rest = path
@@ -316,6 +368,7 @@ class Live(Page):
         if name == "sensing":
             value = _in_periods(path[-1], value, self.session.period)
         if name in CHANGEABLE:
+            self._go_on()
             return self._apply_event(**{name: changed(self.session.state()[name], rest, value)})
         start = self.session.start
         touched = start[:1] if name in DRIVER else start
@@ -326,9 +379,17 @@ class Live(Page):
         self._restart(new)
 
     def _present(self, scenario: Scenario) -> Scenario:
-        """Returns the scenario with the present values of the fields that events have changed."""
-        now = self.session.state()
-        return scenario.model_copy(update={name: now[name] for name in CHANGEABLE})
+        """Returns a scenario of the start with the present values of the fields that events have changed.
+
+        While a visitor looks back it is the scenario itself, since another run repeats the events until then.
+        """
+        now = self.session.state() if self._back is None else {}
+        return scenario.model_copy(update={name: now[name] for name in CHANGEABLE if name in now})
+
+    def _now(self) -> Scenario:
+        """Returns the first robot's scenario with the values that hold at the moment that is shown."""
+        now = self.session.state(self.time)
+        return self.session.start[0].model_copy(update={name: now[name] for name in CHANGEABLE})
 
     def _compare(self, name: FeedforwardName, wanted: bool) -> None:
         first, *ghosts = map(self._present, self.session.start)
@@ -344,19 +405,39 @@ class Live(Page):
         """Begins another run with another robot, in its steering and on a reference that suit it."""
         if name not in self._robots:
             raise InputError(f"{name}: not one of the choices")
+        self._back = None
         try:
             self._restart([_with_robot(s, self._robots[name]) for s in self.session.start])
         finally:
             self._robot.value = self.session.start[0].robot.path
 
     def _restart(self, scenarios: Sequence[Scenario]) -> None:
-        self.session = Session(scenarios)
+        """Begins another run; while a visitor looks back, drives it up to there, with the events until then."""
+        if self._back is None:
+            self.session = Session(scenarios)
+        else:
+            self.session = self.session.repeated(scenarios, self._back, self._tell_progress())
+            self._back = None
+        self._return.visible = False
         if time.monotonic() > self._tidied + TIDY_INTERVAL:
             self._tidied = time.monotonic()
             _tidy()
         self.message = ""
         self._learning.value = True
         self._show_session()
+
+    def _tell_progress(self) -> Callable[[int], None]:
+        """Returns what `Session.repeated` calls, which says on the page how far it is."""
+        total, done, told = self.tick * len(self.session.start), 0, time.monotonic()
+
+        def tell(robots: int) -> None:
+            nonlocal done, told
+            done += robots
+            if (now := time.monotonic()) > told + 0.5:
+                told = now
+                write(self._status, block("status", f"driving again up to {self.time:.2f} s: {done / total:.0%}"))
+
+        return tell
 
     def _save(self, client: viser.ClientHandle) -> None:
         if client.client_id not in self.server.get_clients():
@@ -369,7 +450,7 @@ class Live(Page):
     def shown(self) -> list[Recording]:
         if self.session.tick < 2:
             raise InputError("download: nothing has happened yet")
-        result = self.session.result(LONGEST)
+        result = self.session.result(max(0, self.session.tick - round(LONGEST / self.session.period)))
         return [Recording(result.isel(run=row)) for row in range(self.session.size)]
 
     # -- the loop ----------------------------------------------------------------------------------------------------
@@ -398,25 +479,36 @@ class Live(Page):
 
     @override
     def draw(self) -> None:
-        session, (marked, magnified) = self.session, self.marks
-        now = session.tick, self._follow.value, marked, magnified, self._deviation
+        session, (marked, magnified), tick = self.session, self.marks, self.tick
+        now = tick, self._back, self._follow.value, marked, magnified, self._deviation
         if now == self._drawn:
             return
         self._drawn = now
         for row in range(session.size):
-            self._scene.show(row, session.qpos(row))
+            self._scene.show(row, self._qpos(row))
         logs, scans = [], []
         if marked:
-            scans = [session.scan(row) for row in range(min(session.size, MAX_MARKED))]
+            scans = [session.scan(row) for row in range(min(session.size, MAX_MARKED))] if self._back is None else []
             ticks = round(FIX_AGE / session.period) + max(self._latencies)
-            logs = list(session.log(max(0, session.tick - ticks)).T)
+            logs = list(session.log(max(0, tick - ticks), tick).T)
         with self.server.atomic():
             if session.tick:
-                self._scene.show_targets(session.log(session.tick - 1)[-1], self._deviation)
-            self._scene.show_obstacles(session.time)
+                self._scene.show_targets(self._record(), self._deviation)
+            self._scene.show_obstacles(self.time)
             self._scene.show_sensors(logs, session.period, self._latencies, magnified)
             self._scene.show_scans(scans)
             self._scene.flush(self._follow.value)
+
+    def _record(self) -> Rows:
+        """Returns a record of `TICK` of each robot: the last one, or that of the moment that is shown."""
+        tick = self.session.tick - 1 if self._back is None else self._back
+        return self.session.log(tick, tick + 1)[0]
+
+    def _qpos(self, row: int) -> Array:
+        """Returns the generalised position of a robot at the moment that is shown; one that has stopped stays."""
+        if self._back is None or not np.isfinite(self._record()["x"][row]):
+            return self.session.qpos(row)
+        return Recording(self.session.result(self._back, self._back + 1).isel(run=row)).qpos(0)
 
     @override
     def refresh(self) -> None:
@@ -429,55 +521,62 @@ class Live(Page):
             self.factor = (session.tick - tick) * session.period / (now - since)
             self._counted = now, session.tick
         doing = "playing" if self.playing else "paused" if session.running else "finished; reset starts again"
-        lap = "" if self._ends is not None else f" · lap {1 + int(session.time / session.start[0].reference.period)}"
+        if self._back is not None:
+            doing = f"of {session.time:.2f} s; what you do now, it goes on from here"
+        lap = "" if self._ends is not None else f" · lap {1 + int(self.time / session.start[0].reference.period)}"
         factor = f" · {self.factor:.2f}× real time" if self.playing else ""
-        lines = [f"<b>{session.time:.2f} s</b>{lap} · {doing}{factor}"]
+        lines = [f"<b>{self.time:.2f} s</b>{lap} · {doing}{factor}"]
         for row, label in enumerate(self._labels):
-            if reason := session.failure(row):
+            stopped = self._back is None or not np.isfinite(self._record()["x"][row])
+            if stopped and (reason := session.failure(row)):
                 lines.append(warning(f"{label} stopped: {reason}"))
         if session.tick:
-            lines += arrivals(self._labels, session.log(session.tick - 1)[-1], self._ends)
+            lines += arrivals(self._labels, self._record(), self._ends)
         write(self._status, block("status", *lines))
-        happened = sum(event.time <= session.time for scenario in session.saved() for event in scenario.events)
+        happened = sum(event.time <= self.time for scenario in session.saved() for event in scenario.events)
         if happened != self._happened:  # such as those that the scenarios brought along
             self._happened = happened
             self._describe()
-        past = session.tick, self.playing, self.deviation.value  # a pause draws what was left out before it
+        past = session.tick, self._back, self.playing, self.deviation.value  # a pause draws what was left out before it
         if past != self._plotted:
             self._plotted = past
             self._show_past()
         if session.tick:
-            now = session.log(session.tick - 1)[-1]
+            now = self._record()
             self.describe_estimates(self._labels, now)
             ticks = round(session.start[0].reference.period / session.period)
             if session.tick >= (len(self._laps) + 1) * ticks:
                 self._laps += whole_laps(session.log(len(self._laps) * ticks), ticks, session.period)
-            self._plots.score(now, self._laps)
+            self._plots.score(now, self._laps[: self.tick // ticks])
 
     def _show_past(self) -> None:
-        """Draws the last seconds: their curves, and the trails of the robots, which change less often."""
+        """Draws the last seconds, or those around the moment that is shown: curves, and trails, which change less."""
         session = self.session
         ticks = round(WINDOW / session.period)
         step = max(1, ticks // SAMPLES)
-        first = max(0, session.tick - ticks) // step * step
-        log = session.log(first)
+        last = session.tick if self._back is None else min(session.tick, max(self._back + ticks // 2, ticks))
+        first = max(0, last - ticks) // step * step
+        log = session.log(first, last)
         if len(log) < 2:
             return self._plots.clear(WINDOW)
         times = np.arange(first, first + len(log), dtype=float) * session.period
-        self._plots.show(times, log, session.clearance(first), step, self._event_times())
+        near = session.clearance(first)
+        self._plots.show(times, log, None if near is None else near[: len(log)], step, self._event_times())
+        self._plots.point(None if self._back is None else (self._back - first) / ((len(log) - 1) // step * step))
         self._plots_since_trail += 1
         if self._plots_since_trail >= PLOTS_PER_TRAIL or not self.playing:
             self._plots_since_trail = 0
             every = -(-ticks // (self._scene.trail_points - 2))
-            marked = session.tick // every * every - every * np.arange(self._scene.trail_points - 1)[::-1]
-            rows = np.append(marked, session.tick - 1) - first  # the same moments of the run in every picture
+            marked = last // every * every - every * np.arange(self._scene.trail_points - 1)[::-1]
+            rows = np.clip(np.append(marked, last - 1) - first, 0, len(log) - 1)  # the same moments in every picture
             self._deviation = self.magnified_deviation(log)
-            self._scene.show_trails(log[np.clip(rows, 0, len(log) - 1)], self._deviation)
+            self._trail = first + rows, drawn(log[rows], self._deviation)
+            self._scene.show_trails(log[rows], self._deviation)
 
     def _event_times(self) -> list[float]:
         """Returns the times of the events until now in s."""
         events = {event.time for scenario in self.session.saved() for event in scenario.events}
-        return sorted(time for time in events if time <= self.session.time)
+        return sorted(time for time in events if time <= self.time)
 
     def _describe(self) -> None:
         """Writes the timeline, marks the events on the track, and sets the inputs to the present values."""
@@ -491,12 +590,17 @@ class Live(Page):
         driven = self.session.driven()
         ticks = np.minimum(np.round(np.array(self._event_times()) / self.session.period).astype(int), len(driven) - 1)
         self._scene.show_events(driven[ticks[ticks >= 0]])
-        self._ends = ends(scenario, self.session.time + self.session.lead * self.session.period)
+        soon = self.time + self.session.lead * self.session.period
+        self._ends = ends(scenario, soon)
         self._scene.show_ends(self._ends)
-        present = self._present(self.session.start[0])
+        way = followed(scenario, soon)
+        if way != self._way and any(event.reference for event in self.session.added):
+            self._way = way
+            self._scene.draw_references([way])
         for row, saved in enumerate(self.session.saved()):
-            self._scene.show_payload(row, state(saved, self.session.time)["perturbation"])
+            self._scene.show_payload(row, state(saved, self.time)["perturbation"])
         self._controls.designed = self.session.designed()
+        present = self._now()
         self._controls.show(present)
         units = ("V/(m/s)", "V/m"), RIGID_UNITS if present.steering == "rigid" else ("V/(rad/s)", "V/rad")
         lines = ["<b>Present gains of the velocity PID</b>"]

@@ -53,6 +53,7 @@ class Replay(Page):
     def _build(self, run: int) -> None:
         gui, table = self.server.gui, self.library.table
         self._plots = Plots(gui, self.curves, zoom=False)
+        self.on(self._plots.time, self._scrub)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Replay"):
             self._status = gui.add_html("")
@@ -259,7 +260,7 @@ class Replay(Page):
         self.describe_estimates(self._labels, last)
         if self.time != self._plotted:
             self._plotted = self.time
-            self.scrubber.value = self.time
+            self.scrubber.value = self._plots.time.value = self.time  # a click there again changes it again
             tick = min(round(self.time / self.recordings[0].period), len(self._log) - 1)
             self._plots.score(self._log[tick], self._laps[: (tick + 1) // self._lap])
             start, end = self._interval.value

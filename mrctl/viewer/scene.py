@@ -56,6 +56,7 @@ HALO = 1.04  # size of a ghost, of which only the far side is drawn: a rim aroun
 MAX_MARKED = 4  # number of robots whose estimates and targets are drawn
 NEXT_TRAIL = 0.001  # m, from the height of the trails of one colour to that of the next; equal ones would flicker
 TRAIL_WIDTH = 0.004  # as a share of the width of the view; the reference is twice as wide
+REACH = 0.03  # distance from a trail of clicks on it, as a share of the width of the view
 LEAST_VIEW = 1.2  # m, least width of the view
 SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
 NONE = Obstacles()
@@ -473,6 +474,11 @@ class Scene:
                     some = found[1][:: max(1, len(found[1]) // MAX_PARTICLES), :2]
                     met.points = places
                     particles.points = np.pad(some, [(0, 0), (0, 1)], constant_values=ABOVE).astype(np.float32)
+
+    @property
+    def reach(self) -> float:
+        """Distance in m from a trail within which a click on the floor is a click on it."""
+        return REACH * self._view
 
     @property
     def trail_points(self) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import ceil, floor, pi, remainder, sqrt
 from typing import Any, TypeVar
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mrctl.control.design import motion
 from mrctl.control.margins import Gains
 from mrctl.kernel import Array, Rows
-from mrctl.loop.simulation import Simulation, arranged, uniform
+from mrctl.loop.simulation import Simulation, arranged, run, uniform
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import MARGIN, SLIM, prepared
 from mrctl.physics.hull import footprint
@@ -97,6 +97,37 @@ class Session:
                     sim.step()
         self.tick += 1
 
+    @property
+    def added(self) -> tuple[Event, ...]:
+        """Events that visitors have added, in the order in which they did."""
+        each = (saved.events[len(start.events) :] for saved, start in zip(self.saved(), self.start, strict=True))
+        return max(each, key=len)  # a robot that has stopped gets no more
+
+    def repeated(
+        self, scenarios: Sequence[Scenario], tick: int, progress: Callable[[int], object] | None = None
+    ) -> Session:
+        """Returns another session that has done the ticks before one of this one, with the same events of visitors.
+
+        With the scenarios of this session the robots did the same in them, to the bit.
+
+        Args:
+            scenarios: Scenario of each robot at the start.
+            tick: Number of control periods to do; events that had no effect before are left out.
+            progress: Is called after every tick of a simulation with the number of its robots.
+
+        Raises:
+            InputError: As for a new session, or an event does not fit the scenarios.
+        """
+        other = Session(scenarios)
+        for event in self.added:
+            known = self.lead if event.reference else 0  # a reference acts that long before its time
+            if event.tick(self.period) - known < tick:
+                for _, sim in other.simulations:
+                    sim.add(event)
+        run([sim for _, sim in other.simulations], progress, tick, threads=1)
+        other.tick = tick
+        return other
+
     def apply(self, **change: Any) -> None:  # noqa: ANN401
         """Applies an event to every robot at the coming tick, or a new reference as soon as a voltage can act on it.
 
@@ -135,9 +166,9 @@ class Session:
         _, found = prepared(Task.from_dict(task), first, speed, MARGIN if near > MARGIN else SLIM)
         self.apply(reference=found.reference)
 
-    def state(self) -> dict[str, Any]:
-        """Returns the present values of the fields `CHANGEABLE`, and `learning`."""
-        return state(max(self.saved(), key=lambda s: len(s.events)), self.time)
+    def state(self, time: float | None = None) -> dict[str, Any]:
+        """Returns the values of the fields `CHANGEABLE`, and `learning`, at a time in s, by default now."""
+        return state(max(self.saved(), key=lambda s: len(s.events)), self.time if time is None else time)
 
     def designed(self) -> dict[tuple[str, ...], float | None]:
         """Returns what fields of the first robot are while they are not set, by path, as `Hierarchy` designs them.
@@ -181,11 +212,16 @@ class Session:
         whole = [sim.scenarios[k] for sim, k in (self._place[row] for row in range(self.size))]
         return [s.model_copy(update={"laps": max(1, ceil(self.time / s.reference.period - 1e-9))}) for s in whole]
 
-    def log(self, first: int = 0) -> Rows:
-        """Returns the log from a tick on, a record of `TICK` for each tick and robot; NaN after a robot has stopped."""
-        parts = blank(self.tick - first, self.size)
+    def log(self, first: int = 0, last: int | None = None) -> Rows:
+        """Returns the log from a tick on, and up to another one, without it.
+
+        Returns:
+            A record of `TICK` for each tick and robot, `(T, B)`; NaN after a robot has stopped.
+        """
+        last = self.tick if last is None else last
+        parts = blank(last - first, self.size)
         for rows, sim in self.simulations:
-            done = sim.log.ticks[first : sim.tick]
+            done = sim.log.ticks[first : min(last, sim.tick)]
             parts[: len(done), rows] = done
         return parts
 
@@ -222,15 +258,14 @@ class Session:
         met = turned(self.start[row].sensing.lidar.points(ranges), pose)
         return met, np.zeros((0, 3)) if particles is None else particles.particles
 
-    def result(self, longest: float) -> xr.Dataset:
-        """Returns the signals of the last `longest` s, as a result of `simulate` without what was learned."""
-        first = max(0, self.tick - round(longest / self.period))
+    def result(self, first: int, last: int | None = None) -> xr.Dataset:
+        """Returns the signals of what `log` returns, as a result of `simulate` without what was learned."""
         names, failure = [s.feedforward for s in self.start], [self.failure(row) for row in range(self.size)]
         nothing = np.full(self.size, np.nan)
         saved = self.saved()
-        part = dataset(saved, names, names, self.log(first), failure, nothing, None)
+        part = dataset(saved, names, names, self.log(first, last), failure, nothing, None)
         if (clearance := self.clearance(first)) is not None:
-            part = part.assign(clearance=(("run", "time"), clearance.T))
+            part = part.assign(clearance=(("run", "time"), clearance[: part.sizes["time"]].T))
         found = combine([(range(self.size), part)], saved)
         return found.assign_coords(time=found["time"] + first * self.period)
 

@@ -292,6 +292,48 @@ def test_inputs(browser, tmp_path):
         del genuine
 
 
+FLOOR_TO_SCREEN = """([x, y]) => {
+    const m = window.__viserMutable, point = new m.camera.position.constructor(x, y, 0);
+    m.nodeRefFromName['/world'].localToWorld(point).project(m.camera);
+    const r = m.canvas.getBoundingClientRect();
+    return [r.left + (point.x + 1) / 2 * r.width, r.top + (1 - point.y) / 2 * r.height];
+}"""
+
+
+def click_on_curve(page, title, share):
+    """Clicks into a chart; returns the time in s that is there."""
+    index = list(axes := page.evaluate(AXES)).index(title)
+    box = page.locator(".u-over").nth(index).bounding_box()
+    page.mouse.click(box["x"] + share * box["width"], box["y"] + box["height"] / 2)
+    start, end = axes[title]["x"]
+    return start + share * (end - start)
+
+
+def test_looking_back(browser, tmp_path):
+    """A click on a curve, or on a trail, shows the robots as they were then; from there they drive on."""
+    with serving(lambda server: Live([BASE], server)) as (live, url), visit(browser, url) as page:
+        live.ask(live._set_speed, float("inf"))
+        until(lambda: live.session.time > 15 and curves(page, "V, m/s"), "15 s")
+        live.ask(live._command, "pause")
+        until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
+        page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
+        end = live.session.tick
+        until(lambda: curves(page, "V, m/s")[0][0][-1] > live.session.time - 0.1, "the last curves")
+        there = click_on_curve(page, "position error, mm", 0.4)
+        until(lambda: live._back is not None, "a former moment")
+        assert 0.01 * live._back == pytest.approx(there, abs=0.1)  # two pixels
+        then = live.session.log()[live._back, 0]
+        until(lambda: np.allclose(node(page, ROBOT)[:2], [then["x"], then["y"]], atol=1e-3), "the robot of then")
+        until(lambda: page.evaluate(AXES)["V, m/s"]["cursor"] == pytest.approx(0.01 * live._back, abs=0.02), "a cursor")
+        picture(page, tmp_path / "back.png")
+        ticks, drawn = live._trail
+        page.mouse.click(*page.evaluate(FLOOR_TO_SCREEN, drawn[len(drawn) // 2, 0].tolist()))
+        until(lambda: abs(live._back - ticks[len(ticks) // 2]) < 20, "the moment of that place of the trail")
+        back = live._back
+        page.get_by_text("step", exact=True).click()
+        until(lambda: live.session.tick == back + 1 < end and live._back is None, "it to go on from there")
+
+
 def test_visitors_come_and_go(browser):
     """A second page, a reload and a page that is closed leave the session alone; a late visitor sees it as it is."""
     with serving(lambda server: Live([BASE], server)) as (live, url):
@@ -356,6 +398,8 @@ def test_replay(browser, tmp_path):
         until(lambda: {*score, "–"} <= set(page.inner_text("#mrctl-score").split()), "the score of the tables")
         pose = f"window.__viserMutable.nodePoseData[{GHOST!r}].wxyz"
         until(lambda: abs(2 * np.arcsin(np.hypot(*page.evaluate(pose)[1:3])) - tilt) < 1e-3, "the ghost to be tipped")
+        there = click_on_curve(page, "V, m/s", 0.5)
+        until(lambda: replay.time == pytest.approx(there, abs=0.02), "it to go to a click on a curve")
         replay.ask(replay._choose, 1)
         until(lambda: replay.runs == [1], "the other run, once")
         page.get_by_text("Keep this run as a ghost").click()

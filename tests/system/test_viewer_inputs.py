@@ -248,6 +248,46 @@ def test_robots(live):
     assert "not one of the choices" in live.message and live._robot.value == "car"
 
 
+def test_looking_back(live):
+    """The page shows a former moment as it was; from there the session goes on to the bit, and another one can."""
+    live._restart([Scenario(), Scenario(learner="none")])
+    for tick, event in ((100, "drop payload"), (200, "remove"), (300, None)):
+        while live.session.tick < tick:
+            live.session.step()
+        if event:
+            live._press("Payload", event)
+    former = live.session.log().copy()
+    live._look_back(1.5)
+    live.draw()
+    live.refresh()
+    then, frames = former[150], [frames[live._scene._chassis] for frames in live._scene._frames]
+    for frame, row in zip(frames, then, strict=True):
+        assert frame.position == pytest.approx([row["x"], row["y"], row["z"]], abs=1e-6)
+    assert live._controls._inputs["perturbation", "payload"].value == pytest.approx(10.0) and live._return.visible
+    assert live.session.tick == 300 and "1.50 s" in live._status.content and "of 3.00 s" in live._status.content
+    live._look_back(9.0)
+    live.draw()
+    assert not live._return.visible and frames[0].position == pytest.approx(live.session.qpos(0)[:3])
+
+    live._look_back(1.5)
+    live._note_input(("learner",), "rls")
+    live._apply_inputs()
+    saved = live.session.saved()
+    assert [(s.feedforward, len(s.events)) for s in saved] == [("rls", 1), ("none", 1)] and live.session.tick == 150
+    same = live.session.log()[:, 1]
+    assert same.tobytes() == np.ascontiguousarray(former[:150, 1]).tobytes()
+    live._command("step")
+    live._look_back(1.2)
+    live._press("Push", "push")
+    live._command("play")
+    while live.session.tick < 200:
+        live.session.step()
+    again = simulate(live.session.saved())
+    for name in ("x", "theta", "voltage_left", "weight_norm"):
+        assert again[name].values[:, :200].tobytes() == np.ascontiguousarray(live.session.log()[name].T).tobytes()
+    assert [e.time for e in live.session.added] == [1.0, 1.2]
+
+
 def test_order(live):
     """What a visitor does after changing an input comes after it: a reset removes it."""
     live._restart([Scenario()])
