@@ -18,11 +18,13 @@ from viser._messages import HotkeyKey
 
 from mrctl.kernel import Array, Rows
 from mrctl.loop.simulation import arranged, suited
+from mrctl.navigation.mission import Avoid
 from mrctl.physics.files import SHIPPED
 from mrctl.record import InputError
 from mrctl.results.controllers import title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
+from mrctl.theory.obstacles import Pose
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot, RobotFile
@@ -33,12 +35,12 @@ from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
-from mrctl.viewer.scene import MAX_MARKED, Scene
+from mrctl.viewer.scene import HARD, MAX_MARKED, Scene
 from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import CHANGEABLE, Session, changed, ends, followed, state
+from mrctl.viewer.session import CHANGEABLE, Session, changed, ends, followed, pushed, state
 
 WINDOW = 12.0  # s, time span of the plots
 SAMPLES = 300  # about the largest number of samples in a curve
@@ -46,11 +48,25 @@ TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each 
 PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
 REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
 MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
-GOAL_HINT = "Two clicks on the floor: where the robots shall go, and towards where they shall look there."
+GOAL_HINT = "Drag on the floor from where the robots shall go to where they shall look there; or click twice."
+PUSH_HINT = "A drag from the first robot pushes all robots that way, a robot's length as hard as the button."
+FAN_HINT = "Draws some of the ways that `window` or `mppi` considers, and the one that it chooses."
+# What *Save session* writes beside the scenarios of a mission with an avoider.
+AVOIDER = '''"""The motion stage of a session: `mrctl run {scenario} --controller motion={avoid}.py:{avoid}`."""
+
+from pathlib import Path
+
+from mrctl.navigation.mission import avoiding
+from mrctl.scenario import Scenario
+
+{avoid} = avoiding("{avoid}", Scenario.from_toml(str(Path(__file__).with_name("{scenario}"))))
+'''
 KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of each group
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
 DRIVER = ("prior", "learner")  # what the ghosts differ in
+NOTHING = np.zeros((0, 2, 2))
+PLANNED = ("world", "steering", "reference")  # what a plan was made for
 KEPT = ("prior", "learner", "seed")  # by another robot, and the tier of the sensors
 NEW_RUN = ("world", "steering", "sensing", "reference", "seed", "prefilter")
 HIDDEN = (
@@ -75,7 +91,7 @@ def buttons(robot: Robot) -> dict[str, dict[str, dict[str, Any]]]:
     """
     mass, half_track = robot.mass, robot.half_track
     load = _rounded(mass / 2, robot.com_offset / 2, 0.32 * half_track, 5 / 3 * robot.com_height)
-    push, spin = _rounded(3 * mass, 4 * mass * half_track)  # N and N·m
+    push, spin = _rounded(HARD * mass, 4 * mass * half_track)  # N and N·m
     return {
         "Payload": {
             "drop payload": dict(zip(("payload", "payload_x", "payload_y", "payload_z"), load, strict=True)),
@@ -95,20 +111,26 @@ def _rounded(*values: float) -> list[float]:
 class Live(Page):
     """The page of a live session; its loop carries out the requests of visitors between two ticks."""
 
-    def __init__(self, scenarios: Sequence[Scenario], server: Server) -> None:
+    def __init__(
+        self, scenarios: Sequence[Scenario], server: Server, avoid: Avoid = "none", searched: Array | None = None
+    ) -> None:
         """Builds the page and sets the robots on their references.
 
         Args:
             scenarios: Scenario of each robot; the first one is solid, the others are ghosts.
             server: Server of the page.
+            avoid: What keeps robots on a mission from obstacles that move.
+            searched: The arcs of the search for their plan, as of `Plan`.
 
         Raises:
             InputError: A scenario is refused, as by `Session`.
         """
         super().__init__(server)
-        self.session = Session(scenarios)
+        self.session = Session(scenarios, avoid)
+        self._searched = NOTHING if searched is None else searched
         self.factor = 0.0  # ratio of simulated to wall time in the last second
         self._back: int | None = None  # tick that is shown, while a visitor looks back
+        self._pull: tuple[float, ...] | None = None  # push that a visitor draws with the mouse, in N
         self.late = self.ticks = 0  # ticks that began more than a period too late, and all ticks, at a finite speed
         self._due = 0.0  # number of ticks that are due
         self._changed_inputs: dict[tuple[str, ...], Any] = {}
@@ -142,8 +164,13 @@ class Live(Page):
             for label, choices in buttons(self.session.robot).items():
                 group = gui.add_button_group(label, tuple(choices))
                 self.on(group, partial(self._press, label))
+            self._pushes = gui.add_checkbox("Push by dragging", False, hint=PUSH_HINT)
+            self.on(self._pushes, lambda _: self._show_grips())
             self.on(gui.add_button("Set a goal", icon=viser.Icon.FLAG, hint=GOAL_HINT), lambda _: self._await_goal())
             self._picking = gui.add_html("")
+            self._fan = gui.add_checkbox("Avoider", self.session.avoid != "none", hint=FAN_HINT)
+            self._tree = gui.add_checkbox("Search", False, hint="Draws the arcs that the search for the plan drove.")
+            self.on(self._tree, lambda _: self._show_search())
             self.add_drawing()
             self._timeline = gui.add_html("")
             save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
@@ -214,6 +241,8 @@ class Live(Page):
         self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
         self._scene.show_reference(first)
         self._scene.forget_trails()
+        self._fan.visible = session.avoid in ("window", "mppi")
+        self._show_search()
         for name, ghost in self._ghosts.items():
             ghost.value = any(s.feedforward == name for s in session.start[1:])
         self._robot.value = first.robot.path
@@ -264,6 +293,7 @@ class Live(Page):
         tick = max(0, round(time / self.session.period))
         self._back = tick if tick < self.session.tick else None
         self._return.visible = self._back is not None
+        self._forget_goal()
         self._plots.time.value = self.time  # else a second click there would change nothing
         self.playing = False
         self._describe()
@@ -276,20 +306,55 @@ class Live(Page):
     def _tell(self, name: str) -> None:
         if name not in STORIES:
             raise InputError(f"{name}: not one of the choices")
-        self._back = None
-        self._restart(STORIES[name].scenarios)
+        self._begin(STORIES[name].scenarios)
         self.playing = True
 
     def _await_goal(self) -> None:
-        """Waits for two clicks on the floor: the place of a goal, and a point towards which a robot there looks."""
+        """Waits for a drag on the floor, from the place of a goal to where a robot looks there, or for two clicks."""
+        self._go_on()
         self._forget_goal()
         self._picks = True
-        write(self._picking, block("picking", "Click on the floor where the robots shall go."))
+        self._show_grips()
+        write(self._picking, block("picking", "Drag on the floor, or click, where the robots shall go."))
 
     def _forget_goal(self) -> None:
         self._picks = False
         self._picked: list[Array] = []
+        self._show_grips()
         write(self._picking, "")
+
+    def _show_grips(self) -> None:
+        """Lets visitors drag what they may drag at present."""
+        self._scene.hold_floor(partial(self._dragged, self._drag_goal) if self._picks else None)
+        self._scene.hold_robot(partial(self._dragged, self._drag_push) if self._pushes.value else None)
+
+    def _dragged(self, action: Callable[[str, Array, Array], None], event: viser.SceneNodeDragEvent) -> None:
+        """Queues an action with the places on the floor in m, `(2,)`, from and to which a visitor drags."""
+        eye = np.array(event.client.camera.position)
+        ends = [np.array(place) - eye for place in (event.start_position, event.end_position)]
+
+        def act() -> None:
+            start, end = (self._scene.on_floor(eye, ray) for ray in ends)
+            if start is not None and end is not None:
+                action(event.phase, start, end)
+
+        self.ask(act)
+
+    def _drag_goal(self, phase: str, start: Array, end: Array) -> None:
+        """Shows, and at the end sets, the goal at the start of a drag."""
+        if self._picks:
+            goal = (float(start[0]), float(start[1]), float(np.arctan2(*(end - start)[::-1])))
+            self._scene.show_ends(np.array([goal, goal]))
+            if phase == "end":
+                self._head_for(goal)
+
+    def _drag_push(self, phase: str, start: Array, end: Array) -> None:  # noqa: ARG002 (the robot may have moved)
+        """Pushes all robots at the end of a drag from the first one; before, the page draws an arrow."""
+        fx, fy = HARD * self.session.robot.mass * (end - self._qpos(0)[:2]) / self._scene.length
+        self._pull = None if phase == "end" else (float(fx), float(fy))
+        if phase == "end":
+            fx, fy = _rounded(fx, fy)
+            self._apply_event(push=(fx, fy, 0.0))
 
     def _click(self, origin: Array, direction: Array) -> None:
         """Takes a click, a ray from `origin` in m, `(3,)`: for a goal, or on a trail, to look back to that moment."""
@@ -298,19 +363,27 @@ class Live(Page):
             return self._click_on_trail(point)
         if point is None:
             raise InputError("goal: there is no floor where you clicked")
-        self._go_on()
-        place, session = (self._picked[0] if self._picked else point), self.session
-        ahead = point - (place if self._picked else session.qpos(0)[:2])
+        place = self._picked[0] if self._picked else point
+        ahead = point - (place if self._picked else self.session.qpos(0)[:2])
         goal = (float(place[0]), float(place[1]), float(np.arctan2(ahead[1], ahead[0])))
-        if not self._picked:
-            self._picked.append(point)
-            self._scene.show_ends(np.array([goal, goal]))
-            return write(self._picking, block("picking", "Click on the floor towards where they shall look there."))
+        if self._picked:
+            return self._head_for(goal)
+        self._picked.append(point)
+        self._scene.show_ends(np.array([goal, goal]))
+        write(self._picking, block("picking", "Click on the floor towards where they shall look there."))
+
+    def _head_for(self, goal: Pose) -> None:
+        """Sets a goal, x and y in m and θ in rad."""
         self._forget_goal()
         try:
-            session.head_for(goal)
+            self._searched = self.session.head_for(goal).searched
+            self._show_search()
         finally:
             self._describe()
+
+    def _show_search(self) -> None:
+        self._tree.visible = len(self._searched) > 0
+        self._scene.show_search(self._searched if self._tree.value else NOTHING)
 
     def _click_on_trail(self, point: Array | None) -> None:
         """Looks back to when a robot was at a point of the floor in m, `(2,)`, if a trail is there."""
@@ -359,6 +432,10 @@ class Live(Page):
         name, *rest = path
         if path == ("perturbation", "control_delay"):  # in whole control periods
             value = round(value / self.session.period) * self.session.period
+        if name in PLANNED and self.session.avoid != "none":
+            raise InputError(
+                f"{name}: with --avoid {self.session.avoid} the robots keep to the plan that they were given"
+            )
         if path == ("reference",):
             value = {"kind": value}
         if path == ("sensing", "tier"):  # with all values of the tier
@@ -405,19 +482,27 @@ class Live(Page):
         """Begins another run with another robot, in its steering and on a reference that suit it."""
         if name not in self._robots:
             raise InputError(f"{name}: not one of the choices")
-        self._back = None
         try:
-            self._restart([_with_robot(s, self._robots[name]) for s in self.session.start])
+            self._begin([_with_robot(s, self._robots[name]) for s in self.session.start])
         finally:
             self._robot.value = self.session.start[0].robot.path
+
+    def _begin(self, scenarios: Sequence[Scenario]) -> None:
+        """Begins a run that has nothing of the one before, nor of a mission."""
+        session = Session(scenarios)
+        self._searched = NOTHING
+        self._take(session)
 
     def _restart(self, scenarios: Sequence[Scenario]) -> None:
         """Begins another run; while a visitor looks back, drives it up to there, with the events until then."""
         if self._back is None:
-            self.session = Session(scenarios)
+            self._take(Session(scenarios, self.session.avoid))
         else:
-            self.session = self.session.repeated(scenarios, self._back, self._tell_progress())
-            self._back = None
+            self._take(self.session.repeated(scenarios, self._back, self._tell_progress()))
+
+    def _take(self, session: Session) -> None:
+        """Puts a session in the place of the one before."""
+        self.session, self._back = session, None
         self._return.visible = False
         if time.monotonic() > self._tidied + TIDY_INTERVAL:
             self._tidied = time.monotonic()
@@ -442,9 +527,16 @@ class Live(Page):
     def _save(self, client: viser.ClientHandle) -> None:
         if client.client_id not in self.server.get_clients():
             return  # the visitor has left in the meantime
-        for scenario in self.session.saved():
-            name = f"session-{scenario.name or scenario.feedforward}.toml"
-            client.send_file_download(name, scenario.to_toml().encode(), save_immediately=True)
+        for name, content in self.saved().items():
+            client.send_file_download(name, content.encode(), save_immediately=True)
+
+    def saved(self) -> dict[str, str]:
+        """Returns the files that repeat the session, by name: a scenario for each robot, and the avoider, if any."""
+        session = self.session
+        files = {f"session-{s.name or s.feedforward}.toml": s.to_toml() for s in session.saved()}
+        if session.avoid != "none":
+            files[f"{session.avoid}.py"] = AVOIDER.format(avoid=session.avoid, scenario=next(iter(files)))
+        return files
 
     @override
     def shown(self) -> list[Recording]:
@@ -480,7 +572,8 @@ class Live(Page):
     @override
     def draw(self) -> None:
         session, (marked, magnified), tick = self.session, self.marks, self.tick
-        now = tick, self._back, self._follow.value, marked, magnified, self._deviation
+        fan = self._fan.value and self._back is None
+        now = tick, self._back, self._follow.value, marked, magnified, self._deviation, fan, self._pull
         if now == self._drawn:
             return
         self._drawn = now
@@ -497,6 +590,11 @@ class Live(Page):
             self._scene.show_obstacles(self.time)
             self._scene.show_sensors(logs, session.period, self._latencies, magnified)
             self._scene.show_scans(scans)
+            push = pushed(max(session.saved(), key=lambda s: len(s.events)), self.time)
+            for row in range(session.size):
+                self._scene.show_force(row, push if row or self._pull is None else np.array(self._pull))
+            shown = range(min(session.size, MAX_MARKED) if fan else 0)
+            self._scene.show_considered([session.considered(row) for row in shown])
             self._scene.flush(self._follow.value)
 
     def _record(self) -> Rows:

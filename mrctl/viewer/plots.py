@@ -14,7 +14,7 @@ from viser import uplot
 from mrctl.kernel import Rows
 from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.results.dataset import blank
-from mrctl.viewer.looks import Colour, Look
+from mrctl.viewer.looks import Colour, Look, pale
 from mrctl.viewer.scene import EVENT_COLOUR
 from mrctl.viewer.score import table
 
@@ -136,12 +136,6 @@ def charts(log: Rows, robots: Sequence[Look], period: float, clearance: Array | 
             (0.0, 1.0),
         ),
     ]
-
-
-def pale(colour: Colour) -> Colour:
-    """Returns the colour of an estimated quantity of a robot with a colour."""
-    red, green, blue = (255 - (255 - c) // 2 for c in colour)
-    return red, green, blue
 
 
 def _moving_mean(values: Array, window: int) -> Array:

@@ -18,7 +18,7 @@ from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import ends
+from mrctl.viewer.session import ends, pushed
 
 SAMPLES = 800  # about the largest number of samples in a curve
 BOARD_SIZE = np.array([4.0, 0.0, 2.2])  # m, extent of the scatter plot in the scene along x, y and z
@@ -228,6 +228,7 @@ class Replay(Page):
         for row, recording in enumerate(self.recordings):
             self._scene.show(row, recording.qpos(recording.index(self.time)))
             self._scene.show_payload(row, recording.perturbation(self.time))
+            self._scene.show_force(row, pushed(recording.scenario, recording.start + self.time))
         self._scene.show_ends(ends(self.recordings[0].scenario, self.recordings[0].start + self.time))
         period, logs = self.recordings[0].period, []
         if marked:
