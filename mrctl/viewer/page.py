@@ -31,7 +31,8 @@ SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5
 
 # On a phone the panel is as wide as the screen and leaves half of it to the scene, and a finger finds the buttons.
 PHONE = """<style>@media (max-width: 576px) {
-.mantine-Button-root { min-height: 44px !important }
+.mantine-Button-root, .mantine-Tabs-tab, .mantine-Input-input { min-height: 44px !important }
+.mantine-Checkbox-root { --checkbox-size: 44px !important }
 [style*="width: 20em"] { width: 100vw !important; max-height: 50% !important }
 }</style>"""
 
@@ -102,6 +103,8 @@ class Page(ABC):
         )  # fmt: skip
         self._sensed = gui.add_html("")
         self.on(gui.add_checkbox("Dark page", self.server.dark), self._set_dark)
+        self._soft = gui.add_checkbox("Soft light", self.server.soft, hint="Reflections and shadows, for a GPU.")
+        self.on(self._soft, self._set_soft)
 
     def add_download(self) -> None:
         """Adds the button that makes one HTML file, in the present context of the GUI."""
@@ -137,7 +140,11 @@ class Page(ABC):
 
     def _set_dark(self, dark: bool) -> None:
         self.server.set_dark(dark)
-        self._scene.paint(dark)
+        self._scene.paint()
+
+    def _set_soft(self, soft: bool) -> None:
+        self.server.set_soft(soft)
+        self._scene.paint()
 
     def add_key(self, key: HotkeyKey, label: str, action: Callable[[], None]) -> None:
         """Queues an action whenever a visitor presses a key; viser lists it under its label with Ctrl-K."""

@@ -69,6 +69,7 @@ PARTICLE, MAX_PARTICLES = 0.015, 500  # m, size of a particle, and about the num
 SEARCH_COLOUR: Colour = (148, 163, 184)
 COARSE, FAN_HEIGHT, MAX_ARCS = 4, 0.03, 5000  # of the drawn steps of a roll-out; m; about the number that is drawn
 
+SHADE = 0.35  # opacity of shadows on the floor
 GRIP, GRIP_BELOW = 50.0, 0.02  # m, half the side of the floor that can be dragged on, and its depth below the floor
 SQUARE = (-1, -1), (1, -1), (1, 1), (-1, 1)
 HARD = 3.0  # N/kg, a push whose arrow is as long as the robot
@@ -121,6 +122,7 @@ class Scene:
         self._positions = np.zeros((self.size, len(self._bodies), 3))
         self._quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (self.size, len(self._bodies), 1))
         self._surroundings = Surroundings(obstacles)
+        self._walls: list[viser.MeshHandle] = []
         self._movers: list[viser.MeshHandle] = []  # in the order of `Surroundings.courses`
         self._draw_world()
         self._looks: list[tuple[viser.FrameHandle, viser.MeshHandle]] = []  # of each body, solid and translucent
@@ -210,6 +212,7 @@ class Scene:
                     flat_shading=True, cast_shadow=False, receive_shadow=False,
                     wxyz=data.xquat[body], position=data.xpos[body],
                 )  # fmt: skip
+                self._walls.append(drawn)
                 if model.body_mocapid[body] >= 0:
                     self._movers.append(drawn)
 
@@ -300,7 +303,7 @@ class Scene:
         self._factor.position = [(low[0] + high[0]) / 2, high[1] + self.length / 2, high[2]]
         middle = (low + high) / 2
         self._look(middle + self._view * CAMERA_POSITION, middle + self._view * CAMERA_TARGET)
-        self.paint(self._server.dark)
+        self.paint()
 
     def draw_references(self, references: Sequence[Reference]) -> None:
         """Draws a lap of each reference on the ground, in place of those before; the cameras stay."""
@@ -326,8 +329,13 @@ class Scene:
             client.camera.position = position
             client.camera.look_at = target
 
-    def paint(self, dark: bool) -> None:
-        """Gives floor and horizon the colours of a dark or a light page."""
+    def paint(self) -> None:
+        """Gives floor and horizon the colours of a dark or a light page, and, in soft light, shadows to what stands."""
+        dark, soft = self._server.dark, self._server.soft
+        for floor in self._floors:
+            floor.shadow_opacity = SHADE if soft else 0.0
+        for part in (*self._held, *self._walls):
+            part.cast_shadow = soft
         colours = DARK_FLOOR if dark else LIGHT_FLOOR
         for floor in self._floors:
             floor.cell_color, floor.section_color, floor.plane_color = colours

@@ -223,6 +223,8 @@ def test_live(browser, tmp_path):
         page.set_viewport_size({"width": 390, "height": 844})
         button = page.get_by_role("button", name="reset", exact=True)
         until(lambda: (box := button.bounding_box()) and box["height"] >= 44, "a button for a finger")
+        boxes = [box.bounding_box() for box in page.locator("input[type=checkbox]").all() if box.is_visible()]
+        assert len(boxes) > 2 and all(min(box["width"], box["height"]) >= 44 for box in boxes)
         page.screenshot(path=tmp_path / "phone.png", timeout=PATIENCE)
         page.set_viewport_size({"width": 1280, "height": 800})
         page.get_by_text("reset", exact=True).click()
@@ -618,5 +620,14 @@ def test_sweep(browser, tmp_path):
         time.sleep(0.5)
         page.mouse.click(*at)
         until(lambda: replay.runs == [4], "the run to open")
+        points, ring = replay._board[:2]
+        until(lambda: np.allclose(ring.position, points.batched_positions[4]), "the mark of the run")
+        replay.library.table["energy"] = [0.1, 1.0, 10.0, 100.0, 1e3, 1e4]  # J
+        replay._axes[1].value = "electrical energy, J"
+        replay.ask(replay._scatter)
+        until(lambda: replay._board[0] is not points, "another axis")
+        assert np.ptp(np.diff(replay._board[0].batched_positions[:, 2])) < 1e-6  # decades, which are equally far
+        written = [drawn.text for drawn in replay._board if hasattr(drawn, "text")]
+        assert "electrical energy, J, logarithmic 0.1" in written and "1e+04" in written
     again = simulate(jobs.scenario_of(tmp_path / "store", 4))
     assert replay._log["x"][:, 0].tobytes() == again.x.values.tobytes()
