@@ -160,6 +160,7 @@ class Live(Page):
             self.on(self._return, lambda _: self._look_back(self.session.time))
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
             self.on(speed, lambda name: self._set_speed(SPEEDS[name]))
+            self.add_cameras()
             self._follow = gui.add_checkbox("Camera follows", False, hint="The first robot stays in the middle.")
             for label, choices in buttons(self.session.robot).items():
                 group = gui.add_button_group(label, tuple(choices))
@@ -596,6 +597,7 @@ class Live(Page):
             shown = range(min(session.size, MAX_MARKED) if fan else 0)
             self._scene.show_considered([session.considered(row) for row in shown])
             self._scene.flush(self._follow.value)
+        self.chase()
 
     def _record(self) -> Rows:
         """Returns a record of `TICK` of each robot: the last one, or that of the moment that is shown."""

@@ -26,6 +26,7 @@ from mrctl.viewer.scene import MAX_MARKED, Scene
 from mrctl.viewer.server import Server
 
 FRAME, REFRESH = 1 / 25, 1 / 15  # s of wall time between two pictures, and between two updates of the plots
+CAMERAS = ("overview", "top", "chase")
 SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "as fast as it goes": float("inf")}
 
 
@@ -62,6 +63,7 @@ class Page(ABC):
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._closing = False
         self._making: threading.Thread | None = None
+        self._chasing: dict[int, viser.ClientHandle] = {}  # visitors whose cameras are behind the first robot
         panel = server.gui.add_panel()
         self.curves = panel.add_tab("Curves", viser.Icon.CHART_LINE)
         panel.dock_left()
@@ -78,6 +80,32 @@ class Page(ABC):
         above = self._scene.above_floor(here)
         if not np.array_equal(above, here):
             camera.position, camera.look_at = above, target
+
+    def add_cameras(self) -> None:
+        """Adds the buttons that place a visitor's own camera, in the present context of the GUI."""
+        group = self.server.gui.add_button_group("Camera", CAMERAS)
+
+        @group.on_click
+        async def _(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                self.ask(self._place_camera, event.client, group.value)
+
+    def _place_camera(self, client: viser.ClientHandle, name: str) -> None:
+        self._chasing.pop(client.client_id, None)
+        if name == "chase":
+            self._chasing[client.client_id] = client
+            return self.chase()
+        client.camera.position, client.camera.look_at = self._scene.camera(name == "top")
+
+    def chase(self) -> None:
+        """Moves the cameras of visitors who chase the first robot."""
+        visitors = self.server.get_clients()
+        for number, client in list(self._chasing.items()):
+            if number not in visitors:
+                del self._chasing[number]
+                continue
+            with client.atomic():
+                client.camera.position, client.camera.look_at = self._scene.behind()
 
     @property
     def message(self) -> str:

@@ -72,6 +72,7 @@ class Replay(Page):
                 gui.add_dropdown("Speed", speeds, initial_value="1×"),
                 lambda name: setattr(self, "speed", SPEEDS[name]),
             )
+            self.add_cameras()
             self._follow = gui.add_checkbox("Camera follows", False)
             self.add_drawing()
             self.on(self.deviation, lambda _: self._show(self.runs))
@@ -283,6 +284,7 @@ class Replay(Page):
             self._scene.show_obstacles(self.recordings[0].start + self.time)
             self._scene.show_sensors(logs, period, self._latencies, magnified)
             self._scene.flush(self._follow.value)
+        self.chase()
 
     @override
     def refresh(self) -> None:

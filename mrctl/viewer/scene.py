@@ -329,6 +329,22 @@ class Scene:
             client.camera.position = position
             client.camera.look_at = target
 
+    def camera(self, top: bool) -> tuple[Array, Array]:
+        """Returns the position of a camera that sees the whole reference, and what it looks at, in m, `(3,)` each."""
+        initial = self._server.initial_camera
+        if not top:
+            return np.array(initial.position), np.array(initial.look_at)
+        middle = np.array(initial.look_at) - self._view * CAMERA_TARGET
+        return middle + self._view * np.array([0.0, -0.01, 1.6]), middle  # a camera cannot look straight down
+
+    def behind(self) -> tuple[Array, Array]:
+        """Returns the position of a camera behind the first robot, and what it looks at, in m, `(3,)` each."""
+        here, turn = self._positions[0, self._chassis] + self._root.position, self._quaternions[0, self._chassis]
+        ahead = np.zeros(3)
+        mujoco.mju_rotVecQuat(ahead, np.array([1.0, 0, 0]), turn)
+        ahead = np.array([ahead[0], ahead[1], 0.0]) / max(1e-9, np.hypot(ahead[0], ahead[1]))
+        return here + self.length * (np.array([0.0, 0, 1.2]) - 2.5 * ahead), here + self.length * ahead
+
     def paint(self) -> None:
         """Gives floor and horizon the colours of a dark or a light page, and, in soft light, shadows to what stands."""
         dark, soft = self._server.dark, self._server.soft

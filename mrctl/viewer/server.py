@@ -67,7 +67,7 @@ class Server(viser.ViserServer):
     def set_soft(self, soft: bool) -> None:
         """Lights scenes by a photographed room and with shadows, or evenly; `Scene.paint` does the rest."""
         self.soft = soft
-        self.scene.configure_environment_map("studio" if soft else None, environment_intensity=0.5)
+        self.scene.configure_environment_map("studio" if soft else None, environment_intensity=0.2)
         self.scene.configure_default_lights(cast_shadow=soft)
         self._ambient.visible = not soft
 

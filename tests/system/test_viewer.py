@@ -377,12 +377,30 @@ def test_dragging(browser, tmp_path):
 
 
 def test_visitors_come_and_go(browser):
-    """A second page, a reload and a page that is closed leave the session alone; a late visitor sees it as it is."""
+    """A second page, a reload and a page that is closed leave the session alone; a late visitor sees it as it is.
+
+    Each has a camera of its own; soft light is for all.
+    """
     with serving(lambda server: Live([BASE], server)) as (live, url):
         with visit(browser, url) as page:
             until(lambda: node(page, ROBOT) is not None, "the scene")
             with visit(browser, url) as other:
                 until(lambda: node(other, ROBOT) is not None, "the other page")
+                camera = page.evaluate(CAMERA)
+                other.get_by_role("button", name="chase", exact=True).click()
+                until(lambda: len(live._chasing) == 1, "the chase")
+
+                def behind():
+                    (x, y, z), length = np.array(other.evaluate(CAMERA)) - node(other, ROBOT), live._scene.length
+                    along = (x * np.cos(live.session.log()[-1]["theta"]) + y * np.sin(live.session.log()[-1]["theta"]))[
+                        0
+                    ]
+                    return abs(along / length + 2.5) < 0.8 and abs(z / length - 1.2) < 0.1
+
+                until(behind, "the camera behind the robot")
+                assert page.evaluate(CAMERA) == camera
+                other.get_by_label("Soft light").click()
+                until(lambda: page.evaluate(CASTS, f"{ROBOT}/mesh"), "the shadow")
                 page.reload()
             until(lambda: node(page, ROBOT) is not None, "the page again")
         tick = live.session.tick
@@ -475,6 +493,11 @@ VISIBLE = """(name) => {
     let node = window.__viserMutable.nodeRefFromName[name];
     while (node && node.visible) node = node.parent;
     return !node;
+}"""
+CASTS = """(name) => {
+    let casts = false;
+    window.__viserMutable.nodeRefFromName[name].traverse((part) => { casts ||= part.castShadow; });
+    return casts;
 }"""
 MARKS = "/world/sensors/0"
 
