@@ -392,15 +392,16 @@ def test_visitors_come_and_go(browser):
 
                 def behind():
                     (x, y, z), length = np.array(other.evaluate(CAMERA)) - node(other, ROBOT), live._scene.length
-                    along = (x * np.cos(live.session.log()[-1]["theta"]) + y * np.sin(live.session.log()[-1]["theta"]))[
-                        0
-                    ]
+                    theta = live.session.log()[-1, 0]["theta"]
+                    along = x * np.cos(theta) + y * np.sin(theta)
                     return abs(along / length + 2.5) < 0.8 and abs(z / length - 1.2) < 0.1
 
                 until(behind, "the camera behind the robot")
                 assert page.evaluate(CAMERA) == camera
                 other.get_by_label("Soft light").click()
                 until(lambda: page.evaluate(CASTS, f"{ROBOT}/mesh"), "the shadow")
+                other.get_by_label("Soft light").click()
+                until(lambda: not page.evaluate(CASTS, f"{ROBOT}/mesh"), "the shadow to go")
                 page.reload()
             until(lambda: node(page, ROBOT) is not None, "the page again")
         tick = live.session.tick
