@@ -379,7 +379,7 @@ def test_dragging(browser, tmp_path):
 def test_visitors_come_and_go(browser):
     """A second page, a reload and a page that is closed leave the session alone; a late visitor sees it as it is.
 
-    Each has a camera of its own; soft light is for all.
+    Each has a camera of its own.
     """
     with serving(lambda server: Live([BASE], server)) as (live, url):
         with visit(browser, url) as page:
@@ -398,10 +398,6 @@ def test_visitors_come_and_go(browser):
 
                 until(behind, "the camera behind the robot")
                 assert page.evaluate(CAMERA) == camera
-                other.get_by_label("Soft light").click()
-                until(lambda: page.evaluate(CASTS, f"{ROBOT}/mesh"), "the shadow")
-                other.get_by_label("Soft light").click()
-                until(lambda: not page.evaluate(CASTS, f"{ROBOT}/mesh"), "the shadow to go")
                 page.reload()
             until(lambda: node(page, ROBOT) is not None, "the page again")
         tick = live.session.tick
@@ -494,11 +490,6 @@ VISIBLE = """(name) => {
     let node = window.__viserMutable.nodeRefFromName[name];
     while (node && node.visible) node = node.parent;
     return !node;
-}"""
-CASTS = """(name) => {
-    let casts = false;
-    window.__viserMutable.nodeRefFromName[name].traverse((part) => { casts ||= part.castShadow; });
-    return casts;
 }"""
 MARKS = "/world/sensors/0"
 

@@ -228,6 +228,7 @@ def test_robots(live):
     """Another robot begins another run, in which the controllers of before follow what it can; no other name does."""
     live._restart([Scenario(prior="model", learner="rls", seed=3), Scenario(learner="none", seed=3)])
     live._press("Payload", "drop payload")
+    live._set_soft(True)
     for name, steering in (("racecar", "rigid"), ("turtlebot", "caster"), ("car", "compliant")):
         visitor_sets(live, live._robot, name)
         live._run_requests()
@@ -243,6 +244,9 @@ def test_robots(live):
         assert np.hypot(log["longitudinal_error"], log["lateral_error"]).max() < 0.1 and live.message == ""
         live.draw()
         live.refresh()
+        assert all(part.cast_shadow for part in live._scene._held)  # of the new robot, too
+    live._set_soft(False)
+    assert not any(part.cast_shadow for part in live._scene._held)
     live.ask(live._choose_robot, "nosuch")
     live._run_requests()
     assert "not one of the choices" in live.message and live._robot.value == "car"
