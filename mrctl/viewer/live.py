@@ -40,7 +40,7 @@ from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import CHANGEABLE, Session, changed, ends, followed, pushed, state
+from mrctl.viewer.session import CHANGEABLE, HOUR, Session, changed, ends, followed, pushed, state
 
 WINDOW = 12.0  # s, time span of the plots
 SAMPLES = 300  # about the largest number of samples in a curve
@@ -149,6 +149,7 @@ class Live(Page):
     def _build(self) -> None:
         gui, tabs = self.server.gui, self.server.gui.add_tab_group()
         self._plots = Plots(gui, self.curves)
+        self._plots.time.max = HOUR
         self.on(self._plots.time, self._look_back)
         with tabs.add_tab("Drive"):
             self.on(gui.add_button_group("Watch", tuple(STORIES)), self._tell)
@@ -291,6 +292,8 @@ class Live(Page):
 
     def _look_back(self, time: float) -> None:
         """Shows the session at an earlier time in s and pauses; at the present time, or later, shows the present."""
+        if not isinstance(time, int | float) or not np.isfinite(time):
+            raise InputError(f"go to: {time} is not a time")
         tick = max(0, round(time / self.session.period))
         self._back = tick if tick < self.session.tick else None
         self._return.visible = self._back is not None
@@ -622,7 +625,7 @@ class Live(Page):
             self._counted = now, session.tick
         doing = "playing" if self.playing else "paused" if session.running else "finished; reset starts again"
         if self._back is not None:
-            doing = f"of {session.time:.2f} s; what you do now, it goes on from here"
+            doing = f"of {session.time:.2f} s; whatever you do goes on from here"
         lap = "" if self._ends is not None else f" · lap {1 + int(self.time / session.start[0].reference.period)}"
         factor = f" · {self.factor:.2f}× real time" if self.playing else ""
         lines = [f"<b>{self.time:.2f} s</b>{lap} · {doing}{factor}"]

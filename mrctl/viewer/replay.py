@@ -221,7 +221,7 @@ class Replay(Page):
             max(np.sqrt(np.mean(off**2, axis=0)).max(), *(s["fix_position_noise"] for s in sensing)),
         )
         self.duration = float(times[-1])
-        self.scrubber.max = self._interval.max = self.duration
+        self.scrubber.max = self._interval.max = self._plots.time.max = self.duration
         self._interval.value = (0.0, self.duration)
         self._draw_curves()
         self._mark_chosen()

@@ -269,6 +269,10 @@ def test_looking_back(live):
         assert frame.position == pytest.approx([row["x"], row["y"], row["z"]], abs=1e-6)
     assert live._controls._inputs["perturbation", "payload"].value == pytest.approx(10.0) and live._return.visible
     assert live.session.tick == 300 and "1.50 s" in live._status.content and "of 3.00 s" in live._status.content
+    for nonsense in (float("nan"), "soon", None):
+        live.ask(live._look_back, nonsense)
+        live._run_requests()
+        assert "not a time" in live.message and live._back == 150
     live._look_back(9.0)
     live.draw()
     assert not live._return.visible and frames[0].position == pytest.approx(live.session.qpos(0)[:3])
