@@ -92,6 +92,8 @@ class Page(ABC):
 
     def _place_camera(self, client: viser.ClientHandle, name: str) -> None:
         self._chasing.pop(client.client_id, None)
+        if client.client_id not in self.server.get_clients():
+            return  # the visitor has left in the meantime
         if name == "chase":
             self._chasing[client.client_id] = client
             return self.chase()
