@@ -327,7 +327,8 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
                 in the way (`window`, `mppi`).
             out: Folder for the result, the table in JSON and the figures.
             json: Print JSON instead of a table.
-            view: Instead of a table, show the mission live in the browser, where further goals can be set by clicks.
+            view: Instead of a table, show the mission live in the browser; without --avoid, further goals can be set
+                by clicks there.
             port: Number of the port to listen on, with --view.
             suite: Instead of one mission, find how narrow a corridor, and how fast, the robot can drive with PID,
                 model, fel and model+composite, on three plants; how long this takes is printed first. The tables are
@@ -348,13 +349,13 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         if port != 8080 and not view:
             raise InputError("port: belongs to --view")
         if view:
-            if avoid != "none" or out is not None or json:
-                raise InputError("view: a live session has no --avoid, --out and --json")
+            if out is not None or json:
+                raise InputError("view: a live session has no --out and --json")
             from mrctl.navigation.mission import task_of
             from mrctl.viewer import view as viewing
 
             task = task_of(world, chosen, start, goal)
-            return viewing.mission(task, chosen, compare, speed, margin, "127.0.0.1", port)
+            return viewing.mission(task, chosen, compare, speed, margin, avoid, "127.0.0.1", port)
         text, outcome = mission.run(world, chosen, goal, start, compare, speed, margin, avoid, out, json)
         print(text)
         if outcome != "arrived":

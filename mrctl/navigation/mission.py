@@ -131,10 +131,8 @@ def navigate(
     Raises:
         InputError: Start or goal is in an obstacle, there is no way, or the robot cannot drive the plan.
     """
-    found, own = prepared(task, scenario, speed, margin, forward=avoid in ("window", "mppi"))
+    found, own = prepared(task, scenario, speed, margin, avoid)
     stage = avoiding(avoid, own)
-    if avoid in ("window", "mppi"):
-        own = own.replace(motion_period=PERIOD, laps=WAITING)
     others = [own.replace(name="", **FEEDFORWARDS[name]) for name in compare]
     result = simulate([own, *others], progress=progress, motion=stage)
     driven = np.flatnonzero(np.isfinite(result["x"].values).any(axis=0))
@@ -143,25 +141,19 @@ def navigate(
 
 
 def prepared(
-    task: Task, scenario: Scenario, speed: float | None = None, margin: float = MARGIN, forward: bool = False
+    task: Task, scenario: Scenario, speed: float | None = None, margin: float = MARGIN, avoid: Avoid = "none"
 ) -> tuple[Plan, Scenario]:
-    """Returns a plan, and the scenario that drives it; arguments and errors are those of `navigate`.
-
-    Args:
-        task: World, start and goal.
-        scenario: The robot and all else.
-        speed: Largest speed in m/s.
-        margin: Clearance that the plan keeps in m.
-        forward: Whether the plan must not reverse, not even where there is no way forward.
-    """
+    """Returns a plan, and the scenario that drives it; arguments and errors are those of `navigate`."""
+    reactive = avoid in ("window", "mppi")
     model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
     try:
         found, reference = planned(task, scenario, speed, margin)
     except InputError:
-        if forward or not mjcf.reverses(model, scenario.steering):
+        if reactive or not mjcf.reverses(model, scenario.steering):
             raise
         found, reference = planned(task, scenario, speed, margin, reverse=True)
     own = {"obstacles": task.obstacles, "reference": reference, "laps": PATIENCE}
+    own |= {"motion_period": PERIOD, "laps": WAITING} if reactive else {}
     return found, scenario.replace(**own, initial_pose=task.start, goal=task.goal)
 
 

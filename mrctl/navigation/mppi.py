@@ -10,10 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Reactive, Scene, roll_out
+from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Reactive, Scene, roll_out
 
 SAMPLES = 2000
 TEMPERATURE = 0.05  # λ, in units of the cost; chosen
+KEPT = 40  # of the samples, which are kept to be looked at
 SPREAD = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
 
 
@@ -40,8 +41,9 @@ class Mppi(Reactive):
         roll_out.compiled(self._knots, nominal, pose, last, period, self.bounds, scene, twists, costs)
         weights = np.exp((costs.min() - costs) / TEMPERATURE)
         mean = np.tensordot(weights / weights.sum(), twists, 1)
-        cheapest = twists[costs.argmin()].copy()
+        cheapest, some = twists[costs.argmin()].copy(), twists[:: SAMPLES // KEPT].copy()
         touches = costs.min() >= TOUCH
         roll_out.compiled(self._knots[:1], mean, pose, last, period, self.bounds, scene, twists[:1], costs[:1])
         nominal[:] = mean if touches or costs[0] < TOUCH else cheapest
+        self.considered[row] = Considered(pose.copy(), some, nominal.copy())
         return nominal[0]

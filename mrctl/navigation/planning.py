@@ -77,6 +77,8 @@ class Plan(NamedTuple):
     """Length in m, in reverse times 1.5, plus 0.5 m for each change of direction."""
     expanded: int
     """Number of poses that the search expanded."""
+    searched: Array = np.zeros((0, 2, 2))
+    """Ends of the arcs that the search drove, x and y in m, `(k, 2, 2)`."""
 
     @property
     def length(self) -> float:
@@ -164,7 +166,7 @@ def plan(where: Space, start: Array, goal: Array, radius: float, reverse: bool, 
             raise InputError(f"{name}: the robot {found} at {place}")
     ahead = around(where, goal)
     step = max(1.5 * where.field.resolution, radius * 2 * np.pi / HEADINGS)
-    tree = Tree(np.empty((most, 3)), np.empty(most, np.int64), *np.empty((3, most)))
+    tree = Tree(np.empty((most, 3)), np.full(most, -1), *np.empty((3, most)))
     found, expanded = search.compiled(start, goal, float(radius), step, reverse, ahead, where, tree)
     if found < 0:
         why = "there is none" if found == -1 else f"{most:,} poses were not enough"
@@ -208,7 +210,7 @@ def shortcut(where: Space, whole: Plan, radius: float, reverse: bool) -> Plan:
         poses.append(piece)
         ways.append(direction)
         now, last = other, float(direction[-1]) if len(direction) else last
-    return Plan(np.concatenate(poses), np.concatenate(ways), float(total), whole.expanded)
+    return Plan(np.concatenate(poses), np.concatenate(ways), float(total), whole.expanded, whole.searched)
 
 
 def around(where: Space, goal: Array) -> Array:
@@ -419,4 +421,7 @@ def _traced(tree: Tree, last: int, radius: float, step: float, reverse: bool, ex
         poses.append(piece[1:])
         ways.append(directions[1:])
         now = piece[-1]
-    return Plan(np.concatenate(poses), np.concatenate(ways), float(tree.costs[last]), expanded)
+    made = np.flatnonzero(tree.parents >= 0)
+    arcs = made[tree.turns[made] != SHOT]
+    searched = np.stack([tree.poses[tree.parents[arcs], :2], tree.poses[arcs, :2]], axis=1)
+    return Plan(np.concatenate(poses), np.concatenate(ways), float(tree.costs[last]), expanded, searched)

@@ -77,12 +77,46 @@ class Scene(NamedTuple):
     """Circles around those that move: x and y in m, their velocities in m/s, radius in m, `(M, 5)`."""
 
 
+class Considered(NamedTuple):
+    """What a stage considered in a motion period."""
+
+    pose: Array
+    """Where the robot was by its estimate, x and y in m and θ in rad, `(3,)`."""
+    twists: Array
+    """Some of the roll-outs, V in m/s and θ̇ in rad/s, `(k, n, 2)`."""
+    chosen: Array
+    """The one whose first twist was asked for, `(n, 2)`."""
+
+    def paths(self, step: float) -> tuple[Array, Array]:
+        """Returns the places on the ways of the roll-outs in m, `(k, n + 1, 2)`, and on the chosen one, `(n + 1, 2)`.
+
+        Args:
+            step: Duration of a step in s.
+        """
+        ways = [_path(self.pose, twists, step) for twists in (self.twists, self.chosen[None])]
+        return ways[0], ways[1][0]
+
+
+def _path(pose: Array, twists: Array, step: float) -> Array:
+    """Returns the places, `(k, n + 1, 2)`, of unicycles that obey twists `(k, n, 2)` at once, as roll-outs do."""
+    turned = step * np.cumsum(twists[..., 1], axis=-1)
+    heading = pose[2] + turned - step * twists[..., 1] / 2  # half-way through each step
+    moves = step * twists[..., :1] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    return pose[:2] + np.pad(np.cumsum(moves, axis=-2), [(0, 0), (1, 0), (0, 0)])
+
+
 Replan = Callable[[Array, Outlines], Waypoints | None]
 """Plans from a pose in m, m, rad, `(3,)`, among obstacles as they are now; None where there is no way."""
 
 
 class Reactive(ABC):
-    """A motion stage that asks for twists along a plan, and makes another plan when it is off this one or waits."""
+    """A motion stage that asks for twists along a plan, and makes another plan when it is off this one or waits.
+
+    Attributes:
+        bounds: What twists the robot can drive.
+        last: The last twist of each robot, `(B, 2)`.
+        considered: What led to it, for each robot; None before the first one.
+    """
 
     def __init__(
         self, robot: Robot, size: int, plan: Waypoints, obstacles: Obstacles, footprint: Array, replan: Replan
@@ -112,6 +146,7 @@ class Reactive(ABC):
         self._tables = [self._sampled(self._plan)] * self._size
         self._anchor, self._since, self._tried = pose[:, :2].copy(), np.zeros(self._size), np.zeros(self._size)
         self.last = np.zeros((self._size, 2))
+        self.considered: list[Considered | None] = [None] * self._size
 
     def _sampled(self, plan: Waypoints) -> Array:
         """Returns a plan as rows of `Scene.targets`, `FINE` in a motion period."""

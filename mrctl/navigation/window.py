@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Reactive, Scene, roll_out
+from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Reactive, Scene, roll_out
 
 SPEEDS, ROTATIONS = 9, 15  # of the window
 MOMENT = 0.25  # s, in which the twists of the window can be reached
@@ -38,4 +38,6 @@ class Window(Reactive):
         roll_out.compiled(falling, rest, pose, last, period, bounds, scene, stops, braking)
         costs[braking >= TOUCH] = np.inf
         best = int(costs.argmin())
-        return ahead[best, 0] if np.isfinite(costs[best]) else stops[int(braking.argmin()), 0]
+        chosen = ahead[best] if np.isfinite(costs[best]) else stops[int(braking.argmin())]
+        self.considered[row] = Considered(pose.copy(), ahead, chosen)
+        return chosen[0]

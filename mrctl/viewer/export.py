@@ -20,7 +20,7 @@ from mrctl.viewer.recording import Recording, event_times, joint_log
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.sensors import magnification
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import ends
+from mrctl.viewer.session import ends, pushed
 
 PICTURE_RATE = 25  # pictures for each second of the replay
 SAMPLES = 1200  # about the largest number of samples in a curve
@@ -80,6 +80,7 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
             for row, recording in enumerate(recordings):
                 scene.show(row, recording.qpos(recording.index(time)))
                 scene.show_payload(row, recording.perturbation(time))
+                scene.show_force(row, pushed(recording.scenario, recording.start + time))
             scene.show_obstacles(recordings[0].start + time)
             scene.show_ends(ends(recordings[0].scenario, recordings[0].start + time))
             scene.show_targets(np.stack([r.log[r.index(time)] for r in recordings]), magnified)

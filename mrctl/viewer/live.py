@@ -16,27 +16,31 @@ import viser
 from typing_extensions import override
 from viser._messages import HotkeyKey
 
-from mrctl.kernel import Array
-from mrctl.loop.simulation import arranged
+from mrctl.kernel import Array, Rows
+from mrctl.loop.simulation import arranged, suited
+from mrctl.navigation.mission import Avoid
+from mrctl.physics.files import SHIPPED
 from mrctl.record import InputError
 from mrctl.results.controllers import title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
+from mrctl.theory.obstacles import Pose
 from mrctl.theory.perturbation import Perturbation
-from mrctl.theory.references import Waypoints
-from mrctl.theory.robot import Robot
-from mrctl.viewer.controls import Controls
+from mrctl.theory.references import Reference, Waypoints
+from mrctl.theory.robot import Robot, RobotFile
+from mrctl.viewer.controls import WORLDS, Controls
+from mrctl.viewer.deviation import drawn
 from mrctl.viewer.embed import LONGEST
 from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
-from mrctl.viewer.scene import MAX_MARKED, Scene
+from mrctl.viewer.scene import HARD, MAX_MARKED, Scene
 from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import CHANGEABLE, Session, changed, ends, followed, state
+from mrctl.viewer.session import CHANGEABLE, HOUR, Session, changed, ends, followed, pushed, state
 
 WINDOW = 12.0  # s, time span of the plots
 SAMPLES = 300  # about the largest number of samples in a curve
@@ -44,11 +48,26 @@ TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each 
 PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
 REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
 MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
-GOAL_HINT = "Two clicks on the floor: where the robots shall go, and towards where they shall look there."
+GOAL_HINT = "Drag on the floor from where the robots shall go to where they shall look there; or click twice."
+PUSH_HINT = "A drag from the first robot pushes all robots that way, a robot's length as hard as the button."
+FAN_HINT = "Draws some of the ways that `window` or `mppi` considers, and the one that it chooses."
+# What *Save session* writes beside the scenarios of a mission with an avoider.
+AVOIDER = '''"""The motion stage of a session: `mrctl run {scenario} --controller motion={avoid}.py:{avoid}`."""
+
+from pathlib import Path
+
+from mrctl.navigation.mission import avoiding
+from mrctl.scenario import Scenario
+
+{avoid} = avoiding("{avoid}", Scenario.from_toml(str(Path(__file__).with_name("{scenario}"))))
+'''
 KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of each group
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
 DRIVER = ("prior", "learner")  # what the ghosts differ in
+NOTHING = np.zeros((0, 2, 2))
+PLANNED = ("world", "steering", "reference")  # what a plan was made for
+KEPT = ("prior", "learner", "seed")  # by another robot, and the tier of the sensors
 NEW_RUN = ("world", "steering", "sensing", "reference", "seed", "prefilter")
 HIDDEN = (
     "name",
@@ -72,7 +91,7 @@ def buttons(robot: Robot) -> dict[str, dict[str, dict[str, Any]]]:
     """
     mass, half_track = robot.mass, robot.half_track
     load = _rounded(mass / 2, robot.com_offset / 2, 0.32 * half_track, 5 / 3 * robot.com_height)
-    push, spin = _rounded(3 * mass, 4 * mass * half_track)  # N and N·m
+    push, spin = _rounded(HARD * mass, 4 * mass * half_track)  # N and N·m
     return {
         "Payload": {
             "drop payload": dict(zip(("payload", "payload_x", "payload_y", "payload_z"), load, strict=True)),
@@ -92,19 +111,26 @@ def _rounded(*values: float) -> list[float]:
 class Live(Page):
     """The page of a live session; its loop carries out the requests of visitors between two ticks."""
 
-    def __init__(self, scenarios: Sequence[Scenario], server: Server) -> None:
+    def __init__(
+        self, scenarios: Sequence[Scenario], server: Server, avoid: Avoid = "none", searched: Array | None = None
+    ) -> None:
         """Builds the page and sets the robots on their references.
 
         Args:
             scenarios: Scenario of each robot; the first one is solid, the others are ghosts.
             server: Server of the page.
+            avoid: What keeps robots on a mission from obstacles that move.
+            searched: The arcs of the search for their plan, as of `Plan`.
 
         Raises:
             InputError: A scenario is refused, as by `Session`.
         """
         super().__init__(server)
-        self.session = Session(scenarios)
+        self.session = Session(scenarios, avoid)
+        self._searched = NOTHING if searched is None else searched
         self.factor = 0.0  # ratio of simulated to wall time in the last second
+        self._back: int | None = None  # tick that is shown, while a visitor looks back
+        self._pull: tuple[float, ...] | None = None  # push that a visitor draws with the mouse, in N
         self.late = self.ticks = 0  # ticks that began more than a period too late, and all ticks, at a finite speed
         self._due = 0.0  # number of ticks that are due
         self._changed_inputs: dict[tuple[str, ...], Any] = {}
@@ -123,20 +149,30 @@ class Live(Page):
     def _build(self) -> None:
         gui, tabs = self.server.gui, self.server.gui.add_tab_group()
         self._plots = Plots(gui, self.curves)
+        self._plots.time.max = HOUR
+        self.on(self._plots.time, self._look_back)
         with tabs.add_tab("Drive"):
             self.on(gui.add_button_group("Watch", tuple(STORIES)), self._tell)
             self._story = gui.add_html("")
             self._status = gui.add_html("")
             self._play = gui.add_button_group("", ("play", "pause", "step", "reset"))
             self.on(self._play, self._command)
+            self._return = gui.add_button("Return to the present", visible=False)
+            self.on(self._return, lambda _: self._look_back(self.session.time))
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
             self.on(speed, lambda name: self._set_speed(SPEEDS[name]))
+            self.add_cameras()
             self._follow = gui.add_checkbox("Camera follows", False, hint="The first robot stays in the middle.")
             for label, choices in buttons(self.session.robot).items():
                 group = gui.add_button_group(label, tuple(choices))
                 self.on(group, partial(self._press, label))
+            self._pushes = gui.add_checkbox("Push by dragging", False, hint=PUSH_HINT)
+            self.on(self._pushes, lambda _: self._show_grips())
             self.on(gui.add_button("Set a goal", icon=viser.Icon.FLAG, hint=GOAL_HINT), lambda _: self._await_goal())
             self._picking = gui.add_html("")
+            self._fan = gui.add_checkbox("Avoider", self.session.avoid != "none", hint=FAN_HINT)
+            self._tree = gui.add_checkbox("Search", False, hint="Draws the arcs that the search for the plan drove.")
+            self.on(self._tree, lambda _: self._show_search())
             self.add_drawing()
             self._timeline = gui.add_html("")
             save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
@@ -155,6 +191,11 @@ class Live(Page):
             self.add_key(key, next(iter(choices)).capitalize(), partial(self._press, group, next(iter(choices))))
 
         self.add_key("G", "Set a goal", self._await_goal)
+
+        @self.server.scene.on_click()
+        def _(event: viser.SceneClickEvent) -> None:
+            self.ask(self._click, np.array(event.ray_origin), np.array(event.ray_direction))
+
         self._controls = Controls(gui, partial(self.ask, self._note_input))
         self._controls.designed = self.session.designed()
         first, changing = self.session.start[0], [name for name in Scenario.model_fields if name not in HIDDEN]
@@ -173,6 +214,10 @@ class Live(Page):
             self._gains = gui.add_html("")
             self._controls.add(first, only=[n for n in changing if n not in (*NEW_RUN, "perturbation", *DRIVER)])
         with tabs.add_tab("Run"):
+            self._robots = {robot.path: robot for robot in (*(RobotFile(path=p) for p in SHIPPED), first.robot)}
+            hint = "Another robot begins another run, with the steering and a reference that suit it."
+            self._robot = gui.add_dropdown("robot", tuple(self._robots), initial_value=first.robot.path, hint=hint)
+            self.on(self._robot, self._choose_robot)
             self._controls.add(first, only=NEW_RUN)
 
     def _show_session(self) -> None:
@@ -198,9 +243,14 @@ class Live(Page):
         self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
         self._scene.show_reference(first)
         self._scene.forget_trails()
+        self._fan.visible = session.avoid in ("window", "mppi")
+        self._show_search()
         for name, ghost in self._ghosts.items():
             ghost.value = any(s.feedforward == name for s in session.start[1:])
+        self._robot.value = first.robot.path
         self._drawn = self._plotted = None
+        self._trail = np.zeros(0, int), np.zeros((0, session.size, 2))  # ticks of its points, and where they are drawn
+        self._way: Reference | None = None  # that a visitor has brought, as drawn
         self._deviation = 1  # factor on the deviations from the reference in the picture
         self._laps: list[dict[str, Any]] = []  # metrics of the whole laps until now
         self._counted = (time.monotonic(), session.tick)
@@ -218,51 +268,135 @@ class Live(Page):
 
     def _command(self, name: str) -> None:
         if name == "reset":
+            self._back = None
             self._restart(self.session.start)
         elif name == "step":
+            self._go_on()
             self.playing = False
             self.session.step()
+        elif name == "play":
+            self._go_on()
+            self.playing = self.session.running
         else:
-            self.playing = name == "play" and self.session.running
+            self.playing = False
+
+    @property
+    def tick(self) -> int:
+        """Number of control periods before the moment that is shown."""
+        return self.session.tick if self._back is None else self._back
+
+    @property
+    def time(self) -> float:
+        """Time that is shown in s."""
+        return self.tick * self.session.period
+
+    def _look_back(self, time: float) -> None:
+        """Shows the session at an earlier time in s and pauses; at the present time, or later, shows the present."""
+        if not isinstance(time, int | float) or not np.isfinite(time):
+            raise InputError(f"go to: {time} is not a time")
+        tick = max(0, round(time / self.session.period))
+        self._back = tick if tick < self.session.tick else None
+        self._return.visible = self._back is not None
+        self._forget_goal()
+        self._plots.time.value = self.time  # else a second click there would change nothing
+        self.playing = False
+        self._describe()
+
+    def _go_on(self) -> None:
+        """Lets the session go on from where a visitor looks back to, as if nothing had happened since."""
+        if self._back is not None:
+            self._restart(self.session.start)
 
     def _tell(self, name: str) -> None:
         if name not in STORIES:
             raise InputError(f"{name}: not one of the choices")
-        self._restart(STORIES[name].scenarios)
+        self._begin(STORIES[name].scenarios)
         self.playing = True
 
     def _await_goal(self) -> None:
-        """Waits for two clicks on the floor: the place of a goal, and a point towards which a robot there looks."""
+        """Waits for a drag on the floor, from the place of a goal to where a robot looks there, or for two clicks."""
+        self._go_on()
         self._forget_goal()
-        write(self._picking, block("picking", "Click on the floor where the robots shall go."))
-
-        @self.server.scene.on_click()
-        def _(event: viser.SceneClickEvent) -> None:
-            self.ask(self._click, np.array(event.ray_origin), np.array(event.ray_direction))
+        self._picks = True
+        self._show_grips()
+        write(self._picking, block("picking", "Drag on the floor, or click, where the robots shall go."))
 
     def _forget_goal(self) -> None:
-        self.server.scene.remove_click_callback()
+        self._picks = False
         self._picked: list[Array] = []
+        self._show_grips()
         write(self._picking, "")
 
+    def _show_grips(self) -> None:
+        """Lets visitors drag what they may drag at present."""
+        self._scene.hold_floor(partial(self._dragged, self._drag_goal) if self._picks else None)
+        self._scene.hold_robot(partial(self._dragged, self._drag_push) if self._pushes.value else None)
+
+    def _dragged(self, action: Callable[[str, Array, Array], None], event: viser.SceneNodeDragEvent) -> None:
+        """Queues an action with the places on the floor in m, `(2,)`, from and to which a visitor drags."""
+        eye = np.array(event.client.camera.position)
+        ends = [np.array(place) - eye for place in (event.start_position, event.end_position)]
+
+        def act() -> None:
+            start, end = (self._scene.on_floor(eye, ray) for ray in ends)
+            if start is not None and end is not None:
+                action(event.phase, start, end)
+
+        self.ask(act)
+
+    def _drag_goal(self, phase: str, start: Array, end: Array) -> None:
+        """Shows, and at the end sets, the goal at the start of a drag."""
+        if self._picks:
+            goal = (float(start[0]), float(start[1]), float(np.arctan2(*(end - start)[::-1])))
+            self._scene.show_ends(np.array([goal, goal]))
+            if phase == "end":
+                self._head_for(goal)
+
+    def _drag_push(self, phase: str, start: Array, end: Array) -> None:  # noqa: ARG002 (the robot may have moved)
+        """Pushes all robots at the end of a drag from the first one; before, the page draws an arrow."""
+        fx, fy = HARD * self.session.robot.mass * (end - self._qpos(0)[:2]) / self._scene.length
+        self._pull = None if phase == "end" else (float(fx), float(fy))
+        if phase == "end":
+            fx, fy = _rounded(fx, fy)
+            self._apply_event(push=(fx, fy, 0.0))
+
     def _click(self, origin: Array, direction: Array) -> None:
-        """Takes a click, a ray from `origin` in m, `(3,)`."""
+        """Takes a click, a ray from `origin` in m, `(3,)`: for a goal, or on a trail, to look back to that moment."""
         point = self._scene.on_floor(origin, direction)
+        if not self._picks:
+            return self._click_on_trail(point)
         if point is None:
             raise InputError("goal: there is no floor where you clicked")
-        place, session = (self._picked[0] if self._picked else point), self.session
-        ahead = point - (place if self._picked else session.qpos(0)[:2])
+        place = self._picked[0] if self._picked else point
+        ahead = point - (place if self._picked else self.session.qpos(0)[:2])
         goal = (float(place[0]), float(place[1]), float(np.arctan2(ahead[1], ahead[0])))
-        if not self._picked:
-            self._picked.append(point)
-            self._scene.show_ends(np.array([goal, goal]))
-            return write(self._picking, block("picking", "Click on the floor towards where they shall look there."))
+        if self._picked:
+            return self._head_for(goal)
+        self._picked.append(point)
+        self._scene.show_ends(np.array([goal, goal]))
+        write(self._picking, block("picking", "Click on the floor towards where they shall look there."))
+
+    def _head_for(self, goal: Pose) -> None:
+        """Sets a goal, x and y in m and θ in rad."""
         self._forget_goal()
         try:
-            session.head_for(goal)
+            self._searched = self.session.head_for(goal).searched
+            self._show_search()
         finally:
             self._describe()
-        self._scene.draw_references([followed(session.saved()[0], session.time + session.lead * session.period)])
+
+    def _show_search(self) -> None:
+        self._tree.visible = len(self._searched) > 0
+        self._scene.show_search(self._searched if self._tree.value else NOTHING)
+
+    def _click_on_trail(self, point: Array | None) -> None:
+        """Looks back to when a robot was at a point of the floor in m, `(2,)`, if a trail is there."""
+        ticks, drawn = self._trail
+        if point is None or not drawn.size:
+            return
+        away = np.nan_to_num(np.hypot(*np.moveaxis(drawn - point, -1, 0)), nan=np.inf).min(axis=1)
+        if away.min() < self._scene.reach:
+            self._look_back(int(ticks[away.argmin()]) * self.session.period)
 
     def _set_speed(self, speed: float) -> None:
         self.speed, self._due = speed, 0.0
@@ -271,6 +405,7 @@ class Live(Page):
         choices = buttons(self.session.robot)[group]
         if name not in choices:
             raise InputError(f"{name}: not one of the choices")
+        self._go_on()
         change = choices[name]
         if "push" in change:
             return self._apply_event(**change)
@@ -278,6 +413,7 @@ class Live(Page):
         self._apply_event(perturbation=now.model_copy(update=change))
 
     def _apply_event(self, **change: Any) -> None:  # noqa: ANN401
+        self._go_on()
         self.session.apply(**change)
         self._describe()
 
@@ -294,12 +430,16 @@ class Live(Page):
                 self._apply(path, value)
             except InputError as error:
                 self.complain(error)
-                self._controls.show(self._present(self.session.start[0]))
+                self._controls.show(self._now())
 
     def _apply(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
         name, *rest = path
         if path == ("perturbation", "control_delay"):  # in whole control periods
             value = round(value / self.session.period) * self.session.period
+        if name in PLANNED and self.session.avoid != "none":
+            raise InputError(
+                f"{name}: with --avoid {self.session.avoid} the robots keep to the plan that they were given"
+            )
         if path == ("reference",):
             value = {"kind": value}
         if path == ("sensing", "tier"):  # with all values of the tier
@@ -309,6 +449,7 @@ class Live(Page):
         if name == "sensing":
             value = _in_periods(path[-1], value, self.session.period)
         if name in CHANGEABLE:
+            self._go_on()
             return self._apply_event(**{name: changed(self.session.state()[name], rest, value)})
         start = self.session.start
         touched = start[:1] if name in DRIVER else start
@@ -319,9 +460,17 @@ class Live(Page):
         self._restart(new)
 
     def _present(self, scenario: Scenario) -> Scenario:
-        """Returns the scenario with the present values of the fields that events have changed."""
-        now = self.session.state()
-        return scenario.model_copy(update={name: now[name] for name in CHANGEABLE})
+        """Returns a scenario of the start with the present values of the fields that events have changed.
+
+        While a visitor looks back it is the scenario itself, since another run repeats the events until then.
+        """
+        now = self.session.state() if self._back is None else {}
+        return scenario.model_copy(update={name: now[name] for name in CHANGEABLE if name in now})
+
+    def _now(self) -> Scenario:
+        """Returns the first robot's scenario with the values that hold at the moment that is shown."""
+        now = self.session.state(self.time)
+        return self.session.start[0].model_copy(update={name: now[name] for name in CHANGEABLE})
 
     def _compare(self, name: FeedforwardName, wanted: bool) -> None:
         first, *ghosts = map(self._present, self.session.start)
@@ -333,8 +482,32 @@ class Live(Page):
             ghosts.append(first.model_copy(update=FEEDFORWARDS[name] | {"name": ""}))
         self._restart([first, *ghosts])
 
+    def _choose_robot(self, name: str) -> None:
+        """Begins another run with another robot, in its steering and on a reference that suit it."""
+        if name not in self._robots:
+            raise InputError(f"{name}: not one of the choices")
+        try:
+            self._begin([_with_robot(s, self._robots[name]) for s in self.session.start])
+        finally:
+            self._robot.value = self.session.start[0].robot.path
+
+    def _begin(self, scenarios: Sequence[Scenario]) -> None:
+        """Begins a run that has nothing of the one before, nor of a mission."""
+        session = Session(scenarios)
+        self._searched = NOTHING
+        self._take(session)
+
     def _restart(self, scenarios: Sequence[Scenario]) -> None:
-        self.session = Session(scenarios)
+        """Begins another run; while a visitor looks back, drives it up to there, with the events until then."""
+        if self._back is None:
+            self._take(Session(scenarios, self.session.avoid))
+        else:
+            self._take(self.session.repeated(scenarios, self._back, self._tell_progress()))
+
+    def _take(self, session: Session) -> None:
+        """Puts a session in the place of the one before."""
+        self.session, self._back = session, None
+        self._return.visible = False
         if time.monotonic() > self._tidied + TIDY_INTERVAL:
             self._tidied = time.monotonic()
             _tidy()
@@ -342,18 +515,38 @@ class Live(Page):
         self._learning.value = True
         self._show_session()
 
+    def _tell_progress(self) -> Callable[[int], None]:
+        """Returns what `Session.repeated` calls, which says on the page how far it is."""
+        total, done, told = self.tick * len(self.session.start), 0, time.monotonic()
+
+        def tell(robots: int) -> None:
+            nonlocal done, told
+            done += robots
+            if (now := time.monotonic()) > told + 0.5:
+                told = now
+                write(self._status, block("status", f"driving again up to {self.time:.2f} s: {done / total:.0%}"))
+
+        return tell
+
     def _save(self, client: viser.ClientHandle) -> None:
         if client.client_id not in self.server.get_clients():
             return  # the visitor has left in the meantime
-        for scenario in self.session.saved():
-            name = f"session-{scenario.name or scenario.feedforward}.toml"
-            client.send_file_download(name, scenario.to_toml().encode(), save_immediately=True)
+        for name, content in self.saved().items():
+            client.send_file_download(name, content.encode(), save_immediately=True)
+
+    def saved(self) -> dict[str, str]:
+        """Returns the files that repeat the session, by name: a scenario for each robot, and the avoider, if any."""
+        session = self.session
+        files = {f"session-{s.name or s.feedforward}.toml": s.to_toml() for s in session.saved()}
+        if session.avoid != "none":
+            files[f"{session.avoid}.py"] = AVOIDER.format(avoid=session.avoid, scenario=next(iter(files)))
+        return files
 
     @override
     def shown(self) -> list[Recording]:
         if self.session.tick < 2:
             raise InputError("download: nothing has happened yet")
-        result = self.session.result(LONGEST)
+        result = self.session.result(max(0, self.session.tick - round(LONGEST / self.session.period)))
         return [Recording(result.isel(run=row)) for row in range(self.session.size)]
 
     # -- the loop ----------------------------------------------------------------------------------------------------
@@ -382,25 +575,43 @@ class Live(Page):
 
     @override
     def draw(self) -> None:
-        session, (marked, magnified) = self.session, self.marks
-        now = session.tick, self._follow.value, marked, magnified, self._deviation
+        session, (marked, magnified), tick = self.session, self.marks, self.tick
+        fan = self._fan.value and self._back is None
+        now = tick, self._back, self._follow.value, marked, magnified, self._deviation, fan, self._pull
         if now == self._drawn:
             return
         self._drawn = now
         for row in range(session.size):
-            self._scene.show(row, session.qpos(row))
+            self._scene.show(row, self._qpos(row))
         logs, scans = [], []
         if marked:
-            scans = [session.scan(row) for row in range(min(session.size, MAX_MARKED))]
+            scans = [session.scan(row) for row in range(min(session.size, MAX_MARKED))] if self._back is None else []
             ticks = round(FIX_AGE / session.period) + max(self._latencies)
-            logs = list(session.log(max(0, session.tick - ticks)).T)
+            logs = list(session.log(max(0, tick - ticks), tick).T)
         with self.server.atomic():
             if session.tick:
-                self._scene.show_targets(session.log(session.tick - 1)[-1], self._deviation)
-            self._scene.show_obstacles(session.time)
+                self._scene.show_targets(self._record(), self._deviation)
+            self._scene.show_obstacles(self.time)
             self._scene.show_sensors(logs, session.period, self._latencies, magnified)
             self._scene.show_scans(scans)
+            push = pushed(max(session.saved(), key=lambda s: len(s.events)), self.time)
+            for row in range(session.size):
+                self._scene.show_force(row, push if row or self._pull is None else np.array(self._pull))
+            shown = range(min(session.size, MAX_MARKED) if fan else 0)
+            self._scene.show_considered([session.considered(row) for row in shown])
             self._scene.flush(self._follow.value)
+        self.chase()
+
+    def _record(self) -> Rows:
+        """Returns a record of `TICK` of each robot: the last one, or that of the moment that is shown."""
+        tick = self.session.tick - 1 if self._back is None else self._back
+        return self.session.log(tick, tick + 1)[0]
+
+    def _qpos(self, row: int) -> Array:
+        """Returns the generalised position of a robot at the moment that is shown; one that has stopped stays."""
+        if self._back is None or not np.isfinite(self._record()["x"][row]):
+            return self.session.qpos(row)
+        return Recording(self.session.result(self._back, self._back + 1).isel(run=row)).qpos(0)
 
     @override
     def refresh(self) -> None:
@@ -413,55 +624,62 @@ class Live(Page):
             self.factor = (session.tick - tick) * session.period / (now - since)
             self._counted = now, session.tick
         doing = "playing" if self.playing else "paused" if session.running else "finished; reset starts again"
-        lap = "" if self._ends is not None else f" · lap {1 + int(session.time / session.start[0].reference.period)}"
+        if self._back is not None:
+            doing = f"of {session.time:.2f} s; whatever you do goes on from here"
+        lap = "" if self._ends is not None else f" · lap {1 + int(self.time / session.start[0].reference.period)}"
         factor = f" · {self.factor:.2f}× real time" if self.playing else ""
-        lines = [f"<b>{session.time:.2f} s</b>{lap} · {doing}{factor}"]
+        lines = [f"<b>{self.time:.2f} s</b>{lap} · {doing}{factor}"]
         for row, label in enumerate(self._labels):
-            if reason := session.failure(row):
+            stopped = self._back is None or not np.isfinite(self._record()["x"][row])
+            if stopped and (reason := session.failure(row)):
                 lines.append(warning(f"{label} stopped: {reason}"))
         if session.tick:
-            lines += arrivals(self._labels, session.log(session.tick - 1)[-1], self._ends)
+            lines += arrivals(self._labels, self._record(), self._ends)
         write(self._status, block("status", *lines))
-        happened = sum(event.time <= session.time for scenario in session.saved() for event in scenario.events)
+        happened = sum(event.time <= self.time for scenario in session.saved() for event in scenario.events)
         if happened != self._happened:  # such as those that the scenarios brought along
             self._happened = happened
             self._describe()
-        past = session.tick, self.playing, self.deviation.value  # a pause draws what was left out before it
+        past = session.tick, self._back, self.playing, self.deviation.value  # a pause draws what was left out before it
         if past != self._plotted:
             self._plotted = past
             self._show_past()
         if session.tick:
-            now = session.log(session.tick - 1)[-1]
+            now = self._record()
             self.describe_estimates(self._labels, now)
             ticks = round(session.start[0].reference.period / session.period)
             if session.tick >= (len(self._laps) + 1) * ticks:
                 self._laps += whole_laps(session.log(len(self._laps) * ticks), ticks, session.period)
-            self._plots.score(now, self._laps)
+            self._plots.score(now, self._laps[: self.tick // ticks])
 
     def _show_past(self) -> None:
-        """Draws the last seconds: their curves, and the trails of the robots, which change less often."""
+        """Draws the last seconds, or those around the moment that is shown: curves, and trails, which change less."""
         session = self.session
         ticks = round(WINDOW / session.period)
         step = max(1, ticks // SAMPLES)
-        first = max(0, session.tick - ticks) // step * step
-        log = session.log(first)
+        last = session.tick if self._back is None else min(session.tick, max(self._back + ticks // 2, ticks))
+        first = max(0, last - ticks) // step * step
+        log = session.log(first, last)
         if len(log) < 2:
             return self._plots.clear(WINDOW)
         times = np.arange(first, first + len(log), dtype=float) * session.period
-        self._plots.show(times, log, session.clearance(first), step, self._event_times())
+        near = session.clearance(first)
+        self._plots.show(times, log, None if near is None else near[: len(log)], step, self._event_times())
+        self._plots.point(None if self._back is None else (self._back - first) / ((len(log) - 1) // step * step))
         self._plots_since_trail += 1
         if self._plots_since_trail >= PLOTS_PER_TRAIL or not self.playing:
             self._plots_since_trail = 0
             every = -(-ticks // (self._scene.trail_points - 2))
-            marked = session.tick // every * every - every * np.arange(self._scene.trail_points - 1)[::-1]
-            rows = np.append(marked, session.tick - 1) - first  # the same moments of the run in every picture
+            marked = last // every * every - every * np.arange(self._scene.trail_points - 1)[::-1]
+            rows = np.clip(np.append(marked, last - 1) - first, 0, len(log) - 1)  # the same moments in every picture
             self._deviation = self.magnified_deviation(log)
-            self._scene.show_trails(log[np.clip(rows, 0, len(log) - 1)], self._deviation)
+            self._trail = first + rows, drawn(log[rows], self._deviation)
+            self._scene.show_trails(log[rows], self._deviation)
 
     def _event_times(self) -> list[float]:
         """Returns the times of the events until now in s."""
         events = {event.time for scenario in self.session.saved() for event in scenario.events}
-        return sorted(time for time in events if time <= self.session.time)
+        return sorted(time for time in events if time <= self.time)
 
     def _describe(self) -> None:
         """Writes the timeline, marks the events on the track, and sets the inputs to the present values."""
@@ -475,12 +693,17 @@ class Live(Page):
         driven = self.session.driven()
         ticks = np.minimum(np.round(np.array(self._event_times()) / self.session.period).astype(int), len(driven) - 1)
         self._scene.show_events(driven[ticks[ticks >= 0]])
-        self._ends = ends(scenario, self.session.time + self.session.lead * self.session.period)
+        soon = self.time + self.session.lead * self.session.period
+        self._ends = ends(scenario, soon)
         self._scene.show_ends(self._ends)
-        present = self._present(self.session.start[0])
+        way = followed(scenario, soon)
+        if way != self._way and any(event.reference for event in self.session.added):
+            self._way = way
+            self._scene.draw_references([way])
         for row, saved in enumerate(self.session.saved()):
-            self._scene.show_payload(row, state(saved, self.session.time)["perturbation"])
+            self._scene.show_payload(row, state(saved, self.time)["perturbation"])
         self._controls.designed = self.session.designed()
+        present = self._now()
         self._controls.show(present)
         units = ("V/(m/s)", "V/m"), RIGID_UNITS if present.steering == "rigid" else ("V/(rad/s)", "V/rad")
         lines = ["<b>Present gains of the velocity PID</b>"]
@@ -496,6 +719,13 @@ def _in_periods(name: str, value: Any, period: float) -> Any:  # noqa: ANN401
     if name.endswith("_rate") and value > 0:
         return 1 / (max(1, round(1 / (value * period))) * period)
     return value
+
+
+def _with_robot(scenario: Scenario, robot: RobotFile) -> Scenario:
+    """Returns a scenario for another robot: with the same controller, seed and tier, and a reference that suits it."""
+    kept: dict[str, Any] = {name: getattr(scenario, name) for name in KEPT}
+    world = scenario.world if scenario.world in WORLDS else "flat"
+    return suited(Scenario(**kept, world=world, robot=robot, sensing=Sensing(tier=scenario.sensing.tier)))
 
 
 def _tidy() -> None:

@@ -22,6 +22,12 @@ def looks(labels: Sequence[str], controllers: Sequence[str]) -> list[Look]:
     return [Look(*pair) for pair in zip(labels, map(_rgb, colours_of(controllers)), strict=True)]
 
 
+def pale(colour: Colour) -> Colour:
+    """Returns the colour of what a robot with a colour estimates or considers."""
+    red, green, blue = (255 - (255 - c) // 2 for c in colour)
+    return red, green, blue
+
+
 def _rgb(colour: str) -> Colour:
     red, green, blue = bytes.fromhex(colour.removeprefix("#"))
     return red, green, blue

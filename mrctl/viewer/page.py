@@ -26,12 +26,14 @@ from mrctl.viewer.scene import MAX_MARKED, Scene
 from mrctl.viewer.server import Server
 
 FRAME, REFRESH = 1 / 25, 1 / 15  # s of wall time between two pictures, and between two updates of the plots
+CAMERAS = ("overview", "top", "chase")
 SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "as fast as it goes": float("inf")}
 
 
 # On a phone the panel is as wide as the screen and leaves half of it to the scene, and a finger finds the buttons.
 PHONE = """<style>@media (max-width: 576px) {
-.mantine-Button-root { min-height: 44px !important }
+.mantine-Button-root, .mantine-Tabs-tab, .mantine-Input-input { min-height: 44px !important }
+.mantine-Checkbox-root { --checkbox-size: 44px !important }
 [style*="width: 20em"] { width: 100vw !important; max-height: 50% !important }
 }</style>"""
 
@@ -61,6 +63,7 @@ class Page(ABC):
         self._requests: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._closing = False
         self._making: threading.Thread | None = None
+        self._chasing: dict[int, viser.ClientHandle] = {}  # visitors whose cameras are behind the first robot
         panel = server.gui.add_panel()
         self.curves = panel.add_tab("Curves", viser.Icon.CHART_LINE)
         panel.dock_left()
@@ -77,6 +80,34 @@ class Page(ABC):
         above = self._scene.above_floor(here)
         if not np.array_equal(above, here):
             camera.position, camera.look_at = above, target
+
+    def add_cameras(self) -> None:
+        """Adds the buttons that place a visitor's own camera, in the present context of the GUI."""
+        group = self.server.gui.add_button_group("Camera", CAMERAS)
+
+        @group.on_click
+        async def _(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                self.ask(self._place_camera, event.client, group.value)
+
+    def _place_camera(self, client: viser.ClientHandle, name: str) -> None:
+        self._chasing.pop(client.client_id, None)
+        if client.client_id not in self.server.get_clients():
+            return  # the visitor has left in the meantime
+        if name == "chase":
+            self._chasing[client.client_id] = client
+            return self.chase()
+        client.camera.position, client.camera.look_at = self._scene.camera(name == "top")
+
+    def chase(self) -> None:
+        """Moves the cameras of visitors who chase the first robot."""
+        visitors = self.server.get_clients()
+        for number, client in list(self._chasing.items()):
+            if number not in visitors:
+                del self._chasing[number]
+                continue
+            with client.atomic():
+                client.camera.position, client.camera.look_at = self._scene.behind()
 
     @property
     def message(self) -> str:
@@ -102,6 +133,8 @@ class Page(ABC):
         )  # fmt: skip
         self._sensed = gui.add_html("")
         self.on(gui.add_checkbox("Dark page", self.server.dark), self._set_dark)
+        self._soft = gui.add_checkbox("Soft light", self.server.soft, hint="Reflections and shadows, for a GPU.")
+        self.on(self._soft, self._set_soft)
 
     def add_download(self) -> None:
         """Adds the button that makes one HTML file, in the present context of the GUI."""
@@ -137,7 +170,11 @@ class Page(ABC):
 
     def _set_dark(self, dark: bool) -> None:
         self.server.set_dark(dark)
-        self._scene.paint(dark)
+        self._scene.paint()
+
+    def _set_soft(self, soft: bool) -> None:
+        self.server.set_soft(soft)
+        self._scene.paint()
 
     def add_key(self, key: HotkeyKey, label: str, action: Callable[[], None]) -> None:
         """Queues an action whenever a visitor presses a key; viser lists it under its label with Ctrl-K."""

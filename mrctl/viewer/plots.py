@@ -14,7 +14,7 @@ from viser import uplot
 from mrctl.kernel import Rows
 from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.results.dataset import blank
-from mrctl.viewer.looks import Colour, Look
+from mrctl.viewer.looks import Colour, Look, pale
 from mrctl.viewer.scene import EVENT_COLOUR
 from mrctl.viewer.score import table
 
@@ -30,6 +30,24 @@ HOVER = """<style>
 .uplot-container .u-legend .u-series { display: block }
 .uplot-container .u-legend .u-series:last-child, .u-over .u-cursor-pt:last-child { display: none }
 </style>"""
+# A click on a curve writes its time into the number field above the charts, as a visitor would type it; viser has no
+# event for it. What began as a drag zooms in. The charts are where viser shows them to tests of pages.
+GO_TO = """<style onload="
+if (!window.mrctlGoTo) {
+    let down = 0;
+    window.addEventListener('pointerdown', (event) => { down = event.clientX; }, true);
+    window.addEventListener('click', window.mrctlGoTo = (event) => {
+        const over = event.target.closest && event.target.closest('.u-over');
+        if (!over || Math.abs(event.clientX - down) > 3) return;
+        const chart = Object.values(window.__viserTestpoints.uplots).map((u) => u.chart).find((c) => c.over === over);
+        const label = [...document.querySelectorAll('label')].find((l) => l.textContent === 'GOTO');
+        if (!chart || !label) return;
+        const field = document.getElementById(label.htmlFor), at = event.clientX - over.getBoundingClientRect().left;
+        const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set;
+        set.call(field, Math.max(0, chart.posToVal(at, 'x')).toFixed(2));
+        field.dispatchEvent(new Event('input', { bubbles: true }));
+    }, true);
+}"></style>""".replace("GOTO", TIME := "Go to, s")
 MAX_ROBOTS = 4  # number of robots whose curves are drawn
 
 
@@ -120,12 +138,6 @@ def charts(log: Rows, robots: Sequence[Look], period: float, clearance: Array | 
     ]
 
 
-def pale(colour: Colour) -> Colour:
-    """Returns the colour of an estimated quantity of a robot with a colour."""
-    red, green, blue = (255 - (255 - c) // 2 for c in colour)
-    return red, green, blue
-
-
 def _moving_mean(values: Array, window: int) -> Array:
     """Returns the mean of the last `window` values, or of fewer at the beginning; a NaN counts as 0."""
     total = np.concatenate([[0.0], np.cumsum(np.nan_to_num(values))])
@@ -139,6 +151,9 @@ class Plots:
 
     There is a set of charts for each number of robots so far, with and without obstacles, of which one is visible; as
     in `Controls`, nothing is removed.
+
+    Attributes:
+        time: Input of a time in s to go to, which a click on a curve sets, too.
     """
 
     def __init__(self, gui: viser.GuiApi, tab: viser.GuiTabHandle, zoom: bool = True) -> None:
@@ -149,7 +164,8 @@ class Plots:
             self._legend = gui.add_html("")
             self._score = gui.add_html("")
             self._cursor = gui.add_html("")
-            gui.add_html(HOVER)
+            gui.add_html(HOVER + GO_TO)
+            self.time = gui.add_number(TIME, 0.0, min=0.0, step=0.01, hint="A click on a curve sets it, too.")
 
     def set_robots(self, robots: Sequence[Look], period: float, obstacles: bool) -> None:
         """Sets the robots whose curves `show` will draw.
@@ -214,8 +230,11 @@ class Plots:
         """Draws empty charts of `span` s."""
         self.show(np.array([0.0, span]), blank(2, len(self._robots)), self._nowhere(), 1)
 
-    def point(self, share: float) -> None:
-        """Draws a vertical line in all charts at a share of their time; their data need not be sent again."""
+    def point(self, share: float | None) -> None:
+        """Draws a vertical line in all charts at a share of their time, or none; their data need not be sent again."""
+        if share is None:
+            self._cursor.content = ""
+            return
         left = f"{100 * share:.3f}%"
         line = f"content:'';position:absolute;top:0;bottom:0;left:{left};border-left:1px solid rgb{CURSOR_COLOUR}"
         self._cursor.content = f"<style>.u-over{{overflow:hidden}}.u-over::after{{{line}}}</style>"

@@ -11,6 +11,9 @@ import viser
 from typing_extensions import override
 
 from mrctl.record import InputError
+from mrctl.results.controllers import title_of
+from mrctl.results.metrics import METRICS
+from mrctl.viewer.looks import Colour, looks
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
@@ -18,12 +21,13 @@ from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import ends
+from mrctl.viewer.session import ends, pushed
 
 SAMPLES = 800  # about the largest number of samples in a curve
 BOARD_SIZE = np.array([4.0, 0.0, 2.2])  # m, extent of the scatter plot in the scene along x, y and z
 BOARD_CORNER = np.array([-2.0, 3.2, 0.3])  # m, its lower left corner
-DROVE, FAILED = (71, 85, 105), (185, 28, 28)
+DROVE, FAILED, CHOSEN = (71, 85, 105), (185, 28, 28), (17, 24, 39)
+DECADES, TINY = 30.0, 1e-300  # ratio of largest to least beyond which an axis is logarithmic; what stands for 0 there
 
 
 class Replay(Page):
@@ -44,6 +48,7 @@ class Replay(Page):
         self.library = library
         self.time = 0.0
         self.recordings: list[Recording] = []
+        self.runs: list[int] = []
         self._drawn: tuple[object, ...] | None = None
         self._plotted: float | None = None
         self._kept = list(runs[1:])  # the ghosts
@@ -53,6 +58,7 @@ class Replay(Page):
     def _build(self, run: int) -> None:
         gui, table = self.server.gui, self.library.table
         self._plots = Plots(gui, self.curves, zoom=False)
+        self.on(self._plots.time, self._scrub)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Replay"):
             self._status = gui.add_html("")
@@ -66,6 +72,7 @@ class Replay(Page):
                 gui.add_dropdown("Speed", speeds, initial_value="1×"),
                 lambda name: setattr(self, "speed", SPEEDS[name]),
             )
+            self.add_cameras()
             self._follow = gui.add_checkbox("Camera follows", False)
             self.add_drawing()
             self.on(self.deviation, lambda _: self._show(self.runs))
@@ -84,39 +91,62 @@ class Replay(Page):
         self._board: list[Any] = []
         if len(table) > MAX_SHOWN and numbers:
             with tabs.add_tab("All runs"):
-                text = "Each sphere behind the track is a run; red runs have failed. Click on one to show it."
-                gui.add_html(block("scatter", text))
+                gui.add_html(block("scatter", *self._explained()))
                 last = "position_rmse" if "position_rmse" in numbers else numbers[-1]
+                self._columns = {_in_words(name): name for name in numbers}
                 self._axes = [
-                    gui.add_dropdown(label, numbers, initial_value=value)
+                    gui.add_dropdown(label, tuple(self._columns), initial_value=_in_words(value))
                     for label, value in (("across", numbers[0]), ("up", last))
                 ]
                 for axis in self._axes:
                     self.on(axis, lambda _: self._scatter())
             self._scatter()
 
+    def _explained(self) -> list[str]:
+        """Returns lines of HTML that say what the board shows, and which colour is which controller's."""
+        text = "Each sphere behind the track is a run; failed ones are red, the large one is shown. Click on another."
+        own = self._colours().items()
+        keys = [f'<span style="color:rgb{colour}">■ {html.escape(title_of(name))}</span>' for name, colour in own]
+        return [text, " &nbsp; ".join(keys)]
+
+    def _colours(self) -> dict[str, Colour]:
+        """Returns the colour of each controller, where there are several."""
+        table = self.library.table
+        names = [str(name) for name in table["feedforward"].unique()] if "feedforward" in table else []
+        return {name: look.colour for name, look in zip(names, looks(names, names), strict=True)} if names[1:] else {}
+
     def _scatter(self) -> None:
-        """Draws all runs as a scatter plot of two columns of the table, on a board behind the track."""
+        """Draws all runs as a scatter plot of two columns of the table, on a board behind the track.
+
+        An axis of positive numbers that differ by more than a factor of `DECADES` is logarithmic.
+        """
         scene, table = self.server.scene, self.library.table
         for node in self._board:
             node.remove()
         fields = [axis.value for axis in self._axes]
-        values = table[fields].to_numpy(float)
+        values = table[[self._columns[field] for field in fields]].to_numpy(float)
         known = np.isfinite(values).all(axis=1)
         if not known.any():
             self._board = []
             raise InputError(f"{fields[0]}, {fields[1]}: no run has both numbers")
         low, high = values[known].min(axis=0), values[known].max(axis=0)
-        share = (values[known] - low) / np.where(high > low, high - low, 1.0)
+        logarithmic = (low > 0) & (high > DECADES * np.abs(low))
+        scaled = np.where(logarithmic, np.log(np.maximum(values[known], TINY)), values[known])
+        bottom, top = scaled.min(axis=0), scaled.max(axis=0)
+        share = (scaled - bottom) / np.where(top > bottom, top - bottom, 1.0)
         where = BOARD_CORNER + share[:, [0, 0, 1]] * BOARD_SIZE
         failed = table["failed"].to_numpy(bool)[known]
+        own = self._colours()
+        colours = [own[str(name)] for name in table["feedforward"][known]] if own else DROVE
         sphere = _sphere()
         points = scene.add_batched_meshes_simple(
             "/board/runs", *sphere, np.tile([1.0, 0, 0, 0], (len(where), 1)), where,
-            batched_colors=np.where(failed[:, None], FAILED, DROVE).astype(np.uint8),
+            batched_colors=np.where(failed[:, None], FAILED, colours).astype(np.uint8),
             lod="off", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
         runs = table.index.to_numpy()[known]
+        self._places = dict(zip(runs.tolist(), where, strict=True))
+        fields = [f"{field}, logarithmic" if scale else field for field, scale in zip(fields, logarithmic, strict=True)]
 
         @points.on_click
         async def _(event: viser.SceneNodePointerEvent) -> None:
@@ -129,14 +159,26 @@ class Replay(Page):
             "low": (f"{fields[0]} {low[0]:.3g}", [0, 0, -0.15]), "high": (f"{high[0]:.3g}", [1, 0, -0.15]),
             "bottom": (f"{fields[1]} {low[1]:.3g}", [-0.1, 0, 0.06]), "top": (f"{high[1]:.3g}", [-0.1, 0, 1]),
         }  # fmt: skip
+        ring = scene.add_mesh_simple("/board/chosen", 2 * sphere[0], sphere[1], color=CHOSEN, opacity=0.5)
         self._board = [
             points,
+            ring,
             scene.add_line_segments("/board/frame", lines, (120, 120, 120), thickness=0.01),
             *(
                 scene.add_label(f"/board/{key}", text, position=BOARD_CORNER + BOARD_SIZE * at)
                 for key, (text, at) in labels.items()
             ),
         ]
+
+        self._mark_chosen()
+
+    def _mark_chosen(self) -> None:
+        """Marks the first run that is shown on the board, if it is there."""
+        place = self._places.get(self.runs[0]) if self._board and self.runs else None
+        if self._board:
+            self._board[1].visible = place is not None
+        if place is not None:
+            self._board[1].position = place
 
     def _open(self, run: int) -> None:
         self._choose(run)
@@ -179,9 +221,10 @@ class Replay(Page):
             max(np.sqrt(np.mean(off**2, axis=0)).max(), *(s["fix_position_noise"] for s in sensing)),
         )
         self.duration = float(times[-1])
-        self.scrubber.max = self._interval.max = self.duration
+        self.scrubber.max = self._interval.max = self._plots.time.max = self.duration
         self._interval.value = (0.0, self.duration)
         self._draw_curves()
+        self._mark_chosen()
         self._scrub(self.time, pause=False)
 
     def _draw_curves(self) -> None:
@@ -227,6 +270,7 @@ class Replay(Page):
         for row, recording in enumerate(self.recordings):
             self._scene.show(row, recording.qpos(recording.index(self.time)))
             self._scene.show_payload(row, recording.perturbation(self.time))
+            self._scene.show_force(row, pushed(recording.scenario, recording.start + self.time))
         self._scene.show_ends(ends(self.recordings[0].scenario, self.recordings[0].start + self.time))
         period, logs = self.recordings[0].period, []
         if marked:
@@ -240,6 +284,7 @@ class Replay(Page):
             self._scene.show_obstacles(self.recordings[0].start + self.time)
             self._scene.show_sensors(logs, period, self._latencies, magnified)
             self._scene.flush(self._follow.value)
+        self.chase()
 
     @override
     def refresh(self) -> None:
@@ -259,11 +304,17 @@ class Replay(Page):
         self.describe_estimates(self._labels, last)
         if self.time != self._plotted:
             self._plotted = self.time
-            self.scrubber.value = self.time
+            self.scrubber.value = self._plots.time.value = self.time  # a click there again changes it again
             tick = min(round(self.time / self.recordings[0].period), len(self._log) - 1)
             self._plots.score(self._log[tick], self._laps[: (tick + 1) // self._lap])
             start, end = self._interval.value
             self._plots.point((self.time - start) / (end - start) if end > start else 0.0)
+
+
+def _in_words(column: str) -> str:
+    """Returns the name of a column with its unit, and that of a metric in words."""
+    unit, text = METRICS.get(column, ("1", column))
+    return text if unit == "1" else f"{text}, {unit}"
 
 
 def _sphere() -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import itertools
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -28,7 +29,7 @@ from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Reference
 from mrctl.viewer.deviation import Target
-from mrctl.viewer.looks import Colour, Look
+from mrctl.viewer.looks import Colour, Look, pale
 from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, path
 from mrctl.viewer.sensors import Marks, outline
 from mrctl.viewer.server import Server
@@ -56,6 +57,7 @@ HALO = 1.04  # size of a ghost, of which only the far side is drawn: a rim aroun
 MAX_MARKED = 4  # number of robots whose estimates and targets are drawn
 NEXT_TRAIL = 0.001  # m, from the height of the trails of one colour to that of the next; equal ones would flicker
 TRAIL_WIDTH = 0.004  # as a share of the width of the view; the reference is twice as wide
+REACH = 0.03  # distance from a trail of clicks on it, as a share of the width of the view
 LEAST_VIEW = 1.2  # m, least width of the view
 SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
 NONE = Obstacles()
@@ -63,6 +65,15 @@ GOAL_COLOUR: Colour = (22, 163, 74)
 OUTLINE = 0.02  # m, width of the outlines at start and goal
 SCAN_POINT, SCAN_HEIGHT = 0.03, HEIGHT + 0.01  # m, size of the points of a scan, which lie on top of the walls
 PARTICLE, MAX_PARTICLES = 0.015, 500  # m, size of a particle, and about the number that is drawn
+
+SEARCH_COLOUR: Colour = (148, 163, 184)
+COARSE, FAN_HEIGHT, MAX_ARCS = 4, 0.03, 5000  # of the drawn steps of a roll-out; m; about the number that is drawn
+
+SHADE = 0.35  # opacity of shadows on the floor
+GRIP, GRIP_BELOW = 50.0, 0.02  # m, half the side of the floor that can be dragged on, and its depth below the floor
+SQUARE = (-1, -1), (1, -1), (1, 1), (-1, 1)
+HARD = 3.0  # N/kg, a push whose arrow is as long as the robot
+Dragged = Callable[[viser.SceneNodeDragEvent], None]
 
 _NUMBERS = itertools.count()  # of scenes
 
@@ -101,7 +112,8 @@ class Scene:
         self._model, self._data = mjcf.clone(model), mujoco.MjData(model)
         round_ends = self._model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
         self._model.geom_type[round_ends] = mujoco.mjtGeom.mjGEOM_CYLINDER  # a capsule takes thousands of triangles
-        self._radius = read_robot(model).wheel_radius
+        robot = read_robot(model)
+        self._radius, self._mass = robot.wheel_radius, robot.mass
         self._back = np.zeros(4)  # scratch
         self._root = self._scene.add_frame("/world", show_axes=False)
         chassis = model.body("chassis").id
@@ -110,13 +122,15 @@ class Scene:
         self._positions = np.zeros((self.size, len(self._bodies), 3))
         self._quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (self.size, len(self._bodies), 1))
         self._surroundings = Surroundings(obstacles)
+        self._walls: list[viser.MeshHandle] = []
         self._movers: list[viser.MeshHandle] = []  # in the order of `Surroundings.courses`
         self._draw_world()
         self._looks: list[tuple[viser.FrameHandle, viser.MeshHandle]] = []  # of each body, solid and translucent
+        self._held: list[viser.MeshHandle | viser.GlbHandle] = []  # parts of the first robot
         self._top = 0.0  # height of the robot in m
         self._footprint = np.array([[np.inf, np.inf], [-np.inf, -np.inf]])
         self._parts = self._draw_bodies()
-        self._length = float(np.hypot(*(self._footprint[1] - self._footprint[0])))
+        self.length = float(np.hypot(*(self._footprint[1] - self._footprint[0])))
         self._frames = [self._draw_robot(row) for row in range(self.size)]
         self._labels = [
             self._scene.add_label(f"/world/label{row}", robot.label, font_screen_scale=0.8)
@@ -135,7 +149,7 @@ class Scene:
             Marks(self._scene, row, self._footprint, robot.colour) for row, robot in enumerate(robots[:MAX_MARKED])
         ]
         self._targets = [
-            Target(self._scene, row, self._top + TARGET_ABOVE * self._length, THICK * self._length, robot.colour)
+            Target(self._scene, row, self._top + TARGET_ABOVE * self.length, THICK * self.length, robot.colour)
             for row, robot in enumerate(robots[:MAX_MARKED])
         ]
         self._ends = [
@@ -154,6 +168,16 @@ class Scene:
                         point_shading="flat", precision="float32", visible=False,
                     )
                 )  # fmt: skip
+        self._fans = [
+            [
+                self._draw_segments(f"/world/considered/{row}/{name}", colour, width)
+                for name, colour, width in (("some", pale(robot.colour), 1.0), ("chosen", robot.colour, 3.0))
+            ]
+            for row, robot in enumerate(robots[:MAX_MARKED])
+        ]
+        self._forces: list[viser.ArrowsHandle | None] = [None] * self.size
+        self._grip: viser.MeshHandle | None = None
+        self._search = self._draw_segments("/world/search", SEARCH_COLOUR, 1.0)
         self._factor = self._scene.add_label("/world/deviation", "", visible=False, font_screen_scale=0.8)
         self._perturbations: list[Perturbation | None] = [None] * self.size  # as drawn
         self._ribbons: list[viser.MeshHandle] = []
@@ -188,6 +212,7 @@ class Scene:
                     flat_shading=True, cast_shadow=False, receive_shadow=False,
                     wxyz=data.xquat[body], position=data.xpos[body],
                 )  # fmt: skip
+                self._walls.append(drawn)
                 if model.body_mocapid[body] >= 0:
                     self._movers.append(drawn)
 
@@ -205,6 +230,7 @@ class Scene:
                 solid = self._draw_solid(f"{name}/mesh", geoms)
                 glass = self._draw_glass(f"{name}/glass", parts[-1], GLASS, GLASS_OPACITY, visible=False)
                 self._looks.append((solid, glass))
+                self._held.append(glass)
                 corners = mesh.vertices @ self._data.xmat[body].reshape(3, 3).T
                 corners = corners + self._data.xpos[body] - self._data.xpos[self._bodies[self._chassis]]
                 self._top = max(self._top, float(corners[:, 2].max()) + self._radius)
@@ -226,12 +252,13 @@ class Scene:
         for k, (colour, same) in enumerate(groups.items()):
             mesh = merge_geoms(model, same)
             if colour is None:
-                self._scene.add_mesh_trimesh(f"{name}/{k}", mesh, cast_shadow=False, receive_shadow=False)
+                drawn = self._scene.add_mesh_trimesh(f"{name}/{k}", mesh, cast_shadow=False, receive_shadow=False)
             else:
-                self._scene.add_mesh_simple(
+                drawn = self._scene.add_mesh_simple(
                     f"{name}/{k}", mesh.vertices, mesh.faces, color=colour, flat_shading=True,
                     cast_shadow=False, receive_shadow=False,
                 )  # fmt: skip
+            self._held.append(drawn)
         return root
 
     def _draw_glass(
@@ -271,12 +298,12 @@ class Scene:
         references = [scenario.reference, *(e.reference for e in scenario.events if e.reference)]
         lines = self._lines(references)
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
-        self._view = max(LEAST_VIEW, *(high - low)) + self._length
+        self._view = max(LEAST_VIEW, *(high - low)) + self.length
         self.draw_references(references)
-        self._factor.position = [(low[0] + high[0]) / 2, high[1] + self._length / 2, high[2]]
+        self._factor.position = [(low[0] + high[0]) / 2, high[1] + self.length / 2, high[2]]
         middle = (low + high) / 2
         self._look(middle + self._view * CAMERA_POSITION, middle + self._view * CAMERA_TARGET)
-        self.paint(self._server.dark)
+        self.paint()
 
     def draw_references(self, references: Sequence[Reference]) -> None:
         """Draws a lap of each reference on the ground, in place of those before; the cameras stay."""
@@ -302,8 +329,29 @@ class Scene:
             client.camera.position = position
             client.camera.look_at = target
 
-    def paint(self, dark: bool) -> None:
-        """Gives floor and horizon the colours of a dark or a light page."""
+    def camera(self, top: bool) -> tuple[Array, Array]:
+        """Returns the position of a camera that sees the whole reference, and what it looks at, in m, `(3,)` each."""
+        initial = self._server.initial_camera
+        if not top:
+            return np.array(initial.position), np.array(initial.look_at)
+        middle = np.array(initial.look_at) - self._view * CAMERA_TARGET
+        return middle + self._view * np.array([0.0, -0.01, 1.6]), middle  # a camera cannot look straight down
+
+    def behind(self) -> tuple[Array, Array]:
+        """Returns the position of a camera behind the first robot, and what it looks at, in m, `(3,)` each."""
+        here, turn = self._positions[0, self._chassis] + self._root.position, self._quaternions[0, self._chassis]
+        ahead = np.zeros(3)
+        mujoco.mju_rotVecQuat(ahead, np.array([1.0, 0, 0]), turn)
+        ahead = np.array([ahead[0], ahead[1], 0.0]) / max(1e-9, np.hypot(ahead[0], ahead[1]))
+        return here + self.length * (np.array([0.0, 0, 1.2]) - 2.5 * ahead), here + self.length * ahead
+
+    def paint(self) -> None:
+        """Gives floor and horizon the colours of a dark or a light page, and, in soft light, shadows to what stands."""
+        dark, soft = self._server.dark, self._server.soft
+        for floor in self._floors:
+            floor.shadow_opacity = SHADE if soft else 0.0
+        for part in (*self._held, *self._walls):
+            part.cast_shadow = soft
         colours = DARK_FLOOR if dark else LIGHT_FLOOR
         for floor in self._floors:
             floor.cell_color, floor.section_color, floor.plane_color = colours
@@ -320,11 +368,11 @@ class Scene:
         if self._posts is not None:
             self._posts.remove()
             self._posts = None
-        thick, posts = THICK * self._length, []
+        thick, posts = THICK * self.length, []
         for x, y in zip(rows["x_ref"], rows["y_ref"], strict=True):
             if np.isfinite(x):
                 foot = np.array([x, y, self._height(x, y)])
-                posts.append(bar(foot, foot + [0, 0, self._length / 2], thick))
+                posts.append(bar(foot, foot + [0, 0, self.length / 2], thick))
         if posts:
             vertices, faces = zip(*posts, strict=True)
             moved = [face + 8 * k for k, face in enumerate(faces)]
@@ -411,7 +459,7 @@ class Scene:
         """Moves the labels; robots that are close together have one label, which names at most three of them."""
         here, near = self._positions[:, self._chassis], {}
         for row in range(len(self._labels)):
-            first = next((r for r in near if np.hypot(*(here[r] - here[row])[:2]) < TOGETHER * self._length), row)
+            first = next((r for r in near if np.hypot(*(here[r] - here[row])[:2]) < TOGETHER * self.length), row)
             near.setdefault(first, []).append(self._robots[row].label)
         for row, label in enumerate(self._labels):
             label.visible = row in near
@@ -421,7 +469,7 @@ class Scene:
                 text = ", ".join(names[: 2 if more else 3]) + more
                 if label.text != text:
                     label.text = text
-                label.position = here[row] + [0, 0, self._top - self._radius + LABEL_ABOVE * self._length]
+                label.position = here[row] + [0, 0, self._top - self._radius + LABEL_ABOVE * self.length]
 
     def show_payload(self, row: int, perturbation: Perturbation) -> None:
         """Draws the payload of a robot as a cube with the density of water at its place; if there is none, nothing."""
@@ -473,6 +521,75 @@ class Scene:
                     some = found[1][:: max(1, len(found[1]) // MAX_PARTICLES), :2]
                     met.points = places
                     particles.points = np.pad(some, [(0, 0), (0, 1)], constant_values=ABOVE).astype(np.float32)
+
+    def show_force(self, row: int, force: Array | None) -> None:
+        """Draws a push on a robot, along the world's x and y in N, `(2,)`: a robot's length for 3 N/kg.
+
+        None hides it.
+        """
+        arrow = self._forces[row]
+        if force is None:
+            if arrow is not None and arrow.visible:
+                arrow.visible = False
+            return
+        way = np.append(self.length * force / (HARD * self._mass), 0.0)
+        if arrow is None:
+            size = 0.03 * self.length
+            arrow = self._forces[row] = self._scene.add_arrows(
+                f"/world/force/{row}", np.zeros((1, 2, 3)), EVENT_COLOUR,
+                shaft_radius=size, head_radius=2.5 * size, head_length=5 * size,
+            )  # fmt: skip
+        ends = np.stack([np.zeros(3), way])[None].astype(np.float32)
+        if not np.array_equal(arrow.points, ends):
+            arrow.points = ends
+        arrow.position, arrow.visible = self._positions[row, self._chassis] + [0, 0, self._top / 2], True
+
+    def hold_floor(self, dragged: Dragged | None) -> None:
+        """Calls a function while a visitor drags on the floor, or with None no longer."""
+        if dragged is None:
+            if self._grip is not None:
+                self._grip.remove()
+            self._grip = None
+            return
+        if self._grip is None:
+            normal, point = self._floor
+            along, across = np.cross([0.0, 1, 0], normal), np.cross(normal, [1.0, 0, 0])
+            corners = [point - GRIP_BELOW * normal + GRIP * (a * along + b * across) for a, b in SQUARE]
+            self._grip = self._scene.add_mesh_simple(
+                "/world/grip", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]), side="double",
+                cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+            self._grip.on_drag(_in_order(dragged))
+
+    def hold_robot(self, dragged: Dragged | None) -> None:
+        """Calls a function while a visitor drags the first robot, or with None no longer."""
+        for part in self._held:
+            part.remove_drag_callback()
+            if dragged is not None:
+                part.on_drag(_in_order(dragged))
+
+    def _draw_segments(self, name: str, colour: Colour, width: float) -> viser.LineSegmentsHandle:
+        """Adds line segments of a width in pixels, of which there are none yet."""
+        return self._scene.add_line_segments(
+            name, np.zeros((0, 2, 3)), colour, thickness=width, thickness_units="screen", visible=False
+        )
+
+    def show_considered(self, ways: Sequence[tuple[Array, Array] | None]) -> None:
+        """Draws what `Session.considered` returns, for each of the first robots; no ways hide all."""
+        for row, drawn in enumerate(self._fans):
+            found = ways[row] if row < len(ways) else None
+            for lines, places in zip(drawn, found or (None, None), strict=True):
+                _show_segments(lines, None if places is None else _segments(places[..., ::COARSE, :]), FAN_HEIGHT)
+
+    def show_search(self, arcs: Array) -> None:
+        """Draws the arcs of a search, ends in m, `(k, 2, 2)`; none hide them."""
+        some = arcs[:: max(1, len(arcs) // MAX_ARCS)]
+        _show_segments(self._search, some if len(some) else None, ABOVE)
+
+    @property
+    def reach(self) -> float:
+        """Distance in m from a trail within which a click on the floor is a click on it."""
+        return REACH * self._view
 
     @property
     def trail_points(self) -> int:
@@ -530,6 +647,30 @@ class Scene:
     def remove(self) -> None:
         """Removes the world with everything in it."""
         self._root.remove()
+
+
+def _in_order(dragged: Dragged) -> Callable[[viser.SceneNodeDragEvent], Coroutine[Any, Any, None]]:
+    """Returns a coroutine; viser runs them in order, unlike functions."""
+
+    async def called(event: viser.SceneNodeDragEvent) -> None:
+        dragged(event)
+
+    return called
+
+
+def _segments(ways: Array) -> Array:
+    """Returns the pieces of ways, `(…, n, 2)`, as ends of segments, `(k, 2, 2)`."""
+    return np.stack([ways[..., :-1, :], ways[..., 1:, :]], axis=-2).reshape(-1, 2, 2)
+
+
+def _show_segments(lines: viser.LineSegmentsHandle, ends: Array | None, height: float) -> None:
+    """Draws segments between points on the floor in m, `(k, 2, 2)`, at a height in m; None hides them."""
+    if lines.visible != (ends is not None):
+        lines.visible = ends is not None
+    if ends is not None:
+        points = np.pad(ends, [(0, 0), (0, 0), (0, 1)], constant_values=height).astype(np.float32)
+        if not np.array_equal(lines.points, points):
+            lines.points = points
 
 
 def _rough(model: mujoco.MjModel, geoms: Sequence[int]) -> trimesh.Trimesh:

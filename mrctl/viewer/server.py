@@ -56,14 +56,20 @@ class Server(viser.ViserServer):
             self.stop()
             raise InputError(f"port: {port} is in use; choose another with --port")
         self.set_dark(False)
-        self.scene.configure_environment_map(None)
-        self.scene.configure_default_lights(cast_shadow=False)
-        self.scene.add_light_ambient("/light", intensity=1.2)
+        self._ambient = self.scene.add_light_ambient("/light", intensity=1.2)
+        self.set_soft(False)
 
     def set_dark(self, dark: bool) -> None:
         """Makes pages dark or light; `Scene.paint` does so for a scene."""
         self.dark = dark
         self.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium", dark_mode=dark)
+
+    def set_soft(self, soft: bool) -> None:
+        """Lights scenes by a photographed room and with shadows, or evenly; `Scene.paint` does the rest."""
+        self.soft = soft
+        self.scene.configure_environment_map("studio" if soft else None, environment_intensity=0.2)
+        self.scene.configure_default_lights(cast_shadow=soft)
+        self._ambient.visible = not soft
 
     async def _update_value(self, client: ClientId, message: GuiUpdateMessage) -> None:
         """Sets the value of an input for a client; viser would set whatever attribute of it a client names."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import ceil, floor, pi, remainder, sqrt
 from typing import Any, TypeVar
 
@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 
 from mrctl.control.design import motion
 from mrctl.control.margins import Gains
+from mrctl.control.stages import Motion, Stages
 from mrctl.kernel import Array, Rows
-from mrctl.loop.simulation import Simulation, arranged, uniform
+from mrctl.loop.simulation import Simulation, arranged, run, uniform
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import MARGIN, SLIM, prepared
+from mrctl.navigation.mission import MARGIN, SLIM, Avoid, avoiding, prepared
+from mrctl.navigation.planning import Plan
+from mrctl.navigation.rollouts import Reactive
 from mrctl.physics.hull import footprint
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank, combine, dataset
@@ -26,6 +29,7 @@ from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
 
 HOUR = 3600.0  # s of simulated time after which a session ends
+SEEN_PUSH = 0.5  # s, for which a push is drawn, at least
 SHARED_FIELDS = ("world", "obstacles", "robot", "steering", "control_period", "physics_step")
 # Fields of a scenario that can change in the middle of a run; a change of another field needs a new run.
 CHANGEABLE = [name for name in ("perturbation", "kanayama", "pid") if name in Event.model_fields]
@@ -38,17 +42,19 @@ class Session:
 
     Attributes:
         start: Scenarios at the start of the session.
+        avoid: What keeps the robots from obstacles that move.
         simulations: Indices of the robots in each simulation, and the simulation.
         period: Control period in s.
         lead: Number of control periods until a new reference is followed, the longest delay of a robot.
         tick: Number of control periods done.
     """
 
-    def __init__(self, scenarios: Sequence[Scenario]) -> None:
+    def __init__(self, scenarios: Sequence[Scenario], avoid: Avoid = "none") -> None:
         """Sets the robots on their references.
 
         Args:
             scenarios: Scenario of each robot; their laps are ignored, since a session lasts up to an hour.
+            avoid: What keeps robots on a mission from obstacles that move.
 
         Raises:
             InputError: A scenario is refused, as by `mrctl.simulate`, or robots differ in a field of `SHARED_FIELDS`.
@@ -60,7 +66,18 @@ class Session:
         self.start = list(scenarios)
         self.period = scenarios[0].control_period
         long = [s.model_copy(update={"laps": max(1, floor(HOUR / s.reference.period))}) for s in scenarios]
-        self.simulations = [(rows, Simulation([long[row] for row in rows], threads=1)) for rows in uniform(long)]
+        self.avoid: Avoid = avoid
+        motion, self._stages = avoiding(avoid, scenarios[0]), []
+
+        def kept(robot: Robot, size: int) -> Motion:
+            assert motion is not None
+            self._stages.append(motion(robot, size))
+            return self._stages[-1]
+
+        stages: Stages = {"motion": kept} if motion else {}
+        self.simulations = [
+            (rows, Simulation([long[row] for row in rows], threads=1, **stages)) for rows in uniform(long)
+        ]
         self._place = {row: (sim, k) for rows, sim in self.simulations for k, row in enumerate(rows)}
         self.lead = max(sim.lead for _, sim in self.simulations)
         self.tick = 0
@@ -97,6 +114,37 @@ class Session:
                     sim.step()
         self.tick += 1
 
+    @property
+    def added(self) -> tuple[Event, ...]:
+        """Events that visitors have added, in the order in which they did."""
+        each = (saved.events[len(start.events) :] for saved, start in zip(self.saved(), self.start, strict=True))
+        return max(each, key=len)  # a robot that has stopped gets no more
+
+    def repeated(
+        self, scenarios: Sequence[Scenario], tick: int, progress: Callable[[int], object] | None = None
+    ) -> Session:
+        """Returns another session that has done the ticks before one of this one, with the same events of visitors.
+
+        With the scenarios of this session the robots did the same in them, to the bit.
+
+        Args:
+            scenarios: Scenario of each robot at the start.
+            tick: Number of control periods to do; events that had no effect before are left out.
+            progress: Is called after every tick of a simulation with the number of its robots.
+
+        Raises:
+            InputError: As for a new session, or an event does not fit the scenarios.
+        """
+        other = Session(scenarios, self.avoid)
+        for event in self.added:
+            known = self.lead if event.reference else 0  # a reference acts that long before its time
+            if event.tick(self.period) - known < tick:
+                for _, sim in other.simulations:
+                    sim.add(event)
+        run([sim for _, sim in other.simulations], progress, tick, threads=1)
+        other.tick = tick
+        return other
+
     def apply(self, **change: Any) -> None:  # noqa: ANN401
         """Applies an event to every robot at the coming tick, or a new reference as soon as a voltage can act on it.
 
@@ -112,7 +160,7 @@ class Session:
             if sim.tick == self.tick:  # the others have stopped
                 sim.add(event)
 
-    def head_for(self, goal: Pose) -> None:
+    def head_for(self, goal: Pose) -> Plan:
         """Plans a way for the first robot from where it is, and gives it to every robot as an event.
 
         The plan keeps 5 cm from obstacles that stand still, or 2 cm where the robot is nearer than that now.
@@ -121,8 +169,11 @@ class Session:
             goal: x and y in m and θ in rad.
 
         Raises:
-            InputError: The robot has stopped, the goal is in an obstacle, or there is no way.
+            InputError: The robot has stopped, the goal is in an obstacle, or there is no way; or the robots keep to the
+                plan of their mission.
         """
+        if self.avoid != "none":
+            raise InputError(f"goal: with --avoid {self.avoid} the robots keep to their plan")
         sim, k = self._place[0]
         if sim.plant.failed[k]:
             raise InputError("goal: the first robot has stopped; a reset starts again")
@@ -132,12 +183,13 @@ class Session:
         near = clearance(self._footprint, np.array([x, y, theta]), self._surroundings.at(self.time))
         plan = followed(sim.scenarios[k], self.time)
         speed = plan.speed if isinstance(plan, Waypoints) else None
-        _, found = prepared(Task.from_dict(task), first, speed, MARGIN if near > MARGIN else SLIM)
-        self.apply(reference=found.reference)
+        found, driven = prepared(Task.from_dict(task), first, speed, MARGIN if near > MARGIN else SLIM)
+        self.apply(reference=driven.reference)
+        return found
 
-    def state(self) -> dict[str, Any]:
-        """Returns the present values of the fields `CHANGEABLE`, and `learning`."""
-        return state(max(self.saved(), key=lambda s: len(s.events)), self.time)
+    def state(self, time: float | None = None) -> dict[str, Any]:
+        """Returns the values of the fields `CHANGEABLE`, and `learning`, at a time in s, by default now."""
+        return state(max(self.saved(), key=lambda s: len(s.events)), self.time if time is None else time)
 
     def designed(self) -> dict[tuple[str, ...], float | None]:
         """Returns what fields of the first robot are while they are not set, by path, as `Hierarchy` designs them.
@@ -181,11 +233,16 @@ class Session:
         whole = [sim.scenarios[k] for sim, k in (self._place[row] for row in range(self.size))]
         return [s.model_copy(update={"laps": max(1, ceil(self.time / s.reference.period - 1e-9))}) for s in whole]
 
-    def log(self, first: int = 0) -> Rows:
-        """Returns the log from a tick on, a record of `TICK` for each tick and robot; NaN after a robot has stopped."""
-        parts = blank(self.tick - first, self.size)
+    def log(self, first: int = 0, last: int | None = None) -> Rows:
+        """Returns the log from a tick on, and up to another one, without it.
+
+        Returns:
+            A record of `TICK` for each tick and robot, `(T, B)`; NaN after a robot has stopped.
+        """
+        last = self.tick if last is None else last
+        parts = blank(last - first, self.size)
         for rows, sim in self.simulations:
-            done = sim.log.ticks[first : sim.tick]
+            done = sim.log.ticks[first : min(last, sim.tick)]
             parts[: len(done), rows] = done
         return parts
 
@@ -222,15 +279,28 @@ class Session:
         met = turned(self.start[row].sensing.lidar.points(ranges), pose)
         return met, np.zeros((0, 3)) if particles is None else particles.particles
 
-    def result(self, longest: float) -> xr.Dataset:
-        """Returns the signals of the last `longest` s, as a result of `simulate` without what was learned."""
-        first = max(0, self.tick - round(longest / self.period))
+    def considered(self, row: int) -> tuple[Array, Array] | None:
+        """Returns the ways that the avoider of a robot considered last, from the samples that it drew itself.
+
+        Returns:
+            Places on some of its roll-outs and on the one that it chose in m, `(k, n, 2)` and `(n, 2)`; None where it
+            has none.
+        """
+        sim, k = self._place[row]
+        index = next(i for i, (_, other) in enumerate(self.simulations) if other is sim)
+        stage = self._stages[index] if self._stages else None
+        if not isinstance(stage, Reactive) or not sim.tick or (found := stage.considered[k]) is None:
+            return None
+        return found.paths(self.start[row].motion_period)
+
+    def result(self, first: int, last: int | None = None) -> xr.Dataset:
+        """Returns the signals of what `log` returns, as a result of `simulate` without what was learned."""
         names, failure = [s.feedforward for s in self.start], [self.failure(row) for row in range(self.size)]
         nothing = np.full(self.size, np.nan)
         saved = self.saved()
-        part = dataset(saved, names, names, self.log(first), failure, nothing, None)
+        part = dataset(saved, names, names, self.log(first, last), failure, nothing, None)
         if (clearance := self.clearance(first)) is not None:
-            part = part.assign(clearance=(("run", "time"), clearance.T))
+            part = part.assign(clearance=(("run", "time"), clearance[: part.sizes["time"]].T))
         found = combine([(range(self.size), part)], saved)
         return found.assign_coords(time=found["time"] + first * self.period)
 
@@ -257,6 +327,14 @@ def state(scenario: Scenario, time: float) -> dict[str, Any]:
         if event.time <= time + 1e-9:
             now |= {name: value for name in now if (value := getattr(event, name)) is not None}
     return now
+
+
+def pushed(scenario: Scenario, time: float) -> Array | None:
+    """Returns the force of a push along the world's x and y in N, `(2,)`, that has begun half a second ago or later."""
+    for event in scenario.events:
+        if event.push is not None and 0 < time - event.time + 1e-9 < max(event.push_duration, SEEN_PUSH):
+            return np.array(event.push[:2])
+    return None
 
 
 def followed(scenario: Scenario, time: float) -> Reference:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from mrctl.loop.simulation import simulate
 from mrctl.navigation.generators import Task
+from mrctl.navigation.mission import Avoid
 from mrctl.navigation.mission import prepared as prepare
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
@@ -51,10 +52,11 @@ def mission(
     compare: Sequence[FeedforwardName],
     speed: float | None,
     margin: float,
+    avoid: Avoid,
     host: str,
     port: int,
 ) -> None:
-    """Shows a mission live in the browser; at the goal the robots wait for another one.
+    """Shows a mission live in the browser; at the goal the robots wait for another one, but end with an avoider.
 
     Args:
         task: World, start and goal.
@@ -62,14 +64,20 @@ def mission(
         compare: Feedforwards of the ghosts.
         speed: Largest speed in m/s; by default 0.9 of the robot's.
         margin: Clearance that the plan keeps in m.
+        avoid: What keeps the robots from obstacles that move, as in `navigate`.
         host: Address to listen on.
         port: Port to listen on.
 
     Raises:
         InputError: As `mrctl.navigation.mission.navigate` and `live`.
     """
-    _, prepared = prepare(task, scenario, speed, margin)
-    live(prepared.replace(goal=None), compare, None, host, port)
+    from mrctl.viewer.live import Live
+
+    plan, own = prepare(task, scenario, speed, margin, avoid)
+    if avoid == "none":
+        own = own.replace(goal=None)
+    others = [own.replace(name="", **FEEDFORWARDS[name]) for name in compare]
+    _serve(lambda server: Live([own, *others], server, avoid, plan.searched), host, port)
 
 
 def replay(

@@ -17,7 +17,7 @@ from mrctl.loop.simulation import simulate
 from mrctl.results.metrics import per_lap
 from mrctl.sensing.tiers import Sensing
 from mrctl.sweep import jobs
-from mrctl.viewer.live import Live
+from mrctl.viewer.live import Live, buttons
 from mrctl.viewer.recording import Library
 from mrctl.viewer.replay import Replay
 from mrctl.viewer.server import Server
@@ -41,9 +41,12 @@ def browser():
         browser.close()
 
 
+DRAG_ERROR = "Unable to preventDefault inside passive event listener invocation."  # of viser's page, with any drag
+
+
 @contextmanager
-def visit(browser, url, offline=False):
-    """A page; no error on its console is tolerated."""
+def visit(browser, url, offline=False, known=()):
+    """A page; no error on its console is tolerated, but those that are known."""
     context = browser.new_context(viewport={"width": 1280, "height": 800}, offline=offline)
     page = context.new_page()
     errors = []
@@ -51,7 +54,7 @@ def visit(browser, url, offline=False):
     page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
     page.goto(url)
     yield page
-    assert errors == []
+    assert [text for text in errors if text not in known] == []
     context.close()
 
 
@@ -220,6 +223,8 @@ def test_live(browser, tmp_path):
         page.set_viewport_size({"width": 390, "height": 844})
         button = page.get_by_role("button", name="reset", exact=True)
         until(lambda: (box := button.bounding_box()) and box["height"] >= 44, "a button for a finger")
+        boxes = [box.bounding_box() for box in page.locator("input[type=checkbox]").all() if box.is_visible()]
+        assert len(boxes) > 2 and all(min(box["width"], box["height"]) >= 44 for box in boxes)
         page.screenshot(path=tmp_path / "phone.png", timeout=PATIENCE)
         page.set_viewport_size({"width": 1280, "height": 800})
         page.get_by_text("reset", exact=True).click()
@@ -292,13 +297,107 @@ def test_inputs(browser, tmp_path):
         del genuine
 
 
+FLOOR_TO_SCREEN = """([x, y]) => {
+    const m = window.__viserMutable, point = new m.camera.position.constructor(x, y, 0);
+    m.nodeRefFromName['/world'].localToWorld(point).project(m.camera);
+    const r = m.canvas.getBoundingClientRect();
+    return [r.left + (point.x + 1) / 2 * r.width, r.top + (1 - point.y) / 2 * r.height];
+}"""
+
+
+def click_on_curve(page, title, share):
+    """Clicks into a chart; returns the time in s that is there."""
+    index = list(axes := page.evaluate(AXES)).index(title)
+    box = page.locator(".u-over").nth(index).bounding_box()
+    page.mouse.click(box["x"] + share * box["width"], box["y"] + box["height"] / 2)
+    start, end = axes[title]["x"]
+    return start + share * (end - start)
+
+
+def test_looking_back(browser, tmp_path):
+    """A click on a curve, or on a trail, shows the robots as they were then; from there they drive on."""
+    with serving(lambda server: Live([BASE], server)) as (live, url), visit(browser, url) as page:
+        live.ask(live._set_speed, float("inf"))
+        until(lambda: live.session.time > 15 and curves(page, "V, m/s"), "15 s")
+        live.ask(live._command, "pause")
+        until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
+        page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
+        end = live.session.tick
+        until(lambda: curves(page, "V, m/s")[0][0][-1] > live.session.time - 0.1, "the last curves")
+        there = click_on_curve(page, "position error, mm", 0.4)
+        until(lambda: live._back is not None, "a former moment")
+        assert 0.01 * live._back == pytest.approx(there, abs=0.1)  # two pixels
+        then = live.session.log()[live._back, 0]
+        until(lambda: np.allclose(node(page, ROBOT)[:2], [then["x"], then["y"]], atol=1e-3), "the robot of then")
+        until(lambda: page.evaluate(AXES)["V, m/s"]["cursor"] == pytest.approx(0.01 * live._back, abs=0.02), "a cursor")
+        picture(page, tmp_path / "back.png")
+        ticks, drawn = live._trail
+        page.mouse.click(*page.evaluate(FLOOR_TO_SCREEN, drawn[len(drawn) // 2, 0].tolist()))
+        until(lambda: abs(live._back - ticks[len(ticks) // 2]) < 20, "the moment of that place of the trail")
+        back = live._back
+        page.get_by_text("step", exact=True).click()
+        until(lambda: live.session.tick == back + 1 < end and live._back is None, "it to go on from there")
+
+
+def test_dragging(browser, tmp_path):
+    """A drag from the robot pushes it that way, one on the floor is a goal and its heading; the camera stays."""
+    robots = [BASE, BASE.replace(learner="none")]
+    with serving(lambda server: Live(robots, server)) as (live, url), visit(browser, url, known=[DRAG_ERROR]) as page:
+        until(lambda: live.session.time > 1 and node(page, ROBOT) is not None, "the scene")
+        live.ask(live._command, "pause")
+        page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
+        page.get_by_label("Push by dragging").click()
+        until(lambda: not live.playing and live._pushes.value, "the pause")
+        page.wait_for_timeout(1000)
+        camera, here = page.evaluate(CAMERA), live.session.qpos(0)[:2]
+
+        def drag(start, end):
+            page.mouse.move(*page.evaluate(FLOOR_TO_SCREEN, list(start)))
+            page.mouse.down()
+            page.mouse.move(*page.evaluate(FLOOR_TO_SCREEN, [(a + b) / 2 for a, b in zip(start, end, strict=True)]))
+            page.mouse.move(*page.evaluate(FLOOR_TO_SCREEN, list(end)))
+
+        drag(here, here + [0.3, -0.5])
+        until(lambda: page.evaluate(VISIBLE, "/world/force/0") and live._pull, "an arrow")
+        picture(page, tmp_path / "push.png")
+        page.mouse.up()
+        (event,) = until(lambda: live.session.saved()[0].events or None, "the push")
+        press = buttons(live.session.robot)["Push"]["push"]["push"][1]  # for a drag of a robot's length
+        assert np.array(event.push[:2]) / press * live._scene.length == pytest.approx([0.3, -0.5], abs=0.03)
+        assert [s.events for s in live.session.saved()] == [(event,)] * 2
+
+        page.get_by_text("Set a goal", exact=True).click()
+        until(lambda: "Drag on the floor" in page.inner_text("#mrctl-picking"), "the wait for a goal")
+        page.wait_for_timeout(1000)
+        drag((0.7, 0.2), (0.7, 0.9))
+        page.mouse.up()
+        until(lambda: len(live.session.saved()[0].events) == 2, "the goal")
+        assert live._ends[1] == pytest.approx([0.7, 0.2, np.pi / 2], abs=0.1)
+        assert page.evaluate(CAMERA) == pytest.approx(camera, abs=1e-6) and not live._picks
+
+
 def test_visitors_come_and_go(browser):
-    """A second page, a reload and a page that is closed leave the session alone; a late visitor sees it as it is."""
+    """A second page, a reload and a page that is closed leave the session alone; a late visitor sees it as it is.
+
+    Each has a camera of its own.
+    """
     with serving(lambda server: Live([BASE], server)) as (live, url):
         with visit(browser, url) as page:
             until(lambda: node(page, ROBOT) is not None, "the scene")
             with visit(browser, url) as other:
                 until(lambda: node(other, ROBOT) is not None, "the other page")
+                camera = page.evaluate(CAMERA)
+                other.get_by_role("button", name="chase", exact=True).click()
+                until(lambda: len(live._chasing) == 1, "the chase")
+
+                def behind():
+                    (x, y, z), length = np.array(other.evaluate(CAMERA)) - node(other, ROBOT), live._scene.length
+                    theta = live.session.log()[-1, 0]["theta"]
+                    along = x * np.cos(theta) + y * np.sin(theta)
+                    return abs(along / length + 2.5) < 0.8 and abs(z / length - 1.2) < 0.1
+
+                until(behind, "the camera behind the robot")
+                assert page.evaluate(CAMERA) == camera
                 page.reload()
             until(lambda: node(page, ROBOT) is not None, "the page again")
         tick = live.session.tick
@@ -356,6 +455,8 @@ def test_replay(browser, tmp_path):
         until(lambda: {*score, "–"} <= set(page.inner_text("#mrctl-score").split()), "the score of the tables")
         pose = f"window.__viserMutable.nodePoseData[{GHOST!r}].wxyz"
         until(lambda: abs(2 * np.arcsin(np.hypot(*page.evaluate(pose)[1:3])) - tilt) < 1e-3, "the ghost to be tipped")
+        there = click_on_curve(page, "V, m/s", 0.5)
+        until(lambda: replay.time == pytest.approx(there, abs=0.02), "it to go to a click on a curve")
         replay.ask(replay._choose, 1)
         until(lambda: replay.runs == [1], "the other run, once")
         page.get_by_text("Keep this run as a ghost").click()
@@ -534,5 +635,14 @@ def test_sweep(browser, tmp_path):
         time.sleep(0.5)
         page.mouse.click(*at)
         until(lambda: replay.runs == [4], "the run to open")
+        points, ring = replay._board[:2]
+        until(lambda: np.allclose(ring.position, points.batched_positions[4]), "the mark of the run")
+        replay.library.table["energy"] = [0.1, 1.0, 10.0, 100.0, 1e3, 1e4]  # J
+        replay._axes[1].value = "electrical energy, J"
+        replay.ask(replay._scatter)
+        until(lambda: replay._board[0] is not points, "another axis")
+        assert np.ptp(np.diff(replay._board[0].batched_positions[:, 2])) < 1e-6  # decades, which are equally far
+        written = [drawn.text for drawn in replay._board if hasattr(drawn, "text")]
+        assert "electrical energy, J, logarithmic 0.1" in written and "1e+04" in written
     again = simulate(jobs.scenario_of(tmp_path / "store", 4))
     assert replay._log["x"][:, 0].tobytes() == again.x.values.tobytes()

@@ -10,8 +10,11 @@ import viser
 
 from mrctl import Event, Kanayama, Perturbation, Pid, Scenario, per_lap, simulate
 from mrctl.loop.simulation import arranged
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.references import Reference
+from mrctl.theory.robot import RobotFile
 from mrctl.viewer import live as module
 from mrctl.viewer.live import Live
 from mrctl.viewer.scenes import STORIES
@@ -219,6 +222,78 @@ def test_stories(live):
     assert 4 < ice[0, 1] < ice[1, 1] < 7 and ice[0, -1] < ice[0, 0]
     live._restart([Scenario()])
     assert live._story.content == ""
+
+
+def test_robots(live):
+    """Another robot begins another run, in which the controllers of before follow what it can; no other name does."""
+    live._restart([Scenario(prior="model", learner="rls", seed=3), Scenario(learner="none", seed=3)])
+    live._press("Payload", "drop payload")
+    live._set_soft(True)
+    for name, steering in (("racecar", "rigid"), ("turtlebot", "caster"), ("car", "compliant")):
+        visitor_sets(live, live._robot, name)
+        live._run_requests()
+        first, other = live.session.start
+        assert (first.robot.path, first.steering, first.seed, live.session.tick) == (name, steering, 3, 0)
+        assert (first.feedforward, other.feedforward, first.perturbation) == ("model+rls", "none", Perturbation())
+        mass = read_robot(mjcf.load(robot=RobotFile(path=name))).mass
+        live._press("Payload", "drop payload")
+        assert live.session.state()["perturbation"].payload == pytest.approx(mass / 2, rel=0.05)
+        for _ in range(100):
+            live.session.step()
+        log = live.session.log()
+        assert np.hypot(log["longitudinal_error"], log["lateral_error"]).max() < 0.1 and live.message == ""
+        live.draw()
+        live.refresh()
+        assert all(part.cast_shadow for part in live._scene._held)  # of the new robot, too
+    live._set_soft(False)
+    assert not any(part.cast_shadow for part in live._scene._held)
+    live.ask(live._choose_robot, "nosuch")
+    live._run_requests()
+    assert "not one of the choices" in live.message and live._robot.value == "car"
+
+
+def test_looking_back(live):
+    """The page shows a former moment as it was; from there the session goes on to the bit, and another one can."""
+    live._restart([Scenario(), Scenario(learner="none")])
+    for tick, event in ((100, "drop payload"), (200, "remove"), (300, None)):
+        while live.session.tick < tick:
+            live.session.step()
+        if event:
+            live._press("Payload", event)
+    former = live.session.log().copy()
+    live._look_back(1.5)
+    live.draw()
+    live.refresh()
+    then, frames = former[150], [frames[live._scene._chassis] for frames in live._scene._frames]
+    for frame, row in zip(frames, then, strict=True):
+        assert frame.position == pytest.approx([row["x"], row["y"], row["z"]], abs=1e-6)
+    assert live._controls._inputs["perturbation", "payload"].value == pytest.approx(10.0) and live._return.visible
+    assert live.session.tick == 300 and "1.50 s" in live._status.content and "of 3.00 s" in live._status.content
+    for nonsense in (float("nan"), "soon", None):
+        live.ask(live._look_back, nonsense)
+        live._run_requests()
+        assert "not a time" in live.message and live._back == 150
+    live._look_back(9.0)
+    live.draw()
+    assert not live._return.visible and frames[0].position == pytest.approx(live.session.qpos(0)[:3])
+
+    live._look_back(1.5)
+    live._note_input(("learner",), "rls")
+    live._apply_inputs()
+    saved = live.session.saved()
+    assert [(s.feedforward, len(s.events)) for s in saved] == [("rls", 1), ("none", 1)] and live.session.tick == 150
+    same = live.session.log()[:, 1]
+    assert same.tobytes() == np.ascontiguousarray(former[:150, 1]).tobytes()
+    live._command("step")
+    live._look_back(1.2)
+    live._press("Push", "push")
+    live._command("play")
+    while live.session.tick < 200:
+        live.session.step()
+    again = simulate(live.session.saved())
+    for name in ("x", "theta", "voltage_left", "weight_norm"):
+        assert again[name].values[:, :200].tobytes() == np.ascontiguousarray(live.session.log()[name].T).tobytes()
+    assert [e.time for e in live.session.added] == [1.0, 1.2]
 
 
 def test_order(live):

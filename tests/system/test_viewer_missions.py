@@ -2,11 +2,12 @@
 
 import json
 import re
+import runpy
 
 import numpy as np
 import pytest
 import shapely
-from test_viewer import CHROMIUM, PATIENCE, ROBOT, SOFTWARE, node, serving, until, visit
+from test_viewer import CHROMIUM, DRAG_ERROR, PATIENCE, ROBOT, SOFTWARE, node, serving, until, visit
 
 from mrctl import Box, Circle, Disc, InputError, Line, Obstacles, Scenario, save, simulate
 from mrctl.cli import main
@@ -184,15 +185,84 @@ def test_session_with_goals_runs_again(driven, tmp_path):
         assert result[name].values[:, : driven.tick].tobytes() == np.ascontiguousarray(log[name].T).tobytes(), name
 
 
-def test_flags(monkeypatch):
+CROSSING = Disc(x=-1.5, y=-2.0, radius=0.2, course=Line(heading=np.pi / 2, speed=0.6))  # from (2, −1.5) along +y
+
+
+@pytest.mark.parametrize("avoid", ["window", "mppi"])
+def test_avoiders(server, tmp_path, avoid):
+    """Live they keep clear of what crosses their way; the page shows what they consider, and saves what repeats it."""
+    task = Task(obstacles=Obstacles(shapes=(CROSSING,)), start=(0.0, 0.0, 0.0), goal=(2.5, 0.0, 0.0))
+    plan, own = prepared(task, PID.replace(prior="model"), avoid=avoid)
+    live = Live([own], server, avoid, plan.searched)
+    session = live.session
+    assert session.considered(0) is None and live._fan.visible and live._fan.value
+    for _ in range(81):  # the last one decides
+        session.step()
+    live.draw()
+    some, chosen = session.considered(0)
+    stage, now = session._stages[0], session.log()[80, 0]
+    assert np.allclose(some[:, 0], [now["x_measured"], now["y_measured"]], atol=0.02)  # it is predicted over the delay
+    pose, sampled, best = stage.considered[0]
+    for way, twists in zip([*some[::10], chosen], [*sampled[::10], best], strict=True):
+        x, y, theta = pose
+        for v, omega in np.repeat(twists, 50, axis=0):  # Euler, a millisecond each
+            x, y, theta = x + 1e-3 * v * np.cos(theta), y + 1e-3 * v * np.sin(theta), theta + 1e-3 * omega
+        assert way[-1] == pytest.approx([x, y], abs=3e-3)
+    assert np.hypot(*(chosen[1] - chosen[0])) == pytest.approx(0.05 * stage.last[0, 0]) and np.ptp(some[:, -1, 1]) > 0.5
+    lines = live._scene._fans[0]
+    assert all(drawn.visible for drawn in lines) and np.allclose(lines[1].points[0, 0, :2], chosen[0], atol=1e-6)
+    live._fan.value = False
+    live.draw()
+    assert not any(drawn.visible for drawn in lines)
+    live._note_input(("reference",), "circle")
+    live._apply_inputs()
+    assert f"--avoid {avoid}" in live.message
+    while session.running and session.time < 12:
+        session.step()
+    assert session.clearance().min() > 0
+    live.refresh()
+    assert "has arrived" in live._status.content
+    for name, content in live.saved().items():
+        (tmp_path / name).write_text(content)
+    stage = runpy.run_path(str(tmp_path / f"{avoid}.py"))[avoid]  # as `mrctl run --controller` does
+    again = simulate(Scenario.from_toml(tmp_path / "session-model.toml"), motion=stage)
+    for name in ("x", "theta", "voltage_left"):
+        assert again[name].values[: session.tick].tobytes() == session.log()[name][:, 0].tobytes()
+
+
+def test_search(server):
+    """Its arcs hang together, come from the start, and are free; the page draws those of a goal that is set."""
+    behind = Task(obstacles=Obstacles(shapes=(Box(x=1.5, length=0.2, width=1.0),)), start=(0, 0, 0), goal=(3, 0, 0))
+    plan, own = prepared(behind, PID)
+    ends = {tuple(end) for end in plan.searched[:, 1]} | {tuple(plan.poses[0, :2])}
+    assert len(plan.searched) > plan.expanded / 2 > 5 and all(tuple(start) in ends for start in plan.searched[:, 0])
+    walls = shapely.union_all([shapely.Polygon(shape.vertices) for shape in behind.obstacles.shapes])
+    assert shapely.MultiPoint(plan.searched[:, 1]).distance(walls) > footprint(mjcf.load())[:, 1].max()
+    live = Live([own.replace(goal=None)], server, "none", plan.searched)
+    live._tree.value = True
+    live._show_search()
+    drawn = live._scene._search
+    assert drawn.visible and np.allclose(drawn.points[..., :2], plan.searched, atol=1e-6)
+    live._searched = live.session.head_for((3.0, -1.0, 0.0)).searched
+    live._show_search()
+    assert np.allclose(drawn.points[0, 0, :2], live.session.qpos(0)[:2], atol=1e-6) and len(drawn.points) == len(
+        live._searched
+    )
+    live._tree.value = False
+    live._show_search()
+    assert not drawn.visible
+
+
+def test_flags(server, monkeypatch):
     """`mrctl navigate --view` shows the mission's plan with robot and ghosts, and no run that ends at the goal."""
     shown = []
-    monkeypatch.setattr(viewing, "live", lambda *arguments: shown.append(arguments))
+    monkeypatch.setattr(viewing, "_serve", lambda page, *address: shown.append((page(server), *address)))
     flags = ["--view", "--compare", "none", "--speed", "0.4", "--port", "8081"]
     assert main(["navigate", "doorway:3", *flags]) == 0
-    ((scenario, compare, export, host, port),) = shown
+    ((live, host, port),) = shown
+    scenario, other = live.session.start
     task = task_of("doorway:3", Scenario())
-    assert (compare, export, host, port) == (("none",), None, "127.0.0.1", 8081)
+    assert (other.feedforward, host, port) == ("none", "127.0.0.1", 8081) and len(live._searched) > 10
     assert scenario.feedforward == "model+composite" and scenario.obstacles == task.obstacles
     assert scenario.reference.speed == 0.4 and scenario.initial_pose == task.start and scenario.goal is None
     bound = ends(scenario, 0.0)
@@ -268,7 +338,8 @@ def test_goal_by_click(tmp_path):
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
-        with serving(lambda server: Live(scenarios, server)) as (live, url), visit(browser, url) as page:
+        known = [DRAG_ERROR]
+        with serving(lambda server: Live(scenarios, server)) as (live, url), visit(browser, url, known=known) as page:
             until(lambda: node(page, ROBOT) is not None, "the scene")
             page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
             click(page, (0.9, -0.5), (0.9, -1.2))
