@@ -328,18 +328,19 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             port: Number of the port to listen on, with --view.
             suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
                 model, fel and model+composite, on three plants; then drive MPPI around obstacles, with and without a
-                lag in its model, over PID and over model+composite. Each part prints first how long it takes. The
-                tables are written to the folder, by default navigate_suite.
+                lag in its model, over PID and over model+composite; then plan with what model+composite has learned.
+                Each part prints first how long it takes. The tables are written to the folder, by default
+                navigate_suite.
             quick: With --suite, drive fewer draws, so few that some intervals have no end.
         """
-        from mrctl.experiments import mission, mission_suite, three_mppis
+        from mrctl.experiments import feeding_up, mission, mission_suite, three_mppis
 
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
         if suite:
             taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _given(arguments)
             if taken or world or goal or start or compare or speed or avoid != "none" or json or view:
                 raise InputError("suite: has worlds, controllers and speeds of its own; give only the robot's flags")
-            for part in (mission_suite.suite, three_mppis.suite):
+            for part in (mission_suite.suite, three_mppis.suite, feeding_up.suite):
                 print(part(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
             return
         if quick or not world:

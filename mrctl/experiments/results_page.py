@@ -44,6 +44,7 @@ def main(
     search: tuple[Path, ...] = (),
     navigate: tuple[Path, ...] = (),
     mppi: tuple[Path, ...] = (),
+    limits: tuple[Path, ...] = (),
     identify: tuple[Path, ...] = (),
     bench: Path | None = None,
     out: Path = Path("RESULTS.md"),
@@ -58,6 +59,7 @@ def main(
         search: Folders that `mrctl tune --search` wrote, one for each entry.
         navigate: Folders that `mrctl navigate --suite` wrote, one for each robot, for what it found in corridors.
         mppi: The same folders, for what it found with MPPI.
+        limits: The same folders, for what it found with learned limits.
         identify: Files with the output of `mrctl identify --json`, one for each robot.
         bench: File with the output of `mrctl bench --json`.
         out: The page to write.
@@ -90,6 +92,8 @@ def main(
         written["How narrow and how fast"] = _navigated(navigate, "table", "needed")
     if mppi:
         written["Three MPPIs"] = _navigated(mppi, "mppi", "runs")
+    if limits:
+        written["Feeding up"] = _navigated(limits, "limits", "limits")
     if identify:
         tables = [_read(file, "constants", "robot") for file in identify]
         parts = [_section(f"mrctl identify --robot.path {t['robot']['path']}", t, identify_text(t)) for t in tables]

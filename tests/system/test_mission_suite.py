@@ -10,15 +10,18 @@ import xarray as xr
 from scipy.signal import lsim
 from test_commands import refused
 
+import mrctl.experiments.feeding_up as feeding
 import mrctl.experiments.mission_suite as suite
 import mrctl.experiments.three_mppis as three
 import mrctl.navigation.mppi as mppi
-from mrctl import Scenario, cli, simulate
+from mrctl import Lemniscate, Perturbation, Scenario, cli, simulate
 from mrctl.navigation.generators import bent_line, corridor, corridor_width
+from mrctl.navigation.mission import robot_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.theory.clearance import clearance, clearances
 from mrctl.theory.obstacles import Obstacles, Surroundings
+from mrctl.theory.timing import Limits
 
 HULL = footprint(mjcf.load())
 
@@ -57,6 +60,8 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     for part in (suite, three):
         monkeypatch.setattr(part, "PLANTS", {"nominal": suite.PLANTS["nominal"]})
     monkeypatch.setattr(three, "WORLDS", {"quick": 1})
+    monkeypatch.setattr(feeding, "DRAWS", {"quick": 1})
+    monkeypatch.setattr(feeding, "PLANTS", {"all": suite.PERTURBATIONS["all"]})
     monkeypatch.setattr(mppi, "SAMPLES", 200)
     assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
     printed, values = capsys.readouterr().out, json.loads((tmp_path / "table.json").read_text())
@@ -74,6 +79,26 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
         assert re.search(rf"{re.escape(name)} +\| 1/1 \[21, 100\] % \| 0/1 .* {run['lateness']:.2f} \[", printed)
     first, second, _ = (of["nominal"][0] for of in values["runs"].values())
     assert first != second  # they differ in the lag alone
+    assert "\n3 runs that feed up, about 1 min" in printed and (tmp_path / "limits.md").read_text() in printed
+    (before,), (after,) = json.loads((tmp_path / "limits.json").read_text())["limits"]["all"].values()
+    assert before["arrived"] and after["arrived"] and before["plan"] < after["plan"] < 1.1 * before["plan"]
+    assert after["error"] < before["error"]
+
+
+def test_learned_limits() -> None:
+    """What is learned on a robot that is half as heavy again and has a weak supply is what its equations say."""
+    wrong = Perturbation(mass_factor=1.5, supply_factor=0.8)
+    course = Lemniscate(size=1.2, period=9.0)
+    run = simulate(Scenario(prior="model", learner="composite", perturbation=wrong, reference=course, laps=3))
+    nominal = robot_of(Scenario())[1]
+    heavy = nominal.replace(mass=1.5 * nominal.mass, drive_gain=0.8)
+    found = feeding.limits_of(run, nominal)
+    learned, known, true = (
+        np.array(x)[[0, 2], 0] for x in (found.inverse, Limits.of(nominal).inverse, Limits.of(heavy).inverse)
+    )
+    assert found.replace(inverse=()) == Limits.of(nominal).replace(inverse=())
+    np.testing.assert_allclose(learned, true, rtol=0.05)  # of V and V̇
+    assert np.abs(known / true - 1).min() > 0.15
 
 
 def test_worlds() -> None:
