@@ -330,19 +330,21 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             view: Instead of a table, show the mission live in the browser; without --avoid, further goals can be set
                 by clicks there.
             port: Number of the port to listen on, with --view.
-            suite: Instead of one mission, find how narrow a corridor, and how fast, the robot can drive with PID,
-                model, fel and model+composite, on three plants; how long this takes is printed first. The tables are
-                written to --out, by default navigate_suite.
+            suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
+                model, fel and model+composite, on three plants; then drive MPPI around obstacles, with and without a
+                lag in its model, over PID and over model+composite; then plan with what model+composite has learned.
+                Each part prints first how long it takes. The tables are written to --out, by default navigate_suite.
             quick: With --suite, drive fewer draws; some confidence intervals then have no upper end.
         """
-        from mrctl.experiments import mission, mission_suite
+        from mrctl.experiments import feeding_up, mission, mission_suite, three_mppis
 
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
         if suite:
             taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _given(arguments)
             if taken or world or goal or start or compare or speed or avoid != "none" or json or view:
                 raise InputError("suite: has its own worlds, controllers and speeds; give only flags of the robot")
-            print(mission_suite.suite(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
+            for part in (mission_suite.suite, three_mppis.suite, feeding_up.suite):
+                print(part(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
             return
         if quick or not world:
             raise InputError("quick: belongs to --suite" if quick else "world: none given; see mrctl navigate --help")

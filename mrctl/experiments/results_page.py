@@ -43,6 +43,8 @@ def main(
     tune: Path | None = None,
     search: tuple[Path, ...] = (),
     navigate: tuple[Path, ...] = (),
+    mppi: tuple[Path, ...] = (),
+    limits: tuple[Path, ...] = (),
     identify: tuple[Path, ...] = (),
     bench: Path | None = None,
     out: Path = Path("RESULTS.md"),
@@ -55,7 +57,9 @@ def main(
         held_out: Folder that `mrctl suite --held-out` wrote.
         tune: Folder that `mrctl tune --out` wrote.
         search: Folders that `mrctl tune --search` wrote, one for each entry.
-        navigate: Folders that `mrctl navigate --suite` wrote, one for each robot.
+        navigate: Folders that `mrctl navigate --suite` wrote, one for each robot, for what it found in corridors.
+        mppi: The same folders, for what it found with MPPI.
+        limits: The same folders, for what it found with learned limits.
         identify: Files with the output of `mrctl identify --json`, one for each robot.
         bench: File with the output of `mrctl bench --json`.
         out: The page to write.
@@ -85,13 +89,11 @@ def main(
         tables = [_read(folder / "table.json", "entry", "shipped", "tiers") for folder in search]
         written["The search of settings"] = _section("mrctl tune --search NAME", tables[0], search_text(tables))
     if navigate:
-        parts = []
-        for folder in navigate:
-            table = _read(folder / "table.json", "scenario", "mode", "needed")
-            flags = " --quick" if table["mode"] == "quick" else ""
-            flags += f" --robot.path {table['scenario']['robot']['path']}"
-            parts.append(_section(f"mrctl navigate --suite{flags}", table, _text(folder / "table.md").strip()))
-        written["How narrow and how fast"] = "\n\n".join(parts).replace("\n## ", "\n### ")
+        written["How narrow and how fast"] = _navigated(navigate, "table", "needed")
+    if mppi:
+        written["Three MPPIs"] = _navigated(mppi, "mppi", "runs")
+    if limits:
+        written["Feeding up"] = _navigated(limits, "limits", "limits")
     if identify:
         tables = [_read(file, "constants", "robot") for file in identify]
         parts = [_section(f"mrctl identify --robot.path {t['robot']['path']}", t, identify_text(t)) for t in tables]
@@ -209,6 +211,17 @@ def _section(command: str, table: Table, text: str) -> str:
     machine = table["machine"]
     source = f"`{command}` made this with {versions}, on {machine['processor']} with {machine['cores']} cores."
     return f"{source}\n\n{text}"
+
+
+def _navigated(folders: Sequence[Path], name: str, key: str) -> str:
+    """One part of what `mrctl navigate --suite` wrote for each robot."""
+    parts = []
+    for folder in folders:
+        table = _read(folder / f"{name}.json", "scenario", "mode", key)
+        flags = " --quick" if table["mode"] == "quick" else ""
+        flags += f" --robot.path {table['scenario']['robot']['path']}"
+        parts.append(_section(f"mrctl navigate --suite{flags}", table, _text(folder / f"{name}.md").strip()))
+    return "\n\n".join(parts).replace("\n## ", "\n### ")
 
 
 def _text(path: Path) -> str:

@@ -157,8 +157,14 @@ def prepared(
     return found, scenario.replace(**own, initial_pose=task.start, goal=task.goal)
 
 
-def avoiding(avoid: Avoid, scenario: Scenario) -> Callable[[Robot, int], Any] | None:
-    """Returns the factory of the motion stage of a mission, which bears the name in tables; None for that of mrctl."""
+def avoiding(avoid: Avoid, scenario: Scenario, lag: float = 0.0) -> Callable[[Robot, int], Any] | None:
+    """Returns the factory of the motion stage of a mission, which bears the name in tables; None for that of mrctl.
+
+    Args:
+        avoid: What keeps the robot from obstacles.
+        scenario: The scenario that `prepared` returns, with the motion period of the mission.
+        lag: Time constant of the roll-outs of `mppi` in s; see `Mppi`.
+    """
     if avoid == "none":
         return None
     corners, robot = robot_of(scenario)
@@ -175,7 +181,8 @@ def avoiding(avoid: Avoid, scenario: Scenario) -> Callable[[Robot, int], Any] | 
     def made(robot: Robot, size: int) -> Avoiding | Window | Mppi:
         if avoid == "barrier":
             return Avoiding(robot, size, follow, obstacles, barrier)
-        return (Window if avoid == "window" else Mppi)(robot, size, plan, obstacles, corners, replan)
+        parts = robot, size, plan, obstacles, corners, replan
+        return Window(*parts) if avoid == "window" else Mppi(*parts, lag)
 
     made.__name__ = avoid
     return made

@@ -10,16 +10,50 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Reactive, Scene, roll_out
+from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Reactive, Replan, Scene, roll_out
+from mrctl.record import InputError
+from mrctl.theory.obstacles import Obstacles
+from mrctl.theory.references import Waypoints
+from mrctl.theory.robot import Robot
 
 SAMPLES = 2000
 TEMPERATURE = 0.05  # λ, in units of the cost; chosen
 KEPT = 40  # of the samples, which are kept to be looked at
 SPREAD = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
+MOST_LAG = 10.0  # s
 
 
 class Mppi(Reactive):
     """A motion stage that samples twists around those of the period before; the same noise for every robot."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        size: int,
+        plan: Waypoints,
+        obstacles: Obstacles,
+        footprint: Array,
+        replan: Replan,
+        lag: float = 0.0,
+    ) -> None:
+        """Takes the arguments of `Reactive`, and the lag that the roll-outs assume.
+
+        Args:
+            robot: The nominal robot.
+            size: Number of robots.
+            plan: The way, which each robot goes along at its own pace.
+            obstacles: As in `Reactive`.
+            footprint: As in `Reactive`.
+            replan: As in `Reactive`.
+            lag: Time constant in s with which V and θ̇ follow what is requested; 0: at once.
+
+        Raises:
+            InputError: The lag is negative or too large.
+        """
+        if not 0 <= lag <= MOST_LAG:
+            raise InputError(f"lag: must be between 0 and {MOST_LAG:g} s, not {lag:g}")
+        super().__init__(robot, size, plan, obstacles, footprint, replan)
+        self._lag = lag
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
@@ -34,16 +68,17 @@ class Mppi(Reactive):
         self._knots[0] = 0.0
         self._knots[1] = -self.bounds.speed, 0.0
 
-    def choose(self, row: int, pose: Array, last: Array, period: float, scene: Scene) -> Array:
+    def choose(self, row: int, pose: Array, twist: Array, last: Array, period: float, scene: Scene) -> Array:
         """Returns the first of the mean twists, or of the cheapest sample where only the mean touches an obstacle."""
         nominal, twists, costs = self._nominal[row], self._twists, self._costs
         nominal[:-1] = nominal[1:].copy()  # a period has passed
-        roll_out.compiled(self._knots, nominal, pose, last, period, self.bounds, scene, twists, costs)
+        state = pose, twist, last, self._lag, period, self.bounds, scene
+        roll_out.compiled(self._knots, nominal, *state, twists, costs)
         weights = np.exp((costs.min() - costs) / TEMPERATURE)
         mean = np.tensordot(weights / weights.sum(), twists, 1)
         cheapest, some = twists[costs.argmin()].copy(), twists[:: SAMPLES // KEPT].copy()
         touches = costs.min() >= TOUCH
-        roll_out.compiled(self._knots[:1], mean, pose, last, period, self.bounds, scene, twists[:1], costs[:1])
+        roll_out.compiled(self._knots[:1], mean, *state, twists[:1], costs[:1])
         nominal[:] = mean if touches or costs[0] < TOUCH else cheapest
         self.considered[row] = Considered(pose.copy(), some, nominal.copy())
         return nominal[0]

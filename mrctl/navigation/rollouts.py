@@ -1,9 +1,9 @@
 """What the reactive controllers share: what they see of the plan and the obstacles, and roll-outs of twists.
 
-A roll-out integrates the unicycle with twists that are obeyed at once, from the pose of the robot over a horizon, and
-has a cost: squared distance and heading error from the plan, nearness to obstacles, and collision. Its twists are
-limited to what the robot can drive: forward, below its largest speed, rotation and curvature, and within its
-acceleration.
+A roll-out integrates the unicycle from the pose of the robot over a horizon, and has a cost: squared distance and
+heading error from the plan, nearness to obstacles, and collision. Its twists are limited to what the robot can drive:
+forward, below its largest speed, rotation and curvature, and within its acceleration. They are obeyed at once, or with
+a first-order lag, τ dV/dt = V_requested − V, and the same for θ̇.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class Reactive(ABC):
                 self._tables[row] = table
             targets = table[np.minimum(self._place[row] + FINE * np.arange(1, STEPS + 1), len(table) - 1)]
             scene = Scene(targets, self._discs, self._field, movers)
-            self.last[row] = self.choose(row, pose[row], self.last[row], self._period, scene)
+            self.last[row] = self.choose(row, pose[row], twist[row], self.last[row], self._period, scene)
         self._tick += 1
         return self.last.copy()
 
@@ -188,12 +188,13 @@ class Reactive(ABC):
         """Is called once in a motion period, before `choose` for each robot."""
 
     @abstractmethod
-    def choose(self, row: int, pose: Array, last: Array, period: float, scene: Scene) -> Array:
+    def choose(self, row: int, pose: Array, twist: Array, last: Array, period: float, scene: Scene) -> Array:
         """Returns the twist of one robot.
 
         Args:
             row: Which robot.
             pose: x and y in m and θ in rad, `(3,)`.
+            twist: The twist that it drives, as measured, V in m/s and θ̇ in rad/s, `(2,)`.
             last: The twist that was requested in the last period, V in m/s and θ̇ in rad/s, `(2,)`.
             period: Motion period in s, which is also a step of a roll-out.
             scene: What it sees.
@@ -239,8 +240,8 @@ def clear(
 
 @kernel
 def roll_out(
-    knots: Array, nominal: Array, pose: Array, twist: Array, step: float, bounds: Bounds, scene: Scene,
-    twists: Array, costs: Array,
+    knots: Array, nominal: Array, pose: Array, twist: Array, last: Array, lag: float, step: float, bounds: Bounds,
+    scene: Scene, twists: Array, costs: Array,
 ) -> None:  # fmt: skip
     """Adds knots to nominal twists, limits the sums to what the robot can drive, and returns the cost of each roll-out.
 
@@ -248,7 +249,9 @@ def roll_out(
         knots: What is added to V in m/s and θ̇ in rad/s, at equal distances over the horizon, `(K, KNOTS, 2)`.
         nominal: Nominal twists, `(n, 2)`.
         pose: x and y in m and θ in rad, `(3,)`.
-        twist: The twist that was requested in the last period, `(2,)`.
+        twist: The twist that the robot drives, `(2,)`; matters only with a lag.
+        last: The twist that was requested in the last period, `(2,)`.
+        lag: Time constant with which the robot follows the requested twist in s; 0: at once.
         step: Duration of a step in s.
         bounds: What twists the robot can drive.
         scene: Plan and obstacles.
@@ -259,9 +262,12 @@ def roll_out(
     steps, reach = len(nominal), 0.0
     for d in range(len(discs)):
         reach = max(reach, np.hypot(discs[d, 0], discs[d, 1]) + discs[d, 2])
+    # While a request is held, what is missing of it decays: to `left` at the end of a step, to `mean` on its average.
+    left = np.exp(-step / lag) if lag > 0 else 0.0
+    mean = (1 - left) * lag / step
     for n in range(len(knots)):
-        x, y, c, s, v, omega, cost = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]), twist[0], twist[1], 0.0
-        touched = False
+        x, y, c, s, v, omega, cost = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]), last[0], last[1], 0.0
+        drives, turns, touched = twist[0], twist[1], False
         for k in range(steps):
             along = k * (knots.shape[1] - 1) / (steps - 1)
             i = min(int(along), knots.shape[1] - 2)
@@ -277,11 +283,13 @@ def roll_out(
             twists[n, k, 0], twists[n, k, 1] = v, omega
             if touched:
                 continue
+            speed, rotation = v + mean * (drives - v), omega + mean * (turns - omega)
+            drives, turns = v + left * (drives - v), omega + left * (turns - omega)
             # Half of the turn, the way, and the other half; the cosine of so small an angle is that of its series.
-            half = omega * step / 2
+            half = rotation * step / 2
             ch, sh = 1 - half * half / 2 * (1 - half * half / 12), half * (1 - half * half / 6 * (1 - half * half / 20))
             c, s = c * ch - s * sh, s * ch + c * sh
-            x, y = x + v * step * c, y + v * step * s
+            x, y = x + speed * step * c, y + speed * step * s
             c, s = c * ch - s * sh, s * ch + c * sh
             dx, dy = targets[k, 0] - x, targets[k, 1] - y
             cost += step * (PLACE * (dx * dx + dy * dy) + HEADING * (1 - c * targets[k, 2] - s * targets[k, 3]))

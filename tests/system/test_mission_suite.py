@@ -1,19 +1,27 @@
 """The comparison of velocity controllers in corridors: the width that a run needs, and the command."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
+from scipy.signal import lsim
 from test_commands import refused
 
+import mrctl.experiments.feeding_up as feeding
 import mrctl.experiments.mission_suite as suite
-from mrctl import Scenario, cli, simulate
+import mrctl.experiments.three_mppis as three
+import mrctl.navigation.mppi as mppi
+from mrctl import Lemniscate, Perturbation, Scenario, cli, simulate
 from mrctl.navigation.generators import bent_line, corridor, corridor_width
+from mrctl.navigation.mission import robot_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
-from mrctl.theory.clearance import clearances
-from mrctl.theory.obstacles import Surroundings
+from mrctl.theory.clearance import clearance, clearances
+from mrctl.theory.obstacles import Obstacles, Surroundings
+from mrctl.theory.timing import Limits
 
 HULL = footprint(mjcf.load())
 
@@ -49,7 +57,12 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     """The tables say what the numbers beside them say."""
     monkeypatch.setattr(suite, "DRAWS", {"quick": 3})
     monkeypatch.setattr(suite, "SPEEDS", (0.6, 0.9))
-    monkeypatch.setattr(suite, "PLANTS", {"nominal": suite.PLANTS["nominal"]})
+    for part in (suite, three):
+        monkeypatch.setattr(part, "PLANTS", {"nominal": suite.PLANTS["nominal"]})
+    monkeypatch.setattr(three, "WORLDS", {"quick": 1})
+    monkeypatch.setattr(feeding, "DRAWS", {"quick": 1})
+    monkeypatch.setattr(feeding, "PLANTS", {"all": suite.PERTURBATIONS["all"]})
+    monkeypatch.setattr(mppi, "SAMPLES", 200)
     assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
     printed, values = capsys.readouterr().out, json.loads((tmp_path / "table.json").read_text())
     assert printed.startswith("36 runs, about 1 min") and (tmp_path / "table.md").read_text() in printed
@@ -57,6 +70,65 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert needed.shape == (2, 4, 1, 3) and np.all(needed > np.ptp(HULL[:, 1]))
     assert np.abs(needed - values["plans"]).max() < 0.1
     assert f"{1e3 * needed[-1, 0, 0].max():.1f} [" in printed and "| 3/3 [44, 100] %" in printed
+    values = json.loads((tmp_path / "mppi.json").read_text())
+    assert "\n3 runs with MPPI, about 1 min" in printed and (tmp_path / "mppi.md").read_text() in printed
+    assert list(values["runs"]) == list(three.ENTRIES) and 0.005 < values["lag"] < 0.1
+    for name, of in values["runs"].items():
+        (run,) = of["nominal"]
+        assert run["outcome"] == "arrived" and 0 < run["clearance"] and abs(run["lateness"]) < 3
+        assert re.search(rf"{re.escape(name)} +\| 1/1 \[21, 100\] % \| 0/1 .* {run['lateness']:.2f} \[", printed)
+    first, second, _ = (of["nominal"][0] for of in values["runs"].values())
+    assert first != second  # they differ in the lag alone
+    assert "\n3 runs that feed up, about 1 min" in printed and (tmp_path / "limits.md").read_text() in printed
+    (before,), (after,) = json.loads((tmp_path / "limits.json").read_text())["limits"]["all"].values()
+    assert before["arrived"] and after["arrived"] and before["plan"] < after["plan"] < 1.1 * before["plan"]
+    assert after["error"] < before["error"]
+
+
+def test_learned_limits() -> None:
+    """What is learned on a robot that is half as heavy again and has a weak supply is what its equations say."""
+    wrong = Perturbation(mass_factor=1.5, supply_factor=0.8)
+    course = Lemniscate(size=1.2, period=9.0)
+    run = simulate(Scenario(prior="model", learner="composite", perturbation=wrong, reference=course, laps=3))
+    nominal = robot_of(Scenario())[1]
+    heavy = nominal.replace(mass=1.5 * nominal.mass, drive_gain=0.8)
+    found = feeding.limits_of(run, nominal)
+    learned, known, true = (
+        np.array(x)[[0, 2], 0] for x in (found.inverse, Limits.of(nominal).inverse, Limits.of(heavy).inverse)
+    )
+    assert found.replace(inverse=()) == Limits.of(nominal).replace(inverse=())
+    np.testing.assert_allclose(learned, true, rtol=0.05)  # of V and V̇
+    assert np.abs(known / true - 1).min() > 0.15
+
+
+def test_worlds() -> None:
+    """The discs cross the middle line where and about when a robot is there, and the plan does not know them."""
+    base = Scenario()
+    for one in filter(None, (three.world(base, seed) for seed in (0, 1))):
+        own, goal = one.scenario.obstacles, one.scenario.goal
+        still = tuple(shape for shape in own.shapes if shape.course is None)
+        assert goal is not None and goal[0] == pytest.approx(6.0)
+        times = np.linspace(0, 10, 2001)
+        around = Surroundings(Obstacles(shapes=own.moving))
+        places = np.stack([around.at(time).discs[:, :2] for time in times])
+        for disc, way in zip(places.swapaxes(0, 1), three.CROSSINGS, strict=True):
+            there = int(np.abs(disc[:, 1]).argmin())
+            assert 0 < there < len(times) - 1 and abs(disc[there, 0] - way) < 0.51
+            assert abs(times[there] - disc[there, 0] / 1.35) < 0.51
+        where = Surroundings(Obstacles(shapes=still)).at(0.0)
+        assert min(clearance(HULL, pose, where) for pose in one.plan.poses) > 0.049
+
+
+def test_fitted_lag() -> None:
+    """The lag of a first-order system is found from its response, which scipy integrates."""
+    times = np.arange(0, 5, 0.01)
+    command = np.where(times % 1 < 0.5, 1.0, 0.2)
+    for lag in (0.03, 0.2):
+        _, v, _ = lsim((1, (lag, 1)), command, times, interp=False)
+        result = xr.Dataset(
+            {"v_command": (("run", "time"), command[None]), "v": (("run", "time"), v[None])}, {"time": times}
+        )
+        assert three.fitted([result]) == pytest.approx(lag, rel=0.01)
 
 
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

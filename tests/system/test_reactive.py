@@ -7,6 +7,7 @@ import mrctl
 from mrctl import Box, Disc, Obstacles, Scenario
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import Avoid, avoiding, navigate, planned, robot_of
+from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.rollouts import KNOTS, STEPS, Bounds, Scene, roll_out
 from mrctl.theory.clearance import clearance, cover
 from mrctl.theory.grid import field_of
@@ -36,9 +37,8 @@ def test_roll_out() -> None:
     knots[0] = 0.0
     twists, costs = np.empty((200, STEPS, 2)), np.empty(200)
     start, last = np.zeros(3), np.array([1.0, 0.0])
-    roll_out(
-        knots, np.tile(last, (STEPS, 1)), start, last, 0.05, BOUNDS, Scene(targets, discs, field, mover), twists, costs
-    )
+    scene = Scene(targets, discs, field, mover)
+    roll_out(knots, np.tile(last, (STEPS, 1)), start, last, last, 0.0, 0.05, BOUNDS, scene, twists, costs)
     v, omega = twists[..., 0], twists[..., 1]
     assert v.min() >= 0 and v.max() <= BOUNDS.speed and np.abs(omega).max() <= BOUNDS.rotation
     assert np.all(np.abs(omega) <= BOUNDS.curvature * v + 1e-12)
@@ -61,6 +61,31 @@ def test_roll_out() -> None:
             verdicts.append(free < 0)
             assert (cost >= 1000) == (free < 0)
     assert 20 < sum(verdicts) < len(verdicts) - 20
+
+
+def test_lag() -> None:
+    """A roll-out with a lag goes where a fine integration of the lag and the unicycle goes, and not where none goes."""
+    lag, start, began, last = 0.15, np.array([0.3, -0.2, 0.5]), np.array([0.4, 0.0]), np.array([1.0, 0.6])
+    parts, request = 500, np.tile(last, (STEPS, 1))
+    request[20:] = 0.7, -0.8
+    request[20:28] = np.linspace(last, request[-1], 9)[1:]  # as fast as the bounds allow
+    pose, twist, targets = start.copy(), began.copy(), np.empty((STEPS, 4))
+    for k in range(STEPS):
+        for _ in range(parts):
+            h = 0.05 / parts
+            pose += h * np.array([twist[0] * np.cos(pose[2]), twist[0] * np.sin(pose[2]), twist[1]])
+            twist += h * (request[k] - twist) / lag
+        targets[k] = *pose[:2], np.cos(pose[2]), np.sin(pose[2])
+    field = field_of(Surroundings(Obstacles()).at(0.0), np.array([-3.0, -3.0]), np.array([3.0, 3.0]), 0.1)
+    scene = Scene(targets, cover(FOOTPRINT, 4), field, np.empty((0, 5)))
+    twists, costs, found = np.empty((1, STEPS, 2)), np.empty(1), []
+    for tried in (lag, 0.0, 0.5 * lag):
+        roll_out(np.zeros((1, KNOTS, 2)), request, start, began, last, tried, 0.05, BOUNDS, scene, twists, costs)
+        np.testing.assert_allclose(twists[0], request, atol=1e-12)
+        found.append(costs[0])
+    assert found[0] < 1e-5 and found[1] > 0.1 and found[2] > 0.01
+    with pytest.raises(mrctl.InputError, match="^lag: "):
+        Mppi(mrctl.load_robot("car"), 1, None, Obstacles(), FOOTPRINT, None, lag=-0.1)  # pyright: ignore
 
 
 @pytest.mark.parametrize("avoid", ["window", "mppi"])

@@ -73,7 +73,12 @@ def searched(tmp_path: Path) -> Path:
 @pytest.fixture
 def navigated(tmp_path: Path) -> Path:
     values = {"scenario": {"robot": {"path": "racecar"}}, "mode": "quick", "needed": []}
-    return written(tmp_path / "navigated", values, "## Critical width\n\nAll tie.\n\n| plant |\n| --- |\n")
+    folder = written(tmp_path / "navigated", values, "## Critical width\n\nAll tie.\n\n| plant |\n| --- |\n")
+    write_json(folder / "mppi.json", SOURCE | values | {"runs": {}})
+    write_json(folder / "limits.json", SOURCE | values | {"limits": {}})
+    (folder / "limits.md").write_text("## Up\n\nSmaller.\n\n| plant |\n| --- |\n")
+    (folder / "mppi.md").write_text("## Three\n\nNone differs.\n\n| plant |\n| --- |\n")
+    return folder
 
 
 @pytest.fixture
@@ -108,13 +113,13 @@ def test_sections(
     """Every input becomes a section with its numbers, and with the versions and the machine that it names."""
     out = tmp_path / "RESULTS.md"
     inputs = {"suite": suite, "reproduce": reproduction, "tune": tune, "search": searched}
-    inputs |= {"navigate": navigated}
+    inputs |= {"navigate": navigated, "mppi": navigated, "limits": navigated}
     inputs |= {"identify": identified, "bench": figures}
     words = [word for name, path in inputs.items() for word in (f"--{name}", str(path))]
     assert results_page.command([*words, "--out", str(out)]) == 0
     page = results_page.sections(out.read_text())
     titles = ["The paper", "The uncertainty suite", "Where learning is safe", "The search of settings"]
-    titles += ["How narrow and how fast", "Identification", "Speed"]
+    titles += ["How narrow and how fast", "Three MPPIs", "Feeding up", "Identification", "Speed"]
     assert list(page) == ["", *titles]
     assert all(MADE in page[title] and "on Abacus with 3 cores." in page[title] for title in titles)
     short, *folded = page["The uncertainty suite"].split("<details>")
@@ -143,6 +148,7 @@ def test_sections(
     corridors = page["How narrow and how fast"]
     assert corridors.startswith("`mrctl navigate --suite --quick --robot.path racecar` made this")
     assert "\n\n### Critical width\n\nAll tie." in corridors
+    assert "\n\n### Three\n\nNone differs." in page["Three MPPIs"] and "### Up" in page["Feeding up"]
     assert "`mrctl identify --robot.path racecar`" in page["Identification"]
     assert "| 21.32    | 21 to 21.64   | 21.28 | +0.19 % |" in page["Identification"]
     assert "| 0.912 |" in page["Speed"] and bench.text(json.loads(figures.read_text())) in page["Speed"]

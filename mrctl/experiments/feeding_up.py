@@ -1,0 +1,196 @@
+"""Feeding up, of `mrctl navigate --suite`: plans whose limits know what the learner knows.
+
+The time law of a plan keeps the motors below nine tenths of the supply, by the inverse dynamics of the nominal robot. A
+heavier robot, or one whose supply is weak, needs more voltage than that, and is left behind where the motors saturate.
+Here a robot with `model+composite` drives a plan with nominal limits. The coefficients that it adapts on the way take
+the place of the nominal ones in the limits of a second plan along the same path. Then the robot, which keeps what it
+has learned, drives both. A draw is a corridor, and a robot on one day (`mrctl.scenario.replicates`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from tqdm import tqdm
+
+from mrctl.control.features import INPUTS, feature_scale
+from mrctl.experiments.mission_suite import PATIENCE, ROOMY, SHAPE, TIE, Mode
+from mrctl.experiments.mission_suite import PLANTS as SHARED
+from mrctl.experiments.suite_tables import Table
+from mrctl.experiments.tables import machine, output_folder, write_json
+from mrctl.kernel import Array
+from mrctl.loop.goals import arrived
+from mrctl.loop.learned import kept, save_learned
+from mrctl.loop.simulation import arranged, cores, simulate
+from mrctl.navigation.generators import corridor
+from mrctl.navigation.mission import SLIM, planned, robot_of
+from mrctl.navigation.planning import Plan
+from mrctl.record import InputError
+from mrctl.results.comparison import bootstrap_interval, superiority, wilson
+from mrctl.results.dataset import scenarios_of, versions
+from mrctl.scenario import FEEDFORWARDS, Scenario, replicates
+from mrctl.theory.dynamics import inverse_coefficients
+from mrctl.theory.obstacles import Pose
+from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
+from mrctl.theory.references import Waypoints
+from mrctl.theory.robot import Robot
+from mrctl.theory.timing import RESERVE, Limits
+
+PLANTS: dict[str, Perturbation] = {**SHARED, "mass +50 %": PERTURBATIONS["mass +50 %"]}
+DRAWS = {"quick": 6, "core": 40}
+MOST = 10  # corridors that are made, over the number of draws
+PACE = 50  # simulated s in a s of one core, planning included
+LIMITS = ("nominal", "learned")
+
+
+class Draw(NamedTuple):
+    """A corridor, and the plan through it with nominal limits."""
+
+    seed: int
+    plan: Plan
+    reference: Waypoints
+    goal: Pose
+
+
+class Run(NamedTuple):
+    """How a robot followed a plan."""
+
+    arrived: bool
+    plan: float
+    """Time of the plan in s."""
+    error: float
+    """Largest distance from the reference in m; infinite where it did not arrive."""
+
+
+def suite(base: Scenario, mode: Mode, out: Path) -> str:
+    """Drives all draws; writes `limits.md` and `limits.json`.
+
+    Args:
+        base: Robot, steering, sensing and all else that is the same for all.
+        mode: Which suite.
+        out: Folder.
+
+    Returns:
+        The table in Markdown.
+
+    Raises:
+        InputError: The folder cannot be written, or the robot does not fit most corridors.
+    """
+    output_folder(out)
+    runs = drive(base, DRAWS[mode])
+    text = table(runs, f"{base.robot.path}, {mode}").markdown
+    (out / "limits.md").write_text(text)
+    source = {"versions": versions(), "machine": machine(), "mode": mode, "scenario": base.model_dump(mode="json")}
+    told = {plant: {name: [run._asdict() for run in own] for name, own in of.items()} for plant, of in runs.items()}
+    write_json(out / "limits.json", source | {"limits": told})
+    return text
+
+
+def drive(base: Scenario, count: int) -> dict[str, dict[str, list[Run]]]:
+    """Drives so many draws on all plants; says first how long that takes. Returns the runs by plant and limits."""
+    corners, robot = robot_of(base)
+    width, speed, draws = ROOMY * float(np.ptp(corners[:, 1])), RESERVE * robot.max_speed, []
+    for seed in range(MOST * count):
+        task = corridor(width, seed, **SHAPE)
+        with suppress(InputError):
+            draws.append(Draw(seed, *planned(task, base, speed, SLIM), task.goal))
+        if len(draws) == count:
+            break
+    else:
+        raise InputError(f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m")
+    times = sum(one.reference.period for one in draws) * (1 + len(LIMITS)) * len(PLANTS)
+    minutes = max(1, round(times / PACE / cores() / 60))
+    print(f"{(1 + len(LIMITS)) * len(PLANTS) * count} runs that feed up, about {minutes} min", flush=True)
+    own = base.replace(**FEEDFORWARDS["model+composite"], laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
+    found = {}
+    for plant, perturbation in tqdm(PLANTS.items(), unit="plant"):
+        ill = own.replace(perturbation=perturbation)
+        first = simulate([_replicate(ill, one, one.reference) for one in draws])
+        with TemporaryDirectory() as folder:
+            files, references = [], []
+            for k, one in enumerate(draws):
+                run, path, limits = first.isel(run=k), str(Path(folder) / f"{k}.safetensors"), Limits.of(robot)
+                with suppress(InputError):  # a run that failed teaches nothing
+                    save_learned(path, run)
+                    limits = limits_of(run, robot)
+                files.append(path if Path(path).exists() else None)
+                references.append(one.plan.reference(speed, limits))
+            ways = {"nominal": [one.reference for one in draws], "learned": references}
+            found[plant] = {name: _driven(ill, draws, way, files) for name, way in ways.items()}
+    return found
+
+
+def limits_of(run: xr.Dataset, robot: Robot) -> Limits:
+    """Returns the limits of a robot with the coefficients that `composite` has adapted at the end of a run.
+
+    With rigid steering the second channel is no voltage, so its coefficients stay nominal.
+
+    Args:
+        run: One run of a result, with the prior `model`.
+        robot: The nominal robot.
+    """
+    (scenario,) = scenarios_of(run)
+    ((name, shape), *_) = kept(scenario).items()
+    assert name == "a" and scenario.prior == "model"
+    weights = run["weights"].values[: int(np.prod(shape))].reshape(shape)[:, :INPUTS]
+    adapted = inverse_coefficients(robot)
+    channels = 1 if arranged(scenario).steering == "rigid" else 2
+    adapted[:, :channels] += (weights[:channels] / feature_scale(robot)).T
+    return Limits.of(robot).replace(inverse=tuple((float(common), float(other)) for common, other in adapted))
+
+
+def _replicate(scenario: Scenario, one: Draw, reference: Waypoints, learned: str | None = None) -> Scenario:
+    own = scenario.replace(reference=reference, goal=one.goal, learned=learned)
+    return replicates(own, 1, one.seed)[0]
+
+
+def _driven(
+    ill: Scenario, draws: Sequence[Draw], references: Sequence[Waypoints], files: Sequence[str | None]
+) -> list[Run]:
+    """Drives plans with what was learned."""
+    cases = zip(draws, references, files, strict=True)
+    result, found = simulate([_replicate(ill, *case) for case in cases]), []
+    for k, (one, reference) in enumerate(zip(draws, references, strict=True)):
+        run = result.isel(run=k).dropna("time", subset=["x"])
+        end = run.isel(time=-1)
+        pose = np.array([float(end[name]) for name in ("x", "y", "theta")])
+        there = run["failure"].item() == "" and bool(arrived(pose, float(end["v"]), np.array(one.goal)))
+        error = float(np.hypot(run["longitudinal_error"], run["lateral_error"]).max())
+        found.append(Run(there, reference.period, error if there else np.inf))
+    return found
+
+
+def table(runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
+    """How the robots followed the plans on each plant, and the sentence that follows."""
+    rows, told = [], []
+    for plant, of in runs.items():
+        errors = {name: np.array([run.error for run in own]) for name, own in of.items()}
+        for name, own in of.items():
+            there = sum(run.arrived for run in own)
+            low, high = wilson(there / len(own), len(own))
+            share = f"{there}/{len(own)} [{100 * low:.0f}, {100 * high:.0f}] %"
+            times = np.array([run.plan for run in own])
+            rows.append([plant, name, share, _median(times, 2), _median(1e3 * errors[name], 1)])
+        wins = superiority(errors["learned"], errors["nominal"], floor=TIE)
+        word = "smaller" if wins.low > 0.5 else "larger" if wins.high < 0.5 else "level"
+        told.append(f"{word} on {plant} ({wins.value:.2f} [{wins.low:.2f}, {wins.high:.2f}])")
+    says = (
+        f"In paired draws, with 95 % confidence and differences up to {1e3 * TIE:.0f} mm as ties, the largest error "
+        f"with learned limits is, against nominal ones: {', '.join(told)}. Times and errors are medians; errors are of "
+        "the robots that arrive."
+    )
+    header = ["plant", "limits of the plan", "arrived", "time of the plan, s", "largest error, mm"]
+    return Table(f"Feeding up ({shown})", says, pd.DataFrame(rows, columns=header))  # pyright: ignore[reportArgumentType]
+
+
+def _median(samples: Array, digits: int) -> str:
+    """The median of the finite samples with its interval."""
+    value, low, high, *_ = bootstrap_interval(samples, median=True)
+    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]" if np.isfinite(value) else "–"

@@ -1,0 +1,231 @@
+"""Three MPPIs, of `mrctl navigate --suite`: does an adaptive velocity loop make the simplest roll-out model right?
+
+MPPI predicts what the robot does with a twist that it asks for. Here the same MPPI drives in the same worlds (1) with
+roll-outs that obey at once, over PID alone; (2) over the same PID, with roll-outs that obey with a first-order lag; (3)
+with roll-outs that obey at once, over `model+composite`. The lag is the one that fits V of PID on the nominal plant in
+the runs of (1). A world is a slalom with two discs that cross it, and a robot on one day (`mrctl.scenario.replicates`);
+all three have the same worlds and draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from scipy.optimize import fminbound
+from tqdm import tqdm
+
+from mrctl.experiments.mission_suite import PLANTS, Mode
+from mrctl.experiments.suite_tables import Table
+from mrctl.experiments.tables import machine, output_folder, write_json
+from mrctl.kernel import Array
+from mrctl.loop.simulation import cores, simulate
+from mrctl.navigation.generators import Task, slalom
+from mrctl.navigation.mission import PERIOD, avoiding, outcomes, prepared, robot_of
+from mrctl.navigation.planning import Plan
+from mrctl.record import InputError
+from mrctl.results.comparison import bootstrap_interval, superiority, wilson
+from mrctl.results.dataset import versions
+from mrctl.results.metrics import control_period
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
+from mrctl.theory.obstacles import Disc, Obstacles
+from mrctl.theory.references import Line
+from mrctl.theory.timing import RESERVE
+
+
+class Entry(NamedTuple):
+    """One of the three."""
+
+    feedforward: FeedforwardName
+    lagging: bool
+    """Whether its roll-outs have the lag."""
+
+
+ENTRIES = {
+    "PID, ideal roll-outs": Entry("none", False),
+    "PID, lagging roll-outs": Entry("none", True),
+    "model+composite, ideal roll-outs": Entry("model+composite", False),
+}
+FIRST, SECOND, THIRD = ENTRIES
+WORLDS = {"quick": 4, "core": 30}
+GATES, SPACING = 2, 2.0  # of the slalom; m
+CROSSINGS = (3.0, 5.0)  # m, where the discs cross the way, on average
+RADIUS = 0.2  # m, of the discs
+PATIENCE = 2  # time of a run over that of its plan, after which it is out of time
+MOST = 10  # worlds that are made, over the number that is driven
+MOST_LAG = 1.0  # s
+PACE = 2.2  # simulated s in a s of one core
+TIE = PERIOD
+
+
+class World(NamedTuple):
+    """A world, and the plan through it."""
+
+    seed: int
+    plan: Plan
+    scenario: Scenario
+
+
+class Run(NamedTuple):
+    """How a run ended."""
+
+    outcome: str
+    """As in `mrctl.navigation.mission.outcomes`."""
+    lateness: float
+    """Time at which the robot arrived beyond that of the plan in s; infinite where it did not arrive."""
+    clearance: float
+    """Smallest clearance in m."""
+
+
+def suite(base: Scenario, mode: Mode, out: Path) -> str:
+    """Drives all worlds; writes `mppi.md` and `mppi.json`.
+
+    Args:
+        base: Robot, steering, sensing and all else that is the same for all.
+        mode: Which suite.
+        out: Folder.
+
+    Returns:
+        The table in Markdown.
+
+    Raises:
+        InputError: The folder cannot be written, or the robot finds no way through most worlds.
+    """
+    output_folder(out)
+    lag, runs = drive(base, WORLDS[mode])
+    text = table(lag, runs, f"{base.robot.path}, {mode}").markdown
+    (out / "mppi.md").write_text(text)
+    source = {"versions": versions(), "machine": machine(), "mode": mode, "scenario": base.model_dump(mode="json")}
+    told = {entry: {plant: [run._asdict() for run in own] for plant, own in of.items()} for entry, of in runs.items()}
+    write_json(out / "mppi.json", source | {"lag": lag, "runs": told})
+    return text
+
+
+def drive(base: Scenario, count: int) -> tuple[float, dict[str, dict[str, list[Run]]]]:
+    """Drives so many worlds with all three on all plants; says first how long that takes.
+
+    Returns:
+        The lag in s, and the runs by entry and plant, in the order of the worlds.
+    """
+    worlds = list(islice(filter(None, (world(base, seed) for seed in range(MOST * count))), count))
+    if len(worlds) < count:
+        raise InputError(f"suite: {base.robot.path} finds no way through most slaloms")
+    cases = [(plant, one) for plant in PLANTS for one in worlds]
+    seconds = len(ENTRIES) * sum(one.scenario.reference.period for _, one in cases)
+    minutes = max(1, round(seconds / PACE / cores() / 60))
+    print(f"{len(ENTRIES) * len(cases)} runs with MPPI, about {minutes} min on {cores()} cores", flush=True)
+    lag, found = 0.0, {}
+    with ThreadPoolExecutor(cores()) as pool, tqdm(total=len(ENTRIES) * len(cases), unit="run") as bar:
+        for name, (feedforward, lagging) in ENTRIES.items():
+            own = FEEDFORWARDS[feedforward]
+
+            def driven(case: tuple[str, World], own: Any = own, lag: float = lag * lagging) -> xr.Dataset:  # noqa: ANN401
+                plant, one = case
+                (scenario,) = replicates(one.scenario.replace(**own, perturbation=PLANTS[plant]), 1, one.seed)
+                result = simulate([scenario], threads=1, motion=avoiding("mppi", one.scenario, lag))
+                bar.update()
+                return result
+
+            results = list(pool.map(driven, cases))
+            if name == FIRST:
+                lag = fitted([result for (plant, _), result in zip(cases, results, strict=True) if plant == "nominal"])
+            ends = [ended(result, one) for (_, one), result in zip(cases, results, strict=True)]
+            found[name] = {plant: ends[k * count : (k + 1) * count] for k, plant in enumerate(PLANTS)}
+    return lag, found
+
+
+def world(base: Scenario, seed: int) -> World | None:
+    """Makes a world and plans a way through it without the discs that move; None where there is no way.
+
+    A disc crosses the middle line of the slalom at about the time at which a robot is there that drives along it at 0.9
+    of its largest speed.
+    """
+    corners, robot = robot_of(base)
+    still, random = slalom(2 * float(np.ptp(corners[:, 1])), seed, GATES, SPACING), np.random.default_rng([seed, 1])
+    movers = []
+    for way in CROSSINGS:
+        x, late = way + random.uniform(-0.5, 0.5), random.uniform(-0.5, 0.5)
+        speed, heading = random.uniform(0.3, 0.9), random.choice([-1, 1]) * np.pi / 2 + random.uniform(-0.5, 0.5)
+        behind = speed * (x / (RESERVE * robot.max_speed) + late)
+        at = x * np.exp(-1j * heading) - behind  # as the disc counts, from the pose of its course
+        movers.append(Disc(x=at.real, y=at.imag, radius=RADIUS, course=Line(heading=heading, speed=speed)))
+    task = Task(obstacles=Obstacles(shapes=(*still.obstacles.shapes, *movers)), start=still.start, goal=still.goal)
+    try:
+        plan, own = prepared(task, base, forward=True)
+    except InputError:
+        return None
+    changes = {"motion_period": PERIOD, "laps": PATIENCE, "initial_spread": (0.0, 0.0, 0.0)}
+    return World(seed, plan, own.replace(**changes))
+
+
+def fitted(results: Sequence[xr.Dataset]) -> float:
+    """Returns the time constant in s with which V follows its command in runs best, by least squares."""
+    period = control_period(results[0])
+    driven = [result.isel(run=0).dropna("time", subset=["v"]) for result in results]
+    pairs = [(one["v_command"].values, one["v"].values) for one in driven]
+
+    def missed(lag: float) -> float:
+        left, total = np.exp(-period / lag), 0.0
+        for command, v in pairs:
+            now = v[0]
+            for wanted, there in zip(command, v, strict=True):
+                total += (now - there) ** 2
+                now = wanted + left * (now - wanted)
+        return total
+
+    return float(fminbound(missed, 1e-3, MOST_LAG))  # pyright: ignore[reportArgumentType] (without full_output one number)
+
+
+def ended(result: xr.Dataset, one: World) -> Run:
+    """Returns how a run ended."""
+    goal, plan = one.scenario.goal, one.scenario.reference
+    assert goal is not None
+    row = outcomes(result, goal, one.plan).iloc[0]
+    there = row["outcome"] == "arrived"
+    return Run(row["outcome"], row["time"] - plan.period if there else np.inf, row["clearance"])
+
+
+def table(lag: float, runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
+    """How each of the three fared on each plant, and the sentence that follows."""
+    rows, told = [], {SECOND: [], FIRST: []}
+    for plant in PLANTS:
+        late = {name: np.array([run.lateness for run in of[plant]]) for name, of in runs.items()}
+        for name, of in runs.items():
+            own = of[plant]
+            counts = [sum(run.outcome == outcome for run in own) for outcome in ("arrived", "collided")]
+            cells = [f"{count}/{len(own)} {_percent(wilson(count / len(own), len(own)))}" for count in counts]
+            near = np.array([run.clearance for run in own])
+            rows.append([plant, name, *cells, _mean(late[name], 2), _mean(1e3 * near, 0)])
+            for rival in (FIRST, SECOND):
+                wins = superiority(late[name], late[rival], floor=TIE)
+                rows[-1].append("" if rival == name else f"{wins.value:.2f} [{wins.low:.2f}, {wins.high:.2f}]")
+        for rival, parts in told.items():
+            both = np.isfinite(late[THIRD]) & np.isfinite(late[rival])
+            wins = superiority(late[THIRD], late[rival], floor=TIE)
+            word = "faster" if wins.low > 0.5 else "slower" if wins.high < 0.5 else "level"
+            parts.append(f"{word} ({plant}, {_mean(late[THIRD][both] - late[rival][both], 2)} s later)")
+    header = ["plant", "MPPI", "arrived", "collided", "later than the plan, s", "least clearance, mm"]
+    header += ["arrives before the first", "before the second"]
+    says = (
+        f"The lag that fits PID on the nominal plant is {1e3 * lag:.0f} ms. In paired draws, with 95 % confidence, "
+        f"differences up to {1e3 * TIE:.0f} ms as ties and who does not arrive as last, the third is, against the "
+        f"second: {', '.join(told[SECOND])}; against the first: {', '.join(told[FIRST])}. The differences in time are "
+        "means over the draws in which both arrive."
+    )
+    return Table(f"Three MPPIs ({shown})", says, pd.DataFrame(rows, columns=header))  # pyright: ignore[reportArgumentType]
+
+
+def _percent(interval: tuple[float, float]) -> str:
+    return f"[{100 * interval[0]:.0f}, {100 * interval[1]:.0f}] %"
+
+
+def _mean(samples: Array, digits: int) -> str:
+    """The mean of the finite samples with its interval."""
+    value, low, high, *_ = bootstrap_interval(samples)
+    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]" if np.isfinite(value) else "–"
