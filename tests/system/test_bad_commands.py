@@ -87,8 +87,9 @@ RUN = [
 OTHERS = [
     "dance", "Run", "\x1b[31m", "navigate", "navigate nowhere", "navigate doorway:x", "navigate missing.toml",
     "navigate doorway:1 --goal 1 2", "navigate doorway:1 --margin -1", "navigate doorway:1 --speed nan",
-    "navigate doorway:1 --view --avoid mppi", "navigate doorway:1 --view --json", "navigate doorway:1 --port 8081",
-    "navigate doorway:1 --view --port 99999", "navigate doorway:1 --view --goal 9 0 0",
+    "navigate doorway:1 --view --avoid mppi --out x", "navigate doorway:1 --view --json",
+    "navigate doorway:1 --port 8081", "navigate doorway:1 --view --port 99999",
+    "navigate doorway:1 --view --goal 9 0 0",
     "navigate text.toml", "navigate latin.toml", "reproduce x", "reproduce --out file/out", "reproduce --nosuch",
     "sweep", "sweep sweep.toml", "sweep missing.toml --out s", "sweep text.toml --out s", "sweep huge.toml --out s",
     "sweep field.toml --out s", "sweep twice.toml --out s", "sweep wide.toml --out s", "sweep mixed.toml --out s",
