@@ -157,7 +157,7 @@ def world(base: Scenario, seed: int) -> World | None:
         movers.append(Disc(x=at.real, y=at.imag, radius=RADIUS, course=Line(heading=heading, speed=speed)))
     task = Task(obstacles=Obstacles(shapes=(*still.obstacles.shapes, *movers)), start=still.start, goal=still.goal)
     try:
-        plan, own = prepared(task, base, forward=True)
+        plan, own = prepared(task, base, avoid="mppi")
     except InputError:
         return None
     changes = {"motion_period": PERIOD, "laps": PATIENCE, "initial_spread": (0.0, 0.0, 0.0)}
