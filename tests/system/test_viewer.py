@@ -372,7 +372,9 @@ def test_dragging(browser, tmp_path):
         drag((0.7, 0.2), (0.7, 0.9))
         page.mouse.up()
         until(lambda: len(live.session.saved()[0].events) == 2, "the goal")
-        assert live._ends[1] == pytest.approx([0.7, 0.2, np.pi / 2], abs=0.1)
+        *place, heading = live._ends[1]
+        assert place == pytest.approx([0.7, 0.2], abs=0.1)
+        assert abs(np.angle(np.exp(1j * heading) / 1j)) < 0.1  # a way may turn once more
         assert page.evaluate(CAMERA) == pytest.approx(camera, abs=1e-6) and not live._picks
 
 

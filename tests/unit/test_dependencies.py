@@ -15,6 +15,7 @@ OPTIONAL = {  # file that alone may import a module of an extra
     "envs/gym.py": "env",
     "sweep/pool.py": "dask",
     "results/export.py": "mcap",
+    "viewer/video.py": "video",
     "checks/pytest_plugin.py": "dev",  # pytest itself loads it
 }
 
