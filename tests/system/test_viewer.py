@@ -297,8 +297,8 @@ def test_inputs(browser, tmp_path):
         del genuine
 
 
-FLOOR_TO_SCREEN = """([x, y]) => {
-    const m = window.__viserMutable, point = new m.camera.position.constructor(x, y, 0);
+WORLD_TO_SCREEN = """([x, y, z = 0]) => {
+    const m = window.__viserMutable, point = new m.camera.position.constructor(x, y, z);
     m.nodeRefFromName['/world'].localToWorld(point).project(m.camera);
     const r = m.canvas.getBoundingClientRect();
     return [r.left + (point.x + 1) / 2 * r.width, r.top + (1 - point.y) / 2 * r.height];
@@ -332,7 +332,7 @@ def test_looking_back(browser, tmp_path):
         until(lambda: page.evaluate(AXES)["V, m/s"]["cursor"] == pytest.approx(0.01 * live._back, abs=0.02), "a cursor")
         picture(page, tmp_path / "back.png")
         ticks, drawn = live._trail
-        page.mouse.click(*page.evaluate(FLOOR_TO_SCREEN, drawn[len(drawn) // 2, 0].tolist()))
+        page.mouse.click(*page.evaluate(WORLD_TO_SCREEN, drawn[len(drawn) // 2, 0].tolist()))
         until(lambda: abs(live._back - ticks[len(ticks) // 2]) < 20, "the moment of that place of the trail")
         back = live._back
         page.get_by_text("step", exact=True).click()
@@ -351,13 +351,14 @@ def test_dragging(browser, tmp_path):
         page.wait_for_timeout(1000)
         camera, here = page.evaluate(CAMERA), live.session.qpos(0)[:2]
 
-        def drag(start, end):
-            page.mouse.move(*page.evaluate(FLOOR_TO_SCREEN, list(start)))
+        def drag(start, *places):
+            page.mouse.move(*page.evaluate(WORLD_TO_SCREEN, list(start)))
             page.mouse.down()
-            page.mouse.move(*page.evaluate(FLOOR_TO_SCREEN, [(a + b) / 2 for a, b in zip(start, end, strict=True)]))
-            page.mouse.move(*page.evaluate(FLOOR_TO_SCREEN, list(end)))
+            for place in places:
+                page.mouse.move(*page.evaluate(WORLD_TO_SCREEN, list(place)))
 
-        drag(here, here + [0.3, -0.5])
+        theta = live.session.qpos(0)[2]
+        drag((*here + 0.15 * np.array([np.cos(theta), np.sin(theta)]), 0.1), here + [0.1, -0.2], here + [0.3, -0.5])
         until(lambda: page.evaluate(VISIBLE, "/world/force/0") and live._pull, "an arrow")
         picture(page, tmp_path / "push.png")
         page.mouse.up()
@@ -369,9 +370,9 @@ def test_dragging(browser, tmp_path):
         page.get_by_text("Set a goal", exact=True).click()
         until(lambda: "Drag on the floor" in page.inner_text("#mrctl-picking"), "the wait for a goal")
         page.wait_for_timeout(1000)
-        drag((0.7, 0.2), (0.7, 0.9))
+        drag((0.7, 0.2), (0.7, 0.5), (0.7, 0.9))
         page.mouse.up()
-        until(lambda: len(live.session.saved()[0].events) == 2, "the goal")
+        until(lambda: len(live.session.saved()[0].events) == 2 and live._ends is not None, "the goal")
         *place, heading = live._ends[1]
         assert place == pytest.approx([0.7, 0.2], abs=0.1)
         assert abs(np.angle(np.exp(1j * heading) / 1j)) < 0.1  # a way may turn once more
