@@ -390,13 +390,15 @@ class Live(Page):
         self._scene.show_search(self._searched if self._tree.value else NOTHING)
 
     def _click_on_trail(self, point: Array | None) -> None:
-        """Looks back to when a robot was at a point of the floor in m, `(2,)`, if a trail is there."""
-        ticks, drawn = self._trail
-        if point is None or not drawn.size:
+        """Looks back to when a robot last was at a point of the floor in m, `(2,)`, if a trail is there."""
+        if point is None:
             return
+        ticks, drawn = self._trail
         away = np.nan_to_num(np.hypot(*np.moveaxis(drawn - point, -1, 0)), nan=np.inf).min(axis=1)
-        if away.min() < self._scene.reach:
-            self._look_back(int(ticks[away.argmin()]) * self.session.period)
+        near = np.flatnonzero(away < self._scene.reach)
+        if near.size:
+            passage = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)[-1]  # laps lie one on the other
+            self._look_back(int(ticks[passage[away[passage].argmin()]]) * self.session.period)
 
     def _set_speed(self, speed: float) -> None:
         self.speed, self._due = speed, 0.0
