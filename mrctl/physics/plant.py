@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.physics import mjcf
 from mrctl.physics.car import CarPhysics
+from mrctl.physics.contacts import Contacts, contacts
 from mrctl.physics.elements import COLLISION, has
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import fields, limit_current, perturb, write
@@ -352,6 +353,16 @@ class Plant(ABC):
     def current(self) -> Array:
         """Returns the armature currents left and right at the end of the last control period in A, `(B, 2)`."""
         return self.state["current"]
+
+    def contacts(self, robot: int) -> Contacts:
+        """Returns the contacts of one robot in its present state; the engine's own data remain as they are."""
+        model = self._model_of(robot)
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.act[:] = self.qpos[robot], self.qvel[robot], self.act[robot]
+        data.ctrl[:], data.xfrc_applied[:] = self.ctrl[robot], self.wrench[robot]
+        data.mocap_pos[:], data.mocap_quat[:] = (part[robot] for part in self.mocap)
+        mujoco.mj_forward(model, data)
+        return contacts(model, data)
 
     def _begin(self, rows: slice) -> None:
         """Reads robots that were just placed on the ground; the second look makes their initial acceleration zero.

@@ -31,6 +31,7 @@ from mrctl.theory.robot import Robot, RobotFile
 from mrctl.viewer.controls import WORLDS, Controls
 from mrctl.viewer.deviation import drawn
 from mrctl.viewer.embed import LONGEST
+from mrctl.viewer.hands import Hands
 from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
 from mrctl.viewer.plots import Plots
@@ -48,8 +49,7 @@ TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each 
 PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
 REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
 MAX_BACKLOG = 0.25  # s of wall time that a late loop catches up with; it drops the rest
-GOAL_HINT = "Drag on the floor from where the robots shall go to where they shall look there; or click twice."
-PUSH_HINT = "A drag from the first robot pushes all robots that way, a robot's length as hard as the button."
+TOUCH_HINT = "Blue: forces on the wheels, a robot's length for its weight. Red: slip, for a tenth of its top speed."
 FAN_HINT = "Draws some of the ways that `window` or `mppi` considers, and the one that it chooses."
 # What *Save session* writes beside the scenarios of a mission with an avoider.
 AVOIDER = '''"""The motion stage of a session: `mrctl run {scenario} --controller motion={avoid}.py:{avoid}`."""
@@ -130,7 +130,6 @@ class Live(Page):
         self._searched = NOTHING if searched is None else searched
         self.factor = 0.0  # ratio of simulated to wall time in the last second
         self._back: int | None = None  # tick that is shown, while a visitor looks back
-        self._pull: tuple[float, ...] | None = None  # push that a visitor draws with the mouse, in N
         self.late = self.ticks = 0  # ticks that began more than a period too late, and all ticks, at a finite speed
         self._due = 0.0  # number of ticks that are due
         self._changed_inputs: dict[tuple[str, ...], Any] = {}
@@ -166,11 +165,12 @@ class Live(Page):
             for label, choices in buttons(self.session.robot).items():
                 group = gui.add_button_group(label, tuple(choices))
                 self.on(group, partial(self._press, label))
-            self._pushes = gui.add_checkbox("Push by dragging", False, hint=PUSH_HINT)
-            self.on(self._pushes, lambda _: self._show_grips())
-            self.on(gui.add_button("Set a goal", icon=viser.Icon.FLAG, hint=GOAL_HINT), lambda _: self._await_goal())
-            self._picking = gui.add_html("")
+            self._hands = Hands(
+                self.server, self.on, self.ask, self._command, self._present_session, self._apply_event,
+                self._head_for, self._look_back,
+            )  # fmt: skip
             self._fan = gui.add_checkbox("Avoider", self.session.avoid != "none", hint=FAN_HINT)
+            self._touch = gui.add_checkbox("Contact forces", False, hint=TOUCH_HINT)
             self._tree = gui.add_checkbox("Search", False, hint="Draws the arcs that the search for the plan drove.")
             self.on(self._tree, lambda _: self._show_search())
             self.add_drawing()
@@ -190,11 +190,8 @@ class Live(Page):
         for key, (group, choices) in zip(KEYS, buttons(self.session.robot).items(), strict=True):
             self.add_key(key, next(iter(choices)).capitalize(), partial(self._press, group, next(iter(choices))))
 
-        self.add_key("G", "Set a goal", self._await_goal)
-
-        @self.server.scene.on_click()
-        def _(event: viser.SceneClickEvent) -> None:
-            self.ask(self._click, np.array(event.ray_origin), np.array(event.ray_direction))
+        self.add_key("G", "Set a goal", self._hands.await_goal)
+        self.add_key("W", "Draw a way", self._hands.draw_way)
 
         self._controls = Controls(gui, partial(self.ask, self._note_input))
         self._controls.designed = self.session.designed()
@@ -239,17 +236,16 @@ class Live(Page):
             self.set_marks(any(s.source != "truth" for s in sensing), spread)
         told = [story.watch for story in STORIES.values() if [arranged(s) for s in story.scenarios] == session.start]
         write(self._story, block("story", *told) if told else "")
-        self._forget_goal()
         self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
         self._scene.show_reference(first)
         self._scene.forget_trails()
+        self._hands.begin(self._scene, session)
         self._fan.visible = session.avoid in ("window", "mppi")
         self._show_search()
         for name, ghost in self._ghosts.items():
             ghost.value = any(s.feedforward == name for s in session.start[1:])
         self._robot.value = first.robot.path
         self._drawn = self._plotted = None
-        self._trail = np.zeros(0, int), np.zeros((0, session.size, 2))  # ticks of its points, and where they are drawn
         self._way: Reference | None = None  # that a visitor has brought, as drawn
         self._deviation = 1  # factor on the deviations from the reference in the picture
         self._laps: list[dict[str, Any]] = []  # metrics of the whole laps until now
@@ -297,7 +293,7 @@ class Live(Page):
         tick = max(0, round(time / self.session.period))
         self._back = tick if tick < self.session.tick else None
         self._return.visible = self._back is not None
-        self._forget_goal()
+        self._hands.forget()
         self._plots.time.value = self.time  # else a second click there would change nothing
         self.playing = False
         self._describe()
@@ -307,78 +303,19 @@ class Live(Page):
         if self._back is not None:
             self._restart(self.session.start)
 
+    def _present_session(self) -> Session:
+        """Returns the session, which goes on from where a visitor looks back to."""
+        self._go_on()
+        return self.session
+
     def _tell(self, name: str) -> None:
         if name not in STORIES:
             raise InputError(f"{name}: not one of the choices")
         self._begin(STORIES[name].scenarios)
         self.playing = True
 
-    def _await_goal(self) -> None:
-        """Waits for a drag on the floor, from the place of a goal to where a robot looks there, or for two clicks."""
-        self._go_on()
-        self._forget_goal()
-        self._picks = True
-        self._show_grips()
-        write(self._picking, block("picking", "Drag on the floor, or click, where the robots shall go."))
-
-    def _forget_goal(self) -> None:
-        self._picks = False
-        self._picked: list[Array] = []
-        self._show_grips()
-        write(self._picking, "")
-
-    def _show_grips(self) -> None:
-        """Lets visitors drag what they may drag at present."""
-        self._scene.hold_floor(partial(self._dragged, self._drag_goal) if self._picks else None)
-        self._scene.hold_robot(partial(self._dragged, self._drag_push) if self._pushes.value else None)
-
-    def _dragged(self, action: Callable[[str, Array, Array], None], event: viser.SceneNodeDragEvent) -> None:
-        """Queues an action with the places on the floor in m, `(2,)`, from and to which a visitor drags."""
-        eye = np.array(event.client.camera.position)
-        ends = [np.array(place) - eye for place in (event.start_position, event.end_position)]
-
-        def act() -> None:
-            start, end = (self._scene.on_floor(eye, ray) for ray in ends)
-            if start is not None and end is not None:
-                action(event.phase, start, end)
-
-        self.ask(act)
-
-    def _drag_goal(self, phase: str, start: Array, end: Array) -> None:
-        """Shows, and at the end sets, the goal at the start of a drag."""
-        if self._picks:
-            goal = (float(start[0]), float(start[1]), float(np.arctan2(*(end - start)[::-1])))
-            self._scene.show_ends(np.array([goal, goal]))
-            if phase == "end":
-                self._head_for(goal)
-
-    def _drag_push(self, phase: str, start: Array, end: Array) -> None:  # noqa: ARG002 (the robot may have moved)
-        """Pushes all robots at the end of a drag from the first one; before, the page draws an arrow."""
-        fx, fy = HARD * self.session.robot.mass * (end - self._qpos(0)[:2]) / self._scene.length
-        self._pull = None if phase == "end" else (float(fx), float(fy))
-        if phase == "end":
-            fx, fy = _rounded(fx, fy)
-            self._apply_event(push=(fx, fy, 0.0))
-
-    def _click(self, origin: Array, direction: Array) -> None:
-        """Takes a click, a ray from `origin` in m, `(3,)`: for a goal, or on a trail, to look back to that moment."""
-        point = self._scene.on_floor(origin, direction)
-        if not self._picks:
-            return self._click_on_trail(point)
-        if point is None:
-            raise InputError("goal: there is no floor where you clicked")
-        place = self._picked[0] if self._picked else point
-        ahead = point - (place if self._picked else self.session.qpos(0)[:2])
-        goal = (float(place[0]), float(place[1]), float(np.arctan2(ahead[1], ahead[0])))
-        if self._picked:
-            return self._head_for(goal)
-        self._picked.append(point)
-        self._scene.show_ends(np.array([goal, goal]))
-        write(self._picking, block("picking", "Click on the floor towards where they shall look there."))
-
     def _head_for(self, goal: Pose) -> None:
         """Sets a goal, x and y in m and θ in rad."""
-        self._forget_goal()
         try:
             self._searched = self.session.head_for(goal).searched
             self._show_search()
@@ -388,17 +325,6 @@ class Live(Page):
     def _show_search(self) -> None:
         self._tree.visible = len(self._searched) > 0
         self._scene.show_search(self._searched if self._tree.value else NOTHING)
-
-    def _click_on_trail(self, point: Array | None) -> None:
-        """Looks back to when a robot last was at a point of the floor in m, `(2,)`, if a trail is there."""
-        if point is None:
-            return
-        ticks, drawn = self._trail
-        away = np.nan_to_num(np.hypot(*np.moveaxis(drawn - point, -1, 0)), nan=np.inf).min(axis=1)
-        near = np.flatnonzero(away < self._scene.reach)
-        if near.size:
-            passage = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)[-1]  # laps lie one on the other
-            self._look_back(int(ticks[passage[away[passage].argmin()]]) * self.session.period)
 
     def _set_speed(self, speed: float) -> None:
         self.speed, self._due = speed, 0.0
@@ -578,8 +504,8 @@ class Live(Page):
     @override
     def draw(self) -> None:
         session, (marked, magnified), tick = self.session, self.marks, self.tick
-        fan = self._fan.value and self._back is None
-        now = tick, self._back, self._follow.value, marked, magnified, self._deviation, fan, self._pull
+        fan, touch = (box.value and self._back is None for box in (self._fan, self._touch))
+        now = tick, self._back, touch, self._follow.value, marked, magnified, self._deviation, fan, self._hands.pull
         if now == self._drawn:
             return
         self._drawn = now
@@ -598,8 +524,10 @@ class Live(Page):
             self._scene.show_scans(scans)
             push = pushed(max(session.saved(), key=lambda s: len(s.events)), self.time)
             for row in range(session.size):
-                self._scene.show_force(row, push if row or self._pull is None else np.array(self._pull))
+                self._scene.show_force(row, push if row or self._hands.pull is None else np.array(self._hands.pull))
             shown = range(min(session.size, MAX_MARKED) if fan else 0)
+            touching = range(min(session.size, MAX_MARKED) if touch and session.tick else 0)
+            self._scene.show_contacts([session.contacts(row) for row in touching])
             self._scene.show_considered([session.considered(row) for row in shown])
             self._scene.flush(self._follow.value)
         self.chase()
@@ -675,7 +603,7 @@ class Live(Page):
             marked = last // every * every - every * np.arange(self._scene.trail_points - 1)[::-1]
             rows = np.clip(np.append(marked, last - 1) - first, 0, len(log) - 1)  # the same moments in every picture
             self._deviation = self.magnified_deviation(log)
-            self._trail = first + rows, drawn(log[rows], self._deviation)
+            self._hands.trail = first + rows, drawn(log[rows], self._deviation)
             self._scene.show_trails(log[rows], self._deviation)
 
     def _event_times(self) -> list[float]:

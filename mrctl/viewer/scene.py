@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mrctl.kernel import Rows
 from mrctl.physics import mjcf
+from mrctl.physics.contacts import NOTHING, Contacts
 from mrctl.physics.obstacles import HEIGHT, quaternion
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.pictures import REFERENCE_COLOUR
@@ -28,12 +29,13 @@ from mrctl.scenario import Scenario
 from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Reference
+from mrctl.theory.robot import GRAVITY
 from mrctl.viewer.deviation import Target
 from mrctl.viewer.looks import Colour, Look, pale
 from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, path
 from mrctl.viewer.sensors import Marks, outline
 from mrctl.viewer.server import Server
-from mrctl.viewer.shapes import bar, ribbons
+from mrctl.viewer.shapes import bar, disc, ribbons
 
 Array = NDArray[np.float64]
 EVENT_COLOUR: Colour = (217, 119, 6)
@@ -73,6 +75,10 @@ SHADE = 0.35  # opacity of shadows on the floor
 GRIP, GRIP_BELOW = 50.0, 0.02  # m, half the side of the floor that can be dragged on, and its depth below the floor
 SQUARE = (-1, -1), (1, -1), (1, 1), (-1, 1)
 HARD = 3.0  # N/kg, a push whose arrow is as long as the robot
+SLIDING = 0.1  # share of the robot's largest speed, a slip whose arrow is as long as the robot
+LEAST_ARROW = 0.03  # robot lengths; shorter ones are not drawn
+FORCE_COLOUR: Colour = (37, 99, 235)
+SLIP_COLOUR: Colour = (220, 38, 38)
 Dragged = Callable[[viser.SceneNodeDragEvent], None]
 
 _NUMBERS = itertools.count()  # of scenes
@@ -113,7 +119,7 @@ class Scene:
         round_ends = self._model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE
         self._model.geom_type[round_ends] = mujoco.mjtGeom.mjGEOM_CYLINDER  # a capsule takes thousands of triangles
         robot = read_robot(model)
-        self._radius, self._mass = robot.wheel_radius, robot.mass
+        self._radius, self._mass, self._max_speed = robot.wheel_radius, robot.mass, robot.max_speed
         self._back = np.zeros(4)  # scratch
         self._root = self._scene.add_frame("/world", show_axes=False)
         chassis = model.body("chassis").id
@@ -178,6 +184,8 @@ class Scene:
         self._forces: list[viser.ArrowsHandle | None] = [None] * self.size
         self._grip: viser.MeshHandle | None = None
         self._search = self._draw_segments("/world/search", SEARCH_COLOUR, 1.0)
+        self._touches: list[list[viser.ArrowsHandle]] = []  # of each robot: forces and slips
+        self._way: list[viser.MeshHandle] = []  # that a visitor draws: its points and the way
         self._factor = self._scene.add_label("/world/deviation", "", visible=False, font_screen_scale=0.8)
         self._perturbations: list[Perturbation | None] = [None] * self.size  # as drawn
         self._ribbons: list[viser.MeshHandle] = []
@@ -534,15 +542,67 @@ class Scene:
             return
         way = np.append(self.length * force / (HARD * self._mass), 0.0)
         if arrow is None:
-            size = 0.03 * self.length
-            arrow = self._forces[row] = self._scene.add_arrows(
-                f"/world/force/{row}", np.zeros((1, 2, 3)), EVENT_COLOUR,
-                shaft_radius=size, head_radius=2.5 * size, head_length=5 * size,
-            )  # fmt: skip
+            arrow = self._forces[row] = self._draw_arrows(f"/world/force/{row}", EVENT_COLOUR, 0.03)
         ends = np.stack([np.zeros(3), way])[None].astype(np.float32)
         if not np.array_equal(arrow.points, ends):
             arrow.points = ends
         arrow.position, arrow.visible = self._positions[row, self._chassis] + [0, 0, self._top / 2], True
+
+    def _draw_arrows(self, name: str, colour: Colour, thick: float) -> viser.ArrowsHandle:
+        """Adds arrows with shafts of a radius in robot lengths, of which there are none yet."""
+        radius = thick * self.length
+        return self._scene.add_arrows(
+            name, np.zeros((1, 2, 3)), colour, shaft_radius=radius, head_radius=2.5 * radius, head_length=5 * radius,
+            visible=False,
+        )  # fmt: skip
+
+    def show_contacts(self, touches: Sequence[Contacts]) -> None:
+        """Draws what the first robots touch, as arrows that move with them; no contacts hide all arrows.
+
+        The force on a robot is as long as the robot where it is its weight, and the velocity with which it slides where
+        that is a tenth of its largest speed.
+        """
+        if touches and not self._touches:
+            for row in range(min(self.size, MAX_MARKED)):
+                name = f"{name_of(row)}/chassis"
+                named = ("force", FORCE_COLOUR), ("slip", SLIP_COLOUR)
+                self._touches.append([self._draw_arrows(f"{name}/{kind}", colour, 0.02) for kind, colour in named])
+        for row, arrows in enumerate(self._touches):
+            touch = touches[row] if row < len(touches) else NOTHING
+            turn = np.empty(9)
+            mujoco.mju_quat2Mat(turn, self._quaternions[row, self._chassis])
+            places = (touch.places - self._positions[row, self._chassis]) @ turn.reshape(3, 3)
+            lengths = touch.forces / (self._mass * GRAVITY), touch.slips / (SLIDING * self._max_speed)
+            for drawn, ways in zip(arrows, lengths, strict=True):
+                seen = np.linalg.norm(ways, axis=1) > LEAST_ARROW
+                if drawn.visible != seen.any():
+                    drawn.visible = bool(seen.any())
+                if drawn.visible:
+                    start = places[seen]
+                    drawn.points = np.stack([start, start + self.length * ways[seen] @ turn.reshape(3, 3)], axis=1)
+
+    def place(self, row: int) -> Array:
+        """Returns x and y in m, `(2,)`, at which a robot is drawn."""
+        return self._positions[row, self._chassis, :2].copy()
+
+    def show_way(self, points: Sequence[Array], way: Reference | None) -> None:
+        """Draws points on the floor in m, `(2,)` each, and a way through them, in place of those before."""
+        for part in self._way:
+            part.remove()
+        self._way = []
+        radius, turn = self.reach / 2, np.linspace(0, 2 * np.pi, 25)
+        for k, (x, y) in enumerate(points):
+            mesh = disc(radius * np.column_stack([np.cos(turn), np.sin(turn)]))
+            self._way.append(
+                self._scene.add_mesh_simple(
+                    f"/world/way/{k}", *mesh, color=GOAL_COLOUR, side="double", cast_shadow=False,
+                    receive_shadow=False, position=(x, y, self._height(x, y) + 2 * ABOVE),
+                )
+            )  # fmt: skip
+        if way is not None:
+            self._way.append(
+                self._draw_lines("/world/way/line", self._lines([way]), TRAIL_WIDTH * self._view, GOAL_COLOUR)
+            )
 
     def hold_floor(self, dragged: Dragged | None) -> None:
         """Calls a function while a visitor drags on the floor, or with None no longer."""

@@ -19,14 +19,16 @@ from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import MARGIN, SLIM, Avoid, avoiding, prepared
 from mrctl.navigation.planning import Plan
 from mrctl.navigation.rollouts import Reactive
+from mrctl.physics.contacts import NOTHING, Contacts
 from mrctl.physics.hull import footprint
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank, combine, dataset
 from mrctl.scenario import Event, Scenario
 from mrctl.theory.clearance import clearance, clearances
 from mrctl.theory.obstacles import Pose, Surroundings, turned
-from mrctl.theory.references import Reference, Waypoints
+from mrctl.theory.references import Reference, Waypoints, check
 from mrctl.theory.robot import Robot
+from mrctl.theory.timing import RESERVE, Limits
 
 HOUR = 3600.0  # s of simulated time after which a session ends
 SEEN_PUSH = 0.5  # s, for which a push is drawn, at least
@@ -172,20 +174,54 @@ class Session:
             InputError: The robot has stopped, the goal is in an obstacle, or there is no way; or the robots keep to the
                 plan of their mission.
         """
-        if self.avoid != "none":
-            raise InputError(f"goal: with --avoid {self.avoid} the robots keep to their plan")
-        sim, k = self._place[0]
-        if sim.plant.failed[k]:
-            raise InputError("goal: the first robot has stopped; a reset starts again")
-        x, y, theta = sim.plant.reading["pose"][k]
+        x, y, theta = self._pose("goal")
         first = self.start[0]
         task = {"obstacles": first.obstacles, "start": (x, y, remainder(theta, 2 * pi)), "goal": goal}
         near = clearance(self._footprint, np.array([x, y, theta]), self._surroundings.at(self.time))
-        plan = followed(sim.scenarios[k], self.time)
+        plan = followed(self.saved()[0], self.time)
         speed = plan.speed if isinstance(plan, Waypoints) else None
         found, driven = prepared(Task.from_dict(task), first, speed, MARGIN if near > MARGIN else SLIM)
         self.apply(reference=driven.reference)
         return found
+
+    def way(self, points: Sequence[Array], closed: bool) -> Waypoints:
+        """Returns a way from the first robot, straight ahead at first, through points, at the speed of its reference.
+
+        Args:
+            points: Places in m, `(2,)` each.
+            closed: Whether it returns to where the robot is and begins again; otherwise it ends on the last point.
+
+        Raises:
+            InputError: The robot has stopped, cannot follow such a way, or would touch an obstacle as they are now; or
+                the robots keep to the plan of their mission.
+        """
+        x, y, theta = self._pose("way")
+        reach = abs(self.robot.wheelbase)
+        ahead = x + reach * np.cos(theta), y + reach * np.sin(theta)
+        now = followed(self.saved()[0], self.time)
+        speed = (
+            now.speed if isinstance(now, Waypoints) else now.sample(np.linspace(0, now.period, 400)).twist[:, 0].max()
+        )
+        found = Waypoints.from_dict({
+            "points": [(x, y), ahead, *map(tuple, points)], "closed": closed, "timing": "limits",
+            "speed": min(speed, RESERVE * self.robot.max_speed), "limits": Limits.of(self.robot),
+        })  # fmt: skip
+        check(found, self.robot, reverse=False)
+        if len(self._footprint):
+            poses = found.sample(np.linspace(0, found.period, max(2, round(100 * found.period)))).pose
+            near = clearances(self._footprint, poses, np.full(len(poses), self.time), self._surroundings)
+            if near.min() <= 0:
+                raise InputError("way: meets an obstacle near ({:.2f}, {:.2f}) m".format(*poses[near.argmin(), :2]))
+        return found
+
+    def _pose(self, what: str) -> Array:
+        """Returns where the first robot is, x and y in m and θ in rad; refuses robots that take no other reference."""
+        if self.avoid != "none":
+            raise InputError(f"{what}: with --avoid {self.avoid} the robots keep to their plan")
+        sim, k = self._place[0]
+        if sim.plant.failed[k]:
+            raise InputError(f"{what}: the first robot has stopped; a reset starts again")
+        return sim.plant.reading["pose"][k].copy()
 
     def state(self, time: float | None = None) -> dict[str, Any]:
         """Returns the values of the fields `CHANGEABLE`, and `learning`, at a time in s, by default now."""
@@ -278,6 +314,11 @@ class Session:
         pose = np.array([then["x"], then["y"], then["theta"]])
         met = turned(self.start[row].sensing.lidar.points(ranges), pose)
         return met, np.zeros((0, 3)) if particles is None else particles.particles
+
+    def contacts(self, row: int) -> Contacts:
+        """Returns what a robot touches now; nothing once it has stopped."""
+        sim, k = self._place[row]
+        return NOTHING if sim.plant.failed[k] else sim.plant.contacts(k)
 
     def considered(self, row: int) -> tuple[Array, Array] | None:
         """Returns the ways that the avoider of a robot considered last, from the samples that it drew itself.

@@ -335,7 +335,7 @@ def test_looking_back(browser, tmp_path):
         until(lambda: np.allclose(node(page, ROBOT)[:2], [then["x"], then["y"]], atol=1e-3), "the robot of then")
         until(lambda: page.evaluate(AXES)["V, m/s"]["cursor"] == pytest.approx(0.01 * live._back, abs=0.02), "a cursor")
         picture(page, tmp_path / "back.png")
-        ticks, drawn = live._trail
+        ticks, drawn = live._hands.trail
         places = np.array([page.evaluate(WORLD_TO_SCREEN, place.tolist()) for place in drawn[:, 0]])
         clear = (abs(places - [640, 400]) < [240, 300]).all(axis=1)  # not below a panel
         there = np.flatnonzero(clear & (ticks > ticks[-1] - 500))[-1]  # of the last lap of two
@@ -347,14 +347,14 @@ def test_looking_back(browser, tmp_path):
 
 
 def test_dragging(browser, tmp_path):
-    """A drag from the robot pushes it that way, one on the floor is a goal and its heading; the camera stays."""
+    """A drag pushes the robot, or sets a goal; clicks draw a way, whose points can be dragged; the camera stays."""
     robots = [BASE, BASE.replace(learner="none")]
     with serving(lambda server: Live(robots, server)) as (live, url), visit(browser, url, known=[DRAG_ERROR]) as page:
         until(lambda: live.session.time > 1 and node(page, ROBOT) is not None, "the scene")
         live.ask(live._command, "pause")
         page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
         page.get_by_label("Push by dragging").click()
-        until(lambda: not live.playing and live._pushes.value, "the pause")
+        until(lambda: not live.playing and live._hands._pushes.value, "the pause")
         page.wait_for_timeout(1000)
         camera, here = page.evaluate(CAMERA), live.session.qpos(0)[:2]
 
@@ -366,7 +366,7 @@ def test_dragging(browser, tmp_path):
 
         theta = live.session.qpos(0)[2]
         drag((*here + 0.15 * np.array([np.cos(theta), np.sin(theta)]), 0.1), here + [0.1, -0.2], here + [0.3, -0.5])
-        until(lambda: page.evaluate(VISIBLE, "/world/force/0") and live._pull, "an arrow")
+        until(lambda: page.evaluate(VISIBLE, "/world/force/0") and live._hands.pull, "an arrow")
         picture(page, tmp_path / "push.png")
         page.mouse.up()
         (event,) = until(lambda: live.session.saved()[0].events or None, "the push")
@@ -383,7 +383,26 @@ def test_dragging(browser, tmp_path):
         *place, heading = live._ends[1]
         assert place == pytest.approx([0.7, 0.2], abs=0.1)
         assert abs(np.angle(np.exp(1j * heading) / 1j)) < 0.1  # a way may turn once more
-        assert page.evaluate(CAMERA) == pytest.approx(camera, abs=1e-6) and not live._picks
+        assert not live._hands._waits
+
+        page.get_by_label("Contact forces").click()
+        page.get_by_text("Draw a way", exact=True).click()
+        until(lambda: "add a point" in page.inner_text("#mrctl-picking"), "the wait for points")
+        page.wait_for_timeout(1000)
+        for k, place in enumerate([(0.8, 1.3), (-0.1, 1.9)]):
+            page.mouse.click(*page.evaluate(WORLD_TO_SCREEN, list(place)))
+            until(lambda k=k: len(live._hands._points) == k + 1, "a point")
+        drag((-0.1, 1.9), (0.0, 1.9), (0.2, 1.8))
+        until(lambda: live._hands._points[1] == pytest.approx([0.2, 1.8], abs=0.03), "the point elsewhere")
+        page.mouse.up()
+        until(lambda: page.evaluate(VISIBLE, "/world/way/line"), "the way")
+        assert page.evaluate(VISIBLE, f"{ROBOT}/force")  # the wheels stand on the floor
+        picture(page, tmp_path / "way.png")
+        page.get_by_role("button", name="drive it").click()
+        until(lambda: len(live.session.saved()[0].events) == 3 and live.playing, "the way as an event")
+        points = live.session.saved()[0].events[2].reference.points
+        assert np.array(points[2:]) == pytest.approx(np.array([[0.8, 1.3], [0.2, 1.8]]), abs=0.03)
+        assert page.evaluate(CAMERA) == pytest.approx(camera, abs=1e-6)
 
 
 def test_visitors_come_and_go(browser):

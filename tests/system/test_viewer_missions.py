@@ -288,22 +288,62 @@ def test_no_way(goal, says):
     assert session.saved()[0].events == ()
 
 
+@pytest.mark.parametrize("closed", [False, True])
+def test_way(closed):
+    """The robots leave their reference for a way through points, from where the first one is and looks."""
+    slow = PID.replace(reference=Circle(radius=0.8, period=12.0))
+    session = Session([slow, slow.replace(prior="model")])
+    for _ in range(200):
+        session.step()
+    x, y, theta = session.qpos(0)[:2].tolist() + [session.log()["theta"][-1, 0]]
+    turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+    points = [turn @ point + [x, y] for point in ((1.5, 0.5), (1.0, 1.5), (-0.5, 0.8))]
+    way = session.way(points, closed)
+    session.apply(reference=way)
+    for _ in range(round(1.2 * way.period / session.period)):
+        session.step()
+    driven = session.log(200)
+    path = shapely.LineString(np.stack([driven["x"][:, 0], driven["y"][:, 0]], axis=1))
+    assert max(path.distance(shapely.Point(point)) for point in points) < 0.02
+    off = np.hypot(driven["longitudinal_error"], driven["lateral_error"])
+    assert off[round(2 / session.period) :].max() < 0.02 and abs(driven["theta"][:60] - theta).max() < 0.4
+    assert session.failure(0) == session.failure(1) == ""
+    if not closed:
+        assert np.hypot(*(session.qpos(0)[:2] - points[-1])) < 0.01 and driven["v"][-1, 0] < 0.01
+
+
+@pytest.mark.parametrize(
+    ("points", "says"),
+    [
+        ([(4.0, 0.0)], r"way: meets an obstacle near \((2|1)\.\d+, -?0\.\d+\) m"),
+        ([(1.0, 0.02), (0.9, 0.0)], "reference waypoints: steering angle"),
+        ([(1.0, 0.0), (1.0, 0.0)], "points: 2 and 3 coincide"),
+    ],
+)
+def test_no_such_way(points, says):
+    """A way through a wall, or one that is too narrow for the robot, is refused before it drives."""
+    session = Session([PID.replace(obstacles=WALLS, reference=Line(speed=0.2, length=1.0))])
+    session.step()
+    with pytest.raises(InputError, match=f"^{says}[^\n]*$"):
+        session.way([np.array(point) for point in points], closed=False)
+
+
 def test_clicks(server):
     """Two clicks on the floor are place and direction of a goal, also where the camera follows; the sky is refused."""
     live = Live([PID.replace(reference=Line(speed=0.2, length=1.0))], server)
     live.session.step()
     live._follow.value = True
     live.draw()
-    live._await_goal()
+    live._hands.await_goal()
     with pytest.raises(InputError, match="no floor"):
-        live._click(np.array([0.0, 0, 1]), np.array([1.0, 0, 0.1]))
+        live._hands.click(np.array([0.0, 0, 1]), np.array([1.0, 0, 0.1]))
     here = live._scene._root.position
     for x, y in ((2.0, 1.0), (2.0, 2.0)):
-        live._click(np.array([x - 3, y, 3.0]) + here, np.array([1.0, 0, -1]))
+        live._hands.click(np.array([x - 3, y, 3.0]) + here, np.array([1.0, 0, -1]))
     (event,) = live.session.saved()[0].events
     bound = ends(live.session.saved()[0], 1.0)
     assert bound is not None and bound[1] == pytest.approx([2, 1, np.pi / 2], abs=0.1)
-    assert "way to (2.00, 1.00) m" in live._timeline.content and live._picking.content == ""
+    assert "way to (2.00, 1.00) m" in live._timeline.content and live._hands._picking.content == ""
     live.refresh()
     goal = live._scene._ends[1]
     assert goal.visible and goal.position[:2] == pytest.approx([2, 1])
