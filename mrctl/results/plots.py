@@ -378,7 +378,7 @@ def excitation(result: xr.Dataset, span: float = 4.0, motion: str = "commanded",
         if any((np.asarray(line.get_ydata(), float) > 0).any() for line in one.lines):  # on a circle every value is 0
             one.set_yscale("log", nonpositive="mask")
     axes[1].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
-    _legend(figure, curves)
+    _legend(figure, curves, _plant(result))
     return figure
 
 
