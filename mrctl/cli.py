@@ -45,6 +45,9 @@ BEST: FeedforwardName = "model+composite"
 `navigate` drives with it, and `view` shows it beside PID alone.
 """
 
+IN_A_FILE = {"MININTERVAL": "60", "MAXINTERVAL": "60", "BAR_FORMAT": "{l_bar}{bar}{r_bar}\n"}
+"""Settings of tqdm with which progress that nobody watches is a line a minute, not a bar that moves."""
+
 LAB = Sensing(tier="lab")
 DELAYS = 0.0, 0.01, 0.02  # s
 
@@ -64,6 +67,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"mrctl {__version__}")
         return 0
+    if not sys.stderr.isatty():
+        for name, value in IN_A_FILE.items():
+            os.environ.setdefault(f"TQDM_{name}", value)  # which tqdm reads when it is imported
     warnings.showwarning = lambda message, *_: print(f"mrctl: {printable(str(message))}", file=sys.stderr)
     try:
         try:
@@ -268,15 +274,15 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         if number is not None:
             return _repeat(file, number, out, json, code)
         if file is not None and file.is_dir():
-            raise InputError(f"run: {file} is a store; give the number of one of its runs with --run")
+            raise InputError(f"run: {file} is a folder; for a run of a sweep's store give its number with --run")
         if file is not None and str(file) != scenario_file:
             raise InputError(f"run: {file} is not a scenario file, whose name ends in .toml; see mrctl run --help")
         from mrctl.experiments import single
 
         text, failure = single.run(_suited(scenario, arguments, scenario_file), out, json, controller)
-        print(text)
+        _report(text, out, json)
         if failure:
-            raise _Incomplete(f"the run failed: {failure}")
+            raise _Incomplete(f"the run failed {failure}")
 
     if _is_short_help(arguments):
         short = _part(default, FIRST)
@@ -359,7 +365,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             task = task_of(world, chosen, start, goal)
             return viewing.mission(task, chosen, compare, speed, margin, avoid, "127.0.0.1", port)
         text, outcome = mission.run(world, chosen, goal, start, compare, speed, margin, avoid, out, json)
-        print(text)
+        _report(text, out, json)
         if outcome != "arrived":
             raise _Incomplete(f"the robot did not arrive: {outcome}")
 
@@ -375,6 +381,13 @@ def _scenario_file(arguments: Sequence[str]) -> str | None:
     return None
 
 
+def _report(text: str, out: Path | None, json: bool) -> None:
+    """Prints a report, and where its files are; JSON stays alone on stdout."""
+    print(text)
+    if out is not None:
+        print(f"The files are in {out}.", file=sys.stderr if json else sys.stdout)
+
+
 def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code: bool) -> None:
     """Runs one run of a sweep again and compares it with the store: `mrctl run STORE --run K`."""
     from mrctl.experiments import single
@@ -385,9 +398,8 @@ def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code:
         raise InputError("run: --run needs the store of a sweep, as in mrctl run STORE --run 3")
     jobs.stages_of(store, code)
     if out is not None or json:
-        print(
-            single.run(jobs.scenario_of(store, number), out, json, Store(store).manifest["sweep"].get("controller"))[0]
-        )
+        own = Store(store).manifest["sweep"].get("controller")
+        _report(single.run(jobs.scenario_of(store, number), out, json, own)[0], out, json)
     repeated = jobs.repeat(store, number)
     verdict = f"run {number}: {repeated.verdict}"
     if not repeated.same:
@@ -540,7 +552,7 @@ def tune(
         if (robot, wheels, steering, chassis) == (CAR.path, (), (), "")
         else load_robot(robot, wheels, steering, chassis)
     )
-    print(tuning.tune(file, world, time_constant, delay, lag, out, json))
+    _report(tuning.tune(file, world, time_constant, delay, lag, out, json), out, json)
 
 
 def identify(

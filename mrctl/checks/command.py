@@ -11,6 +11,7 @@ import unicodedata
 from collections.abc import Sequence
 
 import mujoco
+from tqdm import tqdm
 
 from mrctl.checks.comparison import Comparison
 from mrctl.checks.examination import Examination, Finding, excess
@@ -78,7 +79,7 @@ def run(
         InputError: The robot cannot be loaded.
     """
     robot = examination(path, wheels, steering, chassis)
-    findings = [robot.examine(check) for check in robot.checks]
+    findings = [robot.examine(check) for check in tqdm(robot.checks, unit="check")]
     failed = sum(finding.status == "failed" for finding in findings)
     verdict = f"{failed} of {len(findings)} checks failed" if failed else ""
     if json:

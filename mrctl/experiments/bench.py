@@ -18,6 +18,7 @@ from unittest import mock
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from mrctl.control.features import feature_scale
 from mrctl.experiments import paper
@@ -74,12 +75,12 @@ def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int
     """
     threads = [1, 2] if (os.cpu_count() or 1) > 1 else [1]
     middle = sizes[len(sizes) // 2]
-    rows = [_compare(size, 1, repetitions, chunk) for size in sizes]
-    parts = {str(size): _parts(size, 10 * chunk) for size in (sizes[0], sizes[-1])}
+    rows = [_compare(size, 1, repetitions, chunk) for size in tqdm(sizes, unit="size")]
+    parts = {str(size): _parts(size, 10 * chunk) for size in tqdm((sizes[0], sizes[-1]), unit="size", desc="parts")}
     return {
         "machine": {**machine(), **versions()},
         "robots": rows,
-        "threads": [_compare(middle, count, repetitions, chunk) for count in threads],
+        "threads": [_compare(middle, count, repetitions, chunk) for count in tqdm(threads, desc="threads")],
         "lab": _compare(middle, 1, repetitions, chunk, "lab"),
         "parts": parts,
         "sensing_share": {size: (p["sensors"] + p["estimator"]) / sum(p.values()) for size, p in parts.items()},

@@ -31,6 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from tqdm import trange
 
 from mrctl.checks.open_loop import on_skid
 from mrctl.experiments.tables import json_text, machine, markdown
@@ -252,7 +253,7 @@ def excite(plant: Plant, robot: Robot, sensing: Sensing, random: np.random.Gener
     samples = np.zeros((ticks + 1, REPEATS), sensors.ring.dtype)
     voltage, current = np.zeros((2, ticks + 1, REPEATS, 2))
     command = np.zeros((REPEATS, 4))
-    for k in range(ticks + 1):
+    for k in trange(ticks + 1, unit="tick", unit_scale=True, desc="turning" if turns else "straight on"):
         sensors.measure(k, plant.state)
         samples[k] = sensors.ring[k % len(sensors.ring)]
         voltage[k], current[k] = plant.applied, plant.current()  # of the tick that ends

@@ -341,7 +341,7 @@ def search(
         fresh = compare(searched, candidates, memories[tier], drawn[tier].fresh)
         table["tiers"][tier] = one | {"fresh": fresh, "flags": searched.flags(one["found"])}
     (out / "table.json").write_text(json_text(table) + "\n")
-    return json_text(table) if json else text(table)
+    return json_text(table) if json else f"{text(table)}\n\nThe files are in {out}."
 
 
 def _head(searched: Entry, drawn: Worlds, budget: Budget) -> dict[str, Any]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
+import numpy as np
 import xarray as xr
-from numba.core.event import Event, Listener, install_listener
 
 from mrctl.control.stages import Stages
 from mrctl.experiments.tables import markdown, number, output_folder
@@ -41,21 +40,6 @@ FIGURES = {  # file: function of `results.plots`
 }
 
 
-class _Announcement(Listener):
-    """Tells the user that laws are being compiled, which delays the progress bar of a first run."""
-
-    said = False
-
-    def on_start(self, event: Event) -> None:
-        """Prints the message at the first compilation."""
-        if not self.said:
-            self.said = True
-            print("mrctl: compiling the laws, which takes half a minute, once", file=sys.stderr)
-
-    def on_end(self, event: Event) -> None:
-        """Prints nothing."""
-
-
 def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = None) -> tuple[str, str]:
     """Runs a scenario.
 
@@ -66,7 +50,8 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         own: Stages of the user; see `mrctl.loop.user_files`.
 
     Returns:
-        The report, with a row of metrics for each lap; and why the run failed, or "".
+        The report, with a row of metrics for each lap that was driven to its end; and when and why the run failed, or
+        "".
 
     Raises:
         InputError: The scenario or a stage is invalid, or the folder cannot be written or holds a result already.
@@ -78,8 +63,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     try:
         if out is not None:
             output_folder(out)
-        with install_listener("numba:compile", _Announcement()):
-            result = simulate([scenario], progress=True, **stages)
+        result = simulate([scenario], progress=True, **stages)
     except InputError:
         if out is not None and new and out.is_dir():
             out.rmdir()
@@ -90,16 +74,16 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         if "weights" in result and not result["failed"].any():
             save_learned(out / "learned.safetensors", result)
         _draw(result, laps, out)
-    failure = str(result["failure"].values[0])
-    row = laps.isel(run=0)
+    row, reason = laps.isel(run=0), str(result["failure"].values[0])
+    failure = f"after {float(row['failure_time']):.2f} s: {reason}" if reason else ""
     events = metrics.guard_events(result).drop(columns="run")
     if as_json:
         values = {
             "scenario": scenario.model_dump(mode="json"),
             "controller": own,
             "versions": versions(),
-            "failed": bool(failure),
-            "failure": failure,
+            "failed": bool(reason),
+            "failure": reason,
             "failure_time": float(row["failure_time"]) if failure else None,
             "laps": [{name: _number(row[name].values[k]) for name in metrics.METRICS} for k in range(row.sizes["lap"])],
             "guard": events.to_dict("records"),
@@ -108,7 +92,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     header = ["lap", *(title for title, _ in COLUMNS.values())]
     rows = [
         [str(k + 1), *(number(scale * float(row[name].values[k])) for name, (_, scale) in COLUMNS.items())]
-        for k in range(row.sizes["lap"])
+        for k in np.flatnonzero(np.isfinite(row["position_rmse"].values))
     ]
     name = str(result["feedforward"].values[0]) + (f", own stages {own}" if own else "")
     steering, course = result["steering"].values[0], scenario.reference
@@ -117,9 +101,11 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         f"steering {steering}"
     ]
     if failure:
-        lines.append(f"failed after {float(row['failure_time']):.2f} s: {failure}")
+        lines.append(f"failed {failure}")
+    if rows:
+        lines.append(markdown(header, rows))
     acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]
-    return "\n".join([*lines, markdown(header, rows), *(text.removesuffix(", ") for text in acted)]), failure
+    return "\n".join([*lines, *(text.removesuffix(", ") for text in acted)]), failure
 
 
 def _written() -> list[str]:

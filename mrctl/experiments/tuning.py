@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from tqdm import tqdm
 
 from mrctl.control.design import M_S, M_T, SPEEDS, plants
 from mrctl.control.design import motion as motion_design
@@ -129,7 +130,8 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
             lags = dict(zip(("v_lag", "omega_lag"), found.lag, strict=True))
             suits = found.kanayama.model_dump() | {"prefilter": found.prefilter} | lags
             table["motion"].append({"steering": steering, "delay": delay} | suits)
-        for channel in (0, 1) if steering == offered[0] else (1,):
+        channels = (0, 1) if steering == offered[0] else (1,)
+        for channel in tqdm(channels, unit="loop", desc=steering):
             plant = plants(nominal, rigid, channel)[0]
             frequency, measured = measure(scenarios, channel, SPEEDS[0] * nominal.max_speed)
             for k, delay in enumerate(delays):

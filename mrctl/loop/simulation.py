@@ -224,6 +224,9 @@ class Simulation:
         Raises:
             InputError: A scenario or a stage is refused, as in `simulate`.
         """
+        from mrctl.loop.announcement import announced  # imported here because it needs Numba
+
+        announced()
         scenarios = [arranged(s) for s in scenarios]
         first, size = scenarios[0], len(scenarios)
         self.scenarios = scenarios

@@ -1,13 +1,14 @@
 """Figures of a result for print, 88 mm or 180 mm wide, with Okabe and Ito's (2008) colours and units on every axis.
 
 Each function returns a matplotlib `Figure` and shows nothing. Results may hold several runs or one that was squeezed;
-runs with the same `label` share a colour and one entry in the legend, which says how many of them failed. A cross marks
-where a run failed. `window` is a pair of times in s; `lap` is the number of a lap, counted from 1, or from −1 backwards
-from the end of the run.
+runs with the same `label` share a colour and one entry in the legend, which says how many of them failed. A heading
+names the plant. Errors are in mm and mrad, as in tables. A cross marks where a run failed. `window` is a pair of times
+in s; `lap` is the number of a lap, counted from 1, or from −1 backwards from the end of the run.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from pathlib import Path
@@ -27,6 +28,7 @@ from mrctl.results import excitation as exciting
 from mrctl.results.controllers import colours_of
 from mrctl.results.dataset import scenarios_of
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap
+from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 
 COLUMN, PAGE = 88 / 25.4, 180 / 25.4  # inches
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000")
@@ -39,6 +41,8 @@ STYLE: dict[Any, Any] = {
     "axes.titlesize": 9,
     "axes.labelsize": 9,
     "legend.fontsize": 8,
+    "legend.title_fontsize": 8,
+    "figure.titlesize": 8,
     "xtick.labelsize": 8,
     "ytick.labelsize": 8,
     "axes.linewidth": 0.6,
@@ -61,10 +65,11 @@ STYLE: dict[Any, Any] = {
     "pdf.fonttype": 42,
 }
 ERRORS = {
-    "longitudinal_error": "longitudinal\nerror (m)",
-    "lateral_error": "lateral\nerror (m)",
-    "heading_error": "heading\nerror (rad)",
+    "longitudinal_error": "longitudinal\nerror (mm)",
+    "lateral_error": "lateral\nerror (mm)",
+    "heading_error": "heading\nerror (mrad)",
 }
+MILLI = 1e3  # errors are drawn in thousandths of the units in a result
 
 P = ParamSpec("P")
 Point = Sequence[float] | np.ndarray
@@ -140,7 +145,7 @@ def path(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int
         _cross(axes, data, x, y)
     axes.set(xlabel="$x$ (m)", ylabel="$y$ (m)", aspect="equal")
     axes.set_adjustable("datalim")
-    _legend(figure, curves, reference=True)
+    _legend(figure, curves, _plant(result), reference=True)
     return figure
 
 
@@ -158,14 +163,14 @@ def velocities(
     for one, name in zip(axes, signals, strict=True):
         _references(one, curves, "time", f"{name}_ref")
         _signals(one, curves, name, texts[name])
-    _legend(figure, curves, reference=True)
+    _legend(figure, curves, _plant(result), reference=True)
     return figure
 
 
 @styled
 def errors(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
     """Draws longitudinal, lateral and heading error over time."""
-    return _errors(_curves(result, window, lap))
+    return _errors(_curves(result, window, lap), _plant(result))
 
 
 @styled
@@ -190,12 +195,12 @@ def compare_errors(
     for result, label, colour in zip((result_pid, result_nn), labels, colours, strict=True):
         for data, _, style in _curves(result, window, lap):
             curves.append(Curve(data, label, {**style, "color": colour}))
-    figure = _errors(curves)
+    figure = _errors(curves, _plant(result_pid, result_nn))
     for axes, name in zip(figure.axes, ERRORS, strict=True):
         for row, label in enumerate(labels):
             colour = colours[row]
             squares = np.concatenate([np.square(data[name].values) for data, other, _ in curves if other == label])
-            text = f"RMS {np.sqrt(squares.mean()):.2g}" if np.isfinite(squares).all() else "failed"
+            text = f"RMS {MILLI * np.sqrt(squares.mean()):.2g}" if np.isfinite(squares).all() else "failed"
             axes.text(1 - 0.26 * (1 - row), 1.0, text, color=colour, fontsize=8, ha="right", va="bottom",
                       transform=axes.transAxes)  # fmt: skip
     return figure
@@ -224,7 +229,8 @@ def voltages(result: xr.Dataset, window: tuple[float, float] | None = None, lap:
             if row == 1:
                 one.set_xlabel("time (s)")
     handles = [Line2D([], [], color=colour, lw=line) for _, colour, line in parts]
-    figure.legend(handles, ["total", "feedback", "feedforward"], loc="outside upper center", ncols=3)
+    names = ["total", "feedback", "feedforward"]
+    figure.legend(handles, names, loc="outside upper center", ncols=3, title=_plant(result))
     return figure
 
 
@@ -237,7 +243,7 @@ def feedforward_outputs(
     curves = _curves(result, window, lap)
     for one, wheel in zip(axes, ("left", "right"), strict=True):
         _signals(one, curves, f"feedforward_{wheel}", rf"$U_{{ff,{wheel[0]}}}$ (V)")
-    _legend(figure, curves)
+    _legend(figure, curves, _plant(result))
     return figure
 
 
@@ -263,11 +269,13 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
     labels = [str(label) for label in laps["label"].values]
     for unused in axes[len(names) :]:
         unused.remove()
+    figure.suptitle(_plant(laps))
     for one, name in zip(axes, names, strict=False):
+        scale, text = _shown(name)
         ends: list[tuple[float, float, str, str]] = []
         for label, colour in _colours(laps).items():
             rows = [row for row, other in enumerate(labels) if other == label]
-            values = laps[name].values[rows]
+            values = scale * laps[name].values[rows]
             finite = np.isfinite(values)
             some = finite.any(0)
             mean = np.where(finite, values, 0).sum(0)[some] / finite.sum(0)[some]
@@ -277,8 +285,7 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
             failed = int(laps["failed"].values[rows].sum())
             at = (number[some][-1], mean[-1]) if some.any() else (number[0], np.nan)
             ends.append((float(at[0]), float(at[1]), _counted(label, failed, len(rows)), colour))
-        unit, text = METRICS[name]
-        one.set(xlabel="lap", ylabel=text if unit == "1" else f"{text} ({unit})", yscale="log")
+        one.set(xlabel="lap", ylabel=text, yscale="log")
         one.xaxis.get_major_locator().set_params(integer=True)
         _label_ends(one, ends)
     return figure
@@ -296,7 +303,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
     Raises:
         InputError: The metric is unknown, or there is no case.
     """
-    unit, text = METRICS[known(metric)]
+    scale, text = _shown(known(metric))
     if not cases:
         raise InputError("cases: at least one is needed")
     columns = 2 if len(cases) in (2, 4) else min(3, len(cases))
@@ -307,7 +314,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
         number, labels = laps["lap"].values, [str(label) for label in laps["label"].values]
         for label in dict.fromkeys(labels):
             order += [label] if label not in order else []
-            values = laps[metric].values[[row for row, other in enumerate(labels) if other == label]]
+            values = scale * laps[metric].values[[row for row, other in enumerate(labels) if other == label]]
             some = np.isfinite(values).any(0)
             line = _line(order.index(label))
             if some.any():
@@ -322,7 +329,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
         one.set_xlabel("lap" if place + columns >= len(cases) else "")
         one.tick_params(labelbottom=place + columns >= len(cases))
         if place % columns == 0:
-            one.set_ylabel(text if unit == "1" else f"{text} ({unit})", fontsize=8)
+            one.set_ylabel(text, fontsize=8)
     for unused in axes[len(cases) :]:
         unused.remove()
     handles = [Line2D([], [], **_line(k)) for k in range(len(order))]
@@ -371,7 +378,7 @@ def excitation(result: xr.Dataset, span: float = 4.0, motion: str = "commanded",
         if any((np.asarray(line.get_ydata(), float) > 0).any() for line in one.lines):  # on a circle every value is 0
             one.set_yscale("log", nonpositive="mask")
     axes[1].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
-    _legend(figure, curves)
+    _legend(figure, curves, _plant(result))
     return figure
 
 
@@ -491,10 +498,36 @@ def _cut(run: xr.Dataset, window: tuple[float, float] | None, lap: int | None) -
     return run.isel(time=slice(edges[index], edges[index + 1]))
 
 
-def _signals(axes: Axes, curves: Iterable[Curve], name: str, label: str) -> None:
+def _shown(metric: str) -> tuple[float, str]:
+    """Returns the factor by which a metric is drawn, and its description with the unit; errors are in thousandths."""
+    unit, text = METRICS[metric]
+    if unit == "1":
+        return 1.0, text
+    milli = unit.startswith(("m", "rad"))
+    return (MILLI if milli else 1.0), f"{text} ({'m' * milli}{unit})"
+
+
+def _plant(*results: xr.Dataset) -> str:
+    """Names robot, perturbation and sensing tier of the runs, or says which differ; "" where they are not known."""
+    if any("scenarios" not in result.attrs for result in results):
+        return ""
+    names = [(name, perturbation.model_dump(mode="json")) for name, perturbation in PERTURBATIONS.items()]
+    found: dict[str, set[str]] = {"robots": set(), "perturbations": set(), "sensing tiers": set()}
+    for result in results:
+        every = json.loads(result.attrs["scenarios"])
+        for one in (every[run] for run in np.atleast_1d(result["run"])):
+            change = Perturbation().model_dump(mode="json") | one["perturbation"]
+            name = next((name for name, fields in names if fields == change), "perturbed")
+            parts = Path(one["robot"]["path"]).stem, name + " with events" * bool(one["events"]), one["sensing"]["tier"]
+            for kind, part in zip(found, parts, strict=True):
+                found[kind].add(part)
+    return "plant: " + ", ".join(f"different {k}" if len(parts) > 1 else parts.pop() for k, parts in found.items())
+
+
+def _signals(axes: Axes, curves: Iterable[Curve], name: str, label: str, scale: float = 1.0) -> None:
     """Draws one variable of every run over time."""
     for data, _, style in curves:
-        time, signal = data["time"].values, data[name].values
+        time, signal = data["time"].values, scale * data[name].values
         axes.plot(time, signal, **style)
         _cross(axes, data, time, signal)
     axes.set_ylabel(label)
@@ -528,8 +561,8 @@ def _counted(label: str, failed: int, count: int) -> str:
     return f"{label} (failed)" if count == 1 else f"{label} ({failed} of {count} failed)"
 
 
-def _legend(figure: Figure, curves: Sequence[Curve], reference: bool = False) -> None:
-    """Draws a legend above the axes, with an entry for each label and its number of failures."""
+def _legend(figure: Figure, curves: Sequence[Curve], title: str, reference: bool = False) -> None:
+    """Draws a legend with a title above the axes, with an entry for each label and its number of failures."""
     entries: dict[str, list[Curve]] = {}
     for curve in curves:
         entries.setdefault(curve.label, []).append(curve)
@@ -540,17 +573,17 @@ def _legend(figure: Figure, curves: Sequence[Curve], reference: bool = False) ->
         dashes = {key: value for key, value in REFERENCE.items() if key != "zorder"}
         handles, names = [Line2D([], [], **dashes), *handles], ["reference", *names]
     columns = 2 if sum(map(len, names)) > 36 and figure.get_figwidth() < PAGE else 4
-    figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), columns))
+    figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), columns), title=title)
 
 
-def _errors(curves: Sequence[Curve]) -> Figure:
+def _errors(curves: Sequence[Curve], plant: str) -> Figure:
     """Draws the three errors, each in a panel."""
     figure, axes = _figure(COLUMN, 1.15 * COLUMN, rows=3)
     for one, (name, label) in zip(axes, ERRORS.items(), strict=True):
         one.axhline(0, color="0.6", lw=0.6)
-        _signals(one, curves, name, label)
+        _signals(one, curves, name, label, MILLI)
     figure.align_ylabels()
-    _legend(figure, curves)
+    _legend(figure, curves, plant)
     return figure
 
 

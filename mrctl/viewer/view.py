@@ -44,6 +44,7 @@ def live(scenario: Scenario, compare: Sequence[FeedforwardName], export: Path | 
     result = simulate(scenarios, progress=True)
     recordings = [Recording(result.isel(run=k)) for k in range(result.sizes["run"])]
     write(recordings, looks_of(recordings, range(len(recordings))), export)
+    print(f"page: {export}")
 
 
 def mission(
@@ -119,6 +120,7 @@ def replay(
         return _serve(lambda server: Replay(library, shown, server), host, port)
     recordings = [library.recording(k) for k in shown]
     write(recordings, looks_of(recordings, shown), export)
+    print(f"page: {export}")
 
 
 def _serve(page: Callable[[Server], Page], host: str, port: int) -> None:

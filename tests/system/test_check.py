@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -224,7 +225,8 @@ def test_command(robot, capsys):
     out, err = capsys.readouterr()
     assert "cause: wrong gear; once repaired, V at its limit" in out
     assert "- wrong gear: gear 86" in out and "skipped, waits for limits" in out
-    assert err == f"mrctl: {path}: 1 of {len(Examination.checks)} checks failed\n"
+    said = [line for line in err.replace("\r", "\n").splitlines() if not re.search("check/s|s/check|^$", line)]
+    assert said == [f"mrctl: {path}: 1 of {len(Examination.checks)} checks failed"]
     assert main(["check", path, "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
     failed = [check for check in report["checks"] if check["status"] == "failed"]

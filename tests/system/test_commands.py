@@ -55,6 +55,15 @@ def test_run_prints_a_row_per_lap(capsys: pytest.CaptureFixture) -> None:
     assert [line.split("|")[1].strip() for line in out.splitlines()[3:]] == ["1", "2"]
 
 
+def test_run_that_fails(capsys: pytest.CaptureFixture) -> None:
+    """It ends with status 1, says when and why, and has a row for each lap that was driven to its end, none of nan."""
+    tall = ["--perturbation.payload", "20", "--perturbation.payload-z", "0.5"]
+    assert cli.main(["run", "--robot.path", "racecar", *tall, "--laps", "1"]) == 1
+    out, said = capsys.readouterr()
+    assert (found := re.fullmatch(r"mrctl: the run (failed after \d+\.\d\d s: tilt over 30°)", said.splitlines()[-1]))
+    assert out.splitlines()[1:] == [found[1]]
+
+
 def test_run_json_is_the_simulation(capsys: pytest.CaptureFixture, scenario: Path) -> None:
     """`--json` holds the metrics of the same scenario run from Python."""
     assert cli.main(["run", str(scenario), "--json"]) == 0
@@ -80,6 +89,7 @@ def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.Cap
     flags = ["--sensing.tier", "ideal", "--pid.time-constant", "0.15"]
     command = ["run", "--out", str(out), "--learner", "fel", *flags, *SHORT]
     assert cli.main(command) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"The files are in {out}."
     result = mrctl.open(out / "result.zarr")
     circle = mrctl.Circle(radius=0.5, period=5)
     again = mrctl.simulate(mrctl.Scenario(learner="fel", laps=1, reference=circle, **ideal))
@@ -107,7 +117,8 @@ def test_tune_states_the_learning_condition(tmp_path: Path, capsys: pytest.Captu
     """By the IMC rule the ratio of the learning condition is 1 + τ/λ, with the robot's own time constant."""
     by_rule = ["tune", "--time-constant", "0.15", "--delay", "0", "0.03", "--out", str(tmp_path), "--json"]
     assert cli.main(by_rule) == 0
-    printed = capsys.readouterr().out
+    printed, said = capsys.readouterr()
+    assert said.splitlines()[-1] == f"The files are in {tmp_path}."
     table = json.loads(printed)
     assert json.loads((tmp_path / "table.json").read_text()) == table
     assert (tmp_path / "sensitivity.png").stat().st_size > 5000
@@ -370,7 +381,7 @@ def test_unwritable_folder_is_refused_before_the_work(
 
 
 def test_installed_command_without_a_display(tmp_path: Path) -> None:
-    """The console script runs without a display, and its stderr has the progress bar alone."""
+    """The console script runs without a display; its stderr, a file, has lines of progress alone, one a minute."""
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "MUJOCO_GL")}
     script = Path(sys.executable).with_name("mrctl")
     done = subprocess.run(
@@ -378,7 +389,8 @@ def test_installed_command_without_a_display(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "RMSE per lap" in done.stdout
-    assert all("tick" in line for line in done.stderr.replace("\r", "\n").splitlines() if line.strip())
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 2 and all("tick" in line for line in lines), done.stderr  # the first and the last
     bad = subprocess.run([script, "run", "nowhere.toml"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (bad.returncode, bad.stdout) == (2, "")
     assert bad.stderr == "mrctl: nowhere.toml: No such file or directory\n"

@@ -10,9 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba import njit
 
 import mrctl
 from mrctl.kernel import kernel, over_rows
+from mrctl.loop.announcement import announced
+from mrctl.loop.simulation import Simulation
 from mrctl.physics.files import models_folder
 
 PACKAGE = Path(mrctl.__file__).parent
@@ -232,3 +235,13 @@ def test_constants_of_kernels():
     assert found["steering", "allocate", "SIGN_SPEED"] == {PACKAGE / "control" / "features.py"}
     for place, sources in found.items():
         assert sources <= set(files), place
+
+
+def test_compilation_is_announced_once(capsys):
+    """Whoever waits for a first simulation reads why, once in a process."""
+    Simulation([mrctl.Scenario(laps=1)])
+    announced().said = False
+    capsys.readouterr()
+    for _ in range(2):
+        njit(lambda x: x + 1.0)(1.0)
+    assert capsys.readouterr().err == "mrctl: compiling the laws, which takes half a minute, once\n"

@@ -1,5 +1,6 @@
 """Figures hold the data they are given, carry units, and reach the disk."""
 
+import json
 import re
 
 import matplotlib as mpl
@@ -12,6 +13,7 @@ from mrctl.record import InputError
 from mrctl.results import metrics, plots
 from mrctl.results.controllers import CONTROLLERS
 from mrctl.scenario import FEEDFORWARDS
+from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.viewer.looks import looks
 
 LAP = 2.0
@@ -77,8 +79,9 @@ def test_time_series(plot, cut):
     assert len(figure.axes) == len(SIGNALS[plot])
     for axes, names in zip(figure.axes, SIGNALS[plot], strict=True):
         for name in names:
+            scale = 1e3 if name.endswith("error") else 1.0  # errors in mm and mrad, as in tables
             for run in (0, 1):
-                assert drawn(axes, seen["time"], seen[name].isel(run=run)), name
+                assert drawn(axes, seen["time"], scale * seen[name].isel(run=run)), name
     assert legend(figure)[-2:] == ["none", "fel"]
 
 
@@ -93,6 +96,23 @@ def test_colours():
     (pid, net, own, again) = looks("abcd", ["none", "fel", "mine", "none"])
     assert pid == ("a", (0xD5, 0x5E, 0x00)) and len({pid.colour, net.colour, own.colour, again.colour}) == 4
     assert set(CONTROLLERS) == set(FEEDFORWARDS) and len(set(CONTROLLERS.values())) == len(FEEDFORWARDS)
+
+
+def test_plant_is_named():
+    """Every figure of runs names robot, perturbation and tier, or says that the runs differ in them."""
+    kinds = [
+        {"robot": {"path": path}, "perturbation": change.model_dump(), "events": [], "sensing": {"tier": "lab"}}
+        for path, change in (("car", PERTURBATIONS["all"]), ("a/b.xml", Perturbation(mass_factor=1.2)))
+    ]
+    result = make()
+    result.attrs["scenarios"] = json.dumps(kinds)
+    for name, plot in ALL.items():
+        figure = plot(result.isel(run=[1]))
+        titles = [one.get_title().get_text() for one in figure.legends] + [figure.get_suptitle()]
+        assert "plant: b, perturbed, lab" in titles, name
+    both = "plant: different robots, different perturbations, lab"
+    assert plots.path(result).legends[0].get_title().get_text() == both
+    assert plots.compare_errors(result.isel(run=0), result.isel(run=1)).legends[0].get_title().get_text() == both
 
 
 def test_path():
@@ -123,8 +143,8 @@ def test_compare_errors():
     pid, nn = result.isel(run=0), result.isel(run=[1])
     figure = plots.compare_errors(pid, nn)
     for axes, name in zip(figure.axes, plots.ERRORS, strict=True):
-        assert drawn(axes, result["time"], pid[name]) and drawn(axes, result["time"], nn[name][0])
-        rms = [np.sqrt(np.mean(one[name].values ** 2)) for one in (pid, nn)]
+        assert drawn(axes, result["time"], 1e3 * pid[name]) and drawn(axes, result["time"], 1e3 * nn[name][0])
+        rms = [1e3 * np.sqrt(np.mean(one[name].values ** 2)) for one in (pid, nn)]
         assert [text.get_text() for text in axes.texts] == [f"RMS {value:.2g}" for value in rms]
     failed = plots.compare_errors(pid, fail(nn, 0, 3.0))
     assert failed.axes[0].texts[1].get_text() == "failed" and legend(failed)[1].endswith("(failed)")
@@ -136,8 +156,8 @@ def test_learning_curve():
     laps = metrics.per_lap(result)
     for source in (result, laps):
         left, right = plots.learning_curve(source, ["v_rmse", "energy"]).axes
-        assert left.get_yscale() == "log" and "(m/s)" in left.get_ylabel() and "(J)" in right.get_ylabel()
-        value = laps["v_rmse"].values
+        assert left.get_yscale() == "log" and "(mm/s)" in left.get_ylabel() and "(J)" in right.get_ylabel()
+        value = 1e3 * laps["v_rmse"].values
         for line in (value[0], value[2], (value[0] + value[2]) / 2, value[1]):
             assert drawn(left, [1, 2, 3], line)
         assert sorted(text.get_text() for text in left.texts) == ["fel", "none"]
@@ -182,7 +202,7 @@ def test_units_on_axes(name):
     """A single run draws too, and every labelled axis but the lap number has a unit in brackets."""
     figure = ALL[name](make().isel(run=1))
     labels = [text for axes in figure.axes for text in (axes.get_xlabel(), axes.get_ylabel()) if text]
-    assert labels and all(text == "lap" or re.search(r"\((m|s|V|rad|m/s|rad/s)\)$", text) for text in labels)
+    assert labels and all(text == "lap" or re.search(r"\(((m?m|m?rad)(/s)?|s|V)\)$", text) for text in labels)
 
 
 @pytest.mark.parametrize(
