@@ -89,13 +89,20 @@ class Processes:
             pipe.send(job)
 
     def _start(self) -> tuple[BaseProcess, Connection]:
+        """Starts a worker; if the process that forks workers is killed meanwhile, another one takes its place.
+
+        Raises:
+            InputError: Every such process is killed.
+        """
         resource_tracker.ensure_running()  # here, because its start unblocks Ctrl-C
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_serve, args=(self._work, self._path, theirs), daemon=True)
-        with _uninterrupted():
-            process.start()
-        theirs.close()
-        return process, ours
+        for _ in range(self.tries):
+            ours, theirs = self._context.Pipe()
+            process = self._context.Process(target=_serve, args=(self._work, self._path, theirs), daemon=True)
+            with theirs, contextlib.suppress(EOFError, OSError), _uninterrupted():
+                process.start()
+                return process, ours
+            ours.close()
+        raise InputError("workers: no process can be started; what was done is kept")
 
     def wait(self) -> list[Outcome]:
         """Waits for outcomes, or for pipes that break because their process died."""
