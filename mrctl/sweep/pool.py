@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from multiprocessing import resource_tracker
@@ -18,6 +19,7 @@ from typing import Any, NamedTuple, Protocol
 
 from mrctl.record import InputError
 
+PAUSE = 1.0  # s until a killed process has ended on a busy machine
 PATIENCE = 30.0  # s to wait for a scheduler and its first worker
 
 
@@ -102,6 +104,7 @@ class Processes:
                 process.start()
                 return process, ours
             ours.close()
+            time.sleep(PAUSE)
         raise InputError("workers: no process can be started; what was done is kept")
 
     def wait(self) -> list[Outcome]:
