@@ -64,6 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"mrctl {__version__}")
         return 0
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a file may have a name that is not UTF-8
+        sys.stdout.reconfigure(errors="replace")
     warnings.showwarning = lambda message, *_: print(f"mrctl: {printable(str(message))}", file=sys.stderr)
     try:
         try:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from math import ceil
 from typing import Annotated, Any, Literal, get_args
+from unicodedata import category
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from mrctl.control.composite import Composite
 from mrctl.control.fel import Fel
@@ -156,6 +157,13 @@ class Scenario(Record):
     """Period of the velocity controller in s, a multiple of the physics step."""
     motion_period: Annotated[float, Field(ge=1e-3, le=1)] = 0.01
     """Period of the motion controller in s, a multiple of the control period."""
+
+    @field_validator("name")
+    @classmethod
+    def _can_be_shown(cls, name: str) -> str:
+        if any(category(character) in ("Cc", "Cs") for character in name):
+            raise ValueError("has a control character or is not UTF-8")
+        return name
 
     @model_validator(mode="after")
     def _multiples(self) -> Scenario:

@@ -111,8 +111,12 @@ class Store:
         """Makes the folder of a store unless it exists.
 
         Raises:
-            InputError: There is something else at this path; it is left untouched.
+            InputError: There is something else at this path, which is left untouched, or the path is not UTF-8.
         """
+        try:
+            str(path).encode()
+        except UnicodeEncodeError:
+            raise InputError(f"{path}: the name is not UTF-8") from None
         if not path.exists():
             path.mkdir(parents=True)
         elif not path.is_dir():
