@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from math import ceil
 from typing import Annotated, Any, Literal, get_args
-from unicodedata import category
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -160,9 +159,9 @@ class Scenario(Record):
 
     @field_validator("name")
     @classmethod
-    def _can_be_shown(cls, name: str) -> str:
-        if any(category(character) in ("Cc", "Cs") for character in name):
-            raise ValueError("has a control character or is not UTF-8")
+    def _is_utf8(cls, name: str) -> str:
+        if any("\ud800" <= character <= "\udfff" for character in name):
+            raise ValueError("is not UTF-8")
         return name
 
     @model_validator(mode="after")

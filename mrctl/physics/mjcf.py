@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import warnings
 from collections.abc import Sequence
 from inspect import getmembers
 from pathlib import Path
@@ -71,16 +72,19 @@ def build(
     path = world_path(world)
     source = path if robot == CAR else robot_path(robot)
     try:
-        spec = _assembled(path, robot)
-        model = spec.compile()
-        nominal = _arranged(model, steering, robot)
-        if obstacles.shapes:
+        with warnings.catch_warnings(record=True) as held:  # a robot that is refused gets one line
             spec = _assembled(path, robot)
-            walls.add(spec, obstacles, footprint(model))
             model = spec.compile()
             nominal = _arranged(model, steering, robot)
+            if obstacles.shapes:
+                spec = _assembled(path, robot)
+                walls.add(spec, obstacles, footprint(model))
+                model = spec.compile()
+                nominal = _arranged(model, steering, robot)
     except ValueError as error:
         raise InputError(f"{source}: {' '.join(str(error).split())}") from None
+    for warning in held:
+        warnings.warn(warning.message, stacklevel=2)
     if timestep is not None:
         _set_timestep(model, timestep)
     return model, nominal
