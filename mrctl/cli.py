@@ -70,6 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not sys.stderr.isatty():
         for name, value in IN_A_FILE.items():
             os.environ.setdefault(f"TQDM_{name}", value)  # which tqdm reads when it is imported
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a file may have a name that is not UTF-8
+        sys.stdout.reconfigure(errors="replace")
     warnings.showwarning = lambda message, *_: print(f"mrctl: {printable(str(message))}", file=sys.stderr)
     try:
         try:

@@ -9,7 +9,7 @@ from math import ceil
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from mrctl.control.composite import Composite
 from mrctl.control.fel import Fel
@@ -156,6 +156,13 @@ class Scenario(Record):
     """Period of the velocity controller in s, a multiple of the physics step."""
     motion_period: Annotated[float, Field(ge=1e-3, le=1)] = 0.01
     """Period of the motion controller in s, a multiple of the control period."""
+
+    @field_validator("name")
+    @classmethod
+    def _is_utf8(cls, name: str) -> str:
+        if any("\ud800" <= character <= "\udfff" for character in name):
+            raise ValueError("is not UTF-8")
+        return name
 
     @model_validator(mode="after")
     def _multiples(self) -> Scenario:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import warnings
 from collections.abc import Sequence
 from inspect import getmembers
 from pathlib import Path
@@ -24,9 +25,10 @@ from mrctl.physics.elements import MOTORS, NUMERICS, RIGID, fronts, has, left_ty
 from mrctl.physics.files import robot_path, world_path
 from mrctl.physics.hull import footprint
 from mrctl.physics.parameters import load_torques, read_robot
+from mrctl.physics.units import derived_limits
 from mrctl.record import InputError
 from mrctl.theory.obstacles import Obstacles
-from mrctl.theory.robot import ANY_ANGLE, CAR, GRAVITY, STEERINGS, Robot, RobotFile, Steering
+from mrctl.theory.robot import CAR, STEERINGS, Robot, RobotFile, Steering
 
 NONE = Obstacles()
 
@@ -70,16 +72,19 @@ def build(
     path = world_path(world)
     source = path if robot == CAR else robot_path(robot)
     try:
-        spec = _assembled(path, robot)
-        model = spec.compile()
-        nominal = _arranged(model, steering, robot)
-        if obstacles.shapes:
+        with warnings.catch_warnings(record=True) as held:  # a robot that is refused gets one line
             spec = _assembled(path, robot)
-            walls.add(spec, obstacles, footprint(model))
             model = spec.compile()
             nominal = _arranged(model, steering, robot)
+            if obstacles.shapes:
+                spec = _assembled(path, robot)
+                walls.add(spec, obstacles, footprint(model))
+                model = spec.compile()
+                nominal = _arranged(model, steering, robot)
     except ValueError as error:
         raise InputError(f"{source}: {' '.join(str(error).split())}") from None
+    for warning in held:
+        warnings.warn(warning.message, stacklevel=2)
     if timestep is not None:
         _set_timestep(model, timestep)
     return model, nominal
@@ -208,21 +213,9 @@ def _set_timestep(model: mujoco.MjModel, timestep: float) -> None:
 
 
 def _derive_limits(model: mujoco.MjModel) -> None:
-    """Derives the numeric `limits` of a robot whose file has none from its motors and its grip.
-
-    The shares are chosen so that the default robot's numbers come out near its own limits: 64 % of the no-load speed,
-    a sixth of the acceleration at stall, and of the tyres' grip a fifth along and a half across.
-    """
+    """Sets the numeric `limits` of a robot whose file has none."""
     model.numeric("limits").data[:] = 1.0  # so that the robot is valid and can be read
-    robot = read_robot(model)
-    grip = robot.tyre_friction * GRAVITY
-    speed = 0.64 * robot.velocity_gain * robot.supply
-    rotation = min(0.4 * speed / robot.half_track, 0.5 * grip / speed)
-    if robot.steering_limit < ANY_ANGLE:
-        rotation = min(rotation, 0.5 * speed * np.tan(robot.steering_limit) / robot.wheelbase)
-    stall = 2 * robot.motor_gain * robot.supply / robot.wheel_radius / robot.effective_mass
-    acceleration = min(stall / 6, 0.2 * grip)
-    model.numeric("limits").data[:] = speed, rotation, acceleration, 2 * rotation * acceleration / speed
+    model.numeric("limits").data[:] = derived_limits(read_robot(model))
 
 
 def _check_elements(model: mujoco.MjModel, steering: Steering) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 from mrctl.kernel import Array
 from mrctl.physics.elements import bodies_of
 from mrctl.record import InputError
-from mrctl.theory.robot import Robot
+from mrctl.theory.robot import ANY_ANGLE, GRAVITY, Robot
 
 RPM = 30 / math.pi  # rpm of 1 rad/s
 GYRATION = 0.05, 1.0  # least and largest radius of gyration over the size of a robot
@@ -67,6 +67,22 @@ def reach(robot: Robot) -> Array:
     force = 2 * stall / robot.wheel_radius
     turning = force * robot.half_track / robot.effective_inertia
     return np.array([speed, speed / robot.half_track, force / robot.effective_mass, turning])
+
+
+def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
+    """Returns limits on V, θ̇, V̇ and θ̈, in SI units, for a robot whose file has none, from its motors and its grip.
+
+    The shares are chosen so that the default robot's numbers come out near its own limits: 64 % of the no-load speed,
+    a sixth of the acceleration at stall, and of the tyres' grip a fifth along and a half across.
+    """
+    grip = robot.tyre_friction * GRAVITY
+    speed = 0.64 * robot.velocity_gain * robot.supply
+    rotation = min(0.4 * speed / robot.half_track, 0.5 * grip / speed)
+    if robot.steering_limit < ANY_ANGLE:
+        rotation = min(rotation, 0.5 * speed * np.tan(robot.steering_limit) / robot.wheelbase)
+    stall = 2 * robot.motor_gain * robot.supply / robot.wheel_radius / robot.effective_mass
+    acceleration = min(stall / 6, 0.2 * grip)
+    return speed, rotation, acceleration, 2 * rotation * acceleration / speed
 
 
 def bounds(robot: Robot) -> list[Bound]:
@@ -161,17 +177,19 @@ def _candidates(model: mujoco.MjModel, robot: Robot) -> list[Mistake]:
         (of_rotor, "g·cm²", "kg·m²", _scaled(robot, ("rotor_inertia",), 1e-7)),
         (f"the supply {motors} is {robot.supply:,.6g} V", "mV", "V", _scaled(robot, ("supply",), 1e-3)),
     ]
-    if robot.gear_ratio == 1 and (ends := sufficient_gears(robot)):
-        text = (
-            f"the gear {motors} is 1: was it left out? The declared limits need one of {ends[0]:.2g} to {ends[1]:.2g}"
-        )
+    derived = np.allclose([getattr(robot, name) for name in LIMITS], derived_limits(robot), rtol=1e-9, atol=0)
+    ends = (_possible_gears if derived else sufficient_gears)(robot) if robot.gear_ratio == 1 else None
+    if ends:
+        limits = f"The declared limits need one of {ends[0]:.2g} to {ends[1]:.2g}"
+        needed = f"Such a robot needs at least {ends[0]:.2g}" if derived else limits
+        text = f"the gear {motors} is 1: was it left out? {needed}"
         found.append(Mistake(text, robot.model_copy(update={"gear_ratio": math.sqrt(ends[0] * ends[1])})))
     for number, unit, right, changes in rows:
         is_it, it = ("are they", "They") if number.startswith(("the lengths", "the numeric")) else ("is it", "It")
         with contextlib.suppress(InputError):
             text = f"{number}, which no robot has; {is_it} in {unit}? {it} must be in {right}"
             found.append(Mistake(text, robot.replace(**changes)))
-    return found
+    return [one._replace(robot=_limited(one.robot)) for one in found] if derived else found
 
 
 def _scaled(robot: Robot, names: tuple[str, ...], factor: float) -> dict[str, float]:
@@ -205,6 +223,18 @@ def sufficient_gears(robot: Robot) -> tuple[float, float] | None:
     gears = robot.gear_ratio * np.geomspace(1e-3, 1e3, 601)
     found = [float(gear) for gear in gears if reaches_limits(robot.model_copy(update={"gear_ratio": gear}))]
     return (found[0], found[-1]) if found else None
+
+
+def _possible_gears(robot: Robot) -> tuple[float, float] | None:
+    """Returns the lowest and the highest gear with which a robot that declares no limits is possible, or None."""
+    gears = np.geomspace(1, 1e3, 301)
+    found = [float(gear) for gear in gears if _least(_limited(robot.model_copy(update={"gear_ratio": gear}))) > 0]
+    return (found[0], found[-1]) if found else None
+
+
+def _limited(robot: Robot) -> Robot:
+    """Returns the robot with the limits that follow from its motors and its grip."""
+    return robot.model_copy(update=dict(zip(LIMITS, derived_limits(robot), strict=True)))
 
 
 def reaches_limits(robot: Robot) -> bool:

@@ -233,6 +233,21 @@ def only_files(folder: Path) -> int:
     return total
 
 
+def check_declared(path: Path, declared: int, stored: int) -> None:
+    """Refuses a folder whose files unpack to far more than they hold, before they are read.
+
+    Args:
+        path: The folder.
+        declared: Size of its data in memory in bytes.
+        stored: Size of its files in bytes.
+
+    Raises:
+        InputError: The data would take too much memory.
+    """
+    if declared > max(SMALL, EXPANSION * stored):
+        raise InputError(f"{path}: declares {declared / 1e9:,.0f} GB of data and holds {stored / 1e6:,.3g} MB")
+
+
 def open_result(path: str | Path) -> xr.Dataset:
     """Opens a saved result, whichever version of mrctl wrote it: a result names its variables, with their units.
 
@@ -251,9 +266,7 @@ def open_result(path: str | Path) -> xr.Dataset:
     for folder in sorted(file.parent for file in Path(path).glob("*/zarr.json")):
         with reading(folder):
             arrays[folder] = zarr.open_array(folder, mode="r", zarr_format=3)
-    declared = sum(array.nbytes for array in arrays.values())
-    if declared > max(SMALL, EXPANSION * stored):
-        raise InputError(f"{path}: declares {declared / 1e9:,.0f} GB of signals and holds {stored / 1e6:,.3g} MB")
+    check_declared(Path(path), sum(array.nbytes for array in arrays.values()), stored)
     with reading(f"{path}: not a saved result"):
         result = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
     for folder, array in arrays.items():

@@ -14,11 +14,13 @@ import json
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import product
+from multiprocessing import parent_process
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import pyarrow as pa
 from pydantic import Field, model_validator
+from tqdm import tqdm
 
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import SIGNALS
@@ -29,6 +31,7 @@ from mrctl.theory.robot import RobotFile
 CHUNK_BYTES = 2**27  # largest size of the signals of a job in memory
 LARGEST = 2**43  # largest size of the signals of all runs in bytes, before compression
 TRIED = 20  # number of first runs, at least one of which must have a valid scenario
+QUIET = 2.0  # s for which values are checked without a progress bar
 WHOLE = "scenario"  # the field of an axis whose values are tables of changes to the scenario
 
 
@@ -174,7 +177,9 @@ class Sweep(Record):
         for group in self._dimensions:
             trials += [{self.axes[a].field: self.axes[a].listed[k] for a in group} for k in range(self._length(group))]
         trials += [{axis.field: end} for axis in self.axes for end in axis.uniform or axis.loguniform or ()]
-        periods = {self._assemble(middle | trial).control_period for trial in trials}
+        silent = parent_process() is not None  # a worker reads a sweep that has been checked
+        bar = tqdm(trials, desc="checks the values", unit="value", delay=QUIET, leave=False, disable=silent)
+        periods = {self._assemble(middle | trial).control_period for trial in bar}
         if len(periods) > 1 and self.record in ("decimated", "full"):
             raise ValueError("control_period: signals share their time axis; keep it, or record metrics")
         first = range(min(self.size, TRIED))
@@ -261,12 +266,9 @@ class Sweep(Record):
             return None
 
     def _assemble(self, values: dict[str, Any], source: str = "") -> Scenario:
-        data = copy.deepcopy(self._plain)
+        data = self._plain
         for field, value in values.items():
-            if field == WHOLE and isinstance(value, dict):
-                data |= value
-            else:
-                _put(data, field, value)
+            data = data | value if field == WHOLE and isinstance(value, dict) else _put(data, field, value)
             if isinstance(value, dict):  # a table is completed, so that later axes find its fields
                 data = Scenario.from_dict(data, source).model_dump(mode="json")
         return Scenario.from_dict(data, source)
@@ -305,20 +307,23 @@ class Sweep(Record):
         return pa.schema([pa.field(name, kind, metadata={"units": u}) for name, (kind, u) in columns.items()])
 
 
-def _put(data: Any, field: str, value: object) -> None:  # noqa: ANN401
-    """Sets a field of nested tables and lists by its dotted path.
+def _put(data: Any, field: str, value: object) -> Any:  # noqa: ANN401
+    """Returns nested tables and lists in which the field at a dotted path has another value; the rest is shared.
 
     Raises:
         InputError: There is no such field.
     """
-    node, parts = data, field.split(".")
+    node, parts, passed = data, field.split("."), []
     for depth, part in enumerate(parts):
         known = dict(enumerate(node)) if isinstance(node, list) else node if isinstance(node, dict) else {}
         names = {str(key): key for key in known}
         if part not in names:
             where = ".".join(parts[:depth]) or "the scenario"
             raise InputError(f"{field}: no {part!r} in {where}" + (f", which has {', '.join(names)}" if names else ""))
-        if depth == len(parts) - 1:
-            node[names[part]] = value
-        else:
-            node = node[names[part]]
+        passed.append((node, names[part]))
+        node = node[names[part]]
+    for node, key in reversed(passed):
+        changed = copy.copy(node)
+        changed[key] = value
+        value = changed
+    return value

@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from multiprocessing import resource_tracker
@@ -18,6 +19,7 @@ from typing import Any, NamedTuple, Protocol
 
 from mrctl.record import InputError
 
+PAUSE = 1.0  # s until a killed process has ended on a busy machine
 PATIENCE = 30.0  # s to wait for a scheduler and its first worker
 
 
@@ -89,13 +91,21 @@ class Processes:
             pipe.send(job)
 
     def _start(self) -> tuple[BaseProcess, Connection]:
+        """Starts a worker; if the process that forks workers is killed meanwhile, another one takes its place.
+
+        Raises:
+            InputError: Every such process is killed.
+        """
         resource_tracker.ensure_running()  # here, because its start unblocks Ctrl-C
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_serve, args=(self._work, self._path, theirs), daemon=True)
-        with _uninterrupted():
-            process.start()
-        theirs.close()
-        return process, ours
+        for _ in range(self.tries):
+            ours, theirs = self._context.Pipe()
+            process = self._context.Process(target=_serve, args=(self._work, self._path, theirs), daemon=True)
+            with theirs, contextlib.suppress(EOFError, OSError), _uninterrupted():
+                process.start()
+                return process, ours
+            ours.close()
+            time.sleep(PAUSE)
+        raise InputError("workers: no process can be started; what was done is kept")
 
     def wait(self) -> list[Outcome]:
         """Waits for outcomes, or for pipes that break because their process died."""

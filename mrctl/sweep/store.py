@@ -40,7 +40,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from mrctl import __version__
 from mrctl.record import InputError, Record, read_file, reading
-from mrctl.results.dataset import SIGNALS, only_files, open_result
+from mrctl.results.dataset import SIGNALS, check_declared, only_files, open_result
 from mrctl.results.metrics import METRICS
 from mrctl.scenario import LONGEST
 
@@ -111,8 +111,12 @@ class Store:
         """Makes the folder of a store unless it exists.
 
         Raises:
-            InputError: There is something else at this path; it is left untouched.
+            InputError: There is something else at this path, which is left untouched, or the path is not UTF-8.
         """
+        try:
+            str(path).encode()
+        except UnicodeEncodeError:
+            raise InputError(f"{path}: the name is not UTF-8") from None
         if not path.exists():
             path.mkdir(parents=True)
         elif not path.is_dir():
@@ -265,6 +269,7 @@ class Store:
         """Returns the row of one run, or None if the run is not done."""
         job = run // self.manifest["chunk"]
         source = self._part(job) if self._part(job).exists() else self.table
+        self._check_size([source] if source.exists() else [])
         with reading(source):
             found = pq.read_table(source, filters=[("run", "=", run)]).to_pylist() if source.exists() else []
         return found[0] if found else None
@@ -291,16 +296,43 @@ class Store:
 
     @cached_property
     def _signals(self) -> zarr.Array:
+        path = self.path / "signals.zarr" / "signals"
         with reading(self.path / "signals.zarr"):
-            return zarr.open_array(self.path / "signals.zarr" / "signals", mode="r+", zarr_format=3)
+            found = zarr.open_array(path, mode="r+", zarr_format=3)
+        if (found.shape, found.shards, found.chunks) != self._layout(found.shape[-1] if found.shape else 0):
+            raise InputError(f"{path}: of shape {found.shape}, which is not that of the sweep")
+        return found
+
+    def _layout(self, signals: int) -> tuple[tuple[int, ...], ...]:
+        """Returns the shapes of the array of all signals, of a shard, and of a chunk of it."""
+        chunk = self.manifest["chunk"]
+        return (
+            (self.size, self.samples, signals),
+            (chunk, self.samples, signals),
+            (math.gcd(chunk, INNER), self.samples, 1),
+        )
+
+    def _check_size(self, tables: Iterable[Path], samples: int = 0) -> None:
+        """Refuses tables of rows, or samples of all signals, that take far more memory than the store on the disk.
+
+        Raises:
+            InputError: They would, or a file of the store is a pipe or a device.
+        """
+        stored, values = only_files(self.path), samples * len(self.signal_names) if samples else 0
+        for table in tables:
+            with reading(table):
+                about = pq.read_metadata(table)
+                groups = (about.row_group(k) for k in range(about.num_row_groups))
+                values += sum(group.column(k).num_values for group in groups for k in range(group.num_columns))
+        check_declared(self.path, 8 * values, stored)
 
     def _create_signals(self) -> None:
-        chunk = self.manifest["chunk"]
+        shape, shards, chunks = self._layout(len(self.signal_names))
         zarr.open_group(self.path / "signals.zarr", mode="a").create_array(
             "signals",
-            shape=(self.size, self.samples, len(self.signal_names)),
-            shards=(chunk, self.samples, len(self.signal_names)),
-            chunks=(math.gcd(chunk, INNER), self.samples, 1),
+            shape=shape,
+            shards=shards,
+            chunks=chunks,
             dtype="float64",
             fill_value=np.nan,
             compressors=[BloscCodec(cname="zstd", clevel=3, shuffle="shuffle"), Crc32cCodec()],
@@ -314,10 +346,12 @@ class Store:
             InputError: No run is done.
         """
         if self.table.exists():
+            self._check_size([self.table])
             with reading(self.table):
                 return pd.read_parquet(self.table)
         if not (jobs := sorted(self.done())):
             raise InputError(f"{self.path}: no job is done yet")
+        self._check_size(map(self._part, jobs))
         return pa.concat_tables(self.rows(job) for job in jobs).to_pandas()
 
     def dataset(self) -> xr.Dataset:
@@ -363,6 +397,7 @@ class Store:
             return xr.Dataset(outcome | columns(["laps"]) | found, coords | {"lap": number}, attrs)
         if not self.samples:
             return xr.Dataset(outcome | columns(METRICS), coords, attrs)
+        self._check_size([], len(frame) * self.samples)
         whole = xr.open_zarr(self.path / "signals.zarr", chunks=None, consolidated=False, zarr_format=3)["signals"]
         whole = whole.assign_coords(signal=self.signal_names)
         signals = whole.isel(run=frame["run"].to_numpy()).to_dataset("signal")
@@ -386,7 +421,6 @@ def open(path: str | Path) -> xr.Dataset:
     """
     path = Path(path)
     if (path / "sweep.json").is_file():
-        only_files(path)
         return Store(path).dataset()
     return open_result(path / "result.zarr" if (path / "result.zarr").exists() else path)
 

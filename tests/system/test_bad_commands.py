@@ -82,7 +82,7 @@ RUN = [
     "missing --run 0", "good.toml good.toml", "reference:spiral", "reference:circle --reference.radius -1",
     "reference:circle --reference.radius 0.2 --reference.period 1", "reference:line --reference.speed 9",
     "reference:lemniscate --reference.period 1", "reference:waypoints --reference.points 1", "--laps 1 --nosuch",
-    "--learner a\x1b[31mb",
+    "--learner a\x1b[31mb", "--laps 1 --name \udcff",
 ]  # fmt: skip
 OTHERS = [
     "dance", "Run", "\x1b[31m", "navigate", "navigate nowhere", "navigate doorway:x", "navigate missing.toml",
@@ -96,6 +96,7 @@ OTHERS = [
     "sweep own.toml --out s", "sweep sweep.toml --out file", "sweep sweep.toml --out s --workers 0",
     "sweep sweep.toml --out s --scheduler bogus", "sweep sweep.toml --out s --workers 1 --scheduler tcp://a:1",
     "sweep pipe.toml --out s", "suite --workers 0 --quick --out s", "suite --seeds 0 --out s", "suite --random -1",
+    "sweep sweep.toml --out \udcff",
     "suite --quick --full", "suite --held-out magic --out s", "suite --held-out none --random 3",
     "suite --feedforward magic", "suite --controller own.py", "suite --controller raises.py:Good --out s",
     "tune nothing", "tune broken.xml", "tune --delay 0.013", "tune --delay -1", "tune --lag -1", "tune --lag nan",

@@ -1,11 +1,14 @@
 """Damaged stores and results, and stores that name code: one line names the file, and what is whole still opens."""
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import mrctl
@@ -104,6 +107,56 @@ def test_missing_shard_leaves_its_runs_out(whole: Path, tmp_path: Path) -> None:
         found = mrctl.open(tmp_path / "store")
     assert found["run"].values.tolist() == [0, 1] and found.attrs["unfinished"] == 2
     np.testing.assert_array_equal(found["x"], mrctl.open(whole / "store")["x"][:2])
+
+
+def zarr_of(store: Path, **changes: object) -> None:
+    """Changes what the signals of a store declare."""
+    edited(**changes)(store / "signals.zarr" / "signals" / "zarr.json")
+
+
+def larger(store: Path) -> None:
+    """Signals of 10 TB, though the sweep has 4 runs."""
+    zarr_of(store, shape=[1_000_000, 1_250_000, 1])
+
+
+def longer(store: Path) -> None:
+    """Runs of 28 hours, in all files of the store."""
+    about = json.loads((store / "signals.zarr/signals/zarr.json").read_text())
+    (runs, _, signals), (codec,) = about["shape"], about["codecs"]
+    codec["configuration"]["chunk_shape"][1] = 10_000_000
+    grid = {"name": "regular", "configuration": {"chunk_shape": [2, 10_000_000, signals]}}
+    zarr_of(store, shape=[runs, 10_000_000, signals], chunk_grid=grid, codecs=[codec])
+    edited(samples=10_000_000)(store / "sweep.json")
+
+
+def taller(store: Path) -> None:
+    """A table of 140 million equal values."""
+    column = pa.repeat(0.0, 1_000_000)
+    pq.write_table(pa.table({f"c{k}": column for k in range(140)}), store / "runs.parquet")
+
+
+def piped(store: Path) -> None:
+    """A table that nobody ever writes."""
+    (store / "runs.parquet").unlink()
+    os.mkfifo(store / "runs.parquet")
+
+
+@pytest.mark.parametrize(
+    ("made", "says"),
+    [(larger, "not that of the sweep"), (longer, "declares 18 GB"), (taller, "declares 1 GB"), (piped, "a pipe")],
+)
+def test_foreign_store_is_bounded(
+    whole: Path, tmp_path: Path, made: Callable[[Path], None], says: str, capsys: pytest.CaptureFixture
+) -> None:
+    """Whatever somebody else's small store declares, every command that opens it refuses it at once, in one line."""
+    shutil.copytree(whole / "store", tmp_path / "store")
+    made(tmp_path / "store")
+    store, commands = str(tmp_path / "store"), [["export", "--to", "npz", "--out", "x.npz"]]
+    commands += [["view", "--export", "x.html"], ["run", "--run", "2"]] if made in (taller, piped) else []
+    for name, *flags in commands:
+        assert cli.main([name, store, *flags]) == 2
+        said = capsys.readouterr().err
+        assert says in said and said.count("\n") == 1
 
 
 def test_view_drives_the_controller_of_the_sweep(whole: Path) -> None:

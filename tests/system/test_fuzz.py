@@ -9,6 +9,7 @@ import random
 import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,10 @@ import pytest
 
 import mrctl
 from mrctl import InputError, Scenario, cli
+from mrctl.checks import examination
 from mrctl.control.fel import initial_weights
 from mrctl.control.weights import load_weights
+from mrctl.physics import mjcf
 from mrctl.physics.files import models_folder
 from mrctl.sweep import jobs
 from mrctl.sweep.plan import Sweep
@@ -122,6 +125,28 @@ def test_robots(name: str, seed: int, tmp_path: Path) -> None:
             one[k] = "" if chance.random() < 0.2 else re.sub(r"(?<=[\" ])-?[\d.]+(?=[\" ])", value, one[k], count=1)
         file.write_text("\n".join(one))
         attempt(lambda: mrctl.load_robot(file))
+
+
+@pytest.mark.parametrize("seed", range(TIMES))
+def test_worlds_and_check(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """A world or robot with wrong numbers, or without some lines, is compiled or refused; `check` has a verdict."""
+    monkeypatch.setattr(examination, "SECONDS", 0.2)
+    chance = random.Random(f"worlds {seed}")
+    for k in range(20):
+        name = chance.choice(["flat", "slope", "rough", "patch"]) if k < 18 else "turtlebot"
+        lines = (models_folder() / f"{name}.xml").read_text().splitlines()
+        for line in chance.choices(range(len(lines)), k=chance.randint(1, 3)):
+            value = chance.choice(["0", "-1", "1e-9", "1e9", "nan", "x", ""])
+            lines[line] = re.sub(r"(?<=[\" ])-?[\d.]+(?=[\" ])", value, lines[line], count=chance.randrange(3))
+        file = tmp_path / "one.xml"
+        file.write_text("\n".join(lines).replace('file="', f'file="{models_folder()}/'))
+        if name != "turtlebot":
+            attempt(partial(mjcf.load, str(file), None))
+            continue
+        status = cli.main(["check", str(file)])
+        assert status in (0, 1, 2) and capsys.readouterr().err.count("\n") == (status > 0)
 
 
 @pytest.mark.parametrize("seed", range(TIMES))

@@ -485,6 +485,21 @@ def test_kill(long, tmp_path, moment, victim):
     print(f"killed the {victim} after {done} of 60 jobs")
 
 
+def test_fork_server_killed(long, tmp_path):
+    """The process that forks the workers is replaced as it is killed before it has forked one."""
+    file, expected = long
+    process = start(file, tmp_path / "store")
+
+    def forks():
+        commands = {pid: Path(f"/proc/{pid}/cmdline").read_text() for pid in children(process.pid)}
+        return [pid for pid, command in commands.items() if "forkserver" in command]
+
+    os.kill(until(forks)[0], signal.SIGKILL)
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 0 and "Traceback" not in stderr, stderr
+    assert content(tmp_path / "store") == expected
+
+
 def test_ctrl_c(long, tmp_path):
     """One line, status 130, and the same command goes on."""
     file, expected = long

@@ -111,12 +111,30 @@ def test_other_robots_are_possible(robot: str, factor: float) -> None:
         assert mistake(model, other) is None and min(bound.margin for bound in bounds(other)) > 0, name
 
 
+@pytest.mark.parametrize(
+    ("mistake", "said"),
+    zip(
+        MISTAKES,
+        ("needs at least 3.2", "in kV·s/rad?", "10,000 kg", "80, which no robot has; is it in %?", "in mΩ?", "in N·mm"),
+        strict=True,
+    ),
+)
+def test_names_the_unit_where_no_limits_are_declared(
+    mistake: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """Limits that follow from a wrong number are wrong too, and do not hide it."""
+    (tmp_path / "mine.xml").write_text(ROBOT.replace(*MISTAKES[mistake]))
+    assert cli.main(["check", str(tmp_path / "mine.xml")]) == 1
+    assert re.search(f"- wrong unit: .*{re.escape(said)}", capsys.readouterr().out)
+
+
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_ends_in_time(
     mistake: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    """The whole takes little more than its limit, however slow the robot; no error of a check ends it."""
+    """The whole takes little more than its limit, even if no unit is suspected; no error of a check ends it."""
     monkeypatch.setattr(examination, "SECONDS", 1.0)
+    monkeypatch.setattr(examination, "_wrong_unit", lambda model: ())
     (tmp_path / "mine.xml").write_text(ROBOT.replace(*MISTAKES[mistake]))
     start = time.process_time()
     status = cli.main(["check", str(tmp_path / "mine.xml")])

@@ -1,5 +1,6 @@
 """What a sweep file means: axes, draws, pairs; what is refused; files that appear whole or not at all."""
 
+import cProfile
 import itertools
 import tomllib
 
@@ -12,6 +13,7 @@ from scipy import stats
 
 from mrctl import Circle, Event, InputError, Perturbation, RobotFile, Scenario, Sweep
 from mrctl.results.dataset import SIGNALS
+from mrctl.sweep import plan
 from mrctl.sweep import store as folder
 
 BASE = {"laps": 1, "prior": "none", "learner": "none", "reference": {"kind": "line", "length": 0.4}}
@@ -173,6 +175,23 @@ def test_refused(message, axes, changes):
     with pytest.raises(InputError, match=f"^s.toml: .*{message}") as error:
         sweep(*axes, **changes)
     assert "\n" not in str(error.value)
+
+
+def test_many_values_are_checked_fast(capsys, monkeypatch):
+    """Checking a value calls hardly more functions than validating its scenario; a long check shows a bar."""
+
+    def calls(function, *arguments):
+        profile = cProfile.Profile()
+        profile.runcall(function, *arguments)
+        return sum(entry.callcount for entry in profile.getstats())
+
+    base = Scenario.from_dict(BASE).model_dump(mode="json")
+    one = calls(Scenario.from_dict, base)
+    assert calls(sweep, axis(MASS["field"], values=np.linspace(1, 2, 500).tolist())) < 2 * 500 * one
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(plan, "QUIET", 0.0)
+    sweep(axis(MASS["field"], values=[1, 2]))
+    assert "checks the values" in capsys.readouterr().err
 
 
 def test_no_such_run():
