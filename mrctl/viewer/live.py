@@ -159,7 +159,7 @@ class Live(Page):
             self._return = gui.add_button("Return to the present", visible=False)
             self.on(self._return, lambda _: self._look_back(self.session.time))
             speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
-            self.on(speed, lambda name: self._set_speed(SPEEDS[name]))
+            self.on(speed, self.choose_speed)
             self.add_cameras()
             self._follow = gui.add_checkbox("Camera follows", False, hint="The first robot stays in the middle.")
             for label, choices in buttons(self.session.robot).items():
@@ -326,8 +326,10 @@ class Live(Page):
         self._tree.visible = len(self._searched) > 0
         self._scene.show_search(self._searched if self._tree.value else NOTHING)
 
-    def _set_speed(self, speed: float) -> None:
-        self.speed, self._due = speed, 0.0
+    @override
+    def choose_speed(self, name: str) -> None:
+        super().choose_speed(name)
+        self._due = 0.0
 
     def _press(self, group: str, name: str) -> None:
         choices = buttons(self.session.robot)[group]
@@ -362,7 +364,7 @@ class Live(Page):
 
     def _apply(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
         name, *rest = path
-        if path == ("perturbation", "control_delay"):  # in whole control periods
+        if path == ("perturbation", "control_delay") and np.isfinite(value):  # in whole control periods
             value = round(value / self.session.period) * self.session.period
         if name in PLANNED and self.session.avoid != "none":
             raise InputError(
@@ -644,6 +646,8 @@ class Live(Page):
 
 def _in_periods(name: str, value: Any, period: float) -> Any:  # noqa: ANN401
     """Returns a value of a field of `Sensing`, a time or a rate rounded to whole control periods of `period` in s."""
+    if isinstance(value, float) and not np.isfinite(value):
+        return value  # which the record refuses
     if name.endswith("_latency") or name == "delay":
         return round(value / period) * period
     if name.endswith("_rate") and value > 0:

@@ -221,6 +221,12 @@ class Page(ABC):
             )
         write(self._sensed, block("sensors", *lines))
 
+    def choose_speed(self, name: str) -> None:
+        """Sets how fast simulated time passes, by the name of a speed in `SPEEDS`."""
+        if name not in SPEEDS:
+            raise InputError(f"{name}: not one of the choices")
+        self.speed = SPEEDS[name]
+
     def ask(self, action: Callable[..., None], *arguments: Any) -> None:  # noqa: ANN401
         """Queues an action for the loop; any thread may call this."""
         self._requests.put(partial(action, *arguments))

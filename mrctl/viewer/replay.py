@@ -68,10 +68,7 @@ class Replay(Page):
             self._interval = gui.add_multi_slider("Curves, s", 0.0, 1.0, 0.01, (0.0, 1.0))
             self.on(self._interval, lambda _: self._draw_curves())
             speeds = tuple(name for name, speed in SPEEDS.items() if np.isfinite(speed))
-            self.on(
-                gui.add_dropdown("Speed", speeds, initial_value="1×"),
-                lambda name: setattr(self, "speed", SPEEDS[name]),
-            )
+            self.on(gui.add_dropdown("Speed", speeds, initial_value="1×"), self.choose_speed)
             self.add_cameras()
             self._follow = gui.add_checkbox("Camera follows", False)
             self.add_drawing()

@@ -212,7 +212,7 @@ def test_live(browser, tmp_path):
         text = download.value.path().read_text()
         assert f'"marks": [{dropped:.5g}' in text and text.count("<canvas") == 0 and len(text) > 1e6
         live.deviation.value = "1×"
-        live.ask(live._set_speed, float("inf"))
+        live.ask(live.choose_speed, "as fast as it goes")
         live.ask(live._command, "play")
         until(lambda: live.session.time > 9.0, "some seconds within a few pictures")
         live.ask(live._command, "pause")
@@ -321,7 +321,7 @@ def click_on_curve(page, title, share):
 def test_looking_back(browser, tmp_path):
     """A click on a curve, or on a trail, shows the robots as they were then; from there they drive on."""
     with serving(lambda server: Live([BASE], server)) as (live, url), visit(browser, url) as page:
-        live.ask(live._set_speed, float("inf"))
+        live.ask(live.choose_speed, "as fast as it goes")
         until(lambda: live.session.time > 15 and curves(page, "V, m/s"), "15 s")
         live.ask(live._command, "pause")
         until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
@@ -356,7 +356,7 @@ def test_dragging(browser, tmp_path):
         page.get_by_label("Push by dragging").click()
         until(lambda: not live.playing and live._hands._pushes.value, "the pause")
         page.wait_for_timeout(1000)
-        camera, here = page.evaluate(CAMERA), live.session.qpos(0)[:2]
+        camera, here = page.evaluate(CAMERA), live.session.qpos(0)[:2].copy()
 
         def drag(start, *places):
             page.mouse.move(*page.evaluate(WORLD_TO_SCREEN, list(start)))
@@ -364,8 +364,13 @@ def test_dragging(browser, tmp_path):
             for place in places:
                 page.mouse.move(*page.evaluate(WORLD_TO_SCREEN, list(place)))
 
-        theta = live.session.qpos(0)[2]
-        drag((*here + 0.15 * np.array([np.cos(theta), np.sin(theta)]), 0.1), here + [0.1, -0.2], here + [0.3, -0.5])
+        theta = live.session.log()["theta"][-1, 0]
+        turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
+
+        def at(*place):  # in the robot's frame, in which the circle is to the left, to a place in the world
+            return here + turn @ place
+
+        drag((*at(0.15, 0.0), 0.1), here + [0.1, -0.2], here + [0.3, -0.5])
         until(lambda: page.evaluate(VISIBLE, "/world/force/0") and live._hands.pull, "an arrow")
         picture(page, tmp_path / "push.png")
         page.mouse.up()
@@ -377,23 +382,23 @@ def test_dragging(browser, tmp_path):
         page.get_by_text("Set a goal", exact=True).click()
         until(lambda: "Drag on the floor" in page.inner_text("#mrctl-picking"), "the wait for a goal")
         page.wait_for_timeout(1000)
-        drag((0.7, 0.2), (0.7, 0.5), (0.7, 0.9))
+        drag(at(0.3, 1.2), at(0.3, 1.4), at(0.3, 1.6))
         page.mouse.up()
         until(lambda: len(live.session.saved()[0].events) == 2 and live._ends is not None, "the goal")
         *place, heading = live._ends[1]
-        assert place == pytest.approx([0.7, 0.2], abs=0.1)
-        assert abs(np.angle(np.exp(1j * heading) / 1j)) < 0.1  # a way may turn once more
+        assert place == pytest.approx(at(0.3, 1.2), abs=0.1)
+        assert abs(np.angle(np.exp(1j * (heading - theta)) / 1j)) < 0.1  # a way may turn once more
         assert not live._hands._waits
 
         page.get_by_label("Contact forces").click()
         page.get_by_text("Draw a way", exact=True).click()
         until(lambda: "add a point" in page.inner_text("#mrctl-picking"), "the wait for points")
         page.wait_for_timeout(1000)
-        for k, place in enumerate([(0.8, 1.3), (-0.1, 1.9)]):
-            page.mouse.click(*page.evaluate(WORLD_TO_SCREEN, list(place)))
+        for k, place in enumerate([at(0.8, 0.6), at(0.3, 1.2)]):
+            page.mouse.click(*page.evaluate(WORLD_TO_SCREEN, place.tolist()))
             until(lambda k=k: len(live._hands._points) == k + 1, "a point")
-        drag((-0.1, 1.9), (0.0, 1.9), (0.2, 1.8))
-        until(lambda: live._hands._points[1] == pytest.approx([0.2, 1.8], abs=0.03), "the point elsewhere")
+        drag(at(0.3, 1.2), at(0.25, 1.25), at(0.2, 1.3))
+        until(lambda: live._hands._points[1].tolist() == pytest.approx(at(0.2, 1.3), abs=0.03), "the point elsewhere")
         page.mouse.up()
         until(lambda: page.evaluate(VISIBLE, "/world/way/line"), "the way")
         assert page.evaluate(VISIBLE, f"{ROBOT}/force")  # the wheels stand on the floor
@@ -401,7 +406,7 @@ def test_dragging(browser, tmp_path):
         page.get_by_role("button", name="drive it").click()
         until(lambda: len(live.session.saved()[0].events) == 3 and live.playing, "the way as an event")
         points = live.session.saved()[0].events[2].reference.points
-        assert np.array(points[2:]) == pytest.approx(np.array([[0.8, 1.3], [0.2, 1.8]]), abs=0.03)
+        assert np.array(points[2:]) == pytest.approx(np.array([at(0.8, 0.6), at(0.2, 1.3)]), abs=0.03)
         assert page.evaluate(CAMERA) == pytest.approx(camera, abs=1e-6)
 
 

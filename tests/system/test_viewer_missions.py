@@ -386,7 +386,7 @@ def test_goal_by_click(tmp_path):
             until(lambda: len(live.session.saved()[0].events) == 1, "the plan")
             set_at = live.session.saved()[0].events[0].time
             until(lambda: place(page, "/world/goal") == pytest.approx([0.9, -0.5], abs=0.03), "the goal in sight")
-            live.ask(live._set_speed, float("inf"))
+            live.ask(live.choose_speed, "as fast as it goes")
             until(lambda: live.session.time > set_at + 2, "the robots to drive")
             until(lambda: page.inner_text("#mrctl-status").count("has arrived") == 2, "the robots at the goal")
             live.ask(live._command, "pause")
