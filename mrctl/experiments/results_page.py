@@ -39,6 +39,7 @@ Table = Mapping[str, Any]
 def main(
     reproduce: Path | None = None,
     suite: Path | None = None,
+    random: Path | None = None,
     held_out: Path | None = None,
     tune: Path | None = None,
     search: tuple[Path, ...] = (),
@@ -54,6 +55,7 @@ def main(
     Args:
         reproduce: Folder that `mrctl reproduce --out` wrote.
         suite: Folder that `mrctl suite --out` wrote.
+        random: Folder that `mrctl suite --full --random 1000 --out` wrote, for its random worlds alone.
         held_out: Folder that `mrctl suite --held-out` wrote.
         tune: Folder that `mrctl tune --out` wrote.
         search: Folders that `mrctl tune --search` wrote, one for each entry.
@@ -78,6 +80,11 @@ def main(
             flag += f" --seeds {count}"
         text = suite_text(table, _text(suite / "table.md"))
         written["The uncertainty suite"] = _section(f"mrctl suite{flag}", table, text)
+    if random is not None:
+        table = _read(random / "table.json", "rows", "mode")
+        names, count = (list(dict.fromkeys(row[k] for row in _random(table))) for k in ("feedforward", "runs"))
+        flags = f"--{table['mode']} --feedforward {' '.join(names)} --random {max(count)}"
+        written["Random worlds"] = _section(f"mrctl suite {flags}", table, random_text(_text(random / "table.md")))
     if held_out is not None:
         table = _read(held_out / "table.json", "cells", "entry")
         text = held_out_text(_text(held_out / "table.md"), _text(held_out / LOG))
@@ -148,6 +155,19 @@ def suite_text(table: Table, everything: str) -> str:
     ]
     title = f"RMSE of the last lap ({table['mode']}), mean [95 % bootstrap interval]:"
     return "\n\n".join([says, title, short, *folded])
+
+
+def _random(table: Table) -> list[Mapping[str, Any]]:
+    """Returns the rows of the random worlds in a table of `mrctl suite`; refuses one that has none."""
+    rows = [row for row in table["rows"] if row["part"] == "random"]
+    if not rows:
+        raise InputError("random: the suite drove no random worlds")
+    return rows
+
+
+def random_text(everything: str) -> str:
+    """Returns the statement and the table of the random worlds from the content of a suite's `table.md`."""
+    return next(text for title, text in sections(everything).items() if title.startswith("Random"))
 
 
 def held_out_text(table: str, log: str) -> str:
