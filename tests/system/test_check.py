@@ -18,6 +18,11 @@ from mrctl.physics.files import models_folder
 from mrctl.physics.mjcf import load
 
 
+def messages(err):
+    """Lines on stderr that are not progress."""
+    return [line for line in err.replace("\r", "\n").splitlines() if not re.search("check/s|s/check|^$", line)]
+
+
 def wheel(side, attributes):
     """A rear wheel's contact geom with other attributes."""
     geom = f'<geom name="wheel_{side}" class="contact" '
@@ -225,7 +230,7 @@ def test_command(robot, capsys):
     out, err = capsys.readouterr()
     assert "cause: wrong gear; once repaired, V at its limit" in out
     assert "- wrong gear: gear 86" in out and "skipped, waits for limits" in out
-    said = [line for line in err.replace("\r", "\n").splitlines() if not re.search("check/s|s/check|^$", line)]
+    said = messages(err)
     assert said == [f"mrctl: {path}: 1 of {len(Examination.checks)} checks failed"]
     assert main(["check", path, "--json"]) == 1
     report = json.loads(capsys.readouterr().out)

@@ -191,7 +191,7 @@ def test_run_again(sweep, tmp_path, capsys):
     assert "run 14: departs: signal v is" in (line := refused(capsys, "run", store, "--run", 14, status=1))
     assert line.endswith("at t = 0.7 s, in the store 3.0")
     assert "run: 24 is not in 0 to 23" in refused(capsys, "run", store, "--run", 24)
-    assert "give the number of one of its runs with --run" in refused(capsys, "run", store)
+    assert "give its number with --run" in refused(capsys, "run", store)
     assert "not a sweep's store" in refused(capsys, "run", tmp_path, "--run", 1)
 
 
