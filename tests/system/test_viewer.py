@@ -256,11 +256,10 @@ def test_inputs(browser, tmp_path):
             page.mouse.move(thumb["x"] + 4 + 4 * k, thumb["y"] + 4)
             time.sleep(0.05)
         page.mouse.up()
-        until(lambda: live.session.saved()[0].events, "the slider's event")
-        time.sleep(1.0)
-        events = live.session.saved()[0].events  # one, unless the page takes its time
-        factor = live.session.state()["perturbation"].mass_factor
-        assert factor == pytest.approx(float(slider.get_attribute("aria-valuenow"))) and factor > 1.05
+        mass_factor = lambda: live.session.state()["perturbation"].mass_factor  # noqa: E731
+        shown = lambda: float(slider.get_attribute("aria-valuenow"))  # noqa: E731
+        until(lambda: mass_factor() > 1.05 and mass_factor() == pytest.approx(shown()), "the slider's last value")
+        factor, events = mass_factor(), live.session.saved()[0].events  # one event, unless the page takes its time
         live.ask(live._note_input, ("reference",), "stop_and_go")  # it reverses
         until(lambda: "reverses" in page.inner_text("#mrctl-message"), "the refusal, on whatever tab")
         page.get_by_role("tab", name="Controllers").click()
