@@ -19,8 +19,8 @@ class Contacts(NamedTuple):
     Attributes:
         places: Positions in the world in m, `(n, 3)`.
         forces: Forces of the world on the robot along the world's axes in N, `(n, 3)`.
-        slips: Velocities of the robot's surface along the other one, in the world in m/s, `(n, 3)`; those of a tyre
-            that rolls are zero.
+        slips: Velocities of the robot's surface along the other one, in the world in m/s, `(n, 3)`; a tyre
+            that rolls creeps at some mm/s.
     """
 
     places: Array

@@ -22,6 +22,11 @@ PUSH_HINT = "A drag from the first robot pushes all robots that way, a robot's l
 ENDINGS = "drive it", "as a loop", "cancel"  # of the drawing of a way
 
 
+def rounded(*values: float) -> list[float]:
+    """Returns numbers to two digits, as somebody would type them."""
+    return [float(f"{value:.2g}") for value in values]
+
+
 class Hands:
     """The inputs for the mouse in the scene, and what it does there.
 
@@ -36,7 +41,7 @@ class Hands:
         on: Callable[[Any, Callable[[Any], None]], None],
         ask: Callable[..., None],
         command: Callable[[str], None],
-        present: Callable[[], Session],
+        go_on: Callable[[], None],
         apply: Callable[..., None],
         head_for: Callable[[Pose], None],
         look_back: Callable[[float], None],
@@ -48,12 +53,12 @@ class Hands:
             on: Queues a function whenever a visitor uses an input.
             ask: Queues a function and its arguments.
             command: Plays or pauses.
-            present: Lets the session go on from the moment that is shown, and returns it.
+            go_on: Lets the session go on from the moment that is shown.
             apply: Applies an event, whose fields are the keywords.
             head_for: Sets a goal.
             look_back: Shows the session at an earlier time in s.
         """
-        self._ask, self._command, self._present = ask, command, present
+        self._ask, self._command, self._go_on = ask, command, go_on
         self._apply, self._head_for, self._look_back = apply, head_for, look_back
         gui = server.gui
         self._pushes = gui.add_checkbox("Push by dragging", False, hint=PUSH_HINT)
@@ -89,7 +94,7 @@ class Hands:
         self._command("pause")
 
     def _wait(self, what: Literal["goal", "way"], text: str) -> None:
-        self._session = self._present()
+        self._go_on()
         self.forget()
         self._waits, self._endings.visible = what, what == "way"
         self._show_grips()
@@ -145,7 +150,7 @@ class Hands:
         fx, fy = HARD * robot.mass * (end - self._scene.place(0)) / self._scene.length
         self.pull = None if phase == "end" else (float(fx), float(fy))
         if phase == "end":
-            self._apply(push=(*(float(f"{force:.2g}") for force in (fx, fy)), 0.0))
+            self._apply(push=(*rounded(fx, fy), 0.0))
 
     def click(self, origin: Array, direction: Array) -> None:
         """Takes a click, a ray from `origin` in m, `(3,)`: for a goal, for a way, or on a trail, to look back."""

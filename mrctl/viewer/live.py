@@ -31,7 +31,7 @@ from mrctl.theory.robot import Robot, RobotFile
 from mrctl.viewer.controls import WORLDS, Controls
 from mrctl.viewer.deviation import drawn
 from mrctl.viewer.embed import LONGEST
-from mrctl.viewer.hands import Hands
+from mrctl.viewer.hands import Hands, rounded
 from mrctl.viewer.looks import looks
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
 from mrctl.viewer.plots import Plots
@@ -90,8 +90,8 @@ def buttons(robot: Robot) -> dict[str, dict[str, dict[str, Any]]]:
     Payload and push are in proportion to the robot: the payload is half of its mass.
     """
     mass, half_track = robot.mass, robot.half_track
-    load = _rounded(mass / 2, robot.com_offset / 2, 0.32 * half_track, 5 / 3 * robot.com_height)
-    push, spin = _rounded(HARD * mass, 4 * mass * half_track)  # N and N·m
+    load = rounded(mass / 2, robot.com_offset / 2, 0.32 * half_track, 5 / 3 * robot.com_height)
+    push, spin = rounded(HARD * mass, 4 * mass * half_track)  # N and N·m
     return {
         "Payload": {
             "drop payload": dict(zip(("payload", "payload_x", "payload_y", "payload_z"), load, strict=True)),
@@ -101,11 +101,6 @@ def buttons(robot: Robot) -> dict[str, dict[str, dict[str, Any]]]:
         "Floor": {"slippery patch": {"tyre_friction_factor": 0.15}, "dry": {"tyre_friction_factor": 1.0}},
         "Push": {"push": {"push": (0.0, push, 0.0)}, "spin": {"push": (0.0, 0.0, spin)}},
     }
-
-
-def _rounded(*values: float) -> list[float]:
-    """Returns numbers to two digits, as somebody would type them."""
-    return [float(f"{value:.2g}") for value in values]
 
 
 class Live(Page):
@@ -166,7 +161,7 @@ class Live(Page):
                 group = gui.add_button_group(label, tuple(choices))
                 self.on(group, partial(self._press, label))
             self._hands = Hands(
-                self.server, self.on, self.ask, self._command, self._present_session, self._apply_event,
+                self.server, self.on, self.ask, self._command, self._go_on, self._apply_event,
                 self._head_for, self._look_back,
             )  # fmt: skip
             self._fan = gui.add_checkbox("Avoider", self.session.avoid != "none", hint=FAN_HINT)
@@ -302,11 +297,6 @@ class Live(Page):
         """Lets the session go on from where a visitor looks back to, as if nothing had happened since."""
         if self._back is not None:
             self._restart(self.session.start)
-
-    def _present_session(self) -> Session:
-        """Returns the session, which goes on from where a visitor looks back to."""
-        self._go_on()
-        return self.session
 
     def _tell(self, name: str) -> None:
         if name not in STORIES:

@@ -1,4 +1,4 @@
-"""Ten views of the page as pictures, for people to look at; in each of them the robot is in sight."""
+"""Ten views of the page as pictures, for people to look at; each has the robot, which a phone's panel may hide."""
 
 import pytest
 from test_viewer import (
@@ -31,7 +31,7 @@ FIRST = [Scenario(**FEEDFORWARDS[BEST]), Scenario(**FEEDFORWARDS["none"])]  # as
 
 
 def look(page, path, frame="window"):
-    """Takes a picture in which the first robot is between the panels, or on the whole of a small page."""
+    """Takes a picture; the first robot is between the panels, or anywhere on a small page, also below the panel."""
     until(lambda: node(page, ROBOT, frame) is not None, "the scene")
     page.wait_for_timeout(2000)  # the last pictures arrive
     if frame == "window":
