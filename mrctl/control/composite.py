@@ -6,7 +6,7 @@ A Kalman filter (`predict`) estimates the weights a and the disturbance d from t
 that followed, both low-passed; the tracking term (`track`) moves a by a share of the feedback voltage e:
 
     U_f = prior(x_f) + φ(x_f)ᵀ a + d + noise,      x_f = (V_f, V̇_f)
-    a ← a + P φ(x_c) · step · e / (φ(x_c)ᵀ P φ(x_c)),      x_c = commanded motion
+    a ← a + P φ(x_c) · step · e / (φ(x_c)ᵀ P φ(x_c)),      x_c = commanded motion that e answers (`matching.recall`)
 
 Slotine and Li (1989) combine the two errors; Neural-Fly (O'Connell et al. 2022) and MAGIC-VFM (Lupu et al. 2024) do so
 with a Kalman filter. The weights of cosine and sine of the heading are gravity on a slope of any direction.
@@ -37,6 +37,7 @@ from pydantic import Field
 
 from mrctl.control.features import INPUTS, feature_scale, features
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, explained
+from mrctl.control.matching import histories, recall
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
@@ -108,6 +109,8 @@ COMPOSITE = np.dtype(
         ("rate", "f8", CHANNELS),  # filtered acceleration, m/s² and rad/s²
         ("phi", "f8", FEATURES + 1),  # (φ, 1) at the filtered motion
         ("phi_c", "f8", FEATURES + 1),  # (φ, 1) at the command
+        ("tick", "i8"),  # number of ticks so far
+        ("past", "f8", FEATURES + 1),  # φ_c of the output that the feedback answers
         ("residual", "f8", CHANNELS),  # filtered voltage less the prior's, V
         # What is learned
         ("a", "f8", (CHANNELS, FEATURES + 1)),  # weights of φ and, last, the disturbance d, V
@@ -183,7 +186,7 @@ def predict(k: int, s: Row) -> None:
 def track(k: int, feedback: float, s: Row) -> None:
     """The tracking term of channel k moves φ_cᵀ a by `step` times the feedback voltage e, along P φ_c.
 
-        a ← a + P φ_c · step · e / (φ_cᵀ P φ_c),    φ_c = φ at the commanded motion; d is left out
+        a ← a + P φ_c · step · e / (φ_cᵀ P φ_c),    φ_c = φ at the command that e answers; d is left out
 
     Args:
         k: Channel.
@@ -192,7 +195,7 @@ def track(k: int, feedback: float, s: Row) -> None:
     """
     if not abs(feedback) > s.dead_zone[k]:
         return
-    a, P, phi, Pphi = s.a[k], s.P[k], s.phi_c, s.Pphi
+    a, P, phi, Pphi = s.a[k], s.P[k], s.past, s.Pphi
     for i in range(FEATURES):
         Pphi[i] = 0.0
     for j in range(FEATURES):
@@ -276,7 +279,7 @@ def filter_motion(command: Array, twist: Array, voltage: Array, period: float, r
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
     """U = φ(x_c)ᵀ a + d at the commanded motion x_c."""
-    rows, scale = arrays
+    rows, scale, _ = arrays
     s = rows[i]
     regressor(command, derivative, s.signals[4:], robot.half_track, scale, s.phi_c)
     for k in range(CHANNELS):
@@ -292,8 +295,10 @@ def learn(
 
     `added` leaves the disturbance out, so that the PID's integral keeps its part of it, as with `observer`.
     """
-    rows, scale = arrays
+    rows, scale, queue = arrays
     s = rows[i]
+    answered = recall(s.phi_c, s.tick, queue[i], s.past)
+    s.tick += 1
     filter_motion(command, twist, voltage, period, robot, s)
     added[0] = added[1] = 0.0
     moves = abs(s.twice[2]) + robot.half_track * abs(s.twice[3]) > SLOW
@@ -304,7 +309,8 @@ def learn(
             s.residual[k] = s.twice[k] - s.residual[k]
             added[k] = learned_voltage(s.a[k], s.phi_c)
             predict(k, s)
-            track(k, feedback[k], s)
+            if answered:
+                track(k, feedback[k], s)
         detect_change(period, s)
         for k in range(CHANNELS):
             added[k] = learned_voltage(s.a[k], s.phi_c) - added[k]
@@ -353,7 +359,9 @@ class CompositeAdaptation(Learner):
 
     respond, learn_one, learned = respond, learn, ("a", "P")
 
-    def __init__(self, robot: Robot, settings: list[Composite], rigid: bool, period: float, prior: bool = True) -> None:
+    def __init__(
+        self, robot: Robot, settings: list[Composite], rigid: bool, period: float, prior: bool = True, delay: int = 0
+    ) -> None:
         """Makes the learners.
 
         Args:
@@ -362,6 +370,7 @@ class CompositeAdaptation(Learner):
             rigid: Whether channel two is steering.
             period: Control period in s.
             prior: Whether a model is the prior; otherwise P₀ allows weights as large as those of a model.
+            delay: Delay from measurement to voltage in control periods.
         """
         super().__init__(robot, len(settings), rigid, period)
         scale = feature_scale(robot)
@@ -377,7 +386,7 @@ class CompositeAdaptation(Learner):
             row["scatter"] = SCATTER * unit * (1.0, robot.half_track)
             row["brief"], row["lasting"] = period / (period + BRIEF), period / (period + LASTING)
             row["filter"] = period / (period + s.filter)
-        self.arrays = rows, scale
+        self.arrays = rows, scale, histories(len(settings), delay, FEATURES + 1)
         self.restore(np.arange(len(settings)))
 
     @property
@@ -399,6 +408,6 @@ class CompositeAdaptation(Learner):
         self.weight_norm[rows] = 0.0
         for i in rows:
             s = self.rows[i]
-            s["a"], s["norm"], s["P"] = 0.0, 0.0, s["prior"]
+            s["a"], s["norm"], s["P"], s["tick"] = 0.0, 0.0, s["prior"], 0
             s["power"] = (s["noise"] ** 2 + s["scatter"] ** 2 * s["variance"])[:, None]
             s["since"] = SETTLED * self.period * (1 / s["filter"] - 1)

@@ -3,8 +3,10 @@
     U_ff = scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x),      Ẇ = γ (∂U_ff/∂W)ᵀ U_fb
 
 The feedback voltage U_fb is the teaching signal, so the network takes over the work that the feedback still does
-(Kawato, Furukawa and Suzuki 1987, Gomi and Kawato 1993). `update` is the normalised discrete step; `fel_torch` has the
-same law for any stateless torch module.
+(Kawato, Furukawa and Suzuki 1987, Gomi and Kawato 1993). `update` is the normalised discrete step. Its gradient is
+taken at the features of the output that the feedback answers, a few ticks ago (`matching.recall`); with those of the
+same tick, learning oscillates if the robot is light and its motors are strong. `fel_torch` has the same law for any
+stateless torch module.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from pydantic import Field
 
 from mrctl.control.features import INPUTS, OUTPUTS, feature_scale, features
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner
+from mrctl.control.matching import histories, recall
 from mrctl.control.weights import initial_weights, load_weights
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
@@ -63,6 +66,8 @@ FEL = np.dtype(
         ("bound", "f8"),  # largest ‖W − W₀‖
         ("x", "f8", INPUTS),  # scaled features of the commanded motion
         ("output", "f8", OUTPUTS),  # feedforward at x, V (rad/s)
+        ("tick", "i8"),  # number of ticks so far
+        ("past", "f8", INPUTS),  # x of the output that the feedback answers
         ("error", "f8", OUTPUTS),  # e: feedback in units of the network's output
         ("norm", "f8"),  # ‖W − W₀‖
     ],
@@ -171,15 +176,17 @@ def update(feedback: Array, s: Row, w: Array, initial: Array, hidden: Array, gra
 
         ΔW = μ Jᵀe / (‖Jᵀe‖²/‖e‖² + ε) − leak (W − W₀),    ‖W − W₀‖ ≤ bound
 
-    e is the scaled feedback, 0 in the dead zone, and J = ∂(output/scale)/∂W. With one output this is normalised LMS:
-    the feedforward at this input moves by about μ times the feedback, whatever the size of the regressor.
+    e is the scaled feedback, 0 in the dead zone, and J = ∂(output/scale)/∂W at the features that it answers. With one
+    output this is normalised LMS: the feedforward at that input moves by about μ times the feedback, whatever the size
+    of the regressor.
 
     Args:
         feedback: Feedback of the two channels in V (rad/s on a steering channel), `(2,)`.
-        s: In and out: a record of `FEL`, whose `x` and `output` are those of the last output.
+        s: In and out: a record of `FEL`, whose `x` and `output` are those of the last output, and `past` the features
+            that the feedback answers.
         w: In and out: flat weights W, `(n,)`.
         initial: Initial weights W₀, `(n,)`.
-        hidden: In and out: activations at `x`, `(units,)`.
+        hidden: Scratch, `(units,)`.
         gradient: Scratch, `(n,)`.
     """
     power = 0.0
@@ -188,7 +195,8 @@ def update(feedback: Array, s: Row, w: Array, initial: Array, hidden: Array, gra
         power += s.error[k] * s.error[k]
     if power == 0:
         return
-    backpropagate(s.x, w, hidden, s.error, gradient)
+    network(s.past, w, hidden, s.scale, s.output)
+    backpropagate(s.past, w, hidden, s.error, gradient)
     rate = s.step / (squared_norm(gradient) / power + REGULARISATION)
     distance = gradient  # from here on W − W₀, in the same memory
     for n in range(w.shape[0]):
@@ -205,7 +213,7 @@ def update(feedback: Array, s: Row, w: Array, initial: Array, hidden: Array, gra
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
     """U_ff of the network at the commanded motion, not at the measured one."""
-    rows, scale, weights, _, hidden, _ = arrays
+    rows, scale, weights, _, hidden, _, _ = arrays
     s = rows[i]
     features(command, derivative, robot.half_track, scale, s.x)
     network(s.x, weights[i], hidden[i], s.scale, s.output)
@@ -217,15 +225,17 @@ def learn(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
     prior: Row, arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
-    """One step of `update` on the features of the last output, unless the robot must not learn.
+    """One step of `update`, unless the robot must not learn.
 
     At the bound of the weights `added` is zero: the projection takes away elsewhere what the step adds here, so the
     PID's integral must not give up its share.
     """
-    rows, _, weights, initial, hidden, gradient = arrays
+    rows, _, weights, initial, hidden, gradient, queue = arrays
     s = rows[i]
     added[0] = added[1] = 0.0
-    if frozen == 0 and s.step > 0:
+    answered = recall(s.x, s.tick, queue[i], s.past)
+    s.tick += 1
+    if frozen == 0 and s.step > 0 and answered:
         before, before_second = s.output[0], s.output[1]
         update(feedback, s, weights[i], initial[i], hidden[i], gradient)
         if s.norm < s.bound:
@@ -244,7 +254,9 @@ class FeedbackErrorLearning(Learner):
 
     respond, learn_one = respond, learn
 
-    def __init__(self, robot: Robot, settings: list[Fel], seeds: list[int], rigid: bool, period: float) -> None:
+    def __init__(
+        self, robot: Robot, settings: list[Fel], seeds: list[int], rigid: bool, period: float, delay: int = 0
+    ) -> None:
         """Builds the networks.
 
         Args:
@@ -253,6 +265,7 @@ class FeedbackErrorLearning(Learner):
             seeds: Seed of the initial weights of each robot.
             rigid: Whether channel two is steering.
             period: Control period in s.
+            delay: Delay from measurement to voltage in control periods.
 
         Raises:
             InputError: A weights file is missing, broken or of another shape.
@@ -267,7 +280,8 @@ class FeedbackErrorLearning(Learner):
         self.weights = self.initial.copy()
         self.rows = fresh(settings, rigid)
         hidden, gradient = np.zeros((len(settings), settings[0].hidden)), np.zeros(self.initial.shape[1])
-        self.arrays = self.rows, feature_scale(robot), self.weights, self.initial, hidden, gradient
+        queue = histories(len(settings), delay, INPUTS)
+        self.arrays = self.rows, feature_scale(robot), self.weights, self.initial, hidden, gradient, queue
 
     def adapted(self) -> Array:
         """The weights, `(B, n)`."""
@@ -280,4 +294,4 @@ class FeedbackErrorLearning(Learner):
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to their initial weights."""
         self.weights[rows] = self.initial[rows]
-        self.rows["norm"][rows] = self.weight_norm[rows] = 0.0
+        self.rows["tick"][rows], self.rows["norm"][rows], self.weight_norm[rows] = 0, 0.0, 0.0

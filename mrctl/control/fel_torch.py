@@ -12,6 +12,7 @@ from torch.func import functional_call, stack_module_state, vjp, vmap
 
 from mrctl.control.features import INPUTS, OUTPUTS, feature_matrix, feature_scale
 from mrctl.control.fel import BIAS_GAIN, HIDDEN_GAIN, REGULARISATION, Fel, fresh
+from mrctl.control.matching import histories
 from mrctl.kernel import Array
 from mrctl.theory.robot import Robot
 
@@ -46,7 +47,13 @@ class ModuleLearning:
     """
 
     def __init__(
-        self, module: nn.Module, robot: Robot, size: int, settings: Fel | None = None, rigid: bool = False
+        self,
+        module: nn.Module,
+        robot: Robot,
+        size: int,
+        settings: Fel | None = None,
+        rigid: bool = False,
+        delay: int = 0,
     ) -> None:
         """Copies a module for B robots.
 
@@ -56,6 +63,7 @@ class ModuleLearning:
             size: Number of robots B.
             settings: Settings of `fel`; `hidden` and `weights` have no effect.
             rigid: Whether the second channel is steering.
+            delay: Delay from measurement to voltage in control periods; 0 in `ideal`, 1 in `lab` and 2 in `field`.
 
         Raises:
             ValueError: The module has buffers, or does not map 8 inputs to 2 outputs.
@@ -78,6 +86,7 @@ class ModuleLearning:
         )
         self._step, self._leak, self._bound = float(start["step"]), float(start["leak"]), float(start["bound"])
         self._features = np.zeros((size, INPUTS))
+        self._queue, self._tick = histories(size, delay, INPUTS), np.zeros(size, int)
         stacked, _ = stack_module_state([self._module] * size)
         self.prior = {name: value.detach().clone() for name, value in stacked.items()}
         self.state = {name: value.clone() for name, value in self.prior.items()}
@@ -87,25 +96,31 @@ class ModuleLearning:
         """Resets robots to the parameters of the module."""
         for name, value in self.state.items():
             value[rows] = self.prior[name][rows]
-        self.weight_norm[rows] = 0.0
+        self._tick[rows], self.weight_norm[rows] = 0, 0.0
 
-    def _forward(self, parameters: dict[str, torch.Tensor]) -> torch.Tensor:
-        x = torch.from_numpy(self._features)
+    def _forward(self, parameters: dict[str, torch.Tensor], features: Array) -> torch.Tensor:
+        x = torch.from_numpy(features)
         return vmap(lambda p, row: functional_call(self._module, p, (row,)))(parameters, x)
 
     def output(self, command: Array, derivative: Array) -> Array:
         """Returns the outputs of the modules at the commanded motion."""
-        self._features = feature_matrix(command, derivative, self._half_track, self._scale)
+        self._features = x = feature_matrix(command, derivative, self._half_track, self._scale)
         with torch.no_grad():
-            return (self._output_scale * (self._forward(self.state) - self._forward(self.prior))).numpy()
+            return (self._output_scale * (self._forward(self.state, x) - self._forward(self.prior, x))).numpy()
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
         """Does the step of `fel.update` for all robots, with Jᵀe by automatic differentiation."""
+        every, oldest = np.arange(len(self._tick)), self._tick % self._queue.shape[1]
+        answered = self._tick >= self._queue.shape[1]
+        past = self._queue[every, oldest]
+        self._queue[every, oldest] = self._features
+        self._tick += 1
         fb = torch.from_numpy(np.array(feedback))
         error = torch.where(fb.abs() > self._dead_zone, self._share * fb / self._output_scale, 0.0)
         power = (error**2).sum(1)
-        active = (power > 0) & (torch.from_numpy(np.array(saturated)) == 0) & bool(self._step > 0)
-        before, pull = vjp(self._forward, self.state)[:2]
+        allowed = torch.from_numpy(answered & (np.asarray(saturated) == 0) & (self._step > 0))
+        active = (power > 0) & allowed
+        pull = vjp(lambda state: self._forward(state, past), self.state)[1]
         (gradient,) = pull(error)
         square = _square(gradient)
         rate = torch.where(active, self._step / (square / power.clamp_min(1e-300) + REGULARISATION), 0.0)
@@ -116,12 +131,14 @@ class ModuleLearning:
         }
         distance = _square({name: moved[name] - self.prior[name] for name in moved}).sqrt()
         shrink = torch.where(active & (distance > self._bound), self._bound / distance.clamp_min(1e-300), 1.0)
+        with torch.no_grad():
+            before = self._forward(self.state, self._features)
         for name, value in moved.items():
             self.state[name] = self.prior[name] + (value - self.prior[name]) * _like(shrink, value)
         norm = torch.where(active, distance.clamp_max(self._bound), torch.from_numpy(self.weight_norm))
         self.weight_norm = norm.numpy()
         with torch.no_grad():
-            added = self._output_scale * (self._forward(self.state) - before)
+            added = self._output_scale * (self._forward(self.state, self._features) - before)
         return torch.where((norm >= self._bound)[:, None], 0.0, added).numpy()
 
 

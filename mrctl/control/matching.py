@@ -9,6 +9,14 @@ period. The controllers receive the motion predicted to the moment when the comi
 the period before, (x_n − x_(n−1))/h, is exactly what the voltage u_(n−1−d) made, together with all other forces. The
 latencies of the sensors, which an estimator bridges in the same way, are not matched, nor is the `control_delay` of a
 perturbation, which nobody knows.
+
+A law that is taught by the feedback voltage must know which output that voltage answers: `recall` returns the features
+of τ = (d + 2) h ago. With the loop L of PID and plant, what a learner adds to the feedforward changes the feedback by
+−T_a times that, T_a = ½ (1 + T) and T = L/(1 + L), since half of it leaves the PID's integral at once. A gradient step
+descends at the frequencies where Re [T_a e^(jωτ)] > 0 (Morgan 1980; by averaging: Anderson et al. 1986). For the
+nominal robot that holds without τ, too. But if the loop gain is twice the nominal one, as with a light robot or strong
+motors, T has a resonance at which Re T < −1, so that learning with the features of the same tick oscillates: at 80 to
+90 rad/s in `lab`, and about 50 in `field`. With those of τ ago the resonance is safe (`tests/unit/test_matching.py`).
 """
 
 from __future__ import annotations
@@ -17,6 +25,7 @@ import numpy as np
 
 from mrctl.kernel import Array, Row, kernel
 
+LAG = 2  # periods in addition to the delay until the feedback answers an output
 MATCHED = np.dtype(
     [
         ("tick", "i8"),  # number of control ticks so far
@@ -77,3 +86,28 @@ def low_pass(signal: float, k: int, share: float, once: Array, twice: Array) -> 
     """
     once[k] += share * (signal - once[k])
     twice[k] += share * (once[k] - twice[k])
+
+
+def histories(size: int, delay: int, width: int) -> Array:
+    """Returns empty queues for `recall`, `(B, delay + 2, width)`; the delay is in control periods."""
+    return np.zeros((size, delay + LAG, width))
+
+
+@kernel
+def recall(x: Array, tick: int, queue: Array, past: Array) -> bool:
+    """Writes the features that the feedback of this tick answers, and puts those of this tick in their place.
+
+    Args:
+        x: Features of the commanded motion of this tick, `(n,)`.
+        tick: Number of ticks so far.
+        queue: In and out: x of the last d + 2 ticks, `(d + 2, n)`.
+        past: Out: x of d + 2 ticks ago, `(n,)`.
+
+    Returns:
+        Whether there was one; in the first d + 2 ticks there was not.
+    """
+    oldest = tick % len(queue)
+    for j in range(len(x)):
+        past[j] = queue[oldest, j]
+        queue[oldest, j] = x[j]
+    return tick >= len(queue)

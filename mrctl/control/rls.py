@@ -10,6 +10,7 @@ from pydantic import Field
 
 from mrctl.control.features import feature_scale, features, linear
 from mrctl.control.feedforward import STEERING_SHARE, Learner
+from mrctl.control.matching import histories, recall
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot
@@ -22,6 +23,8 @@ RLS = np.dtype(
         ("dead_zone", "f8"),  # feedback below which nothing is learned, V (rad/s on a steering channel)
         ("share", "f8", 2),  # factor on the gain in the two channels; a steering channel learns more slowly
         ("x", "f8", 8),  # scaled features of the commanded motion
+        ("tick", "i8"),  # number of ticks so far
+        ("past", "f8", 8),  # x of the output that the feedback answers
         ("theta", "f8", (8, 2)),  # θ: coefficients of the features in the two channels, V
         ("P", "f8", (8, 8)),  # covariance of θ over the variance of the feedback
         ("gain", "f8", 8),  # P x
@@ -87,7 +90,7 @@ class Rls(Record):
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
     """U = θᵀ x at the commanded motion."""
-    rows, scale = arrays
+    rows, scale, _ = arrays
     features(command, derivative, robot.half_track, scale, rows[i].x)
     linear(rows[i].x, rows[i].theta, voltage)
 
@@ -97,12 +100,14 @@ def learn(
     i: int, command: Array, feedback: Array, frozen: float, twist: Array, voltage: Array, period: float, robot: Row,
     prior: Row, arrays: tuple[Any, ...], added: Array,
 ) -> float:  # fmt: skip
-    """One step of `update` on the features of the last output, unless the robot must not learn."""
+    """One step of `update` on the features of the output that the feedback answers, unless it must not learn."""
     s = arrays[0][i]
     linear(s.x, s.theta, added)
     before, before_second = added[0], added[1]
-    if frozen == 0:
-        update(s.x, feedback, s)
+    answered = recall(s.x, s.tick, arrays[2][i], s.past)
+    s.tick += 1
+    if frozen == 0 and answered:
+        update(s.past, feedback, s)
         linear(s.x, s.theta, added)
     added[0] -= before
     added[1] -= before_second
@@ -118,8 +123,16 @@ class RecursiveLeastSquares(Learner):
 
     respond, learn_one, learned = respond, learn, ("theta", "P")
 
-    def __init__(self, robot: Robot, settings: list[Rls], rigid: bool, period: float) -> None:
-        """Takes the nominal robot, the settings of each robot, whether channel two is steering, and the period in s."""
+    def __init__(self, robot: Robot, settings: list[Rls], rigid: bool, period: float, delay: int = 0) -> None:
+        """Makes the learners.
+
+        Args:
+            robot: The nominal robot.
+            settings: Settings of each robot.
+            rigid: Whether channel two is steering.
+            period: Control period in s.
+            delay: Delay from measurement to voltage in control periods.
+        """
         super().__init__(robot, len(settings), rigid, period)
         self.rows = rows = np.zeros(len(settings), RLS)
         rows["step"], rows["drift"] = [s.step for s in settings], [s.drift for s in settings]
@@ -127,7 +140,7 @@ class RecursiveLeastSquares(Learner):
         rows["share"] = 1.0, STEERING_SHARE if rigid else 1.0
         self._covariance = np.array([s.initial_covariance * np.eye(8) for s in settings])
         rows["P"] = self._covariance
-        self.arrays = rows, feature_scale(robot)
+        self.arrays = rows, feature_scale(robot), histories(len(settings), delay, 8)
 
     @property
     def parameters(self) -> Array:
@@ -137,4 +150,4 @@ class RecursiveLeastSquares(Learner):
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to zero coefficients and the initial covariance."""
         self.rows["theta"][rows], self.rows["norm"][rows], self.weight_norm[rows] = 0.0, 0.0, 0.0
-        self.rows["P"][rows] = self._covariance[rows]
+        self.rows["tick"][rows], self.rows["P"][rows] = 0, self._covariance[rows]

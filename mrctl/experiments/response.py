@@ -2,8 +2,9 @@
 
 Feedback-error learning lowers U_fb by adding to U_ff, so it depends on the response of U_fb to U_ff:
 ∂U_fb/∂U_ff = −T with T = L/(1 + L), where L is the loop opened at the voltage. Learning converges at frequencies where
-Re T(jω) > 0, whatever the regressor (Gomi and Kawato 1993). T is measured in the complete loop by a feedforward that
-does not learn and adds a multisine to the voltage.
+Re T(jω) > 0, whatever the regressor (Gomi and Kawato 1993), and with the regressor of τ ago where Re [T e^(jωτ)] > 0
+(Morgan 1980). T is measured in the complete loop by a feedforward that does not learn and adds a multisine to the
+voltage.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from mrctl.control.feedforward import STEERING_SCALE
 from mrctl.control.guard import Guard
+from mrctl.control.matching import LAG
 from mrctl.loop.hierarchy import TAKE_OVER
 from mrctl.loop.simulation import Simulation, arranged
 from mrctl.record import InputError
@@ -136,37 +138,47 @@ class Safety(NamedTuple):
 
     With a constant regressor a learner of normalised step μ is an integrator, U_ff(k + 1) = U_ff(k) + μ U_fb(k), in a
     loop with T. If a share a of what it adds is taken from the PID's integral, as `Hierarchy` does, T is replaced by
-    a + (1 − a) T; the condition is then Re T > −a/(1 − a).
+    T_a = a + (1 − a) T. The built-in learners also use the regressor of τ ago (`mrctl.control.matching.recall`).
 
     Attributes:
         positive_to: Frequency in rad/s up to which Re T(jω) > 0; infinite if Re T is positive everywhere.
         lowest: Least Re T.
+        built_in_to: The same frequency for Re [T_a e^(jωτ)], the condition of the built-in learners.
         step: Largest μ at which the loop is stable without this hand-over.
         step_handed_over: Largest μ at which the loop is stable with the hand-over.
     """
 
     positive_to: float
     lowest: float
+    built_in_to: float
     step: float
     step_handed_over: float
 
 
-def safety(frequency: Array, response: Response, period: float) -> Safety:
+def safety(frequency: Array, response: Response, period: float, delay: float = 0.0) -> Safety:
     """Computes the frequencies and steps at which learning is safe, from T on a fine grid.
 
     Args:
         frequency: ω in rad/s, `(F,)`.
         response: T, `(F,)`.
-        period: Control period in s.
+        period: Control period h in s.
+        delay: Delay d of the loop in s that the learner knows; τ = d + 2 h.
     """
-    negative = np.flatnonzero(response.real <= 0)
     handed_over = TAKE_OVER + (1 - TAKE_OVER) * response
+    early = np.exp(1j * frequency * (delay + LAG * period))
     return Safety(
-        positive_to=float(frequency[negative[0]]) if negative.size else float("inf"),
+        positive_to=_positive_to(frequency, response),
         lowest=float(response.real.min()),
+        built_in_to=_positive_to(frequency, handed_over * early),
         step=_largest_step(frequency, response, period),
         step_handed_over=_largest_step(frequency, handed_over, period),
     )
+
+
+def _positive_to(frequency: Array, response: Response) -> float:
+    """Returns the lowest frequency at which the real part is not positive, or infinity."""
+    negative = np.flatnonzero(response.real <= 0)
+    return float(frequency[negative[0]]) if negative.size else float("inf")
 
 
 def _largest_step(frequency: Array, response: Response, period: float) -> float:

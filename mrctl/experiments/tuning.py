@@ -18,7 +18,6 @@ from mrctl.control.margins import learning_ratio, margins, sampled_loop
 from mrctl.control.pid import Pid
 from mrctl.experiments.response import Array, Response, measure, refine, safety
 from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder
-from mrctl.loop.hierarchy import TAKE_OVER
 from mrctl.physics import mjcf
 from mrctl.record import InputError
 from mrctl.results import plots
@@ -39,7 +38,12 @@ MARGINS = {
     "gain": "gain margin",
     "sensitivity": "max \\|S\\|",
 }
-SAFETY = {"positive_to": "Re T > 0 to, rad/s", "lowest": "least Re T", "step": "largest step"}
+SAFETY = {
+    "positive_to": "Re T > 0 to, rad/s",
+    "lowest": "least Re T",
+    "built_in_to": "built-in learners to, rad/s",
+    "step": "largest step",
+}
 GAINS = ("plant gain", "plant lag, s", "K_p", "K_i", "learning ratio")
 UNITS = """\
 Units: common m/s, V/(m/s), V/m; second rad/s, V/(rad/s), V/rad; of rigid steering 1, 1, 1/s. Learning without delay and
@@ -48,9 +52,10 @@ MOTION = (
     *("steering", "delay, ms", "lag of V, ms", "lag of θ̇, ms", "prefilter, ms"),
     *("K_x, 1/s", "K_y, 1/m²", "K_θ, 1/m"),
 )
-ADVICE = f"""\
-Learning by feedback error is safe at frequencies where Re T > 0; with the hand-over of the built-in learners, where
-Re T > {-TAKE_OVER / (1 - TAKE_OVER):g}. Both hold for commands that do not depend on the motion of the robot; a fast
+ADVICE = """\
+A learner that the feedback voltage teaches is safe at frequencies where Re T > 0. The built-in ones take half of what
+they add out of the PID's integral, the hand-over, and learn at the features of τ ago, the delay and two periods: they
+are safe where Re [(1 + T) e^(jωτ)] > 0. Both hold for commands that do not depend on the motion of the robot; a fast
 motion controller behind a delay narrows them. Above the largest step a learner of one constant oscillates without
 hand-over: choose at most half of it."""
 
@@ -140,7 +145,7 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
                 row = {"steering": steering, "channel": channel, "delay": delay}
                 made = {"static_gain": plant.gain, "plant_lag": plant.lag, **gains[k][channel]._asdict()}
                 made["ratio"] = learning_ratio(plant.gain, plant.lag, gains[k][channel])
-                judged = {name: _judge(frequency, t[name], period) for name in RESPONSES}
+                judged = {name: _judge(frequency, t[name], period, delay) for name in RESPONSES}
                 table["loops"].append(row | made | judged)
                 table["responses"].append(row | {name: _parts(one) for name, one in t.items()})
             table["frequency"] = frequency.tolist()
@@ -151,9 +156,9 @@ def _parts(response: Response) -> dict[str, list[float]]:
     return {"real": response.real.tolist(), "imaginary": response.imag.tolist()}
 
 
-def _judge(frequency: Array, response: Response, period: float) -> dict[str, float]:
+def _judge(frequency: Array, response: Response, period: float, delay: float) -> dict[str, float]:
     fine, t = refine(frequency, response)
-    return margins(fine, t / (1 - t))._asdict() | safety(fine, t, period)._asdict()
+    return margins(fine, t / (1 - t))._asdict() | safety(fine, t, period, delay)._asdict()
 
 
 def text(table: dict[str, Any]) -> str:

@@ -190,12 +190,12 @@ def learner_of(scenarios: Sequence[Scenario], robot: Robot) -> Learner:
             return ModelReferenceAdaptive(robot, [s.mrac for s in scenarios], rigid, period, delay)
         case "composite":
             settings = [s.composite for s in scenarios]
-            return CompositeAdaptation(robot, settings, rigid, period, prior=first.prior != "none")
+            return CompositeAdaptation(robot, settings, rigid, period, prior=first.prior != "none", delay=delay)
         case "rls":
-            return RecursiveLeastSquares(robot, [s.rls for s in scenarios], rigid, period)
+            return RecursiveLeastSquares(robot, [s.rls for s in scenarios], rigid, period, delay)
         case "fel":
             seeds = [s.seed for s in scenarios]
-            return FeedbackErrorLearning(robot, [s.fel for s in scenarios], seeds, rigid, period)
+            return FeedbackErrorLearning(robot, [s.fel for s in scenarios], seeds, rigid, period, delay)
 
 
 class Hierarchy:

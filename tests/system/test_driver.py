@@ -42,12 +42,12 @@ def limited(feedforward, amperes, period, laps, seeds, told, guard=False):
 
 
 def test_least_squares_under_a_limit():
-    """3 A are too few for the first lap of `rls`. Not told, it learns from voltages that never acted, and is lost."""
-    untold, _ = limited("rls", 3.0, 10.0, 4, range(5), told=False)
+    """2.2 A are too few for the first lap of `rls`. Not told, it learns from voltages that never acted, and is lost."""
+    untold, _ = limited("rls", 2.2, 10.0, 4, range(5), told=False)
     assert untold.max() > 15
-    told, _ = limited("rls", 3.0, 10.0, 4, range(5), told=True)
+    told, _ = limited("rls", 2.2, 10.0, 4, range(5), told=True)
     assert told.max() < 1.5
-    _, guarded = limited("rls", 3.0, 10.0, 4, range(5), told=True, guard=True)
+    _, guarded = limited("rls", 2.2, 10.0, 4, range(5), told=True, guard=True)
     assert guarded.max() < 0.05
 
 

@@ -28,6 +28,7 @@ from mrctl.sensing.tiers import Sensing
 OFF = Guard(on=False)
 ERRORS = ("position_rmse", "v_rmse", "omega_rmse")
 DELAYED = Scenario(**IDEAL, reference=Lemniscate(period=12.0), laps=4, perturbation=Perturbation(control_delay=0.04))
+LATE = DELAYED.model_copy(update={"perturbation": Perturbation(control_delay=0.06)})
 
 
 def fast(times):
@@ -54,7 +55,7 @@ def same(one, other):
 
 @pytest.mark.parametrize(
     ("steering", "name", "delay", "times"),
-    [("compliant", "rls", 0.06, 10), ("caster", "rls", 0.04, 25), ("rigid", "fel", 0.04, 10)],
+    [("compliant", "rls", 0.06, 25), ("caster", "fel", 0.06, 10), ("rigid", "rls", 0.06, 15)],
 )
 def test_too_fast(steering, name, delay, times):
     """Delay and many times the learning rate: without the guard it shakes the robot, with it it tracks."""
@@ -93,7 +94,7 @@ def test_silent():
 
 def test_batch():
     """A guard that acts in one row does what it does alone, and nothing to the others."""
-    hasty = of(DELAYED, "fel", Guard(), steering="rigid", laps=1, **FAST)
+    hasty = of(LATE, "fel", Guard(), steering="rigid", laps=1, **FAST)
     calm = of(hasty, "fel", Guard(), fel=Fel(step=0.02), seed=3)
     together = simulate([calm, hasty, calm])
     alone = simulate(hasty)
@@ -142,7 +143,7 @@ def test_own_stage():
 
 def test_told():
     """A run says how often and why."""
-    fast = of(DELAYED, "fel", Guard(), steering="rigid", laps=1, **FAST)
+    fast = of(LATE, "fel", Guard(), steering="rigid", laps=1, **FAST)
     text, _ = single.run(fast, None, False)
     assert "guard acted" in text and re.search(r"guard at \d\.\d\d s: fallback, velocity far from the command", text)
     listed = json.loads(single.run(fast, None, True)[0])

@@ -113,6 +113,10 @@ def test_safety_of_a_known_loop():
     assert found.step == pytest.approx(step, rel=1e-3)
     assert found.step_handed_over > 10 * found.step
     assert safety(w, 1 / (1j * w * closed + 1), H).positive_to == np.inf
+    # (1 + T) e^(jωτ), τ = T_d + 2 h: the first turns back by its phase, the second forth.
+    known = safety(w, t, H, delay).built_in_to
+    turned = np.angle((1 + np.exp(-1j * known * delay) / (1j * known * closed + 1)) / 2) + known * (delay + 2 * H)
+    assert turned == pytest.approx(np.pi / 2, abs=1e-3)
 
 
 def test_hand_over_turns_the_condition():

@@ -56,7 +56,7 @@ def channel(variance, forgetting, noise, step=0.0, dead_zone=0.0):
 
 def adapt(k, x, residual, command, feedback, s):
     """One composite step of one channel at these features of measured and commanded motion."""
-    s["phi"], s["phi_c"], s["residual"][k] = np.append(x, 1), np.append(command, 1), residual
+    s["phi"], s["past"], s["residual"][k] = np.append(x, 1), np.append(command, 1), residual
     predict(k, s)
     track(k, feedback, s)
 

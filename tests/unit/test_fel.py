@@ -25,6 +25,7 @@ from mrctl.control.fel import (
     update,
 )
 from mrctl.control.fel_torch import Network
+from mrctl.control.matching import LAG
 from mrctl.control.weights import flatten, initial_weights, load_weights, save_weights, shapes, unflatten
 from mrctl.record import InputError
 
@@ -56,7 +57,7 @@ def one_step(x, feedback, weights, rigid=False, prior=None, **settings):
     """Weights and norm after one step of one robot, without leak and far within the bound by default."""
     s = fresh([Fel(**{"step": 0.05, "leak": 0.0, "weight_bound": 1e4} | settings)], rigid)[0]
     after, hidden = weights.copy(), np.zeros(HIDDEN)
-    s["x"] = x
+    s["x"] = s["past"] = x
     network(s["x"], after, hidden, s["scale"], s["output"])
     update(np.array(feedback, float), s, after, weights if prior is None else prior, hidden, np.zeros(len(weights)))
     return after, float(s["norm"])
@@ -69,10 +70,14 @@ def teach(stage, feedback, frozen=0.0):
 
 
 def taught(robot, settings=None, rigid=False, size=1):
-    """A stage with a command and its derivative."""
+    """A stage that has driven one motion for as long as feedback takes to answer, with its command and derivative."""
     stage = FeedbackErrorLearning(robot, [settings or Fel(hidden=HIDDEN)] * size, list(range(size)), rigid, PERIOD)
     command = RNG.uniform([-1.5, -3], [1.5, 3], (size, 2))
     derivative = RNG.uniform([-1.5, -6], [1.5, 6], (size, 2))
+    for _ in range(LAG):
+        stage.output(command, derivative)
+        teach(stage, np.ones((size, 2)))
+    assert not stage.weight_norm.any()
     return stage, command, derivative
 
 
@@ -136,15 +141,16 @@ def test_normalised_step(robot, rigid, feedback):
 
 
 def test_learns(robot):
-    """Taught by what is missing to an inverse, the network finds it."""
+    """Taught by what was missing to an inverse two periods ago, the network finds it."""
     stage = FeedbackErrorLearning(robot, [Fel(step=0.2, dead_zone=0.0)] * 8, list(range(8)), False, PERIOD)
     gains = np.array([[6.0, 1.0, 3.0, 0.5, -1.0, 0.4, 1.0, 1.0], [0.2, 5.0, 0.1, 4.0, 2.0, 0.0, -1.0, 1.0]]).T
-    rng, missing = np.random.default_rng(0), []
+    rng, missing, late = np.random.default_rng(0), [], [np.zeros((8, 2))] * LAG
     for _ in range(600):
         command, derivative = rng.uniform([0.2, -2], [1.2, 2], (8, 2)), rng.uniform([-1, -4], [1, 4], (8, 2))
         given = stage.output(command, derivative)
         error = feature_matrix(command, derivative, robot.half_track, feature_scale(robot)) @ gains - given
-        teach(stage, error)
+        late.append(error)
+        teach(stage, late.pop(0))
         missing.append(np.sqrt((error**2).mean()))
     assert np.mean(missing[-50:]) < 0.1 * np.mean(missing[:5])
 
@@ -226,7 +232,10 @@ def test_rows(robot, motion, feedback, data):
     def after(rows, lost=()):
         command, derivative = motion[:, rows].copy()
         command[list(lost)] = np.nan
-        stage, _, _ = taught(robot, settings, size=len(command))
+        stage = FeedbackErrorLearning(robot, [settings] * len(command), [0] * len(command), False, PERIOD)
+        for _ in range(LAG):
+            stage.output(command, derivative)
+            teach(stage, feedback[rows])
         stage.initial[:], stage.weights[:] = prior[rows], prior[rows] + 0.01
         output = stage.output(command, derivative).copy()
         added = teach(stage, feedback[rows], frozen[rows])

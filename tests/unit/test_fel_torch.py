@@ -7,6 +7,7 @@ from torch import nn
 
 from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.fel_torch import ModuleLearning, Network
+from mrctl.control.matching import LAG
 from mrctl.control.weights import flatten, initial_weights, unflatten
 
 HIDDEN, SIZE, PERIOD = 5, 3, 0.01
@@ -45,10 +46,13 @@ def test_twins(robot, settings, rigid, ticks):
     rng = np.random.default_rng(2)
     module = Network(HIDDEN)
     module.load_state_dict({k: torch.tensor(v) for k, v in unflatten(initial_weights(HIDDEN, 4)).items()})
-    compiled = FeedbackErrorLearning(robot, [settings] * SIZE, [4] * SIZE, rigid, PERIOD)
-    general = ModuleLearning(module, robot, SIZE, settings, rigid)
+    compiled = FeedbackErrorLearning(robot, [settings] * SIZE, [4] * SIZE, rigid, PERIOD, delay=2)
+    general = ModuleLearning(module, robot, SIZE, settings, rigid, delay=2)
     largest = 0.0
-    for _ in range(ticks):
+    for tick in range(ticks):
+        if tick == ticks // 2:  # the guard, or an environment, resets one robot
+            for stage in (compiled, general):
+                stage.restore(np.array([1]))
         command, derivative = draw(rng, SIZE)
         found, expected = general.output(command, derivative), compiled.output(command, derivative)
         np.testing.assert_allclose(found, expected, atol=1e-12)
@@ -86,15 +90,16 @@ def test_any_module(robot):
     module = nn.Sequential(nn.Linear(8, 16), nn.GELU(), nn.Linear(16, 16), nn.GELU(), nn.Linear(16, 2))
     before = {name: value.clone() for name, value in module.state_dict().items()}
     stage = ModuleLearning(module, robot, 8, Fel(step=0.3, dead_zone=0.0, weight_bound=100.0))
-    rng, missing = np.random.default_rng(0), []
-    for tick in range(500):
+    rng, missing, late = np.random.default_rng(0), [], [np.zeros((8, 2))] * LAG
+    for tick in range(700):
         command, derivative = draw(rng, 8)
         given = stage.output(command, derivative)
         if tick == 0:
             np.testing.assert_array_equal(given, np.zeros((8, 2)))
         target = np.stack([5 * command[:, 0] + derivative[:, 0], 2 * command[:, 1] - 0.3 * derivative[:, 1]], -1)
         missing.append(np.sqrt(((target - given) ** 2).mean()))
-        teach(stage, target - given, np.zeros(8))
+        late.append(target - given)
+        teach(stage, late.pop(0), np.zeros(8))
     assert np.mean(missing[-50:]) < 0.2 * np.mean(missing[:5])
     for name, value in module.state_dict().items():
         assert value.dtype == torch.float32

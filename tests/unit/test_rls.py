@@ -8,6 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from mrctl.control.features import feature_matrix, feature_scale
 from mrctl.control.feedforward import Prior
+from mrctl.control.matching import LAG
 from mrctl.control.rls import RLS, RecursiveLeastSquares, Rls, update
 from mrctl.theory.dynamics import inverse_coefficients
 
@@ -38,6 +39,15 @@ def learn(stage, feedback, saturated=0.0):
     return stage.learn(np.asarray(feedback, float), np.broadcast_to(saturated, len(feedback)), unused, unused)
 
 
+def drive(stage, command, derivative):
+    """The stage after it has driven one motion for as long as feedback takes to answer."""
+    for _ in range(LAG):
+        stage.output(command, derivative)
+        learn(stage, np.ones_like(command))
+    assert not stage.weight_norm.any()
+    return stage
+
+
 @given(numbers(8), numbers(8, 8, bound=1.0), numbers(8, 2), numbers(2), st.floats(0, 0.1), st.floats(0.05, 1))
 def test_kalman(x, root, coefficients, feedback, drift, step_size):
     """One step is the Kalman filter of a random walk: K = P x/(R + xᵀP x), θ + K e, (I − K xᵀ) P + Q.
@@ -66,10 +76,13 @@ def test_learns_physics(robot):
     teacher = Prior([robot] * 2, rigid=False)
     eager = Rls(step=1, initial_covariance=1000, drift=0, covariance_bound=1e-9, dead_zone=0)
     pupil = RecursiveLeastSquares(robot, [eager] * 2, rigid=False, period=PERIOD)
-    first = None
+    scale, first, driven = feature_scale(robot), None, []
     for _ in range(200):
-        command, derivative = draw(2)
-        missing = teacher.output(command, derivative) - pupil.output(command, derivative)
+        driven.append(draw(2))
+        pupil.output(*driven[-1])
+        answered = driven[-LAG - 1] if len(driven) > LAG else driven[0]
+        x = feature_matrix(*answered, robot.half_track, scale)
+        missing = teacher.output(*answered) - np.einsum("bi,bik->bk", x, pupil.rows["theta"])
         first = np.abs(missing).max() if first is None else first
         learn(pupil, missing)
     assert first > 1
@@ -93,7 +106,8 @@ def test_frozen(robot, feedback, saturated):
     """A voltage that did not act, or feedback within the dead zone, teaches nothing."""
     settings = Rls(step=0.05, initial_covariance=0.05, drift=1e-3, covariance_bound=0.5, dead_zone=0.02)
     stage, coefficients = RecursiveLeastSquares(robot, [settings], False, PERIOD), RNG.normal(size=(8, 2))
-    stage.rows["x"], stage.rows["theta"] = 1.0, coefficients
+    drive(stage, *draw(1))
+    stage.rows["theta"] = coefficients
     assert not learn(stage, [feedback], saturated).any()
     np.testing.assert_array_equal(stage.rows["theta"][0], coefficients)
     np.testing.assert_array_equal(stage.rows["P"][0], 0.05 * np.eye(8))
@@ -113,7 +127,7 @@ def test_steering_learns_slower(robot):
     found = []
     command, derivative = draw(1)
     for rigid in (False, True):
-        stage = RecursiveLeastSquares(robot, [Rls()], rigid, PERIOD)
+        stage = drive(RecursiveLeastSquares(robot, [Rls()], rigid, PERIOD), command, derivative)
         stage.output(command, derivative)
         learn(stage, [[1.0, 2.0]])
         found.append(stage.output(command, derivative)[0])
@@ -125,7 +139,7 @@ def test_steering_learns_slower(robot):
 def test_step(robot, command, derivative, share, initial):
     """However uncertain it is, one step moves the feedforward by no more than its share of the feedback."""
     stage = RecursiveLeastSquares(robot, [Rls(step=share, initial_covariance=initial)], False, PERIOD)
-    stage.output(command, derivative)
+    drive(stage, command, derivative).output(command, derivative)
     learn(stage, [[4.0, -2.0]])
     moved = stage.output(command, derivative)[0] / [4, -2]
     assert (moved >= 0).all()
