@@ -6,6 +6,7 @@ import contextlib
 import inspect
 import json
 import stat
+import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -84,11 +85,15 @@ class Record(BaseModel):
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Adds the fields to the docstring of the class, so that `help` explains them."""
+        """Makes one line of each field's docstring, and adds them to that of the class, so that `help` explains them."""
         super().__pydantic_init_subclass__(**kwargs)
-        described = {name: field.description for name, field in cls.model_fields.items() if field.description}
-        if described and cls.__doc__:
-            lines = (f"    {name}: {text}".replace("\n", "\n        ") for name, text in described.items())
+        lines = []
+        for name, field in cls.model_fields.items():
+            if field.description:
+                field.description = " ".join(field.description.split())
+                text = f"{name}: {field.description}"
+                lines.append(textwrap.fill(text, 112, initial_indent=4 * " ", subsequent_indent=8 * " "))
+        if lines and cls.__doc__:
             cls.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__), "", "Attributes:", *lines])
 
     @model_validator(mode="before")

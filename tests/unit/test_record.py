@@ -134,9 +134,11 @@ def test_field_docs():
         """A record."""
 
         rate: float = 1.0
-        """Turns per second."""
+        """Turns per second, of a wheel
+        that rolls."""
 
-    assert Documented.model_fields["rate"].description == "Turns per second."
+    assert Documented.model_fields["rate"].description == "Turns per second, of a wheel that rolls."
+    assert "rate: Turns per second, of a wheel that rolls." in Documented.__doc__
 
 
 def public_records():
