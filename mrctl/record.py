@@ -85,7 +85,7 @@ class Record(BaseModel):
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Makes one line of each field's docstring, and adds them to that of the class, so that `help` explains them."""
+        """Makes each field's docstring one line and adds it to that of the class, so that `help` explains the field."""
         super().__pydantic_init_subclass__(**kwargs)
         lines = []
         for name, field in cls.model_fields.items():
