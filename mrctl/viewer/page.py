@@ -73,6 +73,8 @@ class Page(ABC):
         @server.on_client_connect
         async def _(client: viser.ClientHandle) -> None:
             client.camera.on_update(self._keep_above)
+            if client.camera.aspect < 1:
+                self.ask(self._place_camera, client, CAMERAS[0])
 
     async def _keep_above(self, camera: viser.CameraHandle) -> None:
         """Keeps a visitor's camera above the floor."""
@@ -97,7 +99,7 @@ class Page(ABC):
         if name == "chase":
             self._chasing[client.client_id] = client
             return self.chase()
-        client.camera.position, client.camera.look_at = self._scene.camera(name == "top")
+        self._scene.turn(client, *self._scene.camera(name == "top"))
 
     def chase(self) -> None:
         """Moves the cameras of visitors who chase the first robot."""
@@ -107,7 +109,7 @@ class Page(ABC):
                 del self._chasing[number]
                 continue
             with client.atomic():
-                client.camera.position, client.camera.look_at = self._scene.behind()
+                self._scene.turn(client, *self._scene.behind())
 
     @property
     def message(self) -> str:

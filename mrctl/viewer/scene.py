@@ -35,7 +35,7 @@ from mrctl.viewer.looks import Colour, Look, pale
 from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, path
 from mrctl.viewer.sensors import Marks, outline
 from mrctl.viewer.server import Server
-from mrctl.viewer.shapes import bar, disc, ribbons
+from mrctl.viewer.shapes import bar, disc, lowered, ribbons
 
 Array = NDArray[np.float64]
 EVENT_COLOUR: Colour = (217, 119, 6)
@@ -334,8 +334,13 @@ class Scene:
             return
         initial.position, initial.look_at = position, target
         for client in self._server.get_clients().values():
-            client.camera.position = position
-            client.camera.look_at = target
+            self.turn(client, position, target)
+
+    def turn(self, client: viser.ClientHandle, position: Array, target: Array) -> None:
+        """Places a visitor's camera, in m, `(3,)` each; a narrow page shows the target above its panel."""
+        if client.camera.aspect < 1:
+            position, target = lowered(position, target, client.camera.fov)
+        client.camera.position, client.camera.look_at = position, target
 
     def camera(self, top: bool) -> tuple[Array, Array]:
         """Returns the position of a camera that sees the whole reference, and what it looks at, in m, `(3,)` each."""

@@ -49,3 +49,20 @@ def bar(start: Array, end: Array, thickness: float) -> Mesh:
     low, high = np.minimum(start, end) - across, np.maximum(start, end) + across
     shape = trimesh.creation.box(bounds=[low, high])
     return shape.vertices.astype(np.float32), shape.faces.astype(np.uint32)
+
+
+def lowered(position: Array, target: Array, fov: float) -> tuple[Array, Array]:
+    """Returns a camera that sees its target a quarter of the picture above the middle, with what it looks at, in m.
+
+    It looks lower, or moves if it would then look beyond straight down.
+
+    Args:
+        position: Position of the camera in m, `(3,)`.
+        target: What it looked at, in m, not straight below it, `(3,)`.
+        fov: Angle in rad that the picture is high.
+    """
+    forward = target - position
+    up = np.cross(np.cross(forward, [0.0, 0.0, 1.0]), forward)
+    shift = -up / np.linalg.norm(up) * np.linalg.norm(forward) * np.tan(fov / 2) / 2
+    below = (forward + shift)[:2] @ forward[:2] > 0
+    return position if below else position + shift, target + shift

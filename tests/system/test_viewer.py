@@ -229,6 +229,9 @@ def test_live(browser, tmp_path):
         until(lambda: (box := button.bounding_box()) and box["height"] >= 44, "a button for a finger")
         boxes = [box.bounding_box() for box in page.locator("input[type=checkbox]").all() if box.is_visible()]
         assert len(boxes) > 2 and all(min(box["width"], box["height"]) >= 44 for box in boxes)
+        page.get_by_role("button", name="overview", exact=True).click()
+        middle = lambda: page.evaluate(WORLD_TO_SCREEN, [0, 0.8, 0])  # noqa: E731 (of the circle that is driven)
+        until(lambda: np.allclose(middle(), [390 / 2, 844 / 4], atol=30), "the circle above the panel")
         page.screenshot(path=tmp_path / "phone.png", timeout=PATIENCE)
         page.set_viewport_size({"width": 1280, "height": 800})
         page.get_by_text("reset", exact=True).click()
