@@ -178,3 +178,88 @@ def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float =
     lateral = min(damped, reached, PUBLISHED_K_THETA / 2)
     k_x = min(float(1 / (4 * DAMPING**2 * (v_lag + prefilter))), (robot.max_acceleration / ERROR) ** 0.5, PUBLISHED_K_X)
     return Motion(Kanayama(k_x=k_x, k_y=lateral**2, k_theta=2 * lateral), prefilter, (v_lag, omega_lag))
+
+
+def sensitivity(
+    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], motion: Motion, delay: float = 0.0, period: float = 0.01
+) -> tuple[float, float]:
+    """Returns max |S| of each channel with the motion controller and the nominal model, the largest of `SPEEDS`.
+
+    The loop is opened at the voltage, as for `design`, but with all that answers a voltage. The model as feedforward
+    turns the acceleration of the command into a voltage, and the motion controller makes the command follow the motion,
+    so that K_x times the inertia adds to K_p. With the prior `none` it is so once the network has learned the model.
+
+    Args:
+        robot: The nominal robot in its steering arrangement.
+        rigid: Whether the second channel is steering.
+        gains: PI gains of both channels.
+        motion: The motion controller.
+        delay: Delay from measurement to voltage in s, over which the motion is predicted.
+        period: Control period in s.
+    """
+    frequency = np.geomspace(1e-3, 1, 600) * np.pi / period * (1 - 1e-9)
+    worst = []
+    for channel in (0, 1):
+        loops = [
+            whole_loop(frequency, robot, rigid, channel, plant, gains[channel], motion, share, delay, period)
+            for plant in plants(robot, rigid, channel)
+            for share in SPEEDS
+        ]
+        worst.append(float(np.max(np.abs(1 / (1 + np.array(loops))))))
+    return worst[0], worst[1]
+
+
+def whole_loop(
+    frequency: NDArray[np.float64], robot: Robot, rigid: bool, channel: int, plant: Linear, gains: Gains,
+    motion: Motion, share: float, delay: float, period: float,
+) -> NDArray[np.complex128]:  # fmt: skip
+    """Frequency response of the loop of one channel with the motion controller and the nominal model as feedforward.
+
+        L = [C + (C (G − D) + F) Q] P z^(−d),    z = e^(jωh)
+
+    - C is the PI controller, P the plant behind the hold, z^(−d) the delay.
+    - Q is the correction that the motion controller requests after a deviation of the velocity, G the prefilter and R
+      its rate: G = a z/(z − 1 + a), a = h/T, R = (1 − G/z)/T.
+    - F = (G + τ R)/K is the model, and G itself for steering.
+    - D = h R Σ z^(−p), p = 1 … d, is by how much the predicted velocity is ahead because of the commanded acceleration,
+      and E the same for the predicted position.
+
+    With the integration I = h/2 · (z + 1)/(z − 1) and its prediction I + d h, driving straight on at the speed v,
+
+        common:  Q = K_x (I + d h)/(1 + K_x E);    second:  Q = k (I + d h)/(1 + k E),  k = v K_θ + v² K_y (I + d h)
+
+    Args:
+        frequency: ω in rad/s, below π/h, `(F,)`.
+        robot: The nominal robot in its steering arrangement.
+        rigid: Whether the second channel is steering.
+        channel: 0 for the common channel, 1 for the second.
+        plant: The plant.
+        gains: PI gains.
+        motion: The motion controller.
+        share: Speed, as a share of the robot's largest one.
+        delay: Delay d h from measurement to voltage in s.
+        period: Control period h in s.
+
+    Returns:
+        L(e^(jωh)), dimensionless, `(F,)`.
+    """
+    z, late = np.exp(1j * frequency * period), round(delay / period)
+    pi = gains.k_p + gains.k_i * period * z / (z - 1)
+    a = min(1.0, period / motion.prefilter)
+    prefilter = a * z / (z - 1 + a)
+    rate = (1 - prefilter / z) * a / period
+    ahead = moved = np.zeros_like(z)  # D and E
+    for p in range(late, 0, -1):
+        moved = moved + period * (ahead + period * rate * z**-p / 2)
+        ahead = ahead + period * rate * z**-p
+    position = period / 2 * (z + 1) / (z - 1) + late * period
+    k, speed = motion.kanayama, share * robot.max_speed
+    if channel == 0:
+        turned, static, lag = float(k.k_x or 0), robot.velocity_gain, robot.velocity_time_constant
+    else:
+        turned = speed * float(k.k_theta or 0) + speed**2 * float(k.k_y or 0) * position
+        static, lag = robot.rotation_gain, robot.rotation_time_constant
+    request = turned * position / (1 + turned * moved)
+    model = prefilter if rigid and channel == 1 else (prefilter + lag * rate) / static
+    control = pi + (pi * (prefilter - ahead) + model) * request
+    return np.asarray(control * plant.response(frequency, period) * z**-late, complex)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from tqdm import tqdm
 
-from mrctl.control.design import M_S, M_T, SPEEDS, plants
+from mrctl.control.design import M_S, M_T, SPEEDS, plants, sensitivity
 from mrctl.control.design import motion as motion_design
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import learning_ratio, margins, sampled_loop
@@ -50,8 +50,11 @@ Units: common m/s, V/(m/s), V/m; second rad/s, V/(rad/s), V/rad; of rigid steeri
 hold converges with a first-order plant if the ratio K_p (1 + K K_p)/(τ K_i) is above 1."""
 MOTION = (
     *("steering", "delay, ms", "lag of V, ms", "lag of θ̇, ms", "prefilter, ms"),
-    *("K_x, 1/s", "K_y, 1/m²", "K_θ, 1/m"),
+    *("K_x, 1/s", "K_y, 1/m²", "K_θ, 1/m", "max \\|S\\| common", "second"),
 )
+WHOLE = """\
+The last two columns are max |S| of the loop opened at the voltage with this motion controller and the nominal model as
+feedforward, the larger of several speeds: commands that follow the motion add to the feedback."""
 ADVICE = """\
 A learner that the feedback voltage teaches is safe at frequencies where Re T > 0. The built-in ones take half of what
 they add out of the PID's integral, the hand-over, and learn at the features of τ ago, the delay and two periods: they
@@ -134,6 +137,7 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
             found = motion_design(nominal, rigid, both, delay, period)
             lags = dict(zip(("v_lag", "omega_lag"), found.lag, strict=True))
             suits = found.kanayama.model_dump() | {"prefilter": found.prefilter} | lags
+            suits |= {"sensitivity": sensitivity(nominal, rigid, both, found, delay, period)}
             table["motion"].append({"steering": steering, "delay": delay} | suits)
         channels = (0, 1) if steering == offered[0] else (1,)
         for channel in tqdm(channels, unit="loop", desc=steering):
@@ -177,6 +181,7 @@ def text(table: dict[str, Any]) -> str:
             f"{1e3 * row['delay']:g}",
             *(number(1e3 * row[name]) for name in ("v_lag", "omega_lag", "prefilter")),
             *(number(row[name]) for name in ("k_x", "k_y", "k_theta")),
+            *map(number, row["sensitivity"]),
         ]
         for row in table["motion"]
     ]
@@ -196,6 +201,7 @@ def text(table: dict[str, Any]) -> str:
         UNITS,
         "The motion controller for these loops:",
         markdown([*MOTION], motions),
+        WHOLE,
         f"{' / '.join(RESPONSES.values())}:",
         markdown([*loops, *MARGINS.values(), *SAFETY.values()], rows),
         ADVICE,

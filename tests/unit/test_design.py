@@ -18,7 +18,10 @@ from mrctl.control.design import (
     fastest,
     motion,
     plants,
+    sensitivity,
+    whole_loop,
 )
+from mrctl.control.kanayama import Kanayama
 from mrctl.control.pid import Pid
 from mrctl.record import InputError
 from mrctl.theory.linear import TYRE_LAG, first_order
@@ -191,3 +194,66 @@ def test_motion_controller(robot, steering, delay):
     capped = capped[0] or kanayama.k_x == PUBLISHED_K_X, capped[1] or kanayama.k_theta == PUBLISHED_K_THETA
     assert capped[0] or damping(v, 1, kanayama.k_x) == pytest.approx(DAMPING)
     assert capped[1] or lateral[-1] == pytest.approx(DAMPING)
+
+
+@pytest.mark.parametrize("steering", list(ARRANGEMENTS))
+@pytest.mark.parametrize("late", [0, 1, 2])
+def test_whole_loop(robot, steering, late):
+    """S of the loop with motion controller and model is the spectrum of what becomes of one pulse of the voltage.
+
+    The pulse goes through plant, delay, the integration of the posture, its prediction, motion controller, prefilter,
+    PI controller and model, tick by tick.
+    """
+    robot, rigid = arranged(robot, steering), steering == "rigid"
+    gains = design(robot, rigid, late * H)
+    over = motion(robot, rigid, gains, late * H)
+    k, ticks, speed = over.kanayama, 6000, 0.5 * robot.max_speed
+    frequency = np.array([3.0, 10.0, 30.0, 80.0, 200.0])
+    for channel in (0, 1):
+        plant = plants(robot, rigid, channel)[0]
+        held = plant.held(H)
+        state, integral, c, place, heading = np.zeros(len(plant.b)), 0.0, 0.0, 0.0, 0.0
+        sent, rates, totals = [0.0] * late, [0.0] * late, np.zeros(ticks)
+        static, lag = (
+            (robot.velocity_gain, robot.velocity_time_constant),
+            (robot.rotation_gain, robot.rotation_time_constant),
+        )[channel]
+        for n in range(ticks):
+            v, x, y = state[0], place, heading
+            for rate in rates:  # prediction from the measurement to the moment at which the voltage acts
+                if channel == 0:
+                    x += H * (v + H * rate / 2)
+                else:
+                    x, y = x + H * speed * y, y + H * (v + H * rate / 2)
+                v += H * rate
+            wanted = -k.k_x * x if channel == 0 else -speed * (k.k_y * x + k.k_theta * y)
+            rate = (wanted - c) / over.prefilter
+            c += H * rate
+            integral += H * gains[channel].k_i * (c - v)
+            forward = c if rigid and channel == 1 else (c + lag * rate) / static
+            totals[n] = (n == 0) + gains[channel].k_p * (c - v) + integral + forward
+            sent, rates = [*sent, totals[n]], [*rates, rate][1 if late else 1 :]
+            before = state[0]
+            state = held.a @ state + held.b * sent.pop(0)
+            step = H * (before + state[0]) / 2
+            if channel == 0:
+                place += step
+            else:
+                place, heading = place + H * speed * (2 * heading + step) / 2, heading + step
+        spectrum = np.exp(-1j * H * np.outer(frequency, np.arange(ticks))) @ totals
+        loop = whole_loop(frequency, robot, rigid, channel, plant, gains[channel], over, 0.5, late * H, H)
+        np.testing.assert_allclose(1 / (1 + loop), spectrum, atol=0.02)
+
+
+@pytest.mark.parametrize("steering", list(ARRANGEMENTS))
+def test_sensitivity(robot, steering):
+    """Without motion controller max |S| is that of the PID; with it and a delay it is larger, and a prefilter helps."""
+    robot, rigid = arranged(robot, steering), steering == "rigid"
+    gains = design(robot, rigid, H)
+    over = motion(robot, rigid, gains, H)
+    still = over._replace(kanayama=Kanayama(k_x=0.0, k_y=0.0, k_theta=0.0))
+    alone = [max(peaks(plant, gains[k], 1)[0] for plant in plants(robot, rigid, k)) for k in (0, 1)]
+    np.testing.assert_allclose(sensitivity(robot, rigid, gains, still, H), alone, rtol=1e-3)
+    whole = sensitivity(robot, rigid, gains, over, H)
+    filtered = sensitivity(robot, rigid, gains, over._replace(prefilter=0.05), H)
+    assert all(a < f < w for a, f, w in zip(alone, filtered, whole, strict=True))

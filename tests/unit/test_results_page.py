@@ -54,6 +54,7 @@ def tune(tmp_path: Path) -> Path:
     loop |= {name: answer for name in tuning.RESPONSES}
     names = ("k_x", "k_y", "k_theta", "prefilter", "v_lag", "omega_lag")
     motion = {"steering": "caster", "delay": 0.02} | {name: 0.05 for name in names}
+    motion["sensitivity"] = [1.6, 1.75]
     values = {"time_constant": None, "lag": 0.0, "loops": [loop], "motion": [motion]}
     return written(tmp_path / "tune", values)
 
