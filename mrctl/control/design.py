@@ -183,11 +183,11 @@ def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float =
 def sensitivity(
     robot: Robot, rigid: bool, gains: tuple[Gains, Gains], motion: Motion, delay: float = 0.0, period: float = 0.01
 ) -> tuple[float, float]:
-    """Returns max |S| of each channel with the motion controller and the nominal model, the largest of `SPEEDS`.
+    """Returns max |S| of both channels over `SPEEDS`, dimensionless, with motion controller and nominal model.
 
-    The loop is opened at the voltage, as for `design`, but with all that answers a voltage. The model as feedforward
-    turns the acceleration of the command into a voltage, and the motion controller makes the command follow the motion,
-    so that K_x times the inertia adds to K_p. With the prior `none` it is so once the network has learned the model.
+    `design` bounds |S| of the PID alone. The motion controller makes the command follow the motion, and the model as
+    feedforward turns the acceleration of the command into a voltage; together they add about K_x τ/K to K_p. With the
+    prior `none` it is so once the learner has found the model. Lags of armature and measurement are left out.
 
     Args:
         robot: The nominal robot in its steering arrangement.
@@ -221,12 +221,13 @@ def whole_loop(
     - Q is the correction that the motion controller requests after a deviation of the velocity, G the prefilter and R
       its rate: G = a z/(z − 1 + a), a = h/T, R = (1 − G/z)/T.
     - F = (G + τ R)/K is the model, and G itself for steering.
-    - D = h R Σ z^(−p), p = 1 … d, is by how much the predicted velocity is ahead because of the commanded acceleration,
-      and E the same for the predicted position.
+    - D = h R Σ z^(−p), p = 1 … d, is by how much the predicted velocity is ahead because of the commanded acceleration;
+      E and E₂ are the same for its first and its second integral.
 
-    With the integration I = h/2 · (z + 1)/(z − 1) and its prediction I + d h, driving straight on at the speed v,
+    With the integration I = h/2 · (z + 1)/(z − 1), the predicted integrals I₁ = I + d h and I₂ = I² + d h I + (d h)²/2,
+    and driving straight on at the speed v,
 
-        common:  Q = K_x (I + d h)/(1 + K_x E);    second:  Q = k (I + d h)/(1 + k E),  k = v K_θ + v² K_y (I + d h)
+        common:  Q = K_x I₁/(1 + K_x E);    second:  Q = (v K_θ I₁ + v² K_y I₂)/(1 + v K_θ E + v² K_y E₂)
 
     Args:
         frequency: ω in rad/s, below π/h, `(F,)`.
@@ -248,18 +249,22 @@ def whole_loop(
     a = min(1.0, period / motion.prefilter)
     prefilter = a * z / (z - 1 + a)
     rate = (1 - prefilter / z) * a / period
-    ahead = moved = np.zeros_like(z)  # D and E
+    ahead = moved = drifted = np.zeros_like(z)  # D, E and E₂
     for p in range(late, 0, -1):
-        moved = moved + period * (ahead + period * rate * z**-p / 2)
+        middle = ahead + period * rate * z**-p / 2
+        drifted = drifted + period * (moved + period * middle / 2)
+        moved = moved + period * middle
         ahead = ahead + period * rate * z**-p
-    position = period / 2 * (z + 1) / (z - 1) + late * period
+    once, horizon = period / 2 * (z + 1) / (z - 1), late * period
+    position, drift = once + horizon, once**2 + horizon * once + horizon**2 / 2
     k, speed = motion.kanayama, share * robot.max_speed
     if channel == 0:
-        turned, static, lag = float(k.k_x or 0), robot.velocity_gain, robot.velocity_time_constant
+        request = float(k.k_x or 0) * position / (1 + float(k.k_x or 0) * moved)
+        static, lag = robot.velocity_gain, robot.velocity_time_constant
     else:
-        turned = speed * float(k.k_theta or 0) + speed**2 * float(k.k_y or 0) * position
+        heading, lateral = speed * float(k.k_theta or 0), speed**2 * float(k.k_y or 0)
+        request = (heading * position + lateral * drift) / (1 + heading * moved + lateral * drifted)
         static, lag = robot.rotation_gain, robot.rotation_time_constant
-    request = turned * position / (1 + turned * moved)
     model = prefilter if rigid and channel == 1 else (prefilter + lag * rate) / static
     control = pi + (pi * (prefilter - ahead) + model) * request
     return np.asarray(control * plant.response(frequency, period) * z**-late, complex)

@@ -4,8 +4,8 @@
 
 The feedback voltage U_fb is the teaching signal, so the network takes over the work that the feedback still does
 (Kawato, Furukawa and Suzuki 1987, Gomi and Kawato 1993). `update` is the normalised discrete step. Its gradient is
-taken at the features of the output that the feedback answers, a few ticks ago (`matching.recall`); with those of the
-same tick, learning oscillates if the robot is light and its motors are strong. `fel_torch` has the same law for any
+taken at the delayed features, those of the output that the feedback answers (`matching.recall`); with those of the same
+tick, learning oscillates if the robot is light and its motors are strong. `fel_torch` has the same law for any
 stateless torch module.
 """
 
@@ -67,7 +67,7 @@ FEL = np.dtype(
         ("x", "f8", INPUTS),  # scaled features of the commanded motion
         ("output", "f8", OUTPUTS),  # feedforward at x, V (rad/s)
         ("tick", "i8"),  # number of ticks so far
-        ("past", "f8", INPUTS),  # x of the output that the feedback answers
+        ("past", "f8", INPUTS),  # delayed features: x of the output that the feedback answers
         ("error", "f8", OUTPUTS),  # e: feedback in units of the network's output
         ("norm", "f8"),  # ‖W − W₀‖
     ],
@@ -176,14 +176,14 @@ def update(feedback: Array, s: Row, w: Array, initial: Array, hidden: Array, gra
 
         ΔW = μ Jᵀe / (‖Jᵀe‖²/‖e‖² + ε) − leak (W − W₀),    ‖W − W₀‖ ≤ bound
 
-    e is the scaled feedback, 0 in the dead zone, and J = ∂(output/scale)/∂W at the features that it answers. With one
-    output this is normalised LMS: the feedforward at that input moves by about μ times the feedback, whatever the size
-    of the regressor.
+    e = share · feedback/scale, 0 in the dead zone, and J = ∂(output/scale)/∂W at the delayed features. With one output
+    this is normalised LMS: the feedforward at that input moves by about μ times the feedback, whatever the size of the
+    regressor.
 
     Args:
         feedback: Feedback of the two channels in V (rad/s on a steering channel), `(2,)`.
-        s: In and out: a record of `FEL`, whose `x` and `output` are those of the last output, and `past` the features
-            that the feedback answers.
+        s: In and out: a record of `FEL` with the features `x` of this tick, the network's `output` there, which is
+            renewed, and the delayed features `past`.
         w: In and out: flat weights W, `(n,)`.
         initial: Initial weights W₀, `(n,)`.
         hidden: Scratch, `(units,)`.
@@ -227,8 +227,8 @@ def learn(
 ) -> float:  # fmt: skip
     """One step of `update`, unless the robot must not learn.
 
-    At the bound of the weights `added` is zero: the projection takes away elsewhere what the step adds here, so the
-    PID's integral must not give up its share.
+    `added` is by how much that changes the output in V (rad/s on a steering channel), `(2,)`, and the result ‖W − W₀‖.
+    At the bound `added` is zero, so that the integral hands nothing over: there the projection undoes the step.
     """
     rows, _, weights, initial, hidden, gradient, queue = arrays
     s = rows[i]

@@ -10,13 +10,14 @@ the period before, (x_n − x_(n−1))/h, is exactly what the voltage u_(n−1�
 latencies of the sensors, which an estimator bridges in the same way, are not matched, nor is the `control_delay` of a
 perturbation, which nobody knows.
 
-A law that is taught by the feedback voltage must know which output that voltage answers: `recall` returns the features
-of τ = (d + 2) h ago. With the loop L of PID and plant, what a learner adds to the feedforward changes the feedback by
-−T_a times that, T_a = ½ (1 + T) and T = L/(1 + L), since half of it leaves the PID's integral at once. A gradient step
-descends at the frequencies where Re [T_a e^(jωτ)] > 0 (Morgan 1980; by averaging: Anderson et al. 1986). For the
-nominal robot that holds without τ, too. But if the loop gain is twice the nominal one, as with a light robot or strong
-motors, T has a resonance at which Re T < −1, so that learning with the features of the same tick oscillates: at 80 to
-90 rad/s in `lab`, and about 50 in `field`. With those of τ ago the resonance is safe (`tests/unit/test_matching.py`).
+A law that is taught by the feedback voltage must know which output that voltage answers: `recall` returns the delayed
+features, those of τ = (d + 2) h ago. With the loop L of PID and plant, ∂U_fb/∂U_ff = −T_a, T_a = ½ (1 + T) and T =
+L/(1 + L), as the hand-over takes half of what is learned from the PID's integral. A gradient step descends at the
+frequencies where Re [T_a e^(jωτ)] > 0 (Morgan 1980; by averaging: Anderson et al. 1986). On the nominal robot that
+holds at all frequencies without τ, and with τ up to 76 rad/s in `lab` and 51 in `field`, above what a command holds.
+But if the loop gain is twice the nominal one, as with a light robot or strong motors, T has a resonance with Re T <
+−1 at 80 to 120 rad/s in `lab` and 48 to 71 in `field`, where learning with the features of the same tick oscillates;
+with the delayed ones the resonance is safe (`tests/unit/test_matching.py`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import numpy as np
 
 from mrctl.kernel import Array, Row, kernel
 
-LAG = 2  # periods in addition to the delay until the feedback answers an output
+LAG = 2  # periods, hold and sampling, *chosen*; with one the worst robots in `field` do worse
 MATCHED = np.dtype(
     [
         ("tick", "i8"),  # number of control ticks so far
@@ -95,16 +96,16 @@ def histories(size: int, delay: int, width: int) -> Array:
 
 @kernel
 def recall(x: Array, tick: int, queue: Array, past: Array) -> bool:
-    """Writes the features that the feedback of this tick answers, and puts those of this tick in their place.
+    """Reads the features of d + 2 ticks ago, whose output this feedback answers, and stores the present ones.
 
     Args:
         x: Features of the commanded motion of this tick, `(n,)`.
         tick: Number of ticks so far.
         queue: In and out: x of the last d + 2 ticks, `(d + 2, n)`.
-        past: Out: x of d + 2 ticks ago, `(n,)`.
+        past: Out: the delayed features, x of d + 2 ticks ago, `(n,)`.
 
     Returns:
-        Whether there was one; in the first d + 2 ticks there was not.
+        Whether `past` is valid; in the first d + 2 ticks it is not.
     """
     oldest = tick % len(queue)
     for j in range(len(x)):

@@ -162,7 +162,7 @@ def safety(frequency: Array, response: Response, period: float, delay: float = 0
         frequency: ω in rad/s, `(F,)`.
         response: T, `(F,)`.
         period: Control period h in s.
-        delay: Delay d of the loop in s that the learner knows; τ = d + 2 h.
+        delay: Delay d h of the loop in s that the learner knows; τ = (d + 2) h.
     """
     handed_over = TAKE_OVER + (1 - TAKE_OVER) * response
     early = np.exp(1j * frequency * (delay + LAG * period))

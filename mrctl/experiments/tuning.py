@@ -41,7 +41,7 @@ MARGINS = {
 SAFETY = {
     "positive_to": "Re T > 0 to, rad/s",
     "lowest": "least Re T",
-    "built_in_to": "built-in learners to, rad/s",
+    "built_in_to": "built-in learners safe to, rad/s",
     "step": "largest step",
 }
 GAINS = ("plant gain", "plant lag, s", "K_p", "K_i", "learning ratio")
@@ -50,17 +50,17 @@ Units: common m/s, V/(m/s), V/m; second rad/s, V/(rad/s), V/rad; of rigid steeri
 hold converges with a first-order plant if the ratio K_p (1 + K K_p)/(τ K_i) is above 1."""
 MOTION = (
     *("steering", "delay, ms", "lag of V, ms", "lag of θ̇, ms", "prefilter, ms"),
-    *("K_x, 1/s", "K_y, 1/m²", "K_θ, 1/m", "max \\|S\\| common", "second"),
+    *("K_x, 1/s", "K_y, 1/m²", "K_θ, 1/m", "max \\|S\\| common", "max \\|S\\| second"),
 )
 WHOLE = """\
-The last two columns are max |S| of the loop opened at the voltage with this motion controller and the nominal model as
-feedforward, the larger of several speeds: commands that follow the motion add to the feedback."""
+The last two columns are max |S| of the loop opened at the voltage, the largest over several speeds, with this motion
+controller and the nominal model as feedforward, which close a second loop around the PID's."""
 ADVICE = """\
-A learner that the feedback voltage teaches is safe at frequencies where Re T > 0. The built-in ones take half of what
-they add out of the PID's integral, the hand-over, and learn at the features of τ ago, the delay and two periods: they
-are safe where Re [(1 + T) e^(jωτ)] > 0. Both hold for commands that do not depend on the motion of the robot; a fast
-motion controller behind a delay narrows them. Above the largest step a learner of one constant oscillates without
-hand-over: choose at most half of it."""
+A learner that the feedback voltage teaches is safe at frequencies where Re T > 0. `fel`, `rls` and `composite` take
+half of what they add from the PID's integral (the hand-over), and learn at features delayed by τ, the delay and two
+periods: they are safe where Re [(1 + T) e^(jωτ)] > 0. Both hold for commands that do not depend on the motion of the
+robot. The third value is measured with a motion controller that does not predict over the delay. Above the largest
+step a learner with a constant regressor and without hand-over is unstable: choose at most half of it."""
 
 
 def tune(

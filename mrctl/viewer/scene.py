@@ -337,7 +337,7 @@ class Scene:
             self.turn(client, position, target)
 
     def turn(self, client: viser.ClientHandle, position: Array, target: Array) -> None:
-        """Places a visitor's camera, in m, `(3,)` each; a narrow page shows the target above its panel."""
+        """Places a visitor's camera, in m, `(3,)` each; a page higher than wide shows the target above its panel."""
         if client.camera.aspect < 1:
             position, target = lowered(position, target, client.camera.fov)
         client.camera.position, client.camera.look_at = position, target

@@ -52,14 +52,17 @@ def bar(start: Array, end: Array, thickness: float) -> Mesh:
 
 
 def lowered(position: Array, target: Array, fov: float) -> tuple[Array, Array]:
-    """Returns a camera that sees its target a quarter of the picture above the middle, with what it looks at, in m.
+    """Moves what a camera sees up by a quarter of the height of its picture.
 
-    It looks lower, or moves if it would then look beyond straight down.
+    The camera tilts down, or is shifted if it would tilt past the vertical.
 
     Args:
         position: Position of the camera in m, `(3,)`.
-        target: What it looked at, in m, not straight below it, `(3,)`.
-        fov: Angle in rad that the picture is high.
+        target: What it looks at, in m, not straight below it, `(3,)`.
+        fov: Vertical field of view in rad.
+
+    Returns:
+        The new position and what the camera then looks at, in m, `(3,)` each.
     """
     forward = target - position
     up = np.cross(np.cross(forward, [0.0, 0.0, 1.0]), forward)

@@ -224,7 +224,8 @@ def test_whole_loop(robot, steering, late):
                 if channel == 0:
                     x += H * (v + H * rate / 2)
                 else:
-                    x, y = x + H * speed * y, y + H * (v + H * rate / 2)
+                    turned = H * (v + H * rate / 2)
+                    x, y = x + H * speed * (y + turned / 2), y + turned
                 v += H * rate
             wanted = -k.k_x * x if channel == 0 else -speed * (k.k_y * x + k.k_theta * y)
             rate = (wanted - c) / over.prefilter
@@ -242,7 +243,7 @@ def test_whole_loop(robot, steering, late):
                 place, heading = place + H * speed * (2 * heading + step) / 2, heading + step
         spectrum = np.exp(-1j * H * np.outer(frequency, np.arange(ticks))) @ totals
         loop = whole_loop(frequency, robot, rigid, channel, plant, gains[channel], over, 0.5, late * H, H)
-        np.testing.assert_allclose(1 / (1 + loop), spectrum, atol=0.02)
+        np.testing.assert_allclose(1 / (1 + loop), spectrum, atol=1e-3)
 
 
 @pytest.mark.parametrize("steering", list(ARRANGEMENTS))
