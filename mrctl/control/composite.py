@@ -297,8 +297,7 @@ def learn(
     """
     rows, scale, queue = arrays
     s = rows[i]
-    answered = recall(s.phi_c, s.tick, queue[i], s.past)
-    s.tick += 1
+    answered = recall(s.phi_c, queue[i], s)
     filter_motion(command, twist, voltage, period, robot, s)
     added[0] = added[1] = 0.0
     moves = abs(s.twice[2]) + robot.half_track * abs(s.twice[3]) > SLOW

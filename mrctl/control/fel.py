@@ -233,8 +233,7 @@ def learn(
     rows, _, weights, initial, hidden, gradient, queue = arrays
     s = rows[i]
     added[0] = added[1] = 0.0
-    answered = recall(s.x, s.tick, queue[i], s.past)
-    s.tick += 1
+    answered = recall(s.x, queue[i], s)
     if frozen == 0 and s.step > 0 and answered:
         before, before_second = s.output[0], s.output[1]
         update(feedback, s, weights[i], initial[i], hidden[i], gradient)

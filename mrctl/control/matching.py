@@ -95,20 +95,20 @@ def histories(size: int, delay: int, width: int) -> Array:
 
 
 @kernel
-def recall(x: Array, tick: int, queue: Array, past: Array) -> bool:
+def recall(x: Array, queue: Array, s: Row) -> bool:
     """Reads the features of d + 2 ticks ago, whose output this feedback answers, and stores the present ones.
 
     Args:
         x: Features of the commanded motion of this tick, `(n,)`.
-        tick: Number of ticks so far.
         queue: In and out: x of the last d + 2 ticks, `(d + 2, n)`.
-        past: Out: the delayed features, x of d + 2 ticks ago, `(n,)`.
+        s: In and out: a record with the number of ticks so far, `tick`, and the delayed features, `past`, `(n,)`.
 
     Returns:
         Whether `past` is valid; in the first d + 2 ticks it is not.
     """
-    oldest = tick % len(queue)
+    oldest = s.tick % len(queue)
     for j in range(len(x)):
-        past[j] = queue[oldest, j]
+        s.past[j] = queue[oldest, j]
         queue[oldest, j] = x[j]
-    return tick >= len(queue)
+    s.tick += 1
+    return s.tick > len(queue)

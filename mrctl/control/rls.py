@@ -104,8 +104,7 @@ def learn(
     s = arrays[0][i]
     linear(s.x, s.theta, added)
     before, before_second = added[0], added[1]
-    answered = recall(s.x, s.tick, arrays[2][i], s.past)
-    s.tick += 1
+    answered = recall(s.x, arrays[2][i], s)
     if frozen == 0 and answered:
         update(s.past, feedback, s)
         linear(s.x, s.theta, added)
