@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Polygon
 from matplotlib.rcsetup import cycler
+from matplotlib.ticker import LogFormatterSciNotation
 
 from mrctl.record import InputError
 from mrctl.results import excitation as exciting
@@ -285,9 +286,13 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
             failed = int(laps["failed"].values[rows].sum())
             at = (number[some][-1], mean[-1]) if some.any() else (number[0], np.nan)
             ends.append((float(at[0]), float(at[1]), _counted(label, failed, len(rows)), colour))
-        one.set(xlabel="lap", ylabel=text, yscale="log")
+        one.set(title=text, yscale="log")
         one.xaxis.get_major_locator().set_params(integer=True)
+        _plain(one)
         _label_ends(one, ends)
+    for one in axes[max(0, len(names) - columns) : len(names)]:  # the lowest of each column
+        one.set_xlabel("lap")
+        one.tick_params(labelbottom=True)
     return figure
 
 
@@ -325,6 +330,7 @@ def laps_by_case(cases: Mapping[str, xr.Dataset], metric: str, changes: Sequence
             one.axvline(lap - 0.5, color="0.4", lw=0.8, ls=":")
         one.set(title=title, yscale="log")
         one.xaxis.get_major_locator().set_params(integer=True)
+        _plain(one)
     for place, one in enumerate(axes):
         one.set_xlabel("lap" if place + columns >= len(cases) else "")
         one.tick_params(labelbottom=place + columns >= len(cases))
@@ -585,6 +591,18 @@ def _errors(curves: Sequence[Curve], plant: str) -> Figure:
     figure.align_ylabels()
     _legend(figure, curves, plant)
     return figure
+
+
+class _Plain(LogFormatterSciNotation):
+    """Writes the numbers of a log axis as `0.3` or `20`, where Matplotlib would write powers of ten."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return f"{x:g}" if super().__call__(x, pos) else ""
+
+
+def _plain(axes: Axes) -> None:
+    axes.yaxis.set_major_formatter(_Plain())
+    axes.yaxis.set_minor_formatter(_Plain(minor_thresholds=(2, 0.5)))
 
 
 def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> None:

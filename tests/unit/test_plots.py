@@ -7,6 +7,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
 
 from mrctl.record import InputError
@@ -156,11 +157,24 @@ def test_learning_curve():
     laps = metrics.per_lap(result)
     for source in (result, laps):
         left, right = plots.learning_curve(source, ["v_rmse", "energy"]).axes
-        assert left.get_yscale() == "log" and "(mm/s)" in left.get_ylabel() and "(J)" in right.get_ylabel()
+        assert left.get_yscale() == "log" and "(mm/s)" in left.get_title() and "(J)" in right.get_title()
         value = 1e3 * laps["v_rmse"].values
         for line in (value[0], value[2], (value[0] + value[2]) / 2, value[1]):
             assert drawn(left, [1, 2, 3], line)
         assert sorted(text.get_text() for text in left.texts) == ["fel", "none"]
+
+
+def test_titles_fit_their_panels():
+    """The name of each metric is as wide as its panel at most, and the numbers of the axis are plain."""
+    figure = plots.learning_curve(make(("fel", "none")), ["position_rmse", "v_rmse", "omega_rmse"])
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    figure.draw(renderer)
+    numbers = set()
+    for axes in figure.axes:
+        assert axes.title.get_window_extent(renderer).width < axes.get_window_extent(renderer).width
+        numbers |= {label.get_text() for label in axes.get_yticklabels(which="both")} - {""}
+    assert numbers and all(float(number) > 0 for number in numbers)
+    assert [axes.get_xlabel() for axes in figure.axes] == ["", "lap", "lap"]
 
 
 def test_names_do_not_overlap():
