@@ -29,6 +29,8 @@ M_S, M_T = 1.6, 1.1
 """Largest |S| and |T|: 1.2 to 2 and 1 to 1.5 are usual (Åström and Hägglund, Advanced PID Control, 2006, ch. 4)."""
 SPEEDS = 0.5, 0.2, 1.0
 """Shares of the robot's largest speed at which its loops keep the bounds, *chosen*; `mrctl tune` uses the first one."""
+WHOLE = 1.1
+"""Factor by which the motion controller may raise max |S| of the velocity loops, *chosen*."""
 DAMPING = 0.5
 """Damping ratio of the motion controller's loops at the largest speed, *chosen*; it is higher at a lower speed."""
 ERROR = 0.05
@@ -140,24 +142,33 @@ class Motion(NamedTuple):
 
 
 def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float = 0.0, period: float = 0.01) -> Motion:
-    """Designs the motion controller over the velocity loops, with damping ratio ζ ≥ `DAMPING` up to the largest speed.
+    """Designs the motion controller over the velocity loops: gains, damping and prefilter.
 
         x:  τ s² + s + K_x = 0,                         ζ = 1/(2 √(K_x τ))
         y:  τ s³ + s² + v_r K_θ s + v_r² K_y = 0,       K_θ = 2 √K_y
 
-    τ is the sum of the lags of the velocity loop and of the prefilter; the prefilter has half the lag of the slower
-    velocity loop, *chosen*. A velocity loop follows a slow command with the lag 1/(K K_i). The steering is commanded to
-    the angle at which the wheel does not scrub, so that the fork makes no torque when the robot turns as commanded, and
-    K is that of equation (3) without the fork. A stiff servo (`rigid`) follows angle and rate of the command, which
-    leaves the delay and the lag of the tyre.
+    τ is the sum of the lags of the velocity loop and of the prefilter. A velocity loop follows a slow command with the
+    lag 1/(K K_i). The steering is commanded to the angle at which the wheel does not scrub, so that the fork makes no
+    torque when the robot turns as commanded, and K is that of equation (3) without the fork. A stiff servo (`rigid`)
+    follows angle and rate of the command, which leaves the delay and the lag of the tyre.
 
-    K_θ makes the lateral error critically damped where τ = 0. With p = τ s and κ = τ v_r √K_y the second equation is
-    p³ + (p + κ)² = 0; its root r e^(jψ) with cos ψ = −ζ has √r = −sin ψ/cos(3ψ/2) and
-    κ = r^(3/2) sin(3ψ/2) − r cos ψ.
+    K_x and √K_y are the largest that keep four bounds:
 
-    An error e = `ERROR` must not request more than the limits on acceleration, because a rate limit in the loop makes
-    it oscillate: K_x² e ≤ V̇_max, and v² K_y^(3/2) e ≤ θ̈_max, as the loops have the time constants 1/K_x and
-    1/(v √K_y). No gain is above those of Kanayama et al. (1990).
+    - The damping ratio ζ is at least `DAMPING` up to the largest speed. K_θ makes the lateral error critically damped
+      where τ = 0. With p = τ s and κ = τ v_r √K_y the second equation is p³ + (p + κ)² = 0; its root r e^(jψ) with
+      cos ψ = −ζ has √r = −sin ψ/cos(3ψ/2) and κ = r^(3/2) sin(3ψ/2) − r cos ψ.
+    - An error e = `ERROR` does not request more than the limits on acceleration, because a rate limit in the loop makes
+      it oscillate: K_x² e ≤ V̇_max, and v² K_y^(3/2) e ≤ θ̈_max, as the loops have the time constants 1/K_x and
+      1/(v √K_y).
+    - They are at most those of Kanayama et al. (1990).
+    - max |S| of each channel is at most `WHOLE` · max(M_s, max |S| of the PID alone), at this gain and at every
+      smaller one. The model as feedforward turns the acceleration of the command into a voltage, and the motion
+      controller makes the command follow the motion: a second feedback, with the same delay (`sensitivity`).
+
+    A slower prefilter costs damping and spares max |S|. Its time constant T is the one with the largest K_x √K_y, of
+    those that are at least a control period and half the lag of the slower velocity loop, *chosen*, in steps of 10 %.
+
+    A design takes about 0.1 s; the last 256 are cached.
 
     Args:
         robot: The nominal robot in its steering arrangement.
@@ -166,54 +177,80 @@ def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float =
         delay: Delay from measurement to voltage in s.
         period: Control period in s.
     """
+    return _motion(robot, rigid, gains, delay, period)  # pyright: ignore[reportArgumentType] (frozen, so hashable)
+
+
+@lru_cache(maxsize=256)
+def _motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float, period: float) -> Motion:
     free = linear.yaw(robot.model_copy(update={"fork_inertia": 0.0}), robot.max_speed)
     v_lag = 1 / (linear.common(robot).gain * gains[0].k_i)
     omega_lag = linear.TYRE_LAG + delay if rigid else 1 / (free.gain * gains[1].k_i)
-    prefilter = max(period, v_lag / 2, omega_lag / 2)
     angle = np.pi - np.arccos(DAMPING)
     root = (np.sin(angle) / np.cos(1.5 * angle)) ** 2
     kappa = root**1.5 * np.sin(1.5 * angle) - root * np.cos(angle)
-    damped = float(kappa / ((omega_lag + prefilter) * robot.max_speed))
-    reached = (robot.max_rotation_acceleration / (robot.max_speed**2 * ERROR)) ** (1 / 3)
-    lateral = min(damped, reached, PUBLISHED_K_THETA / 2)
-    k_x = min(float(1 / (4 * DAMPING**2 * (v_lag + prefilter))), (robot.max_acceleration / ERROR) ** 0.5, PUBLISHED_K_X)
+    turned = robot.max_rotation_acceleration / robot.max_speed**2
+    reached = (robot.max_acceleration / ERROR) ** (1 / 2), (turned / ERROR) ** (1 / 3)
+    shares = np.linspace(0, 1, 21)
+    prefilter, best, chosen = max(period, v_lag / 2, omega_lag / 2), 0.0, (0.0, 0.0, 0.0)
+    while True:
+        damped = 1 / (4 * DAMPING**2 * (v_lag + prefilter)), kappa / ((omega_lag + prefilter) * robot.max_speed)
+        k_x = min(damped[0], reached[0], PUBLISHED_K_X)
+        lateral = min(damped[1], reached[1], PUBLISHED_K_THETA / 2)
+        if k_x * lateral <= best:  # nor is any slower prefilter better
+            break
+        tried = np.array([shares * k_x, (shares * lateral) ** 2, 2 * shares * lateral])
+        peaks = sensitivity(robot, rigid, gains, tried, prefilter, delay, period)
+        k_x, lateral = k_x * _kept(shares, peaks[0]), lateral * _kept(shares, peaks[1])
+        if k_x * lateral > best:
+            best, chosen = k_x * lateral, (k_x, lateral, prefilter)
+        prefilter *= 1.1
+    k_x, lateral, prefilter = chosen
     return Motion(Kanayama(k_x=k_x, k_y=lateral**2, k_theta=2 * lateral), prefilter, (v_lag, omega_lag))
 
 
-def sensitivity(
-    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], motion: Motion, delay: float = 0.0, period: float = 0.01
-) -> tuple[float, float]:
-    """Returns max |S| of both channels over `SPEEDS`, dimensionless, with motion controller and nominal model.
+def _kept(shares: NDArray[np.float64], peaks: NDArray[np.float64]) -> float:
+    """Returns the largest share up to which the peaks keep the bound; the first peak is that of the PID alone."""
+    bound = WHOLE * max(M_S, peaks[0])
+    beyond = np.flatnonzero(peaks > bound)
+    if beyond.size == 0:
+        return float(shares[-1])
+    i = beyond[0]
+    return float(np.interp(bound, peaks[i - 1 : i + 1], shares[i - 1 : i + 1]))
 
-    `design` bounds |S| of the PID alone. The motion controller makes the command follow the motion, and the model as
-    feedforward turns the acceleration of the command into a voltage; together they add about K_x τ/K to K_p. With the
-    prior `none` it is so once the learner has found the model. Lags of armature and measurement are left out.
+
+def sensitivity(
+    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], kanayama: NDArray[np.float64], prefilter: float,
+    delay: float = 0.0, period: float = 0.01,
+) -> NDArray[np.float64]:  # fmt: skip
+    """Returns max |S| of both channels over `SPEEDS`, with motion controller and nominal model, dimensionless.
+
+    With the prior `none` it is so once the learner has found the model. Lags of armature and measurement are left out.
 
     Args:
         robot: The nominal robot in its steering arrangement.
         rigid: Whether the second channel is steering.
         gains: PI gains of both channels.
-        motion: The motion controller.
+        kanayama: K_x in 1/s, K_y in 1/m² and K_θ in 1/m of one or of several motion controllers, `(3,)` or `(3, N)`.
+        prefilter: Time constant of the prefilter in s.
         delay: Delay from measurement to voltage in s, over which the motion is predicted.
         period: Control period in s.
+
+    Returns:
+        max |S| of the common and of the second channel, `(2,)` or `(2, N)`.
     """
-    frequency = np.geomspace(1e-3, 1, 600) * np.pi / period * (1 - 1e-9)
-    worst = []
-    for channel in (0, 1):
-        loops = [
-            whole_loop(frequency, robot, rigid, channel, plant, gains[channel], motion, share, delay, period)
-            for plant in plants(robot, rigid, channel)
-            for share in SPEEDS
-        ]
-        worst.append(float(np.max(np.abs(1 / (1 + np.array(loops))))))
-    return worst[0], worst[1]
+    frequency = np.geomspace(1e-3, 1, 200) * np.pi / period * (1 - 1e-9)
+    both = [
+        whole_loop(frequency, robot, rigid, channel, gains[channel], kanayama, prefilter, delay, period)
+        for channel in (0, 1)
+    ]
+    return np.array([np.max(np.abs(1 / (1 + loops)), axis=(-3, -2, -1)) for loops in both])
 
 
 def whole_loop(
-    frequency: NDArray[np.float64], robot: Robot, rigid: bool, channel: int, plant: Linear, gains: Gains,
-    motion: Motion, share: float, delay: float, period: float,
+    frequency: NDArray[np.float64], robot: Robot, rigid: bool, channel: int, gains: Gains,
+    kanayama: NDArray[np.float64], prefilter: float, delay: float, period: float,
 ) -> NDArray[np.complex128]:  # fmt: skip
-    """Frequency response of the loop of one channel with the motion controller and the nominal model as feedforward.
+    """Frequency responses of the loop of one channel with the motion controller and the nominal model as feedforward.
 
         L = [C + (C (G − D) + F) Q] P z^(−d),    z = e^(jωh)
 
@@ -234,21 +271,21 @@ def whole_loop(
         robot: The nominal robot in its steering arrangement.
         rigid: Whether the second channel is steering.
         channel: 0 for the common channel, 1 for the second.
-        plant: The plant.
         gains: PI gains.
-        motion: The motion controller.
-        share: Speed, as a share of the robot's largest one.
+        kanayama: K_x in 1/s, K_y in 1/m² and K_θ in 1/m, `(3,)` or `(3, N)`.
+        prefilter: Time constant T of the prefilter in s.
         delay: Delay d h from measurement to voltage in s.
         period: Control period h in s.
 
     Returns:
-        L(e^(jωh)), dimensionless, `(F,)`.
+        L(e^(jωh)) of each of the `plants`, at each of `SPEEDS` of the motion controller, dimensionless, `(P, S, F)` or
+        `(N, P, S, F)`; S is 1 in the common channel, where the speed does not matter.
     """
     z, late = np.exp(1j * frequency * period), round(delay / period)
     pi = gains.k_p + gains.k_i * period * z / (z - 1)
-    a = min(1.0, period / motion.prefilter)
-    prefilter = a * z / (z - 1 + a)
-    rate = (1 - prefilter / z) * a / period
+    a = min(1.0, period / prefilter)
+    filtered = a * z / (z - 1 + a)
+    rate = (1 - filtered / z) * a / period
     ahead = moved = drifted = np.zeros_like(z)  # D, E and E₂
     for p in range(late, 0, -1):
         middle = ahead + period * rate * z**-p / 2
@@ -257,14 +294,15 @@ def whole_loop(
         ahead = ahead + period * rate * z**-p
     once, horizon = period / 2 * (z + 1) / (z - 1), late * period
     position, drift = once + horizon, once**2 + horizon * once + horizon**2 / 2
-    k, speed = motion.kanayama, share * robot.max_speed
+    k_x, k_y, k_theta = np.asarray(kanayama, float)[..., None, None, None]
     if channel == 0:
-        request = float(k.k_x or 0) * position / (1 + float(k.k_x or 0) * moved)
+        request = k_x * position / (1 + k_x * moved)
         static, lag = robot.velocity_gain, robot.velocity_time_constant
     else:
-        heading, lateral = speed * float(k.k_theta or 0), speed**2 * float(k.k_y or 0)
+        speed = np.array(SPEEDS)[:, None] * robot.max_speed
+        heading, lateral = speed * k_theta, speed**2 * k_y
         request = (heading * position + lateral * drift) / (1 + heading * moved + lateral * drifted)
         static, lag = robot.rotation_gain, robot.rotation_time_constant
-    model = prefilter if rigid and channel == 1 else (prefilter + lag * rate) / static
-    control = pi + (pi * (prefilter - ahead) + model) * request
-    return np.asarray(control * plant.response(frequency, period) * z**-late, complex)
+    model = filtered if rigid and channel == 1 else (filtered + lag * rate) / static
+    response = np.array([plant.response(frequency, period) for plant in plants(robot, rigid, channel)]) * z**-late
+    return np.asarray(response[:, None] * (pi + (pi * (filtered - ahead) + model) * request), complex)

@@ -3,8 +3,8 @@
 A disturbance d of a channel's voltage that never exceeds D causes an error e that never exceeds ‖G‖₁ D, where ‖G‖₁ is
 the sum of |g| over the response g of the error to a pulse of one period. No smaller bound holds for all d: sign(g),
 reversed in time, reaches it (Boyd and Barratt 1991, Linear Controller Design, section 5.1). The loops are those that
-`design` designs: PI control of the linear plants, with delay and hold, and around it the motion controller with its
-prefilter, linearised about driving straight on,
+`design` designs: PI control of the linear plants, with delay and hold, around it the motion controller with its
+prefilter, and the prediction of the motion over the delay, linearised about driving straight on,
 
     ẋ_e = −v,    ẏ_e = v_r θ_e,    θ̇_e = −ω        with v, ω beyond the reference.
 """
@@ -114,7 +114,8 @@ class Loop:
 
     Attributes:
         step: Matrix from the state of one tick to that of the next; the state is that of the plant, the integral, the
-            filtered correction, one or two posture errors, and the queue of delayed voltages.
+            filtered correction, one or two posture errors, and the queues of the voltages and of the rates of the
+            correction that have not acted yet.
         pulse: State after a disturbance of one unit that lasts one period.
         errors: Rows that give the velocity error and the position error of a state.
         state: Index of the velocity, the integral, the position error and the heading error in the state, by name.
@@ -133,27 +134,31 @@ class Loop:
             (robot.velocity_gain, robot.velocity_time_constant),
             (robot.rotation_gain, robot.rotation_time_constant),
         )[channel]
-        size = n + 5 + late  # plant, integral, correction, velocity error, position, heading, queued voltages
-        i, c, e, p, h, u = n, n + 1, n + 2, n + 3, n + 4, n + 5
+        i, c, p, h, u, r = n, n + 1, n + 2, n + 3, n + 4, n + 4 + late
+        size = n + 4 + 2 * late  # plant, integral, correction, position, heading, voltages, rates
+
+        def moved(velocity: float, after: float, p: float, h: float) -> tuple[float, float]:
+            """Position and heading error after a period in which the velocity changes uniformly."""
+            step = period * (velocity + after) / 2
+            if channel == 0:
+                return p - step, 0.0
+            return p + period * speed * (2 * h - step) / 2, h - step
 
         def after(s: NDArray[np.float64], disturbance: float) -> NDArray[np.float64]:
-            new = s.copy()
-            request = k_x * s[p] if channel == 0 else speed * (k_y * s[p] + k_theta * s[h])
+            new, v, position, heading = s.copy(), s[0], s[p], s[h]
+            for rate in s[r:]:  # predicted over the delay
+                position, heading = moved(v, v + period * rate, position, heading)
+                v += period * rate
+            request = k_x * position if channel == 0 else speed * (k_y * position + k_theta * heading)
             rate = (request - s[c]) / time_constant
             new[c] = s[c] + period * rate
-            new[e] = new[c] - s[0]
-            new[i] = s[i] + period * gains.k_i * new[e]
+            new[i] = s[i] + period * gains.k_i * (new[c] - v)
             forward = new[c] if rigid and channel == 1 else (new[c] + lag * rate) / gain
-            voltage = gains.k_p * new[e] + new[i] + forward + disturbance
-            queue = np.append(s[u : u + late], voltage)
-            new[u : u + late] = queue[1:]
+            voltage = gains.k_p * (new[c] - v) + new[i] + forward + disturbance
+            queue = np.append(s[u:r], voltage)
+            new[u:r], new[r:] = queue[1:], np.append(s[r:], rate)[1:]
             new[:n] = held.a @ s[:n] + held.b * queue[0]
-            moved = period * (s[0] + new[0]) / 2
-            if channel == 0:
-                new[p], new[h] = s[p] - moved, 0.0
-            else:
-                new[h] = s[h] - moved
-                new[p] = s[p] + period * speed * (s[h] + new[h]) / 2
+            new[p], new[h] = moved(s[0], new[0], s[p], s[h])
             return new
 
         self.step = np.stack([after(column, 0.0) for column in np.eye(size)], axis=1)

@@ -137,7 +137,9 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
             found = motion_design(nominal, rigid, both, delay, period)
             lags = dict(zip(("v_lag", "omega_lag"), found.lag, strict=True))
             suits = found.kanayama.model_dump() | {"prefilter": found.prefilter} | lags
-            suits |= {"sensitivity": sensitivity(nominal, rigid, both, found, delay, period)}
+            kanayama = np.array([suits[name] for name in ("k_x", "k_y", "k_theta")])
+            whole = sensitivity(nominal, rigid, both, kanayama, found.prefilter, delay, period)
+            suits |= {"sensitivity": whole.tolist()}
             table["motion"].append({"steering": steering, "delay": delay} | suits)
         channels = (0, 1) if steering == offered[0] else (1,)
         for channel in tqdm(channels, unit="loop", desc=steering):
