@@ -1,5 +1,7 @@
 """The design of PID and motion controller against the poles, the Nyquist curve and a search by brute force."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -254,7 +256,7 @@ def test_the_prefilter_is_the_best(robot, steering, delay):
 @pytest.mark.parametrize("steering", list(ARRANGEMENTS))
 @pytest.mark.parametrize("late", [0, 1, 2])
 def test_whole_loop(robot, steering, late):
-    """S of the loop with motion controller and model is the spectrum of what becomes of one pulse of the voltage.
+    """S of the whole loop, with and without the model, is the spectrum of what becomes of one pulse of the voltage.
 
     The pulse goes through plant, delay, the integration of the posture, its prediction, motion controller, prefilter,
     PI controller and model, tick by tick. The errors are those of `Loop`, with which the guard's D is computed.
@@ -264,7 +266,7 @@ def test_whole_loop(robot, steering, late):
     over = motion(robot, rigid, gains, late * H)
     k, ticks, speed = over.kanayama, 6000, 0.5 * robot.max_speed
     frequency = np.array([3.0, 10.0, 30.0, 80.0, 200.0])
-    for channel in (0, 1):
+    for channel, with_model in product((0, 1), (False, True)):
         plant = plants(robot, rigid, channel)[0]
         held = plant.held(H)
         state, integral, c, place, heading = np.zeros(len(plant.b)), 0.0, 0.0, 0.0, 0.0
@@ -287,7 +289,7 @@ def test_whole_loop(robot, steering, late):
             rate = (wanted - c) / over.prefilter
             c += H * rate
             integral += H * gains[channel].k_i * (c - v)
-            forward = c if rigid and channel == 1 else (c + lag * rate) / static
+            forward = with_model * (c if rigid and channel == 1 else (c + lag * rate) / static)
             totals[n] = (n == 0) + gains[channel].k_p * (c - v) + integral + forward
             sent, rates = [*sent, totals[n]], [*rates, rate][1 if late else 1 :]
             before = state[0]
@@ -298,8 +300,11 @@ def test_whole_loop(robot, steering, late):
             else:
                 place, heading = place + H * speed * (2 * heading + step) / 2, heading + step
         spectrum = np.exp(-1j * H * np.outer(frequency, np.arange(ticks))) @ totals
-        loops = whole_loop(frequency, robot, rigid, channel, gains[channel], vector(k), over.prefilter, late * H, H)
-        np.testing.assert_allclose(1 / (1 + loops[0, SPEEDS.index(0.5) if channel else 0]), spectrum, atol=1e-3)
+        both = whole_loop(frequency, robot, rigid, channel, gains[channel], vector(k), over.prefilter, late * H, H)
+        loop = both[int(with_model), 0, SPEEDS.index(0.5) if channel else 0]
+        np.testing.assert_allclose(1 / (1 + loop), spectrum, atol=1e-3)
+        if not with_model:
+            continue
         linear = Loop(robot, rigid, channel, plant, gains[channel], over, 0.5, late * H, H)
         np.testing.assert_allclose(linear.response(linear.pulse)[:, :999], errors[:, 1:1000], atol=1e-9)
 
