@@ -210,7 +210,7 @@ def vector(kanayama):
 @pytest.mark.parametrize("steering", list(ARRANGEMENTS))
 @pytest.mark.parametrize("delay", [0.0, 0.01, 0.02, 0.06])
 def test_the_prefilter_is_the_best(robot, steering, delay):
-    """No other prefilter allows gains that are larger by more than 3 %, the cost of steps of 10 %.
+    """No other prefilter allows gains whose product is larger by more than 5 %, the cost of steps of 10 %.
 
     The gains of each prefilter come from a bisection with the bounds on damping, requested acceleration and max |S|.
     """
@@ -249,7 +249,7 @@ def test_the_prefilter_is_the_best(robot, steering, delay):
     reached = found.kanayama.k_x * found.kanayama.k_y**0.5
     scores = [score(least * factor) for factor in (1, 1.5, 2, 3, 4, 5, 7, 10, 15)]
     assert found.prefilter >= least
-    assert reached > 0.97 * max(scores)
+    assert reached > 0.95 * max(scores)
     assert score(found.prefilter) == pytest.approx(reached, rel=0.02)
 
 
