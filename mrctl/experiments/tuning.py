@@ -53,8 +53,8 @@ MOTION = (
     *("K_x, 1/s", "K_y, 1/m²", "K_θ, 1/m", "max \\|S\\| common", "max \\|S\\| second"),
 )
 WHOLE = """\
-The last two columns are max |S| of the loop opened at the voltage, the largest over several speeds, with this motion
-controller and the nominal model as feedforward, which close a second loop around the PID's."""
+The last two columns are max |S| of the loop opened at the voltage, the largest over several speeds, with and without
+the nominal model as feedforward, under this motion controller, which closes a second loop around the PID's."""
 ADVICE = """\
 A learner that the feedback voltage teaches is safe at frequencies where Re T > 0. `fel`, `rls` and `composite` take
 half of what they add from the PID's integral (the hand-over), and learn at features delayed by τ, the delay and two
