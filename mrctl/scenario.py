@@ -149,7 +149,7 @@ class Scenario(Record):
     """Seed of the random numbers: initial offset, initial weights, noise and biases of the sensors."""
     prefilter: Annotated[float, Field(ge=0.01, le=1)] | None = None
     """Time constant in s of the filter on the velocities that the motion controller adds to the reference; by default
-    it follows from the lag of the velocity loops."""
+    it is designed with the gains of the motion controller."""
     physics_step: Annotated[float, Field(ge=1e-5, le=0.01)] = 0.002
     """Duration of one physics step in s."""
     control_period: Annotated[float, Field(ge=1e-3, le=0.1)] = 0.01

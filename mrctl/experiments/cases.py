@@ -49,6 +49,7 @@ RANDOM_LAPS = 4
 MARGIN = 0.8  # share of the robot's limits that a random spline may ask for
 GRIP = 0.3  # tyre friction that a random spline relies on
 NO_WORSE = 1.02  # ratio to the error of PID alone up to which a feedforward does no harm
+MUCH_WORSE = 5.0  # and above which it does much
 BAND = 1.2  # largest ratio to the error before a step, or to the final one, that counts as recovered or converged
 
 

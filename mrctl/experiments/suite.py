@@ -20,6 +20,7 @@ from mrctl.experiments.cases import (
     FLOOR,
     HALF,
     HINDSIGHT,
+    MUCH_WORSE,
     NO_WORSE,
     PARTS,
     SUITE_SEEDS,
@@ -257,14 +258,17 @@ def standing(name: str, errors: Mapping[str, NDArray[np.float64]], floor: Floor,
     return found
 
 
-def no_worse(error: NDArray[np.float64], pid: NDArray[np.float64]) -> dict[str, float]:
+def no_worse(error: NDArray[np.float64], pid: NDArray[np.float64]) -> dict[str, float | int]:
     """Share of runs whose error is at most `NO_WORSE` times that of PID alone, with Wilson's 95 % interval.
 
-    A failed run, whose error is NaN, counts as worse, unless PID alone failed too.
+    With it come the 99 % quantile of that ratio, and the number of runs in which it is above `MUCH_WORSE`. The ratio of
+    a failed run, whose error is NaN, is infinite, and 0 where PID alone failed.
     """
-    share = float(np.mean((error <= NO_WORSE * pid) | np.isnan(pid)))
-    low, high = wilson(share, len(error))
-    return {"value": share, "low": low, "high": high}
+    ratio = np.where(np.isnan(pid), 0.0, np.where(np.isnan(error), np.inf, error) / pid)
+    share = float(np.mean(ratio <= NO_WORSE))
+    low, high = wilson(share, len(ratio))
+    quantile = float(np.quantile(ratio, 0.99, method="higher"))
+    return {"value": share, "low": low, "high": high, "quantile_99": quantile, "much": int((ratio > MUCH_WORSE).sum())}
 
 
 def titled(name: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from mrctl.experiments.cases import BAND, FLOOR, HALF, HINDSIGHT, NO_WORSE, PARTS, REFERENCES, UNCHANGED
+from mrctl.experiments.cases import BAND, FLOOR, HALF, HINDSIGHT, MUCH_WORSE, NO_WORSE, PARTS, REFERENCES, UNCHANGED
 from mrctl.experiments.tables import markdown, number
 
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
@@ -146,13 +146,14 @@ def last_laps(rows: Sequence[Row]) -> pd.DataFrame:
     header = ["case", "feedforward", "failed", *(f"{title}; worst 5 %" for title in COLUMNS.values())]
     header += ["beats PID in V / θ̇ / position", "beats model", "guard acted"]
     unchanged, random = rows[0]["part"] in UNCHANGED, any("no_worse" in row["position_rmse"] for row in rows)
-    header += [f"at most {NO_WORSE:g}× PID in V / θ̇ / position"] if random else []
+    harm = f"at most {NO_WORSE:g}× PID in V / θ̇ / position", f"position over PID, 99 %; runs above {MUCH_WORSE:g}"
+    header += harm if random else ()
     header += [f"laps to {BAND:g}× the final V / θ̇ / position"] if unchanged else []
     cells = [
         [
             row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", *(_mean(row[m]) for m in COLUMNS),
             *(_wins(row, TITLES.get(one, one)) for one in YARDSTICKS), number(row["guard_events"]),
-            *([_harmless(row)] if random else []), *([_converged(row)] if unchanged else []),
+            *(_harm(row) if random else ()), *([_converged(row)] if unchanged else []),
         ]
         for row in rows
     ]  # fmt: skip
@@ -276,11 +277,13 @@ def _converged(row: Row) -> str:
     return " / ".join(f"{one['value']:.1f}" if one["samples"] else "–" for one in laps)
 
 
-def _harmless(row: Row) -> str:
+def _harm(row: Row) -> tuple[str, str]:
     if "no_worse" not in row["position_rmse"]:
-        return ""
+        return "", ""
     shares = [row[metric]["no_worse"] for metric in COLUMNS]
-    return " / ".join(f"{one['value']:.3f}" for one in shares) + f" [{shares[-1]['low']:.3f}, {shares[-1]['high']:.3f}]"
+    *_, last = shares
+    no_worse = " / ".join(f"{one['value']:.3f}" for one in shares) + f" [{last['low']:.3f}, {last['high']:.3f}]"
+    return no_worse, f"{number(last['quantile_99'])}; {last['much']}"
 
 
 def _wins(row: Row, rival: str) -> str:

@@ -131,6 +131,8 @@ def test_table(whole: Path) -> None:
         assert row["beats_PID"]["wins"] == (own < bare).sum() and found[case, "rls"]["failed"] == 0
         if case == "random":
             assert row["no_worse"]["value"] == pytest.approx((own <= 1.02 * bare).mean())
+            assert row["no_worse"]["much"] == (own > 5 * bare).sum()
+            assert row["no_worse"]["quantile_99"] == pytest.approx((own / bare).max())
         assert ("laps_to_converge" in row) == (case != "random")
         if case != "random":
             laps = alone["rls"]["laps_to_converge"].mean()
@@ -264,6 +266,16 @@ def test_sentences() -> None:
 def test_interval(value: float, low: float, high: float, text: str) -> None:
     """No interval is printed with equal ends."""
     assert suite_tables.interval({"value": value, "low": low, "high": high, "samples": 2}) == text
+
+
+def test_no_worse() -> None:
+    """A run that is lost where PID is not counts as infinitely worse; one that PID loses too does no harm."""
+    pid, lost = np.full(200, 2.0), np.arange(200) < 3
+    pid[-5:] = np.nan
+    found = suite.no_worse(np.where(lost, np.nan, np.where(np.arange(200) < 60, 12.0, 2.0)), pid)
+    assert found["value"] == 140 / 200 and found["low"] < 0.7 < found["high"] and found["much"] == 60
+    assert found["quantile_99"] == np.inf
+    assert suite.no_worse(np.where(lost[::-1], np.nan, 3.0), pid)["quantile_99"] == 1.5
 
 
 def test_goes_on_where_it_stopped(whole: Path, tmp_path: Path) -> None:
