@@ -30,8 +30,8 @@ M_S, M_T = 1.6, 1.1
 SPEEDS = 0.5, 0.2, 1.0
 """Shares of the robot's largest speed at which its loops keep the bounds, *chosen*; `mrctl tune` uses the first one."""
 WHOLE = 1.15
-"""Factor by which the motion controller may raise max |S| of the velocity loops, *chosen* in random worlds: 1.1 costs
-PID alone 8 % of its accuracy in `field`, and 1.2 leaves `lab` as fragile as without a bound."""
+"""Largest |S| under the motion controller over the larger one of `M_S` and that of the PID alone, *chosen* in random
+worlds: 1.1 makes the position error of PID alone 8 % larger in `field`; 1.2 does not change the gains of `lab`."""
 DAMPING = 0.5
 """Damping ratio of the motion controller's loops at the largest speed, *chosen*; it is higher at a lower speed."""
 ERROR = 0.05
@@ -40,23 +40,31 @@ PUBLISHED_K_X, PUBLISHED_K_THETA = 10.0, 16.0
 """Gains K_x in 1/s and K_θ in 1/m of Kanayama et al. (1990); upper bounds of the designed ones."""
 
 
-def plants(robot: Robot, rigid: bool, channel: int) -> list[Linear]:
-    """Returns the plant of a channel at each of `SPEEDS`, or one plant where the speed does not matter.
+def points(robot: Robot, rigid: bool, channel: int) -> list[tuple[float, Linear]]:
+    """Returns the speeds in m/s at which a channel is designed, and its plant at each.
 
-    The yaw of a robot with its centre of mass behind the axle is unstable above some speed. Speeds at which it is
-    unstable are left out; if none is left, the plant is that at rest.
+    They are `SPEEDS`, or only the first in the common channel, where the speed does not matter. The yaw of a robot with
+    its centre of mass behind the axle is unstable above some speed. Speeds at which it is unstable are left out; if
+    none is left, the slowest has the plant at rest.
 
     Args:
         robot: The nominal robot in its steering arrangement.
         rigid: Whether the second channel is steering.
         channel: 0 for the common channel, 1 for the second.
     """
+    speeds = [share * robot.max_speed for share in SPEEDS]
     if channel == 0:
-        return [linear.common(robot)]
+        return [(speeds[0], linear.common(robot))]
     if rigid:
-        return [linear.steering(robot)]
-    found = [linear.yaw(robot, share * robot.max_speed) for share in SPEEDS]
-    return [plant for plant in found if plant.stable] or [linear.yaw(robot, 0.0)]
+        return [(speed, linear.steering(robot)) for speed in speeds]
+    stable = [(speed, plant) for speed in speeds if (plant := linear.yaw(robot, speed)).stable]
+    return stable or [(min(speeds), linear.yaw(robot, 0.0))]
+
+
+def plants(robot: Robot, rigid: bool, channel: int) -> list[Linear]:
+    """Returns the plants of the `points` of a channel; where the speed does not matter, it is one."""
+    found = [plant for _, plant in points(robot, rigid, channel)]
+    return found[:1] if rigid or channel == 0 else found
 
 
 def design(robot: Robot, rigid: bool, delay: float, lag: float = 0.0, period: float = 0.01) -> tuple[Gains, Gains]:
@@ -142,8 +150,11 @@ class Motion(NamedTuple):
     lag: tuple[float, float]
 
 
-def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float = 0.0, period: float = 0.01) -> Motion:
-    """Designs the motion controller over the velocity loops: gains, damping and prefilter.
+def motion(
+    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float = 0.0, period: float = 0.01,
+    prefilter: float | None = None,
+) -> Motion:  # fmt: skip
+    """Designs the motion controller over the velocity loops: gains and prefilter.
 
         x:  τ s² + s + K_x = 0,                         ζ = 1/(2 √(K_x τ))
         y:  τ s³ + s² + v_r K_θ s + v_r² K_y = 0,       K_θ = 2 √K_y
@@ -153,7 +164,7 @@ def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float =
     torque when the robot turns as commanded, and K is that of equation (3) without the fork. A stiff servo (`rigid`)
     follows angle and rate of the command, which leaves the delay and the lag of the tyre.
 
-    K_x and √K_y are the largest that keep four bounds:
+    For a given time constant T of the prefilter, K_x and √K_y are each the largest within four bounds:
 
     - The damping ratio ζ is at least `DAMPING` up to the largest speed. K_θ makes the lateral error critically damped
       where τ = 0. With p = τ s and κ = τ v_r √K_y the second equation is p³ + (p + κ)² = 0; its root r e^(jψ) with
@@ -162,14 +173,16 @@ def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float =
       it oscillate: K_x² e ≤ V̇_max, and v² K_y^(3/2) e ≤ θ̈_max, as the loops have the time constants 1/K_x and
       1/(v √K_y).
     - They are at most those of Kanayama et al. (1990).
-    - max |S| of each channel is at most `WHOLE` · max(M_s, max |S| of the PID alone), at this gain and at every
-      smaller one, with and without the model as feedforward. The motion controller makes the command follow the
-      motion: a second feedback, with the same delay, and a stronger one with the model (`sensitivity`).
+    - max |S| of the channel is at most `WHOLE` · max(M_s, max |S| of the PID alone), for this K_x or √K_y and for
+      smaller ones, with and without the model as feedforward (`sensitivity`). The motion controller makes the command
+      follow the motion, which is a second feedback with the same delay; the model as feedforward makes it stronger.
 
-    A slower prefilter costs damping and spares max |S|. Its time constant T is the one with the largest K_x √K_y, of
-    those that are at least a control period and half the lag of the slower velocity loop, *chosen*, in steps of 10 %.
+    T starts at the control period, or at half the lag of the slower velocity loop where that is more, *chosen*, and
+    grows in steps of 10 %; the T with the largest K_x √K_y is taken. A slower prefilter lowers max |S| as long as the
+    motion loops are well damped, and it lowers the gains that damping allows.
 
-    A design takes about 0.2 s; the last 256 are cached.
+    A design takes 0.03 s, at most 0.2 s; the last 256 are cached. If the PID alone is unstable, the bound on max |S|
+    means nothing.
 
     Args:
         robot: The nominal robot in its steering arrangement.
@@ -177,13 +190,16 @@ def motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float =
         gains: PI gains of both channels.
         delay: Delay from measurement to voltage in s.
         period: Control period in s.
+        prefilter: Time constant of the prefilter in s, if it is given.
     """
-    return _motion(robot, rigid, gains, delay, period)  # pyright: ignore[reportArgumentType] (frozen, so hashable)
+    return _motion(robot, rigid, gains, delay, period, prefilter)  # pyright: ignore[reportArgumentType] (hashable)
 
 
 @lru_cache(maxsize=256)
-def _motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float, period: float) -> Motion:
-    free = linear.yaw(robot.model_copy(update={"fork_inertia": 0.0}), robot.max_speed)
+def _motion(
+    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float, period: float, given: float | None
+) -> Motion:
+    _, free = max(points(robot.model_copy(update={"fork_inertia": 0.0}), False, 1), key=lambda point: point[0])
     v_lag = 1 / (linear.common(robot).gain * gains[0].k_i)
     omega_lag = linear.TYRE_LAG + delay if rigid else 1 / (free.gain * gains[1].k_i)
     angle = np.pi - np.arccos(DAMPING)
@@ -192,18 +208,21 @@ def _motion(robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float,
     turned = robot.max_rotation_acceleration / robot.max_speed**2
     reached = (robot.max_acceleration / ERROR) ** (1 / 2), (turned / ERROR) ** (1 / 3)
     shares = np.linspace(0, 1, 21)
-    prefilter, best, chosen = max(period, v_lag / 2, omega_lag / 2), 0.0, (0.0, 0.0, 0.0)
+    prefilter = max(period, v_lag / 2, omega_lag / 2) if given is None else max(period, given)
+    best, chosen = 0.0, (0.0, 0.0, prefilter)
     while True:
         damped = 1 / (4 * DAMPING**2 * (v_lag + prefilter)), kappa / ((omega_lag + prefilter) * robot.max_speed)
         k_x = min(damped[0], reached[0], PUBLISHED_K_X)
         lateral = min(damped[1], reached[1], PUBLISHED_K_THETA / 2)
-        if k_x * lateral <= best:  # nor is any slower prefilter better
+        if k_x * lateral <= best:  # by the first three bounds no slower prefilter is better
             break
         tried = np.array([shares * k_x, (shares * lateral) ** 2, 2 * shares * lateral])
         peaks = sensitivity(robot, rigid, gains, tried, prefilter, delay, period)
         k_x, lateral = k_x * _kept(shares, peaks[0]), lateral * _kept(shares, peaks[1])
         if k_x * lateral > best:
             best, chosen = k_x * lateral, (k_x, lateral, prefilter)
+        if given is not None:
+            break
         prefilter *= 1.1
     k_x, lateral, prefilter = chosen
     return Motion(Kanayama(k_x=k_x, k_y=lateral**2, k_theta=2 * lateral), prefilter, (v_lag, omega_lag))
@@ -225,8 +244,8 @@ def sensitivity(
 ) -> NDArray[np.float64]:  # fmt: skip
     """Returns max |S| of both channels under the motion controller, with and without the nominal model as feedforward.
 
-    It is the largest over `SPEEDS`, dimensionless. The prior `none` is without the model until the learner has found
-    it. Lags of armature and measurement are left out.
+    Each is the largest over the speeds of `points`, dimensionless. The prior `none` is without the model until the
+    learner has found it. Lags of armature and measurement (`pid.lag`) are left out.
 
     Args:
         robot: The nominal robot in its steering arrangement.
@@ -240,12 +259,13 @@ def sensitivity(
     Returns:
         max |S| of the common and of the second channel, `(2,)` or `(2, N)`.
     """
-    frequency = np.geomspace(1e-3, 1, 200) * np.pi / period * (1 - 1e-9)
+    share = np.concatenate([np.geomspace(1e-5, 1e-3, 60, endpoint=False), np.geomspace(1e-3, 1, 200)])
+    frequency = share * np.pi / period * (1 - 1e-9)
     peaks = []
     for channel in (0, 1):
         own = robot, rigid, channel, gains[channel]
         both = whole_loop(frequency, *own, kanayama, prefilter, delay, period)
-        peaks.append(np.max([np.max(np.abs(1 / (1 + loops)), axis=(-3, -2, -1)) for loops in both], axis=0))
+        peaks.append(np.max([np.max(np.abs(1 / (1 + loops)), axis=(-2, -1)) for loops in both], axis=0))
     return np.array(peaks)
 
 
@@ -260,7 +280,7 @@ def whole_loop(
     - C is the PI controller, P the plant behind the hold, z^(−d) the delay.
     - Q is the correction that the motion controller requests after a deviation of the velocity, G the prefilter and R
       its rate: G = a z/(z − 1 + a), a = h/T, R = (1 − G/z)/T.
-    - F is the feedforward: none or the nominal model, (G + τ R)/K, which is G itself for steering.
+    - F is 0 without the model; with it F = (G + τ R)/K, K and τ of equation (3), or G if the channel is steering.
     - D = h R Σ z^(−p), p = 1 … d, is by how much the predicted velocity is ahead because of the commanded acceleration;
       E and E₂ are the same for its first and its second integral.
 
@@ -281,9 +301,8 @@ def whole_loop(
         period: Control period h in s.
 
     Returns:
-        L(e^(jωh)) without feedforward and with the model, of each of the `plants`, at each of `SPEEDS` of the motion
-        controller, dimensionless, `(2, P, S, F)` or `(2, N, P, S, F)`; S is 1 in the common channel, where the speed
-        does not matter.
+        L(e^(jωh)) without and with the model, at each of the `points`, dimensionless, `(2, points, frequencies)` or
+        `(2, N, points, frequencies)`.
     """
     z, late = np.exp(1j * frequency * period), round(delay / period)
     pi = gains.k_p + gains.k_i * period * z / (z - 1)
@@ -298,16 +317,17 @@ def whole_loop(
         ahead = ahead + period * rate * z**-p
     once, horizon = period / 2 * (z + 1) / (z - 1), late * period
     position, drift = once + horizon, once**2 + horizon * once + horizon**2 / 2
-    k_x, k_y, k_theta = np.asarray(kanayama, float)[..., None, None, None]
+    speeds, plants = zip(*points(robot, rigid, channel), strict=True)
+    k_x, k_y, k_theta = np.asarray(kanayama, float)[..., None, None]
     if channel == 0:
         request = k_x * position / (1 + k_x * moved)
         static, lag = robot.velocity_gain, robot.velocity_time_constant
     else:
-        speed = np.array(SPEEDS)[:, None] * robot.max_speed
+        speed = np.array(speeds)[:, None]
         heading, lateral = speed * k_theta, speed**2 * k_y
         request = (heading * position + lateral * drift) / (1 + heading * moved + lateral * drifted)
         static, lag = robot.rotation_gain, robot.rotation_time_constant
     model = filtered if rigid and channel == 1 else (filtered + lag * rate) / static
-    response = np.array([plant.response(frequency, period) for plant in plants(robot, rigid, channel)]) * z**-late
+    response = np.array([plant.response(frequency, period) for plant in plants]) * z**-late
     parts = [pi + (pi * (filtered - ahead) + forward) * request for forward in (0, model)]
-    return np.asarray(response[:, None] * np.array(parts), complex)
+    return np.asarray(response * np.array(parts), complex)

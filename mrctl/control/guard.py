@@ -24,8 +24,8 @@ learning is a third of the one before, and the authority grows three times as sl
    The guard leaves such a learner alone, unless the loop oscillates.
 2. |d| > D: it ends in the tick in which an error leaves the region. Until then the errors are inside.
 3. From then on PID and model act alone; the PID's integral starts within D of the model, and the rest of the step in
-   voltage, which fades, is within D too. From any such state the position error stays below a bound that the loops give
-   (`recovery`, which counts the rest of the step as a part of the integral): 0.23 to 0.26 m for the default robot.
+   voltage, which fades, is within D too. From any such state the position error stays below a bound that both loops
+   give (`recovery`, which counts the rest of the step as a part of the integral): 0.22 to 0.25 m for the default robot.
 
 The bounds are those of the linear loops that the PID was designed for; the limits of voltage and acceleration, and what
 happens within the loop's delay, add to them. `tests/system/test_adversaries.py` drives against the worst learners.

@@ -12,12 +12,12 @@ from mrctl.record import Record
 
 
 class Kanayama(Record):
-    """Gains of Kanayama's motion controller; by default they follow from the velocity loops and the robot's limits."""
+    """Gains of Kanayama's motion controller; by default `design.motion` finds them for the velocity loops."""
 
     k_x: Annotated[float, Field(ge=0, le=100)] | None = None
-    """Longitudinal gain K_x in 1/s; by default it follows from the lag of V and the limit on V̇."""
+    """Longitudinal gain K_x in 1/s; by default the largest that damping, the limit on V̇ and max |S| allow."""
     k_y: Annotated[float, Field(ge=0, le=1000)] | None = None
-    """Lateral gain K_y in 1/m²; by default it follows from the lag of θ̇ and the limit on θ̈."""
+    """Lateral gain K_y in 1/m²; by default the largest that damping, the limit on θ̈ and max |S| allow."""
     k_theta: Annotated[float, Field(ge=0, le=100)] | None = None
     """Heading gain K_θ in 1/m; by default 2√K_y, critical damping of the lateral error where θ̇ has no lag."""
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.control.design import SPEEDS, Motion, plants
+from mrctl.control.design import Motion, points
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains
 from mrctl.theory.linear import Linear
@@ -66,11 +66,10 @@ def _rejection(
     alone = motion._replace(kanayama=Kanayama(k_x=0.0, k_y=0.0, k_theta=0.0))
     for channel in range(2):
         velocity = position = 0.0
-        for plant in plants(robot, rigid, channel):
-            for share in SPEEDS:
-                parts = robot, rigid, channel, plant, gains[channel]
-                velocity = max(velocity, Loop(*parts, alone, share, delay, period).sums()[0])
-                position = max(position, Loop(*parts, motion, share, delay, period).sums()[1])
+        for speed, plant in points(robot, rigid, channel):
+            parts = robot, rigid, channel, plant, gains[channel]
+            velocity = max(velocity, Loop(*parts, alone, speed, delay, period).sums()[0])
+            position = max(position, Loop(*parts, motion, speed, delay, period).sums()[1])
         found.append(Peaks(velocity, position))
     return found[0], found[1]
 
@@ -96,15 +95,14 @@ def recovery(
     found = []
     for channel in range(2):
         errors = np.zeros(2)
-        for plant in plants(robot, rigid, channel):
-            for share in SPEEDS:
-                loop = Loop(robot, rigid, channel, plant, gains[channel], motion, share, delay, period)
-                total = 0.0
-                for name, limit in limits[channel].items():
-                    state = np.zeros(len(loop.step))
-                    state[loop.state[name]] = limit
-                    total = total + np.abs(loop.response(state))
-                errors = np.maximum(errors, np.max(total, axis=1))
+        for speed, plant in points(robot, rigid, channel):
+            loop = Loop(robot, rigid, channel, plant, gains[channel], motion, speed, delay, period)
+            total = 0.0
+            for name, limit in limits[channel].items():
+                state = np.zeros(len(loop.step))
+                state[loop.state[name]] = limit
+                total = total + np.abs(loop.response(state))
+            errors = np.maximum(errors, np.max(total, axis=1))
         found.append(Peaks(float(errors[0]), float(errors[1])))
     return found[0], found[1]
 
@@ -114,20 +112,20 @@ class Loop:
 
     Attributes:
         step: Matrix from the state of one tick to that of the next; the state is that of the plant, the integral, the
-            filtered correction, one or two posture errors, and the queues of the voltages and of the rates of the
-            correction that have not acted yet.
+            filtered correction, the position and heading errors, the voltages that have not acted yet, and the rates of
+            the correction over which the motion is predicted.
         pulse: State after a disturbance of one unit that lasts one period.
         errors: Rows that give the velocity error and the position error of a state.
         state: Index of the velocity, the integral, the position error and the heading error in the state, by name.
     """
 
     def __init__(
-        self, robot: Robot, rigid: bool, channel: int, plant: Linear, gains: Gains, motion: Motion, share: float,
+        self, robot: Robot, rigid: bool, channel: int, plant: Linear, gains: Gains, motion: Motion, speed: float,
         delay: float, period: float,
     ) -> None:  # fmt: skip
-        """Wires the loop of one channel; the arguments are as for `rejection`, at a share of the largest speed."""
+        """Wires the loop of one channel; the arguments are as for `rejection`, at a speed in m/s."""
         n, late, held = len(plant.b), round(delay / period), plant.held(period)
-        k, speed = motion.kanayama, share * robot.max_speed
+        k = motion.kanayama
         k_x, k_y, k_theta = float(k.k_x or 0), float(k.k_y or 0), float(k.k_theta or 0)
         time_constant = max(motion.prefilter, period)
         gain, lag = (
@@ -137,12 +135,12 @@ class Loop:
         i, c, p, h, u, r = n, n + 1, n + 2, n + 3, n + 4, n + 4 + late
         size = n + 4 + 2 * late  # plant, integral, correction, position, heading, voltages, rates
 
-        def moved(velocity: float, after: float, p: float, h: float) -> tuple[float, float]:
+        def moved(begins: float, ends: float, position: float, heading: float) -> tuple[float, float]:
             """Position and heading error after a period in which the velocity changes uniformly."""
-            step = period * (velocity + after) / 2
+            step = period * (begins + ends) / 2
             if channel == 0:
-                return p - step, 0.0
-            return p + period * speed * (2 * h - step) / 2, h - step
+                return position - step, 0.0
+            return position + period * speed * (2 * heading - step) / 2, heading - step
 
         def after(s: NDArray[np.float64], disturbance: float) -> NDArray[np.float64]:
             new, v, position, heading = s.copy(), s[0], s[p], s[h]

@@ -23,6 +23,7 @@ from mrctl.record import InputError
 from mrctl.results import plots
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
+from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import CAR, RobotFile
 
 RESPONSES = {"design": "designed", "measured": "measured", "hierarchy": "measured with motion controller"}
@@ -52,15 +53,15 @@ MOTION = (
     *("steering", "delay, ms", "lag of V, ms", "lag of θ̇, ms", "prefilter, ms"),
     *("K_x, 1/s", "K_y, 1/m²", "K_θ, 1/m", "max \\|S\\| common", "max \\|S\\| second"),
 )
-WHOLE = """\
-The last two columns are max |S| of the loop opened at the voltage, the largest over several speeds, with and without
-the nominal model as feedforward, under this motion controller, which closes a second loop around the PID's."""
+SECOND_LOOP = """\
+The last two columns are max |S| of the loop opened at the voltage, under this motion controller, which closes a second
+loop around the PID's: the largest over several speeds, with or without the nominal model as feedforward."""
 ADVICE = """\
 A learner that the feedback voltage teaches is safe at frequencies where Re T > 0. `fel`, `rls` and `composite` take
 half of what they add from the PID's integral (the hand-over), and learn at features delayed by τ, the delay and two
 periods: they are safe where Re [(1 + T) e^(jωτ)] > 0. Both hold for commands that do not depend on the motion of the
-robot. The third value is measured with a motion controller that does not predict over the delay. Above the largest
-step a learner with a constant regressor and without hand-over is unstable: choose at most half of it."""
+robot. The third value is measured with the motion controller above, but without its prediction over the delay. Above
+the largest step a learner with a constant regressor and without hand-over is unstable: choose at most half of it."""
 
 
 def tune(
@@ -118,23 +119,28 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
     for steering in offered:
         _, nominal = mjcf.build(world, steering, robot=robot)
         pids = [pid.replace(delay=delay) for delay in delays]
-        common = {"world": world, "robot": robot.model_dump(), "steering": steering, "sensing": {"tier": "ideal"}}
+        common = Scenario.from_dict(
+            {"world": world, "robot": robot.model_dump(), "steering": steering, "sensing": {"tier": "ideal"}}
+        )
+        period, rigid = common.control_period, steering == "rigid"
+        gains = [one.channels(nominal, rigid, period=period) for one in pids]
+        motions = [
+            motion_design(nominal, rigid, both, delay, period) for delay, both in zip(delays, gains, strict=True)
+        ]
+        still = Kanayama(k_x=0, k_y=0, k_theta=0)
         scenarios = [
-            Scenario.from_dict(
-                common
-                | {
-                    "pid": one.model_dump(),
-                    "kanayama": motion.model_dump(),
-                    "perturbation": {"control_delay": delay},
+            common.model_copy(
+                update={
+                    "pid": one,
+                    "perturbation": Perturbation(control_delay=delay),
+                    "kanayama": found.kanayama if moves else still,
+                    "prefilter": found.prefilter,
                 }
             )
-            for motion in (Kanayama(k_x=0, k_y=0, k_theta=0), Kanayama())
-            for one, delay in zip(pids, delays, strict=True)
+            for moves in (False, True)
+            for one, delay, found in zip(pids, delays, motions, strict=True)
         ]
-        period, rigid = scenarios[0].control_period, steering == "rigid"
-        gains = [one.channels(nominal, rigid, period=period) for one in pids]
-        for delay, both in zip(delays, gains, strict=True):
-            found = motion_design(nominal, rigid, both, delay, period)
+        for delay, both, found in zip(delays, gains, motions, strict=True):
             lags = dict(zip(("v_lag", "omega_lag"), found.lag, strict=True))
             suits = found.kanayama.model_dump() | {"prefilter": found.prefilter} | lags
             kanayama = np.array([suits[name] for name in ("k_x", "k_y", "k_theta")])
@@ -203,7 +209,7 @@ def text(table: dict[str, Any]) -> str:
         UNITS,
         "The motion controller for these loops:",
         markdown([*MOTION], motions),
-        WHOLE,
+        SECOND_LOOP,
         f"{' / '.join(RESPONSES.values())}:",
         markdown([*loops, *MARGINS.values(), *SAFETY.values()], rows),
         ADVICE,

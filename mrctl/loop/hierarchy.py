@@ -244,10 +244,9 @@ class Hierarchy:
         self._motions: list[Motion] = []
         for row, scenario in enumerate(scenarios):
             gains = scenario.pid.channels(robot, self._rigid, self._delays[row], self._period)
-            designed = motion(robot, self._rigid, gains, self._delays[row], self._period)
+            designed = motion(robot, self._rigid, gains, self._delays[row], self._period, scenario.prefilter)
             self._motions.append(designed)
-            prefilter = designed.prefilter if scenario.prefilter is None else scenario.prefilter
-            state["limiter"]["time_constant"][row] = max(prefilter, self._period)
+            state["limiter"]["time_constant"][row] = designed.prefilter
             self.set_kanayama(row, scenario.kanayama)
             self.set_pid(row, scenario.pid)
         rejected = np.array([self._rejection(row) for row in range(size)])

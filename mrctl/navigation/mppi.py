@@ -75,7 +75,7 @@ class Mppi(Reactive):
         state = pose, twist, last, self._lag, period, self.bounds, scene
         roll_out.compiled(self._knots, nominal, *state, twists, costs)
         weights = np.exp((costs.min() - costs) / TEMPERATURE)
-        mean = (weights[:, None, None] / weights.sum() * twists).sum(axis=0)  # in order; BLAS adds in one of its own
+        mean = (weights[:, None, None] / weights.sum() * twists).sum(axis=0)  # BLAS adds in an order of its own
         cheapest, some = twists[costs.argmin()].copy(), twists[:: SAMPLES // KEPT].copy()
         touches = costs.min() >= TOUCH
         roll_out.compiled(self._knots[:1], mean, *state, twists[:1], costs[:1])
