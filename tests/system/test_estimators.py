@@ -103,8 +103,8 @@ def test_start(tier):
 # What a robot meets: changes of the scenario, and the least share of time in which each of posture and twist is within
 # three standard deviations. With one wheel on ice, the heading and V of the tier `field` are in about half of the time;
 # a lifted wheel, whose encoder still counts, turns the heading by up to 3 mrad where the filter believes in 0.5 mrad.
-# In `lab` the heading is then within three standard deviations in 92.6 % of the time (48 runs). In `field` it is so in 84
-# to 85 % (36 runs; 89 % before version 0.9.0, whose motion controller is slower there), and V in 89 %.
+# The heading is then within three standard deviations in 92.6 % of the time in `lab` (48 runs), and in 84 to 85 % in
+# `field` (36 runs; 89 % before version 0.9.0, whose motion controller is slower there), where V is in 89 %.
 MEETS = {
     "lost fixes": ({"fix_lost": 0.5}, {}, (0.98,) * 5),
     "outlying fixes": ({"fix_outliers": 0.2}, {}, (0.98,) * 5),
