@@ -147,7 +147,7 @@ class Scenario(Record):
     """Standard deviations of a random offset from the initial pose: x and y in m, θ in rad."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Seed of the random numbers: initial offset, initial weights, noise and biases of the sensors."""
-    prefilter: Annotated[float, Field(ge=0.01, le=1)] | None = None
+    prefilter: Annotated[float, Field(ge=0.01, le=10)] | None = None
     """Time constant in s of the filter on the velocities that the motion controller adds to the reference; by default
     it is designed with the gains of the motion controller."""
     physics_step: Annotated[float, Field(ge=1e-5, le=0.01)] = 0.002

@@ -129,13 +129,11 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
         ]
         still = Kanayama(k_x=0, k_y=0, k_theta=0)
         scenarios = [
-            common.model_copy(
-                update={
-                    "pid": one,
-                    "perturbation": Perturbation(control_delay=delay),
-                    "kanayama": found.kanayama if moves else still,
-                    "prefilter": found.prefilter,
-                }
+            common.replace(
+                pid=one,
+                perturbation=Perturbation(control_delay=delay),
+                kanayama=found.kanayama if moves else still,
+                prefilter=found.prefilter,
             )
             for moves in (False, True)
             for one, delay, found in zip(pids, delays, motions, strict=True)
