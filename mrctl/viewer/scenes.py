@@ -35,7 +35,7 @@ STORIES = {
             events=(Event(time=6.0, perturbation=_LOAD), Event(time=18.0, push=(0.0, 20.0, 0.0))),
         ),
         "At 6 s a load of two and a half times its mass falls on the racing car, and at 18 s it is pushed: PID alone "
-        "gets ever further from the reference until its run ends, and the learner drives on, 2 cm off.",
+        "gets ever further from the reference until its run ends, and the learner drives on, 2 to 3 cm off.",
     ),
     "sagging battery": _story(
         Scenario(laps=5, events=_SAG),
