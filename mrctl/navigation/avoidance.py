@@ -97,7 +97,7 @@ class Following:
         rigid = arranged(scenario).steering == "rigid"
         latency = scenario.sensing.periods("delay", scenario.control_period) * scenario.control_period
         gains = scenario.pid.channels(robot, rigid, latency, scenario.control_period)
-        designed = design(robot, rigid, gains, latency, scenario.control_period).kanayama
+        designed = design(robot, rigid, gains, latency, scenario.control_period, scenario.prefilter).kanayama
         self._gains = np.zeros((), GAINS)
         for name in self._gains.dtype.names or ():
             own = getattr(scenario.kanayama, name)

@@ -119,7 +119,7 @@ def navigate(
     Args:
         task: World, start and goal.
         scenario: The robot and all else. Reference, laps, goal, obstacles and initial pose are those of the mission,
-            and with `window` and `mppi` the motion period is 0.05 s and the prefilter a control period, unless set.
+            and with `window` and `mppi` the motion period is 0.05 s and the prefilter, unless set, the shortest.
         compare: Feedforwards of further robots, which drive the same plan, each alone.
         speed: Largest speed in m/s; by default 0.9 of the robot's.
         margin: Clearance that the plan keeps in m.
@@ -154,7 +154,8 @@ def prepared(
         found, reference = planned(task, scenario, speed, margin, reverse=True)
     own = {"obstacles": task.obstacles, "reference": reference, "laps": PATIENCE}
     if reactive:  # the designed prefilter is that of Kanayama's controller, whose loop is faster
-        own |= {"motion_period": PERIOD, "laps": WAITING, "prefilter": scenario.prefilter or scenario.control_period}
+        shortest = max(scenario.control_period, 0.01)  # s, that a scenario takes
+        own |= {"motion_period": PERIOD, "laps": WAITING, "prefilter": scenario.prefilter or shortest}
     return found, scenario.replace(**own, initial_pose=task.start, goal=task.goal)
 
 

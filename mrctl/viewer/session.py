@@ -234,12 +234,13 @@ class Session:
         not those of any; the gains on the steering are None unless it is rigid.
         """
         robot, rigid, delay, period = self._design
-        over = motion(robot, rigid, self.start[0].pid.channels(*self._design), delay, period)
+        first = self.start[0]
+        over = motion(robot, rigid, first.pid.channels(*self._design), delay, period, first.prefilter)
         own = self.state()["kanayama"].k_y
         k_y = over.kanayama.k_y if own is None else own
         assert k_y is not None
         values: dict[tuple[str, ...], float | None] = {
-            ("prefilter",): max(over.prefilter, period),
+            ("prefilter",): over.prefilter,
             ("kanayama", "k_x"): over.kanayama.k_x,
             ("kanayama", "k_y"): k_y,
             ("kanayama", "k_theta"): 2 * sqrt(k_y),

@@ -5,8 +5,11 @@ import pytest
 from scipy.optimize import nnls
 from test_obstacles import random_shapes
 
-from mrctl import Box, Obstacles
-from mrctl.navigation.avoidance import Barrier, avoid, nearest
+from mrctl import Box, Obstacles, Scenario, Sensing
+from mrctl.control.kanayama import kanayama, posture_error
+from mrctl.loop.hierarchy import Hierarchy
+from mrctl.navigation.avoidance import Barrier, Following, avoid, nearest
+from mrctl.physics import mjcf
 from mrctl.theory.clearance import clearance, cover
 from mrctl.theory.obstacles import Surroundings
 
@@ -94,3 +97,16 @@ def test_idle_when_clear() -> None:
         for request in random.uniform([-1.5, -3], [1.5, 3], (200, 2)):
             pose = random.uniform([-1, -1, -3], [1, 1, 3])
             assert avoid(request, pose, outlines, BARRIER).tolist() == request.tolist()
+
+
+@pytest.mark.parametrize("prefilter", [None, 0.3])
+def test_following_has_the_gains_of_the_hierarchy(prefilter: float | None) -> None:
+    """Beside the filter the robot follows with the gains that it has without, also where the prefilter is given."""
+    scenario = Scenario(sensing=Sensing(tier="field"), prefilter=prefilter)
+    robot = mjcf.build(scenario.world, scenario.steering)[1]
+    pose, reference = np.array([[0.1, 0.2, 0.3]]), np.array([[0.0, 0.0, 0.0, 0.5, 0.2, 0.0, 0.0]])
+    error, request = np.empty(3), np.empty(2)
+    posture_error.compiled(pose[0], reference[0, :3], error)
+    gains = Hierarchy([scenario], robot).state["kanayama"][0]
+    kanayama.compiled(error, reference[0, 3:5], gains, request)
+    assert np.array_equal(Following(robot, 1, scenario).output(pose, np.zeros((1, 2)), reference)[0], request)
