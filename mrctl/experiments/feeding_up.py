@@ -88,8 +88,8 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     text = table(runs, f"{base.robot.path}, {mode}").markdown
     (out / "limits.md").write_text(text)
     source = {"versions": versions(), "machine": machine(), "mode": mode, "scenario": base.model_dump(mode="json")}
-    told = {plant: {name: [run._asdict() for run in own] for name, own in of.items()} for plant, of in runs.items()}
-    write_json(out / "limits.json", source | {"limits": told})
+    rows = {plant: {name: [run._asdict() for run in own] for name, own in of.items()} for plant, of in runs.items()}
+    write_json(out / "limits.json", source | {"limits": rows})
     return text
 
 
@@ -169,7 +169,7 @@ def _driven(
 
 def table(runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
     """How the robots followed the plans on each plant, and the sentence that follows."""
-    rows, told = [], []
+    rows, verdicts = [], []
     for plant, of in runs.items():
         errors = {name: np.array([run.error for run in own]) for name, own in of.items()}
         for name, own in of.items():
@@ -180,11 +180,11 @@ def table(runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
             rows.append([plant, name, share, _median(times, 2), _median(1e3 * errors[name], 1)])
         wins = superiority(errors["learned"], errors["nominal"], floor=TIE)
         word = "smaller" if wins.low > 0.5 else "larger" if wins.high < 0.5 else "level"
-        told.append(f"{word} on {plant} ({wins.value:.2f} [{wins.low:.2f}, {wins.high:.2f}])")
+        verdicts.append(f"{word} on {plant} ({wins.value:.2f} [{wins.low:.2f}, {wins.high:.2f}])")
     says = (
         f"In paired draws, with 95 % confidence and differences up to {1e3 * TIE:.0f} mm as ties, the largest error "
-        f"with learned limits is, against nominal ones: {', '.join(told)}. Times and errors are medians; errors are of "
-        "the robots that arrive."
+        f"with learned limits is, against nominal ones: {', '.join(verdicts)}. Times and errors are medians; errors "
+        "are of the robots that arrive."
     )
     header = ["plant", "limits of the plan", "arrived", "time of the plan, s", "largest error, mm"]
     return Table(f"Feeding up ({shown})", says, pd.DataFrame(rows, columns=header))  # pyright: ignore[reportArgumentType]

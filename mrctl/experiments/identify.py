@@ -77,7 +77,7 @@ class Constant(NamedTuple):
         return self.estimate / self.true - 1
 
     @property
-    def told(self) -> bool:
+    def identifiable(self) -> bool:
         """Whether the interval is narrow enough for the constant to be identifiable."""
         return self.high - self.low <= 2 * TOLD * abs(self.estimate)
 
@@ -114,7 +114,7 @@ def run(world: str, robot: RobotFile, perturbation: Perturbation, sensing: Sensi
     """
     found = identify(world, robot, perturbation, sensing, seed)
     if json:
-        rows: list[dict[str, Any]] = [c._asdict() | {"error": c.error, "told": c.told} for c in found]
+        rows: list[dict[str, Any]] = [c._asdict() | {"error": c.error, "identifiable": c.identifiable} for c in found]
         source = {"versions": versions(), "machine": machine(), "world": world, "robot": robot.model_dump()}
         return json_text(source | {"sensing": sensing.model_dump(mode="json"), "constants": rows})
     return text(found)
@@ -122,14 +122,14 @@ def run(world: str, robot: RobotFile, perturbation: Perturbation, sensing: Sensi
 
 def text(constants: Sequence[Constant]) -> str:
     """Returns the constants as a Markdown table, and which others such drives do not show."""
-    header = ["constant", "unit", "estimate", "95 % interval", "true", "error", "can be told"]
-    numbers = [[f"{x:.4g}" for x in (c.estimate, c.low, c.high, c.true)] for c in constants]
-    cells = [
-        [c.name, c.unit, estimate, f"{low} to {high}", true, f"{100 * c.error:+.2f} %", "yes" if c.told else "no"]
-        for c, (estimate, low, high, true) in zip(constants, numbers, strict=True)
-    ]
+    header = ["constant", "unit", "estimate", "95 % interval", "true", "error", "identifiable"]
+    cells = []
+    for c in constants:
+        estimate, low, high, true = (f"{x:.4g}" for x in (c.estimate, c.low, c.high, c.true))
+        identifiable = "yes" if c.identifiable else "no"
+        cells.append([c.name, c.unit, estimate, f"{low} to {high}", true, f"{100 * c.error:+.2f} %", identifiable])
     parts = [markdown(header, cells), NOT_IDENTIFIABLE]
-    if vague := [c.name for c in constants if not c.told]:
+    if vague := [c.name for c in constants if not c.identifiable]:
         parts.insert(1, f"These sensors cannot tell within {100 * TOLD:g} %: {', '.join(vague)}.")
     return "\n\n".join(parts)
 

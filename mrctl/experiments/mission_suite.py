@@ -256,10 +256,10 @@ def budget(found: Found, shown: str) -> Table:
                 gains[TITLES.get(name, name)] = (
                     f"{1e3 * (value[0] - value[1]):.1f} and {1e3 * (value[0] - value[2]):.1f}"
                 )
-    told = "; ".join(f"`{name}` {gain} mm" for name, gain in gains.items())
+    shares = "; ".join(f"`{name}` {gain} mm" for name, gain in gains.items())
     says = (
         "On the nominal plant a known posture takes from the allowance, and an estimate that is always on the "
-        f"reference: {told}. The map has no errors here."
+        f"reference: {shares}. The map has no errors here."
     )
     header = ["plant", "controller", "allowance, mm", "with a known posture", "with the estimate on the reference"]
     return Table(f"Error budget of the allowance ({shown})", says, _frame(rows, header))
@@ -282,13 +282,13 @@ def _text(value: float) -> str:
 
 def _against(rival: FeedforwardName, samples: Array) -> str:
     """Who does better or worse than a rival on which plants; samples `(controllers, plants, draws)`, less is better."""
-    told = {"better": [], "worse": []}
+    verdicts = {"better": [], "worse": []}
     for c, name in enumerate(CONTROLLERS):
         for p, plant in enumerate(PLANTS):
             wins = superiority(samples[c, p], samples[CONTROLLERS.index(rival), p], floor=TIE)
             if name != rival and (wins.low > 0.5 or wins.high < 0.5):
-                told["better" if wins.low > 0.5 else "worse"].append(f"`{TITLES.get(name, name)}` ({plant})")
+                verdicts["better" if wins.low > 0.5 else "worse"].append(f"`{TITLES.get(name, name)}` ({plant})")
     parts = [
-        f"{word} than `{TITLES.get(rival, rival)}` are {', '.join(names)}" for word, names in told.items() if names
+        f"{word} than `{TITLES.get(rival, rival)}` are {', '.join(names)}" for word, names in verdicts.items() if names
     ]
     return "; ".join(parts) or f"none differs from `{TITLES.get(rival, rival)}`"

@@ -235,8 +235,8 @@ def tiers_text(rows: Sequence[dict[str, Any]]) -> str:
             cells.append([*key, f"{lost} of {len(group)} fail", *[""] * 3])
             continue
         ratio = means[key]["position_rmse"] / means[*key[:2], "none"]["position_rmse"]
-        told = f"{ratio:.2f}" if math.isfinite(ratio) else "PID fails"
-        cells.append([*key, *(number(1e3 * means[key][m]) for m in METRICS), told])
+        relative = f"{ratio:.2f}" if math.isfinite(ratio) else "PID fails"
+        cells.append([*key, *(number(1e3 * means[key][m]) for m in METRICS), relative])
     title = f"The 12 s lap with the sensors, motors and controllers of each tier, mean of {DRAWS} replicates:"
     return f"{title}\n\n{markdown(header, cells)}"
 

@@ -147,11 +147,11 @@ def suite_text(table: Table, everything: str) -> str:
         if row["case"] == case
     ]
     short = markdown(["case", "feedforward", "failed", *COLUMNS.values()], cells)
-    told = {title: text.partition("\n\n") for title, text in sections(everything).items() if title}
-    says = "\n".join(f"- {title}. {says}" for title, (says, _, _) in told.items())
+    by_title = {title: text.partition("\n\n") for title, text in sections(everything).items() if title}
+    says = "\n".join(f"- {title}. {says}" for title, (says, _, _) in by_title.items())
     folded = [
         f"<details><summary>{title}</summary>\n\n{says}\n\n{text}\n\n</details>"
-        for title, (says, _, text) in told.items()
+        for title, (says, _, text) in by_title.items()
     ]
     title = f"RMSE of the last lap ({table['mode']}), mean [95 % bootstrap interval]:"
     return "\n\n".join([says, title, short, *folded])

@@ -204,11 +204,11 @@ def leaders(rows: Sequence[Row]) -> list[list[str]]:
 def leading(best: pd.DataFrame) -> str:
     """Returns a sentence on who is best, or level with the best, in how many cases."""
     column = best["position"]
-    told = [cell.split(", ") for cell in column if cell != "tie"]
-    counts = {name: sum(name in names for names in told) for name in dict.fromkeys(sum(told, []))}
-    ties = len(column) - len(told)
+    leaders = [cell.split(", ") for cell in column if cell != "tie"]
+    counts = {name: sum(name in names for names in leaders) for name in dict.fromkeys(sum(leaders, []))}
+    ties = len(column) - len(leaders)
     shared = f"In position in the last lap all tie in {ties} of {len(column)} cases"
-    return f"{shared}; in the others, best or level with the best are {_counted(counts)}." if told else f"{shared}."
+    return f"{shared}; in the others, best or level with the best are {_counted(counts)}." if leaders else f"{shared}."
 
 
 def recovery(rows: Sequence[Row]) -> pd.DataFrame:

@@ -102,8 +102,8 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     text = table(lag, runs, f"{base.robot.path}, {mode}").markdown
     (out / "mppi.md").write_text(text)
     source = {"versions": versions(), "machine": machine(), "mode": mode, "scenario": base.model_dump(mode="json")}
-    told = {entry: {plant: [run._asdict() for run in own] for plant, own in of.items()} for entry, of in runs.items()}
-    write_json(out / "mppi.json", source | {"lag": lag, "runs": told})
+    rows = {entry: {plant: [run._asdict() for run in own] for plant, own in of.items()} for entry, of in runs.items()}
+    write_json(out / "mppi.json", source | {"lag": lag, "runs": rows})
     return text
 
 
@@ -193,7 +193,7 @@ def ended(result: xr.Dataset, one: World) -> Run:
 
 def table(lag: float, runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
     """How each of the three fared on each plant, and the sentence that follows."""
-    rows, told = [], {SECOND: [], FIRST: []}
+    rows, verdicts = [], {SECOND: [], FIRST: []}
     for plant in PLANTS:
         late = {name: np.array([run.lateness for run in of[plant]]) for name, of in runs.items()}
         for name, of in runs.items():
@@ -205,7 +205,7 @@ def table(lag: float, runs: dict[str, dict[str, list[Run]]], shown: str) -> Tabl
             for rival in (FIRST, SECOND):
                 wins = superiority(late[name], late[rival], floor=TIE)
                 rows[-1].append("" if rival == name else f"{wins.value:.2f} [{wins.low:.2f}, {wins.high:.2f}]")
-        for rival, parts in told.items():
+        for rival, parts in verdicts.items():
             both = np.isfinite(late[THIRD]) & np.isfinite(late[rival])
             wins = superiority(late[THIRD], late[rival], floor=TIE)
             word = "faster" if wins.low > 0.5 else "slower" if wins.high < 0.5 else "level"
@@ -215,8 +215,8 @@ def table(lag: float, runs: dict[str, dict[str, list[Run]]], shown: str) -> Tabl
     says = (
         f"The lag that fits PID on the nominal plant is {1e3 * lag:.0f} ms. In paired draws, with 95 % confidence, "
         f"differences up to {1e3 * TIE:.0f} ms as ties and who does not arrive as last, the third is, against the "
-        f"second: {', '.join(told[SECOND])}; against the first: {', '.join(told[FIRST])}. The differences in time are "
-        "means over the draws in which both arrive."
+        f"second: {', '.join(verdicts[SECOND])}; against the first: {', '.join(verdicts[FIRST])}. The differences in "
+        "time are means over the draws in which both arrive."
     )
     return Table(f"Three MPPIs ({shown})", says, pd.DataFrame(rows, columns=header))  # pyright: ignore[reportArgumentType]
 

@@ -37,8 +37,10 @@ class Ratio(NamedTuple):
     low: float
     high: float
     pairs: int
-    failed_a: int
-    failed_b: int
+    failed: int
+    """Number of runs of A that failed."""
+    rival_failed: int
+    """Number of runs of B that failed."""
 
 
 class Superiority(NamedTuple):

@@ -229,8 +229,8 @@ class Live(Page):
             self._shown_sensing = sensing
             spread = max(np.inf if s.source == "odometry" else s["fix_position_noise"] for s in sensing)
             self.set_marks(any(s.source != "truth" for s in sensing), spread)
-        told = [story.watch for story in STORIES.values() if [arranged(s) for s in story.scenarios] == session.start]
-        write(self._story, block("story", *told) if told else "")
+        watch = [story.watch for story in STORIES.values() if [arranged(s) for s in story.scenarios] == session.start]
+        write(self._story, block("story", *watch) if watch else "")
         self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
         self._scene.show_reference(first)
         self._scene.forget_trails()
@@ -437,13 +437,13 @@ class Live(Page):
 
     def _tell_progress(self) -> Callable[[int], None]:
         """Returns what `Session.repeated` calls, which says on the page how far it is."""
-        total, done, told = self.tick * len(self.session.start), 0, time.monotonic()
+        total, done, shown = self.tick * len(self.session.start), 0, time.monotonic()
 
         def tell(robots: int) -> None:
-            nonlocal done, told
+            nonlocal done, shown
             done += robots
-            if (now := time.monotonic()) > told + 0.5:
-                told = now
+            if (now := time.monotonic()) > shown + 0.5:
+                shown = now
                 write(self._status, block("status", f"driving again up to {self.time:.2f} s: {done / total:.0%}"))
 
         return tell

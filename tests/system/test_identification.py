@@ -18,7 +18,7 @@ def test_default_robot(capsys):
     assert found["sensing"]["tier"] == "lab"
     assert [row["name"] for row in found["constants"]] == ["R_a", "N k", "M_e", "F_c", "J_e", "m c", "c"]
     for row in found["constants"]:
-        assert abs(row["error"]) < 0.01 and row["told"], row
+        assert abs(row["error"]) < 0.01 and row["identifiable"], row
         assert row["low"] < row["true"] < row["high"], row
         assert row["high"] - row["low"] < 0.05 * row["true"], row
 
@@ -28,7 +28,7 @@ def test_another_than_modelled(tier):
     """It is the plant that is identified, not its model: heavier, weaker motors, more friction, a sagging supply."""
     change = Perturbation(mass_factor=1.5, resistance_factor=1.3, drive_friction_factor=2.0, supply_factor=0.9)
     for c in identify(perturbation=change, sensing=Sensing(tier=tier), seed=1):
-        assert abs(c.error) < 0.02 and c.low < c.true < c.high and c.told, c
+        assert abs(c.error) < 0.02 and c.low < c.true < c.high and c.identifiable, c
         if c.name == "M_e":
             assert c.true == pytest.approx(31.7, rel=0.01)  # half as much again as 21.3, but for the rotors
 
@@ -46,10 +46,10 @@ def test_what_sensors_cannot_tell():
         update={"gyro_noise": 0.5, "encoder_counts": 24, "encoder_rate": 50, "encoder_latency": 0.02}
     )
     found = {c.name: c for c in identify(sensing=bad)}
-    assert {name for name, c in found.items() if not c.told} == {"J_e", "m c", "c"}
+    assert {name for name, c in found.items() if not c.identifiable} == {"J_e", "m c", "c"}
     for c in found.values():
         assert c.low < c.true < c.high, c
-        assert not c.told or abs(c.error) < 0.01, c
+        assert not c.identifiable or abs(c.error) < 0.01, c
 
 
 def test_refused(capsys):

@@ -52,7 +52,7 @@ def test_paired_ratio():
 def test_paired_ratio_failures():
     """A pair with a failure on either side leaves the mean and is counted on its side."""
     found = comparison.paired_ratio([1, 2, np.nan, 4], [2, 4, 6, np.inf])
-    assert found.value == pytest.approx(0.5) and (found.pairs, found.failed_a, found.failed_b) == (2, 1, 1)
+    assert found.value == pytest.approx(0.5) and (found.pairs, found.failed, found.rival_failed) == (2, 1, 1)
     noisy = comparison.paired_ratio([1.0, 2.2, 2.9, 4.1], [2, 4, 6, 8])
     assert noisy.low < noisy.value < noisy.high
 

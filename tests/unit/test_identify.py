@@ -147,7 +147,7 @@ def test_told():
     """A constant is told if half of its interval is at most a tenth of it; the table says which are not."""
     good = identify.Constant("M_e", "kg", 20.0, 18.1, 21.9, 20.5)
     bad = identify.Constant("m c", "kg·m", 2.0, 1.7, 2.3, 2.1)
-    assert good.told and not bad.told
+    assert good.identifiable and not bad.identifiable
     text = identify.text([good, bad])
     assert "within 10 %: m c." in text and "cannot tell" not in identify.text([good])
 
