@@ -1,5 +1,6 @@
 """Fixtures for every test."""
 
+import os
 import subprocess
 import sys
 
@@ -8,6 +9,11 @@ from hypothesis import settings
 
 from mrctl.kernel import kernel_files_digest
 from mrctl.theory.robot import Robot
+
+# The workers of pytest-xdist, which inherit these, use all cores. Threads of BLAS and torch would have to wait for each
+# other there: an exponential of a 2 × 2 matrix took 3 ms instead of 0.02.
+for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(threads, "1")
 
 COMPILE = """
 import sys
