@@ -73,13 +73,13 @@ class Composite(Record):
     """Standard deviation of each weight over plants in V; on a steering channel a tenth of this number in rad/s."""
     memory: Annotated[float, Field(ge=1, le=1e6)] = 1000.0
     """Correlation time of the weights in s, in which they wander by as much as plants differ."""
-    disturbance: Annotated[float, Field(ge=0, le=100)] = 0.15
+    disturbance: Annotated[float, Field(ge=0, le=100)] = 0.05
     """Standard deviation of the disturbance in V; on a steering channel it is 3 % of this number in rad/s."""
     disturbance_memory: Annotated[float, Field(ge=0.01, le=1e6)] = 0.15
     """Correlation time of the disturbance in s, in which it wanders by its standard deviation."""
     filter: Annotated[float, Field(ge=0.01, le=2)] = 0.03
     """Time constant in s of each of the two filters on voltage and motion."""
-    step: Annotated[float, Field(ge=0, le=1)] = 0.025
+    step: Annotated[float, Field(ge=0, le=1)] = 0.005
     """Share of the feedback that the tracking term moves into the feedforward in each control period; on a steering
     channel a tenth of this number."""
     dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02

@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 import xarray as xr
 
+from mrctl.control.composite import Composite
 from mrctl.control.fel import Fel
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.observer import Observer
@@ -42,10 +43,11 @@ IDEAL: dict[str, Any] = {
     "prefilter": 0.05,
     "fel": Fel(step=0.1),
     "observer": Observer(time_constant=0.055),
+    "composite": Composite(disturbance=0.15, step=0.025),
 }
 """The world of the paper: exact measurements without delay, ideal motors, and a PID that is not tuned to its limit.
 
-Learner and observer have settings for that PID; their defaults are for a PID that is ten times as fast.
+Learners and observer have settings for that PID; their defaults are for a PID that is ten times as fast.
 """
 METRICS = ("v_rmse", "omega_rmse", "position_rmse")
 
