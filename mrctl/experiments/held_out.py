@@ -118,15 +118,15 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
     (name,) = (name for name in choices if name not in RIVALS)
     output_folder(out)
     chosen = [one for cell in cells(count) for one in (cell, _half(cell))]
-    entered = {"entry": entry, "mrctl": versions()["mrctl"]}
+    logged = {"entry": entry, "mrctl": versions()["mrctl"]}
     fresh = any(suite.left(out / "runs" / one) for one in choices)
     if fresh:
-        _log(out, entered | {"replicates": count, "settings": _settings(name) if known else None})
+        _log(out, logged | {"replicates": count, "settings": _settings(name) if known else None})
     laps, aside = suite.run(chosen, choices, workers, out / "runs")
     rows = compare(name, suite.runs_of(chosen, laps))
     table = summarised(name, rows, count)
     if fresh:
-        _log(out, entered | {"says": table.says})
+        _log(out, logged | {"says": table.says})
     (out / "table.md").write_text(table.markdown)
     source = {"versions": versions(), "machine": machine()}
     write_json(out / "table.json", source | {"mode": "held-out", "entry": entry, "cells": rows})

@@ -54,7 +54,7 @@ REPEATS = 8  # number of robots, each under its own signal
 TICK = 0.005  # s, for which a voltage is held
 FINE = 100  # physics steps per time constant; the first-order engine adds damping times half a step to the mass
 MODEL = 0.015  # relative error that effects outside equation (3) may cause
-TOLD = 0.1  # largest half of the interval of an identifiable constant, as a share of its value; chosen
+TOLERANCE = 0.1  # largest half of the interval of an identifiable constant, as a share of its value; chosen
 LAB, NOMINAL = Sensing(tier="lab"), Perturbation()
 NOT_IDENTIFIABLE = """\
 For c, the mass m is taken from a scale. These drives do not identify m, J_w and J_m, which enter only M_e and J_e;
@@ -79,7 +79,7 @@ class Constant(NamedTuple):
     @property
     def identifiable(self) -> bool:
         """Whether the interval is narrow enough for the constant to be identifiable."""
-        return self.high - self.low <= 2 * TOLD * abs(self.estimate)
+        return self.high - self.low <= 2 * TOLERANCE * abs(self.estimate)
 
 
 class Drive(NamedTuple):
@@ -130,7 +130,7 @@ def text(constants: Sequence[Constant]) -> str:
         cells.append([c.name, c.unit, estimate, f"{low} to {high}", true, f"{100 * c.error:+.2f} %", identifiable])
     parts = [markdown(header, cells), NOT_IDENTIFIABLE]
     if vague := [c.name for c in constants if not c.identifiable]:
-        parts.insert(1, f"These sensors cannot tell within {100 * TOLD:g} %: {', '.join(vague)}.")
+        parts.insert(1, f"These sensors cannot tell within {100 * TOLERANCE:g} %: {', '.join(vague)}.")
     return "\n\n".join(parts)
 
 

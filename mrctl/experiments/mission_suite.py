@@ -256,10 +256,10 @@ def budget(found: Found, shown: str) -> Table:
                 gains[TITLES.get(name, name)] = (
                     f"{1e3 * (value[0] - value[1]):.1f} and {1e3 * (value[0] - value[2]):.1f}"
                 )
-    shares = "; ".join(f"`{name}` {gain} mm" for name, gain in gains.items())
+    listed = "; ".join(f"`{name}` {gain} mm" for name, gain in gains.items())
     says = (
         "On the nominal plant a known posture takes from the allowance, and an estimate that is always on the "
-        f"reference: {shares}. The map has no errors here."
+        f"reference: {listed}. The map has no errors here."
     )
     header = ["plant", "controller", "allowance, mm", "with a known posture", "with the estimate on the reference"]
     return Table(f"Error budget of the allowance ({shown})", says, _frame(rows, header))

@@ -204,11 +204,11 @@ def leaders(rows: Sequence[Row]) -> list[list[str]]:
 def leading(best: pd.DataFrame) -> str:
     """Returns a sentence on who is best, or level with the best, in how many cases."""
     column = best["position"]
-    leaders = [cell.split(", ") for cell in column if cell != "tie"]
-    counts = {name: sum(name in names for names in leaders) for name in dict.fromkeys(sum(leaders, []))}
-    ties = len(column) - len(leaders)
+    best_of = [cell.split(", ") for cell in column if cell != "tie"]
+    counts = {name: sum(name in names for names in best_of) for name in dict.fromkeys(sum(best_of, []))}
+    ties = len(column) - len(best_of)
     shared = f"In position in the last lap all tie in {ties} of {len(column)} cases"
-    return f"{shared}; in the others, best or level with the best are {_counted(counts)}." if leaders else f"{shared}."
+    return f"{shared}; in the others, best or level with the best are {_counted(counts)}." if best_of else f"{shared}."
 
 
 def recovery(rows: Sequence[Row]) -> pd.DataFrame:

@@ -319,8 +319,8 @@ class UserEstimator(Estimator):
         age = np.where(new, latency * sensors.period, -1.0)
         samples = arrived("encoder")["encoder"], arrived("gyro")["gyro"], arrived("accelerometer")["acceleration"]
         answer = self._stage.call("output", *samples, fix, age)
-        memory["given"] = self._stage.checked(answer, (len(memory), 5), "output")
-        memory["valid"] = np.isfinite(memory["given"]).all(axis=1)
+        memory["answer"] = self._stage.checked(answer, (len(memory), 5), "output")
+        memory["valid"] = np.isfinite(memory["answer"]).all(axis=1)
         for row in np.flatnonzero(~memory["valid"]):
             self.faults[row] = self.faults[row] or f"{self._stage.title}: not finite, tick {tick}"
         return super().estimate(tick, plant)

@@ -25,8 +25,8 @@ from mrctl.theory.robot import Robot, Tyres
 MOTION = np.dtype(
     [
         ("mean", "f8", 5),  # x, y in m, θ in rad, V in m/s, θ̇ in rad/s, when the last samples were taken
-        ("given", "f8", 5),  # estimate of a user's estimator, in the same order
-        ("valid", "?"),  # whether all five numbers of `given` are finite
+        ("answer", "f8", 5),  # estimate of a user's estimator, in the same order
+        ("valid", "?"),  # whether all five numbers of `answer` are finite
     ],
     align=True,
 )
@@ -89,8 +89,8 @@ def user(
     odometry(tick, true, ring, i, sensor, geometry, period, memory, s)
     if memory.valid:
         for k in range(5):  # the mean is as old as the samples, so that odometry can go on from it
-            memory.mean[k] += memory.given[k] - s.estimate[k]
-            s.estimate[k] = memory.given[k]
+            memory.mean[k] += memory.answer[k] - s.estimate[k]
+            s.estimate[k] = memory.answer[k]
 
 
 observe = truth  # the estimator of `estimate`, which `Kernel.calling` replaces

@@ -437,13 +437,13 @@ class Live(Page):
 
     def _tell_progress(self) -> Callable[[int], None]:
         """Returns what `Session.repeated` calls, which says on the page how far it is."""
-        total, done, shown = self.tick * len(self.session.start), 0, time.monotonic()
+        total, done, last = self.tick * len(self.session.start), 0, time.monotonic()
 
         def tell(robots: int) -> None:
-            nonlocal done, shown
+            nonlocal done, last
             done += robots
-            if (now := time.monotonic()) > shown + 0.5:
-                shown = now
+            if (now := time.monotonic()) > last + 0.5:
+                last = now
                 write(self._status, block("status", f"driving again up to {self.time:.2f} s: {done / total:.0%}"))
 
         return tell

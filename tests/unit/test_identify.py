@@ -1,4 +1,4 @@
-"""Identification against equation (3) itself, written out here: a drive is integrated, measured and told apart."""
+"""Identification against equation (3) itself, written out here: a drive is integrated, measured and identified."""
 
 import numpy as np
 import pytest
@@ -143,8 +143,8 @@ def test_intervals_cover(robot):
     assert 106 <= covered <= 119, covered
 
 
-def test_told():
-    """A constant is told if half of its interval is at most a tenth of it; the table says which are not."""
+def test_identifiable():
+    """A constant is identifiable if half of its interval is at most a tenth of it; the table says which are not."""
     good = identify.Constant("M_e", "kg", 20.0, 18.1, 21.9, 20.5)
     bad = identify.Constant("m c", "kg·m", 2.0, 1.7, 2.3, 2.1)
     assert good.identifiable and not bad.identifiable
