@@ -124,7 +124,7 @@ def parameter_error(result: xr.Dataset) -> xr.DataArray:
     """Returns the parameters at the end of a run, of prior and learner together, less those of the true robot.
 
     The parameters are those of equation (3) and of the scaled features. The equation leaves out fork and slip, so that
-    the parameters which drive best are not quite the true ones. What `composite` learns in its tanh units is not
+    the parameters which drive best are not quite the true ones. What `composite` learns as slope and disturbance is not
     counted.
 
     Args:
