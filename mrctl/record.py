@@ -161,7 +161,7 @@ class Record(BaseModel):
         return cls.from_dict(values, f"{path} ({first.removeprefix('# ')})" if another else str(path))
 
     def to_toml(self) -> str:
-        """Returns all fields as TOML that `from_toml` reads back, with one line for each field.
+        """Returns the fields as TOML that `from_toml` reads back, with one line for each that is not None.
 
         The first line is a comment with the version of mrctl. A list of records has one line for each of its elements.
         """

@@ -165,7 +165,7 @@ class Scenario(Record):
         return name
 
     @model_validator(mode="after")
-    def _multiples(self) -> Scenario:
+    def _fits_together(self) -> Scenario:
         whole(self.control_period, self.physics_step, "control_period", "physics_step")
         whole(self.motion_period, self.control_period, "motion_period", "control_period")
         changes = [("perturbation", self.perturbation)]

@@ -90,7 +90,7 @@ COMPOSITE = np.dtype(
     [
         # Settings, for the two channels; the second is in rad/s where it is steering.
         ("f", "f8", (CHANNELS, FEATURES + 1)),  # diagonal of F: decay of a and, last, of d in a period
-        ("prior", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)),  # P₀, V²
+        ("stationary", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)),  # P₀, V²
         ("step", "f8", CHANNELS),  # share of the feedback that the tracking term moves into the feedforward
         ("dead_zone", "f8", CHANNELS),  # feedback below which the tracking term is zero, V
         ("noise", "f8", CHANNELS),  # standard deviation of a sample, V
@@ -179,7 +179,7 @@ def predict(k: int, s: Row) -> None:
     for i in range(FEATURES + 1):
         a[i] = f[i] * (a[i] + Pphi[i] * e)
         for j in range(FEATURES + 1):
-            P[i, j] = f[i] * f[j] * (P[i, j] - Pphi[i] * Pphi[j] / S) + (1 - f[i] * f[j]) * s.prior[k, i, j]
+            P[i, j] = f[i] * f[j] * (P[i, j] - Pphi[i] * Pphi[j] / S) + (1 - f[i] * f[j]) * s.stationary[k, i, j]
 
 
 @kernel
@@ -218,7 +218,7 @@ def reset_covariance(k: int, s: Row) -> None:
     """
     for i in range(FEATURES + 1):
         for j in range(FEATURES + 1):
-            s.P[k, i, j] = s.prior[k, i, j]
+            s.P[k, i, j] = s.stationary[k, i, j]
     for i in range(FEATURES):
         for j in range(FEATURES):
             s.P[k, i, j] += s.a[k, i] * s.a[k, j]
@@ -378,7 +378,7 @@ class CompositeAdaptation(Learner):
         for row, s in zip(rows, settings, strict=True):
             memory, brief_memory = np.exp(-period / np.array([s.memory, s.disturbance_memory]))
             row["f"][:, :FEATURES], row["f"][:, FEATURES] = memory, brief_memory
-            row["prior"] = stationary(s, robot, rigid, prior)
+            row["stationary"] = stationary(s, robot, rigid, prior)
             row["step"] = s.step * np.array([1.0, STEERING_SHARE if rigid else 1.0])
             row["dead_zone"] = s.dead_zone * unit
             row["noise"] = s.noise * unit
@@ -400,13 +400,13 @@ class CompositeAdaptation(Learner):
         local = [*range(INPUTS, FEATURES + 1)]
         s["a"][:, local] = 0.0
         s["P"][:, local, :] = s["P"][:, :, local] = 0.0
-        s["P"][:, local, local] = s["prior"][:, local, local]
+        s["P"][:, local, local] = s["stationary"][:, local, local]
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to their initial weights and covariance."""
         self.weight_norm[rows] = 0.0
         for i in rows:
             s = self.rows[i]
-            s["a"], s["norm"], s["P"], s["tick"] = 0.0, 0.0, s["prior"], 0
+            s["a"], s["norm"], s["P"], s["tick"] = 0.0, 0.0, s["stationary"], 0
             s["power"] = (s["noise"] ** 2 + s["scatter"] ** 2 * s["variance"])[:, None]
             s["since"] = SETTLED * self.period * (1 / s["filter"] - 1)

@@ -35,8 +35,9 @@ class Feedforward(Protocol):
     The voltage of the prior is added to its output.
 
     A stage serves B robots; its memory belongs in arrays with a leading axis B, so that robots cannot mix. It may have
-    two further members: `weight_norm`, a float64 array `(B,)` for the results; and `restore(rows)`, with which the
-    guard (`mrctl.control.guard`) resets the robots with these indices to their initial weights.
+    three further members: `weight_norm`, a float64 array `(B,)` for the results; `restore(rows)`, with which the guard
+    (`mrctl.control.guard`) resets the robots with these indices to their initial weights; and `guarded`, which is False
+    where the guard shall not watch it.
     """
 
     def output(self, command: Array, derivative: Array) -> Array:
@@ -55,7 +56,7 @@ class Feedforward(Protocol):
         """Learns from the feedback that was added to the last `output`, and from the motion of the robot.
 
         Args:
-            feedback: Feedback in the channels and units of `output`, `(B, 2)`.
+            feedback: Feedback times the guard's gain, in the channels and units of `output`, `(B, 2)`.
             saturated: 1 where a limit acted, a driven wheel slips, or this robot must not learn, else 0, `(B,)`.
             twist: Estimated V in m/s and θ̇ in rad/s, on which `voltage` has not acted yet, `(B, 2)`.
             voltage: Voltage of the coming period, after the limits, in the channels and units of `output`, `(B, 2)`.

@@ -39,7 +39,7 @@ class ModuleLearning:
     """Feedback-error learning of B copies of a torch module, with the update and safeguards of `fel`.
 
     The output is scale · (f_W(x) − f_W₀(x)), so that learning begins as pure PID with any module. `simulate` takes it
-    as `feedforward=lambda robot, size: ModuleLearning(module, robot, size)`.
+    as `feedforward=lambda robot, size: ModuleLearning(module, robot, size, delay=1)`, where 1 is the delay of `lab`.
 
     Attributes:
         state: Parameters W by name, each with a leading axis B.
@@ -88,14 +88,14 @@ class ModuleLearning:
         self._features = np.zeros((size, INPUTS))
         self._queue, self._tick = histories(size, delay, INPUTS), np.zeros(size, int)
         stacked, _ = stack_module_state([self._module] * size)
-        self.prior = {name: value.detach().clone() for name, value in stacked.items()}
-        self.state = {name: value.clone() for name, value in self.prior.items()}
+        self.initial = {name: value.detach().clone() for name, value in stacked.items()}
+        self.state = {name: value.clone() for name, value in self.initial.items()}
         self.weight_norm = np.zeros(size)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to the parameters of the module."""
         for name, value in self.state.items():
-            value[rows] = self.prior[name][rows]
+            value[rows] = self.initial[name][rows]
         self._tick[rows], self.weight_norm[rows] = 0, 0.0
 
     def _forward(self, parameters: dict[str, torch.Tensor], features: Array) -> torch.Tensor:
@@ -106,7 +106,7 @@ class ModuleLearning:
         """Returns the outputs of the modules at the commanded motion."""
         self._features = x = feature_matrix(command, derivative, self._half_track, self._scale)
         with torch.no_grad():
-            return (self._output_scale * (self._forward(self.state, x) - self._forward(self.prior, x))).numpy()
+            return (self._output_scale * (self._forward(self.state, x) - self._forward(self.initial, x))).numpy()
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
         """Does the step of `fel.update` for all robots, with Jᵀe by automatic differentiation."""
@@ -126,15 +126,15 @@ class ModuleLearning:
         rate = torch.where(active, self._step / (square / power.clamp_min(1e-300) + REGULARISATION), 0.0)
         leak = self._leak * active.double()  # `where` of two plain numbers would be single precision
         moved = {
-            name: self.state[name] + _like(rate, g) * g - _like(leak, g) * (self.state[name] - self.prior[name])
+            name: self.state[name] + _like(rate, g) * g - _like(leak, g) * (self.state[name] - self.initial[name])
             for name, g in gradient.items()
         }
-        distance = _square({name: moved[name] - self.prior[name] for name in moved}).sqrt()
+        distance = _square({name: moved[name] - self.initial[name] for name in moved}).sqrt()
         shrink = torch.where(active & (distance > self._bound), self._bound / distance.clamp_min(1e-300), 1.0)
         with torch.no_grad():
             before = self._forward(self.state, self._features)
         for name, value in moved.items():
-            self.state[name] = self.prior[name] + (value - self.prior[name]) * _like(shrink, value)
+            self.state[name] = self.initial[name] + (value - self.initial[name]) * _like(shrink, value)
         norm = torch.where(active, distance.clamp_max(self._bound), torch.from_numpy(self.weight_norm))
         self.weight_norm = norm.numpy()
         with torch.no_grad():

@@ -10,13 +10,13 @@ of 1 s, exceeds D, and for an oscillation if it exceeds a quarter of D:
 
 | cause of a fallback   | condition                                                                         |
 | --------------------- | --------------------------------------------------------------------------------- |
-| error                 | |e| > ē or ρ > ρ̄ while the learner is to blame                                    |
+| error                 | |e| > ē, or ρ > ρ̄ and 3 times the least ρ so far, while the learner is to blame   |
 | sustained oscillation | 16 half-waves of the PID's output in a row beyond D/4 while it is to blame        |
 | not finite            | NaN or ∞ from the learner                                                         |
 
 After a hold of 1 s the learner, reset to its initial weights, resumes, and its authority grows from 0 again in 5 s.
-Each further time the hold is three times as long. After an oscillation, and from the second time on, the gain of
-learning is a third of the one before, and the authority grows three times as slowly.
+Each further time the hold is three times as long. After an oscillation, and from the second time on, the feedback that
+teaches is a third of the one before (`mrac` is not taught by it), and the authority grows three times as slowly.
 
 **What it guarantees.**
 
@@ -174,10 +174,11 @@ def guard(
 ) -> None:  # fmt: skip
     """One tick of the guard of one robot, between the feedforward stage and the allocation.
 
-    - fallback: the nominal inverse dynamics replaces the learner. The integral starts from the mean error of the model,
-      so that the step in voltage is small; the rest of the step fades. The learner is reset to its initial weights.
-    - resume: the learner returns after the hold, once nothing is wrong, each time with less gain and after a longer
-      hold. Its share of the output, the authority, grows from 0 to 1 as slowly as it learns; the rest is the
+    - fallback: the nominal inverse dynamics, or nothing, replaces the learner. The integral starts from the mean error of
+      the model, so that the step in voltage is small; the rest of the step fades. The learner is reset to its initial
+      weights.
+    - resume: the learner returns after the hold, once nothing is wrong; from the second time on with less gain and
+      after a longer hold. Its share of the output, the authority, grows from 0 to 1 as slowly as it learns; the rest is the
       fallback's. After `retries` the fallback stays.
 
         output = fallback + authority (learner − fallback) + bump

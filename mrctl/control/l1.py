@@ -20,7 +20,8 @@ The loop opened at the voltage, with a PID C_p that acts L later, the nominal pl
 periods and the delay of the sensing tier, as in `indi`, is (C_p P e^(−Ls) + Q e^(−L's))/(1 − Q e^(−L's)), and 1/(1 +
 loop) = (1 − Q e^(−L's))/(1 + C_p P e^(−Ls)): the adaptation cannot make the nominal loop unstable.
 
-Under `rigid` steering the second channel is the rotation: f is θ̇ itself, σ is in rad/s, and M is the lag of the servo.
+Under `rigid` steering the second channel is the rotation: f is θ̇ itself, σ is in rad/s, and M is the lag of
+servo and tyre.
 """
 
 from __future__ import annotations

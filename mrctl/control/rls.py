@@ -73,8 +73,9 @@ class Rls(Record):
     """Settings of the learner `rls`."""
 
     step: Annotated[float, Field(gt=0, le=1)] = 0.02
-    """Largest share of the feedback that one control period moves into the feedforward. With a larger share, the
-    adaptation is a second integral action that is fast enough to make the loop oscillate."""
+    """Largest share of the feedback that one control period moves into the feedforward; on a steering channel a tenth
+    of this number. With a larger share, the adaptation is a second integral action that is fast enough to make the loop
+    oscillate."""
     initial_covariance: Annotated[float, Field(gt=0, le=1e3)] = 0.2
     """Diagonal of the initial covariance of the coefficients, as a ratio to the variance of the feedback."""
     drift: Annotated[float, Field(ge=0, le=1)] = 3e-5

@@ -34,7 +34,7 @@ class Motion(Protocol):
         """Starts a run.
 
         Args:
-            pose: Posture in m, m, rad, `(B, 3)`.
+            pose: Estimated posture in m, m, rad, `(B, 3)`.
             reference: Reference as for `output`, `(B, 7)`.
             period: Motion period, from one `output` to the next, in s.
         """

@@ -199,7 +199,7 @@ def learner_of(scenarios: Sequence[Scenario], robot: Robot) -> Learner:
 
 
 class Hierarchy:
-    """Both controllers for B robots that share steering arrangement and rates.
+    """Both controllers for the B robots of a uniform group (`simulation.group_of`).
 
     Attributes:
         learner: The learner, or a user's feedforward stage in its place.
@@ -221,6 +221,9 @@ class Hierarchy:
             scenarios: A uniform group of scenarios.
             robot: The nominal robot.
             feedforward: Feedforward stage in place of the learner that the scenarios name.
+
+        Raises:
+            InputError: What was learned or the weights cannot be read, or do not suit the learner.
         """
         first, size = scenarios[0], len(scenarios)
         self._robot, self._rigid = robot, first.steering == "rigid"

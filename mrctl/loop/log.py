@@ -17,7 +17,7 @@ def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, error: Array, tic
     """Writes the signals of one control tick of all robots; returns whether all are near their references.
 
     A sample at time t has the state at t, the commands computed from it, and the currents and the power at the end of
-    the control period in which these commands were held.
+    the control period that begins at t; the commands act after the delay.
 
     Args:
         plant: Record of `PLANT` of each robot, after the control period.

@@ -49,8 +49,8 @@ def simulate(
     One scenario runs through dm_control, several run together on MuJoCo's batch engine, with the same bits.
 
     Args:
-        scenarios: One scenario, or several; those that differ in world, obstacles, robot, laws, steering, delay, length
-            or rates run in batches of their own.
+        scenarios: One scenario, or several; those that differ in world, obstacles, robot, laws, estimator, steering,
+            delay, rates or, without a goal, length run in batches of their own.
         progress: Whether to show a progress bar.
         threads: Number of threads for control and physics, which does not change the result; 0 for all cores.
         stages: The user's stages `motion`, `feedback`, `feedforward`, `steering` or `estimator` in place of the
@@ -263,7 +263,7 @@ class Simulation:
         self.log = Log(self.ticks, size)
         self._failure_time = np.full(size, np.nan)
         self._goals = Goals(scenarios)
-        self._learned: dict[int, Array] = {}  # what each robot had adapted when it arrived or got stuck, flat
+        self._learned: dict[int, Array] = {}  # what each robot had adapted when its run ended, flat
         self._sensed = -1  # last tick whose sensors were read
 
         goal = self.courses.at(0)
@@ -373,7 +373,7 @@ class Simulation:
             self._end(tick)
 
     def _end(self, tick: int) -> None:
-        """Ends the runs that have reached their goals at a tick, or are stuck; the record of the tick is kept."""
+        """Ends the runs that are at their goals, stuck or at their own end; the record of the tick is kept."""
         stage = self.hierarchy.learner
         for row, reason in self._goals.ended(tick, self.log.at(tick)).items():
             self.plant.fail(row, reason)
@@ -406,7 +406,7 @@ class Simulation:
         return found.assign(self._parameters() | self._clearance(length) | faults | constants)
 
     def _clearance(self, length: int) -> dict[str, Any]:
-        """Distance of each robot from the nearest obstacle at each tick, where there are some, and its footprint."""
+        """Distance of each robot's footprint from the nearest obstacle at each tick, where there are obstacles."""
         obstacles = self.scenarios[0].obstacles
         if not obstacles.shapes:
             return {}

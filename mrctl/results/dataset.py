@@ -22,8 +22,8 @@ from mrctl.scenario import Scenario
 SMALL = 2**30  # bytes of signals that any result may have
 EXPANSION = 1000  # bytes of signals that a larger result may have for each byte in its files
 
-# Name: (unit, meaning). A sample at time t holds the state at t, the commands
-# computed from it, and the currents and power at the end of the control period during which these commands are held.
+# Name: (unit, meaning). A sample at time t holds the state at t, the commands computed from it, and the currents and
+# power at the end of the control period that begins at t; the commands act after the delay.
 SIGNALS: dict[str, tuple[str, str]] = {
     "x": ("m", "position of P along the world's x axis"),
     "y": ("m", "position of P along the world's y axis"),

@@ -5,7 +5,7 @@
 over the pose ξ, where d is the distance field of the map, T p a point of the scan in the world, and ρ the function of
 Geman and McClure, which discounts points that the map does not explain. Its width shrinks from `WIDE` to `NARROW`, so
 that a guess may be some decimetres wrong; where the result explains too little of the scan, the search starts again
-beside it. The prior Λ₀ about the guess ξ₀ holds what the scan does not determine, such as the position along a
+beside it. The prior Λ₀ about the start ξ₀ holds what the scan does not determine, such as the position along a
 corridor. (Kohlbrecher, von Stryk, Meyer and Klingauf, "A flexible and scalable SLAM system with full 3D motion
 estimation", IEEE SSRR 2011, for the method on a map; Yang et al., IEEE RA-L 5(2), 2020, for the width that shrinks.)
 """

@@ -116,15 +116,15 @@ class Sensing(Record):
     fix_rate: Rate | None = None
     """Rate of the posture fixes in Hz, a whole fraction of the control rate; 0 is the control rate."""
     fix_position_noise: Annotated[float, Field(ge=0, le=10)] | None = None
-    """Standard deviation of x and y of a fix in m."""
+    """Standard deviation of x and y of a fix in m; with a lidar, which makes its own fixes, what the filter assumes."""
     fix_heading_noise: Annotated[float, Field(ge=0, le=3)] | None = None
-    """Standard deviation of the heading of a fix in rad."""
+    """Standard deviation of the heading of a fix in rad; with a lidar, what the filter assumes."""
     fix_latency: Latency | None = None
     """Age in s of a fix when it arrives, a multiple of the control period."""
     fix_lost: Annotated[float, Field(ge=0, le=1)] | None = None
     """Share of the fixes that never arrive."""
     fix_outliers: Annotated[float, Field(ge=0, le=1)] | None = None
-    """Share of the fixes that are wrong by up to 1 m in x and y."""
+    """Share of the fixes that are wrong by up to 1 m in x and y; not with a lidar."""
     delay: Latency | None = None
     """Delay from the measurement to the voltage in s, a multiple of the control period; the controller knows it."""
     dead_zone: DeadZone | None = None

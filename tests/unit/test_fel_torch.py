@@ -124,7 +124,7 @@ def test_copies(robot):
     for name, value in together.state.items():
         single = torch.cat([stage.state[name] for stage in alone])
         torch.testing.assert_close(value, single, atol=1e-9, rtol=0)
-        assert torch.equal(value[2], together.prior[name][2])  # saturated all along
+        assert torch.equal(value[2], together.initial[name][2])  # saturated all along
         assert not torch.equal(value[0], value[1])
     assert together.weight_norm[2] == 0
     assert (together.weight_norm[:2] > 0).all()
