@@ -174,12 +174,12 @@ def guard(
 ) -> None:  # fmt: skip
     """One tick of the guard of one robot, between the feedforward stage and the allocation.
 
-    - fallback: the nominal inverse dynamics, or nothing, replaces the learner. The integral starts from the mean error of
-      the model, so that the step in voltage is small; the rest of the step fades. The learner is reset to its initial
-      weights.
+    - fallback: the nominal inverse dynamics, or nothing, replaces the learner. The integral starts from the mean error
+      of the model, so that the step in voltage is small; the rest of the step fades. The learner is reset to its
+      initial weights.
     - resume: the learner returns after the hold, once nothing is wrong; from the second time on with less gain and
-      after a longer hold. Its share of the output, the authority, grows from 0 to 1 as slowly as it learns; the rest is the
-      fallback's. After `retries` the fallback stays.
+      after a longer hold. Its share of the output, the authority, grows from 0 to 1 as slowly as it learns; the rest is
+      the fallback's. After `retries` the fallback stays.
 
         output = fallback + authority (learner − fallback) + bump
 
