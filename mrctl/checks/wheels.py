@@ -188,7 +188,7 @@ def scrub_free(model: mujoco.MjModel, robot: Robot) -> Report:
     φ̇)/speed, with the direction and the speed at which the fork's axis moves. The tolerance of the steady angle is 5
     mrad; measured 0.03, as P and the fork drift alike. That of the changing one is a sideslip of 7 ms · θ̇: MuJoCo's
     contacts (time constant T, impedance d) damp the slip velocity in a frame that turns, which they do not take into
-    account, so a tyre drifts outwards with V θ̇ d T/2 whatever its friction; here d T/2 = 4.75 ms.
+    account, so a tyre drifts outwards with V θ̇ d T/2 whatever its friction; here d T/2 = 1.9 ms.
     """
     common, differential = robot.supply / 3, robot.supply / 12
     car = Car(model)

@@ -145,7 +145,7 @@ class Episodes(Simulation):
         if action not in ACTION_KINDS:
             raise InputError(f"action: {action!r} is not {', '.join(ACTION_KINDS)}")
         if len(set(map(group_of, scenarios))) > 1:
-            raise InputError("scenarios: differ in world, steering, prior, learner, length or rates")
+            raise InputError("scenarios: differ in world, robot, steering, laws, estimator, delay, length or rates")
         if len(scenarios) > 1 and first.motion_period != first.control_period:
             raise InputError("motion_period: robots that begin at different times need that of control_period")
         if action == "voltage":  # a learner must not learn from feedback that does not act

@@ -125,7 +125,7 @@ def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
 
     Args:
         mode: Size of the suite: `core`, the default; `quick`, a few of its cases with fewer laps; or `full`, which adds
-            the other uncertainties, tiers and steering arrangements, and drives 8 laps.
+            the other uncertainties, tiers and steering arrangements, and drives 8 laps in most cases.
         seeds: Number of replicates of each case; all cases have the same draws. The return after a step does not bring
             back the same robot, but another draw.
         random: Number of random scenarios in `lab`; `full` has the same ones in the other tiers.

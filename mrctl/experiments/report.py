@@ -88,8 +88,8 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
         ratios = {name: end / ends["none"] for name, end in ends.items()}
         drawn["random"] = (
             plots.distributions(ratios, "position error over that of PID, same run"),
-            "Random scenarios: the share of runs whose error is below a multiple of that of PID alone. A curve that "
-            "does not reach 1 belongs to a feedforward with failed runs.",
+            "Random scenarios: the share of runs whose error is below a multiple of that of PID alone. A curve ends "
+            "below 1 by the share of runs that it or PID alone lost.",
         )
     learners = [name for name in choices if name not in MAPLESS]
     if learners:

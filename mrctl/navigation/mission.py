@@ -129,7 +129,8 @@ def navigate(
         progress: Whether to show a progress bar.
 
     Raises:
-        InputError: Start or goal is in an obstacle, there is no way, or the robot cannot drive the plan.
+        InputError: The margin is out of range, start or goal is within it of an obstacle or off the map, the robot is
+            at its goal, there is no way, or the robot cannot drive the plan or would touch an obstacle on it.
     """
     found, own = prepared(task, scenario, speed, margin, avoid)
     stage = avoiding(avoid, own)
@@ -223,7 +224,7 @@ def planned(
     check(reference, robot, reverse)
     times = np.linspace(0, reference.period, max(2, round(found.length / 0.01)))
     if min(clearance(corners, pose, outlines) for pose in reference.sample(times).pose) <= 0:
-        raise InputError(f"plan: its smooth path comes nearer to an obstacle than the margin of {margin:g} m; set more")
+        raise InputError(f"plan: its smooth path touches an obstacle in spite of the margin of {margin:g} m; set more")
     return found, reference
 
 

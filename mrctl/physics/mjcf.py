@@ -1,7 +1,8 @@
 """Compiles a world with a robot in one of its steering arrangements, and refuses a model that cannot be driven.
 
-The other files of this folder work on the compiled model: `elements` names its parts, `parameters` reads the constants
-of equations (1) to (3) from it, `perturb` changes them, `stand` places the robot, and `plant` steps it.
+`files` finds files and bounds their size; `adopt` and `obstacles` change a world before it is compiled. The other files
+of this folder work on the compiled model: `elements` names its parts, `parameters` reads the constants of equations (1)
+to (3) from it, `perturb` changes them, `stand` places the robot, and `plant` steps it.
 """
 
 # pyright: reportAttributeAccessIssue=false

@@ -51,8 +51,7 @@ def perturb(
 
     What an earlier perturbation changed in that model is undone. The rolling loss in a wheel's frictionloss grows with
     the static load on the wheel. `limit_current` writes the current limit. A model has no
-    fields for the rest of the driver, the steering servo, delay and noise: `mrctl.physics.plant` and
-    `mrctl.sensing.sensors` apply them.
+    fields for the rest of the driver, the steering servo and delay, which `mrctl.physics.plant` applies.
 
     Args:
         nominal: The nominal model, which is only read.

@@ -245,7 +245,7 @@ class Plant(ABC):
             twist: V and θ̇, `(B, 2)` in m/s, rad/s.
 
         Raises:
-            InputError: There is no ground below a pose.
+            InputError: There is no ground below a pose, or an obstacle is in the way.
         """
         for i in range(self.size):
             self.qpos[i], self.qvel[i] = stand(self._model_of(i), pose[i], twist[i], self.truth[i])
@@ -260,7 +260,7 @@ class Plant(ABC):
             twist: V and θ̇, `(2,)` in m/s, rad/s.
 
         Raises:
-            InputError: There is no ground below the pose.
+            InputError: There is no ground below the pose, or an obstacle is in the way.
         """
         if self.failed[robot]:
             self.failed[robot], self.failure[robot] = False, ""

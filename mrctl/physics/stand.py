@@ -1,6 +1,6 @@
 """Computes the state of a robot that stands on the ground and rolls, with its steered wheels turned.
 
-The plant starts a run in that state, and the viewer draws robots in it.
+The plant starts a run in that state, and the viewer draws results in it that lack height and tilt.
 """
 
 # pyright: reportAttributeAccessIssue=false

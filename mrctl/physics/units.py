@@ -86,7 +86,7 @@ def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
 
 
 def bounds(robot: Robot) -> list[Bound]:
-    """Lists quantities and their bounds, which are chosen: density of steel, motors of 10⁶ rpm, tyres with μ = 3."""
+    """Lists quantities and their bounds, which are chosen: 5000 kg/m³, motors of 10⁶ rpm, tyres with μ = 3."""
     size = math.hypot(robot.wheelbase, 2 * robot.half_track)
     stall = robot.motor_gain * robot.supply
     loss = robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from itertools import count
 
-# Display name and colour, by the name in tables. The seven that tables compare have the colours of Okabe and Ito
-# (2008); the others have darker ones.
+# Display name and colour, by the name in tables. The first six have colours of Okabe and Ito (2008).
 CONTROLLERS: dict[str, tuple[str, str]] = {
     "none": ("PID alone", "#D55E00"),
     "fel": ("PID + network (paper)", "#0072B2"),

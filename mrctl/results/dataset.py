@@ -96,7 +96,7 @@ def blank(*shape: int) -> NDArray[np.void]:
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions of all packages that can change a result."""
+    """Returns the versions of the packages that simulate, control and learn."""
     others = ("mujoco", "dm-control", "numpy", "numba", "torch")
     return {"mrctl": __version__} | {name: _installed(name) for name in others}
 

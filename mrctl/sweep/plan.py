@@ -123,7 +123,7 @@ class Sweep(Record):
     base: Scenario = Scenario()
     """Scenario that the runs have in common; each run has a seed of its own unless `seed` is an axis."""
     axes: tuple[Axis, ...] = ()
-    """Axes that vary. Put those that split batches (feedforward, steering, world) first: large batches are fast."""
+    """Axes that vary. Put those that split batches (learner, steering, world) first: large batches are fast."""
     runs: Annotated[int, Field(ge=1, le=100_000_000)] = 1
     """Number of draws of seed and distributions for each combination of the listed values."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0

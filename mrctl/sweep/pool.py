@@ -43,7 +43,7 @@ class Pool(Protocol):
     """Computes jobs, a few at a time.
 
     Attributes:
-        tries: Number of times that a job whose worker dies is computed.
+        tries: Number of times that a job is computed whose worker dies or that raises an error.
     """
 
     tries: int

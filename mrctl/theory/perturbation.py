@@ -24,7 +24,7 @@ from mrctl.theory.drive import (
 )
 
 LONGEST_DELAY = 0.5
-"""Longest delay in s of a command on its way to the motors."""
+"""Longest delay or latency in s; those of sensing and perturbation add, so that a command may take twice as long."""
 
 Factor = Annotated[float, Field(ge=0.05, le=20)]
 

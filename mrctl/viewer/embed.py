@@ -41,7 +41,8 @@ def replay(*results: xr.Dataset) -> Replay:
             `result.sel(time=slice(84, 96))` is an interval of time.
 
     Raises:
-        InputError: There is no run, a run is longer than a minute, or runs differ in world or control period.
+        InputError: There is no run, a run is longer than a minute or failed before the interval, or runs differ in
+            world, obstacles, robot or control period.
     """
     from mrctl.viewer.export import page
     from mrctl.viewer.recording import Recording, looks_of

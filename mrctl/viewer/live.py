@@ -63,11 +63,11 @@ from mrctl.scenario import Scenario
 '''
 KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of each group
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
-# Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
-DRIVER = ("prior", "learner")  # what the ghosts differ in
+CONTROLLER = ("prior", "learner")  # what the ghosts differ in
 NOTHING = np.zeros((0, 2, 2))
 PLANNED = ("world", "steering", "reference")  # what a plan was made for
 KEPT = ("prior", "learner", "seed")  # by another robot, and the tier of the sensors
+# Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
 NEW_RUN = ("world", "steering", "sensing", "reference", "seed", "prefilter")
 HIDDEN = (
     "name",
@@ -194,7 +194,7 @@ class Live(Page):
         with tabs.add_tab("Robot"):
             self._controls.add(first, only=["perturbation"])
         with tabs.add_tab("Controllers"):
-            self._controls.add(first, only=DRIVER)
+            self._controls.add(first, only=CONTROLLER)
             with gui.add_folder("compare with"):
                 self._ghosts: dict[FeedforwardName, viser.GuiCheckboxHandle] = {
                     name: gui.add_checkbox(title_of(name), False) for name in FEEDFORWARDS
@@ -204,7 +204,7 @@ class Live(Page):
             self._learning = gui.add_checkbox("learning", True)
             self.on(self._learning, lambda on: self._apply_event(learning=on))
             self._gains = gui.add_html("")
-            self._controls.add(first, only=[n for n in changing if n not in (*NEW_RUN, "perturbation", *DRIVER)])
+            self._controls.add(first, only=[n for n in changing if n not in (*NEW_RUN, "perturbation", *CONTROLLER)])
         with tabs.add_tab("Run"):
             self._robots = {robot.path: robot for robot in (*(RobotFile(path=p) for p in SHIPPED), first.robot)}
             hint = "Another robot begins another run, with the steering and a reference that suit it."
@@ -372,10 +372,10 @@ class Live(Page):
             self._go_on()
             return self._apply_event(**{name: changed(self.session.state()[name], rest, value)})
         start = self.session.start
-        touched = start[:1] if name in DRIVER else start
+        touched = start[:1] if name in CONTROLLER else start
         others = start[len(touched) :]
         new = [changed(self._present(s), path, value) for s in touched] + [self._present(s) for s in others]
-        if name in DRIVER:
+        if name in CONTROLLER:
             new = [new[0], *(s for s in new[1:] if s.feedforward != new[0].feedforward)]
         self._restart(new)
 

@@ -154,7 +154,7 @@ def looks_of(recordings: Sequence[Recording], runs: Sequence[int]) -> list[Look]
     """Returns the look of each run, with its number in the label if labels would be equal.
 
     Raises:
-        InputError: Runs differ in world, robot or control period, so they cannot share a scene.
+        InputError: Runs differ in world, obstacles, robot or control period, so they cannot share a scene.
     """
     first = recordings[0]
     for r in recordings:

@@ -42,7 +42,7 @@ class Replay(Page):
             server: Server of the page.
 
         Raises:
-            InputError: A run does not exist, or runs differ in world, robot or control period.
+            InputError: A run does not exist, or runs differ in world, obstacles, robot or control period.
         """
         super().__init__(server)
         self.library = library

@@ -66,7 +66,7 @@ NONE = Obstacles()
 GOAL_COLOUR: Colour = (22, 163, 74)
 OUTLINE = 0.02  # m, width of the outlines at start and goal
 SCAN_POINT, SCAN_HEIGHT = 0.03, HEIGHT + 0.01  # m, size of the points of a scan, which lie on top of the walls
-PARTICLE, MAX_PARTICLES = 0.015, 500  # m, size of a particle, and about the number that is drawn
+PARTICLE, MAX_PARTICLES = 0.015, 500  # m, size of a particle, and the number from which on only some are drawn
 
 SEARCH_COLOUR: Colour = (148, 163, 184)
 COARSE, FAN_HEIGHT, MAX_ARCS = 4, 0.03, 5000  # of the drawn steps of a roll-out; m; about the number that is drawn

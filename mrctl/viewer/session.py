@@ -372,7 +372,7 @@ def state(scenario: Scenario, time: float) -> dict[str, Any]:
 
 
 def pushed(scenario: Scenario, time: float) -> Array | None:
-    """Returns the force of a push along the world's x and y in N, `(2,)`, that has begun half a second ago or later."""
+    """Returns the force of a push along the world's x and y in N, `(2,)`, that acts or is half a second old at most."""
     for event in scenario.events:
         if event.push is not None and 0 < time - event.time + 1e-9 < max(event.push_duration, SEEN_PUSH):
             return np.array(event.push[:2])

@@ -48,9 +48,9 @@ def spd(root):
 def channel(variance, forgetting, noise, step=0.0, dead_zone=0.0):
     """A record with weights of this variance, and a disturbance of 0.5 V."""
     s = np.zeros(1, COMPOSITE)[0]
-    s["f"], s["f"][:, N], s["prior"] = forgetting, 0.9, np.diag([*variance, 0.25])
+    s["f"], s["f"][:, N], s["stationary"] = forgetting, 0.9, np.diag([*variance, 0.25])
     s["noise"], s["step"], s["dead_zone"], s["power"] = noise, step, dead_zone, 1.0
-    s["P"] = s["prior"]
+    s["P"] = s["stationary"]
     return s
 
 
