@@ -53,6 +53,8 @@ PARTS: dict[str, tuple[Any, str]] = {
     "readout, currents": (Plant, "look"),
     "record": (Log, "record"),
 }
+STOPWATCH = "stopwatch"
+TURNS = 20  # of the loop with and without stopwatches
 
 
 def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int = CHUNK) -> dict[str, Any]:
@@ -230,25 +232,31 @@ def _today(repetitions: int, chunk: int) -> dict[str, float]:
 
 
 def _parts(size: int, chunk: int) -> dict[str, float]:
-    """Measures the µs per control period of each component while the loop runs."""
-    ticks = max(2, chunk // size)
-    (simulation,) = build(size, ticks, tier="lab")
-    whole = []
-    with _stopwatches() as seconds:
+    """Measures the µs per control period of the loop and of each component, in turns, while the loop runs."""
+    ticks = max(1, chunk // size // TURNS)
+    (simulation,) = build(size, 2 * ticks * TURNS, tier="lab")
+    whole, seconds = [], {}
+    for _ in range(TURNS):
         for _ in range(ticks):
             start = time.perf_counter()
             simulation.step()
             whole.append(time.perf_counter() - start)
+        with _stopwatches(seconds):
+            for _ in range(ticks):
+                simulation.step()
     medians = {name: 1e6 * statistics.median(spent) for name, spent in seconds.items()}
-    rest = 1e6 * statistics.median(whole) - sum(medians.values())
-    return medians | {"the rest": rest}
+    own = medians.pop(STOPWATCH)
+    parts = {name: spent - own for name, spent in medians.items()}
+    return parts | {"the rest": 1e6 * statistics.median(whole) - sum(parts.values())}
 
 
 @contextmanager
-def _stopwatches() -> Iterator[dict[str, list[float]]]:
-    seconds: dict[str, list[float]] = {name: [] for name in PARTS}
+def _stopwatches(seconds: dict[str, list[float]]) -> Iterator[None]:
+    """Adds the times of each part to `seconds` and, under `STOPWATCH`, those of nothing, which the others contain."""
 
-    def watched(function: Callable[..., Any], spent: list[float]) -> Callable[..., Any]:
+    def watched(function: Callable[..., Any], name: str) -> Callable[..., Any]:
+        spent = seconds.setdefault(name, [])
+
         def watch(*arguments: object) -> object:
             start = time.perf_counter()
             answer = function(*arguments)
@@ -259,8 +267,11 @@ def _stopwatches() -> Iterator[dict[str, list[float]]]:
 
     with ExitStack() as stack:
         for name, (owner, attribute) in PARTS.items():
-            stack.enter_context(mock.patch.object(owner, attribute, watched(getattr(owner, attribute), seconds[name])))
-        yield seconds
+            stack.enter_context(mock.patch.object(owner, attribute, watched(getattr(owner, attribute), name)))
+        nothing = watched(lambda *_: None, STOPWATCH)
+        for _ in range(100):
+            nothing(None, None, None)
+        yield
 
 
 def autograd_loop(ticks: int, stretches: int) -> Iterator[tuple[float, float]]:

@@ -259,7 +259,7 @@ class Hierarchy:
         self.command, self.derivative = state["limiter"]["command"], state["limiter"]["derivative"]
         self.feedback, self.weight_norm = state["feedback"], state["weight_norm"]
         self.output, self.saturated = state["allocation"]["command"], state["allocation"]["saturated"]
-        self._update = update_with(type(self.learner)) if isinstance(self.learner, Learner) else update
+        self._update = (update_with(type(self.learner)) if isinstance(self.learner, Learner) else update).repeated()
         self.finite = True
 
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
@@ -354,11 +354,10 @@ class Hierarchy:
         Returns:
             `output`, `(B, 4)`.
         """
-        stage = self.learner
-        assert isinstance(stage, Learner)
+        stage: Any = self.learner  # a Learner: a user's feedforward has a hierarchy of its own
         moves = self._tick % self._every == 0
         self._tick += 1
-        self.finite, forget = self._update.compiled(
+        self.finite, forget = self._update(
             moves, seen, goal, self._record, self._model.rows, self._period, self.prior.rows, stage.arrays, self.state
         )
         if forget:

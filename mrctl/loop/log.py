@@ -74,6 +74,7 @@ class Log:
         # The records of a tick lie side by side, so that the loop writes one block of memory for any number of robots.
         self.ticks = np.empty((length, size), TICK)
         self._error = np.zeros(3)
+        self._record = record.repeated()
 
     def at(self, tick: int) -> Rows:
         """Returns the records of one tick, `(B,)`."""
@@ -85,4 +86,4 @@ class Log:
 
     def record(self, tick: int, plant: Rows, seen: Rows, goal: Rows, control: Rows) -> bool:
         """Records a tick; the arguments and the result are those of the kernel `record`."""
-        return record.compiled(plant, seen, goal, control, self._error, self.at(tick))
+        return self._record(plant, seen, goal, control, self._error, self.at(tick))

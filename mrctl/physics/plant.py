@@ -168,6 +168,8 @@ class Plant(ABC):
         self._acts = np.array(acts, int)
         self.imu = model.site("imu").pos.copy() if has(model, "site", "imu") else np.zeros(3)
         self._period = substeps * model.opt.timestep
+        self._look_at = look.repeated()
+        self._constants = self._address, self._acts, self.imu, self._period
         state["resistance"], state["back_emf"], state["gravity"] = resistance, back_emf, model.opt.gravity
         state["driver"]["supply"], state["driver"]["gain"], state["driver"]["scale"] = robot.supply, 1.0, 1.0
         state["driver"]["current_limit"] = current_limits(model)
@@ -339,7 +341,7 @@ class Plant(ABC):
             for robot in [r for r, end in self._pushes.items() if end == self._tick]:
                 self.wrench[robot, self._chassis] = 0.0
                 del self._pushes[robot]
-        if not self._look():
+        if not self._look_at(self.qpos, self.qvel, self.act, *self._constants, self.state):
             upright = self.reading["upright"]
             for robot in np.flatnonzero(~(upright > TILT)):
                 self.fail(int(robot), "tilt over 30°" if np.isfinite(upright[robot]) else "non-finite state")
@@ -371,16 +373,12 @@ class Plant(ABC):
         At 0 V they would brake it hard.
         """
         self._move(0)
-        self._look(rows)
-        self._look(rows)
         state, queue = self.state[rows], self._queue[:, rows]
+        for _ in range(2):
+            look.compiled(self.qpos[rows], self.qvel[rows], self.act[rows], *self._constants, state)
         state["lost"] = queue[...] = 0.0
         queue[..., :2] = self.robot.back_emf * state["reading"]["wheel_rates"]
         queue[..., 2] = state["servo"]["play"] = state["reading"]["steering_angle"]
-
-    def _look(self, rows: slice = slice(None)) -> bool:
-        constants = self._address, self._acts, self.imu, self._period
-        return look.compiled(self.qpos[rows], self.qvel[rows], self.act[rows], *constants, self.state[rows])
 
 
 class PhysicsPlant(Plant):

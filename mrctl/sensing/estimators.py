@@ -183,7 +183,7 @@ class Estimator:
         Raises:
             InputError: Localisation needs a map, and no obstacle stands still, or the map is too large.
         """
-        self._law, memory = estimate_with(name), ESTIMATORS[name][1]
+        self._law, memory = estimate_with(name).repeated(), ESTIMATORS[name][1]
         self._name, self._sensing, self._sensors = name, list(sensing), sensors
         self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew, *tyres])
         self.seen = np.zeros(len(sensing), SEEN)
@@ -244,8 +244,7 @@ class Estimator:
             `seen`, `(B,)`.
         """
         sensors = self._sensors
-        self.locate(tick, plant)
-        self._law.compiled(
-            tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen
-        )
+        if self.localiser:
+            self.locate(tick, plant)
+        self._law(tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen)
         return self.seen

@@ -112,10 +112,10 @@ def sample(tick: int, true: Row, noise: Row, period: float, s: Row, last: Row, n
 
 @kernel
 def sample_all(tick: int, plant: Rows, noise: Rows, period: float, sensors: Rows, ring: Rows) -> None:
-    """Samples the sensors of all robots into the row of this tick in `ring`, `(N, B)`."""
-    now, last = ring[tick % len(ring)], ring[(tick - 1) % len(ring)]
+    """Samples the sensors of all robots into the row of this tick in `ring`, `(N, B)`, with its row of `noise`."""
+    now, last, errors = ring[tick % len(ring)], ring[(tick - 1) % len(ring)], noise[tick % len(noise)]
     for i in range(len(sensors)):
-        sample(tick, plant[i], noise[i], period, sensors[i], last[i], now[i])
+        sample(tick, plant[i], errors[i], period, sensors[i], last[i], now[i])
 
 
 class Sensors:
@@ -137,6 +137,7 @@ class Sensors:
         """
         size = len(sensing)
         self.period, self._sensing = period, list(sensing)
+        self._sample = sample_all.repeated()
         self.sensors = np.zeros(size, SENSOR)
         waits = [
             max(s.periods(f"{name}_latency", period) for name in ("encoder", "gyro", "accelerometer", "fix"))
@@ -144,6 +145,7 @@ class Sensors:
             for s in sensing
         ]
         self.ring = np.zeros((max(waits) + 2, size), SAMPLE)
+        self._commands = self.ring["command"]
         self._noise = np.zeros((1, size), NOISE)
         self._random: list[dict[str, np.random.Generator]] = [{} for _ in range(size)]
         for row, seed in enumerate(seeds):
@@ -204,8 +206,8 @@ class Sensors:
         if tick % BLOCK == 0:
             for row in range(len(self.sensors)):
                 self._draw(row, 0, tick)
-        sample_all.compiled(tick, plant, self._noise[tick % len(self._noise)], self.period, self.sensors, self.ring)
+        self._sample(tick, plant, self._noise, self.period, self.sensors, self.ring)
 
     def command(self, tick: int, derivative: Array) -> None:
         """Stores the derivative of the commanded twist that was computed in a tick, in m/s² and rad/s², `(B, 2)`."""
-        self.ring["command"][tick % len(self.ring)] = derivative
+        self._commands[tick % len(self._commands)] = derivative

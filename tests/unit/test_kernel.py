@@ -58,6 +58,32 @@ print(mrctl.__file__, hits, misses)
 """
 
 
+@kernel
+def gathered(factor: float, row: object, sums: np.ndarray) -> bool:
+    """Adds the gathered place of a record to the sums."""
+    for k in range(2):
+        sums[k] += factor * row[0].place[k]
+    if not sums[0] >= 0:
+        raise ValueError("negative")
+    return sums[0] > 1
+
+
+def test_repeated():
+    """What is called repeatedly gives the answers, effects and errors of the compiled function, from the first call."""
+    row = np.zeros(1, [("name", "i8"), ("place", "f8", 2)])
+    again, sums, expected = gathered.repeated(), np.zeros(2), np.zeros(2)
+    for factor in (0.5, 0.25, 2, np.float64(0.125)):
+        row["place"] += 0.75
+        assert again(float(factor), row, sums) is gathered.compiled(float(factor), row, expected)
+        assert np.array_equal(sums, expected)
+    with pytest.raises(ValueError, match="negative"):
+        again(-100.0, row, sums)
+    with pytest.raises(TypeError):
+        again(1.0, row)
+    with pytest.raises(TypeError):  # records of another size are noticed, others with the same size are not
+        again(1.0, np.zeros(1), sums)
+
+
 class Copy:
     """A copy of the package and its models, without caches."""
 
