@@ -179,7 +179,7 @@ def held_out_text(table: str, log: str) -> str:
     """
     (text,) = (text for title, text in sections(table).items() if title)
     lines = [json.loads(line) for line in log.splitlines()]
-    driven = [f"- {one['time']}, {one['entry']}: {one.get('says') or 'begun'}" for one in lines]
+    driven = [f"- {one['time']}, {one['entry']}, mrctl {one['mrctl']}: {one.get('says') or 'begun'}" for one in lines]
     return "\n\n".join([text, "Every time that the cells were driven:", "\n".join(driven)])
 
 
