@@ -377,10 +377,24 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
 
 def _scenario_file(arguments: Sequence[str]) -> str | None:
     """Returns the argument of `run` or `view` that is a scenario file: it ends in .toml and is no value of a flag."""
+    alone = {"json", "code", *_switches(Scenario)}
     for before, argument in zip(arguments, arguments[1:], strict=False):
-        if argument.endswith(".toml") and not argument.startswith("-") and not re.match("--(?!json$)", before):
+        valued = before.startswith("--") and re.sub(r"(^--|\.)no-", r"\1", before).removeprefix("--") not in alone
+        if argument.endswith(".toml") and not argument.startswith("-") and not valued:
             return str(Path(argument))
     return None
+
+
+def _switches(record: type[Record], prefix: str = "") -> list[str]:
+    """Returns the flags of a record that take no value, because they are true or false, such as `guard.on`."""
+    found = []
+    for name, field in record.model_fields.items():
+        flag = prefix + name.replace("_", "-")
+        if field.annotation is bool:
+            found.append(flag)
+        elif isinstance(field.annotation, type) and issubclass(field.annotation, Record):
+            found += _switches(field.annotation, f"{flag}.")
+    return found
 
 
 def _report(text: str, out: Path | None, json: bool) -> None:

@@ -82,6 +82,15 @@ def test_flags_override_the_file(capsys: pytest.CaptureFixture, scenario: Path) 
     assert printed["reference"]["kind"] == "circle"
 
 
+@pytest.mark.parametrize("switch", ["--no-code", "--guard.no-on", "--fel.no-frozen", "--json"])
+def test_file_after_a_switch(capsys: pytest.CaptureFixture, scenario: Path, switch: str) -> None:
+    """A scenario file may follow a flag that takes no value."""
+    assert cli.main(["run", switch, str(scenario), *([] if switch == "--json" else ["--json"])]) == 0
+    printed = mrctl.Scenario.from_dict(json.loads(capsys.readouterr().out)["scenario"])
+    expected = mrctl.Scenario.from_toml(scenario)
+    assert printed == (expected.replace(guard={"on": False}) if switch == "--guard.no-on" else expected)
+
+
 def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """`--out` writes result, figures and weights, from which learning goes on, and does not overwrite them."""
     out = tmp_path / "out"
