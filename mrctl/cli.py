@@ -323,7 +323,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
 
         Args:
             world: TOML file of obstacles, yaml file of a ROS map, world in SDF, or a generator with a seed, such as
-                doorway:3; the others are cellular, corridor, slalom and warehouse.
+                doorway:3; the others are cellular, corridor, parking_bay, slalom and warehouse.
             scenario: The scenario.
             goal: Pose of the goal, as x and y in m and θ in rad; by default that of the generator.
             start: Pose of the start, as x and y in m and θ in rad; by default that of the generator, or the origin.

@@ -41,13 +41,15 @@ READERS: dict[str, Callable[[str], Obstacles]] = {
     ".sdf": read_sdf,
     ".world": read_sdf,
 }
-# Openings are twice as wide as the robot; aisles, in which it also turns, are 2.5 times as wide as it is long.
+# Openings are twice as wide as the robot; aisles, in which it also turns, are 2.5 times as wide as it is long. A bay,
+# into which some robots go back and forth, is 2.5 times as long as the robot and 1.5 times as wide.
 GENERATORS: dict[str, Callable[[float, float, int], Task]] = {
     "cellular": lambda length, width, seed: generators.cellular(seed),
     "corridor": lambda length, width, seed: generators.corridor(2 * width, seed),
     "slalom": lambda length, width, seed: generators.slalom(2 * width, seed),
     "doorway": lambda length, width, seed: generators.doorway(2 * width, seed),
     "warehouse": lambda length, width, seed: generators.warehouse(2.5 * length, seed),
+    "parking_bay": lambda length, width, seed: generators.parking_bay(2.5 * length, 1.5 * width, seed),
 }
 ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
 TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot

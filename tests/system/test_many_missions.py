@@ -6,10 +6,11 @@ import pytest
 
 from mrctl import InputError, Scenario, Sensing, simulate
 from mrctl.experiments.cases import HELD_OUT_SEEDS
-from mrctl.navigation.mission import GENERATORS, outcomes, prepared, task_of
+from mrctl.navigation.mission import outcomes, prepared, task_of
 from mrctl.results.comparison import wilson
 
 TIERS = "ideal", "lab"  # with the true posture, and with the estimate
+KINDS = "cellular", "corridor", "slalom", "doorway", "warehouse"
 
 
 def driven(robot: str, seeds: range) -> tuple[dict[str, Counter[str]], int]:
@@ -21,7 +22,7 @@ def driven(robot: str, seeds: range) -> tuple[dict[str, Counter[str]], int]:
     solvable = 0
     for seed in seeds:
         own = {"prior": "model", "learner": "composite", "seed": seed} | ({"robot": {"path": robot}} if robot else {})
-        scenario, kind = Scenario.from_dict(own), list(GENERATORS)[seed % len(GENERATORS)]
+        scenario, kind = Scenario.from_dict(own), KINDS[seed % len(KINDS)]
         task = task_of(f"{kind}:{seed}", scenario)
         try:
             plan, mission = prepared(task, scenario)
@@ -57,3 +58,14 @@ def test_arrives(robot: str, count: int) -> None:
     assert solvable >= 0.9 * count
     assert share["ideal"] >= 0.99 and share["lab"] >= 0.97
     assert found["ideal"]["collided"] <= 0.002 * solvable
+
+
+@pytest.mark.parametrize("robot", ["", "racecar", "turtlebot"])
+def test_parks(robot: str) -> None:
+    """Every robot parks in a bay of its size; all but the default car, which cannot reverse, go back and forth."""
+    own = {"prior": "model", "learner": "composite", "robot": {"path": robot}} if robot else {"learner": "none"}
+    scenario = Scenario.from_dict(own)
+    task = task_of("parking_bay:3", scenario)
+    plan, mission = prepared(task, scenario)
+    assert outcomes(simulate([mission]), task.goal, plan)["outcome"].tolist() == ["arrived"]
+    assert (plan.ways.min() < 0) == bool(robot)
