@@ -53,6 +53,7 @@ GENERATORS: dict[str, Callable[[float, float, int], Task]] = {
 }
 ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
 TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
+GENTLER = 1.2  # times both, where a plan with these is refused because its spline steers beyond the limit
 WIDER = 2.0  # times both, where a plan may reverse, for at a change of direction a spline is straight
 CELLS = 4  # of the search in the width of the robot
 PATIENCE, WAITING = 2, 4  # time of a mission over that of its plan; WAITING with `window` and `mppi`
@@ -220,10 +221,18 @@ def planned(
     if still.shapes:
         low, high = np.minimum(low, still.bounds[0]), np.maximum(high, still.bounds[1])
     where = space(outlines, corners, low, high, cell=float(np.ptp(corners[:, 1])) / CELLS, margin=margin)
-    found = plan(where, np.array(task.start), np.array(task.goal), radius, reverse)
-    found = shortcut(where, found, radius, reverse)
-    reference = found.reference(RESERVE * robot.max_speed if speed is None else speed, Limits.of(robot))
-    check(reference, robot, reverse)
+
+    def smooth(radius: float) -> tuple[Plan, Waypoints]:
+        found = plan(where, np.array(task.start), np.array(task.goal), radius, reverse)
+        found = shortcut(where, found, radius, reverse)
+        return found, found.reference(RESERVE * robot.max_speed if speed is None else speed, Limits.of(robot))
+
+    found, reference = smooth(radius)
+    try:
+        check(reference, robot, reverse)
+    except InputError:  # the spline turns tighter than `ROOM` allows for
+        found, reference = smooth(GENTLER * radius)
+        check(reference, robot, reverse)
     times = np.linspace(0, reference.period, max(2, round(found.length / 0.01)))
     if min(clearance(corners, pose, outlines) for pose in reference.sample(times).pose) <= 0:
         raise InputError(f"plan: its smooth path touches an obstacle in spite of the margin of {margin:g} m; set more")

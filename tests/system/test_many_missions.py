@@ -6,8 +6,9 @@ import pytest
 
 from mrctl import InputError, Scenario, Sensing, simulate
 from mrctl.experiments.cases import HELD_OUT_SEEDS
-from mrctl.navigation.mission import outcomes, prepared, task_of
+from mrctl.navigation.mission import outcomes, prepared, robot_of, task_of
 from mrctl.results.comparison import wilson
+from mrctl.theory.references import check
 
 TIERS = "ideal", "lab"  # with the true posture, and with the estimate
 KINDS = "cellular", "corridor", "slalom", "doorway", "warehouse"
@@ -58,6 +59,16 @@ def test_arrives(robot: str, count: int) -> None:
     assert solvable >= 0.9 * count
     assert share["ideal"] >= 0.99 and share["lab"] >= 0.97
     assert found["ideal"]["collided"] <= 0.002 * solvable
+
+
+@pytest.mark.parametrize("world", ["slalom:200942", "slalom:200962", "cellular:201140"])
+def test_tight_spline(world: str) -> None:
+    """Where the spline of the first plan steers beyond the limit, a plan of wider arcs is driven."""
+    scenario = Scenario(prior="model", learner="composite")
+    task = task_of(world, scenario)
+    plan, mission = prepared(task, scenario)
+    check(mission.reference, robot_of(scenario)[1], False)
+    assert outcomes(simulate([mission]), task.goal, plan)["outcome"].tolist() == ["arrived"]
 
 
 @pytest.mark.parametrize("robot", ["", "racecar", "turtlebot"])
