@@ -25,7 +25,7 @@ from mrctl.sensing.tiers import TIERS, Sensing
 
 pytestmark = pytest.mark.xdist_group("batch_equals_single")  # what its tests share is made once
 
-COUNT, ALL = 60, 100  # of scenarios in the usual run, and with `pytest -m full`
+COUNTS = [60, pytest.param(200, marks=pytest.mark.full)]  # of scenarios in the usual run, and with `pytest -m full`
 REFERENCES = (  # four seconds each, so that they share batches, but for the last two
     Circle(period=4, radius=0.5),
     Circle(period=4, radius=0.6, clockwise=True),
@@ -139,10 +139,10 @@ def scenario(seed: int) -> Scenario:
     )
 
 
-@pytest.fixture(scope="module")
-def scenarios():
+@pytest.fixture(scope="module", params=COUNTS)
+def scenarios(request):
     """All of them."""
-    return [scenario(seed) for seed in range(COUNT)]
+    return [scenario(seed) for seed in range(request.param)]
 
 
 @pytest.fixture(scope="module")
@@ -180,27 +180,18 @@ def test_scenarios_differ(scenarios, alone):
     assert {s.sensing.tier for s in scenarios} == set(TIERS)
     assert {s.sensing.source for s in scenarios} == {"truth", "odometry", "ekf"}
     assert {s.perturbation.control_delay for s in scenarios} == {0, 0.01, 0.02, 0.03, 0.04}
-    assert 1 <= sum(bool(run.failed) for run in alone) <= COUNT // 4
+    assert 1 <= sum(bool(run.failed) for run in alone) <= len(alone) // 4
 
 
-@pytest.mark.parametrize("chunk", [COUNT, 7])
+@pytest.mark.parametrize("chunk", [200, 7])
 def test_equal(scenarios, alone, chunk):
     """Shuffled, all at once and in chunks of seven."""
-    order = np.random.default_rng(chunk).permutation(COUNT)
-    for start in range(0, COUNT, chunk):
+    order = np.random.default_rng(chunk).permutation(len(scenarios))
+    for start in range(0, len(scenarios), chunk):
         rows = order[start : start + chunk]
         whole = simulate([scenarios[row] for row in rows])
         for run, row in enumerate(rows):
             equal(alone[row], whole, run)
-
-
-@pytest.mark.full
-def test_all_equal():
-    """A hundred at once."""
-    scenarios = [scenario(seed) for seed in range(ALL)]
-    whole = simulate(scenarios)
-    for run, one in enumerate(scenarios):
-        equal(simulate(one), whole, run)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -211,7 +202,7 @@ def test_threads(scenarios, alone, threads, monkeypatch):
         return BatchPlant(model, robot, size, substeps, threads, obstacles)
 
     monkeypatch.setattr(import_module("mrctl.loop.simulation"), "build", build)
-    rows = range(0, COUNT, 3)
+    rows = range(0, len(scenarios), 3)
     whole = simulate([scenarios[row] for row in rows])
     for run, row in enumerate(rows):
         equal(alone[row], whole, run)

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import itertools
 import json
 import os
 import random
@@ -10,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
@@ -29,7 +31,7 @@ from mrctl.sweep.jobs import compute
 from mrctl.sweep.pool import Outcome
 from mrctl.sweep.store import KIND, Store
 
-KILLS = int(os.environ.get("MRCTL_KILLS", "2"))  # random moments for each victim; 20 in a release
+KILLS = [moment if moment < 2 else pytest.param(moment, marks=pytest.mark.full) for moment in range(36)]  # per victim
 FILE = """
 runs = 12
 chunk = 5
@@ -409,6 +411,31 @@ def test_disk_full(file, sweep, tmp_path, whole, capsys, work, reason):
     assert content(store) == whole
 
 
+def filling_disk(path, job, moment):
+    """Of two writes of each job, nothing reaches the disk from a moment on, counted in writes."""
+    write, writes = os.fsync, itertools.count(2 * job)
+
+    def fills(descriptor):
+        if next(writes) >= moment:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(descriptor)
+
+    with mock.patch("mrctl.sweep.store.os.fsync", fills):
+        return compute(path, job)
+
+
+@pytest.mark.parametrize("moment", [5, *(pytest.param(moment, marks=pytest.mark.full) for moment in range(10))])
+def test_disk_fills(file, sweep, tmp_path, whole, capsys, moment):
+    """Whichever write fails first, what was done before is kept, and once there is space the same command goes on."""
+    store = tmp_path / "store"
+    with mock.patch("mrctl.sweep.jobs.compute", partial(filling_disk, moment=moment)):
+        line = refused(capsys, "sweep", file, "--out", store, "--workers", 1)
+    assert "No space left on device; what was done is kept" in line
+    assert Store(store).done() == set(range(moment // 2))
+    jobs.run(sweep, store, 1)
+    assert content(store) == whole
+
+
 def test_disk_full_at_the_start_and_the_end(file, sweep, tmp_path, whole, capsys):
     """Neither a store that could not be begun nor a table that could not be written is in the way later."""
     store, full = tmp_path / "store", OSError(errno.ENOSPC, "No space left on device")
@@ -460,7 +487,7 @@ def until(condition, seconds=60.0):
     return value
 
 
-@pytest.mark.parametrize("moment", range(KILLS))
+@pytest.mark.parametrize("moment", KILLS)
 @pytest.mark.parametrize("victim", ["sweep", "worker"])
 def test_kill(long, tmp_path, moment, victim):
     """Kill −9 at a random moment: all runs are there in the end, with the same bytes."""

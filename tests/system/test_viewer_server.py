@@ -181,6 +181,42 @@ def until(condition, seconds):
     assert condition()
 
 
+@pytest.mark.parametrize(("visits", "together"), [(30, 6), pytest.param(400, 30, marks=pytest.mark.full)])
+def test_many_visitors(server, visits, together):
+    """Visitors one after the other, and then together: everyone is sent the scene, it drives on, and leaks nothing."""
+    live = Live([Scenario(learner="none")], server)
+    live.session.step()  # compiles the laws
+    before = threading.active_count()
+    loop = threading.Thread(target=live.run)
+    loop.start()
+    objects = []
+    try:
+        live.ask(live._command, "play")
+        until(lambda: live.session.tick > 5, 60)
+        for visit in range(visits):
+            with client(server) as visitor:
+                visitor.send(packed(CAMERA))
+                assert len(visitor.recv(timeout=30)) > 0
+            if visit % 10 == 9:
+                gc.collect()
+                objects.append(len(gc.get_objects()))
+        with contextlib.ExitStack() as stack:
+            visitors = [stack.enter_context(client(server)) for _ in range(together)]
+            for visitor in visitors:
+                visitor.send(packed(CAMERA))
+            tick = live.session.tick
+            for visitor in visitors:
+                for _ in range(20):  # of the scene and of what changes while it drives
+                    assert len(visitor.recv(timeout=60)) > 0
+            until(lambda: live.session.tick > tick, 60)
+        assert loop.is_alive() and live.playing and live.message == ""
+        until(lambda: threading.active_count() <= before + 3, 30)  # the loop, and viser's pool
+    finally:
+        live.close()
+        loop.join()
+    assert objects[-1] < 1.15 * objects[0]
+
+
 def test_rough_treatment(server, capfd):
     """Hundreds of random inputs, sensible and not, from visitors that come and go: it drives on, and leaks nothing."""
     rng = random.Random(1)
