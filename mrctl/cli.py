@@ -377,10 +377,11 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
 
 def _scenario_file(arguments: Sequence[str]) -> str | None:
     """Returns the argument of `run` or `view` that is a scenario file: it ends in .toml and is no value of a flag."""
-    alone = {"json", "code", *_switches(Scenario)}
-    for before, argument in zip(arguments, arguments[1:], strict=False):
-        valued = before.startswith("--") and re.sub(r"(^--|\.)no-", r"\1", before).removeprefix("--") not in alone
-        if argument.endswith(".toml") and not argument.startswith("-") and not valued:
+    valueless = {"json", "code", *_switches(Scenario)}
+    for previous, argument in zip(arguments, arguments[1:], strict=False):
+        flag = re.sub(r"(^--|\.)no-", r"\1", previous.replace("_", "-")).removeprefix("--")
+        is_value = previous.startswith("--") and "=" not in previous and flag not in valueless
+        if argument.endswith(".toml") and not argument.startswith("-") and not is_value:
             return str(Path(argument))
     return None
 

@@ -63,8 +63,8 @@ class Kernel(Generic[P, T]):
         """Returns the compiled function for one caller, who promises that the types of its arguments never change.
 
         In each call of `compiled` Numba looks up the types of all arguments, which takes 0.3 to 1 µs; here it does so
-        in the first call alone. Later arguments are read with the dtype, the number of dimensions and the memory layout
-        of the first ones, whatever theirs are.
+        in the first call alone. Later arguments are taken to have the dtype, the number of dimensions and the memory
+        layout of the first ones; where they have not, memory is misread or overwritten.
         """
         entry: Callable[..., T] | None = None
 

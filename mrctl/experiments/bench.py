@@ -233,7 +233,7 @@ def _today(repetitions: int, chunk: int) -> dict[str, float]:
 
 def _parts(size: int, chunk: int) -> dict[str, float]:
     """Measures the µs per control period of the loop and of each component, in turns, while the loop runs."""
-    ticks = max(1, chunk // size // TURNS)
+    ticks = max(5, chunk // size // TURNS)
     (simulation,) = build(size, 2 * ticks * TURNS, tier="lab")
     whole, seconds = [], {}
     for _ in range(TURNS):
@@ -252,7 +252,7 @@ def _parts(size: int, chunk: int) -> dict[str, float]:
 
 @contextmanager
 def _stopwatches(seconds: dict[str, list[float]]) -> Iterator[None]:
-    """Adds the times of each part to `seconds` and, under `STOPWATCH`, those of nothing, which the others contain."""
+    """Adds the times of each part to `seconds` and, under `STOPWATCH`, those of an empty call, which all contain."""
 
     def watched(function: Callable[..., Any], name: str) -> Callable[..., Any]:
         spent = seconds.setdefault(name, [])

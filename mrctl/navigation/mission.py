@@ -31,7 +31,7 @@ from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.theory.clearance import clearance, cover
 from mrctl.theory.obstacles import Obstacles, Outlines, Pose, Surroundings
 from mrctl.theory.references import Waypoints, check
-from mrctl.theory.robot import Robot
+from mrctl.theory.robot import ANY_ANGLE, Robot
 from mrctl.theory.timing import RESERVE, Limits
 
 READERS: dict[str, Callable[[str], Obstacles]] = {
@@ -53,8 +53,8 @@ GENERATORS: dict[str, Callable[[float, float, int], Task]] = {
 }
 ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
 TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
-GENTLER = 1.2  # times both, where a plan with these is refused because its spline steers beyond the limit
-WIDER = 2.0  # times both, where a plan may reverse, for at a change of direction a spline is straight
+GENTLER = 1.2  # factor on that radius, for a second plan where the spline of the first steers beyond the limit
+WIDER = 2.0  # factor on it where a plan may reverse, for at a change of direction a spline is straight
 CELLS = 4  # of the search in the width of the robot
 PATIENCE, WAITING = 2, 4  # time of a mission over that of its plan; WAITING with `window` and `mppi`
 MARGIN = 0.05  # m, margin of a plan
@@ -222,17 +222,21 @@ def planned(
         low, high = np.minimum(low, still.bounds[0]), np.maximum(high, still.bounds[1])
     where = space(outlines, corners, low, high, cell=float(np.ptp(corners[:, 1])) / CELLS, margin=margin)
 
-    def smooth(radius: float) -> tuple[Plan, Waypoints]:
-        found = plan(where, np.array(task.start), np.array(task.goal), radius, reverse)
-        found = shortcut(where, found, radius, reverse)
+    def attempt(arc: float) -> tuple[Plan, Waypoints]:
+        found = plan(where, np.array(task.start), np.array(task.goal), arc, reverse)
+        found = shortcut(where, found, arc, reverse)
         return found, found.reference(RESERVE * robot.max_speed if speed is None else speed, Limits.of(robot))
 
-    found, reference = smooth(radius)
+    found, reference = attempt(radius)
     try:
         check(reference, robot, reverse)
-    except InputError:  # the spline turns tighter than `ROOM` allows for
-        found, reference = smooth(GENTLER * radius)
-        check(reference, robot, reverse)
+    except InputError as fault:
+        check(reference, robot.replace(steering_limit=ANY_ANGLE), reverse)  # wider arcs help the steering alone
+        try:
+            found, reference = attempt(GENTLER * radius)
+            check(reference, robot, reverse)
+        except InputError:
+            raise fault from None
     times = np.linspace(0, reference.period, max(2, round(found.length / 0.01)))
     if min(clearance(corners, pose, outlines) for pose in reference.sample(times).pose) <= 0:
         raise InputError(f"plan: its smooth path touches an obstacle in spite of the margin of {margin:g} m; set more")

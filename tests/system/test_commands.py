@@ -82,7 +82,7 @@ def test_flags_override_the_file(capsys: pytest.CaptureFixture, scenario: Path) 
     assert printed["reference"]["kind"] == "circle"
 
 
-@pytest.mark.parametrize("switch", ["--no-code", "--guard.no-on", "--fel.no-frozen", "--json"])
+@pytest.mark.parametrize("switch", ["--no-code", "--guard.no-on", "--fel.no_frozen", "--seed=0", "--json"])
 def test_file_after_a_switch(capsys: pytest.CaptureFixture, scenario: Path, switch: str) -> None:
     """A scenario file may follow a flag that takes no value."""
     assert cli.main(["run", switch, str(scenario), *([] if switch == "--json" else ["--json"])]) == 0

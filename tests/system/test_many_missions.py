@@ -6,11 +6,12 @@ import pytest
 
 from mrctl import InputError, Scenario, Sensing, simulate
 from mrctl.experiments.cases import HELD_OUT_SEEDS
-from mrctl.navigation.mission import outcomes, prepared, robot_of, task_of
+from mrctl.navigation import mission
+from mrctl.navigation.mission import outcomes, prepared, task_of
 from mrctl.results.comparison import wilson
-from mrctl.theory.references import check
 
 TIERS = "ideal", "lab"  # with the true posture, and with the estimate
+TIGHT = "slalom:200942", "cellular:201140"
 KINDS = "cellular", "corridor", "slalom", "doorway", "warehouse"
 
 
@@ -26,7 +27,7 @@ def driven(robot: str, seeds: range) -> tuple[dict[str, Counter[str]], int]:
         scenario, kind = Scenario.from_dict(own), KINDS[seed % len(KINDS)]
         task = task_of(f"{kind}:{seed}", scenario)
         try:
-            plan, mission = prepared(task, scenario)
+            plan, drive = prepared(task, scenario)
         except InputError as error:
             if "there is none" in str(error) or "the robot is" in str(error):  # no way, or no room to stand
                 continue
@@ -37,7 +38,7 @@ def driven(robot: str, seeds: range) -> tuple[dict[str, Counter[str]], int]:
             continue
         solvable += 1
         for tier in TIERS:
-            run = simulate([mission.replace(sensing=Sensing(tier=tier))])
+            run = simulate([drive.replace(sensing=Sensing(tier=tier))])
             outcome = str(outcomes(run, task.goal, plan)["outcome"].iloc[0])
             found[tier][outcome] += 1
             if outcome != "arrived":
@@ -61,22 +62,35 @@ def test_arrives(robot: str, count: int) -> None:
     assert found["ideal"]["collided"] <= 0.002 * solvable
 
 
-@pytest.mark.parametrize("world", ["slalom:200942", "slalom:200962", "cellular:201140"])
-def test_tight_spline(world: str) -> None:
-    """Where the spline of the first plan steers beyond the limit, a plan of wider arcs is driven."""
+@pytest.mark.parametrize("world", ["slalom:200962", *(pytest.param(w, marks=pytest.mark.full) for w in TIGHT)])
+def test_tight_spline(world: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the spline of the first plan steers beyond the limit, a plan of wider arcs is driven, if there is one."""
     scenario = Scenario(prior="model", learner="composite")
     task = task_of(world, scenario)
-    plan, mission = prepared(task, scenario)
-    check(mission.reference, robot_of(scenario)[1], False)
-    assert outcomes(simulate([mission]), task.goal, plan)["outcome"].tolist() == ["arrived"]
+    for factor in (1.0, 30.0):  # the same plan again, and one of arcs for which there is no room
+        with monkeypatch.context() as patch, pytest.raises(InputError, match="steering angle .* exceeds"):
+            patch.setattr(mission, "GENTLER", factor)
+            prepared(task, scenario)
+    plan, drive = prepared(task, scenario)
+    assert outcomes(simulate([drive]), task.goal, plan)["outcome"].tolist() == ["arrived"]
 
 
-@pytest.mark.parametrize("robot", ["", "racecar", "turtlebot"])
-def test_parks(robot: str) -> None:
+def test_other_refusals_are_final(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wider arcs are no remedy for a speed beyond the robot's, which is what the message names."""
+    scenario, searches = Scenario(), []
+    search = mission.plan
+    monkeypatch.setattr(mission, "plan", lambda *arguments: searches.append(arguments) or search(*arguments))
+    with pytest.raises(InputError, match="exceeds the robot's max_"):
+        prepared(task_of("doorway:3", scenario), scenario, speed=9)
+    assert len(searches) == 1
+
+
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.full)])
+@pytest.mark.parametrize("robot", ["", "turtlebot", pytest.param("racecar", marks=pytest.mark.full)])
+def test_parks(robot: str, seed: int) -> None:
     """Every robot parks in a bay of its size; all but the default car, which cannot reverse, go back and forth."""
-    own = {"prior": "model", "learner": "composite", "robot": {"path": robot}} if robot else {"learner": "none"}
-    scenario = Scenario.from_dict(own)
-    task = task_of("parking_bay:3", scenario)
-    plan, mission = prepared(task, scenario)
-    assert outcomes(simulate([mission]), task.goal, plan)["outcome"].tolist() == ["arrived"]
+    scenario = Scenario.from_dict({"prior": "model", "learner": "composite", "robot": {"path": robot or "car"}})
+    task = task_of(f"parking_bay:{seed}", scenario)
+    plan, drive = prepared(task, scenario)
+    assert outcomes(simulate([drive]), task.goal, plan)["outcome"].tolist() == ["arrived"]
     assert (plan.ways.min() < 0) == bool(robot)

@@ -13,9 +13,11 @@ import pytest
 from numba import njit
 
 import mrctl
-from mrctl.kernel import kernel, over_rows
+from mrctl import Event, Line, Scenario, Sensing
+from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
+from mrctl.kernel import Kernel, kernel, over_rows
 from mrctl.loop.announcement import announced
-from mrctl.loop.simulation import Simulation
+from mrctl.loop.simulation import Simulation, run, simulate
 from mrctl.physics.files import models_folder
 
 PACKAGE = Path(mrctl.__file__).parent
@@ -82,6 +84,47 @@ def test_repeated():
         again(1.0, row)
     with pytest.raises(TypeError):  # records of another size are noticed, others with the same size are not
         again(1.0, np.zeros(1), sums)
+
+
+def checked(self):
+    """In place of `Kernel.repeated`: calls that notice whether their callers keep the promise."""
+    first = []
+
+    def call(*arguments):
+        types = [self.compiled.typeof_pyval(argument) for argument in arguments]
+        first[:] = first or types
+        assert types == first, self.__name__
+        return self.compiled(*arguments)
+
+    return call
+
+
+def test_promise_of_repeated(monkeypatch):
+    """All that a tick calls repeatedly gets arguments of the same types: one robot, several, restarts, new courses."""
+    monkeypatch.setattr(Kernel, "repeated", checked)
+    here, there = Line(length=0.8), Line(speed=0.4, length=0.8)
+    turn = Event(time=0.5, reference=there)
+    for tier in ("ideal", "lab"):
+        common = {"laps": 1, "learner": "fel", "sensing": Sensing(tier=tier)}
+        several = [
+            Scenario(reference=reference, seed=seed, events=events, **common)
+            for seed, (reference, events) in enumerate([(here, ()), (here, ()), (here, (turn,))])
+        ]
+        for group in (several[:1], several[2:], several[:2], several):
+            simulate(group)
+        added = Simulation(several)
+        run([added], ticks=20)
+        added.add(Event(time=1.0, reference=there))
+        run([added])
+        vector = TrackingVectorEnv(3, Scenario(reference=Line(speed=0.5, length=0.3), **common))
+        vector.reset(seed=0)
+        ends = sum(vector.step(np.zeros((3, 2)))[3].sum() for _ in range(150))
+        assert ends >= 3
+        one = TrackingEnv(Scenario(reference=Line(speed=0.5, length=0.3), **common))
+        for seed in range(2):
+            one.reset(seed=seed)
+            for _ in range(10):
+                one.step(np.zeros(2))
 
 
 class Copy:
