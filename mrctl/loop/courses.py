@@ -56,11 +56,11 @@ class Courses:
     def at(self, tick: int, ahead: int = 0) -> Rows:
         """Returns the references `ahead` ticks after a control tick, one record of `GOAL` for each robot, `(B,)`."""
         if tick not in self._block:  # only one block of samples is held, (ticks of a block, courses)
-            self._first = first = tick // BLOCK * BLOCK
+            first = tick // BLOCK * BLOCK
             self._block = range(first, min(first + BLOCK, self._ticks))
             whole = range(first, self._block.stop + self._lead)
             self._samples = np.stack([course(s, whole) for s in self._courses], axis=1)
-        now = self._samples[tick + ahead - self._first]
+        now = self._samples[tick + ahead - self._block.start]
         return now if self._own else now[self._place]
 
 

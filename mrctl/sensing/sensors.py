@@ -145,7 +145,7 @@ class Sensors:
             for s in sensing
         ]
         self.ring = np.zeros((max(waits) + 2, size), SAMPLE)
-        self._commands = self.ring["command"]
+        self._commands = self.ring["command"]  # a view, made once because that is slow
         self._noise = np.zeros((1, size), NOISE)
         self._random: list[dict[str, np.random.Generator]] = [{} for _ in range(size)]
         for row, seed in enumerate(seeds):

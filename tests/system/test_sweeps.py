@@ -383,34 +383,6 @@ def test_shaky(sweep, tmp_path, whole):
     assert content(tmp_path / "store") == whole
 
 
-def full_disk(path, job):
-    """From job 2 on nothing reaches the disk."""
-    error = OSError(errno.ENOSPC, "No space left on device")
-    with mock.patch("mrctl.sweep.store.os.fsync", side_effect=error if job >= 2 else None):
-        return compute(path, job)
-
-
-def small_files(path, job):
-    """The system itself cuts what is written."""
-    if job >= 2:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (500, resource.RLIM_INFINITY))
-    return compute(path, job)
-
-
-@pytest.mark.parametrize(("work", "reason"), [(full_disk, "No space left on device"), (small_files, "File too large")])
-def test_disk_full(file, sweep, tmp_path, whole, capsys, work, reason):
-    """One line; what was done is kept, nothing half-written counts, and the sweep goes on when there is space."""
-    store = tmp_path / "store"
-    with mock.patch("mrctl.sweep.jobs.compute", work):
-        assert f"{reason}; what was done is kept" in refused(capsys, "sweep", file, "--out", store, "--workers", 1)
-    assert Store(store).done() == {0, 1}
-    assert mrctl.open(store).sizes["run"] == 10 and mrctl.open(store).attrs["unfinished"] == 14
-    with mock.patch("mrctl.sweep.store.os.fsync", side_effect=OSError(errno.ENOSPC, "No space left on device")):
-        refused(capsys, "sweep", file, "--out", store, "--workers", 1)
-    jobs.run(sweep, store, 1)
-    assert content(store) == whole
-
-
 def filling_disk(path, job, moment):
     """Of two writes of each job, nothing reaches the disk from a moment on, counted in writes."""
     write, writes = os.fsync, itertools.count(2 * job)
@@ -422,6 +394,30 @@ def filling_disk(path, job, moment):
 
     with mock.patch("mrctl.sweep.store.os.fsync", fills):
         return compute(path, job)
+
+
+def small_files(path, job):
+    """The system itself cuts what is written."""
+    if job >= 2:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (500, resource.RLIM_INFINITY))
+    return compute(path, job)
+
+
+FULL = partial(filling_disk, moment=4), "No space left on device"  # from job 2 on
+
+
+@pytest.mark.parametrize(("work", "reason"), [FULL, (small_files, "File too large")])
+def test_disk_full(file, sweep, tmp_path, whole, capsys, work, reason):
+    """One line; what was done is kept, nothing half-written counts, and the sweep goes on when there is space."""
+    store = tmp_path / "store"
+    with mock.patch("mrctl.sweep.jobs.compute", work):
+        assert f"{reason}; what was done is kept" in refused(capsys, "sweep", file, "--out", store, "--workers", 1)
+    assert Store(store).done() == {0, 1}
+    assert mrctl.open(store).sizes["run"] == 10 and mrctl.open(store).attrs["unfinished"] == 14
+    with mock.patch("mrctl.sweep.store.os.fsync", side_effect=OSError(errno.ENOSPC, "No space left on device")):
+        refused(capsys, "sweep", file, "--out", store, "--workers", 1)
+    jobs.run(sweep, store, 1)
+    assert content(store) == whole
 
 
 @pytest.mark.parametrize("moment", [5, *(pytest.param(moment, marks=pytest.mark.full) for moment in range(10))])
