@@ -9,6 +9,7 @@ import contextlib
 import io
 import json as jsonlib
 import logging
+import math
 import os
 import re
 import sys
@@ -25,7 +26,7 @@ import tyro
 from pydantic import ValidationError
 
 from mrctl import __version__
-from mrctl.record import InputError, Record, describe, printable
+from mrctl.record import InputError, Record, describe, printable, reading
 from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.sensing.tiers import TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -47,6 +48,11 @@ BEST: FeedforwardName = "model+composite"
 
 IN_A_FILE = {"MININTERVAL": "60", "MAXINTERVAL": "60", "BAR_FORMAT": "{l_bar}{bar}{r_bar}\n"}
 """Settings of tqdm with which progress that nobody watches is a line a minute, not a bar that moves."""
+
+SHORT = {"--robot": "--robot.path", "--localise": "--sensing.localisation"}
+"""Flags that stand for longer ones."""
+POSES = "--goal", "--start"
+"""Flags of `navigate` whose values may be written as x,y,θ."""
 
 LAB = Sensing(tier="lab")
 DELAYS = 0.0, 0.01, 0.02  # s
@@ -76,7 +82,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         try:
             command = _parse(_written_out(arguments))
-            logging.getLogger("absl").addFilter(lambda _: False)  # it warns of failing runs, whose own message says why
+            for name in ("absl", "asyncio"):  # of failing runs and damaged files, whose own message says why
+                logging.getLogger(name).addFilter(lambda _: False)
             try:
                 command()
             except SystemExit as stop:
@@ -101,27 +108,75 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _known(world: str, robot: RobotFile = CAR) -> None:
+    """Refuses a world or a robot without a file that can be read, before physics is imported, which takes seconds."""
+    from mrctl.physics.files import robot_path, world_path
+
+    world_path(world)
+    if robot != CAR:
+        robot_path(robot)
+
+
+def _there(file: Path) -> None:
+    """Refuses a file or folder that does not exist, before what reads it is imported."""
+    with reading(file):
+        if not file.exists():
+            raise InputError(f"{file}: no such file or folder")
+
+
+def _some(workers: int | None) -> None:
+    """Refuses a number of processes below 1."""
+    if workers is not None and workers < 1:
+        raise InputError(f"workers: {workers} is below 1")
+
+
 class _Incomplete(Exception):
     """A command has ended, but a part of its work failed; the message says which part."""
 
 
 def _written_out(arguments: list[str]) -> list[str]:
-    """Replaces `--perturbation NAME` by the flags of that perturbation, which later flags override.
+    """Replaces what is written shortly by the flags that it stands for.
+
+    `--perturbation NAME` becomes the flags of that perturbation, which later flags override, a flag of `SHORT` the
+    longer one, and a pose x,y,θ three numbers.
 
     Raises:
-        InputError: There is no perturbation of that name.
+        InputError: There is no perturbation of that name, a short flag has no value, or a pose has not three numbers.
     """
     found: list[str] = []
     rest = iter(arguments)
     for argument in rest:
-        flag, given, name = argument.partition("=")
-        if flag != "--perturbation":
-            found.append(argument)
-            continue
-        perturbation = Perturbation.from_dict(name if given else next(rest, ""), "perturbation")
-        for field, value in perturbation.model_dump(exclude_defaults=True).items():
-            found += [f"--perturbation.{field.replace('_', '-')}", str(value)]
+        flag, given, value = argument.partition("=")
+        if flag == "--perturbation":
+            perturbation = Perturbation.from_dict(value if given else next(rest, ""), "perturbation")
+            for field, changed in perturbation.model_dump(exclude_defaults=True).items():
+                found += [f"--perturbation.{field.replace('_', '-')}", str(changed)]
+        elif flag in SHORT:
+            if not (name := value if given else next(rest, "")) or name.startswith("--"):
+                raise InputError(f"{flag.removeprefix('--')}: needs a value; see mrctl {arguments[0]} --help")
+            found += [SHORT[flag], name]
+        elif given and flag in POSES:
+            found += [flag, *_pose(flag, value)]
+        else:
+            in_pose = "," in argument and found[-1:] and found[-1] in POSES
+            found += _pose(found[-1], argument) if in_pose else [argument]
     return found
+
+
+def _pose(flag: str, text: str) -> list[str]:
+    """Splits a pose that is written as x,y,θ.
+
+    Raises:
+        InputError: There are not three numbers.
+    """
+    parts = text.split(",")
+    try:
+        if len(parts) != 3 or not all(math.isfinite(float(part)) for part in parts):
+            raise ValueError
+    except ValueError:
+        name = flag.removeprefix("--")
+        raise InputError(f"{name}: {text} is not x, y and θ in m, m, rad, as in --{name} 2,0,0") from None
+    return parts
 
 
 def _parse(arguments: list[str]) -> Callable[[], Any]:
@@ -279,6 +334,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             raise InputError(f"run: {file} is a folder; for a run of a sweep's store give its number with --run")
         if file is not None and str(file) != scenario_file:
             raise InputError(f"run: {file} is not a scenario file, whose name ends in .toml; see mrctl run --help")
+        _known(scenario.world, scenario.robot)
         from mrctl.experiments import single
 
         text, failure = single.run(_suited(scenario, arguments, scenario_file), out, json, controller)
@@ -300,7 +356,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
     part = _part(default, [name for name in names if name not in GIVEN])
 
     def navigate(
-        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MAP|GENERATOR:SEED")] = "",
+        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MAP|GENERATOR:SEED|MISSION")] = "",
         /,
         scenario: Record = part,
         goal: tuple[float, float, float] | None = None,
@@ -319,14 +375,16 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         """Plans a way among obstacles, drives it, and prints how the drive ended.
 
         The exit status is 1 if the first robot does not arrive. Its controller is that of --prior and --learner, with
-        the defaults of `mrctl run` where one of them is given, and model+composite where none is.
+        the defaults of `mrctl run` where one of them is given, and model+composite where none is. --robot NAME stands
+        for --robot.path NAME, and --localise NAME for --sensing.localisation NAME.
 
         Args:
             world: TOML file of obstacles, yaml file of a ROS map, world in SDF, or a generator with a seed, such as
-                doorway:3; the others are cellular, corridor, parking_bay, slalom and warehouse.
+                doorway:3; the others are cellular, corridor, parking_bay, slalom and warehouse. Or the folder --out of
+                a mission, which is then driven again and compared with what it holds, bit for bit.
             scenario: The scenario.
-            goal: Pose of the goal, as x and y in m and θ in rad; by default that of the generator.
-            start: Pose of the start, as x and y in m and θ in rad; by default that of the generator, or the origin.
+            goal: Pose of the goal, x and y in m and θ in rad, as in 2 0 0 or 2,0,0; by default that of the generator.
+            start: Pose of the start, likewise; by default that of the generator, or the origin.
             compare: Feedforwards of further robots, such as none or model, which drive the same plan.
             speed: Largest speed in m/s; by default 0.9 of the robot's.
             margin: Clearance in m that the plan keeps.
@@ -344,13 +402,13 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
                 Each part prints first how long it takes. The tables are written to --out, by default navigate_suite.
             quick: With --suite, drive fewer draws; some confidence intervals then have no upper end.
         """
-        from mrctl.experiments import feeding_up, mission, mission_suite, three_mppis
-
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
         if suite:
             taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _given(arguments)
             if taken or world or goal or start or compare or speed or avoid != "none" or json or view:
                 raise InputError("suite: has its own worlds, controllers and speeds; give only flags of the robot")
+            from mrctl.experiments import feeding_up, mission_suite, three_mppis
+
             for part in (mission_suite.suite, three_mppis.suite, feeding_up.suite):
                 print(part(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
             return
@@ -358,14 +416,30 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             raise InputError("quick: belongs to --suite" if quick else "world: none given; see mrctl navigate --help")
         if port != 8080 and not view:
             raise InputError("port: belongs to --view")
+        if Path(world).is_dir():
+            new = sorted({a.partition("=")[0] for a in arguments if a.startswith("--")} - {"--out", "--json"})
+            if new:
+                raise InputError(f"{new[0].removeprefix('--')}: {world} holds a mission, which is driven as it was")
+            from mrctl.experiments import mission
+
+            text, _, departs = mission.repeat(Path(world), out, json)
+            _report(text, out, json)
+            if departs:
+                raise _Incomplete(f"{world}: departs in {departs}, from what was saved there")
+            return print(f"{world}: bit-identical", file=sys.stderr if json else sys.stdout)
+        if view and (out is not None or json):
+            raise InputError("view: a live session has no --out and --json")
+        if ":" not in world and not Path(world).is_file():
+            raise InputError(f"world: no file {world}; mrctl navigate --help names the generators, such as doorway:3")
+        _known(chosen.world, chosen.robot)
         if view:
-            if out is not None or json:
-                raise InputError("view: a live session has no --out and --json")
             from mrctl.navigation.mission import task_of
             from mrctl.viewer import view as viewing
 
             task = task_of(world, chosen, start, goal)
             return viewing.mission(task, chosen, compare, speed, margin, avoid, "127.0.0.1", port)
+        from mrctl.experiments import mission
+
         text, outcome = mission.run(world, chosen, goal, start, compare, speed, margin, avoid, out, json)
         _report(text, out, json)
         if outcome != "arrived":
@@ -407,12 +481,13 @@ def _report(text: str, out: Path | None, json: bool) -> None:
 
 def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code: bool) -> None:
     """Runs one run of a sweep again and compares it with the store: `mrctl run STORE --run K`."""
+    if store is None:
+        raise InputError("run: --run needs the store of a sweep, as in mrctl run STORE --run 3")
+    _there(store)
     from mrctl.experiments import single
     from mrctl.sweep import jobs
     from mrctl.sweep.store import Store
 
-    if store is None:
-        raise InputError("run: --run needs the store of a sweep, as in mrctl run STORE --run 3")
     jobs.stages_of(store, code)
     if out is not None or json:
         own = Store(store).manifest["sweep"].get("controller")
@@ -439,6 +514,8 @@ def sweep(
         workers: Number of processes on this machine; by default one for each core.
         scheduler: Address of a Dask scheduler to use instead, such as tcp://127.0.0.1:8786.
     """
+    _there(file)
+    _some(workers)
     from mrctl.sweep import jobs
     from mrctl.sweep.plan import Sweep
 
@@ -491,17 +568,20 @@ def suite(
         out: Folder for report.html, the tables in Markdown and JSON, the figures and the runs; by default suite,
             suite_quick, suite_full or held_out.
     """
+    _some(workers)
+    if seeds is not None and seeds < 1:
+        raise InputError("seeds: the suite needs at least one run of at least one feedforward")
+    if random is not None and random < 0:
+        raise InputError(f"random: {random} is below 0")
+    if quick + full + (held_out is not None) > 1:
+        raise InputError("quick: give one of --quick, --full and --held-out")
+    if held_out is not None and (feedforward or controller or random is not None):
+        raise InputError("held_out: names the one feedforward to judge; give no other, and no random scenarios")
     from mrctl.experiments import held_out as unseen
     from mrctl.experiments import suite as uncertainty
     from mrctl.experiments.cases import HINDSIGHT, RANDOM, REPLICATES, Mode
 
-    if workers is not None and workers < 1:
-        raise InputError(f"workers: {workers} is below 1")
-    if quick + full + (held_out is not None) > 1:
-        raise InputError("quick: give one of --quick, --full and --held-out")
     if held_out is not None:
-        if feedforward or controller or random is not None:
-            raise InputError("held_out: names the one feedforward to judge; give no other, and no random scenarios")
         folder = out or Path("held_out")
         aside = unseen.judge(held_out, REPLICATES["core"] if seeds is None else seeds, workers, folder)
     else:
@@ -552,18 +632,20 @@ def tune(
             default a folder in search.
         json: Print JSON instead of a table.
     """
-    from mrctl.experiments import tuning
-    from mrctl.experiments.search import search as find
-    from mrctl.physics.mjcf import load_robot
-
     if search is not None:
         given = robot, wheels, steering, chassis, world, delay, lag, time_constant
         if given != (CAR.path, (), (), "", "flat", DELAYS, 0.0, None):
             raise InputError(
                 "search: drives the default car in worlds of its own; the flags of the design do not apply"
             )
+        from mrctl.experiments.search import search as find
+
         print(find(search, tier, out, json))
         return
+    _known(world, RobotFile.from_dict({"path": robot}, "robot"))
+    from mrctl.experiments import tuning
+    from mrctl.physics.mjcf import load_robot
+
     file = (
         CAR
         if (robot, wheels, steering, chassis) == (CAR.path, (), (), "")
@@ -590,6 +672,7 @@ def identify(
         seed: Seed of the test signals and of the sensors.
         json: Print JSON instead of a table.
     """
+    _known(world, robot)
     from mrctl.experiments import identify as identification
 
     print(identification.run(world, robot, perturbation, sensing, seed, json))
@@ -614,6 +697,12 @@ def check(
         chassis: Body that carries the wheels; by default the one at their root.
         json: Print JSON instead of a table.
     """
+    from mrctl.physics.files import SHIPPED
+
+    if robot in SHIPPED or wheels or steering or chassis:
+        _known("flat", RobotFile.from_dict({"path": robot}, "robot"))
+    else:
+        _known(robot)
     from mrctl.checks import command as checking
 
     text, verdict = checking.run(robot, wheels, steering, chassis, json)
@@ -623,7 +712,7 @@ def check(
 
 
 def bench(json: bool = False) -> None:
-    """Measures the speed of the closed loop with on-line learning and of the engine alone, in less than two minutes.
+    """Measures the speed of the closed loop with on-line learning, the engine alone, and navigation, in three minutes.
 
     Args:
         json: Print JSON instead of a table.
@@ -674,14 +763,18 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
             port: Number of the port to listen on.
             code: Whether a sweep may run the Python files of the controller that it names.
         """
-        from mrctl.viewer import view as viewing
-
         if file is not None and str(file) != scenario_file:
             if scenario != default:
                 raise InputError(f"view: {file} has its own scenarios; flags of a scenario need a live session")
+            _there(file)
+            from mrctl.viewer import view as viewing
+
             return viewing.replay(file, compare, number, export, host, port, code)
         if number is not None:
             raise InputError("run: chooses a run of a result or a sweep; a live session has none")
+        _known(scenario.world, scenario.robot)
+        from mrctl.viewer import view as viewing
+
         scenario = _suited(scenario, arguments, scenario_file)
         viewing.live(scenario, compare if chosen else ("none",), export, host, port)
 
@@ -697,6 +790,7 @@ def record(
     /,
     out: Path,
     number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
+    code: bool = True,
 ) -> None:
     """Writes a video of a result: the robots in three dimensions with the reference and their trails.
 
@@ -705,12 +799,14 @@ def record(
         out: File to write, whose name ends in .gif, or in .mp4, which needs pip install 'mrctl[video]'.
         number: Number of the run to show; by default up to four runs are shown together, the first one solid and the
             others as ghosts, and of more runs only the first one.
+        code: Whether a sweep may run the Python files of the controller that it names.
     """
+    _there(file)
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # which mujoco reads when it is imported
     from mrctl.viewer import video
 
-    video.record(file, number, out)
+    video.record(file, number, out, code)
     print(f"video: {out}")
 
 
@@ -729,6 +825,7 @@ def export(
         out: File to write.
         number: Number of the run to write; by default all runs, whose numbers are in a column or before each topic.
     """
+    _there(file)
     from mrctl.results import export as exporting
     from mrctl.sweep import jobs, store
 

@@ -32,13 +32,13 @@ class Check(NamedTuple):
         function: Measures a model against a robot's parameters.
         world: World that it needs; `flat` stands for any level floor.
         steering: Steering arrangement in which it drives a robot that offers several.
-        front: Kind of front wheel or caster that it needs.
+        front: Kind of front wheel or caster that it needs; "load ahead" of the driven axle has the centre of mass, too.
     """
 
     function: Callable[[mujoco.MjModel, Robot], Report]
     world: str
     steering: Steering
-    front: Literal["any", "steered", "without trail", "following", "trailing fork"] = "any"
+    front: Literal["any", "steered", "without trail", "following", "trailing fork", "load ahead"] = "any"
 
     @property
     def name(self) -> str:
@@ -55,6 +55,8 @@ class Check(NamedTuple):
             return "servos hold the front wheels, which leaves the motors one degree of freedom"
         if self.front == "trailing fork" and "compliant" not in steerings(model):
             return "no trailing fork"
+        if self.front == "load ahead" and read_robot(model).com_offset < 0:
+            return "the centre of mass is behind the driven axle, where free rolling is unstable"
         return ""
 
     def measure(self, model: mujoco.MjModel, robot: Robot) -> Report:
@@ -94,12 +96,12 @@ CHECKS = (
     Check(drive.stall, "flat", "rigid"),
     Check(drive.velocity_time_constant, "flat", "compliant"),
     Check(drive.rotation_time_constant, "flat", "rigid"),
-    Check(drive.coast_down, "flat", "compliant"),
+    Check(drive.coast_down, "flat", "compliant", "load ahead"),
     Check(wheels.circle, "flat", "rigid", "steered"),
     Check(wheels.rolling, "flat", "rigid", "without trail"),
     Check(wheels.traction, "flat", "compliant"),
     Check(wheels.cornering, "flat", "rigid", "steered"),
-    Check(drive.centre_of_mass, "flat", "rigid"),
+    Check(drive.centre_of_mass, "flat", "rigid", "load ahead"),
     Check(drive.prediction, "flat", "caster", "following"),
     Check(wheels.scrub_free, "flat", "caster", "trailing fork"),
     Check(invariants.energy, "flat", "compliant"),

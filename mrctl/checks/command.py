@@ -15,10 +15,10 @@ from tqdm import tqdm
 
 from mrctl.checks.comparison import Comparison
 from mrctl.checks.examination import Examination, Finding, excess
+from mrctl.physics.bounds import compiling
 from mrctl.physics.elements import has
 from mrctl.physics.files import SHIPPED, world_path
 from mrctl.physics.mjcf import arrangement, load, load_robot, steerings
-from mrctl.record import InputError
 
 UNEXPLAINED = "no inspection explains this, nor does a shorter time step"
 
@@ -49,10 +49,9 @@ def _is_world(path: str) -> bool:
     """Tells whether a file has its own floor, and on it a robot with the names of `mrctl.physics.elements`."""
     if path in SHIPPED:
         return False
-    try:
-        model = mujoco.MjModel.from_xml_path(str(world_path(path)))
-    except ValueError as error:
-        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
+    world = world_path(path)
+    with compiling(path):
+        model = mujoco.MjModel.from_xml_path(str(world))
     return model.npair > 0 and has(model, "geom", "wheel_left")
 
 

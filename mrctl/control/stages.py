@@ -28,7 +28,12 @@ from mrctl.theory.robot import Robot
 
 
 class Motion(Protocol):
-    """The motion controller: it requests the twist that brings the robot to its reference, once in a motion period."""
+    """The motion controller: it requests the twist that brings the robot to its reference, once in a motion period.
+
+    It may have a member `followed`, a float64 array `(B, 7)`: the reference that it follows in place of the given one,
+    in the same units. Its twist then passes the prefilter without lag, as that of the given one does otherwise. It is
+    read after each `output`, and None stands for the given one.
+    """
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run.

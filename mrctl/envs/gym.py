@@ -26,17 +26,29 @@ from numpy.typing import NDArray
 
 from mrctl.envs.episodes import ACTION_KINDS, Action, Array, Draw, Episodes, read
 from mrctl.envs.navigation import Navigating, read_mission
-from mrctl.envs.pictures import picture
+from mrctl.envs.pictures import Pictures
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
 SEEDS = 2**32  # number of seeds that a scenario can have
+RENDER_MODES = ["rgb_array"]
 
 
 def _spaces(episodes: Episodes) -> tuple[Box, Box]:
     """Makes the spaces of observations and actions; each environment needs its own, as they hold random generators."""
     low, high = episodes.limits
     return Box(low, high, dtype=np.float64), Box(-1.0, 1.0, (2,), np.float64)
+
+
+def _pictures(episodes: Episodes, render_mode: str | None) -> Pictures | None:
+    """Returns what draws the robots in a render mode.
+
+    Raises:
+        InputError: There is no such mode.
+    """
+    if render_mode not in (None, *RENDER_MODES):
+        raise InputError(f"render_mode: {render_mode!r} is not rgb_array")
+    return Pictures(episodes) if render_mode else None
 
 
 def asked(options: dict[str, Any] | None) -> Any:  # noqa: ANN401
@@ -53,7 +65,7 @@ def asked(options: dict[str, Any] | None) -> Any:  # noqa: ANN401
 class TrackingEnv(gymnasium.Env):
     """An environment in which one robot follows the reference of a scenario."""
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 100}
+    metadata = {"render_modes": RENDER_MODES, "render_fps": 100}
 
     def __init__(
         self,
@@ -78,9 +90,7 @@ class TrackingEnv(gymnasium.Env):
 
     def _set_up(self, episodes: Episodes, render_mode: str | None) -> None:
         """Takes the closed loop and the way to draw."""
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise InputError(f"render_mode: {render_mode!r} is not rgb_array")
-        self.episodes, self.render_mode = episodes, render_mode
+        self.episodes, self.render_mode, self._pictures = episodes, render_mode, _pictures(episodes, render_mode)
         self.metadata = {**self.metadata, "render_fps": round(1 / episodes.period)}
         self.observation_space, self.action_space = _spaces(episodes)
 
@@ -131,7 +141,7 @@ class TrackingEnv(gymnasium.Env):
         Raises:
             InputError: MuJoCo cannot draw on this machine.
         """
-        return picture(self.episodes) if self.render_mode else None
+        return self._pictures.draw() if self._pictures else None
 
 
 class NavigationEnv(TrackingEnv):
@@ -159,7 +169,7 @@ class NavigationEnv(TrackingEnv):
 class TrackingVectorEnv(VectorEnv):
     """An environment of many robots in a batch; the step after the end of an episode begins another."""
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
+    metadata = {"render_modes": RENDER_MODES, "render_fps": 100, "autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(
         self,
@@ -168,6 +178,7 @@ class TrackingVectorEnv(VectorEnv):
         action: Action = "residual",
         threads: int = 0,
         draw: Draw | None = None,
+        render_mode: str | None = None,
     ) -> None:
         """Stands the robots on their references.
 
@@ -178,16 +189,20 @@ class TrackingVectorEnv(VectorEnv):
             action: Meaning of an action, as for `mrctl.envs.episodes.Episodes`.
             threads: Number of threads of the batch engine; 0 for all cores.
             draw: As for `TrackingEnv`.
+            render_mode: As for `TrackingEnv`.
 
         Raises:
-            InputError: The file or a scenario is invalid, or the scenarios cannot run together.
+            InputError: The file or a scenario is invalid, the scenarios cannot run together, or there is no such
+                `render_mode`.
             ValueError: The number of scenarios is not B.
         """
-        self._set_up(Episodes(_several(num_envs, scenario, read), action, draw=draw, threads=threads))
+        self._set_up(Episodes(_several(num_envs, scenario, read), action, draw=draw, threads=threads), render_mode)
 
-    def _set_up(self, episodes: Episodes) -> None:
-        """Takes the closed loop."""
+    def _set_up(self, episodes: Episodes, render_mode: str | None) -> None:
+        """Takes the closed loop and the way to draw."""
         self.episodes, num_envs = episodes, len(episodes.scenarios)
+        self.render_mode, self._pictures = render_mode, _pictures(episodes, render_mode)
+        self.metadata = {**self.metadata, "render_fps": round(1 / episodes.period)}
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = _spaces(episodes)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -255,6 +270,10 @@ class TrackingVectorEnv(VectorEnv):
             info = self._add_info(info, reason | loop.metrics(row), row)
         return seen, reward, terminated, truncated, info
 
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Returns a picture of each robot, `(480, 640, 3)`, in which the others are not drawn; see `TrackingEnv`."""
+        return tuple(map(self._pictures.draw, range(self.num_envs))) if self._pictures else None
+
 
 class NavigationVectorEnv(TrackingVectorEnv):
     """Navigation of many robots in a batch, in one world."""
@@ -265,6 +284,7 @@ class NavigationVectorEnv(TrackingVectorEnv):
         scenario: Scenario | str | Path | Sequence[Scenario] | None = None,
         threads: int = 0,
         draw: Draw | None = None,
+        render_mode: str | None = None,
     ) -> None:
         """Stands the robots at their starts.
 
@@ -273,12 +293,13 @@ class NavigationVectorEnv(TrackingVectorEnv):
             scenario: As for `NavigationEnv`, or a sequence of B scenarios, which may differ in start, goal and length.
             threads: Number of threads of the batch engine; 0 for all cores.
             draw: As for `TrackingEnv`.
+            render_mode: As for `TrackingEnv`.
 
         Raises:
-            InputError: The file or a scenario is invalid, or the scenarios cannot run together.
+            InputError: As for `TrackingVectorEnv`.
             ValueError: The number of scenarios is not B.
         """
-        self._set_up(Navigating(_several(num_envs, scenario, read_mission), draw=draw, threads=threads))
+        self._set_up(Navigating(_several(num_envs, scenario, read_mission), draw=draw, threads=threads), render_mode)
 
 
 def _several(

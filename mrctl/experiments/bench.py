@@ -1,4 +1,7 @@
-"""`mrctl bench`: the speed of the closed loop, compared with the engine alone and with a loop in NumPy and torch."""
+"""`mrctl bench`: the speed of the closed loop, compared with the engine alone and with a loop in NumPy and torch.
+
+The tables of navigation are those of `mrctl.experiments.bench_navigation`.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ import torch
 from tqdm import tqdm
 
 from mrctl.control.features import feature_scale
-from mrctl.experiments import paper
+from mrctl.experiments import bench_navigation, paper
 from mrctl.experiments.tables import machine, markdown, number
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.log import Log
@@ -54,11 +57,17 @@ PARTS: dict[str, tuple[Any, str]] = {
     "record": (Log, "record"),
 }
 STOPWATCH = "stopwatch"
-TURNS = 20  # of the loop with and without stopwatches
+TURNS = 16  # of the loop with and without stopwatches
+LEAST_TICKS = 17  # of such a turn; so both kinds meet a tick in which the sensors' noise is drawn, each 256th
 
 
-def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int = CHUNK) -> dict[str, Any]:
-    """Measures the speed of the closed loop and of its parts, in less than two minutes on two cores.
+def run(
+    sizes: Sequence[int] = SIZES,
+    repetitions: int = REPETITIONS,
+    chunk: int = CHUNK,
+    worlds: int = bench_navigation.WORLDS,
+) -> dict[str, Any]:
+    """Measures the speed of the closed loop and of its parts, and of navigation, in three minutes on two cores.
 
     The closed loop (Kanayama, PID, `fel` learning in every robot, record) and its limit (open-loop `Batch.rollout` of
     the controls just recorded, from the same state, recording nothing) take turns in one process on one model. A ratio
@@ -68,12 +77,14 @@ def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int
         sizes: Numbers of robots.
         repetitions: Number of turns of each.
         chunk: Control periods of one turn, summed over the robots.
+        worlds: Number of worlds of either kind in which plans are made.
 
     Returns:
         `machine`; `robots`, a row for each size on one thread; `threads`, rows for one thread and for two; `lab`, such
         a row with the sensors, the filter and the motor driver of that tier, whose rollouts have other bits; `parts`,
         µs per control period in that tier by component, for the smallest and the largest size; `sensing_share`, the
-        share of sensors and estimator in it; `today`, the dm_control and autograd loop.
+        share of sensors and estimator in it; `today`, the dm_control and autograd loop; and
+        `navigation`, what `bench_navigation.run` returns.
     """
     threads = [1, 2] if (os.cpu_count() or 1) > 1 else [1]
     middle = sizes[len(sizes) // 2]
@@ -87,11 +98,12 @@ def run(sizes: Sequence[int] = SIZES, repetitions: int = REPETITIONS, chunk: int
         "parts": parts,
         "sensing_share": {size: (p["sensors"] + p["estimator"]) / sum(p.values()) for size, p in parts.items()},
         "today": _today(repetitions, chunk),
+        "navigation": bench_navigation.run(repetitions, worlds),
     }
 
 
 def text(figures: dict[str, Any]) -> str:
-    """Returns the figures of `run` as Markdown."""
+    """Returns the figures of `run` as Markdown; those of earlier versions have no `navigation`."""
     machine, today = figures["machine"], figures["today"]
 
     def table(rows: list[dict[str, Any]]) -> str:
@@ -127,6 +139,7 @@ def text(figures: dict[str, Any]) -> str:
             f"the closed loop with one robot is {today['closed_loop_is_faster_by']:.1f} times as fast.",
             "µs a control period in `lab`:",
             markdown(["part", *(f"{size} robot{'s' * (size != '1')}" for size in sizes)], parts),
+            *([bench_navigation.text(figures["navigation"])] if "navigation" in figures else []),
         ]
     )
 
@@ -232,22 +245,24 @@ def _today(repetitions: int, chunk: int) -> dict[str, float]:
 
 
 def _parts(size: int, chunk: int) -> dict[str, float]:
-    """Measures the µs per control period of the loop and of each component, in turns, while the loop runs."""
-    ticks = max(5, chunk // size // TURNS)
+    """Measures the mean µs per control period of the loop and of each component, in turns, while the loop runs.
+
+    Means, because some ticks cost more: those with a late fix, and each 256th, in which the sensors' noise is drawn.
+    """
+    ticks = max(LEAST_TICKS, chunk // size // TURNS)
     (simulation,) = build(size, 2 * ticks * TURNS, tier="lab")
-    whole, seconds = [], {}
+    whole, seconds = 0.0, {}
     for _ in range(TURNS):
+        start = time.perf_counter()
         for _ in range(ticks):
-            start = time.perf_counter()
             simulation.step()
-            whole.append(time.perf_counter() - start)
+        whole += time.perf_counter() - start
         with _stopwatches(seconds):
             for _ in range(ticks):
                 simulation.step()
-    medians = {name: 1e6 * statistics.median(spent) for name, spent in seconds.items()}
-    own = medians.pop(STOPWATCH)
-    parts = {name: spent - own for name, spent in medians.items()}
-    return parts | {"the rest": 1e6 * statistics.median(whole) - sum(parts.values())}
+    own = statistics.mean(seconds.pop(STOPWATCH))
+    parts = {name: 1e6 * (sum(spent) / (ticks * TURNS) - own) for name, spent in seconds.items()}
+    return parts | {"the rest": 1e6 * whole / (ticks * TURNS) - sum(parts.values())}
 
 
 @contextmanager

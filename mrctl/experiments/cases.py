@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -92,15 +93,23 @@ class Outcome(NamedTuple):
 SLOW = Pid(time_constant=0.15)
 """A PID that is slower than the default, so that a feedforward can gain more."""
 
-LOOP = Waypoints(
-    points=(
-        (0, 0), (0.46, 1.16), (1.59, 1.77), (2.36, 0.84), (1.48, -0.12), (1.07, -1.27), (-0.41, -1.56), (-0.74, -0.72),
-    ),
-    speed=1.2,
-    timing="limits",
-    limits=Limits(acceleration=0.7, rotation=1.8, rotation_acceleration=3.5, lateral_acceleration=0.8),
-)  # fmt: skip
-"""A course at changing speed, which begins where the lemniscate does and in its direction."""
+
+@cache
+def loop() -> Waypoints:
+    """Returns a course at changing speed, which begins where the lemniscate does and in its direction.
+
+    It is no constant, because its timing calls a kernel, which is not to be compiled when this module is imported.
+    """
+    return Waypoints(
+        points=(
+            (0, 0), (0.46, 1.16), (1.59, 1.77), (2.36, 0.84), (1.48, -0.12), (1.07, -1.27), (-0.41, -1.56),
+            (-0.74, -0.72),
+        ),
+        speed=1.2,
+        timing="limits",
+        limits=Limits(acceleration=0.7, rotation=1.8, rotation_acceleration=3.5, lateral_acceleration=0.8),
+    )  # fmt: skip
+
 
 Mode = Literal["quick", "core", "full"]
 REPLICATES: dict[Mode, int] = {"quick": 3, "core": 20, "full": 20}
@@ -149,7 +158,7 @@ def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
             Event(time=2 * third * SHORT, perturbation=Perturbation()),
         )
         add("step", f"{name}, on and off", third + 1, 2 * third + 1, laps=3 * third, events=events)
-    carried = Event(time=third * SHORT, learning=False, reference=slowed(LOOP, SHORT))
+    carried = Event(time=third * SHORT, learning=False, reference=slowed(loop(), SHORT))
     for name in ("all",) if quick else FLOOR:
         case = {"laps": third + 2, "events": (carried,), "perturbation": PERTURBATIONS[name]}
         add("learning", f"{name}, frozen on another course", third + 1, **case)
@@ -174,7 +183,7 @@ def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
     for name in () if quick else HARD:
         add("fault", f"{name}, 9 s a lap", perturbation=HARD[name], reference=Lemniscate(period=FAST))
     for name in ("all",) if quick else FLOOR:
-        add("course", f"{name}, spline", perturbation=PERTURBATIONS[name], reference=LOOP)
+        add("course", f"{name}, spline", perturbation=PERTURBATIONS[name], reference=loop())
     if not quick:
         back = {"reference": StopAndGo(), "steering": "rigid"}
         add("course", "all, forth and back, rigid", perturbation=PERTURBATIONS["all"], **back)

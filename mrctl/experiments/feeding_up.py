@@ -83,8 +83,8 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     Raises:
         InputError: The folder cannot be written, or the robot does not fit most corridors.
     """
-    output_folder(out)
-    runs = drive(base, DRAWS[mode])
+    with output_folder(out):
+        runs = drive(base, DRAWS[mode])
     text = table(runs, f"{base.robot.path}, {mode}").markdown
     (out / "limits.md").write_text(text)
     source = {"versions": versions(), "machine": machine(), "mode": mode, "scenario": base.model_dump(mode="json")}

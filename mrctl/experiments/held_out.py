@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -35,25 +36,6 @@ RESOLVED = 5  # replicates of each cell that are also driven with half the physi
 LOG = "held_out.jsonl"
 """Name of the log, with a line for each time that the cells were begun, and for each time that they were finished."""
 
-COURSES: dict[str, Reference] = {
-    "circle": Circle(radius=1.3, period=9.0, clockwise=True),
-    "square": RoundedSquare(side=2.6, radius=0.6, speed=0.6),
-    "stop and go": StopAndGo(distance=3.0, move_time=4.5, pause=0.7, reverse=False),
-    "fast spline": Waypoints(
-        points=((0, 0), (1.4, -0.3), (2.6, 0.5), (1.9, 1.7), (0.7, 1.1), (-0.9, 1.8), (-1.5, 0.6)),
-        speed=1.1,
-        timing="limits",
-        limits=Limits(acceleration=0.8, rotation=1.8, rotation_acceleration=3.5, lateral_acceleration=0.9),
-    ),
-    "winding spline": Waypoints(
-        points=((0, 0), (-0.6, 1.0), (0.4, 1.9), (2.0, 1.5), (3.2, 1.9), (3.6, 0.6), (2.6, -0.6), (1.2, 0.1)),
-        speed=0.9,
-        timing="limits",
-        limits=Limits(acceleration=0.5, rotation=1.5, rotation_acceleration=3.0, lateral_acceleration=0.6),
-    ),
-}
-"""Five courses; the speed changes along the last three."""
-
 PLANTS: dict[str, Perturbation] = {
     "light, weak supply": Perturbation(mass_factor=0.7, supply_factor=0.95),
     "payload 3 kg aside": Perturbation(payload=3.0, payload_x=0.25, payload_y=-0.12),
@@ -65,6 +47,31 @@ PLANTS: dict[str, Perturbation] = {
     "right wheel -3 %, right friction x3": Perturbation(right_radius_factor=0.97, right_drive_friction_factor=3.0),
 }
 """Eight plants that differ from the model, none of them in `PERTURBATIONS`."""
+
+
+@cache
+def courses() -> dict[str, Reference]:
+    """Returns five courses; the speed changes along the last three.
+
+    They are no constant, because their timing calls kernels, which are not to be compiled when this module is imported.
+    """
+    return {
+        "circle": Circle(radius=1.3, period=9.0, clockwise=True),
+        "square": RoundedSquare(side=2.6, radius=0.6, speed=0.6),
+        "stop and go": StopAndGo(distance=3.0, move_time=4.5, pause=0.7, reverse=False),
+        "fast spline": Waypoints(
+            points=((0, 0), (1.4, -0.3), (2.6, 0.5), (1.9, 1.7), (0.7, 1.1), (-0.9, 1.8), (-1.5, 0.6)),
+            speed=1.1,
+            timing="limits",
+            limits=Limits(acceleration=0.8, rotation=1.8, rotation_acceleration=3.5, lateral_acceleration=0.9),
+        ),
+        "winding spline": Waypoints(
+            points=((0, 0), (-0.6, 1.0), (0.4, 1.9), (2.0, 1.5), (3.2, 1.9), (3.6, 0.6), (2.6, -0.6), (1.2, 0.1)),
+            speed=0.9,
+            timing="limits",
+            limits=Limits(acceleration=0.5, rotation=1.5, rotation_acceleration=3.0, lateral_acceleration=0.6),
+        ),
+    }
 
 
 def cells(count: int) -> list[Case]:
@@ -88,7 +95,7 @@ def cells(count: int) -> list[Case]:
                 )
             ),
         )
-        for course, reference in COURSES.items()
+        for course, reference in courses().items()
         for plant, perturbation in PLANTS.items()
     ]  # fmt: skip
 
@@ -116,13 +123,13 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
     known = entry in FEEDFORWARDS
     choices = suite.by_name((entry, *RIVALS) if known else RIVALS, () if known else (entry,))
     (name,) = (name for name in choices if name not in RIVALS)
-    output_folder(out)
     chosen = [one for cell in cells(count) for one in (cell, _half(cell))]
     logged = {"entry": entry, "mrctl": versions()["mrctl"]}
-    fresh = any(suite.left(out / "runs" / one) for one in choices)
-    if fresh:
-        _log(out, logged | {"replicates": count, "settings": _settings(name) if known else None})
-    laps, aside = suite.run(chosen, choices, workers, out / "runs")
+    with output_folder(out):
+        fresh = any(suite.left(out / "runs" / one) for one in choices)
+        if fresh:
+            _log(out, logged | {"replicates": count, "settings": _settings(name) if known else None})
+        laps, aside = suite.run(chosen, choices, workers, out / "runs")
     rows = compare(name, suite.runs_of(chosen, laps))
     table = summarised(name, rows, count)
     if fresh:
@@ -159,7 +166,7 @@ def compare(name: str, found: Mapping[str, Laps]) -> list[dict[str, Any]]:
     two means, on any of its plants, when the physics step is halved.
     """
     rows = []
-    for course in COURSES:
+    for course in courses():
         whole = {plant: found[f"{course}; {plant}"] for plant in PLANTS}
         pairs = [
             ({one: laps.isel(run=slice(RESOLVED)) for one, laps in own.items()}, found[f"{course}; {plant}{HALF}"])
@@ -192,7 +199,7 @@ def _standing(mine: NDArray[np.float64], theirs: NDArray[np.float64], floor: sui
 
 def summarised(name: str, rows: Sequence[dict[str, Any]], count: int) -> Table:
     """Counts the cells in which a feedforward is at or below each rival, and lists those where its position is not."""
-    size = len(COURSES) * len(PLANTS)
+    size = len(courses()) * len(PLANTS)
     cells, least = [], size
     for metric, title in COLUMNS.items():
         for window, called in WINDOWS.items():

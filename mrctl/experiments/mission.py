@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import xarray as xr
+
 from mrctl.experiments.tables import json_text, markdown, number, output_folder, write_json
-from mrctl.navigation.mission import Avoid, navigate, task_of
-from mrctl.record import InputError
+from mrctl.navigation.mission import Avoid, Mission, Order, again, navigate, order_of, task_of
 from mrctl.results import plots
-from mrctl.results.dataset import save, versions
+from mrctl.results.dataset import open_result, save, versions
 from mrctl.scenario import FeedforwardName, Scenario
 from mrctl.theory.obstacles import Pose
 
@@ -19,8 +20,15 @@ COLUMNS = {
     "spl": ("SPL", 1.0),
     "clearance": ("least clearance, mm", 1e3),
     "position_rmse": ("position error, mm", 1e3),
+    "jerk": ("jerk, m/s³", 1.0),
     "energy": ("energy, J", 1.0),
+    "planning_time": ("planning, s", 1.0),
 }
+
+
+FIGURES = plots.path, plots.velocities, plots.errors
+FILES = ["result.zarr", "mission.json", *(file for draw in FIGURES for file in plots.files(draw.__name__))]
+"""Names of the files that a mission is saved in."""
 
 
 def run(
@@ -55,24 +63,59 @@ def run(
     Raises:
         InputError: As `task_of` and `navigate`, or the folder cannot be written or holds a result already.
     """
-    task = task_of(world, scenario, start, goal)
-    if out is not None and (output_folder(out) / "result.zarr").exists():
-        raise InputError(f"out: {out} holds a result already; nothing was overwritten")
-    driven = navigate(task, scenario, compare, speed, margin, avoid, progress=True)
+    with output_folder(out, FILES):
+        task = task_of(world, scenario, start, goal)
+        driven = navigate(task, scenario, compare, speed, margin, avoid, progress=True)
+    order = Order(task=task, scenario=scenario, compare=tuple(compare), speed=speed, margin=margin, avoid=avoid)
+    return _report(world, order, driven, out, as_json)
+
+
+def repeat(folder: Path, out: Path | None, as_json: bool) -> tuple[str, str, str]:
+    """Drives a saved mission again, and compares it with what was saved.
+
+    Args:
+        folder: What `run` wrote as `out`.
+        out: As for `run`.
+        as_json: As for `run`.
+
+    Returns:
+        What `run` returns; and in which signal the mission departs from the saved one, or "".
+
+    Raises:
+        InputError: As `again`, or the folder has no result, or `out` cannot be written or holds a result already.
+    """
+    with output_folder(out, FILES):
+        order, saved = order_of(folder), open_result(folder / "result.zarr")
+        driven = again(folder, progress=True)
+    text, outcome = _report(str(folder), order, driven, out, as_json)
+    departs = [str(name) for name in saved.data_vars if not _same(driven.result.get(name), saved[name])]
+    return text, outcome, departs[0] if departs else ""
+
+
+def _same(one: xr.DataArray | None, other: xr.DataArray) -> bool:
+    """Tells whether numbers have the same bits, or texts are the same."""
+    if one is None or one.shape != other.shape:
+        return False
+    texts = one.dtype.kind not in "fiub"
+    return one.values.tolist() == other.values.tolist() if texts else one.values.tobytes() == other.values.tobytes()
+
+
+def _report(world: str, order: Order, driven: Mission, out: Path | None, as_json: bool) -> tuple[str, str]:
+    """Returns what `run` returns, and saves the mission with all that it is a function of."""
     table = driven.table
     values = {
         "world": world,
-        "start": task.start,
-        "goal": task.goal,
+        "start": order.task.start,
+        "goal": order.task.goal,
+        **order.model_dump(mode="json"),
         "plan": {"length": driven.plan.length, "expanded": driven.plan.expanded, "poses": driven.plan.poses.tolist()},
-        "scenario": scenario.model_dump(mode="json"),
         "versions": versions(),
-        "robots": table.reset_index().to_dict("records"),
+        "robots": table.reset_index().assign(planning_time=driven.planning_time).to_dict("records"),
     }
     if out is not None:
         save(driven.result, out / "result.zarr")
         write_json(out / "mission.json", values)
-        for draw in (plots.path, plots.velocities, plots.errors):
+        for draw in FIGURES:
             plots.save(draw(driven.result), out, draw.__name__)
     outcome = str(table["outcome"].iloc[0])
     if as_json:

@@ -99,8 +99,8 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     Raises:
         InputError: The folder cannot be written, or the robot does not fit most corridors.
     """
-    output_folder(out)
-    found = drive(base, DRAWS[mode])
+    with output_folder(out):
+        found = drive(base, DRAWS[mode])
     shown = f"{base.robot.path}, {mode}"
     tables = [critical_widths(found, shown), critical_speeds(found, shown), budget(found, shown)]
     text = "\n".join(table.markdown for table in tables)

@@ -98,10 +98,10 @@ def reproduce(out: Path) -> str:
     Raises:
         InputError: The folder cannot be written.
     """
-    output_folder(out)
     began = time.monotonic()
-    scenarios = benchmark()
-    result = simulate(scenarios, progress=True)
+    with output_folder(out):
+        scenarios = benchmark()
+        result = simulate(scenarios, progress=True)
     endurance = [scenario("fel", case, laps=LONG) for case in ("nominal", CASE)]
     endured = simulate(endurance, progress=True)
     figures(result, scenarios, out)

@@ -328,13 +328,14 @@ def search(
         InputError: The controller is invalid, or the folder cannot be written or holds another search.
     """
     searched = entry(name)
-    out = output_folder(out or Path("search") / searched.title)
+    out = out or Path("search") / searched.title
     table: dict[str, Any] = {"versions": versions(), "machine": machine(), "entry": searched.title}
     table |= {"bounds": searched.bounds, "shipped": searched.shipped, "budget": budget._asdict(), "tiers": {}}
     drawn = {tier: worlds(tier, budget) for tier in tiers}
     heads = {tier: _head(searched, drawn[tier], budget) for tier in tiers}
-    memories = {tier: Memory(out / f"{tier}.jsonl", heads[tier], threads) for tier in tiers}
-    found = {tier: find(searched, tier, memories[tier], drawn[tier].seen, budget) for tier in tiers}
+    with output_folder(out):
+        memories = {tier: Memory(out / f"{tier}.jsonl", heads[tier], threads) for tier in tiers}
+        found = {tier: find(searched, tier, memories[tier], drawn[tier].seen, budget) for tier in tiers}
     candidates = {"shipped": searched.shipped} | {tier: one["found"] for tier, one in found.items()}
     for tier, one in found.items():
         fresh = compare(searched, candidates, memories[tier], drawn[tier].fresh)

@@ -13,9 +13,8 @@ from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.loop import user_files
 from mrctl.loop.learned import save_learned
 from mrctl.loop.simulation import simulate
-from mrctl.record import InputError
 from mrctl.results import metrics
-from mrctl.results.dataset import save, versions
+from mrctl.results.dataset import faults_of, save, versions
 from mrctl.scenario import Scenario
 
 COLUMNS = {
@@ -50,24 +49,15 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         own: Stages of the user; see `mrctl.loop.user_files`.
 
     Returns:
-        The report, with a row of metrics for each lap that was driven to its end; and when and why the run failed, or
-        "".
+        The report, with a row of metrics for each lap that was driven to its end, and what a stage of the user answered
+        that is not finite; and when and why the run failed, or "".
 
     Raises:
         InputError: The scenario or a stage is invalid, or the folder cannot be written or holds a result already.
     """
-    if out is not None and (held := [name for name in _written() if (out / name).exists()]):
-        raise InputError(f"out: {out} holds {held[0]} already; nothing was overwritten")
-    stages: Stages = user_files.load(own) if own else {}
-    new = out is not None and not out.exists()
-    try:
-        if out is not None:
-            output_folder(out)
+    with output_folder(out, () if out is None else _written()):
+        stages: Stages = user_files.load(own) if own else {}
         result = simulate([scenario], progress=True, **stages)
-    except InputError:
-        if out is not None and new and out.is_dir():
-            out.rmdir()
-        raise
     laps = metrics.per_lap(result)
     if out is not None:
         save(result, out / "result.zarr")
@@ -76,7 +66,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         _draw(result, laps, out)
     row, reason = laps.isel(run=0), str(result["failure"].values[0])
     failure = f"after {float(row['failure_time']):.2f} s: {reason}" if reason else ""
-    events = metrics.guard_events(result).drop(columns="run")
+    faults, events = faults_of(result.isel(run=0)), metrics.guard_events(result).drop(columns="run")
     if as_json:
         values = {
             "scenario": scenario.model_dump(mode="json"),
@@ -86,6 +76,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
             "failure": reason,
             "failure_time": float(row["failure_time"]) if failure else None,
             "laps": [{name: _number(row[name].values[k]) for name in metrics.METRICS} for k in range(row.sizes["lap"])],
+            "faults": faults,
             "guard": events.to_dict("records"),
         }
         return json.dumps(values, indent=1), failure
@@ -100,8 +91,8 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         f"RMSE per lap against the reference, a {course.kind} of {course.period:.3g} s; feedforward {name}, "
         f"steering {steering}"
     ]
-    if failure:
-        lines.append(f"failed {failure}")
+    lines += [f"failed {failure}"] if failure else []
+    lines += faults
     if rows:
         lines.append(markdown(header, rows))
     acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]
@@ -111,8 +102,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
 def _written() -> list[str]:
     from mrctl.results import plots  # imported here because a run that draws nothing needs no matplotlib
 
-    figures = (f"{name}.{suffix}" for name in FIGURES for suffix in plots.FORMATS)
-    return ["result.zarr", "learned.safetensors", *figures]
+    return ["result.zarr", "learned.safetensors", *(file for name in FIGURES for file in plots.files(name))]
 
 
 def _draw(result: xr.Dataset, laps: xr.Dataset, out: Path) -> None:

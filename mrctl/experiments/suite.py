@@ -84,9 +84,9 @@ def suite(
     if max(seeds, random) > len(SUITE_SEEDS):
         raise InputError(f"seeds: the suite has the first {len(SUITE_SEEDS):,}; the others are for tuning and held out")
     choices = by_name(feedforwards, controllers)
-    output_folder(out)
-    chosen = cases(mode, seeds, random)
-    laps, aside = run(chosen, choices, workers, out / "runs")
+    with output_folder(out):
+        chosen = cases(mode, seeds, random)
+        laps, aside = run(chosen, choices, workers, out / "runs")
     runs = runs_of(chosen, laps)
     rows = compare(chosen, runs)
     outcome = Outcome(mode, chosen, laps, runs, rows, aside)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import platform
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,20 +27,38 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:#.{digits}g}".rstrip(".")
 
 
-def output_folder(path: Path) -> Path:
-    """Makes a folder and checks that it can be written to, before anything is computed for it.
+@contextlib.contextmanager
+def output_folder(path: Path | None, files: Iterable[str] = ()) -> Iterator[None]:
+    """Makes the folder that a command writes to, before anything is computed for it.
+
+    If the command ends with an error, the folders that were made, and are still empty, are removed.
+
+    Args:
+        path: The folder; None for a command that writes nothing.
+        files: Names of the files that the command writes and that must not be there.
 
     Raises:
-        InputError: The folder cannot be made or written to.
+        InputError: There is one of the files, or the folder cannot be made or written to.
     """
-    probe = path / ".writable"
+    if path is None:
+        yield
+        return
+    if held := [name for name in files if (path / name).exists()]:
+        raise InputError(f"out: {path} holds {held[0]} already; nothing was overwritten")
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f"out: {path}: cannot be written: {error.strerror}") from None
-    return path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=path):
+                pass
+        except OSError as error:
+            raise InputError(f"out: {path}: cannot be written: {error.strerror}") from None
+        yield
+    except BaseException:
+        for folder in missing:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 def machine() -> dict[str, Any]:

@@ -97,8 +97,8 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     Raises:
         InputError: The folder cannot be written, or the robot finds no way through most worlds.
     """
-    output_folder(out)
-    lag, runs = drive(base, WORLDS[mode])
+    with output_folder(out):
+        lag, runs = drive(base, WORLDS[mode])
     text = table(lag, runs, f"{base.robot.path}, {mode}").markdown
     (out / "mppi.md").write_text(text)
     source = {"versions": versions(), "machine": machine(), "mode": mode, "scenario": base.model_dump(mode="json")}

@@ -78,11 +78,10 @@ def tune(
     Without a time constant the gains are designed; with one they follow the IMC rule.
 
     Raises:
-        InputError: As `design`, or the folder cannot be written.
+        InputError: As `design`, or the folder cannot be written or holds such files already.
     """
-    if out is not None:
-        output_folder(out)
-    table = design(world, Pid.from_dict({"time_constant": time_constant, "lag": lag}), delays, robot)
+    with output_folder(out, ["table.json", *plots.files("sensitivity")]):
+        table = design(world, Pid.from_dict({"time_constant": time_constant, "lag": lag}), delays, robot)
     if out is not None:
         (out / "table.json").write_text(json_text(table) + "\n")
         plots.save(figure(table), out, "sensitivity")

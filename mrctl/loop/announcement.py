@@ -3,25 +3,78 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from functools import cache
 from multiprocessing import parent_process
+from typing import Any
 
 from numba.core.event import Event, Listener, register
+from tqdm import tqdm
+
+from mrctl.kernel import Kernel
 
 
 class Announcement(Listener):
-    """Tells the user that laws are being compiled, for which a first simulation waits."""
+    """Tells the user that laws are being compiled, for which a first simulation waits.
+
+    On a terminal, a bar shows how many of the laws are done that the law in work calls.
+
+    Attributes:
+        said: Whether the message was printed.
+        bar: The bar of the law in work or of the last one.
+    """
 
     said = False
 
+    def __init__(self) -> None:
+        """Waits for the first compilation."""
+        self.bar = tqdm(disable=True)
+        self._depth, self._left = 0, set[str]()
+
     def on_start(self, event: Event) -> None:
-        """Prints the message at the first compilation."""
+        """Prints the message at the first compilation; begins a bar for a law that no other one called."""
+        law = _law(event)
         if not self.said:
             self.said = True
-            print("mrctl: compiling the laws, which takes half a minute, once", file=sys.stderr)
+            print("mrctl: compiling the laws that this needs for the first time, up to half a minute", file=sys.stderr)
+        if self._depth == 0:
+            self._left = called(law)
+            name = f"{law.__module__.removeprefix('mrctl.')}.{law.__name__}"
+            self.bar = tqdm(desc=name, total=len(self._left), unit="law", leave=False, disable=None)
+        self._depth += 1
 
     def on_end(self, event: Event) -> None:
-        """Prints nothing."""
+        """Moves the bar on, and clears it with the law that began it."""
+        name = _name(_law(event))
+        self._depth -= 1
+        # The same law may be compiled for several types, and Numba compiles functions of its own.
+        if name in self._left:
+            self._left.discard(name)
+            self.bar.update()
+        if self._depth == 0:
+            self.bar.close()
+
+
+def called(law: Callable[..., Any]) -> set[str]:
+    """Returns the names of a law and of all kernels that it calls, itself or through others."""
+    found: set[str] = set()
+    waiting = [law]
+    while waiting:
+        law = waiting.pop()
+        if (name := _name(law)) not in found:
+            found.add(name)
+            used = (law.__globals__.get(name) for name in law.__code__.co_names)
+            waiting += [kernel.law for kernel in used if isinstance(kernel, Kernel)]
+    return found
+
+
+def _law(event: Event) -> Callable[..., Any]:
+    assert event.data is not None
+    return event.data["dispatcher"].py_func
+
+
+def _name(law: Callable[..., Any]) -> str:
+    return f"{law.__module__}.{law.__qualname__}"
 
 
 @cache

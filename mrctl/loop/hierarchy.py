@@ -176,7 +176,7 @@ def learner_of(scenarios: Sequence[Scenario], robot: Robot) -> Learner:
     """Returns the learner that a uniform group of scenarios names."""
     first = scenarios[0]
     rigid, period = first.steering == "rigid", first.control_period
-    delay = first.sensing.periods("delay", period)
+    delay = first.sensing.loop_delay(period)
     match first.learner:
         case "none":
             return NoLearner(robot, len(scenarios), rigid, period)
@@ -242,7 +242,7 @@ class Hierarchy:
         self._record = nominal(robot, self._rigid)
         self._model = Prior([robot] * size, self._rigid)
         self.state = state = np.zeros(size, CONTROL)
-        self._delays = [s.sensing.periods("delay", self._period) * self._period for s in scenarios]
+        self._delays = [s.sensing.loop_delay(self._period) * self._period for s in scenarios]
         self._pids = [s.pid for s in scenarios]
         self._motions: list[Motion] = []
         for row, scenario in enumerate(scenarios):

@@ -34,7 +34,7 @@ from mrctl.theory.clearance import clearances
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.references import check, enlarged
-from mrctl.theory.robot import Tyres
+from mrctl.theory.robot import ANY_ANGLE, Tyres
 
 LEAST = 8  # smallest number of robots for which a thread pays
 RESERVE = 0.9  # share of the robot's limits that an adapted reference uses
@@ -183,7 +183,8 @@ def suited(scenario: Scenario) -> Scenario:
     """
     scenario = arranged(scenario)
     model, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
-    careful = robot.replace(**{name: RESERVE * getattr(robot, name) for name in LIMITS})
+    names = LIMITS if robot.steering_limit < ANY_ANGLE else LIMITS[:-1]  # a caster swings to any angle
+    careful = robot.replace(**{name: RESERVE * getattr(robot, name) for name in names})
     found = enlarged(scenario.reference, careful, mjcf.reverses(model, scenario.steering))
     return scenario.replace(reference=found or scenario.reference)
 
@@ -191,7 +192,8 @@ def suited(scenario: Scenario) -> Scenario:
 def group_of(s: Scenario) -> Hashable:
     """Returns what the runs of one simulation must share; runs with goals end one by one, and may differ in length."""
     rates = s.ticks if s.goal is None else None, s.physics_step, s.control_period, s.motion_period
-    chain = s.sensing.source, s.sensing.periods("delay", s.control_period)
+    sensing, period = s.sensing, s.control_period
+    chain = sensing.source, sensing.periods("delay", period), sensing.loop_delay(period)
     return s.world, s.obstacles, s.robot, s.steering, s.prior, s.learner, s.fel.hidden, *rates, *chain
 
 
@@ -395,15 +397,21 @@ class Simulation:
         names = [self._label] * size, [self._feedforward] * size
         log, failure = self.log.ticks[:length], self.plant.failure
         found = dataset.dataset(self.scenarios, *names, log, failure, self._failure_time, weights)
-        faults = {
-            "estimator_fault": ("run", np.array(getattr(self.estimator, "faults", [""] * size), object)),
-            "feedforward_fault": ("run", np.array(getattr(self.hierarchy, "feedforward_faults", [""] * size), object)),
-        }
+        faults = {name: ("run", np.array(texts, object)) for name, texts in self.faults.items()}
         constants = {  # with which the features of a commanded motion are computed
             "half_track": ("run", np.full(size, robot.half_track), {"units": "m"}),
             "feature_scale": (("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         }
         return found.assign(self._parameters() | self._clearance(length) | faults | constants)
+
+    @property
+    def faults(self) -> dict[str, list[str]]:
+        """Variables of `dataset.FAULTS`: for each robot the first fault of a stage of the user, or ""."""
+        none = [""] * len(self.scenarios)
+        return {
+            "estimator_fault": getattr(self.estimator, "faults", none),
+            "feedforward_fault": getattr(self.hierarchy, "feedforward_faults", none),
+        }
 
     def _clearance(self, length: int) -> dict[str, Any]:
         """Distance of each robot's footprint from the nearest obstacle at each tick, where there are obstacles."""

@@ -146,6 +146,7 @@ class UserHierarchy(Hierarchy):
         """Wires the user's stages, by name, and for the others those of the scenarios."""
         self._stages = stages
         self._feedforward_stage = stages.get("feedforward")
+        self._wanted: Rows | None = None  # reference of the user's motion controller, until its next call
         super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
         self.faults: dict[int, str] = {}
         self.feedforward_faults = [""] * len(scenarios)
@@ -167,11 +168,11 @@ class UserHierarchy(Hierarchy):
         state, constants = self.state, (self._record, self._period)
         if self._tick % self._every == 0:
             if stage := self._stages.get("motion"):
-                self._request(stage, seen, goal)
+                self._wanted = self._request(stage, seen, goal)
             else:
                 request_all(seen, goal, state)
         self._tick += 1
-        command_all(seen, goal, *constants, state)
+        command_all(seen, goal if self._wanted is None else self._wanted, *constants, state)
         feedback = self._stages.get("feedback")
         if feedback:
             self._feed_back(feedback, seen["twist"])
@@ -190,15 +191,20 @@ class UserHierarchy(Hierarchy):
         self._read_weight_norm()
         return self.output
 
-    def _request(self, stage: UserStage, seen: Rows, goal: Rows) -> None:
-        """Calls the user's motion controller."""
+    def _request(self, stage: UserStage, seen: Rows, goal: Rows) -> Rows | None:
+        """Calls the user's motion controller; returns the reference that it follows, if it has one of its own."""
         state = self.state
         reference = goal.view(float).reshape(len(goal), -1)
         if self._tick == 0:
             stage.call("reset", seen["pose"], reference, self._period * self._every)
-        over_rows(posture_error, seen["pose"], goal["pose"], state["error"])
         request = self._finite_rows(stage, stage.output(seen["pose"], seen["twist"], reference))
+        own = getattr(stage.stage, "followed", None)
+        if own is not None:
+            own = self._finite_rows(stage, stage.checked(own, reference.shape, "`followed`"))
+            own = goal = np.ascontiguousarray(own).view(goal.dtype)[:, 0]
+        over_rows(posture_error, seen["pose"], goal["pose"], state["error"])
         state["correction"] = request - goal["twist"]
+        return own
 
     def _feed_back(self, stage: UserStage, twist: Array) -> None:
         """Calls the user's feedback, and copies its integral for guard and hand-over."""

@@ -5,6 +5,9 @@ u = (V, θ̇) has to keep ḣ ≥ −α(h), a half-plane of twists (Ames, Xu, Gr
 quadratic programs for safety critical systems", IEEE TAC 62(8), 2017). Here α(h) is the speed from which a robot stops
 within h: α T + α² / (2 a) = h, with the deceleration a and the period T for which a twist is held. As α ≥ 0, rest is
 always among the twists that are allowed.
+
+A robot that follows a plan in time is not helped by the nearest twist: the plan goes on without it, and its controller
+then asks for a way across obstacles. `Pacing` therefore slows the plan itself.
 """
 
 from __future__ import annotations
@@ -24,6 +27,8 @@ from mrctl.theory.clearance import outside, point_to_segment
 from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings, moved
 from mrctl.theory.robot import Robot
 
+BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
+
 
 class Barrier(NamedTuple):
     """What the filter keeps."""
@@ -36,7 +41,7 @@ class Barrier(NamedTuple):
     """Deceleration a with which the robot can brake in m/s²."""
     period: float
     """Period T for which a twist is held in s."""
-    lever: float
+    lever: float = 0.3
     """Weight of a change of θ̇ against one of V in m: a change of 1 rad/s counts as much as one of `lever` m/s."""
 
 
@@ -50,7 +55,7 @@ def avoid(request: Array, pose: Array, outlines: Outlines, barrier: Barrier) -> 
         barrier: Discs, margin and braking of the robot.
     """
     found = np.empty(2)
-    rows = np.empty((len(barrier.discs) * (len(outlines.discs) + len(outlines.rings)), 3))
+    rows = _scratch(outlines, barrier)
     allowed.compiled(np.asarray(request, float), np.asarray(pose, float), outlines, barrier, rows, found)
     return found
 
@@ -95,7 +100,7 @@ class Following:
     def __init__(self, robot: Robot, size: int, scenario: Scenario) -> None:
         """Takes the nominal robot, the number of robots, and the scenario of all, which differ in what they learn."""
         rigid = arranged(scenario).steering == "rigid"
-        latency = scenario.sensing.periods("delay", scenario.control_period) * scenario.control_period
+        latency = scenario.sensing.loop_delay(scenario.control_period) * scenario.control_period
         gains = scenario.pid.channels(robot, rigid, latency, scenario.control_period)
         designed = design(robot, rigid, gains, latency, scenario.control_period, scenario.prefilter).kanayama
         self._gains = np.zeros((), GAINS)
@@ -115,32 +120,136 @@ class Following:
         return requests
 
 
+class Pacing:
+    """A motion stage that follows a plan with Kanayama's law, and slows the clock of the plan where the filter asks.
+
+    With the clock s of the plan, the request u(s) of Kanayama's law, and the largest λ ≤ 1 for which λ u is allowed,
+
+        u_c = λ u(s),    ds/dt = λ
+
+    (path-velocity decomposition: Kant and Zucker, "Toward efficient trajectory planning", IJRR 5(3), 1986). The robot
+    drives the curvature that the plan asks for, and in the time s its error of posture obeys the same equations as
+    without obstacles. λ changes no faster than the robot can follow.
+
+    Attributes:
+        followed: What the robots follow, as in `mrctl.control.stages.Motion`, `(B, 7)`.
+    """
+
+    def __init__(self, robot: Robot, size: int, scenario: Scenario, discs: Array, still: float, moving: float) -> None:
+        """Makes the stage.
+
+        Args:
+            robot: Nominal robot.
+            size: Number of robots.
+            scenario: The scenario of all, with obstacles and the plan as its reference.
+            discs: Discs that cover at least the outline of the robot, as in `Barrier`; see `rim`.
+            still: Clearance of the discs from obstacles that stand still in m, less than what they have on the plan;
+                negative where they touch some there.
+            moving: Clearance of the discs in m from obstacles that move, which are taken as if they stood where they
+                are.
+        """
+        self._follow, self._robot, self._scenario = Following(robot, size, scenario), robot, scenario
+        deceleration, obstacles = BRAKING * robot.max_acceleration, scenario.obstacles
+        self._kept = [
+            (Surroundings(Obstacles(shapes=shapes)), Barrier(discs, margin, deceleration, scenario.motion_period))
+            for shapes, margin in ((obstacles.standing, still), (obstacles.moving, moving))
+        ]
+
+    def reset(self, pose: Array, reference: Array, period: float) -> None:
+        """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
+        plan, step, sensing = self._scenario.reference, self._scenario.control_period, self._scenario.sensing
+        ticks = round(period / step) * np.arange(int(plan.period / period) + 2) + sensing.periods("delay", step)
+        self._plan = np.hstack(
+            plan.sample(np.asarray(step * ticks, float))
+        )  # as `output` gets it, for each motion period
+        self._clock, self._pace = np.zeros(len(pose)), np.ones(len(pose))  # s in motion periods, and λ
+        self._period, self._tick, self.followed = period, 0, reference
+
+    def output(self, pose: Array, twist: Array, reference: Array) -> Array:
+        """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
+        first = np.minimum(self._clock.astype(int), len(self._plan) - 2)
+        part = np.minimum(self._clock - first, 1.0)[:, None]
+        now = self._plan[first] + part * (self._plan[first + 1] - self._plan[first])
+        requests, twists = self._follow.output(pose, twist, now), now[:, 3:5].copy()
+        around = [(surroundings.at(self._period * self._tick), barrier) for surroundings, barrier in self._kept]
+        free = [min(share(*own, *kept) for kept in around) for own in zip(requests, pose, strict=True)]
+        change = self._period * self._robot.max_acceleration / np.maximum(np.abs(twists[:, 0]), 1e-9)
+        pace = np.minimum(np.clip(free, self._pace - change, self._pace + BRAKING * change), 1.0)[:, None]
+        now[:, 3:5] = pace * twists
+        now[:, 5:] = pace**2 * now[:, 5:] + (pace - self._pace[:, None]) / self._period * twists
+        self._pace, self._clock = pace[:, 0], self._clock + pace[:, 0]
+        self._tick, self.followed = self._tick + 1, now
+        return pace * requests
+
+
+def share(request: Array, pose: Array, outlines: Outlines, barrier: Barrier) -> float:
+    """Returns the largest λ in [0, 1] for which λ times a request is allowed; the arguments are those of `avoid`.
+
+    As rest is allowed and what is allowed is convex, so is every smaller λ. All have the curvature of the request.
+    """
+    return largest.compiled(request, pose, outlines, barrier, _scratch(outlines, barrier))
+
+
+def _scratch(outlines: Outlines, barrier: Barrier) -> Array:
+    """Returns room for a row for each disc and obstacle, `(m, 3)`."""
+    return np.empty((len(barrier.discs) * (len(outlines.discs) + len(outlines.rings)), 3))
+
+
 @kernel
 def allowed(request: Array, pose: Array, outlines: Outlines, barrier: Barrier, rows: Array, found: Array) -> None:
     """Writes what `avoid` returns into `found`; `rows` is scratch with a row for each disc and obstacle, `(m, 3)`."""
+    n = half_planes(request, pose, outlines, barrier, rows)
+    found[0], found[1] = nearest(request[0], barrier.lever * request[1], rows[:n])
+    if found[0] == request[0] and found[1] == barrier.lever * request[1]:
+        found[1] = request[1]  # bit for bit
+    else:
+        found[1] /= barrier.lever
+
+
+@kernel
+def largest(request: Array, pose: Array, outlines: Outlines, barrier: Barrier, rows: Array) -> float:
+    """Returns what `share` returns; `rows` is scratch with a row for each disc and obstacle, `(m, 3)`."""
+    found = 1.0
+    for k in range(half_planes(request, pose, outlines, barrier, rows)):
+        rate = rows[k, 0] * request[0] + rows[k, 1] * barrier.lever * request[1]
+        if rate < rows[k, 2]:
+            found = min(found, rows[k, 2] / rate)
+    return found
+
+
+@kernel
+def half_planes(request: Array, pose: Array, outlines: Outlines, barrier: Barrier, rows: Array) -> int:
+    """Writes a, b and c of each half-plane a V + b (θ̇ · lever) ≥ c of allowed twists into rows; returns their number.
+
+    Obstacles that are too far for any twist that is no larger than the request are left out.
+    """
     discs, edges, first, rings = outlines
-    cos, sin, n = np.cos(pose[2]), np.sin(pose[2]), 0
+    cos, sin, n, reach, arm = np.cos(pose[2]), np.sin(pose[2]), 0, 0.0, 0.0
     for k in range(len(barrier.discs)):
-        ahead, aside, radius = barrier.discs[k]
-        x, y = moved(pose, ahead, aside)
-        for other in range(len(discs) + len(rings)):
-            if other < len(discs):
-                dx, dy = x - discs[other, 0], y - discs[other, 1]
+        centre = np.hypot(barrier.discs[k, 0], barrier.discs[k, 1])
+        reach, arm = max(reach, centre + barrier.discs[k, 2]), max(arm, centre / barrier.lever)
+    fastest = np.sqrt((1 + arm * arm) * (request[0] ** 2 + (barrier.lever * request[1]) ** 2))  # m/s, of a disc
+    for other in range(len(discs) + len(rings)):
+        p = other - len(discs)
+        ring = discs[other] if p < 0 else rings[p]
+        away = np.hypot(pose[0] - ring[0], pose[1] - ring[1]) - ring[2] - reach - barrier.margin
+        if approach(away, barrier.deceleration, barrier.period) >= fastest:
+            continue
+        for k in range(len(barrier.discs)):
+            ahead, aside, radius = barrier.discs[k]
+            x, y = moved(pose, ahead, aside)
+            if p < 0:
+                dx, dy = x - ring[0], y - ring[1]
                 centre = np.hypot(dx, dy)
-                away, nx, ny = centre - discs[other, 2], dx / max(centre, 1e-9), dy / max(centre, 1e-9)
+                away, nx, ny = centre - ring[2], dx / max(centre, 1e-9), dy / max(centre, 1e-9)
             else:
-                p = other - len(discs)
                 away, nx, ny = from_polygon(x, y, edges[first[p] : first[p + 1]])
             # ḣ = n · ṗ of the disc's centre p, with ṗ = V (cos θ, sin θ) + θ̇ (−(p − P)_y, (p − P)_x).
             rows[n, 0] = nx * cos + ny * sin
             rows[n, 1] = (ny * (x - pose[0]) - nx * (y - pose[1])) / barrier.lever
             rows[n, 2] = -approach(away - radius - barrier.margin, barrier.deceleration, barrier.period)
             n += 1
-    found[0], found[1] = nearest(request[0], barrier.lever * request[1], rows)
-    if found[0] == request[0] and found[1] == barrier.lever * request[1]:
-        found[1] = request[1]  # bit for bit
-    else:
-        found[1] /= barrier.lever
+    return n
 
 
 @kernel

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import simulate
 from mrctl.navigation import generators
-from mrctl.navigation.avoidance import Avoiding, Barrier, Following
+from mrctl.navigation.avoidance import Pacing
 from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
 from mrctl.navigation.mppi import Mppi
@@ -25,10 +26,10 @@ from mrctl.navigation.sdf import read_sdf
 from mrctl.navigation.window import Window
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
-from mrctl.record import InputError
+from mrctl.record import InputError, Record, read_file
 from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
-from mrctl.theory.clearance import clearance, cover
+from mrctl.theory.clearance import clearance, rim
 from mrctl.theory.obstacles import Obstacles, Outlines, Pose, Surroundings
 from mrctl.theory.references import Waypoints, check
 from mrctl.theory.robot import ANY_ANGLE, Robot
@@ -56,11 +57,16 @@ TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the
 GENTLER = 1.2  # factor on that radius, for a second plan where the spline of the first steers beyond the limit
 WIDER = 2.0  # factor on it where a plan may reverse, for at a change of direction a spline is straight
 CELLS = 4  # of the search in the width of the robot
-PATIENCE, WAITING = 2, 4  # time of a mission over that of its plan; WAITING with `window` and `mppi`
+PATIENCE, WAITING = 2, 4  # time of a mission over that of its plan; WAITING where something keeps it from obstacles
 MARGIN = 0.05  # m, margin of a plan
 SLIM = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
 PERIOD = 0.05  # s, motion period of `window` and `mppi`
-BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
+RIM = 0.02  # m, radius of the discs around the robot for `barrier`, which reach as far beyond its footprint
+KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from obstacles that stand still and from those that move; chosen
+TRACKED = 0.01  # m, by which the margin KEPT is smaller than what the discs have on the plan, at least
+
+JERKED = 0.1  # s, step of the differences whose third is the jerk; chosen
+LARGEST = 64 * 2**20  # bytes of a `mission.json`, which holds the obstacles of its world
 
 Avoid = Literal["none", "barrier", "window", "mppi"]
 
@@ -74,6 +80,52 @@ class Mission(NamedTuple):
     """Result of one robot or several, until the last of them has ended; NaN after the end of each."""
     table: pd.DataFrame
     """What `outcomes` returns."""
+    planning_time: float
+    """Wall time of the first plan, its checks and its time law in s; unlike all else, it differs from call to call."""
+
+
+class Order(Record):
+    """All that a mission is a function of: with the same versions of the packages, the same order gives the same bits.
+
+    The fields are the arguments of `navigate`. `mission.json`, which `mrctl navigate … --out` writes, contains them.
+    """
+
+    task: Task
+    """World, start and goal."""
+    scenario: Scenario
+    """The robot and all else."""
+    compare: tuple[FeedforwardName, ...] = ()
+    """Feedforwards of further robots."""
+    speed: float | None = None
+    """Largest speed in m/s; by default 0.9 of the robot's."""
+    margin: float = MARGIN
+    """Clearance that the plan keeps in m."""
+    avoid: Avoid = "none"
+    """What keeps the robot from obstacles that move."""
+
+
+def order_of(folder: str | Path) -> Order:
+    """Reads the order of a mission that was driven.
+
+    Args:
+        folder: What `mrctl navigate … --out` wrote.
+
+    Raises:
+        InputError: There is no mission in the folder, or one of an older version, which was not saved whole.
+    """
+    path = Path(folder) / "mission.json"
+    try:
+        values = json.loads(read_file(path, LARGEST))
+    except ValueError:
+        raise InputError(f"{path}: is not JSON") from None
+    known = values if isinstance(values, dict) else {}
+    return Order.from_dict({name: known[name] for name in Order.model_fields if name in known}, str(path))
+
+
+def again(folder: str | Path, progress: bool = False) -> Mission:
+    """Drives a saved mission again, with the same bits; arguments and errors are those of `order_of` and `navigate`."""
+    order = order_of(folder)
+    return navigate(**{name: getattr(order, name) for name in Order.model_fields}, progress=progress)
 
 
 def task_of(world: str, scenario: Scenario, start: Pose | None = None, goal: Pose | None = None) -> Task:
@@ -127,21 +179,23 @@ def navigate(
         speed: Largest speed in m/s; by default 0.9 of the robot's.
         margin: Clearance that the plan keeps in m.
         avoid: What keeps the robot from obstacles that move, which the first plan does not know: nothing, so that it
-            follows the plan in time (`none`), the filter on what it would do then (`barrier`), or a motion stage that
-            goes along the plan at its own pace (`window`, `mppi`).
+            follows the plan in time (`none`), a filter that slows the time of the plan (`barrier`), or a motion stage
+            that goes along the plan at its own pace (`window`, `mppi`).
         progress: Whether to show a progress bar.
 
     Raises:
         InputError: The margin is out of range, start or goal is within it of an obstacle or off the map, the robot is
             at its goal, there is no way, or the robot cannot drive the plan or would touch an obstacle on it.
     """
+    began = perf_counter()
     found, own = prepared(task, scenario, speed, margin, avoid)
+    planning_time = perf_counter() - began
     stage = avoiding(avoid, own)
     others = [own.replace(name="", **FEEDFORWARDS[name]) for name in compare]
     result = simulate([own, *others], progress=progress, motion=stage)
     driven = np.flatnonzero(np.isfinite(result["x"].values).any(axis=0))
     result = result.isel(time=slice(int(driven[-1]) + 1))
-    return Mission(found, result, outcomes(result, task.goal, found))
+    return Mission(found, result, outcomes(result, task.goal, found), planning_time)
 
 
 def prepared(
@@ -156,10 +210,11 @@ def prepared(
         if reactive or not mjcf.reverses(model, scenario.steering):
             raise
         found, reference = planned(task, scenario, speed, margin, reverse=True)
-    own = {"obstacles": task.obstacles, "reference": reference, "laps": PATIENCE}
+    laps = PATIENCE if avoid == "none" else WAITING
+    own = {"obstacles": task.obstacles, "reference": reference, "laps": laps}
     if reactive:  # the designed prefilter is that of Kanayama's controller, whose loop is faster
         shortest = max(scenario.control_period, 0.01)  # s, that a scenario takes
-        own |= {"motion_period": PERIOD, "laps": WAITING, "prefilter": scenario.prefilter or shortest}
+        own |= {"motion_period": PERIOD, "prefilter": scenario.prefilter or shortest}
     return found, scenario.replace(**own, initial_pose=task.start, goal=task.goal)
 
 
@@ -176,17 +231,17 @@ def avoiding(avoid: Avoid, scenario: Scenario, lag: float = 0.0) -> Callable[[Ro
     corners, robot = robot_of(scenario)
     plan, obstacles = scenario.reference, scenario.obstacles
     assert isinstance(plan, Waypoints)
-    barrier = Barrier(cover(corners, 4), 0.02, BRAKING * robot.max_acceleration, scenario.motion_period, 0.3)
-    follow = partial(Following, scenario=scenario)
 
     def replan(pose: Array, outlines: Outlines) -> Waypoints | None:
         start = Task.from_dict({"obstacles": obstacles, "start": pose.tolist(), "goal": scenario.goal})
         with contextlib.suppress(InputError):  # it waits, and tries again
             return planned(start, scenario, plan.speed, SLIM, outlines)[1]
 
-    def made(robot: Robot, size: int) -> Avoiding | Window | Mppi:
+    def made(robot: Robot, size: int) -> Pacing | Window | Mppi:
         if avoid == "barrier":
-            return Avoiding(robot, size, follow, obstacles, barrier)
+            free = room(corners, plan, Surroundings(Obstacles(shapes=obstacles.standing)).at(0.0))
+            kept = min(KEPT, free - RIM - TRACKED)
+            return Pacing(robot, size, scenario, rim(corners, RIM), kept, AWAY)
         parts = robot, size, plan, obstacles, corners, replan
         return Window(*parts) if avoid == "window" else Mppi(*parts, lag)
 
@@ -211,7 +266,7 @@ def planned(
     if not 0 <= margin <= 10:
         raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
     corners, robot = robot_of(scenario)
-    still = Obstacles(shapes=tuple(shape for shape in task.obstacles.shapes if shape.course is None))
+    still = Obstacles(shapes=task.obstacles.standing)
     outlines = Surroundings(still).at(0.0) if outlines is None else outlines
     radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (
         WIDER if reverse else 1
@@ -237,10 +292,15 @@ def planned(
             check(reference, robot, reverse)
         except InputError:
             raise fault from None
-    times = np.linspace(0, reference.period, max(2, round(found.length / 0.01)))
-    if min(clearance(corners, pose, outlines) for pose in reference.sample(times).pose) <= 0:
+    if room(corners, reference, outlines) <= 0:
         raise InputError(f"plan: its smooth path touches an obstacle in spite of the margin of {margin:g} m; set more")
     return found, reference
+
+
+def room(footprint: Array, plan: Waypoints, outlines: Outlines) -> float:
+    """Returns the smallest clearance along a plan in m; `footprint` has the corners of the robot in m, `(n, 2)`."""
+    times = np.linspace(0, plan.period, max(2, round(plan.speed * plan.period / 0.01)))
+    return min(clearance(footprint, pose, outlines) for pose in plan.sample(times).pose)
 
 
 def robot_of(scenario: Scenario) -> tuple[Array, Robot]:
@@ -263,8 +323,8 @@ def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
         A row for each robot: `outcome` (arrived, collided, stuck, out of time, or why it failed), `time` in s, `length`
         of its path in m, `spl`, success weighted by path length, ℓ / max(ℓ, length) or 0 unless it arrived, with the
         length ℓ of the plan (Anderson et al., "On evaluation of embodied navigation agents", 2018), the smallest
-        `clearance` in m, `position_rmse` in m, `energy` in J, and `expanded`, the number of poses that the search
-        expanded.
+        `clearance` in m, `position_rmse` in m, `jerk` in m/s³ (`jerk_of`), `energy` in J, and `expanded`, the number of
+        poses that the search expanded.
     """
     runs, period, rows = as_runs(result), control_period(result), []
     for row in range(runs.sizes["run"]):
@@ -280,7 +340,24 @@ def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
             "spl": there * found.length / max(found.length, length),
             "clearance": float(driven["clearance"].min()) if "clearance" in driven else np.inf,
             "position_rmse": float(np.sqrt(np.mean(driven["longitudinal_error"] ** 2 + driven["lateral_error"] ** 2))),
+            "jerk": jerk_of(np.column_stack([driven["x"].values, driven["y"].values]), period),
             "energy": float(driven["power"].sum()) * period,
             "expanded": found.expanded,
         })  # fmt: skip
     return pd.DataFrame(rows, index=pd.Index(runs["label"].values, name="label"))
+
+
+def jerk_of(places: Array, period: float) -> float:
+    """Returns the RMS of the jerk of a robot in m/s³: of the third derivative of its position in the world.
+
+    It is the third difference of the position over steps of `JERKED`, so that the vibration of single ticks, which says
+    nothing about the ride, does not count; NaN for a run that is shorter than three of them.
+
+    Args:
+        places: x and y at each tick in m, `(T, 2)`.
+        period: Control period in s.
+    """
+    n = max(1, round(JERKED / period))
+    p, q, r, s = (places[k * n : len(places) - (3 - k) * n] for k in range(4))
+    jerks = (s - 3 * r + 3 * q - p) / (n * period) ** 3
+    return float(np.sqrt(np.mean(np.sum(jerks**2, axis=1)))) if len(jerks) else np.nan

@@ -16,7 +16,7 @@ import numpy as np
 
 from mrctl.kernel import Array, kernel
 from mrctl.theory.clearance import cover
-from mrctl.theory.grid import Field, at, field_of
+from mrctl.theory.grid import Field, field_of, value
 from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings
 from mrctl.theory.references import Waypoints
 from mrctl.theory.robot import Robot
@@ -208,27 +208,20 @@ class Reactive(ABC):
 
 
 @kernel
-def clear(
-    x: float, y: float, c: float, s: float, time: float, reach: float, discs: Array, field: Field, movers: Array
-) -> float:
-    """Returns the distance in m of the discs of a robot from all obstacles, or `KEPT` where it is larger.
+def apart(x: float, y: float, c: float, s: float, time: float, reach: float, discs: Array, movers: Array) -> float:
+    """Returns the distance in m of the discs of a robot from the obstacles that move, or `KEPT` where it is larger.
 
     Args:
         x: x of the robot in m.
         y: y of the robot in m.
         c: Cosine of its heading.
         s: Sine of its heading.
-        time: Time in s, from now on, for which the obstacles that move go on as they do now.
+        time: Time in s, from now on, for which the obstacles go on as they do now.
         reach: Radius in m of a circle around the robot's own point that holds all its discs.
         discs: `Scene.discs`.
-        field: `Scene.field`.
         movers: `Scene.movers`.
     """
     free = KEPT
-    if at(field, x, y)[0] < reach + KEPT:  # else no disc can be nearer
-        for d in range(len(discs)):
-            px, py = x + c * discs[d, 0] - s * discs[d, 1], y + s * discs[d, 0] + c * discs[d, 1]
-            free = min(free, at(field, px, py)[0] - discs[d, 2])
     for m in range(len(movers)):
         mx, my = movers[m, 0] + time * movers[m, 2] - x, movers[m, 1] + time * movers[m, 3] - y
         if mx * mx + my * my < (movers[m, 4] + reach + KEPT) ** 2:
@@ -259,19 +252,23 @@ def roll_out(
         costs: Out: their costs, `(K,)`.
     """
     targets, discs, field, movers = scene
+    distance, left, low, resolution = field.distance, field.origin[0], field.origin[1], field.resolution
     steps, reach = len(nominal), 0.0
     for d in range(len(discs)):
         reach = max(reach, np.hypot(discs[d, 0], discs[d, 1]) + discs[d, 2])
-    # While a request is held, what is missing of it decays: to `left` at the end of a step, to `mean` on its average.
-    left = np.exp(-step / lag) if lag > 0 else 0.0
-    mean = (1 - left) * lag / step
+    # While a request is held, what is missing of it decays: to `rest` at the end of a step, to `mean` on its average.
+    rest = np.exp(-step / lag) if lag > 0 else 0.0
+    mean = (1 - rest) * lag / step
+    before, shares = np.empty(steps, np.int64), np.empty(steps)  # knot before each step, and share of the one after it
+    for k in range(steps):
+        along = k * (knots.shape[1] - 1) / (steps - 1)
+        before[k] = min(int(along), knots.shape[1] - 2)
+        shares[k] = along - before[k]
     for n in range(len(knots)):
         x, y, c, s, v, omega, cost = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]), last[0], last[1], 0.0
         drives, turns, touched = twist[0], twist[1], False
         for k in range(steps):
-            along = k * (knots.shape[1] - 1) / (steps - 1)
-            i = min(int(along), knots.shape[1] - 2)
-            share = along - i
+            i, share = before[k], shares[k]
             wanted = nominal[k, 0] + (1 - share) * knots[n, i, 0] + share * knots[n, i + 1, 0]
             turning = nominal[k, 1] + (1 - share) * knots[n, i, 1] + share * knots[n, i + 1, 1]
             change = bounds.acceleration * step
@@ -284,7 +281,7 @@ def roll_out(
             if touched:
                 continue
             speed, rotation = v + mean * (drives - v), omega + mean * (turns - omega)
-            drives, turns = v + left * (drives - v), omega + left * (turns - omega)
+            drives, turns = v + rest * (drives - v), omega + rest * (turns - omega)
             # Half of the turn, the way, and the other half; the cosine of so small an angle is that of its series.
             half = rotation * step / 2
             ch, sh = 1 - half * half / 2 * (1 - half * half / 12), half * (1 - half * half / 6 * (1 - half * half / 20))
@@ -293,7 +290,13 @@ def roll_out(
             c, s = c * ch - s * sh, s * ch + c * sh
             dx, dy = targets[k, 0] - x, targets[k, 1] - y
             cost += step * (PLACE * (dx * dx + dy * dy) + HEADING * (1 - c * targets[k, 2] - s * targets[k, 3]))
-            free = clear(x, y, c, s, (k + 1) * step, reach, discs, field, movers)
+            free = KEPT
+            if value(distance, left, low, resolution, x, y) < reach + KEPT:  # else no disc can be nearer
+                for d in range(len(discs)):
+                    px, py = x + c * discs[d, 0] - s * discs[d, 1], y + s * discs[d, 0] + c * discs[d, 1]
+                    free = min(free, value(distance, left, low, resolution, px, py) - discs[d, 2])
+            if len(movers) > 0:
+                free = min(free, apart(x, y, c, s, (k + 1) * step, reach, discs, movers))
             if free <= 0:
                 touched = True
                 cost += TOUCH * (1 + (steps - k) / steps)  # the earlier, the worse

@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
 
@@ -286,13 +287,19 @@ def sample(start: Array, curve: Curve, radius: float, step: float) -> tuple[Arra
         Poses in m, m, rad, `(n, 3)`, and for each whether the robot comes to it forward (1), in reverse (−1), or starts
         there (0), `(n,)`.
     """
-    poses, ways, now = [np.array(start, float)], [0.0], np.array(start, float)
-    for turn, length in zip(*curve, strict=True):
-        count = int(np.ceil(abs(length) / step - 1e-9))
-        for k in range(1, count + 1):
-            pose = np.empty(3)
-            advance.compiled(now, turn, radius, length * k / count, pose)
-            poses.append(pose)
-            ways.append(float(np.sign(length)))
-        now = poses[-1]
-    return np.array(poses), np.array(ways)
+    counts = np.ceil(np.abs(curve.lengths) / step - 1e-9).astype(int)
+    poses, ways = np.empty((counts.sum() + 1, 3)), np.zeros(counts.sum() + 1)
+    poses[0] = start
+    trace.compiled(*curve, counts, float(radius), poses, ways)
+    return poses, ways
+
+
+@kernel
+def trace(turns: Array, lengths: Array, counts: NDArray[np.int64], radius: float, poses: Array, ways: Array) -> None:
+    """Writes what `sample` returns, from the first pose on, with a number of samples on each of m pieces, `(m,)`."""
+    first = 0
+    for piece in range(len(turns)):
+        for k in range(1, counts[piece] + 1):
+            advance(poses[first], turns[piece], radius, lengths[piece] * k / counts[piece], poses[first + k])
+            ways[first + k] = np.sign(lengths[piece])
+        first += counts[piece]

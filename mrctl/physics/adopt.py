@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.physics.bounds import compiling
 from mrctl.physics.elements import FRONTS, MOTORS, NUMERICS, REAR, RIGID, has
 from mrctl.physics.files import robot_path
 from mrctl.record import InputError
@@ -59,10 +60,8 @@ def adopted(robot: RobotFile, world: Path) -> mujoco.MjSpec:
         InputError: A file is no MJCF, or a part of the robot is missing, ambiguous or impossible.
     """
     path = robot_path(robot)
-    try:
+    with compiling(path):
         return _Adoption(robot, path).into(world)
-    except ValueError as error:
-        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
 
 
 class _Adoption:

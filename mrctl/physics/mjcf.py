@@ -22,6 +22,7 @@ import numpy as np
 
 from mrctl.physics import adopt
 from mrctl.physics import obstacles as walls
+from mrctl.physics.bounds import compiling
 from mrctl.physics.elements import MOTORS, NUMERICS, RIGID, fronts, has, left_tyre_pairs
 from mrctl.physics.files import robot_path, world_path
 from mrctl.physics.hull import footprint
@@ -72,18 +73,16 @@ def build(
     """
     path = world_path(world)
     source = path if robot == CAR else robot_path(robot)
-    try:
-        with warnings.catch_warnings(record=True) as held:  # a robot that is refused gets one line
+    # A robot that is refused gets one line, without warnings.
+    with compiling(source), warnings.catch_warnings(record=True) as held:
+        spec = _assembled(path, robot)
+        model = spec.compile()
+        nominal = _arranged(model, steering, robot)
+        if obstacles.shapes:
             spec = _assembled(path, robot)
+            walls.add(spec, obstacles, footprint(model))
             model = spec.compile()
             nominal = _arranged(model, steering, robot)
-            if obstacles.shapes:
-                spec = _assembled(path, robot)
-                walls.add(spec, obstacles, footprint(model))
-                model = spec.compile()
-                nominal = _arranged(model, steering, robot)
-    except ValueError as error:
-        raise InputError(f"{source}: {' '.join(str(error).split())}") from None
     for warning in held:
         warnings.warn(warning.message, stacklevel=2)
     if timestep is not None:

@@ -10,12 +10,14 @@ and with no floor, wheel or other hull.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from mrctl.kernel import Array
+from mrctl.physics.bounds import check_bounds, compiling
 from mrctl.physics.elements import COLLISION
 from mrctl.physics.hull import convex
 from mrctl.record import InputError
@@ -70,6 +72,27 @@ def add_walls(spec: mujoco.MjSpec, obstacles: Obstacles) -> None:
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **common)
 
 
+def multi_ray(obstacles: Obstacles) -> Callable[[Array, Array, float], Array]:
+    """Returns a function that casts MuJoCo's rays at obstacles, a judge of `mrctl.theory.rays.cast`.
+
+    Its arguments are x and y of the sensor in m, `(2,)`, the directions of the rays in rad, `(n,)`, and the largest
+    range in m; it returns the ranges in m, `(n,)`.
+    """
+    spec = mujoco.MjSpec()
+    add_walls(spec, obstacles)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+
+    def ranges(place: Array, directions: Array, reach: float) -> Array:
+        n, found = len(directions), np.empty(len(directions))
+        rays, ids = np.column_stack([np.cos(directions), np.sin(directions), np.zeros(n)]), np.empty(n, np.int32)
+        mujoco.mj_multiRay(model, data, np.append(place, 0.0), rays.ravel(), None, 1, -1, ids, found, None, n, reach)
+        return np.where(found < 0, reach, np.minimum(found, reach))
+
+    return ranges
+
+
 def quaternion(angle: float) -> Array:
     """Returns the quaternion of a rotation by an angle in rad about the vertical, `(4,)`."""
     return np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
@@ -103,11 +126,10 @@ def read_mjcf(path: str | Path) -> Obstacles:
     Raises:
         InputError: The file is no MJCF, or one of its obstacles is neither an upright box or cylinder nor a mesh.
     """
-    try:
+    check_bounds(Path(path))
+    with compiling(path):
         spec = mujoco.MjSpec.from_file(str(path))
         model = spec.compile()
-    except ValueError as error:
-        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
     data, shapes, texts = mujoco.MjData(model), [], {text.name: text.data for text in spec.texts}
     mujoco.mj_kinematics(model, data)
     for geom in range(model.ngeom):

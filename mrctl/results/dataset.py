@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -16,7 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from mrctl import __version__
-from mrctl.record import InputError, reading
+from mrctl.record import InputError, printable, read_file, reading
 from mrctl.scenario import Scenario
 
 SMALL = 2**30  # bytes of signals that any result may have
@@ -84,7 +86,18 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "pitch_angle": ("rad", "pitch, positive nose down; after the heading"),
 }
 
-WHOLE = "all_chunks"  # attribute of a saved result whose files hold all chunks, even those with only NaN
+# Variables with the first tick at which a stage of the user answered what is not finite, "" if none did, and what then
+# happens to the robot, which drives on.
+FAULTS = {
+    "estimator_fault": "the robot coasts on odometry",
+    "feedforward_fault": "the guard lets PID and nominal model drive it",
+}
+
+WHOLE = (
+    "variables"  # attribute of a saved result: its variables, each of whose files holds all chunks, even with only NaN
+)
+WHOLE_BEFORE_0_10_2 = "all_chunks"  # the same without their names
+CODECS = {"bytes", "vlen-utf8", "zstd", "blosc", "crc32c", "sharding_indexed"}  # all that mrctl ever wrote
 SINCE_0_4_2 = ("z", "roll_angle", "pitch_angle")  # signals that older results lack
 
 TICK = np.dtype([(name, "f8") for name in SIGNALS])  # the signals of one robot at one control tick
@@ -105,6 +118,12 @@ def versions() -> dict[str, str]:
 def _installed(name: str) -> str:
     """Returns the version of a package; it is cached, because reading it takes a millisecond."""
     return metadata.version(name)
+
+
+def faults_of(run: xr.Dataset) -> list[str]:
+    """Returns what happened to the stages of the user in one run that drove on, a sentence for each fault."""
+    found = {name: str(run[name].values) for name in FAULTS if name in run}
+    return [f"{text}; {FAULTS[name]}" for name, text in found.items() if text]
 
 
 def written_by(result: xr.Dataset) -> str:
@@ -209,7 +228,7 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
         checked = {str(name): {"compressors": (ZstdCodec(), Crc32cCodec())} for name in result.variables}
-        result = result.assign_attrs({WHOLE: 1})
+        result = result.assign_attrs({WHOLE: sorted(map(str, result.variables))})
         result.to_zarr(partial, mode="w", zarr_format=3, consolidated=False, encoding=checked, write_empty_chunks=True)
         partial.rename(path)
     except OSError as error:
@@ -248,6 +267,49 @@ def check_declared(path: Path, declared: int, stored: int) -> None:
         raise InputError(f"{path}: declares {declared / 1e9:,.0f} GB of data and holds {stored / 1e6:,.3g} MB")
 
 
+@contextlib.contextmanager
+def reading_chunks(path: str | Path) -> Iterator[None]:
+    """Like `reading`, for chunks of zarr arrays, of which zarr goes on to read others after an error; they are stopped.
+
+    Otherwise Python prints a traceback for each of them when the process ends.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    from zarr.core.sync import sync
+
+    async def stop() -> None:
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    try:
+        with reading(path):
+            yield
+    except InputError:
+        sync(stop())
+        raise
+
+
+def check_codecs(path: Path) -> None:
+    """Refuses a zarr array that is not encoded as mrctl writes it: a codec is code, and some unpickle what they read.
+
+    Raises:
+        InputError: It has another codec, or its metadata are damaged.
+    """
+    names = set[str]()
+    with reading(path):
+        waiting = list(json.loads(read_file(path / "zarr.json"))["codecs"])
+        while waiting:
+            codec = waiting.pop()
+            names.add(str(codec["name"]))
+            inner = codec.get("configuration", {})
+            waiting += [*inner.get("codecs", ()), *inner.get("index_codecs", ())]
+    if foreign := names - CODECS:
+        raise InputError(f"{path}: has the codec {printable(min(foreign))}, which mrctl does not write")
+
+
 def open_result(path: str | Path) -> xr.Dataset:
     """Opens a saved result, whichever version of mrctl wrote it: a result names its variables, with their units.
 
@@ -264,18 +326,23 @@ def open_result(path: str | Path) -> xr.Dataset:
     stored = only_files(Path(path))
     arrays: dict[Path, zarr.Array] = {}
     for folder in sorted(file.parent for file in Path(path).glob("*/zarr.json")):
+        check_codecs(folder)
         with reading(folder):
             arrays[folder] = zarr.open_array(folder, mode="r", zarr_format=3)
     check_declared(Path(path), sum(array.nbytes for array in arrays.values()), stored)
     with reading(f"{path}: not a saved result"):
         result = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
+    if gone := set(result.attrs.get(WHOLE, ())) - set(result.variables):
+        raise InputError(f"{Path(path) / min(gone)}: missing")
     for folder, array in arrays.items():
-        if WHOLE in result.attrs and (lost := array.nchunks - array.nchunks_initialized):
+        whole = {WHOLE, WHOLE_BEFORE_0_10_2} & set(result.attrs)
+        if whole and (lost := array.nchunks - array.nchunks_initialized):
             raise InputError(f"{folder}: {lost} chunks are missing")
     for name in result.variables:
-        with reading(f"{path}/{name}"):
+        with reading_chunks(f"{path}/{name}"):
             result[name].load()
-    result.attrs.pop(WHOLE, None)
+    for name in (WHOLE, WHOLE_BEFORE_0_10_2):
+        result.attrs.pop(name, None)
     if missing := {"scenarios", "versions", "control_period"} - set(result.attrs):
         raise InputError(f"{path}: not a saved result: no {min(missing)}")
     return result

@@ -43,7 +43,7 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 
 from mrctl.record import InputError, reading
-from mrctl.results.dataset import SIGNALS, SINCE_0_4_2, require, scenarios_of
+from mrctl.results.dataset import FAULTS, SIGNALS, SINCE_0_4_2, require, scenarios_of
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import GRAVITY
 
@@ -207,7 +207,8 @@ def _npz(whole: xr.Dataset, path: Path) -> None:
     names = [name for name in SIGNALS if name in whole]
     arrays: Columns = {name: whole[name].transpose("run", "time").values for name in names}
     arrays |= {"time": whole["time"].values, "run": whole["run"].values}
-    arrays |= {name: np.array([str(text) for text in np.atleast_1d(whole[name])]) for name in ("label", "failure")}
+    texts = ("label", "failure", *(name for name in FAULTS if name in whole))
+    arrays |= {name: np.array([str(text) for text in np.atleast_1d(whole[name])]) for name in texts}
     arrays["units"] = np.array(json.dumps({name: _unit(name) for name in ("time", *names)}))
     arrays |= {name: np.array(str(value)) for name, value in whole.attrs.items()}
     with open(path, "wb") as file:

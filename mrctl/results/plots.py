@@ -103,6 +103,11 @@ def _literal(value: Any) -> Any:  # noqa: ANN401
     return value.assign_coords(label=(value["label"].dims, labels.reshape(value["label"].shape)))
 
 
+def files(name: str) -> list[str]:
+    """Returns the names of the files that `save` writes for a figure of this name."""
+    return [f"{name}.{suffix}" for suffix in FORMATS]
+
+
 def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     """Writes a figure as PNG (200 dpi) and PDF.
 
@@ -117,7 +122,7 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     Raises:
         InputError: The folder cannot be created or written to.
     """
-    paths = [Path(folder) / f"{name}.{suffix}" for suffix in FORMATS]
+    paths = [Path(folder) / file for file in files(name)]
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
         with mpl.rc_context({"pdf.fonttype": STYLE["pdf.fonttype"]}):

@@ -35,7 +35,7 @@ VALUES: dict[str, tuple[float, float, float]] = {
     # Field: Kobuki's 2578.33 ticks a wheel turn (Yujin Robot, Kobuki user guide).
     "encoder_counts": (0, 88_064, 2_578),
     "encoder_rate": (0, 0, 0),  # with the control loop
-    "encoder_latency": (0, 0, 0),
+    "encoder_latency": (0, 0, 0),  # chosen, like the other zeros: read over a bus in less than a control period
     # Bosch BMI088: 0.014 °/s/√Hz, with the vibration of a robot 0.017 (chosen). ST L3GD20: 0.03 °/s/√Hz.
     "gyro_noise": (0, 3e-4, 5e-4),
     "gyro_bias": (0, 2e-3, 0.5 * DEGREE),  # chosen: after a calibration at rest; within a L3GD20's drift in minutes
@@ -63,6 +63,8 @@ VALUES: dict[str, tuple[float, float, float]] = {
     "steering_backlash": (0, 0, 1 * DEGREE),
 }
 """Values of the three tiers in the units of the fields of `Sensing`; a rate of 0 is that of the control loop."""
+
+LATENCIES = "encoder_latency", "gyro_latency", "accelerometer_latency"
 
 LOCALISED: dict[str, dict[str, float]] = {
     "scan": {"fix_position_noise": 0.01, "fix_heading_noise": 0.005, "fix_lost": 0, "fix_outliers": 0},
@@ -188,6 +190,18 @@ class Sensing(Record):
                 f"sensing.{name}: {value:g} s is not a whole multiple of control_period ({control_period:g} s)"
             )
         return count
+
+    def loop_delay(self, control_period: float) -> int:
+        """Returns the delay of the loop for which controllers are designed, in control periods.
+
+        It is `delay` and, where an estimator waits for the samples of encoders, gyro and accelerometer, the latency of
+        the slowest of them.
+
+        Args:
+            control_period: Control period in s.
+        """
+        late = 0 if self.source == "truth" else max(self.periods(name, control_period) for name in LATENCIES)
+        return self.periods("delay", control_period) + late
 
     def check(self, control_period: float, duration: float) -> None:
         """Refuses rates and latencies that do not fit a run.

@@ -26,7 +26,7 @@ from mrctl.loop.simulation import Simulation, arranged, cores, simulate
 from mrctl.physics import mjcf
 from mrctl.record import InputError, printable
 from mrctl.results import metrics
-from mrctl.results.dataset import SIGNALS, versions
+from mrctl.results.dataset import FAULTS, SIGNALS, versions
 from mrctl.scenario import Scenario
 from mrctl.sweep.plan import TRIED, Sweep
 from mrctl.sweep.pool import Cluster, Outcome, Pool, Processes, Work
@@ -259,7 +259,8 @@ def _compute(
             queue.extend({run: scenario} for run, scenario in batch.items())
             continue
         laps = metrics.per_lap(result)
-        table = metrics.summary(laps).assign(lap_time=laps["lap_time"].values, failure=result["failure"].values)
+        texts = {name: result[name].values for name in ("failure", *FAULTS)}
+        table = metrics.summary(laps).assign(lap_time=laps["lap_time"].values, **texts)
         if sweep.record == "laps":
             for name in metrics.METRICS:
                 table[f"{name}_per_lap"] = [v[:n] for v, n in zip(laps[name].values, laps["laps"].values, strict=True)]
@@ -276,7 +277,7 @@ def _row(sweep: Sweep, run: int, failure: str = "", **found: object) -> dict[str
     values, valid = sweep.values(run), sweep.valid(run)
     scenario = valid or sweep.base
     row: dict[str, Any] = {name: np.nan for name in (*metrics.METRICS, "lap_time")}
-    row |= {name: [] for name in sweep.columns.names if name.endswith("_per_lap")}
+    row |= {name: [] for name in sweep.columns.names if name.endswith("_per_lap")} | dict.fromkeys(FAULTS, "")
     row |= {"run": run, "label": scenario.name or scenario.feedforward, "feedforward": scenario.feedforward}
     row |= {
         "steering": found.get("steering") or arranged(scenario).steering,

@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 from tqdm import tqdm
 
 from mrctl.record import InputError, Record
-from mrctl.results.dataset import SIGNALS
+from mrctl.results.dataset import FAULTS, SIGNALS
 from mrctl.results.metrics import METRICS
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import RobotFile
@@ -299,6 +299,7 @@ class Sweep(Record):
             ("label", pa.string(), ""), ("feedforward", pa.string(), ""), ("steering", pa.string(), ""),
             ("seed", pa.int64(), "1"), ("lap_time", pa.float64(), "s"), ("laps", pa.int64(), "1"),
             ("failed", pa.bool_(), "1"), ("failure_time", pa.float64(), "s"), ("failure", pa.string(), ""),
+            *((name, pa.string(), "") for name in FAULTS),
         ):  # fmt: skip
             columns.setdefault(name, (kind, unit))
         columns |= {name: (pa.float64(), unit) for name, (unit, _) in METRICS.items()}

@@ -156,6 +156,7 @@ def _uninterrupted() -> Iterator[None]:
 def _serve(work: Work, path: str, pipe: Connection) -> None:
     """Runs the loop of a worker: receives jobs and sends their outcomes until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logging.getLogger("absl").addFilter(lambda _: False)  # it warns of failing runs, whose failure says why
     multiprocessing.set_start_method("fork", force=True)  # locks of this method do not outlive a kill
     if parent := multiprocessing.parent_process():
         threading.Thread(target=_follow, args=(parent.sentinel,), daemon=True).start()

@@ -7,7 +7,8 @@
     STORE/lock              held, through the operating system, by the one process that runs the sweep
 
 `mrctl.open` reads a store that another version of mrctl wrote, in this format or an older one: a metric that the
-old version did not compute is NaN. Only the version that began a sweep continues it. Format 1 did not list its signals.
+old version did not compute is NaN. Only the version that began a sweep continues it. Format 1 did not list its signals;
+formats 1 and 2 had checksums of the signals alone, format 3 has them in every file.
 
 One job owns one shard and one part. Each file is written under a temporary name, synchronised and renamed, the part
 last: the existence of a part says that its job is done. A job that is computed twice writes the same bytes twice.
@@ -16,6 +17,7 @@ last: the existence of a part says that its job is done. A job that is computed 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import math
 import os
@@ -40,12 +42,14 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from mrctl import __version__
 from mrctl.record import InputError, Record, read_file, reading
-from mrctl.results.dataset import SIGNALS, check_declared, only_files, open_result
+from mrctl.results.dataset import FAULTS, SIGNALS, check_codecs, check_declared, only_files, open_result, reading_chunks
 from mrctl.results.metrics import METRICS
 from mrctl.scenario import LONGEST
+from mrctl.sweep.signals import DIMENSIONS, lazily
 
 LARGEST = 2**28  # largest size of sweep.json in bytes
-KIND, FORMAT = "mrctl sweep", 2
+KIND, FORMAT = "mrctl sweep", 3
+CHECKSUM = "checksum"  # key in sweep.json: what `_checksum` returns of all others
 ROW_GROUP = 16384  # number of rows of the table that are written at once
 INNER = 16  # runs that are compressed together, signal by signal
 COMPLETE = b"complete"  # key in the metadata of the table; b"1" if it holds every job
@@ -91,7 +95,7 @@ class Store:
         """Opens a store that exists.
 
         Raises:
-            InputError: There is none, or its format is newer than this version of mrctl knows.
+            InputError: There is none, its `sweep.json` is damaged, or its format is newer than this version knows.
         """
         self.path = Path(path).absolute()
         try:
@@ -105,6 +109,8 @@ class Store:
                 f"{path}: mrctl {self.writer} wrote this store in format {found}; "
                 f"mrctl {__version__} reads formats up to {FORMAT}"
             )
+        if self.manifest.pop(CHECKSUM, None) != _checksum(self.manifest) and found > 2:
+            raise InputError(f"{path}/sweep.json: damaged: its checksum is that of another text")
 
     @staticmethod
     def prepare(path: Path) -> None:
@@ -138,7 +144,7 @@ class Store:
         manifest = json.loads(json.dumps({KIND: FORMAT, **manifest}))
         if not (path / "sweep.json").exists():
             with _whole(path / "sweep.json") as file:
-                file.write(json.dumps(manifest, indent=1).encode())
+                file.write(json.dumps(manifest | {CHECKSUM: _checksum(manifest)}, indent=1).encode())
         store = cls(path)
         if store.writer != __version__:
             raise InputError(
@@ -226,10 +232,16 @@ class Store:
             return self.table.exists() and pq.read_schema(self.table).metadata.get(COMPLETE) == b"1"
 
     def done(self) -> set[int]:
-        """Returns the numbers of the jobs that are done."""
-        if self.complete:
-            return set(range(self.jobs))
-        return {int(part.stem) for part in (self.path / "parts").glob("[0-9]*.parquet")}
+        """Returns the numbers of the jobs that are done; one whose signals are missing has to be done again."""
+        parts = {int(part.stem) for part in (self.path / "parts").glob("[0-9]*.parquet")}
+        found = set(range(self.jobs)) if self.complete else parts
+        return {job for job in found if not self._lost(job)}
+
+    def _lost(self, job: int) -> bool:
+        """Tells whether the signals of a job are missing though one of its runs drove."""
+        if not self.samples or self._shard(job).exists():
+            return False
+        return bool(_drove(self.rows(job).select(["failed", "failure_time"]).to_pandas()).any())
 
     def _part(self, job: int) -> Path:
         return self.path / "parts" / f"{job:06d}.parquet"
@@ -243,7 +255,7 @@ class Store:
                 _synchronise(shard)  # zarr keeps no shard that is all NaN
         self._part(job).parent.mkdir(exist_ok=True)
         buffer = pa.BufferOutputStream()
-        pq.write_table(rows, buffer)
+        pq.write_table(rows, buffer, write_page_checksum=True)
         with _whole(self._part(job)) as file:
             file.write(buffer.getvalue())
 
@@ -255,15 +267,16 @@ class Store:
         if not self.samples:
             return {}
         _ = self._signals  # raises an error where there are none at all
-        drove = ~(frame["failed"] & ~(frame["failure_time"] > 0))
         jobs = frame["run"] // self.manifest["chunk"]
-        found = ((job, self._shard(job)) for job in sorted(set(jobs[drove])))
+        found = ((job, self._shard(job)) for job in sorted(set(jobs[_drove(frame)])))
         return {shard: frame["run"][jobs == job].tolist() for job, shard in found if not shard.exists()}
 
     def rows(self, job: int) -> pa.Table:
         """Returns the rows of a job that is done."""
-        with reading(self._part(job)):
-            return pq.read_table(self._part(job))
+        source, runs = (self._part(job), None) if self._part(job).exists() else (self.table, self.runs(job))
+        filters = None if runs is None else [("run", ">=", runs.start), ("run", "<", runs.stop)]
+        with reading(source):
+            return pq.read_table(source, filters=filters, page_checksum_verification=True)
 
     def row(self, run: int) -> dict[str, Any] | None:
         """Returns the row of one run, or None if the run is not done."""
@@ -271,12 +284,21 @@ class Store:
         source = self._part(job) if self._part(job).exists() else self.table
         self._check_size([source] if source.exists() else [])
         with reading(source):
-            found = pq.read_table(source, filters=[("run", "=", run)]).to_pylist() if source.exists() else []
+            if not source.exists():
+                return None
+            found = pq.read_table(source, filters=[("run", "=", run)], page_checksum_verification=True).to_pylist()
         return found[0] if found else None
 
     def signals(self, run: int) -> NDArray[np.float64]:
-        """Returns the signals of one run `(samples, signals)`, if the store keeps them."""
-        with reading(self._shard(run // self.manifest["chunk"])):
+        """Returns the signals of one run `(samples, signals)`, if the store keeps them.
+
+        Raises:
+            InputError: The file with them is missing or damaged.
+        """
+        job = run // self.manifest["chunk"]
+        if self._lost(job):
+            raise InputError(f"{self._shard(job)}: missing; the command that began the sweep makes it again")
+        with reading_chunks(self._shard(job)):
             return np.asarray(self._signals[run])
 
     def finish(self, schema: pa.Schema, rows: Iterable[pa.Table], complete: bool) -> None:
@@ -288,7 +310,7 @@ class Store:
             complete: Whether all jobs are done; their parts are then removed.
         """
         schema = schema.with_metadata({COMPLETE: b"1" if complete else b"0"})
-        with _whole(self.table) as file, pq.ParquetWriter(file, schema) as writer:
+        with _whole(self.table) as file, pq.ParquetWriter(file, schema, write_page_checksum=True) as writer:
             for group in _regroup(rows):
                 writer.write_table(group.cast(schema), ROW_GROUP)
         if complete:
@@ -297,6 +319,7 @@ class Store:
     @cached_property
     def _signals(self) -> zarr.Array:
         path = self.path / "signals.zarr" / "signals"
+        check_codecs(path)
         with reading(self.path / "signals.zarr"):
             found = zarr.open_array(path, mode="r+", zarr_format=3)
         if (found.shape, found.shards, found.chunks) != self._layout(found.shape[-1] if found.shape else 0):
@@ -336,7 +359,7 @@ class Store:
             dtype="float64",
             fill_value=np.nan,
             compressors=[BloscCodec(cname="zstd", clevel=3, shuffle="shuffle"), Crc32cCodec()],
-            dimension_names=("run", "time", "signal"),
+            dimension_names=DIMENSIONS,
         )
 
     def frame(self) -> pd.DataFrame:
@@ -348,7 +371,7 @@ class Store:
         if self.table.exists():
             self._check_size([self.table])
             with reading(self.table):
-                return pd.read_parquet(self.table)
+                return pq.read_table(self.table, page_checksum_verification=True).to_pandas()
         if not (jobs := sorted(self.done())):
             raise InputError(f"{self.path}: no job is done yet")
         self._check_size(map(self._part, jobs))
@@ -379,7 +402,7 @@ class Store:
 
         axes = [axis["field"] for axis in self.manifest["sweep"]["axes"]]
         coords = columns(["run", *axes, "label", "feedforward", "steering", "seed", "lap_time"])
-        outcome = columns(["failed", "failure", "failure_time"])
+        outcome = columns(["failed", "failure", "failure_time", *(name for name in FAULTS if name in frame)])
         attrs = {name: json.dumps(self.manifest[name]) for name in ("sweep", "versions")}
         period = self.manifest["control_period"] * self.manifest["stride"]
         attrs |= {"control_period": period, "unfinished": self.size - len(frame)}
@@ -398,8 +421,7 @@ class Store:
         if not self.samples:
             return xr.Dataset(outcome | columns(METRICS), coords, attrs)
         self._check_size([], len(frame) * self.samples)
-        whole = xr.open_zarr(self.path / "signals.zarr", chunks=None, consolidated=False, zarr_format=3)["signals"]
-        whole = whole.assign_coords(signal=self.signal_names)
+        whole = lazily(self.path / "signals.zarr" / "signals", self._shard).assign_coords(signal=self.signal_names)
         signals = whole.isel(run=frame["run"].to_numpy()).to_dataset("signal")
         for name, (unit, meaning) in SIGNALS.items():
             if name in signals:
@@ -423,6 +445,11 @@ def open(path: str | Path) -> xr.Dataset:
     if (path / "sweep.json").is_file():
         return Store(path).dataset()
     return open_result(path / "result.zarr" if (path / "result.zarr").exists() else path)
+
+
+def _drove(frame: pd.DataFrame) -> NDArray[np.bool]:
+    """Tells of each row of the table whether its run drove at all, so that it has signals."""
+    return ~(frame["failed"].to_numpy(bool) & ~(frame["failure_time"].to_numpy(float) > 0))
 
 
 def _plain(frame: pd.DataFrame, name: str) -> NDArray:
@@ -453,6 +480,11 @@ def _synchronise(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _checksum(manifest: dict[str, Any]) -> str:
+    """Returns the SHA-256 of what `sweep.json` holds besides its checksum."""
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
 def _temporary(path: Path) -> bool:

@@ -26,6 +26,23 @@ def cover(footprint: Array, count: int = 3) -> Array:
     return np.column_stack([x, np.full(count, y), np.full(count, radius)])
 
 
+def rim(footprint: Array, radius: float) -> Array:
+    """Covers the outline of a footprint, but not what is within it, with equal discs, which reach `radius` beyond it.
+
+    Args:
+        footprint: Corners in the robot's frame in m, `(n, 2)`.
+        radius: Radius of the discs in m.
+
+    Returns:
+        x and y of the centres in the robot's frame and radius in m, `(k, 3)`.
+    """
+    corners = np.vstack([footprint, footprint[:1]])
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
+    count = int(np.ceil(along[-1] / (2 * radius)))
+    places = along[-1] / count * (np.arange(count) + 0.5)
+    return np.column_stack([*(np.interp(places, along, side) for side in corners.T), np.full(count, radius)])
+
+
 def clearance(footprint: Array, pose: Array, outlines: Outlines) -> float:
     """Returns the distance in m between a footprint and the nearest obstacle.
 
@@ -73,11 +90,13 @@ def gap(footprint: Array, pose: Array, sides: Array, outlines: Outlines) -> floa
         reach = max(reach, np.hypot(footprint[k, 0], footprint[k, 1]))
     for k in range(len(discs)):
         x, y, radius = discs[k]
-        if np.hypot(x - pose[0], y - pose[1]) - radius - reach < nearest:
+        within = max(radius + reach + nearest, 0.0)  # farther off than this it cannot be the nearest
+        if (x - pose[0]) ** 2 + (y - pose[1]) ** 2 < within * within:
             nearest = min(nearest, point_to_polygon(x, y, sides) - radius)
     for k in range(len(rings)):
         x, y, radius = rings[k]
-        if np.hypot(x - pose[0], y - pose[1]) - radius - reach < nearest:
+        within = max(radius + reach + nearest, 0.0)  # farther off than this it cannot be the nearest
+        if (x - pose[0]) ** 2 + (y - pose[1]) ** 2 < within * within:
             nearest = min(nearest, polygon_to_polygon(sides, edges[first[k] : first[k + 1]]))
     return nearest
 

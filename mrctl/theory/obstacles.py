@@ -115,6 +115,11 @@ class Obstacles(Record):
         return cls.from_toml(values).model_dump()
 
     @property
+    def standing(self) -> tuple[Disc | Box | Polygon, ...]:
+        """Obstacles that stand still."""
+        return tuple(shape for shape in self.shapes if shape.course is None)
+
+    @property
     def moving(self) -> tuple[Disc | Box | Polygon, ...]:
         """Obstacles that move."""
         return tuple(shape for shape in self.shapes if shape.course is not None)

@@ -290,10 +290,11 @@ class Waypoints(Record):
     stop_time: Duration = 2.0
     """Duration in s of the braking at the end of an open curve, whose speed is constant before."""
     timing: Literal["constant", "limits"] = "constant"
-    """Keep the speed all along the path (`constant`), or drive as fast as the `limits` allow, from rest on an open
-    curve."""
+    """Keep the speed all along the path (`constant`), or drive nearly as fast as the `limits` allow, from rest on an
+    open curve; `mrctl.theory.timing.smooth` says how much time the continuous acceleration costs."""
     limits: Limits = Limits()
-    """Limits that `timing` = `limits` keeps, besides the speed."""
+    """Limits that `timing` = `limits` keeps, besides the speed; by default those of the default car, whatever robot
+    drives. `Limits.of(robot)` are those of another one."""
     cusps: tuple[Annotated[int, Field(ge=0)], ...] = ()
     """Indices of the points at which the robot stops and drives on in the other direction, with 0 for a start in
     reverse; only for an open curve with `timing` = `limits`."""

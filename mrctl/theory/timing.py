@@ -41,7 +41,7 @@ Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class Limits(Record):
-    """Limits that a time law keeps; by default they are 0.9 of those of the default robot."""
+    """Limits that a time law keeps; by default 0.9 of those of the default robot, whatever robot drives; see `of`."""
 
     acceleration: Limit = 1.35
     """Limit on |V̇| in m/s²."""
@@ -374,6 +374,10 @@ def smooth(path: Path, limits: Limits, speed: float) -> SmoothLaw:
     s* must therefore keep its limits with the coefficients of all places that the average can be at meanwhile. These
     lie on the stretch that the time-optimal law covers in that time, because no other law overtakes it. Only b x = b ṡ²
     is not convex where it relaxes the limit (b < 0 in an upper limit, b > 0 in a lower one); there it counts as zero.
+
+    So the law takes longer than the time-optimal one: on random splines 2 to 3 % on average and at most 10 %, and on
+    the plans of missions 2 to 9 % on average and at most 13 %, most where the plan is short, because an open path
+    takes the window longer in any case (`tests/unit/test_timing.py`, three robots).
 
     Args:
         path: The path.

@@ -13,13 +13,16 @@ from pydantic.fields import FieldInfo
 
 from mrctl.record import Record
 from mrctl.sensing.tiers import VALUES, Sensing
+from mrctl.theory.robot import Robot
+from mrctl.viewer.usual import Interval, usual
 
 OnChange = Callable[[tuple[str, ...], Any], None]
 WORLDS = ("flat", "slope", "rough", "patch")
 SENSORS = {"encoders": "encoder", "gyro": "gyro", "accelerometer": "accelerometer", "posture fixes": "fix"}
 DRIVER = ("dead_zone", "pwm_steps", "current_limit", "battery_resistance")
 MAPPED = ("localisation", "lidar")  # fields without an input, as they need obstacles, which a scenario file has
-WIDEST = 1e3  # ratio of the limits of a number, beyond which a slider would show only the largest ones
+ANEW, ANEW_HINT = " ↻", "A change begins another run."  # behind the label of what cannot change during a run
+SEED = ("seed",)  # a number that no slider suits
 STEERING = ("steering_offset", "steering_backlash")
 # Fields of large records in groups, by the name of the field that holds the record. The first group of a perturbation
 # is open; what is in no group stands above them.
@@ -58,14 +61,27 @@ class Controls:
     The input of a field that is not set and follows from the design shows the designed value, and its label says so; a
     field that is set has a button that returns it to the design.
 
+    A slider shows what is usual for the present robot. A number that is typed beyond its ends is accepted up to the
+    limits of the record, and moves an end there until the value is within the usual interval again.
+
     Attributes:
         designed: Values by path, in the units of the fields, that fields have while they are not set; those that have
             no effect at present are None and hidden. Whoever adds or shows a record sets them before.
     """
 
-    def __init__(self, gui: viser.GuiApi, on_change: OnChange) -> None:
-        """Takes the GUI of the page, and a function that receives the path and the new value of a changed field."""
-        self._gui, self._on_change = gui, on_change
+    def __init__(self, gui: viser.GuiApi, on_change: OnChange, robot: Robot, changeable: Sequence[str] = ()) -> None:
+        """Takes what inputs need.
+
+        Args:
+            gui: GUI of the page.
+            on_change: Function that receives the path and the new value of a changed field.
+            robot: Parameters of the robot.
+            changeable: First names in paths of fields that can change during a run; the labels of others are marked.
+        """
+        self._gui, self._on_change, self._changeable = gui, on_change, changeable
+        self._robot = robot
+        self._limits: dict[tuple[str, ...], Interval] = {}  # of the record
+        self._sliders: dict[tuple[str, ...], tuple[FieldInfo, Interval]] = {}  # and what is usual
         self._inputs: dict[tuple[str, ...], Any] = {}
         self._folders: dict[tuple[str, ...], viser.GuiFolderHandle] = {}
         self._buttons: dict[tuple[str, ...], viser.GuiButtonHandle] = {}
@@ -90,13 +106,16 @@ class Controls:
                     self._add(self._shown(record, (*path, name)), type(record).model_fields[name], (*path, name))
 
     def _add(self, value: Any, field: FieldInfo, path: tuple[str, ...]) -> None:  # noqa: ANN401
-        label, hint = _label(path), field.description
+        label, hint = self._label(path), self._hint(path, field)
         if isinstance(value, Record):
-            with self._gui.add_folder(label, expand_by_default=len(path) == 1):
+            with self._gui.add_folder(_words(path), expand_by_default=len(path) == 1):
                 if not (kinds := _kinds(field)):
                     return self.add(value, path)
                 kind = type(value).model_fields["kind"].default
-                self._listen(path, self._gui.add_dropdown("kind", tuple(kinds), initial_value=kind))
+                choice = self._gui.add_dropdown(
+                    self._label((*path, "kind")), tuple(kinds), initial_value=kind, hint=hint
+                )
+                self._listen(path, choice)
                 for name, alternative in kinds.items():
                     self._folders[*path, name] = self._gui.add_folder(None, visible=name == kind)
                     with self._folders[*path, name]:
@@ -106,20 +125,24 @@ class Controls:
         if typing.get_origin(kind.annotation) is Literal and len(typing.get_args(kind.annotation)) > 1:
             handle = self._gui.add_dropdown(label, typing.get_args(kind.annotation), initial_value=value, hint=hint)
         elif path == ("world",):
-            handle = self._gui.add_dropdown(label, tuple(dict.fromkeys([value, *WORLDS])), initial_value=value)
+            worlds = tuple(dict.fromkeys([value, *WORLDS]))
+            handle = self._gui.add_dropdown(label, worlds, initial_value=value, hint=hint)
         elif isinstance(value, bool):
             handle = self._gui.add_checkbox(label, value, hint=hint)
         elif path in self.designed:
             return self._add_designed(value, kind, path)
         elif isinstance(value, int | float) and (limits := _limits(kind, _scale(path, value))):
             low, high, step = limits
+            self._limits[path] = low, high
             # Whole numbers are floats too: viser accepts an int of any size from a page, and then fails to pack it for
             # the other pages.
-            decades = any(isinstance(m, Ge) and low > 0 for m in kind.metadata) and high > WIDEST * low
-            if high - low > 1e4 * step or kind is not field or decades:
-                handle = self._gui.add_number(label, float(value), min=low, max=high, step=step, hint=hint)
+            if kind is field and path != SEED and (ends := usual(path, field, (low, high), self._robot)):
+                self._sliders[path] = field, ends
+                first, last = min(ends[0], value), max(ends[1], value)
+                step = step if kind.annotation is int else _step(last - first, value)
+                handle = self._gui.add_slider(label, first, last, step, float(value), hint=hint)
             else:
-                handle = self._gui.add_slider(label, low, high, step, float(value), hint=hint)
+                handle = self._gui.add_number(label, float(value), min=low, max=high, step=step, hint=hint)
         else:
             return
         self._listen(path, handle, whole=kind.annotation is int)
@@ -131,15 +154,25 @@ class Controls:
         assert limits is not None
         low, high, step = limits
         handle = self._gui.add_number(
-            _label(path), value, min=min(low, value), max=max(high, value), step=step, hint=kind.description
+            self._label(path), value, min=min(low, value), max=max(high, value), step=step, hint=self._hint(path, kind)
         )
-        self._buttons[path] = button = self._gui.add_button(f"{_label(path)} as designed", visible=False, color="gray")
+        self._limits[path] = low, high
+        self._buttons[path] = button = self._gui.add_button(f"{_words(path)} as designed", visible=False, color="gray")
         self._listen(path, handle)
 
         @button.on_click
         async def _(event: viser.GuiEvent) -> None:
             if event.client is not None:
                 self._on_change(path, None)
+
+    def _label(self, path: tuple[str, ...]) -> str:
+        """Returns the name of a field in words, with a mark if its change begins another run."""
+        return _words(path) if path[0] in self._changeable else _words(path) + ANEW
+
+    def _hint(self, path: tuple[str, ...], field: FieldInfo) -> str:
+        """Returns what stands beside an input under the mouse."""
+        known = field.description or ""
+        return known if path[0] in self._changeable else f"{known} {ANEW_HINT}".lstrip()
 
     def _listen(self, path: tuple[str, ...], handle: Any, whole: bool = False) -> None:  # noqa: ANN401
         """Reports the values of an input, rounded if the field is a whole number."""
@@ -151,8 +184,12 @@ class Controls:
         async def _(event: viser.GuiEvent) -> None:
             if event.client is not None:
                 value = handle.value
-                if isinstance(value, float) and value < getattr(handle, "min", value):
-                    return  # somebody types: 0.05 begins with 0, and a page raises what is left below the limit
+                if isinstance(value, float):
+                    low, high = self._limits[path]
+                    if value < low:
+                        return  # somebody types: 0.05 begins with 0, and a page raises what is left below the limit
+                    if path in self._sliders and value <= high:  # before the page limits it to the ends of the slider
+                        handle.min, handle.max = min(handle.min, value), max(handle.max, value)
                 self._on_change(field, round(value) if whole and isfinite(value) else value)
 
     def show(self, record: Record, path: tuple[str, ...] = ()) -> None:
@@ -177,14 +214,31 @@ class Controls:
     def _show_design(self, path: tuple[str, ...], value: float | None, own: bool) -> None:
         """Says whether a field has a value of its own or that of the design, which may be beyond what may be set."""
         handle, self._buttons[path].visible = self._inputs[path], own
-        handle.label = _label(path) if own else f"{_label(path)} (designed)"
+        handle.label = self._label(path) if own else f"{self._label(path)} (designed)"
         handle.visible = value is not None
         if value is not None:  # a page would move a value that is beyond the limits of its input
             handle.min, handle.max = min(handle.min, value), max(handle.max, value)
 
     def _set(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
-        if self._inputs[path].value != value:
-            self._inputs[path].value = value
+        handle = self._inputs[path]
+        if path in self._sliders:
+            self._fit(path, value)
+        if handle.value != value:
+            handle.value = value
+
+    def suit(self, robot: Robot) -> None:
+        """Gives the sliders the ends that are usual for a robot."""
+        if robot == self._robot:
+            return
+        self._robot = robot
+        for path, (field, ends) in self._sliders.items():
+            self._sliders[path] = field, usual(path, field, self._limits[path], robot) or ends
+            self._fit(path, self._inputs[path].value)
+
+    def _fit(self, path: tuple[str, ...], value: float) -> None:
+        """Gives a slider its usual ends, or moves one to a value beyond it."""
+        handle, (low, high) = self._inputs[path], self._sliders[path][1]
+        handle.min, handle.max = min(low, value), max(high, value)
 
     def _shown(self, record: Record, path: tuple[str, ...]) -> Any:  # noqa: ANN401
         """Returns the value of a field; one that is not set has the value of the tier or of the design."""
@@ -196,7 +250,7 @@ class Controls:
         return self.designed.get(path)
 
 
-def _label(path: tuple[str, ...]) -> str:
+def _words(path: tuple[str, ...]) -> str:
     """Returns the name of a field in words."""
     return path[-1].replace("_", " ")
 
@@ -227,5 +281,10 @@ def _limits(field: FieldInfo, value: float) -> tuple[float, float, float] | None
         return None
     if field.annotation is int:
         return float(low + (Gt in bounds)), float(high - (Lt in bounds)), 1.0
-    step = 10.0 ** floor(log10(min((high - low) / 1000, abs(value) / 10 or high)))
+    step = _step(high - low, value)
     return float(low + step * (Gt in bounds)), float(high - step * (Lt in bounds)), step
+
+
+def _step(width: float, value: float) -> float:
+    """Returns a power of ten that is a suitable step of a number, of an interval and of a value in it."""
+    return 10.0 ** floor(log10(min(width / 1000, abs(value) / 10 or width)))

@@ -19,7 +19,7 @@ from mrctl.viewer.plots import charts, legend
 from mrctl.viewer.recording import Recording, event_times, joint_log
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.sensors import magnification
-from mrctl.viewer.server import Server
+from mrctl.viewer.server import PHONE, Server
 from mrctl.viewer.session import ends, pushed
 
 PICTURE_RATE = 25  # pictures for each second of the replay
@@ -86,7 +86,7 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
             scene.show_targets(np.stack([r.log[r.index(time)] for r in recordings]), magnified)
             scene.flush(follow=False)
             serializer.insert_sleep(1 / PICTURE_RATE)
-        return serializer.as_html()
+        return serializer.as_html().replace("</head>", f"{PHONE}</head>", 1)
     finally:
         server.stop()
 

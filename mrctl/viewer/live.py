@@ -28,7 +28,7 @@ from mrctl.theory.obstacles import Pose
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot, RobotFile
-from mrctl.viewer.controls import WORLDS, Controls
+from mrctl.viewer.controls import ANEW, WORLDS, Controls
 from mrctl.viewer.deviation import drawn
 from mrctl.viewer.embed import LONGEST
 from mrctl.viewer.hands import Hands, rounded
@@ -44,7 +44,7 @@ from mrctl.viewer.server import Server
 from mrctl.viewer.session import CHANGEABLE, HOUR, Session, changed, ends, followed, pushed, state
 
 WINDOW = 12.0  # s, time span of the plots
-SAMPLES = 300  # about the largest number of samples in a curve
+SAMPLES = 200  # about the largest number of samples in a curve; a chart is some 300 pixels wide
 TIDY_INTERVAL = 10.0  # s, least time between two returns of freed memory, each of which may take half a second
 PLOTS_PER_TRAIL = 3  # updates of the plots for each one of the trails
 REST = 0.3  # s of wall time without a change, after which somebody has let a slider go
@@ -188,14 +188,15 @@ class Live(Page):
         self.add_key("G", "Set a goal", self._hands.await_goal)
         self.add_key("W", "Draw a way", self._hands.draw_way)
 
-        self._controls = Controls(gui, partial(self.ask, self._note_input))
+        self._controls = Controls(gui, partial(self.ask, self._note_input), self.session.robot, CHANGEABLE)
         self._controls.designed = self.session.designed()
         first, changing = self.session.start[0], [name for name in Scenario.model_fields if name not in HIDDEN]
         with tabs.add_tab("Robot"):
             self._controls.add(first, only=["perturbation"])
         with tabs.add_tab("Controllers"):
+            gui.add_html(block("anew", f"A change of an input with{ANEW} begins another run; the others act at once."))
             self._controls.add(first, only=CONTROLLER)
-            with gui.add_folder("compare with"):
+            with gui.add_folder("compare with" + ANEW):
                 self._ghosts: dict[FeedforwardName, viser.GuiCheckboxHandle] = {
                     name: gui.add_checkbox(title_of(name), False) for name in FEEDFORWARDS
                 }
@@ -207,8 +208,10 @@ class Live(Page):
             self._controls.add(first, only=[n for n in changing if n not in (*NEW_RUN, "perturbation", *CONTROLLER)])
         with tabs.add_tab("Run"):
             self._robots = {robot.path: robot for robot in (*(RobotFile(path=p) for p in SHIPPED), first.robot)}
+            gui.add_html(block("all-anew", f"A change of any of these inputs begins another run ({ANEW.strip()})."))
             hint = "Another robot begins another run, with the steering and a reference that suit it."
-            self._robot = gui.add_dropdown("robot", tuple(self._robots), initial_value=first.robot.path, hint=hint)
+            names, now = tuple(self._robots), first.robot.path
+            self._robot = gui.add_dropdown("robot" + ANEW, names, initial_value=now, hint=hint)
             self.on(self._robot, self._choose_robot)
             self._controls.add(first, only=NEW_RUN)
 
@@ -571,7 +574,8 @@ class Live(Page):
             self.describe_estimates(self._labels, now)
             ticks = round(session.start[0].reference.period / session.period)
             if session.tick >= (len(self._laps) + 1) * ticks:
-                self._laps += whole_laps(session.log(len(self._laps) * ticks), ticks, session.period)
+                log = session.log(len(self._laps) * ticks)
+                self._laps += whole_laps(log, ticks, session.period, session.robot)
             self._plots.score(now, self._laps[: self.tick // ticks])
 
     def _show_past(self) -> None:
@@ -625,6 +629,7 @@ class Live(Page):
         for row, saved in enumerate(self.session.saved()):
             self._scene.show_payload(row, state(saved, self.time)["perturbation"])
         self._controls.designed = self.session.designed()
+        self._controls.suit(self.session.robot)
         present = self._now()
         self._controls.show(present)
         units = ("V/(m/s)", "V/m"), RIGID_UNITS if present.steering == "rigid" else ("V/(rad/s)", "V/rad")

@@ -23,19 +23,12 @@ from mrctl.record import InputError
 from mrctl.viewer import deviation, sensors
 from mrctl.viewer.recording import Recording, looks_of
 from mrctl.viewer.scene import MAX_MARKED, Scene
-from mrctl.viewer.server import Server
+from mrctl.viewer.server import PHONE, Server
 
-FRAME, REFRESH = 1 / 25, 1 / 15  # s of wall time between two pictures, and between two updates of the plots
+FRAME, REFRESH = 1 / 25, 1 / 12  # s of wall time between two pictures, and between two updates of the plots
+CURVES_WIDTH, INPUTS_WIDTH = 340.0, 290.0  # px of the panels, of which 1280 px leave half to the scene
 CAMERAS = ("overview", "top", "chase")
 SPEEDS = {"0.1×": 0.1, "0.25×": 0.25, "0.5×": 0.5, "1×": 1.0, "2×": 2.0, "5×": 5.0, "as fast as it goes": float("inf")}
-
-
-# On a phone the panel is as wide as the screen and leaves half of it to the scene, and a finger finds the buttons.
-PHONE = """<style>@media (max-width: 576px) {
-.mantine-Button-root, .mantine-Tabs-tab, .mantine-Input-input { min-height: 44px !important }
-.mantine-Checkbox-root { --checkbox-size: 44px !important }
-[style*="width: 20em"] { width: 100vw !important; max-height: 50% !important }
-}</style>"""
 
 
 class Page(ABC):
@@ -67,8 +60,10 @@ class Page(ABC):
         panel = server.gui.add_panel()
         self.curves = panel.add_tab("Curves", viser.Icon.CHART_LINE)
         panel.dock_left()
-        panel.set_width(430)
+        panel.set_width(CURVES_WIDTH)
+        panel.expand()  # on a phone, where it is a section of the panel of inputs
         server.gui.main_panel.dock_right()
+        server.gui.main_panel.set_width(INPUTS_WIDTH)
 
         @server.on_client_connect
         async def _(client: viser.ClientHandle) -> None:

@@ -21,7 +21,7 @@ from mrctl.physics.parameters import read_robot
 from mrctl.physics.stand import front_rates, stand, steer
 from mrctl.record import InputError
 from mrctl.results.controllers import title_of
-from mrctl.results.dataset import SIGNALS, blank, scenarios_of
+from mrctl.results.dataset import SIGNALS, blank, faults_of, scenarios_of
 from mrctl.results.metrics import as_runs, summary
 from mrctl.scenario import Scenario
 from mrctl.sweep import jobs, store
@@ -48,6 +48,7 @@ class Recording:
         start: Time of the first sample since the start of the run in s; all methods count time from this sample.
         log: Record of `TICK` for each sample until the end or the failure, `(T,)`.
         failure: Reason of an early end, or "".
+        faults: What `dataset.faults_of` returns.
         clearance: Distance from the nearest obstacle at each sample in m, `(T,)`; None where there are no obstacles.
     """
 
@@ -65,7 +66,7 @@ class Recording:
                 log[name] = run[name].values
         driven = np.flatnonzero(np.isfinite(log["x"]))
         self.log = log[: 1 + driven[-1]] if driven.size else log[:1]
-        self.failure = str(run["failure"].values)
+        self.failure, self.faults = str(run["failure"].values), faults_of(run)
         near = bool(self.scenario.obstacles.shapes) and "clearance" in run
         self.clearance: Array | None = run["clearance"].values[: len(self.log)] if near else None
 
@@ -194,14 +195,18 @@ class Library:
         if self.table.empty:
             raise InputError(f"{path}: there is no run in it yet")
 
+    def check(self, run: int) -> None:
+        """Raises `InputError` if there is no such run."""
+        if run not in self.table.index:
+            raise InputError(f"run: {self._path} has no run {run}")
+
     def recording(self, run: int) -> Recording:
         """Returns a run: one of a result is read, one of a sweep is simulated once more, with the same bits.
 
         Raises:
             InputError: There is no such run.
         """
-        if run not in self.table.index:
-            raise InputError(f"run: {self._path} has no run {run}")
+        self.check(run)
         if self._result is not None:
             return Recording(self._result.isel(run=run))
         return Recording(simulate([jobs.scenario_of(self._path, run)], **self._stages).isel(run=0))

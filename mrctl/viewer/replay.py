@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import html
 from collections.abc import Sequence
+from math import ceil, floor, log10
 from typing import Any
 
 import numpy as np
 import viser
+from pandas.api.types import is_bool_dtype, is_numeric_dtype
 from typing_extensions import override
 
+from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
 from mrctl.results.controllers import title_of
 from mrctl.results.metrics import METRICS
@@ -24,9 +27,13 @@ from mrctl.viewer.server import Server
 from mrctl.viewer.session import ends, pushed
 
 SAMPLES = 800  # about the largest number of samples in a curve
-BOARD_SIZE = np.array([4.0, 0.0, 2.2])  # m, extent of the scatter plot in the scene along x, y and z
-BOARD_CORNER = np.array([-2.0, 3.2, 0.3])  # m, its lower left corner
-DROVE, FAILED, CHOSEN = (71, 85, 105), (185, 28, 28), (17, 24, 39)
+TICKS = 4  # about the number of ticks of an axis of the scatter plot, between its ends
+MARGIN = 0.08  # share of an axis, next to its ends, where a tick's number would run into that of the end
+DOT = 0.035  # size of a run in the scatter plot, as a share of its height
+DROVE, FAILED, CHOSEN, GRID = (71, 85, 105), (185, 28, 28), (17, 24, 39), (150, 155, 160)
+# Unit and words of the columns of a table that are not in `METRICS`.
+KNOWN = {"lap_time": ("s", "time of a lap"), "failure_time": ("s", "failed after"), "laps": ("1", "laps")}
+CONTROLLER = ("prior", "learner")  # axes of a sweep that choose the controller
 DECADES, TINY = 30.0, 1e-300  # ratio of largest to least beyond which an axis is logarithmic; what stands for 0 there
 
 
@@ -86,31 +93,42 @@ class Replay(Page):
         self.add_key("F", "Camera follows", lambda: setattr(self._follow, "value", not self._follow.value))
         numbers = [str(name) for name, values in table.select_dtypes("number").nunique().items() if values > 1]
         self._board: list[Any] = []
+        self._axes: list[viser.GuiDropdownHandle[str]] = []
+        self._area: tuple[np.ndarray, np.ndarray] | None = None  # of the scatter plot
         if len(table) > MAX_SHOWN and numbers:
             with tabs.add_tab("All runs"):
                 gui.add_html(block("scatter", *self._explained()))
                 last = "position_rmse" if "position_rmse" in numbers else numbers[-1]
-                self._columns = {_in_words(name): name for name in numbers}
+                self._columns = {_in_words(name)[1]: name for name in numbers}
                 self._axes = [
-                    gui.add_dropdown(label, tuple(self._columns), initial_value=_in_words(value))
-                    for label, value in (("across", numbers[0]), ("up", last))
+                    gui.add_dropdown(label, tuple(self._columns), initial_value=_in_words(value)[1])
+                    for label, value in (("across", next((n for n in numbers if n != "run"), "run")), ("up", last))
                 ]
                 for axis in self._axes:
                     self.on(axis, lambda _: self._scatter())
-            self._scatter()
 
     def _explained(self) -> list[str]:
-        """Returns lines of HTML that say what the board shows, and which colour is which controller's."""
+        """Returns lines of HTML that say what the board shows, and what its colours mean."""
         text = "Each sphere behind the track is a run; failed ones are red, the large one is shown. Click on another."
-        own = self._colours().items()
-        keys = [f'<span style="color:rgb{colour}">■ {html.escape(title_of(name))}</span>' for name, colour in own]
-        return [text, " &nbsp; ".join(keys)]
+        column, own = self._colours()
+        keys = [f'<span style="color:rgb{c}">■ {html.escape(title_of(name))}</span>' for name, c in own.items()]
+        kind = "controller" if column == "feedforward" else _in_words(column)[1]
+        return [text, *([f"{html.escape(kind)}: {' &nbsp; '.join(keys)}"] if keys else [])]
 
-    def _colours(self) -> dict[str, Colour]:
-        """Returns the colour of each controller, where there are several."""
+    def _colours(self) -> tuple[str, dict[str, Colour]]:
+        """Returns by which column runs are coloured, and the colours of its values; none where all are the same.
+
+        It is that of the first axis of a sweep that is no number, such as the world, or else the controller.
+        """
         table = self.library.table
-        names = [str(name) for name in table["feedforward"].unique()] if "feedforward" in table else []
-        return {name: look.colour for name, look in zip(names, looks(names, names), strict=True)} if names[1:] else {}
+        columns = [str(name) for name in table.columns]
+        axes = columns[: columns.index("label")] if "label" in columns else []
+        words = [name for name in axes if not is_numeric_dtype(table[name]) or is_bool_dtype(table[name])]
+        chosen = next((name for name in words if len(set(table[name])) > 1), "feedforward")
+        chosen = "feedforward" if chosen in CONTROLLER else chosen  # which has a colour everywhere
+        names = [str(name) for name in table[chosen].unique()] if chosen in table else []
+        own = {name: look.colour for name, look in zip(names, looks(names, names), strict=True)} if names[1:] else {}
+        return chosen, own
 
     def _scatter(self) -> None:
         """Draws all runs as a scatter plot of two columns of the table, on a board behind the track.
@@ -121,21 +139,26 @@ class Replay(Page):
         for node in self._board:
             node.remove()
         fields = [axis.value for axis in self._axes]
-        values = table[[self._columns[field] for field in fields]].to_numpy(float)
+        columns = [self._columns[field] for field in fields]
+        values = table[columns].to_numpy(float) * [_in_words(column)[0] for column in columns]
         known = np.isfinite(values).all(axis=1)
         if not known.any():
             self._board = []
             raise InputError(f"{fields[0]}, {fields[1]}: no run has both numbers")
         low, high = values[known].min(axis=0), values[known].max(axis=0)
         logarithmic = (low > 0) & (high > DECADES * np.abs(low))
-        scaled = np.where(logarithmic, np.log(np.maximum(values[known], TINY)), values[known])
-        bottom, top = scaled.min(axis=0), scaled.max(axis=0)
-        share = (scaled - bottom) / np.where(top > bottom, top - bottom, 1.0)
-        where = BOARD_CORNER + share[:, [0, 0, 1]] * BOARD_SIZE
+
+        def share(numbers: np.ndarray) -> np.ndarray:
+            """Returns how far numbers `(n, 2)` are along the axes."""
+            first, last, at = (np.where(logarithmic, np.log(np.maximum(v, TINY)), v) for v in (low, high, numbers))
+            return (at - first) / np.where(last > first, last - first, 1.0)
+
+        corner, size = self._area = self._scene.board()
+        where = corner + share(values[known])[:, [0, 0, 1]] * size
         failed = table["failed"].to_numpy(bool)[known]
-        own = self._colours()
-        colours = [own[str(name)] for name in table["feedforward"][known]] if own else DROVE
-        sphere = _sphere()
+        column, own = self._colours()
+        colours = [own[str(name)] for name in table[column][known]] if own else DROVE
+        sphere = _sphere(DOT * size[2])
         points = scene.add_batched_meshes_simple(
             "/board/runs", *sphere, np.tile([1.0, 0, 0, 0], (len(where), 1)), where,
             batched_colors=np.where(failed[:, None], FAILED, colours).astype(np.uint8),
@@ -150,23 +173,27 @@ class Replay(Page):
             if event.instance_index is not None:
                 self.ask(self._open, int(runs[event.instance_index]))
 
-        frame = BOARD_CORNER + BOARD_SIZE * [[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1], [0, 0, 0]]
-        lines = np.stack([frame[:-1], frame[1:]], axis=1)
-        labels = {
-            "low": (f"{fields[0]} {low[0]:.3g}", [0, 0, -0.15]), "high": (f"{high[0]:.3g}", [1, 0, -0.15]),
-            "bottom": (f"{fields[1]} {low[1]:.3g}", [-0.1, 0, 0.06]), "top": (f"{high[1]:.3g}", [-0.1, 0, 1]),
-        }  # fmt: skip
+        frame = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1], [0, 0, 0]], float)
+        lines = [np.stack([frame[:-1], frame[1:]], axis=1)]
+        labels = {"across": (fields[0], [0.5, 0, -0.2]), "up": (fields[1], [0.2, 0, 1.12])}
+        for axis in (0, 1):
+            inner = ticks(low[axis], high[axis], bool(logarithmic[axis]))
+            for k, number in enumerate([low[axis], *inner, high[axis]]):
+                at = share(np.where([axis == 0, axis == 1], number, low))[axis]
+                if not 0 < k <= len(inner) or MARGIN < at < 1 - MARGIN:
+                    labels[f"{axis}/{k}"] = f"{number:.3g}", [at, 0, -0.08] if axis == 0 else [-0.05, 0, at]
+                    lines.append(np.array([[[at, 0, 0], [at, 0, 1]] if axis == 0 else [[0, 0, at], [1, 0, at]]]))
         ring = scene.add_mesh_simple("/board/chosen", 2 * sphere[0], sphere[1], color=CHOSEN, opacity=0.5)
+        thick = DOT * size[2] / 4
         self._board = [
             points,
             ring,
-            scene.add_line_segments("/board/frame", lines, (120, 120, 120), thickness=0.01),
+            scene.add_line_segments("/board/frame", corner + np.concatenate(lines) * size, GRID, thickness=thick),
             *(
-                scene.add_label(f"/board/{key}", text, position=BOARD_CORNER + BOARD_SIZE * at)
+                scene.add_label(f"/board/{key}", text, position=corner + size * at, font_screen_scale=0.8)
                 for key, (text, at) in labels.items()
             ),
         ]
-
         self._mark_chosen()
 
     def _mark_chosen(self) -> None:
@@ -201,14 +228,14 @@ class Replay(Page):
             self._scene.remove()
         self.runs, self.recordings = list(runs), recordings
         obstacles = recordings[0].scenario.obstacles
-        self._scene = Scene(self.server, recordings[0].model, robots, obstacles, fog=not self._board)
+        self._scene = Scene(self.server, recordings[0].model, robots, obstacles, fog=not self._axes)
         times, self._log, self._clearance = joint_log(recordings)
         self._plots.set_robots(robots, recordings[0].period, self._clearance is not None)
         self._deviation = self.magnified_deviation(self._log)
         self._scene.show_recordings(recordings, self._deviation)
         self._times, self._events = times, event_times(recordings)
         self._lap = round(recordings[0].scenario.reference.period / recordings[0].period)
-        self._laps = whole_laps(self._log, self._lap, recordings[0].period)
+        self._laps = whole_laps(self._log, self._lap, recordings[0].period, read_robot(recordings[0].model))
         self._labels, sensing = [robot.label for robot in robots], [r.scenario.sensing for r in recordings]
         self._latencies = [s.periods("fix_latency", r.period) for s, r in zip(sensing, recordings, strict=True)]
         off = np.nan_to_num(np.hypot(*np.moveaxis(error(self._log), -1, 0)))
@@ -221,6 +248,8 @@ class Replay(Page):
         self.scrubber.max = self._interval.max = self._plots.time.max = self.duration
         self._interval.value = (0.0, self.duration)
         self._draw_curves()
+        if self._axes and (self._area is None or not np.allclose(self._area, self._scene.board())):
+            self._scatter()
         self._mark_chosen()
         self._scrub(self.time, pause=False)
 
@@ -290,11 +319,12 @@ class Replay(Page):
         for r in self.recordings:
             if r.failure:
                 lines.append(warning(f"{r.label} stopped after {r.duration:.2f} s: {r.failure}"))
+            lines += [warning(f"{r.label}: {fault}") for fault in r.faults]
         last = np.stack([r.log[r.index(self.time)] for r in self.recordings])
         lines += arrivals(self._labels, last, ends(self.recordings[0].scenario, self.recordings[0].start + self.time))
         row = self.library.table.loc[self.runs[0]]
-        known = [f"{html.escape(str(k))} {v:.4g}" for k, v in row.items() if isinstance(v, int | float) and v == v]
-        lines += known
+        known = [_stated(str(column), value) for column, value in row.items() if isinstance(value, int | float)]
+        lines += [line for line in known if line]
         if self._kept:
             lines.append(f"kept as ghosts: runs {', '.join(map(str, sorted(self._kept)))}")
         write(self._status, block("status", *lines))
@@ -308,15 +338,41 @@ class Replay(Page):
             self._plots.point((self.time - start) / (end - start) if end > start else 0.0)
 
 
-def _in_words(column: str) -> str:
-    """Returns the name of a column with its unit, and that of a metric in words."""
-    unit, text = METRICS.get(column, ("1", column))
-    return text if unit == "1" else f"{text}, {unit}"
+def _in_words(column: str) -> tuple[float, str]:
+    """Returns the factor on a column's values, and its name in words with the unit; errors are in mm, as in figures."""
+    unit, text = METRICS.get(column, KNOWN.get(column, ("1", column.replace(".", ", ").replace("_", " "))))
+    if unit == "1":
+        return 1.0, text
+    milli = unit.startswith(("m", "rad"))
+    return (1e3 if milli else 1.0), f"{text}, {'m' * milli}{unit}"
 
 
-def _sphere() -> tuple[np.ndarray, np.ndarray]:
-    """Returns vertices and faces of an octahedron of 5 cm radius, which looks like a sphere at this size."""
-    corners = 0.05 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+def _stated(column: str, value: float) -> str:
+    """Returns a number of a run in words with its unit as HTML; "" for what is not known or not worth a line."""
+    if isinstance(value, bool) or not np.isfinite(value):
+        return ""
+    factor, words = _in_words(column)
+    text, _, unit = words.partition(", ") if column in METRICS or column in KNOWN else (words, "", "")
+    number = f"{value:d}" if isinstance(value, int) else f"{factor * value:.4g}"
+    return html.escape(f"{text}: {number} {unit}".rstrip())
+
+
+def ticks(low: float, high: float, logarithmic: bool) -> list[float]:
+    """Returns about `TICKS` round numbers between two: on a logarithmic axis powers of ten."""
+    if not low < high:
+        return []
+    if logarithmic:
+        first, last = ceil(log10(low)), floor(log10(high))
+        return [10.0**k for k in range(first, last + 1, max(1, round((last - first) / TICKS))) if low < 10.0**k < high]
+    rough = (high - low) / TICKS
+    power = 10.0 ** floor(log10(rough))
+    step = next(power * s for s in (1, 2, 5, 10) if s * power >= rough * (1 - 1e-9))
+    return [step * k for k in range(ceil(low / step), floor(high / step) + 1) if low < step * k < high]
+
+
+def _sphere(radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns vertices and faces of an octahedron of a radius in m, which looks like a sphere at this size."""
+    corners = radius * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
     faces = [[a, b, c] for a in (0, 1) for b in (2, 3) for c in (4, 5)]
     faces = [f if np.linalg.det(corners[f]) > 0 else f[::-1] for f in faces]
     return corners, np.array(faces)

@@ -53,12 +53,14 @@ TOGETHER, LABEL_ABOVE, TARGET_ABOVE = 0.7, 0.4, 0.15
 CLEARANCE = 0.05  # m, least height of a camera above the floor
 # Initial camera, relative to the middle of the reference and in units of its size.
 CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])
+# Of the scatter plot behind the track, likewise: along x, y and z.
+BOARD_CORNER, BOARD_SIZE = np.array([-0.65, 0.75, 0.15]), np.array([1.35, 0.0, 0.6])
 GHOST_OPACITY, GLASS_OPACITY = 0.5, 0.55
 THICK = 0.012  # thickness of the lines from targets to robots, in diagonals of the robot's outline
 HALO = 1.04  # size of a ghost, of which only the far side is drawn: a rim around a robot that stands in it
 MAX_MARKED = 4  # number of robots whose estimates and targets are drawn
 NEXT_TRAIL = 0.001  # m, from the height of the trails of one colour to that of the next; equal ones would flicker
-TRAIL_WIDTH = 0.004  # as a share of the width of the view; the reference is twice as wide
+LINE_WIDTH = 0.004  # of the reference, as a share of the width of the view; trails, which are below, are twice as wide
 REACH = 0.03  # distance from a trail of clicks on it, as a share of the width of the view
 LEAST_VIEW = 1.2  # m, least width of the view
 SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
@@ -308,7 +310,7 @@ class Scene:
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
         self._view = max(LEAST_VIEW, *(high - low)) + self.length
         self.draw_references(references)
-        self._factor.position = [(low[0] + high[0]) / 2, high[1] + self.length / 2, high[2]]
+        self._factor.position = [(low[0] + high[0]) / 2, low[1] - self.length / 2, low[2]]  # in front of the robots
         middle = (low + high) / 2
         self._look(middle + self._view * CAMERA_POSITION, middle + self._view * CAMERA_TARGET)
         self.paint()
@@ -316,14 +318,16 @@ class Scene:
     def draw_references(self, references: Sequence[Reference]) -> None:
         """Draws a lap of each reference on the ground, in place of those before; the cameras stay."""
         lines = self._lines(references)
-        self._draw_lines("/world/reference", lines, 2 * TRAIL_WIDTH * self._view, REFERENCE_COLOUR)
+        colours = len({robot.colour for robot in self._robots})
+        lines[..., 2] += NEXT_TRAIL * (colours + 1)  # above all trails, which are wider
+        self._draw_lines("/world/reference", lines, LINE_WIDTH * self._view, REFERENCE_COLOUR)
 
     def _lines(self, references: Sequence[Reference]) -> Array:
         """Returns a lap of each of n references, a little above the ground, in m, `(n, 401, 3)`."""
         lines = []
         for reference in references:
             pose = reference.sample(np.linspace(0, reference.period, 401)).pose
-            heights = [self._height(x, y) + 0.006 for x, y in pose[:, :2]]
+            heights = [self._height(x, y) + ABOVE for x, y in pose[:, :2]]
             lines.append(np.column_stack([pose[:, :2], heights]))
         return np.stack(lines)
 
@@ -606,7 +610,7 @@ class Scene:
             )  # fmt: skip
         if way is not None:
             self._way.append(
-                self._draw_lines("/world/way/line", self._lines([way]), TRAIL_WIDTH * self._view, GOAL_COLOUR)
+                self._draw_lines("/world/way/line", self._lines([way]), LINE_WIDTH * self._view, GOAL_COLOUR)
             )
 
     def hold_floor(self, dragged: Dragged | None) -> None:
@@ -651,6 +655,14 @@ class Scene:
         some = arcs[:: max(1, len(arcs) // MAX_ARCS)]
         _show_segments(self._search, some if len(some) else None, ABOVE)
 
+    def board(self) -> tuple[Array, Array]:
+        """Returns the lower left corner and the extent, in m, `(3,)` each, of an upright area behind the track.
+
+        The first view shows all of it, and what is written around it.
+        """
+        middle = np.array(self._server.initial_camera.look_at) - self._view * CAMERA_TARGET
+        return middle + self._view * BOARD_CORNER, self._view * BOARD_SIZE
+
     @property
     def reach(self) -> float:
         """Distance in m from a trail within which a click on the floor is a click on it."""
@@ -691,7 +703,7 @@ class Scene:
             paths[:, [robot.colour == colour for robot in self._robots]].swapaxes(0, 1) + [0, 0, NEXT_TRAIL * k]
             for k, colour in enumerate(colours)
         ]
-        width = TRAIL_WIDTH * self._view
+        width = 2 * LINE_WIDTH * self._view
         self._factor.visible = magnified > 1
         if magnified > 1:
             self._factor.text = f"deviation from the reference × {magnified}"

@@ -8,29 +8,41 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.control.features import feature_scale
 from mrctl.kernel import Rows
-from mrctl.results.metrics import lap_metrics
+from mrctl.results.metrics import excitation, lap_metrics
+from mrctl.theory.robot import Robot
 from mrctl.viewer.looks import Look
 
 Array = NDArray[np.float64]
 
 HEADINGS = (
     "error now, mm", "RMS of last lap, mm", "best lap, mm", "feedback in last lap, %", "energy of last lap, J",
+    "excitation in last lap",
 )  # fmt: skip
 
+# A row for each number and a column for each robot: the names of the numbers stay where many robots are scrolled.
+HEADING = "position:sticky;left:0;background:var(--mantine-color-body);padding-right:0.8em"
+NUMBER = "font-weight:500;text-align:right;vertical-align:bottom"
+SMALL = 1e-3  # below which a number is written with an exponent
 
-def whole_laps(log: Rows, ticks: int, period: float) -> list[dict[str, Array]]:
+
+def whole_laps(log: Rows, ticks: int, period: float, robot: Robot) -> list[dict[str, Array]]:
     """Returns the metrics `(B,)` of `results.metrics.METRICS` of each whole lap, by name.
 
     Args:
         log: Record of `TICK` of each sample from the start of a lap and of each robot, `(T, B)`.
         ticks: Number of samples in a lap.
         period: Time between samples in s.
+        robot: The nominal robot.
     """
     laps = []
     for start in range(0, len(log) - ticks + 1, ticks):
         data = {name: log[name][start : start + ticks].T for name in log.dtype.names or ()}
-        laps.append(lap_metrics(data, data, period))
+        command = np.stack([data["v_command"], data["omega_command"]], axis=-1)
+        size, scale = len(command), feature_scale(robot)
+        excited = excitation(command, period, np.full(size, robot.half_track), np.tile(scale, (size, 1)))
+        laps.append(lap_metrics(data, data, period) | {"excitation": excited})
     return laps
 
 
@@ -44,7 +56,7 @@ def table(robots: Sequence[Look], now: Rows, laps: Sequence[dict[str, Array]]) -
     """
     nothing = np.full(len(robots), np.nan)
     errors = np.array([lap["position_rmse"] for lap in laps] or [nothing])
-    last = laps[-1] if laps else {"feedback_share": nothing, "energy": nothing}
+    last = laps[-1] if laps else dict.fromkeys(("feedback_share", "energy", "excitation"), nothing)
     best = np.where(np.isnan(errors), np.inf, errors).min(axis=0)
     columns = [
         1e3 * np.hypot(now["longitudinal_error"], now["lateral_error"]),
@@ -52,16 +64,24 @@ def table(robots: Sequence[Look], now: Rows, laps: Sequence[dict[str, Array]]) -
         1e3 * np.where(np.isfinite(best), best, np.nan),
         100 * last["feedback_share"],
         last["energy"],
+        last["excitation"],
     ]
-    head = "".join(f'<th style="font-weight:500;text-align:right">{text}</th>' for text in ("", *HEADINGS))
+    names = "".join(f'<th style="{NUMBER};color:rgb{r.colour}">{html.escape(r.label)}</th>' for r in robots)
     rows = "".join(
-        f'<tr><td style="color:rgb{robot.colour}">{html.escape(robot.label)}</td>{_cells([c[k] for c in columns])}</tr>'
-        for k, robot in enumerate(robots)
+        f'<tr><td style="{HEADING}">{heading}</td>{_cells(values)}</tr>'
+        for heading, values in zip(HEADINGS, columns, strict=True)
     )
-    return f'<table id="mrctl-score" style="margin:0.3em 1em;font-size:0.75em"><tr>{head}</tr>{rows}</table>'
+    return (
+        f'<div style="margin:0.3em 1em;overflow-x:auto"><table id="mrctl-score" style="font-size:0.75em">'
+        f'<tr><td style="{HEADING}"></td>{names}</tr>{rows}</table></div>'
+    )
 
 
 def _cells(values: Sequence[float]) -> str:
     """Returns the cells of numbers to three digits; what is not known yet, or not any more, is a dash."""
-    texts = [np.format_float_positional(v, 3, fractional=False, trim="-") if np.isfinite(v) else "–" for v in values]
-    return "".join(f'<td style="text-align:right">{text}</td>' for text in texts)
+    texts = [f"{v:.2g}" if 0 < abs(v) < SMALL else _positional(v) if np.isfinite(v) else "–" for v in values]
+    return "".join(f'<td style="{NUMBER}">{text}</td>' for text in texts)
+
+
+def _positional(value: float) -> str:
+    return np.format_float_positional(value, 3, fractional=False, trim="-")

@@ -262,7 +262,7 @@ class Session:
     def _design(self) -> tuple[Robot, bool, float, float]:
         """For what the controllers are designed: robot, whether its steering is rigid, delay and period in s."""
         start = self.start[0]
-        delay = start.sensing.periods("delay", self.period) * self.period
+        delay = start.sensing.loop_delay(self.period) * self.period
         return self.robot, start.steering == "rigid", delay, self.period
 
     def saved(self) -> list[Scenario]:

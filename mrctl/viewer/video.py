@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from importlib.util import find_spec
@@ -42,13 +43,14 @@ SHADOW = 1024  # pixels of the map of shadows
 WIDTH = 0.003  # of trails, as a share of the width of the view; the reference is twice as wide
 
 
-def record(folder: Path, run: int | None, out: Path) -> None:
+def record(folder: Path, run: int | None, out: Path, code: bool = True) -> None:
     """Writes a video of a result: the first run solid, the others as ghosts, with the reference and their trails.
 
     Args:
         folder: Folder of a result or a sweep.
         run: Number of the one run to show; by default those that `mrctl view` shows first.
         out: File to write, whose name ends in `.mp4` or `.gif`; MP4 needs the extra `video`.
+        code: Whether a sweep may run the Python files that it names.
 
     Raises:
         InputError: The file exists, has another ending or cannot be written; there is no such run; MuJoCo cannot draw
@@ -60,7 +62,9 @@ def record(folder: Path, run: int | None, out: Path) -> None:
         raise InputError(f"out: {out} exists already; nothing was overwritten")
     if out.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
         raise InputError("out: an MP4 needs pip install 'mrctl[video]'; a name in .gif needs nothing")
-    library = Library(folder)
+    if not os.access(out.parent, os.W_OK):  # before all pictures are drawn
+        raise InputError(f"out: {out.parent} is no folder in which a file can be written")
+    library = Library(folder, code)
     shown = [int(k) for k in library.table.index] if run is None else [run]
     recordings = [library.recording(k) for k in (shown if len(shown) <= MAX_SHOWN else shown[:1])]
     times = np.arange(0, max(r.duration for r in recordings), 1 / RATES[out.suffix])

@@ -106,13 +106,18 @@ def replay(
             contradict each other.
     """
     from mrctl.viewer.export import export as write
+    from mrctl.viewer.export import refuse_existing
     from mrctl.viewer.recording import MAX_SHOWN, Library, looks_of
     from mrctl.viewer.replay import Replay
 
     if compare:
         raise InputError("compare: it needs a scenario; the ghosts of a replay are chosen in the page")
+    if export is not None:
+        refuse_existing(export)
     library = Library(folder / "result.zarr" if (folder / "result.zarr").is_dir() else folder, code)
     table = library.table
+    if run is not None:
+        library.check(run)
     shown = [int(table.index[0]) if run is None else run]
     if run is None and len(table) <= MAX_SHOWN:
         shown = [int(k) for k in table.index]

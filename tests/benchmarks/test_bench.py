@@ -11,8 +11,9 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from mrctl import cli
+from mrctl import Box, Obstacles, cli
 from mrctl.experiments import bench
+from mrctl.physics.obstacles import multi_ray
 
 sys.path.append(str(Path(__file__).parent))
 import long_sweep  # noqa: E402
@@ -23,7 +24,7 @@ pytestmark = pytest.mark.xdist_group("bench")  # what its tests share is made on
 @pytest.fixture(scope="module")
 def figures():
     """Everything, in a form of a few seconds."""
-    return bench.run(sizes=(1, 3), repetitions=2, chunk=30)
+    return bench.run(sizes=(1, 3), repetitions=2, chunk=30, worlds=5)
 
 
 @pytest.mark.parametrize(("size", "threads"), [(1, 1), (3, 1), (17, 2)])
@@ -84,6 +85,29 @@ def test_parts(figures):
         assert max(parts, key=parts.__getitem__) == "physics"
 
 
+def test_navigation(figures):
+    """Everything was measured, the parts take less than the whole, and the worlds have the sizes that are said."""
+    found = figures["navigation"]
+    lidar, particles, mppi = found["pairs"]
+    assert lidar["judge"] == "mujoco.mj_multiRay" and particles["ratio"] < 1
+    for row in (lidar, particles, mppi):
+        assert row["us"] > 0 < row["judge_us"]
+    discs, generated = found["plans"]
+    assert discs["cells"] == 384**2 and 1000 < generated["cells"] < discs["cells"]
+    for row in (discs, generated):
+        assert 0 < row["found"] <= row["worlds"] <= 5 and row["expanded"] > 0
+        assert 0 < row["around_ms"] < row["ms"] <= row["ms_95"]
+    assert list(found["missions"]) == ["none", "barrier", "window", "mppi"]
+    assert min(found["missions"].values()) > 0
+
+
+def test_multi_ray():
+    """The judge of the lidar sees a wall where it is, and nothing elsewhere."""
+    cast = multi_ray(Obstacles(shapes=(Box(x=2.5, length=1.0, width=8.0),)))
+    directions = np.array([0.0, 0.5, np.pi])
+    assert cast(np.zeros(2), directions, 9.0) == pytest.approx([2.0, 2.0 / np.cos(0.5), 9.0])
+
+
 def test_autograd_loop_does_the_same_job():
     """What we compare with is no straw man: it follows the lemniscate within centimetres."""
     *_, last = (rmse for _, rmse in bench.autograd_loop(200, 5))
@@ -98,7 +122,9 @@ def test_command(figures, capsys):
         assert cli.main(["bench"]) == 0
     text = capsys.readouterr().out
     assert f"| {figures['robots'][1]['ratio']:.3f} |" in text
-    assert "NO" not in text
+    assert "NO" not in text and "mujoco.mj_multiRay" in text and "| mppi " in text
+    earlier = {key: value for key, value in figures.items() if key != "navigation"}
+    assert text.startswith(bench.text(earlier))  # files of earlier versions are still read
 
 
 def test_long_sweep(tmp_path):

@@ -1,7 +1,8 @@
 """Does the viewer keep real time while a browser watches? `python tests/benchmarks/viewer.py [SECONDS]`.
 
-For one and for sixteen robots: median of simulated over wall time, taken each second; the share of control ticks that
-began more than a period after they were due; pictures and curves that the page was sent; growth of memory.
+For one, two and sixteen robots: median of simulated over wall time, taken each second; the share of control ticks that
+began more than a period after they were due; pictures and curves that the page was sent; what was sent to it in all,
+once the curves are full; growth of memory; and what a change of the payload costs the session, and the page with it.
 
 `python tests/benchmarks/viewer.py rough [SECONDS]` instead treats it roughly, without a browser: visitors that come and
 go and set inputs at random, five times a second. Memory every minute, and its slope in the second half, less the
@@ -17,12 +18,15 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 from playwright.sync_api import sync_playwright
 from viser._messages import GuiUpdateMessage
+from websockets.asyncio.server import ServerConnection
 
-from mrctl import Scenario
-from mrctl.viewer.live import Live
+from mrctl import Perturbation, Scenario
+from mrctl.viewer.live import WINDOW, Live
 from mrctl.viewer.server import Server
 
 # Without a GPU the scene is drawn by SwiftShader; the curves, as in any browser without one, by Skia on the CPU.
@@ -42,11 +46,18 @@ def recorded(live: Live) -> float:
     return sum(simulation.log.ticks[: simulation.tick].nbytes for _, simulation in live.session.simulations) / 2**20
 
 
+def event_cost(apply: Callable[..., None], payload: float) -> float:
+    """Time in ms that a change of the payload to so many kg takes."""
+    start = time.perf_counter()
+    apply(perturbation=Perturbation(payload=payload))
+    return 1e3 * (time.perf_counter() - start)
+
+
 def measure(robots: int, seconds: int) -> None:
     """Prints what it finds."""
     server = Server(port=0)
     live = Live([Scenario(seed=k, name=str(k)) for k in range(robots)], server)
-    sent = {"draw": 0, "refresh": 0}
+    sent = {"draw": 0, "refresh": 0, "bytes": 0}
 
     def counted(name: str) -> Callable[[], None]:
         genuine = getattr(live, name)
@@ -57,12 +68,25 @@ def measure(robots: int, seconds: int) -> None:
 
         return call
 
-    for name in sent:
+    for name in ("draw", "refresh"):
         setattr(live, name, counted(name))
+    while live.session.time < WINDOW:
+        live.session.step()
+    costs = [event_cost(live.session.apply, payload) for payload in (1.0, 2.0, 3.0, 4.0, 5.0)]
+    whole = [event_cost(live._apply_event, payload) for payload in (5.5, 6.0, 7.0, 8.0, 9.0)]
+    print(
+        f"{robots:2d} robots: an event {statistics.median(costs):.1f} ms, with the page {statistics.median(whole):.1f}"
+    )
+    genuine = ServerConnection.send
+
+    async def send(connection: ServerConnection, message: Any) -> None:  # noqa: ANN401
+        sent["bytes"] += len(message)
+        await genuine(connection, message)
+
     loop = threading.Thread(target=live.run)
     loop.start()
     try:
-        with sync_playwright() as playwright:
+        with mock.patch.object(ServerConnection, "send", send), sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=SOFTWARE)
             page = browser.new_page(viewport={"width": 900, "height": 500})
             page.goto(f"http://127.0.0.1:{server.get_port()}")
@@ -74,7 +98,7 @@ def measure(robots: int, seconds: int) -> None:
             )
             time.sleep(3)
             live.late = live.ticks = 0
-            sent.update(draw=0, refresh=0)
+            sent.update(draw=0, refresh=0, bytes=0)
             arrived, memory, factors = page.evaluate("window.arrived"), resident(), []
             for _ in range(seconds):
                 tick, start = live.session.tick, time.monotonic()
@@ -85,7 +109,8 @@ def measure(robots: int, seconds: int) -> None:
                 f"{robots:2d} robots: {statistics.median(factors):.3f}× real time (least {min(factors):.3f}), "
                 f"{100 * live.late / max(1, live.ticks):.2f} % of ticks late, "
                 f"{sent['draw'] / seconds:.1f} pictures/s, curves {sent['refresh'] / seconds:.1f}/s sent, "
-                f"{drawn / seconds:.1f}/s in the page, {resident() - memory:+.1f} MiB"
+                f"{drawn / seconds:.1f}/s in the page, {sent['bytes'] / seconds / 1e6:.2f} MB/s, "
+                f"{resident() - memory:+.1f} MiB"
             )
             browser.close()
     finally:
@@ -138,5 +163,5 @@ if __name__ == "__main__":
     if mode == "rough":
         rough(int(rest[0]) if rest else 600)
     else:
-        for robots in (1, 16):
+        for robots in (1, 2, 16):
             measure(robots, int(rest[0]) if rest else 60)

@@ -45,6 +45,15 @@ HOSTILE = {  # what small files ask for
     "hfield.xml": WORLD.format('<hfield name="h" nrow="30000" ncol="50000" size="1 1 1 1"/>', ""),
     "texture.xml": WORLD.format('<texture name="t" type="2d" builtin="flat" width="60000" height="60000"/>', ""),
     "pixels.xml": WORLD.format('<hfield name="h" file="huge.png" size="1 1 1 1"/>', ""),
+    "entity.xml": WORLD.format("", '<replicate count="&#49;000000"><geom size="1"/></replicate>'),
+    "comment.xml": WORLD.format(
+        "",
+        '<geom name="&lt;!--" size="1"/><geom name="<!--" size="1"/><replicate count="1000000"><geom size="1"/>'
+        '</replicate><geom name="-->" size="1"/>',
+    ),
+    "attached.xml": WORLD.format('<model name="m" file="replicate.xml"/>', '<attach model="m" prefix="a"/>'),
+    "mesh.xml": WORLD.format('<mesh name="m" builtin="supersphere" params="20000 1 1"/>', ""),
+    "crash.xml": f'<mujoco><custom><numeric name="n" size="2000" data="{2000 * "1 "}"/></custom></mujoco>',
     "waits.xml": WORLD.format('<mesh name="m" file="pipe.toml"/>', ""),
     "endless.xml": WORLD.format('<mesh name="m" file="zero.toml"/>', ""),
     "pixels.yaml": "image: huge.png\nresolution: 0.05\norigin: [0, 0, 0]\noccupied_thresh: 0.6\nfree_thresh: 0.2",
@@ -99,6 +108,8 @@ OTHERS = [
     "sweep sweep.toml --out \udcff",
     "suite --quick --full", "suite --held-out magic --out s", "suite --held-out none --random 3",
     "suite --feedforward magic", "suite --controller own.py", "suite --controller raises.py:Good --out s",
+    "navigate doorway:1 --speed nan --out s", "navigate doorway:1 --goal 900 0 0 --out s/t", "tune --out full",
+    "tune --delay 0.6 --out s", "navigate doorway:1 --out full", "run --laps 1 --out full", "tune nothing --out s",
     "tune nothing", "tune broken.xml", "tune --delay 0.013", "tune --delay -1", "tune --lag -1", "tune --lag nan",
     "tune --time-constant 0", "tune --search magic", "tune --search none --lag 1", "tune --world moon",
     "identify --seed -1", "identify --world slope", "identify --world rough", "identify --perturbation.slope 0.1",
@@ -120,6 +131,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (path / name).write_text(text)
     for name, text in HOSTILE.items():
         (path / name).write_text(text)
+    (path / "full").mkdir()
+    for name in (".writable", "path.png", "sensitivity.pdf"):
+        (path / "full" / name).touch()
     for name in ("pipe.toml", "pipe.yaml", "pipe.world"):
         os.mkfifo(path / name)
     for name in ("zero.toml", "zero.yaml", "zero.xml", "zero.pt"):

@@ -5,11 +5,13 @@ from importlib import import_module
 import numpy as np
 import pytest
 
+import mrctl
 from mrctl import (
     FEEDFORWARDS,
     Circle,
     Event,
     Fel,
+    InputError,
     Kanayama,
     LaneChange,
     Lemniscate,
@@ -18,10 +20,15 @@ from mrctl import (
     Pid,
     Scenario,
     StopAndGo,
+    Sweep,
 )
 from mrctl.loop.simulation import Simulation, simulate
 from mrctl.physics.plant import BatchPlant, PhysicsPlant
+from mrctl.results.dataset import SIGNALS
 from mrctl.sensing.tiers import TIERS, Sensing
+from mrctl.sweep import jobs
+from mrctl.sweep.pool import Outcome
+from mrctl.sweep.store import Store
 
 pytestmark = pytest.mark.xdist_group("batch_equals_single")  # what its tests share is made once
 
@@ -139,10 +146,24 @@ def scenario(seed: int) -> Scenario:
     )
 
 
+def equipped(seed: int) -> Scenario:
+    """The same run in the tier lab or field, with every sensor slow, late and noisy and every effect of the driver."""
+    rng = np.random.default_rng(1000 + seed)
+    values: dict[str, object] = {k: float(rng.uniform(max(a, b / 10), b)) for k, (a, b) in SENSES.items()}
+    values["encoder_counts"] = int(rng.integers(50, 100_000))
+    values |= {f"{name}_rate": float(rng.choice([50, 25, 20])) for name in SENSORS}
+    values |= {f"{name}_latency": int(rng.integers(1, 5)) / 100 for name in SENSORS}
+    values |= {"tier": ("lab", "field")[seed % 2], "delay": int(rng.integers(1, 4)) / 100}
+    return scenario(seed).replace(
+        sensing=Sensing.from_dict({**values, "estimator": ("ekf", "odometry")[seed // 2 % 2]})
+    )
+
+
 @pytest.fixture(scope="module", params=COUNTS)
 def scenarios(request):
-    """All of them."""
-    return [scenario(seed) for seed in range(request.param)]
+    """All of them; the last one is pushed off its way."""
+    *drawn, last = (scenario(seed) for seed in range(request.param))
+    return [*drawn, last.replace(events=(Event(time=0.3, push=(0.0, 900.0, 0.0)),))]
 
 
 @pytest.fixture(scope="module")
@@ -207,3 +228,29 @@ def test_threads(scenarios, alone, threads, monkeypatch):
     for run, row in enumerate(rows):
         equal(alone[row], whole, run)
     equal(alone[1], simulate([scenarios[1]]), 0)
+
+
+def first_half(path: str, job: int) -> Outcome:
+    """The sweep stops after half of its jobs."""
+    return Outcome(job, error="half", fatal=True) if job >= Store(path).jobs // 2 else jobs.compute(path, job)
+
+
+@pytest.mark.parametrize("count", [12, pytest.param(100, marks=pytest.mark.full)])
+def test_sweep(count, tmp_path):
+    """A sweep that is interrupted after half of its jobs has the bits of runs alone in the end, and so has a repeat."""
+    drawn = [equipped(seed) if seed % 4 < 2 else scenario(seed) for seed in range(count)]
+    sweep, store = Sweep.of(drawn, record="full", chunk=3), tmp_path / "store"
+    with pytest.raises(InputError, match="half"):
+        jobs.run(sweep, store, 1, work=first_half)
+    assert len(Store(store).done()) == Store(store).jobs // 2 > 0
+    assert jobs.run(sweep, store, 2).runs == count
+    opened = mrctl.open(store)
+    for run, own in enumerate(drawn):
+        one, row = simulate(own), opened.isel(run=run)
+        for name in SIGNALS:
+            found = row[name].values
+            assert found[: one.sizes["time"]].tobytes() == one[name].values.tobytes(), f"{name} of run {run}"
+            assert np.isnan(found[one.sizes["time"] :]).all()
+        assert str(row["failure"].values) == str(one["failure"].values)
+        assert jobs.repeat(store, run) == ("bit-identical", True)
+    print(f"{count} runs, {int(opened['failed'].sum())} of them failed, are the same alone, in the sweep and repeated")

@@ -3,17 +3,19 @@
 import mujoco
 import numpy as np
 import pytest
+import shapely
 
 from mrctl import Box, Circle, Disc, InputError, Line, Obstacles, Polygon, Scenario, load_robot, simulate
+from mrctl.loop.simulation import Simulation
 from mrctl.navigation.generators import warehouse
 from mrctl.physics import mjcf
 from mrctl.physics.elements import COLLISION
 from mrctl.physics.files import models_folder
 from mrctl.physics.hull import footprint
-from mrctl.physics.obstacles import read_mjcf, to_mjcf
+from mrctl.physics.obstacles import BIT, TALL, read_mjcf, to_mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.theory.clearance import clearance
-from mrctl.theory.obstacles import Surroundings
+from mrctl.theory.obstacles import Surroundings, turned
 
 ROBOTS = {
     "car": {"steering": "compliant"},
@@ -70,9 +72,76 @@ def test_contact_is_overlap(name):
         touches, gap = data.sensor(COLLISION).data[0] > 0, clearance(corners, pose, outlines)
         hits += touches
         assert abs(gap) < 1e-3 or touches == (gap < 0)
+        assert not touches_floor(model, data)
     assert 50 < hits < 350
-    floor = {g for c in data.contact for g in c.geom}
-    assert model.geom("hull").id not in floor or hits  # it is high above the floor in any case
+
+
+def touches_floor(model, data):
+    """Whether MuJoCo has a contact of the hull with a plane."""
+    planes = {g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE}
+    assert planes
+    return any(model.geom("hull").id in pair and planes & set(pair) for pair in data.contact.geom.tolist())
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_hull_passes_through_the_floor(name):
+    """A robot that is put into the floor, its hull across the surface, has contacts there, but none of the hull."""
+    model = mjcf.load(**ROBOTS[name], obstacles=wall(1.5))
+    data, middle = mujoco.MjData(model), TALL / 2
+    data.qpos[:7] = 0, 0, -middle, 1, 0, 0, 0  # the hull reaches from the axle up to `TALL`
+    mujoco.mj_forward(model, data)
+    floor = next(g for g in range(model.ngeom) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE)
+    assert data.ncon > 0 and any(floor in pair for pair in data.contact.geom.tolist())
+    assert not touches_floor(model, data) and data.sensor(COLLISION).data[0] == 0
+    model.geom_contype[floor] = model.geom_conaffinity[floor] = BIT  # so that the check above can fail
+    mujoco.mj_forward(model, data)
+    assert touches_floor(model, data) and data.sensor(COLLISION).data[0] > 0
+
+
+def outline(shape, pose):
+    """An obstacle as a geometry of shapely, at a pose of its course."""
+    if isinstance(shape, Disc):
+        return shapely.Point(turned(np.array([[shape.x, shape.y]]), pose)[0]).buffer(shape.radius, quad_segs=200)
+    return shapely.Polygon(turned(shape.vertices, pose))
+
+
+@pytest.mark.parametrize("size", [1, 4])
+@pytest.mark.parametrize("count", [6, pytest.param(60, marks=pytest.mark.full)])
+def test_verdict_of_driven_runs(count, size):
+    """At every tick of driven runs MuJoCo's verdict is shapely's distance, at all but 2 mm; some runs collide.
+
+    Runs drive alone and in fours, beside a box and every other time towards a disc that moves.
+    """
+    random, ticks, decided, ends = np.random.default_rng(2), 0, 0, []
+    for k in range(count):
+        x, y, angle, heading = random.uniform([0.9, -1.0, -3, -0.5], [1.2, 1.0, 3, 0.5])
+        box = Box(x=x, y=y, angle=angle, length=0.4, width=0.2)
+        mover = Disc(x=-1.0, y=0.45, radius=0.1, course=Line(heading=heading, speed=0.3))
+        shapes = (box, mover)[: 1 + k % 2]
+        own = Scenario(
+            **list(ROBOTS.values())[k % 3], reference=Line(length=1.2, speed=0.5), laps=1, prior="model",
+            learner="none", obstacles=Obstacles(shapes=shapes), initial_spread=(0.01, 0.1, 0.1),
+        )  # fmt: skip
+        simulation = Simulation([own.replace(seed=size * k + row) for row in range(size)])
+        corners, plant = footprint(mjcf.load(**list(ROBOTS.values())[k % 3])), simulation.plant
+        while plant.running and simulation.tick < simulation.ticks:
+            running = np.flatnonzero(~plant.failed)
+            simulation.step()
+            time = np.array([simulation.tick * own.control_period])
+            poses = [s.course.sample(time).pose[0] if s.course else np.zeros(3) for s in shapes]
+            walls = shapely.union_all([outline(shape, pose) for shape, pose in zip(shapes, poses, strict=True)])
+            for row in running:
+                assert plant.failure[row] in ("", "collision")
+                robot = shapely.Polygon(turned(corners, plant.reading["pose"][row]))
+                ticks += 1
+                gap = robot.distance(walls)
+                if gap > 2e-3 or (gap == 0 and robot.buffer(-2e-3).intersects(walls)):
+                    decided += 1
+                    assert (plant.failure[row] == "collision") == (gap == 0)
+        ends += plant.failure
+    hits = ends.count("collision")
+    print(f"{len(ends)} runs, {hits} collisions, {ticks} ticks, {ticks - decided} of them within 2 mm")
+    assert 0.2 * len(ends) < hits < 0.8 * len(ends) and decided > 0.97 * ticks
 
 
 def wall(x):

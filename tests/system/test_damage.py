@@ -1,10 +1,15 @@
 """Damaged stores and results, and stores that name code: one line names the file, and what is whole still opens."""
 
+import hashlib
 import json
 import os
+import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +24,7 @@ from mrctl.viewer.recording import Library
 
 BASE = {"laps": 1, "learner": "none", "reference": {"kind": "circle", "radius": 0.5, "period": 4.0}}
 MASSES = {"field": "perturbation.mass_factor", "values": [1.0, 1.2, 1.4, 1.6]}
+SWEEP = {"record": "full", "chunk": 2, "base": BASE, "axes": [MASSES]}
 OWN = """
 class Half:
     def __init__(self, robot, size):
@@ -35,9 +41,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep of two jobs with all signals, one with the user's controller, and a result."""
     folder = tmp_path_factory.mktemp("whole")
     (folder / "own.py").write_text(OWN)
-    sweep = {"record": "full", "chunk": 2, "base": BASE, "axes": [MASSES]}
-    jobs.run(Sweep.from_dict(sweep), folder / "store", 1)
-    jobs.run(Sweep.from_dict(sweep | {"controller": f"{folder}/own.py:Half"}), folder / "own", 1)
+    jobs.run(Sweep.from_dict(SWEEP), folder / "store", 1)
+    jobs.run(Sweep.from_dict(SWEEP | {"controller": f"{folder}/own.py:Half"}), folder / "own", 1)
     mrctl.save(mrctl.simulate([mrctl.Scenario.from_dict(BASE)]), folder / "out" / "result.zarr")
     return folder
 
@@ -48,13 +53,33 @@ def flipped(path: Path) -> None:
     path.write_bytes(data)
 
 
+def recoded(path: Path) -> None:
+    """Names another codec, as a file from elsewhere may."""
+    text = path.read_text()
+    path.write_text(re.sub(r'"name": "(zstd|blosc)",', '"name": "gzip",', text))
+    assert path.read_text() != text
+
+
+def corrupt(path: Path) -> None:
+    """Changes a number in a table, which without a checksum would be read as another."""
+    value = pq.read_table(path)["position_rmse"].to_numpy()[1]
+    assert value.tobytes() in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(value.tobytes(), (2 * value).tobytes()))
+
+
 def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-def edited(**changes: object) -> Callable[[Path], None]:
+def edited(sign: bool = True, **changes: object) -> Callable[[Path], None]:
+    """Changes keys of a JSON file; `sweep.json` gets the checksum of what it then holds, unless told otherwise."""
+
     def damage(path: Path) -> None:
-        path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+        found = json.loads(path.read_text()) | changes
+        if sign and found.pop("checksum", ""):
+            text = json.dumps(found, sort_keys=True)
+            found["checksum"] = hashlib.sha256(text.encode()).hexdigest()
+        path.write_text(json.dumps(found))
 
     return damage
 
@@ -65,8 +90,8 @@ def cleared(path: Path) -> None:
 
 SHARD = "store/signals.zarr/signals/c/1/0/0"
 DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
-    (SHARD, flipped, "run 2"),
-    (SHARD, cut, "run 2"),
+    (SHARD, flipped, "signals/c/1/0/0"),
+    (SHARD, cut, "signals/c/1/0/0"),
     ("store/runs.parquet", cut, "runs.parquet"),
     ("store/runs.parquet", cleared, "runs.parquet"),
     ("store/runs.parquet", Path.unlink, "no job is done"),
@@ -78,6 +103,11 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("store/sweep.json", edited(chunk=0), "sweep.json: chunk"),
     ("store/sweep.json", edited(sweep={}), "sweep.json: sweep.axes"),
     ("store/sweep.json", edited(samples=10**12), "sweep.json: samples"),
+    ("store/sweep.json", edited(sign=False, control_period=0.02), "sweep.json: damaged: its checksum"),
+    ("store/runs.parquet", corrupt, "runs.parquet"),
+    ("out/result.zarr/voltage_left", shutil.rmtree, "result.zarr/voltage_left: missing"),
+    ("out/result.zarr/x/zarr.json", recoded, "result.zarr/x: has the codec gzip, which mrctl does not write"),
+    ("store/signals.zarr/signals/zarr.json", recoded, "signals.zarr/signals: has the codec gzip"),
     ("out/result.zarr/x/c", shutil.rmtree, "result.zarr/x: 1 chunks are missing"),
     ("out/result.zarr/x/c/0/0", flipped, "result.zarr/x"),
     ("out/result.zarr/x/zarr.json", cleared, "result.zarr"),
@@ -99,6 +129,22 @@ def test_damage_is_one_line(
     assert sorted(p.name for p in tmp_path.iterdir()) == [name]
 
 
+def test_damaged_shard_is_named_when_it_is_used(whole: Path, tmp_path: Path) -> None:
+    """In a notebook a store with a damaged shard opens, and gives what is whole, in any order that is asked for."""
+    shutil.copytree(whole / "store", tmp_path / "store")
+    found, undamaged = mrctl.open(tmp_path / "store"), mrctl.open(whole / "store")
+    for pick in ([3, 0, 2], [], slice(None, None, -1), 2):
+        np.testing.assert_array_equal(found["x"][pick, 5:9], undamaged["x"].values[pick, 5:9])
+    flipped(tmp_path / SHARD)
+    found = mrctl.open(tmp_path / "store")
+    np.testing.assert_array_equal(found["x"][[1, 0]], undamaged["x"].values[[1, 0]])
+    with pytest.raises(InputError, match="signals/c/1/0/0: damaged"):
+        found.load()
+    command = [sys.executable, "-m", "mrctl.cli", "run", str(tmp_path / "store"), "--run", "2"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr  # zarr's other readers say nothing
+
+
 def test_missing_shard_leaves_its_runs_out(whole: Path, tmp_path: Path) -> None:
     """The runs of a shard that is gone are not NaN without failure: they are left out, and a warning names the file."""
     shutil.copytree(whole / "store", tmp_path / "store")
@@ -107,6 +153,35 @@ def test_missing_shard_leaves_its_runs_out(whole: Path, tmp_path: Path) -> None:
         found = mrctl.open(tmp_path / "store")
     assert found["run"].values.tolist() == [0, 1] and found.attrs["unfinished"] == 2
     np.testing.assert_array_equal(found["x"], mrctl.open(whole / "store")["x"][:2])
+
+
+def test_missing_shard_is_computed_again(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The command that began a sweep makes the signals that are gone again, with the same bytes."""
+    shutil.copytree(whole / "store", tmp_path / "store")
+    shutil.rmtree(tmp_path / "store/signals.zarr/signals/c/1")
+    assert cli.main(["run", str(tmp_path / "store"), "--run", "2"]) == 2
+    assert "signals/c/1/0/0: missing; the command" in capsys.readouterr().err
+    jobs.run(Sweep.from_dict(SWEEP), tmp_path / "store", 1)
+    for file in ("runs.parquet", "signals.zarr/signals/c/0/0/0", "signals.zarr/signals/c/1/0/0"):
+        assert (tmp_path / "store" / file).read_bytes() == (whole / "store" / file).read_bytes(), file
+
+
+def test_refused_before_anything_is_driven(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A run that is not there, a file that is, a store whose code may not run: one line, and nothing is simulated."""
+    (tmp_path / "x.html").write_text("mine")
+    store = str(whole / "store")
+    with mock.patch("mrctl.viewer.recording.simulate", side_effect=AssertionError("drives")):
+        for words, says in (
+            (["view", store, "--run", "99"], "has no run 99"),
+            (["view", str(whole / "out"), "--run", "-1"], "has no run -1"),
+            (["view", store, "--export", str(tmp_path / "x.html")], "x.html exists already"),
+            (["record", store, "--out", str(tmp_path / "none" / "x.gif")], "none is no folder"),
+            (["record", str(whole / "own"), "--no-code", "--out", str(tmp_path / "x.gif")], "code: "),
+        ):
+            assert cli.main(words) == 2
+            said = capsys.readouterr().err
+            assert says in said and said.count("\n") == 1, said
+    assert [file.name for file in tmp_path.iterdir()] == ["x.html"]
 
 
 def zarr_of(store: Path, **changes: object) -> None:
@@ -180,3 +255,37 @@ def test_code_of_a_store(
     monkeypatch.setattr(jobs.user_files, "digest", lambda name: "of another file")
     with pytest.raises(InputError, match="is not the file that"):
         jobs.stages_of(whole / "own")
+
+
+BLIND = """
+import numpy as np
+
+class Blind:
+    def __init__(self, robot, size):
+        self.ticks = 0
+    def reset(self, pose, twist, period):
+        self.start = np.hstack([pose, twist])
+    def output(self, encoders, gyro, acceleration, fix, age):
+        self.ticks += 1
+        return self.start if self.ticks < 3 else np.full((len(gyro), 5), np.nan)
+"""
+
+
+def test_a_fault_is_told_wherever_the_run_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A robot whose estimator answers NaN drives on: table, JSON, sweep, its export and the replay say so."""
+    (tmp_path / "own.py").write_text(BLIND)
+    own, told = f"estimator={tmp_path}/own.py:Blind", "estimator Blind: not finite, tick 2"
+    (tmp_path / "short.toml").write_text('laps = 1\nlearner = "none"\nreference = {kind = "circle", period = 6.0}\n')
+    command = ["run", str(tmp_path / "short.toml"), "--controller", own]
+    assert cli.main([*command, "--out", str(tmp_path / "out")]) == 0
+    assert f"\n{told}; the robot coasts on odometry\n" in capsys.readouterr().out
+    assert Library(tmp_path / "out").recording(0).faults == [f"{told}; the robot coasts on odometry"]
+    assert cli.main([*command, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["faults"] == [f"{told}; the robot coasts on odometry"]
+    sweep = {"record": "metrics", "base": BASE, "axes": [MASSES], "controller": own}
+    jobs.run(Sweep.from_dict(sweep), tmp_path / "store", 1)
+    found = mrctl.open(tmp_path / "store")
+    assert found["estimator_fault"].values.tolist() == [told] * 4
+    assert found["feedforward_fault"].values.tolist() == [""] * 4 and not found["failed"].any()
+    assert cli.main(["export", str(tmp_path / "out"), "--to", "npz", "--out", str(tmp_path / "x.npz")]) == 0
+    assert np.load(tmp_path / "x.npz")["estimator_fault"].tolist() == [told]

@@ -221,6 +221,13 @@ for tick in range(60):
 assert all(p.shape == (480, 640, 3) and p.dtype == np.uint8 and p.std() > 10 for p in pictures)
 assert (pictures[0] != pictures[1]).any() and other.render() is None
 assert one.metadata["render_fps"] == 100
+many = mrctl.envs.gym.TrackingVectorEnv(2, Scenario(reference=Circle(period=2.2, radius=0.3), laps=1),
+    render_mode="rgb_array")
+many.reset(seed=[3, 4])
+for tick in range(51):
+    many.step(np.zeros((2, 2)))
+drawn = many.render()
+assert len(drawn) == 2 and np.mean(drawn[0] != pictures[1]) < 1e-3 < np.mean(drawn[0] != drawn[1])
 """
 
 

@@ -70,12 +70,16 @@ def test_consistent(tier, runs):
     """
     errors, covariances, innovations, failed = nominal(tier, runs)
     assert not failed.any()
+    whole = errors, covariances
     errors, covariances = errors[SETTLED::APART], covariances[SETTLED::APART]
     for states in POSTURE, POSTURE_AND_TWIST:
         found = normalised(errors, covariances, states)
         low, high = chi2.ppf((0.025, 0.975), runs * len(states)) / runs
         means = found.mean(1)
         assert np.mean((means > low) & (means < high)) >= 0.7, (low, high, means)
+        if runs == 100:  # at every tick; the share is 0.83 and 0.83 in `lab`, 0.88 and 0.95 in `field`
+            every = normalised(*whole, states)[SETTLED:].mean(1)
+            assert np.mean((every > low) & (every < high)) > 0.8
         # All looks together, which are not independent: the errors of a run last for some seconds.
         assert 0.75 < means.mean() / len(states) < 1.25
         assert np.mean(found < chi2.ppf(0.95, len(states))) > 0.9
@@ -101,10 +105,10 @@ def test_start(tier):
 
 
 # What a robot meets: changes of the scenario, and the least share of time in which each of posture and twist is within
-# three standard deviations. With one wheel on ice, the heading and V of the tier `field` are in about half of the time;
-# a lifted wheel, whose encoder still counts, turns the heading by up to 3 mrad where the filter believes in 0.5 mrad.
-# The heading is then within three standard deviations in 90 % of the time in `lab` and in 81 % in `field`, where V is
-# in 87 % (48 runs each).
+# three standard deviations. A lifted wheel, whose encoder still counts, turns the heading by up to 3 mrad where the
+# filter believes in 0.5 mrad. Over 48 runs each, x, y, θ, V and θ̇ are within three standard deviations in this share of
+# the time: with a lifted wheel 0.996, 0.993, 0.90, 0.99, 0.99 in `lab` and 0.98, 0.99, 0.81, 0.87, 0.99 in `field`;
+# with the left wheel on ice 0.97, 0.97, 0.89, 0.84, 0.96 in `lab` and 0.98, 0.98, 0.79, 0.74, 0.94 in `field`.
 MEETS = {
     "lost fixes": ({"fix_lost": 0.5}, {}, (0.98,) * 5),
     "outlying fixes": ({"fix_outliers": 0.2}, {}, (0.98,) * 5),
@@ -115,7 +119,7 @@ MEETS = {
         {}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.8)}, (0.93,) * 5
     ),
     "slipping wheel": (
-        {}, {"perturbation": Perturbation(left_tyre_friction_factor=0.1 / 0.9)}, (0.9, 0.9, 0.5, 0.5, 0.95)
+        {}, {"perturbation": Perturbation(left_tyre_friction_factor=0.1 / 0.9)}, (0.96, 0.96, 0.77, 0.73, 0.94)
     ),
 }  # fmt: skip
 

@@ -315,7 +315,7 @@ def test_command(path, tmp_path, capsys):
         ((str(path), "--to", "csv", "--out", str(out)), "exists already"),
         ((str(path), "--to", "csv", "--out", str(tmp_path / "b"), "--run", "7"), "has no run 7"),
         ((str(path), "--to", "bag", "--out", str(tmp_path / "b")), "bag"),
-        ((str(tmp_path / "none"), "--to", "npz", "--out", str(tmp_path / "b")), "not a saved result"),
+        ((str(tmp_path / "none"), "--to", "npz", "--out", str(tmp_path / "b")), "none: no such file or folder"),
         ((str(path), "--to", "npz", "--out", str(out / "b")), "cannot be written"),
     ):
         assert main(["export", *words]) == 2

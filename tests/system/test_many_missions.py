@@ -11,7 +11,6 @@ from mrctl.navigation.mission import outcomes, prepared, task_of
 from mrctl.results.comparison import wilson
 
 TIERS = "ideal", "lab"  # with the true posture, and with the estimate
-TIGHT = "slalom:200942", "cellular:201140"
 KINDS = "cellular", "corridor", "slalom", "doorway", "warehouse"
 
 
@@ -62,9 +61,13 @@ def test_arrives(robot: str, count: int) -> None:
     assert found["ideal"]["collided"] <= 0.002 * solvable
 
 
-@pytest.mark.parametrize("world", ["slalom:200962", *(pytest.param(w, marks=pytest.mark.full) for w in TIGHT)])
+@pytest.mark.parametrize("world", ["doorway:3", pytest.param("slalom:11", marks=pytest.mark.full)])
 def test_tight_spline(world: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the spline of the first plan steers beyond the limit, a plan of wider arcs is driven, if there is one."""
+    """Where the spline of the first plan steers beyond the limit, a plan of wider arcs is driven, if there is one.
+
+    The plans keep the arcs of the search here, since no world is known in which shortcuts leave such a spline.
+    """
+    monkeypatch.setattr(mission, "shortcut", lambda where, found, *_: found)
     scenario = Scenario(prior="model", learner="composite")
     task = task_of(world, scenario)
     for factor in (1.0, 30.0):  # the same plan again, and one of arcs for which there is no room

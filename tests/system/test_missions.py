@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import mrctl
 from mrctl import Box, Disc, Obstacles, Scenario, cli
 from mrctl.navigation.avoidance import Avoiding, Barrier
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import navigate
+from mrctl.navigation.mission import Avoid, again, jerk_of, navigate, task_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.theory.clearance import cover
@@ -41,8 +42,60 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
         way = np.hypot(np.diff(driven["x"]), np.diff(driven["y"])).sum()
         assert robot["length"] == pytest.approx(way) and 0.9 < robot["spl"] <= 1
         assert f"| {robot['label']} " in printed
+        x, y = (driven[name].values[::10] for name in ("x", "y"))  # every 0.1 s: a subset of the differences
+        assert robot["jerk"] == pytest.approx(np.sqrt(np.mean(np.diff([x, y], 3) ** 2 * 2)) / 1e-3, rel=0.1)
+        assert 0 < robot["planning_time"] < 600
+    assert "jerk, m/s³" in printed and "planning, s" in printed
     again = refused(capsys, "navigate", "doorway:3", "--out", str(out))
     assert "nothing was overwritten" in again
+
+
+def test_jerk() -> None:
+    """On a circle it is V θ̇² at any period of control, of a constant deceleration nothing, of a short run unknown."""
+    for period in (0.01, 0.02):
+        angles = 0.8 * period * np.arange(500.0)
+        circle = 1.5 * np.column_stack([np.cos(angles), np.sin(angles)])
+        assert jerk_of(circle, period) == pytest.approx(1.5 * 0.8**3, rel=1e-3)
+    times = 0.01 * np.arange(100.0)
+    assert jerk_of(np.column_stack([times - times**2 / 2, 3 + 0 * times]), 0.01) < 1e-9
+    assert np.isnan(jerk_of(np.zeros((30, 2)), 0.01))
+
+
+@pytest.mark.parametrize("avoid", get_args(Avoid))
+def test_again(avoid: Avoid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """What is saved of a mission drives it again, bit for bit, also where its world has changed since."""
+    monkeypatch.chdir(tmp_path)
+    yard = '[[shapes]]\nkind = "disc"\nx = 1.0\ny = {}\nradius = 0.2\n'
+    Path("yard.toml").write_text(yard.format(0.5))
+    given = ["--goal", "2", "0", "0", "--speed", "0.7", "--margin", "0.07", "--avoid", avoid, "--compare", "none"]
+    assert cli.main(["navigate", "yard.toml", *given, "--seed", "3", "--sensing.tier", "lab", "--out", "drive"]) == 0
+    Path("yard.toml").write_text(yard.format(0.8))
+    saved, driven = mrctl.open("drive/result.zarr"), again("drive")
+    for name in ("x", "v", "omega_command", "voltage_left", "clearance", "weights"):
+        assert driven.result[name].values.tobytes() == saved[name].values.tobytes()
+    capsys.readouterr()
+    assert cli.main(["navigate", "drive"]) == 0
+    assert "drive: bit-identical" in capsys.readouterr().out
+
+
+def test_changed_mission(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A saved mission that was changed departs, one that lacks a part is refused, and it takes no further flags."""
+    out = tmp_path / "drive"
+    assert cli.main(["navigate", "doorway:3", "--learner", "none", "--out", str(out)]) == 0
+    capsys.readouterr()
+    assert "speed: " in refused(capsys, "navigate", str(out), "--speed", "0.5")
+    file = out / "mission.json"
+    values = json.loads(file.read_text())
+    file.write_text(json.dumps(values | {"speed": 0.5}))
+    assert cli.main(["navigate", str(out)]) == 1
+    assert "departs in " in capsys.readouterr().err
+    for broken in ({k: v for k, v in values.items() if k != "task"}, values | {"avoid": "luck"}, [1]):
+        file.write_text(json.dumps(broken))
+        assert str(file) in refused(capsys, "navigate", str(out))
+    file.write_text("{")
+    assert "is not JSON" in refused(capsys, "navigate", str(out))
+    file.unlink()
+    assert "mission.json" in refused(capsys, "navigate", str(out))
 
 
 def test_outcomes() -> None:
@@ -100,6 +153,13 @@ def test_ends() -> None:
         (["none.toml", "--goal", "3", "0", "0"], "none.toml"),
         (["none.yaml", "--goal", "3", "0", "0"], "none.yaml"),
         (["doorway:3", "--goal", "9", "0", "0"], "goal: no way to (9.00, 0.00) was found"),
+        (["yard.toml", "--goal", "3,0"], "goal: 3,0 is not x, y and θ in m, m, rad, as in --goal 2,0,0"),
+        (["yard.toml", "--goal=3,0,left"], "goal: 3,0,left is not x, y and θ"),
+        (["yard.toml", "--goal", "3,0,0", "--start=nan,0,0"], "start: nan,0,0 is not x, y and θ"),
+        (["yard.toml", "--goal", "3,0,0", "--robot", "tram"], "tram"),
+        (["doorway:3", "--robot"], "robot: needs a value"),
+        (["doorway:3", "--localise", "stars"], "sensing.localisation"),
+        (["doorway:3", "--localise", "--json"], "localise: needs a value"),
         (["doorway:x"], "the seed must be a number"),
         (["maze:3"], "maze:3 is neither a file"),
         (["doorway:3", "--perturbation.control-delay", "0.013"], "control_delay"),
@@ -112,6 +172,71 @@ def test_bad_input_is_one_line(
     monkeypatch.chdir(tmp_path)
     Path("yard.toml").write_text('[[shapes]]\nkind = "disc"\nx = 1.5\ny = 0.8\nradius = 0.2\n')
     assert says in refused(capsys, "navigate", *arguments)
+
+
+@pytest.mark.parametrize(
+    ("robot", "world"),
+    [
+        ("car", "cellular:200000"),  # where the nearest twists and the time of the plan had led the robot to a dead end
+        ("racecar", "corridor:200001"),
+        *(pytest.param("car", f"corridor:{seed}", marks=pytest.mark.full) for seed in (200011, 200036, 200041)),
+    ],
+)
+def test_barrier_arrives(robot: str, world: str) -> None:
+    """Among obstacles that the plan passes by, the filter slows the robot, and does not lead it off its plan."""
+    scenario = Scenario.from_dict({"prior": "model", "learner": "none", "robot": {"path": robot}})
+    driven, free = (
+        navigate(task_of(world, scenario), scenario, avoid=avoid).table.to_dict("records")[0]
+        for avoid in ("barrier", "none")
+    )
+    assert driven["outcome"] == free["outcome"] == "arrived" and driven["clearance"] > 0.03
+    assert 1.05 * free["time"] < driven["time"] < 2 * free["time"] and driven["spl"] > 0.98
+
+
+def test_barrier_waits() -> None:
+    """Discs that cross are hit without the filter, and waited for with it, alone as in a batch."""
+    shapes = [Disc(x=1.0, y=2.0, radius=0.1)]
+    for x, y, speed in ((1.8, 1.1, 0.5), (2.8, -1.6, 0.4)):  # across the straight plan
+        heading = -np.sign(y) * np.pi / 2
+        course = mrctl.Line(heading=heading, speed=speed, length=9.0)
+        shapes.append(Disc(x=-abs(y), y=x * np.sign(y), radius=0.15, course=course))
+    task = Task(obstacles=Obstacles(shapes=tuple(shapes)), start=(0.0, 0.0, 0.0), goal=(4.0, 0.0, 0.0))
+    scenario = PID.replace(prior="model")
+    assert navigate(task, scenario).table["outcome"].tolist() == ["collided"]
+    both = navigate(task, scenario, compare=["model"], avoid="barrier")
+    assert both.table["outcome"].tolist() == ["arrived"] * 2 and float(both.table["clearance"].to_numpy().min()) > 0.02
+    alone = navigate(task, scenario, avoid="barrier").result
+    for name in ("x", "v", "omega_command"):
+        values = both.result[name].values
+        np.testing.assert_array_equal(values[1], values[0])
+        np.testing.assert_array_equal(alone[name].values[0], values[0])
+
+
+@pytest.mark.parametrize("tier", ["ideal", "field"])
+def test_idle_barrier(tier: str) -> None:
+    """Where nothing is near the filter does not change a bit, whatever the delay of the sensors."""
+    shapes = (Disc(x=1.0, y=9.0), Disc(x=9.0, y=9.0, course=mrctl.Line(speed=0.1)))
+    task = Task(obstacles=Obstacles(shapes=shapes), start=(0.0, 0.0, 0.0), goal=(3.0, 0.5, 0.2))
+    own = PID.replace(sensing={"tier": tier})
+    free, filtered = (navigate(task, own, avoid=avoid).result for avoid in ("none", "barrier"))
+    ticks = min(free.sizes["time"], filtered.sizes["time"])
+    for name in ("x", "v", "omega_command", "voltage_left"):
+        np.testing.assert_array_equal(filtered[name][0, :ticks], free[name][0, :ticks], name)
+
+
+def test_short_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """The command as the issue writes it asks for the same mission as the long flags do."""
+    monkeypatch.chdir(tmp_path)
+    Path("yard.toml").write_text('[[shapes]]\nkind = "disc"\nx = 0.6\ny = 0.8\nradius = 0.2\n')
+    short = ["--goal", "1,-0.1,0", "--start=-0.2,0,0", "--robot", "turtlebot", "--localise=particles"]
+    long = ["--goal", "1", "-0.1", "0", "--start", "-0.2", "0", "0", "--robot.path", "turtlebot"]
+    found = []
+    for flags in (short, [*long, "--sensing.localisation", "particles"]):
+        assert cli.main(["navigate", "yard.toml", *flags, "--learner", "fel", "--json"]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+        found[-1]["robots"][0].pop("planning_time")
+    assert found[0] == found[1] and found[0]["scenario"]["robot"]["path"] == "turtlebot"
+    assert found[0]["task"]["goal"] == [1.0, -0.1, 0.0] and found[0]["robots"][0]["outcome"] == "arrived"
 
 
 class Blind:

@@ -20,6 +20,7 @@ from mrctl.theory.robot import RobotFile
 
 H = 0.01
 NO_MOTION_CONTROLLER = Kanayama(k_x=0, k_y=0, k_theta=0)
+ROBOT = read_robot(load("flat"))
 PIDS = {"normal": Pid(time_constant=0.15), "fast": Pid(time_constant=0.075)}
 
 
@@ -174,6 +175,18 @@ def test_designed_is_measured(robot, pid, delays):
         assert found["sensitivity"] == pytest.approx(wanted["sensitivity"], abs=0.1)
         if pid.time_constant is None:
             assert found["sensitivity"] < 1.7 and found["bandwidth"] > 35
+
+
+@pytest.mark.parametrize("late", ["encoder_latency", "gyro_latency"])
+def test_late_sensors_are_in_the_design(late):
+    """The PID is designed for the delay of the whole chain, on which an estimator waits for its slowest sensor."""
+    sensing = mrctl.Sensing(tier="ideal", estimator="odometry", delay=0.01, **{late: 0.02})
+    slow = mrctl.Scenario(**IDEAL | {"kanayama": NO_MOTION_CONTROLLER, "pid": Pid(), "sensing": sensing})
+    frequency, (t,) = measure([slow], 0)
+    plant = first_order(ROBOT.velocity_gain, ROBOT.velocity_time_constant)
+    loop = sampled_loop(frequency, plant, Pid(delay=0.03).channels(ROBOT, rigid=False)[0], H, 0.03)
+    wanted, found = (np.abs(1 - one).max() for _, one in (refine(frequency, loop / (1 + loop)), refine(frequency, t)))
+    assert wanted == pytest.approx(1.6, abs=0.1) and found == pytest.approx(wanted, abs=0.1)
 
 
 @pytest.mark.parametrize(

@@ -156,6 +156,36 @@ def test_slow_motion():
     assert calls == [0.05] + [3] * 80
 
 
+def test_followed():
+    """What a motion controller says that it follows replaces the reference, and has to have its shape."""
+
+    class Later(Kanayama):
+        def __init__(self, robot, size):
+            super().__init__(robot, size)
+            self.course = np.hstack(Circle(period=4, radius=0.5).sample(0.01 * np.arange(400.0)))
+            self.ticks = 0
+
+        def output(self, pose, twist, reference):
+            now = self.course[[max(0, self.ticks - 50)] * len(pose)] * ([1] * 3 + [self.ticks >= 50] * 4)
+            self.ticks, self.followed = self.ticks + 1, now
+            return super().output(pose, twist, now)
+
+    start = {"initial_pose": (0.0, 0.0, 0.0), "initial_spread": (0, 0, 0)}
+    rests = [s.model_copy(update=start) for s in THREE]
+    found = simulate(rests, motion=Later)
+    x, y = Circle(period=4, radius=0.5).sample(np.array([2.0])).pose[0, :2]  # where it is half a second later
+    assert np.abs(found.x.values[:, 250] - x).max() < 0.03 and np.abs(found.y.values[:, 250] - y).max() < 0.03
+
+    class Short(Later):
+        def output(self, pose, twist, reference):
+            found = super().output(pose, twist, reference)
+            self.followed = self.followed[:, :3]
+            return found
+
+    text = str(simulate(THREE, motion=Short).failure.values[0])
+    assert text.startswith("motion Short: `followed` is shape (3, 3), expected shape (3, 7)")
+
+
 def test_stanley():
     """A published motion controller in a few lines drives the robot, and the label of the result names it."""
     run = simulate(LAP, motion=Stanley)

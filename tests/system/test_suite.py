@@ -367,7 +367,7 @@ def test_controller_joins(whole: Path, tmp_path: Path) -> None:
 
 def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """A cell counts where the mean is no more than the rival's and the floor; each time it is driven is kept."""
-    monkeypatch.setattr(held_out, "COURSES", {"circle": mrctl.Circle(radius=0.5, period=LAP)})
+    monkeypatch.setattr(held_out, "courses", lambda: {"circle": mrctl.Circle(radius=0.5, period=LAP)})
     plants = {"heavy": mrctl.Perturbation(mass_factor=2.0), "light": mrctl.Perturbation(mass_factor=0.6)}
     monkeypatch.setattr(held_out, "PLANTS", plants)
     monkeypatch.setattr(held_out, "LAPS", 2)

@@ -291,7 +291,7 @@ def test_repeat_names_another_version(sweep, tmp_path, capsys):
     store = tmp_path / "store"
     jobs.run(sweep, store, 1)
     Store(store)._signals[14, 7, 3] = 3.0
-    aged(store)
+    aged(store, **{KIND: 2})
     line = refused(capsys, "run", store, "--run", 14, status=1)
     assert line.endswith(f"in the store 3.0 (of mrctl 0.1.0; this is mrctl {mrctl.__version__})")
 

@@ -16,6 +16,7 @@ from mrctl.sensing.tiers import Sensing
 from mrctl.theory.references import Reference
 from mrctl.theory.robot import RobotFile
 from mrctl.viewer import live as module
+from mrctl.viewer.controls import ANEW, ANEW_HINT
 from mrctl.viewer.live import Live
 from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.server import Server
@@ -145,6 +146,46 @@ def test_typing(live):
         live._apply_inputs()
         assert handle.value == float(text) and live.message == ""
     assert live.session.start[0].prefilter == 0.05
+
+
+def test_marks(live):
+    """The inputs whose change begins another run are marked, and no others; both tabs say what the mark means."""
+    live._restart([Scenario()])
+    for (first, *_), handle in live._controls._inputs.items():
+        anew = first not in CHANGEABLE
+        assert (ANEW in handle.label, ANEW_HINT in (handle.hint or "")) == (anew, anew), handle.label
+    assert live._controls._inputs["learner",].label == f"learner{ANEW}" and live._robot.label == f"robot{ANEW}"
+
+
+def test_sliders(live):
+    """A slider shows what is usual for the robot; a number beyond its ends is accepted up to the record's limits."""
+    payload, size = ("perturbation", "payload"), ("reference", "lemniscate", "size")
+    shown = {}
+    for name in ("turtlebot", "racecar", "car"):
+        live._choose_robot(name)
+        robot, inputs = live.session.robot, live._controls._inputs
+        for path, handle in inputs.items():
+            if isinstance(handle, viser.GuiSliderHandle):
+                assert handle.min <= handle.value <= handle.max and handle.max > handle.min, path
+        speed = inputs["reference", "line", "speed"]
+        assert inputs[payload].max == pytest.approx(robot.mass, rel=0.05)
+        assert speed.max == pytest.approx(max(robot.max_speed, speed.value), rel=0.05)
+        shown[name] = inputs[size].max
+    assert shown["turtlebot"] < shown["racecar"] < shown["car"] < 20
+    live._restart([Scenario()])
+    handle = inputs[payload]
+    for typed in (6.0, 60.0):
+        visitor_sets(live, handle, typed)
+    assert handle.max == 60.0  # before a page, which somebody leaves, limits it
+    live._run_requests()
+    live._apply_inputs()
+    assert live.session.state()["perturbation"].payload == 60.0 and live.message == ""
+    live._press("Payload", "remove")
+    assert (handle.value, handle.max) == (0.0, 20.0)
+    visitor_sets(live, handle, 300.0)
+    live._run_requests()
+    live._apply_inputs()
+    assert "payload" in live.message and (handle.value, handle.max) == (0.0, 20.0)
 
 
 def test_whole_numbers(live):

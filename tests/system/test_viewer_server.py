@@ -181,6 +181,29 @@ def until(condition, seconds):
     assert condition()
 
 
+def test_wire(server):
+    """A visitor of the two robots that `mrctl view` begins with is sent less than 0.6 MB/s once the curves are full."""
+    live = Live([Scenario(prior="model", learner="composite"), Scenario(learner="none")], server)
+    while live.session.time < 12.5:
+        live.session.step()
+    loop = threading.Thread(target=live.run)
+    loop.start()
+    try:
+        with client(server) as visitor:
+            visitor.send(packed(CAMERA))
+            start, received = time.monotonic() + 2, 0  # the scene comes first
+            while (now := time.monotonic()) < start + 4:
+                received += len(visitor.recv(timeout=30)) * (now > start)
+        for chart in live._plots._handles:
+            t, *_, marks = chart.data
+            assert 200 <= len(t) <= 201 and t[-1] > 12.5 and marks.nbytes == len(t)
+            assert {values.dtype for values in chart.data[:-1]} == {np.dtype(np.float32)}
+    finally:
+        live.close()
+        loop.join()
+    assert 0.1e6 < received / (now - start) < 0.6e6  # a slow machine sends less, not more
+
+
 @pytest.mark.parametrize(("visits", "together"), [(30, 6), pytest.param(400, 30, marks=pytest.mark.full)])
 def test_many_visitors(server, visits, together):
     """Visitors one after the other, and then together: everyone is sent the scene, it drives on, and leaks nothing."""

@@ -37,7 +37,7 @@ def look(page, path, frame="window"):
     if frame == "window":
         x, y = page.evaluate(WORLD_TO_SCREEN, node(page, ROBOT).tolist())
         wide = page.viewport_size["width"] > 600
-        assert (430 if wide else 0) < x < (960 if wide else 390) and 0 < y < (800 if wide else 844 / 2)
+        assert (344 if wide else 0) < x < (986 if wide else 390) and 0 < y < (800 if wide else 844 / 2)
     page.screenshot(path=path, timeout=PATIENCE)
     return picture(page, path.with_stem(path.stem + "_scene")) if frame == "window" else None
 

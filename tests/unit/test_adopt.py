@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 import mrctl
-from mrctl import InputError, Perturbation, Robot, RobotFile
+from mrctl import InputError, Perturbation, Robot, RobotFile, cli
 from mrctl.loop.simulation import Simulation
+from mrctl.navigation.mission import navigate, task_of
 from mrctl.physics import mjcf
 from mrctl.physics.elements import fronts
 from mrctl.physics.files import models_folder
+from mrctl.physics.hull import footprint
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
 from mrctl.physics.plant import build
@@ -284,6 +286,33 @@ def test_perturbed(file):
     robot = read_robot(changed)
     assert robot.mass == pytest.approx(1.5 * 14 + 2) and robot.resistance == pytest.approx(2.6)
     assert robot.wheel_radius == pytest.approx(0.102) and robot.drive_loss == pytest.approx(0.3)
+
+
+def test_load_behind(file, capsys):
+    """A robot whose caster and load are behind the driven axle runs without a reference of its own, and is checked."""
+    wheels = wheel("a", "0 0.2 0") + wheel("b", "0 -0.2 0")
+    path = file(document("<freejoint/>" + BOX.format(-0.05) + BALL.format(-0.3) + wheels, MOTORS))
+    robot = read_robot(mjcf.load(robot=mrctl.load_robot(path)))
+    assert robot.wheelbase < 0 and robot.com_offset < 0
+    assert cli.main(["run", "--robot.path", str(path), "--laps", "1"]) == 0
+    cli.main(["check", str(path)])
+    said = capsys.readouterr().out
+    assert "the centre of mass is behind the driven axle" in said and "Error" not in said
+
+
+def test_hull(file):
+    """A robot of somebody's own gets the hull of its parts, collides with a wall, and arrives behind a door."""
+    robot = mrctl.load_robot(file(document(DIFF, MOTORS)))
+    # The box reaches from −0.1 to 0.3 m; the wheels of radius 0.1 m are 0.04 m wide, at ±0.2 m.
+    corners = footprint(mjcf.load("flat", "caster", robot=robot))
+    assert (corners.min(axis=0), corners.max(axis=0)) == (pytest.approx([-0.1, -0.22]), pytest.approx([0.34, 0.22]))
+    own = mrctl.Scenario(robot=robot, prior="model", learner="none", initial_spread=(0, 0, 0))
+    wall = mrctl.Obstacles(shapes=(mrctl.Box(x=1.0, length=0.1, width=2.0),))
+    run = mrctl.simulate(own.replace(reference=mrctl.Line(length=1.0, speed=0.4), laps=1, obstacles=wall))
+    assert run["failure"] == "collision" and 0 < float(run["clearance"].dropna("time")[-1]) < 0.4 * 0.02
+    assert float(run["x"].dropna("time")[-1]) == pytest.approx(0.95 - 0.34, abs=0.01)
+    mission = navigate(task_of("doorway:3", own), own)
+    assert mission.table["outcome"].tolist() == ["arrived"] and float(mission.table["clearance"].iloc[0]) > 0.02
 
 
 PLAIN = '<velocity name="drive" joint="a"/>' + MOTOR.format("b", 30, "")

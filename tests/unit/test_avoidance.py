@@ -1,17 +1,20 @@
-"""The barrier filter: the nearest twist by an independent solver, no collision, idle where clear, and its braking."""
+"""The barrier filter: the nearest twist by two independent solvers, no collision, idle where clear, and its braking."""
 
 import numpy as np
+import osqp
 import pytest
+import scipy.sparse
+import shapely
 from scipy.optimize import nnls
-from test_obstacles import random_shapes
+from test_obstacles import judged, random_shapes
 
-from mrctl import Box, Obstacles, Scenario, Sensing
+from mrctl import Box, Obstacles, Scenario, Sensing, Waypoints
 from mrctl.control.kanayama import kanayama, posture_error
 from mrctl.loop.hierarchy import Hierarchy
-from mrctl.navigation.avoidance import Barrier, Following, avoid, nearest
+from mrctl.navigation.avoidance import Barrier, Following, Pacing, approach, avoid, nearest, share
 from mrctl.physics import mjcf
-from mrctl.theory.clearance import clearance, cover
-from mrctl.theory.obstacles import Surroundings
+from mrctl.theory.clearance import clearance, cover, rim
+from mrctl.theory.obstacles import Surroundings, turned
 
 FOOTPRINT = np.array([[-0.1, -0.2], [0.44, -0.2], [0.44, 0.2], [-0.1, 0.2]])
 BARRIER = Barrier(cover(FOOTPRINT, 4), margin=0.01, deceleration=1.0, period=0.02, lever=0.3)
@@ -27,30 +30,52 @@ def least_distance(request, rows):
     return request - rest[:2] / rest[2]
 
 
-def test_nearest() -> None:
-    """In random half-planes around the origin, of which up to two have it on their border."""
-    random = np.random.default_rng(0)
-    changed = 0
-    for _ in range(2000):
-        rows = random.normal(size=(random.integers(1, 12), 3))
-        rows[:, 2] = -np.abs(rows[:, 2]) * (random.permutation(len(rows)) >= random.integers(3))
-        request = 2 * random.normal(size=2)
+def by_osqp(request, rows):
+    """The same point by the operator splitting of OSQP, which has no active set."""
+    lengths = np.hypot(rows[:, 0], rows[:, 1])
+    solver = osqp.OSQP()
+    solver.setup(
+        scipy.sparse.identity(2, format="csc"), -request, scipy.sparse.csc_matrix(rows[:, :2] / lengths[:, None]),
+        rows[:, 2] / lengths, np.full(len(rows), np.inf), verbose=False, eps_abs=1e-9, eps_rel=1e-9,
+        max_iter=2_000_000, scaling=0, rho=10.0, adaptive_rho=False, alpha=1.8,
+    )  # fmt: skip
+    return solver.solve(raise_error=True).x
+
+
+def half_planes(random):
+    """Up to eleven random half-planes around the origin, of which up to two have it on their border."""
+    rows = random.normal(size=(random.integers(1, 12), 3))
+    rows[:, 2] = -np.abs(rows[:, 2]) * (random.permutation(len(rows)) >= random.integers(3))
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("judge", "count"), [(least_distance, 2000), (by_osqp, 500), pytest.param(by_osqp, 10_000, marks=pytest.mark.full)]
+)
+def test_nearest(judge, count) -> None:
+    """In random half-planes around the origin the point is the judge's to 1e-6."""
+    random, changed, worst = np.random.default_rng(0), 0, 0.0
+    for _ in range(count):
+        rows, request = half_planes(random), 2 * random.normal(size=2)
         found = nearest(request[0], request[1], rows)
-        np.testing.assert_allclose(found, least_distance(request, rows), atol=1e-6)
+        worst = max(worst, np.abs(judge(request, rows) - found).max())
         changed += found != tuple(request)
-    assert 500 < changed < 1999
+    print(f"{count} problems, {changed} requests changed, largest difference {worst:.1e}")
+    assert worst < 1e-6 and count / 4 < changed < count
     only_rest = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float)
     np.testing.assert_allclose(nearest(1.0, 2.0, only_rest), 0.0, atol=1e-12)
 
 
-def test_no_collision() -> None:
+@pytest.mark.parametrize("starts", [25, pytest.param(10_000, marks=pytest.mark.full)])
+def test_no_collision(starts) -> None:
     """Among random obstacles, still ones, with requests that change at random and are obeyed at once."""
-    random, nearer = np.random.default_rng(1), 0
-    for _ in range(30):
+    random, nearer, driven = np.random.default_rng(1), 0, 0
+    while driven < starts:
         outlines = Surroundings(random_shapes(random, 12)).at(0.0)
         pose = random.uniform([-3, -3, -3], [3, 3, 3])
         if min(clearance(_square(disc), pose, outlines) for disc in BARRIER.discs) <= BARRIER.margin:
             continue
+        driven += 1
         request = np.zeros(2)
         for step in range(300):
             if step % 50 == 0:
@@ -61,7 +86,28 @@ def test_no_collision() -> None:
             way = v * BARRIER.period * np.sinc(turn / 2 / np.pi)  # chord of the arc
             pose = pose + [way * np.cos(pose[2] + turn / 2), way * np.sin(pose[2] + turn / 2), turn]
             assert clearance(FOOTPRINT, pose, outlines) > 0
-    assert nearer > 500
+    print(f"{starts} starts, {300 * starts} ticks, {nearer} requests changed, no collision")
+    assert nearer > 20 * starts
+
+
+@pytest.mark.parametrize("worlds", [30, pytest.param(1000, marks=pytest.mark.full)])
+def test_idle_where_it_could_stop(worlds) -> None:
+    """Among obstacles a request is left as it is, to the bit, if every disc could stop by shapely's distance."""
+    random, clear, near = np.random.default_rng(3), 0, 0
+    for _ in range(worlds):
+        obstacles = random_shapes(random, 8)
+        outlines, shapes = Surroundings(obstacles).at(0.0), shapely.union_all([judged(s) for s in obstacles.shapes])
+        poses = random.uniform([-3, -3, -3], [3, 3, 3], (30, 3))
+        for pose, (v, omega) in zip(poses, random.uniform([-1.5, -3], [1.5, 3], (30, 2)), strict=True):
+            speeds = np.hypot(v - omega * BARRIER.discs[:, 1], omega * BARRIER.discs[:, 0])  # of the discs' centres
+            away = shapely.distance(shapely.points(turned(BARRIER.discs[:, :2], pose)), shapes) - BARRIER.discs[:, 2]
+            braking = speeds * BARRIER.period + speeds**2 / 2 / BARRIER.deceleration
+            if np.all(away - BARRIER.margin > braking + 1e-4):
+                clear += 1
+                near += away.min() < 0.3
+                assert avoid(np.array([v, omega]), pose, outlines, BARRIER).tolist() == [v, omega]
+    print(f"{clear} requests from which the robot could stop, {near} of them within 0.3 m of an obstacle")
+    assert clear > 3 * worlds and near > worlds / 3
 
 
 def _square(disc):
@@ -110,3 +156,57 @@ def test_following_has_the_gains_of_the_hierarchy(prefilter: float | None) -> No
     gains = Hierarchy([scenario], robot).state["kanayama"][0]
     kanayama.compiled(error, reference[0, 3:5], gains, request)
     assert np.array_equal(Following(robot, 1, scenario).output(pose, np.zeros((1, 2)), reference)[0], request)
+
+
+def test_share() -> None:
+    """The largest share of a request keeps every half-plane of finite differences, one of them just, or is 1 or 0."""
+    random, partly = np.random.default_rng(3), 0
+    barrier, h = BARRIER._replace(discs=rim(FOOTPRINT, 0.03), margin=0.02), 1e-6
+    for _ in range(60):
+        obstacles = random_shapes(random, 10)
+        alone = [Surroundings(Obstacles(shapes=(shape,))).at(0.0) for shape in obstacles.shapes]
+        pose, request = random.uniform([-3, -3, -3], [3, 3, 3]), random.uniform([-1.5, -3], [1.5, 3])
+        found = share(request, pose, Surroundings(obstacles).at(0.0), barrier)
+        later = pose + h * np.array([request[0] * np.cos(pose[2]), request[0] * np.sin(pose[2]), request[1]])
+        rests = []
+        for disc in barrier.discs:
+            point = disc[:2] + np.array([[1e-9, 0], [0, 1e-9], [-1e-9, 0]])
+            for outlines in alone:
+                near, then = (clearance(point, p, outlines) for p in (pose, later))
+                braked = approach(near - disc[2] - barrier.margin, barrier.deceleration, barrier.period)
+                if near > 0:  # inside, the distance is that from the nearest side
+                    rests.append(found * (then - near) / h + braked)
+        assert min(rests) > -2e-3
+        if 0 < found < 1:
+            assert min(rests) < 2e-3
+            partly += 1
+    assert partly > 15
+
+
+def test_paced_plan_is_driven_whole() -> None:
+    """Robots that obey at once drive the plan itself, more slowly, pass what it passes narrowly, and end at its end."""
+    wall = [Box(x=2.0, y=side * 1.0, length=0.3, width=1.5) for side in (-1, 1)]  # about 2 cm beside the plan
+    plan = Waypoints(
+        points=(*((x / 2, 0) for x in range(7)), (4, 0.5), (5, 1)), closed=False, timing="limits", speed=1.2
+    )
+    robot = mjcf.build()[1]
+    scenario = Scenario(reference=plan, obstacles=Obstacles(shapes=(*wall,)), prior="model")
+    footprint = np.array([[-0.1, -0.225], [0.44, -0.225], [0.44, 0.225], [-0.1, 0.225]])
+    outlines, pose, period = Surroundings(scenario.obstacles).at(0.0), np.zeros((2, 3)), 0.01
+    pose[:] = plan.sample(np.zeros(1)).pose
+    stage = Pacing(robot, 2, scenario, rim(footprint, 0.02), -0.01, 0.1)
+    stage.reset(pose, np.zeros((2, 7)), period)
+    way, ticks = plan.sample(np.linspace(0, plan.period, 4000)).pose, 0
+    least = min(clearance(footprint, place, outlines) for place in way)
+    assert 0 < least < 0.025
+    while np.hypot(*(pose[0, :2] - way[-1, :2])) > 0.01:
+        requests = stage.output(pose, np.zeros((2, 2)), np.zeros((2, 7)))
+        assert np.array_equal(requests[0], requests[1])
+        middle = pose[:, 2] + period / 2 * requests[:, 1]
+        ahead = requests[:, :1] * np.column_stack([np.cos(middle), np.sin(middle)])
+        pose = pose + period * np.column_stack([ahead, requests[:, 1]])
+        assert np.hypot(*(way[:, :2] - pose[0, :2]).T).min() < 2e-3
+        assert clearance(footprint, pose[0], outlines) > least - 2e-3
+        ticks += 1
+        assert ticks < 3 * plan.period / period
+    assert ticks > 1.02 * plan.period / period

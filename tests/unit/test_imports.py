@@ -1,10 +1,15 @@
 """The arrows of the architecture: who may import whom, and who may touch the physics engine."""
 
 import ast
+import os
+import signal
 import subprocess
 import sys
+import time
 from functools import cache
 from pathlib import Path
+
+import pytest
 
 import mrctl
 
@@ -22,6 +27,7 @@ FLOORS = (
     {"sweep", "envs"},
     {"experiments", "viewer"},
     {"cli"},
+    {"__main__"},
 )
 ENGINE = {"physics", "checks", "viewer", "envs"}  # who may import MuJoCo and dm_control
 
@@ -97,7 +103,7 @@ def test_no_circles() -> None:
 def test_rooms() -> None:
     """`ls mrctl` stays short, and every room says at its door what lives there."""
     boxes = {path.name for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
-    assert len(boxes) <= 17
+    assert len(boxes - {"__init__.py", "__main__.py"}) <= 16
     for path in PACKAGE.glob("*/__init__.py"):
         assert len((ast.get_docstring(ast.parse(path.read_text())) or "").splitlines()) >= 3, path
 
@@ -150,3 +156,136 @@ def test_public_module() -> None:
     """`mrctl.plots` is a module, which is there before anything else has imported it."""
     script = "import mrctl; assert callable(mrctl.plots.save)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+EVERY_MODULE = """
+import importlib, os, pkgutil, warnings
+import mrctl
+from numba.core.event import Listener, register
+
+class Compiled(Listener):
+    def on_start(self, event):
+        print("compiled", event.data["dispatcher"])
+
+    def on_end(self, event):
+        pass
+
+warnings.simplefilter("ignore")
+register("numba:compile", Compiled())
+for module in pkgutil.walk_packages(mrctl.__path__, "mrctl."):
+    importlib.import_module(module.name)
+"""
+
+
+def test_import_compiles_nothing(tmp_path: Path) -> None:
+    """No module calls a kernel when it is imported; a command would compile laws only to refuse its arguments."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}  # empty, so that what is called is compiled
+    command = [sys.executable, "-c", EVERY_MODULE]
+    out = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert (out.returncode, out.stdout) == (0, ""), out
+
+
+LIGHT = [
+    "--help", "run --help", "navigate --help", "view --help", "suite --workers 0", "suite --seeds 0",
+    "suite --random -1", "suite --quick --full", "suite --held-out none --random 3", "tune nosuch", "tune no.xml",
+    "tune --world moon", "view nosuch", "view --world moon", "record nosuch --out x.gif", "navigate",
+    "navigate no.toml", "navigate --quick", "navigate doorway:1 --view --json", "navigate doorway:1 --world moon",
+    "navigate doorway:1 --robot.path nosuch", "run --world moon", "run --robot.path nosuch", "run nosuch --run 1",
+    "run --laps 0", "run nosuch.toml", "sweep no.toml --out s", "sweep no.toml --out s --workers 0", "check nosuch",
+    "check --wheels a b -- nosuch", "identify --world moon", "export nosuch --to csv --out x", "dance",
+]  # fmt: skip
+ANSWER = """
+import sys
+from mrctl import cli
+
+for line in {lines!r}:
+    try:
+        status = cli.main(line.split())
+    except SystemExit as stop:
+        status = stop.code or 0
+    print("answered", status, *[m for m in {heavy} if m in sys.modules])
+"""
+
+
+def test_answers_before_imports() -> None:
+    """Help, and refusals of what can be seen without physics, come before anything heavy is imported."""
+    heavy = ("numba", "mujoco", "dm_control", "torch", "xarray", "zarr", "scipy", "matplotlib")
+    code = ANSWER.format(lines=LIGHT, heavy=heavy)
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    answers = [line for line in out.stdout.splitlines() if line.startswith("answered")]
+    assert answers == [f"answered {0 if '--help' in line else 2}" for line in LIGHT], out
+    assert len(out.stderr.splitlines()) == sum("--help" not in line for line in LIGHT), out.stderr
+
+
+FIRST_LINE = """
+import os, sys
+from mrctl import cli
+from numba.core.event import Listener, register
+
+said = []
+write = sys.stderr.write
+sys.stderr.write = lambda text: said.append(text) or write(text)
+
+class Compiled(Listener):
+    def on_start(self, event):  # registered when the laws are about to be compiled, after what announces them
+        os._exit(0 if "".join(said).startswith("mrctl: compiling the laws") else 1)
+
+    def on_end(self, event):
+        pass
+
+from mrctl.loop import announcement
+announcement.announced()
+register("numba:compile", Compiled())
+cli.main(["run", "--laps", "1"])
+os._exit(2)
+"""
+
+
+def test_first_line_before_compiling(tmp_path: Path) -> None:
+    """A cold run says that it compiles before it does."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    out = subprocess.run(
+        [sys.executable, "-c", FIRST_LINE], capture_output=True, text=True, check=False, env=environment
+    )
+    assert out.returncode == 0, out
+
+
+INTERRUPTED = """
+import os, signal, sys
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == {name!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+from mrctl.__main__ import main
+sys.argv = ["mrctl", "run", "--laps", "1", "--learner", "none"]
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["mrctl.cli", "pydantic", "tyro", "numpy", "mrctl.scenario", "xarray", "numba", "mujoco", "mrctl.loop.simulation"],
+)  # fmt: skip
+def test_interrupt_while_importing(name: str) -> None:
+    """Ctrl-C ends a command with one line, whatever it is importing."""
+    code = INTERRUPTED.format(name=name)
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (out.returncode, out.stderr) == (130, "mrctl: interrupted\n"), out
+
+
+@pytest.mark.parametrize("wait", [0.05, 0.2, 0.5, 1.0, 2.0])
+def test_interrupt_of_a_program(wait: float) -> None:
+    """Ctrl-C at any moment after the program has begun; until then Python has no handler and ends without a word."""
+    code = "print(flush=True); from mrctl.__main__ import main; raise SystemExit(main())"
+    command = [sys.executable, "-c", code, "run", "--learner", "none", "--laps", "200"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
+        assert program.stdout and program.stdout.readline()
+        time.sleep(wait)
+        program.send_signal(signal.SIGINT)
+        said = program.communicate()[1]
+    # The announcement of a compilation may stand before it.
+    assert program.returncode == 130 and said.splitlines()[-1] == "mrctl: interrupted"
+    assert "Traceback" not in said

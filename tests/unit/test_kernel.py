@@ -1,6 +1,8 @@
 """Kernels: an edited law reaches all that call it, nothing is compiled at import, and laws can be put in place."""
 
 import ast
+import importlib
+import io
 import os
 import re
 import shutil
@@ -16,7 +18,7 @@ import mrctl
 from mrctl import Event, Line, Scenario, Sensing
 from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
 from mrctl.kernel import Kernel, kernel, over_rows
-from mrctl.loop.announcement import announced
+from mrctl.loop.announcement import announced, called
 from mrctl.loop.simulation import Simulation, run, simulate
 from mrctl.physics.files import models_folder
 
@@ -313,4 +315,28 @@ def test_compilation_is_announced_once(capsys):
     capsys.readouterr()
     for _ in range(2):
         njit(lambda x: x + 1.0)(1.0)
-    assert capsys.readouterr().err == "mrctl: compiling the laws, which takes half a minute, once\n"
+    said = "mrctl: compiling the laws that this needs for the first time, up to half a minute\n"
+    assert capsys.readouterr().err == said
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_sees_a_bar(tmp_path, monkeypatch):
+    """The bar counts a law and those that it calls, each once, though one of them is compiled for two types."""
+    (tmp_path / "three_laws.py").write_text(
+        "from mrctl.kernel import kernel\n\n"
+        "@kernel\ndef inner(x):\n    return x + 1\n\n"
+        "@kernel\ndef middle(x):\n    return inner(x)\n\n"
+        "@kernel\ndef outer(x):\n    return middle(x) + inner(2)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    three = importlib.import_module("three_laws")
+    assert called(three.outer.law) == {f"three_laws.{name}" for name in ("inner", "middle", "outer")}
+    announced()
+    monkeypatch.setattr(sys, "stderr", shown := Terminal())
+    assert three.outer(1.0) == 5.0
+    bar = announced().bar
+    assert (bar.n, bar.total) == (3, 3) and "\rthree_laws.outer:   0%" in shown.getvalue()

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mrctl import Box, Circle, Disc, InputError, Line, Obstacles, Polygon, Scenario
-from mrctl.theory.clearance import clearance, clearances, cover
-from mrctl.theory.grid import at, distance_field, occupancy, rectangles
+from mrctl.theory.clearance import clearance, clearances, cover, rim
+from mrctl.theory.grid import at, distance_field, occupancy, rectangles, value
 from mrctl.theory.obstacles import Surroundings, turned
 
 FOOTPRINT = np.array([[-0.1, -0.2], [0.4, -0.2], [0.45, 0.0], [0.4, 0.2], [-0.1, 0.2]])
@@ -94,6 +94,16 @@ def test_cover(count):
     assert discs.buffer(1e-3).contains(shapely.Polygon(FOOTPRINT))
 
 
+@pytest.mark.parametrize("radius", [0.02, 0.1, 1.0])
+def test_rim(radius):
+    """The discs of an outline cover it, are no larger than asked for, and have their centres on it."""
+    edge, discs = shapely.Polygon(FOOTPRINT).exterior, rim(FOOTPRINT, radius)
+    places = [shapely.Point(x, y) for x, y, _ in discs]
+    covered = shapely.union_all([p.buffer(radius, quad_segs=ROUND) for p in places])
+    assert covered.buffer(1e-4).contains(edge) and np.all(discs[:, 2] == radius)
+    assert max(edge.distance(p) for p in places) < 1e-12 and len(discs) == np.ceil(edge.length / 2 / radius)
+
+
 def test_grid():
     """A cell is free only where no obstacle touches it, and occupied only within its diagonal of one."""
     random = np.random.default_rng(1)
@@ -115,8 +125,9 @@ def test_distance_field():
     wall = Surroundings(Obstacles(shapes=(Box(x=-0.5, y=1, length=1, width=10),))).at(0.0)
     field = distance_field(occupancy(wall, np.array([-0.5, -1.0]), np.array([3.0, 3.0]), 0.05))
     for x, y in ((0.3, 0.4), (1.02, -0.3), (2.5, 2.1), (-0.2, 1.0)):
-        value, dx, dy = at(field, x, y)
-        assert value == pytest.approx(x - 0.05, abs=0.051)  # the border is on that of a cell
+        distance, dx, dy = at(field, x, y)
+        assert distance == pytest.approx(x - 0.05, abs=0.051)  # the border is on that of a cell
+        assert distance == value(field.distance, *field.origin, field.resolution, x, y)
         assert (dx, dy) == pytest.approx((1, 0), abs=1e-9)
     far = at(field, 50.0, 1.0)
     assert far == (pytest.approx(2.95, abs=0.05), 0, 0)

@@ -1,5 +1,6 @@
 """Figures hold the data they are given, carry units, and reach the disk."""
 
+import colorsys
 import json
 import re
 
@@ -96,6 +97,9 @@ def test_colours():
     assert alone in {line.get_color() for line in both}
     (pid, net, own, again) = looks("abcd", ["none", "fel", "mine", "none"])
     assert pid == ("a", (0xD5, 0x5E, 0x00)) and len({pid.colour, net.colour, own.colour, again.colour}) == 4
+    hue = lambda look: colorsys.rgb_to_hsv(*(c / 255 for c in look.colour))[0]  # noqa: E731
+    assert hue(again) == pytest.approx(hue(pid), abs=0.01) and abs(hue(own) - hue(pid)) > 0.02
+    assert len({look.colour for look in looks("abcde", ["fel"] * 5)}) == 5
     assert set(CONTROLLERS) == set(FEEDFORWARDS) and len(set(CONTROLLERS.values())) == len(FEEDFORWARDS)
 
 

@@ -1,0 +1,136 @@
+"""A mission is the same alone, in a batch, in a sweep that was killed and resumed, and replayed from its store.
+
+Runs come in pairs that differ in seed and plant, because robots with the same obstacles share a batch.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_batch_equals_single import equal
+
+import mrctl
+from mrctl import Disc, InputError, Line, Obstacles, Scenario, Sweep, simulate
+from mrctl.loop import user_files
+from mrctl.navigation.mission import prepared, task_of
+from mrctl.results.dataset import SIGNALS
+from mrctl.sweep import jobs
+from mrctl.sweep.pool import Outcome
+from mrctl.sweep.store import Store
+
+AVOIDERS = "barrier", "window", "mppi"
+KINDS = "doorway", "slalom", "corridor", "cellular", "warehouse"
+LOCALISED = "scan", "particles", "none"
+# The motion stage of a mission, as a file that a sweep names.
+STAGE = '''
+from pathlib import Path
+
+from mrctl import Scenario
+from mrctl.navigation.mission import avoiding
+
+
+def Stage(robot, size, case, avoid):
+    """The motion stage of a mission whose scenario is in a file beside this one."""
+    return avoiding(avoid, Scenario.from_toml(Path(__file__).with_name(case + ".toml")))(robot, size)
+'''
+# Runs each sweep in a process of its own, which is killed half-way.
+KILLED = """
+import json
+import os
+import sys
+from pathlib import Path
+
+sys.path.insert(0, sys.argv[1])
+import test_navigation_bits
+from mrctl import Sweep
+from mrctl.sweep import jobs
+
+for name in sys.argv[2:]:
+    if not (child := os.fork()):
+        os.environ["VICTIM"] = str(os.getpid())
+        sweep = Sweep.from_dict(json.loads(Path(name + ".json").read_text()))
+        jobs.run(sweep, name, 1, work=test_navigation_bits.killing)
+        os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status) and os.WTERMSIG(status) == 9, status
+"""
+
+
+def killing(path: str, job: int) -> Outcome:
+    """Kills the process of the sweep in the middle."""
+    if job == Store(path).jobs // 2:
+        os.kill(int(os.environ["VICTIM"]), signal.SIGKILL)
+        time.sleep(60)  # nobody works on for a dead sweep
+    return jobs.compute(path, job)
+
+
+def pair(number: int, avoid: str) -> list[Scenario]:
+    """Two runs of a mission with obstacles, one of which moves; the world, robot and localisation go by the number."""
+    kind, localised = KINDS[number % 5], LOCALISED[number % 3]
+    path = "car" if avoid != "none" else ("car", "turtlebot", "racecar")[number // 15 % 3]
+    own = Scenario.from_dict({"robot": {"path": path}, "prior": "model", "learner": ("none", "composite")[number % 2]})
+    if localised != "none":
+        own = own.replace(sensing={"tier": ("lab", "field")[number % 2], "localisation": localised})
+    while True:  # worlds without a way are left out
+        try:
+            task = task_of(f"{kind}:{number}", own)
+            x, y, _ = task.start
+            course = Line(heading=1.5, speed=0.3)
+            mover = Disc(x=-2.5, y=-x - 1.6, radius=0.1, course=course)  # crosses ahead of the start along +y
+            task = task.replace(obstacles=Obstacles(shapes=(*task.obstacles.shapes, mover.replace(x=y - 1.5))))
+            drive = prepared(task, own, avoid=avoid)[1]  # pyright: ignore[reportArgumentType]
+            break
+        except InputError:
+            number += 15
+    plants = {}, {"mass_factor": 1.2, "payload": 1.0}
+    return [drive.replace(seed=2 * number + k, perturbation=plant) for k, plant in enumerate(plants)]
+
+
+@pytest.mark.parametrize(
+    ("plain", "avoiders", "avoided"),
+    [([1], AVOIDERS[:2], 1), pytest.param(range(160), AVOIDERS, 30, marks=pytest.mark.full)],
+    ids=["6", "500"],
+)
+def test_same_bits(plain: Sequence[int], avoiders: Sequence[str], avoided: int, tmp_path: Path) -> None:
+    """So with and without the stages that avoid obstacles, in worlds of all generators, with either localisation."""
+    (tmp_path / "stage.py").write_text(STAGE)
+    sweeps = {"none": Sweep.of([run for k in plain for run in pair(k, "none")], record="full", chunk=1)}
+    for avoid, number in product(avoiders, range(avoided)):
+        runs, name = pair(number, avoid), f"{avoid}{number}"
+        (tmp_path / f"{name}.toml").write_text(runs[0].to_toml())
+        stage = f"motion={tmp_path}/stage.py:Stage(case='{name}', avoid='{avoid}')"
+        sweeps[name] = Sweep.of(runs, record="full", chunk=1, controller=stage)
+    for name, sweep in sweeps.items():
+        (tmp_path / f"{name}.json").write_text(sweep.model_dump_json())
+    command = [sys.executable, "-c", KILLED, str(Path(__file__).parent), *(str(tmp_path / name) for name in sweeps)]
+    subprocess.run(command, check=True)
+    count, outcomes = 0, []
+    for name, sweep in sweeps.items():
+        store = tmp_path / name
+        assert len(Store(store).done()) == Store(store).jobs // 2 > 0
+        jobs.run(sweep, store, 2)
+        opened = mrctl.open(store)
+        stages = user_files.load(sweep.controller) if sweep.controller else {}
+        for first in range(0, sweep.size, 2):
+            both = [sweep.scenario(run) for run in (first, first + 1)]
+            together = simulate(both, **stages)
+            for row, own in enumerate(both):
+                alone, stored = simulate(own, **stages), opened.isel(run=first + row)
+                equal(alone, together, row)
+                size = alone.sizes["time"]
+                for signal_name in SIGNALS:
+                    kept = stored[signal_name].values
+                    assert kept[:size].tobytes() == alone[signal_name].values.tobytes(), (name, first, signal_name)
+                    assert np.isnan(kept[size:]).all()
+                assert jobs.repeat(store, first + row) == ("bit-identical", True)
+                outcomes.append(str(alone["failure"].values))
+                count += 1
+    print(f"{count} runs have the same bits; failures: { {why: outcomes.count(why) for why in set(outcomes)} }")
+    assert count == 2 * (len(plain) + len(avoiders) * avoided)

@@ -1,0 +1,44 @@
+"""The folder that a command writes to."""
+
+from pathlib import Path
+
+import pytest
+
+from mrctl import InputError
+from mrctl.experiments.tables import output_folder
+
+
+def test_refused_command_leaves_nothing(tmp_path: Path) -> None:
+    """Folders that were made are removed, those that were there are kept, and so is what was written."""
+    with pytest.raises(InputError, match="no"), output_folder(tmp_path / "a" / "b"):
+        raise InputError("no")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "a").mkdir()
+    with pytest.raises(InputError, match="no"), output_folder(tmp_path / "a"):
+        raise InputError("no")
+    with pytest.raises(InputError, match="no"), output_folder(tmp_path / "b"):
+        (tmp_path / "b" / "x").touch()
+        raise InputError("no")
+    assert sorted(tmp_path.rglob("*")) == [tmp_path / "a", tmp_path / "b", tmp_path / "b" / "x"]
+
+
+def test_what_exists_is_kept(tmp_path: Path) -> None:
+    """No file is overwritten, and none is taken for a probe of the folder."""
+    for name in (".writable", "table.json"):
+        (tmp_path / name).write_text("mine")
+    with pytest.raises(InputError, match=r"holds table\.json already"), output_folder(tmp_path, ["x", "table.json"]):
+        raise AssertionError
+    with output_folder(tmp_path, ["x"]):
+        pass
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {".writable": "mine", "table.json": "mine"}
+
+
+def test_no_folder() -> None:
+    with output_folder(None):
+        pass
+
+
+def test_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"), output_folder(tmp_path / "file" / "out"):
+        raise AssertionError
