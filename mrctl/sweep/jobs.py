@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +34,7 @@ from mrctl.sweep.pool import Cluster, Outcome, Pool, Processes, Work
 from mrctl.sweep.store import Store
 from mrctl.theory.robot import CAR
 
+SHOWING = ("checks", "envs", "experiments", "viewer", "cli.py", "__main__.py")  # rooms on which no stored run depends
 TOLERANCE = 1e-9  # relative difference within which a repeated run agrees
 ASIDE = "set aside: "
 
@@ -169,6 +171,7 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
     return {
         "sweep": sweep.model_dump(mode="json"),
         "versions": versions(),
+        "code": code_digest(),
         "models": models,
         "size": sweep.size,
         "chunk": sweep.chunk_size,
@@ -177,6 +180,21 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
         "control_period": sweep.base.control_period,
         "signals": list(SIGNALS),
     }
+
+
+@cache
+def code_digest() -> str:
+    """Returns a digest of the files on which the runs of a sweep depend.
+
+    The version of mrctl stays the same between two commits; this digest does not, so that a sweep that was begun before
+    a law was changed is not finished after it.
+    """
+    package = Path(__file__).parents[1]
+    found = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        if path.relative_to(package).parts[0] not in SHOWING:
+            found.update(path.read_bytes())
+    return found.hexdigest()
 
 
 def _models(sweep: Sweep) -> dict[str, str]:
@@ -224,6 +242,8 @@ def _agreed(manifest: str) -> Sweep:
     for name, version in versions().items():
         if version != (begun := agreed["versions"].get(name)):
             raise InputError(f"{worker}: has {name} {version}, but the store was begun with {name} {begun}")
+    if agreed.get("code") != code_digest():
+        raise InputError(f"{worker}: has other laws than the process that began the store")
     sweep = Sweep.from_dict(agreed["sweep"], "sweep")
     if unlike := [name for name, digest in _models(sweep).items() if digest != agreed["models"].get(name)]:
         raise InputError(f"{worker}: {unlike[0]} is not the store's")

@@ -87,7 +87,7 @@ class Store:
     Attributes:
         path: The folder.
         writer: The version of mrctl that began it.
-        manifest: What `sweep.json` holds: `sweep`, `versions`, `models`, `size`, `chunk`, `samples`,
+        manifest: What `sweep.json` holds: `sweep`, `versions`, `code` (a digest), `models`, `size`, `chunk`, `samples`,
             `stride` (control periods between samples), `control_period` in s, `signals` (names of the signals kept).
     """
 

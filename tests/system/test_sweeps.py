@@ -7,6 +7,7 @@ import json
 import os
 import random
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -215,7 +216,25 @@ def test_changed_sweep(file, sweep, tmp_path, capsys, whole):
     assert f"mrctl {mrctl.__version__} began this sweep and this is mrctl 9.1" in line
     with mock.patch("mrctl.physics.mjcf.digest", lambda model: "another"):
         assert "begun with another models.flat (" in refused(capsys, "sweep", file, "--out", store)
+    with mock.patch("mrctl.sweep.jobs.code_digest", lambda: "another"):  # a law was edited, the version stays
+        assert 'now "another")' in refused(capsys, "sweep", file, "--out", store)
+        with pytest.raises(InputError, match="has other laws than the process that began the store"):
+            jobs._agreed(json.dumps(Store(store).manifest))
     assert content(store) == whole
+
+
+def test_digest_of_the_code(tmp_path):
+    """It changes with a design that holds no kernel, and not with the viewer."""
+    package = Path(mrctl.__file__).parent
+    copy = tmp_path / "mrctl"
+    shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__", "*.md"))
+    digests = []
+    for file in ("viewer/live.py", "control/design.py", "theory/references.py"):
+        with mock.patch("mrctl.sweep.jobs.__file__", str(copy / "sweep" / "jobs.py")):
+            digests.append(jobs.code_digest.__wrapped__())
+        with (copy / file).open("a") as text:
+            text.write("\nEDITED = 1\n")
+    assert digests[0] == digests[1] == jobs.code_digest() != digests[2]
 
 
 def aged(store, version="0.1.0", drop=(), **manifest):
