@@ -216,9 +216,9 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
         raise InputError(describe(error)) from None
     except SystemExit as stop:
         if stop.code:
-            for name in Scenario.moved:  # the error names what to set in its place
-                if arguments[0] == "run" and f"--{name}" in arguments:
-                    Scenario.from_dict({name: ""})
+            for flag in arguments:
+                if flag.startswith("--"):
+                    Scenario.refuse_moved(flag[2:].partition("=")[0].replace("-", "_"))
             raise InputError(_one_line(complaints.getvalue())) from None
         if _is_short_help(arguments):
             print(_further_flags(arguments[0]))

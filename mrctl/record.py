@@ -19,6 +19,7 @@ from mrctl import __version__
 
 LARGEST = 4 * 2**20  # bytes, largest text file of settings; one of this size takes some seconds to read
 WRITTEN_BY = "# written by mrctl "  # how a TOML file begins that `to_toml` made
+GONE = "this field of an earlier version is gone"
 
 
 class InputError(ValueError):
@@ -100,8 +101,24 @@ class Record(BaseModel):
     @classmethod
     def _knows_moved_fields(cls, values: Any) -> Any:  # noqa: ANN401
         for name in cls.moved.keys() & values.keys() if isinstance(values, dict) else ():
-            raise ValueError(f"{name}: this field of an earlier version is gone; {cls.moved[name]}")
+            raise ValueError(f"{name}: {GONE}; {cls.moved[name]}")
         return values
+
+    @classmethod
+    def refuse_moved(cls, path: str) -> None:
+        """Refuses the dotted path of a field if that is one of an earlier version.
+
+        Raises:
+            InputError: It is; the message says what to set in its place.
+        """
+        values: object = None
+        for part in reversed(path.split(".")):
+            values = {part: values}
+        try:
+            cls.from_dict(values)
+        except InputError as error:
+            if GONE in str(error):
+                raise
 
     def replace(self, **changes: Any) -> Self:  # noqa: ANN401
         """Returns the record with other values in these fields, validated as a whole.

@@ -167,7 +167,7 @@ def left(path: Path) -> float:
 def pace() -> float:
     """Measures the simulated seconds that one core drives in a second, metrics included, on a short drive."""
     batch = replicates(Scenario(laps=1, reference=Circle(period=4.0, radius=0.5), prior="model"), CHUNK)
-    simulate(batch[:1], threads=1)  # compiles or loads the kernels
+    metrics.per_lap(simulate(batch[:1], threads=1))  # compiles or loads the kernels
     began = time.perf_counter()
     metrics.per_lap(simulate(batch, threads=1))
     return sum(s.duration for s in batch) / (time.perf_counter() - began)

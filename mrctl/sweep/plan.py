@@ -319,6 +319,7 @@ def _put(data: Any, field: str, value: object) -> Any:  # noqa: ANN401
         known = dict(enumerate(node)) if isinstance(node, list) else node if isinstance(node, dict) else {}
         names = {str(key): key for key in known}
         if part not in names:
+            Scenario.refuse_moved(field)
             where = ".".join(parts[:depth]) or "the scenario"
             raise InputError(f"{field}: no {part!r} in {where}" + (f", which has {', '.join(names)}" if names else ""))
         passed.append((node, names[part]))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mrctl import InputError, LaneChange, Perturbation, RobotFile, Scenario, simulate
+from mrctl import InputError, LaneChange, Perturbation, RobotFile, Scenario, Sweep, simulate
+from mrctl.cli import main
 from mrctl.loop.simulation import Simulation, suited
 from mrctl.physics.tyres import measure
 from mrctl.results.dataset import SIGNALS
@@ -381,3 +382,30 @@ def test_old_keys(old, successor):
     with pytest.raises(InputError) as error:
         Scenario.from_dict(old)
     assert successor in str(error.value) and "\n" not in str(error.value), error.value
+
+
+@pytest.mark.parametrize(
+    ("command", "successor"),
+    [
+        ("run --feedforward fel", "set prior and learner"),
+        ("view --feedforward=fel", "set prior and learner"),
+        ("navigate doorway:3 --feedforward fel", "set prior and learner"),
+        ("run --perturbation.velocity-noise 0.1", "sensing.encoder_counts"),
+        ("identify --perturbation.rotation-noise=0.1", "sensing.gyro_noise"),
+        ("run --composite.weights trained", "save_learned"),
+    ],
+)
+def test_old_flags(command, successor, capsys):
+    """So does a flag of an earlier version, of whichever command."""
+    assert main(command.split()) == 2
+    assert successor in (line := capsys.readouterr().err.strip()) and "\n" not in line, line
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "successor"),
+    [("feedforward", "none", "set prior and learner"), ("perturbation.velocity_noise", 0.1, "sensing.encoder_counts")],
+)
+def test_old_axes(field, value, successor):
+    """So does an axis of a sweep."""
+    with pytest.raises(InputError, match=successor):
+        Sweep.from_dict({"runs": 1, "axes": [{"field": field, "values": [value]}]})
