@@ -37,8 +37,8 @@ FIRST = ("name", "world", "steering", "reference", "laps", "prior", "learner", "
 
 FROM_FILES = ("events", "obstacles")
 """Fields of `Scenario` that have no flags, because they come from a scenario file."""
-GIVEN = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
-"""Fields of `Scenario` that `mrctl navigate` has no flags for, since they come from files or from the mission."""
+NOT_OF_MISSIONS = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
+"""Fields of `Scenario` without flags in `mrctl navigate`: they come from files, or the mission sets them."""
 
 BEST: FeedforwardName = "model+composite"
 """Feedforward with the least error under `all` in `lab` and `field`, of those in the README that do not know the plant.
@@ -46,8 +46,8 @@ BEST: FeedforwardName = "model+composite"
 `navigate` drives with it, and `view` shows it beside PID alone.
 """
 
-IN_A_FILE = {"MININTERVAL": "60", "MAXINTERVAL": "60", "BAR_FORMAT": "{l_bar}{bar}{r_bar}\n"}
-"""Settings of tqdm with which progress that nobody watches is a line a minute, not a bar that moves."""
+TQDM_WITHOUT_TERMINAL = {"MININTERVAL": "60", "MAXINTERVAL": "60", "BAR_FORMAT": "{l_bar}{bar}{r_bar}\n"}
+"""tqdm settings for output that is no terminal: one line a minute."""
 
 SHORT = {"--robot": "--robot.path", "--localise": "--sensing.localisation"}
 """Flags that stand for longer ones."""
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"mrctl {__version__}")
         return 0
     if not sys.stderr.isatty():
-        for name, value in IN_A_FILE.items():
+        for name, value in TQDM_WITHOUT_TERMINAL.items():
             os.environ.setdefault(f"TQDM_{name}", value)  # which tqdm reads when it is imported
     if isinstance(sys.stdout, io.TextIOWrapper):  # a file may have a name that is not UTF-8
         sys.stdout.reconfigure(errors="replace")
@@ -135,7 +135,7 @@ class _Incomplete(Exception):
 
 
 def _written_out(arguments: list[str]) -> list[str]:
-    """Replaces what is written shortly by the flags that it stands for.
+    """Expands short flags into full ones.
 
     `--perturbation NAME` becomes the flags of that perturbation, which later flags override, a flag of `SHORT` the
     longer one, and a pose x,y,θ three numbers.
@@ -288,7 +288,7 @@ def _part(scenario: Scenario, names: Sequence[str]) -> Record:
 
 def _further_flags(command: str) -> str:
     """Lists and explains the fields, or groups of fields, whose flags the short help of a command leaves out."""
-    never = GIVEN if command == "navigate" else FROM_FILES
+    never = NOT_OF_MISSIONS if command == "navigate" else FROM_FILES
     left_out = [name for name in Scenario.model_fields if name not in (*FIRST, *never)]
     # Perturbations are what people change most.
     names = sorted(left_out, key=lambda name: name != "perturbation")
@@ -353,7 +353,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
     """Returns the `navigate` command, whose short help leaves out the same fields as that of `run`."""
     names = FIRST if _is_short_help(arguments) else Scenario.model_fields
     default = Scenario() if {"prior", "learner"} & _given(arguments) else Scenario(**FEEDFORWARDS[BEST])
-    part = _part(default, [name for name in names if name not in GIVEN])
+    part = _part(default, [name for name in names if name not in NOT_OF_MISSIONS])
 
     def navigate(
         world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MAP|GENERATOR:SEED|MISSION")] = "",

@@ -94,7 +94,8 @@ class Mrac(Record):
     of the supply (of a tenth of that number in rad/s on a steering channel); the projection acts at twice that
     distance."""
     leak: Annotated[float, Field(ge=0, le=1e3)] = 0.1
-    """Leak σ₀ in 1/(V² s) at twice that distance."""
+    """Leak rate σ₀ in 1/(V² s) of parameters at a distance of 2 `radius` from the prior's; it rises linearly from 0 at
+    `radius`."""
     filter: Annotated[float, Field(ge=0.005, le=2)] = 0.03
     """Time constant T in s of each of the two filters on voltage and motion."""
     hand_over: bool = False
