@@ -28,7 +28,7 @@ from pydantic import ValidationError
 from mrctl import __version__
 from mrctl.record import InputError, Record, describe, printable, reading
 from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario
-from mrctl.sensing.tiers import TIERS, Sensing, Tier
+from mrctl.sensing.tiers import LAB, TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, RobotFile
 
@@ -54,7 +54,6 @@ SHORT = {"--robot": "--robot.path", "--localise": "--sensing.localisation"}
 POSES = "--goal", "--start"
 """Flags of `navigate` whose values may be written as x,y,θ."""
 
-LAB = Sensing(tier="lab")
 DELAYS = 0.0, 0.01, 0.02  # s
 
 
