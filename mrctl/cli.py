@@ -28,7 +28,7 @@ from pydantic import ValidationError
 from mrctl import __version__
 from mrctl.record import InputError, Record, describe, printable, reading
 from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario
-from mrctl.sensing.tiers import TIERS, Sensing, Tier
+from mrctl.sensing.tiers import LAB, TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.robot import CAR, RobotFile
 
@@ -37,8 +37,11 @@ FIRST = ("name", "world", "steering", "reference", "laps", "prior", "learner", "
 
 FROM_FILES = ("events", "obstacles")
 """Fields of `Scenario` that have no flags, because they come from a scenario file."""
-GIVEN = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
-"""Fields of `Scenario` that `mrctl navigate` has no flags for, since they come from files or from the mission."""
+NOT_OF_MISSIONS = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
+"""Fields of `Scenario` without flags in `mrctl navigate`: they come from files, or the mission sets them."""
+
+IDENTIFIED = ("perturbation", "robot", "sensing")
+"""Arguments of `mrctl identify` that are records; its short help lists them, as that of `run` does with its fields."""
 
 BEST: FeedforwardName = "model+composite"
 """Feedforward with the least error under `all` in `lab` and `field`, of those in the README that do not know the plant.
@@ -46,15 +49,14 @@ BEST: FeedforwardName = "model+composite"
 `navigate` drives with it, and `view` shows it beside PID alone.
 """
 
-IN_A_FILE = {"MININTERVAL": "60", "MAXINTERVAL": "60", "BAR_FORMAT": "{l_bar}{bar}{r_bar}\n"}
-"""Settings of tqdm with which progress that nobody watches is a line a minute, not a bar that moves."""
+TQDM_WITHOUT_TERMINAL = {"MININTERVAL": "60", "MAXINTERVAL": "60", "BAR_FORMAT": "{l_bar}{bar}{r_bar}\n"}
+"""tqdm settings for output that is no terminal: one line a minute."""
 
 SHORT = {"--robot": "--robot.path", "--localise": "--sensing.localisation"}
 """Flags that stand for longer ones."""
 POSES = "--goal", "--start"
 """Flags of `navigate` whose values may be written as x,y,θ."""
 
-LAB = Sensing(tier="lab")
 DELAYS = 0.0, 0.01, 0.02  # s
 
 
@@ -74,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"mrctl {__version__}")
         return 0
     if not sys.stderr.isatty():
-        for name, value in IN_A_FILE.items():
+        for name, value in TQDM_WITHOUT_TERMINAL.items():
             os.environ.setdefault(f"TQDM_{name}", value)  # which tqdm reads when it is imported
     if isinstance(sys.stdout, io.TextIOWrapper):  # a file may have a name that is not UTF-8
         sys.stdout.reconfigure(errors="replace")
@@ -135,7 +137,7 @@ class _Incomplete(Exception):
 
 
 def _written_out(arguments: list[str]) -> list[str]:
-    """Replaces what is written shortly by the flags that it stands for.
+    """Expands short flags into full ones.
 
     `--perturbation NAME` becomes the flags of that perturbation, which later flags override, a flag of `SHORT` the
     longer one, and a pose x,y,θ three numbers.
@@ -193,7 +195,7 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
         "sweep": sweep,
         "suite": suite,
         "tune": tune,
-        "identify": identify,
+        "identify": _identify_with(arguments),
         "check": check,
         "bench": bench,
         "view": _view_with(arguments),
@@ -254,10 +256,12 @@ def _one_line(box: str) -> str:
 
 
 def _is_short_help(arguments: Sequence[str]) -> bool:
-    """Tells whether a command line asks for the short help of a scenario; the help of a reference is always short."""
+    """Tells whether a command line asks for the short help of a command; the help of a reference is always short."""
     asked = bool({"-h", "--help"} & set(arguments))
     return (
-        arguments[0] in ("run", "navigate", "view") and asked and not any(a.startswith("reference:") for a in arguments)
+        arguments[0] in ("run", "navigate", "identify", "view")
+        and asked
+        and not any(argument.startswith("reference:") for argument in arguments)
     )
 
 
@@ -288,8 +292,11 @@ def _part(scenario: Scenario, names: Sequence[str]) -> Record:
 
 def _further_flags(command: str) -> str:
     """Lists and explains the fields, or groups of fields, whose flags the short help of a command leaves out."""
-    never = GIVEN if command == "navigate" else FROM_FILES
-    left_out = [name for name in Scenario.model_fields if name not in (*FIRST, *never)]
+    if command == "identify":
+        left_out = list(IDENTIFIED)
+    else:
+        never = NOT_OF_MISSIONS if command == "navigate" else FROM_FILES
+        left_out = [name for name in Scenario.model_fields if name not in (*FIRST, *never)]
     # Perturbations are what people change most.
     names = sorted(left_out, key=lambda name: name != "perturbation")
     lines = [f"Further flags, which `mrctl {command} --help-all` explains one by one:"]
@@ -297,6 +304,8 @@ def _further_flags(command: str) -> str:
         field = Scenario.model_fields[name]
         flag = f"--{name.replace('_', '-')}" + (".*" if isinstance(field.default, Record) else "")
         lines += textwrap.wrap(field.description or "", 80, initial_indent=f"  {flag:<17} ", subsequent_indent=" " * 20)
+    if command in ("run", "view"):
+        lines.append(f"`mrctl {command} reference:circle --help` lists the flags of a reference, here of a circle.")
     return "\n".join(lines)
 
 
@@ -306,7 +315,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
     default = Scenario.from_toml(scenario_file) if scenario_file else Scenario()
 
     def run(
-        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml|STORE")] = None,
+        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO.toml|STORE]")] = None,
         /,
         scenario: Annotated[Scenario, tyro.conf.arg(name="")] = default,
         out: Path | None = None,
@@ -320,13 +329,13 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         The exit status is 1 if the run fails.
 
         Args:
-            file: Scenario file, whose values flags override; or with --run the store of a sweep.
+            file: Run this scenario file, whose values flags override; or with --run a sweep's store.
             scenario: The scenario.
-            out: Folder for the result, the figures and the learned weights.
+            out: Write the result, the figures and the learned weights to this folder.
             json: Print JSON instead of a table.
-            controller: Stages of your own, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion,feedback=...
-            number: Number of a run in the store, to run again and compare with what is stored.
-            code: Whether a store may run the Python files of the controller that it names.
+            controller: Use stages of your own: my_file.py:MyFeedforward or motion=my_file.py:MyMotion,feedback=...
+            number: Run the run of this number in the store again, and compare it with what is stored.
+            code: Let a store run the Python files of the controller that it names.
         """
         if number is not None:
             return _repeat(file, number, out, json, code)
@@ -353,10 +362,10 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
     """Returns the `navigate` command, whose short help leaves out the same fields as that of `run`."""
     names = FIRST if _is_short_help(arguments) else Scenario.model_fields
     default = Scenario() if {"prior", "learner"} & _given(arguments) else Scenario(**FEEDFORWARDS[BEST])
-    part = _part(default, [name for name in names if name not in GIVEN])
+    part = _part(default, [name for name in names if name not in NOT_OF_MISSIONS])
 
     def navigate(
-        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MAP|GENERATOR:SEED|MISSION")] = "",
+        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[MAP|GENERATOR:SEED|MISSION]")] = "",
         /,
         scenario: Record = part,
         goal: tuple[float, float, float] | None = None,
@@ -383,15 +392,15 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
                 doorway:3; the others are cellular, corridor, parking_bay, slalom and warehouse. Or the folder --out of
                 a mission, which is then driven again and compared with what it holds, bit for bit.
             scenario: The scenario.
-            goal: Pose of the goal, x and y in m and θ in rad, as in 2 0 0 or 2,0,0; by default that of the generator.
-            start: Pose of the start, likewise; by default that of the generator, or the origin.
+            goal: Drive to this pose, x and y in m and θ in rad, as in 2 0 0 or 2,0,0; by default to the generator's.
+            start: Start at this pose, written as for --goal; by default at that of the generator, or the origin.
             compare: Feedforwards of further robots, such as none or model, which drive the same plan.
-            speed: Largest speed in m/s; by default 0.9 of the robot's.
-            margin: Clearance in m that the plan keeps.
+            speed: Limit the plan to this speed in m/s; by default to 0.9 of the robot's largest.
+            margin: Keep this clearance in m in the plan.
             avoid: Law that keeps the robot from obstacles that move, which the first plan does not know: none, a filter
                 that brakes (`barrier`), or a controller that follows the plan at its own pace and drives around what is
                 in the way (`window`, `mppi`).
-            out: Folder for the result, the table in JSON and the figures.
+            out: Write the result, the table in JSON and the figures to this folder.
             json: Print JSON instead of a table.
             view: Instead of a table, show the mission live in the browser; without --avoid, further goals can be set
                 by clicks there.
@@ -509,10 +518,10 @@ def sweep(
     """Computes the runs of a sweep file in parallel; the same command resumes after an interrupt.
 
     Args:
-        file: Sweep file, with the scenarios and what varies in them.
-        out: Folder of the store, which `mrctl.open` opens.
-        workers: Number of processes on this machine; by default one for each core.
-        scheduler: Address of a Dask scheduler to use instead, such as tcp://127.0.0.1:8786.
+        file: Run this sweep file, with the scenarios and what varies in them.
+        out: Write the store, which `mrctl.open` opens, to this folder.
+        workers: Use this number of processes on this machine; by default one for each core.
+        scheduler: Use the Dask scheduler at this address instead, such as tcp://127.0.0.1:8786.
     """
     _there(file)
     _some(workers)
@@ -530,7 +539,7 @@ def reproduce(out: Path = Path("reproduction")) -> None:
     """Reproduces the paper's figures and tables, and compares the feedforwards in every sensing tier.
 
     Args:
-        out: Folder for the figures in PNG and PDF, and for `table.json` with every number.
+        out: Write the figures in PNG and PDF, and `table.json` with every number, to this folder.
     """
     from mrctl.experiments import paper
 
@@ -598,7 +607,7 @@ def suite(
 
 
 def tune(
-    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT.xml")] = CAR.path,
+    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[ROBOT.xml]")] = CAR.path,
     /,
     wheels: tuple[str, ...] = (),
     steering: tuple[str, ...] = (),
@@ -654,32 +663,40 @@ def tune(
     _report(tuning.tune(file, world, time_constant, delay, lag, out, json), out, json)
 
 
-def identify(
-    world: str = "flat",
-    robot: RobotFile = CAR,
-    perturbation: Perturbation = PERTURBATIONS["nominal"],
-    sensing: Sensing = LAB,
-    seed: int = 0,
-    json: bool = False,
-) -> None:
-    """Identifies the constants of equation (3) from two drives, and says which of them the sensors identify.
+def _identify_with(arguments: list[str]) -> Callable[..., None]:
+    """Returns the `identify` command, whose short help leaves out the flags of its records."""
 
-    Args:
-        world: World to drive in, which must be level: `flat`, or the path of an MJCF file.
-        robot: Robot to identify; by default the world's own.
-        perturbation: Differences of the plant from its model.
-        sensing: Encoders, gyro and motor driver; delays, accelerometer, fixes and the estimator have no effect.
-        seed: Seed of the test signals and of the sensors.
-        json: Print JSON instead of a table.
-    """
-    _known(world, robot)
-    from mrctl.experiments import identify as identification
+    def identify(
+        world: str = "flat",
+        robot: RobotFile = CAR,
+        perturbation: Perturbation = PERTURBATIONS["nominal"],
+        sensing: Sensing = LAB,
+        seed: int = 0,
+        json: bool = False,
+    ) -> None:
+        """Identifies the constants of equation (3) from two drives, and says which of them the sensors identify.
 
-    print(identification.run(world, robot, perturbation, sensing, seed, json))
+        Args:
+            world: The robot drives in this level world: `flat`, or the MJCF file at this path.
+            robot: Identify this robot; by default the world's own.
+            perturbation: Differences of the plant from its model.
+            sensing: Encoders, gyro and motor driver; delays, accelerometer, fixes and the estimator have no effect.
+            seed: This seed determines the test signals and the noise of the sensors.
+            json: Print JSON instead of a table.
+        """
+        _known(world, robot)
+        from mrctl.experiments import identify as identification
+
+        print(identification.run(world, robot, perturbation, sensing, seed, json))
+
+    if _is_short_help(arguments):
+        for name in IDENTIFIED:
+            identify.__annotations__[name] = Annotated[Record, tyro.conf.Suppress]
+    return identify
 
 
 def check(
-    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT.xml")] = "flat",
+    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[ROBOT.xml]")] = "flat",
     /,
     wheels: tuple[str, ...] = (),
     steering: tuple[str, ...] = (),
@@ -737,7 +754,7 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
         default = Scenario.from_toml(scenario_file)
 
     def view(
-        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO.toml|RESULT")] = None,
+        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO.toml|RESULT]")] = None,
         /,
         scenario: Annotated[Scenario, tyro.conf.arg(name="")] = default,
         compare: Annotated[tuple[FeedforwardName, ...], tyro.conf.arg(metavar="NAME ...")] = (),
@@ -758,7 +775,7 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
             compare: Feedforwards of further robots, such as none or model+composite, which are shown as ghosts with the
                 same seed and events.
             number: Number of the run to show first, in a result or sweep.
-            export: HTML file to write instead of serving a page; it plays without a server.
+            export: Write this HTML file, which plays without a server, instead of serving a page.
             host: Address to listen on; an address other than 127.0.0.1 lets others in without a password.
             port: Number of the port to listen on.
             code: Whether a sweep may run the Python files of the controller that it names.

@@ -90,25 +90,25 @@ class Scenario(Record):
     }
 
     name: str = ""
-    """Label of the run in tables and figures; by default that of the feedforward."""
+    """Tables and figures give the run this label; by default that of the feedforward."""
     world: str = "flat"
-    """World to drive in: `flat`, `slope`, `rough`, `patch`, or the path of an MJCF file."""
+    """The robot drives in `flat`, `slope`, `rough`, `patch`, or an MJCF file at this path."""
     obstacles: Obstacles = Obstacles()
     """Obstacles that stand in the world or move in it, or the path of a TOML file of them; a run ends when the robot
     touches one."""
     robot: RobotFile = CAR
     """Robot that drives; by default the world's own."""
     steering: Steering | None = None
-    """Servo of the front wheel: soft (`compliant`), none, so that the wheel trails (`caster`), or stiff (`rigid`); by
+    """The front wheel has a soft servo (`compliant`), none, so that it trails (`caster`), or a stiff one (`rigid`); by
     default the robot's own."""
     reference: Reference = Lemniscate()
-    """Reference trajectory that the robot follows."""
+    """The robot follows this reference trajectory."""
     laps: Annotated[int, Field(ge=1, le=10_000)] = 8
-    """Number of laps."""
+    """The robot drives this number of laps."""
     prior: PriorName = "none"
-    """What the feedforward knows at the start: nothing, the nominal model, or, for reference, the true one."""
+    """The feedforward starts from no model, the nominal one or, for reference, the true one."""
     learner: LearnerName = "fel"
-    """Law that adapts the feedforward, added to the prior; with `none` and prior `none` the PID is alone."""
+    """This law adapts the feedforward and adds to the prior; with `none` and prior `none` the PID is alone."""
     sensing: Sensing = Sensing()
     """Sensors, estimator, motor driver, battery, steering servo and delay, which a tier sets."""
     kanayama: Kanayama = Kanayama()
@@ -146,7 +146,7 @@ class Scenario(Record):
     initial_spread: tuple[Spread, Spread, Annotated[float, Field(ge=0, le=0.5)]] = (0.02, 0.02, 0.03)
     """Standard deviations of a random offset from the initial pose: x and y in m, θ in rad."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    """Seed of the random numbers: initial offset, initial weights, noise and biases of the sensors."""
+    """This seed determines initial offset and weights, and noise and biases of the sensors."""
     prefilter: Annotated[float, Field(ge=0.01, le=10)] | None = None
     """Time constant in s of the filter on the velocities that the motion controller adds to the reference; by default
     it is designed with the gains of the motion controller."""

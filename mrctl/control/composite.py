@@ -35,9 +35,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import INPUTS, feature_scale, features
+from mrctl.control.features import INPUTS, SLOW, feature_scale, features, symmetric_product
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, explained
-from mrctl.control.matching import histories, recall
+from mrctl.control.matching import SETTLED, histories, recall
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
@@ -47,7 +47,6 @@ CHANNELS = 2
 FEATURES = INPUTS + 2  # the eight of the inverse dynamics, and gravity on a slope
 STEERING_DISTURBANCE = 0.03  # rad/s of disturbance per volt; it is smaller, since the geometry needs no motor
 OUTLIER = 3.0  # standard deviations at which an innovation is clipped: a tyre slips, or a wheel lost its load
-SLOW = 0.1  # m/s of the faster wheel; below it the voltage depends on stiction, not on the motion
 BRIEF, LASTING = 0.25, 4.0  # s over which squared innovations are averaged, to detect a change of the plant
 CHANGE = 5.0  # ratio of the brief to the lasting mean square of the innovations that shows a changed plant
 NOTHING = 1e-9  # V² or (rad/s)²; features whose φᵀ P φ is smaller explain no feedback
@@ -55,7 +54,6 @@ NOTHING = 1e-9  # V² or (rad/s)²; features whose φᵀ P φ is smaller explain
 # 20 mrad/s in θ̇, behind filters of 0.03 s, at a control period of 10 ms.
 SCATTER = 300.0
 UNKNOWN = 6.0  # V, standard deviation of the weights of the eight features without a model
-SETTLED = 6.0  # time constants until the two filters have forgotten their initial state
 SIGNALS = 6  # filtered signals: voltage of the two channels, twist, cosine and sine of the heading
 
 
@@ -141,17 +139,6 @@ def regressor(twist: Array, rate: Array, heading: Array, half_track: float, scal
 
 
 @kernel
-def times(P: Array, phi: Array, out: Array) -> None:
-    """P φ; P is symmetric, so it is read by rows, in sums that compile to vector instructions."""
-    n = phi.shape[0]
-    for i in range(n):
-        out[i] = 0.0
-    for j in range(n):
-        for i in range(n):
-            out[i] += P[j, i] * phi[j]
-
-
-@kernel
 def predict(k: int, s: Row) -> None:
     """One Kalman step of channel k for residual = φᵀ a + d + noise; below, a stands for (a, d) and φ for (φ, 1).
 
@@ -166,7 +153,7 @@ def predict(k: int, s: Row) -> None:
         s: In and out: a record of `COMPOSITE`.
     """
     a, P, f, Pphi = s.a[k], s.P[k], s.f[k], s.Pphi
-    times(P, s.phi, Pphi)
+    symmetric_product(P, s.phi, Pphi)
     S = s.noise[k] ** 2 + s.scatter[k] ** 2 * s.variance[k]
     e = s.residual[k]
     for i in range(FEATURES + 1):

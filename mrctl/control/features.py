@@ -12,6 +12,7 @@ NAMES = ("V", "ω", "V̇", "ω̇", "Vω", "ω²", "sgn V_l", "sgn V_r")
 # Kernels are compiled with these sizes, so they must stand in a file that holds kernels; see `mrctl.kernel`.
 INPUTS, OUTPUTS = 8, 2  # of the network of `fel`: the physical features, and channels
 SIGN_SPEED = 0.05  # m/s, width of the smooth sign function of the friction
+SLOW = 0.1  # m/s of the faster wheel; below it the voltage depends on stiction, not on the motion
 
 
 @kernel
@@ -77,3 +78,20 @@ def feature_scale(robot: Robot) -> Array:
     v, omega = robot.max_speed, robot.max_rotation
     products = np.array([robot.max_acceleration, robot.max_rotation_acceleration, v * omega, omega**2]) / 3
     return np.array([v, omega, *products, 3.0, 3.0])
+
+
+@kernel
+def symmetric_product(P: Array, x: Array, out: Array) -> None:
+    """P x of a symmetric P, which is read by rows, in sums that compile to vector instructions.
+
+    Args:
+        P: Symmetric matrix, `(n, n)`.
+        x: Vector, `(n,)`.
+        out: Out: P x, `(n,)`.
+    """
+    n = x.shape[0]
+    for i in range(n):
+        out[i] = 0.0
+    for j in range(n):
+        for i in range(n):
+            out[i] += P[j, i] * x[j]

@@ -94,7 +94,7 @@ def inverse_dynamics(command: Array, derivative: Array, prior: Row, voltage: Arr
 
 @kernel
 def explained(twist: Array, acceleration: Array, rigid: bool, prior: Row, voltage: Array) -> None:
-    """Writes the voltages that, by the prior, make the robot move like this, `(2,)` in V.
+    """Writes the voltages that the prior's inverse dynamics needs for this motion, `(2,)` in V.
 
     Under `rigid` steering the second channel is θ̇ itself, in rad/s: the fork makes it without a voltage.
     """

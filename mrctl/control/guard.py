@@ -25,7 +25,7 @@ teaches is a third of the one before (`mrac` is not taught by it), and the autho
 2. |d| > D: it ends in the tick in which an error leaves the region. Until then the errors are inside.
 3. From then on PID and model act alone; the PID's integral starts within D of the model, and the rest of the step in
    voltage, which fades, is within D too. From any such state the position error stays below a bound that both loops
-   give (`recovery`, which counts the rest of the step as a part of the integral): 0.22 to 0.25 m for the default robot.
+   give (the test below counts the rest of the step as a part of the integral): 0.22 to 0.25 m for the default robot.
 
 The bounds are those of the linear loops that the PID was designed for; the limits of voltage and acceleration, and what
 happens within the loop's delay, add to them. `tests/system/test_adversaries.py` drives against the worst learners.
@@ -58,8 +58,8 @@ SUSTAINED = 16  # half-waves in a row
 RECENT = 1.0  # s, time constant with which the peak of a deviation decays
 MEAN = 0.5  # s over which voltages are averaged before the integral takes them over; a few periods of an oscillation
 RETURN = 5.0  # s in which a learner that resumes at full gain gets its authority back
-APART = 0.15  # m of posture error that are always tolerated; a run fails at 1 m
-LEAST = 0.27, 0.75  # m/s, rad/s, errors of the velocities that are always tolerated; slow robots start with them
+TOLERATED = 0.15  # ρ̄: posture error in m that is always tolerated; a run fails at 1 m
+LEAST = 0.27, 0.75  # m/s and rad/s, errors of V and θ̇ that are always tolerated; slow robots start with them
 ARM = 0.75  # m ahead of the robot at which a heading error counts as a position error
 BACK_OFF = 3.0  # factor by which each attempt learns more slowly, and waits longer
 UNSURE = 0.1  # further factor on the learning gain of a stage that cannot be reset to its initial weights
@@ -79,7 +79,8 @@ class Guard(Record):
     """Largest errors of V and θ̇, as a share of the robot's largest ones, with which a learner may go on; at least
     0.27 m/s and 0.75 rad/s."""
     oscillation: Annotated[float, Field(gt=0, le=1)] = 0.25
-    """Share of D by which the PID's output must swing, and the learner deviate, for an oscillation to count."""
+    """Share of D by which the PID's output must swing, and the learner deviate, for an oscillation to count; D is the
+    deviation from the fallback in V (rad/s on a steering channel) that keeps the errors within their bounds."""
     growth: Annotated[float, Field(ge=1, le=100)] = 3.0
     """Factor by which the posture error may exceed the smallest one so far; 0.15 m are tolerated in any case."""
     hold: Annotated[float, Field(gt=0, le=100)] = 1.0
@@ -88,7 +89,8 @@ class Guard(Record):
     """Number of times that the learner may resume, from the second on with a third of the gain each time; then the
     fallback stays."""
     fade: Annotated[float, Field(gt=0, le=2)] = 0.1
-    """Time constant in s with which the step in voltage at the beginning of a fallback, up to D, fades."""
+    """Time constant in s with which the step in voltage at the beginning of a fallback fades; the step is limited to D,
+    the deviation that `oscillation` explains."""
     fallback: Literal["model", "none"] = "model"
     """Feedforward during a fallback: the nominal inverse dynamics (`model`), or PID alone (`none`)."""
 
@@ -96,12 +98,12 @@ class Guard(Record):
 GUARD = np.dtype(
     [
         # Settings, as in `Guard`
-        ("on", "?"),
-        ("oscillation", "f8"),
-        ("growth", "f8"),
-        ("hold", "f8"),  # s
-        ("retries", "f8"),
-        ("fade", "f8"),  # s
+        ("on", "?"),  # whether the guard watches the learner
+        ("oscillation", "f8"),  # share of D beyond which a half-wave and a deviation count, 1
+        ("growth", "f8"),  # factor by which the posture error may exceed the smallest one so far, 1
+        ("hold", "f8"),  # duration of the first fallback, s
+        ("retries", "f8"),  # number of times that the learner may resume, 1
+        ("fade", "f8"),  # time constant with which the step in voltage at the beginning of a fallback fades, s
         ("model", "?"),  # whether the fallback is the nominal model, not PID alone
         ("range", "f8", 2),  # largest command of a channel: the supply in V, or the largest θ̇ in rad/s
         ("region", "f8", 2),  # ē: largest errors of V and θ̇ with which a learner may go on, m/s and rad/s
@@ -164,7 +166,7 @@ def harmless(region: Array, gains: Array) -> Array:
         region: ē in m/s and rad/s, `(…, 2)`.
         gains: ‖G_e‖₁ and ‖G_ρ‖₁ of each channel, `(…, 2, 2)`.
     """
-    return np.minimum(region / gains[..., 0], APART / gains[..., 1])
+    return np.minimum(region / gains[..., 0], TOLERATED / gains[..., 1])
 
 
 @kernel
@@ -263,7 +265,7 @@ def worst_trouble(g: Row, broken: bool, error: Array, command: Array, twist: Arr
     for k in range(2):
         deviation = np.inf if g.action == FALLBACK else g.deviation[k]
         if deviation > g.harmless[k]:
-            if posture > max(APART, g.growth * g.nearest):
+            if posture > max(TOLERATED, g.growth * g.nearest):
                 return FAR
             if abs(command[k] - twist[k]) > g.region[k]:
                 return FAST

@@ -26,6 +26,7 @@ import numpy as np
 
 from mrctl.kernel import Array, Row, kernel
 
+SETTLED = 6.0  # time constants until the two filters of `low_pass` have forgotten their initial state
 LAG = 2  # periods, hold and sampling, *chosen*; with one the worst robots in `field` do worse
 MATCHED = np.dtype(
     [

@@ -60,17 +60,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.features import INPUTS, feature_scale, features, linear
+from mrctl.control.features import INPUTS, SLOW, feature_scale, features, linear, symmetric_product
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner
-from mrctl.control.matching import MATCHED, low_pass, match, queues
+from mrctl.control.matching import MATCHED, SETTLED, low_pass, match, queues
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
 SIGNALS = INPUTS + 2  # filtered signals: the features and the voltage of the two channels
-SETTLED = 6.0  # time constants until the two filters have forgotten their initial state
-SLOW = 0.1  # m/s of the faster wheel; below it the voltage depends on stiction, not on the motion
 
 
 class Mrac(Record):
@@ -94,7 +92,8 @@ class Mrac(Record):
     of the supply (of a tenth of that number in rad/s on a steering channel); the projection acts at twice that
     distance."""
     leak: Annotated[float, Field(ge=0, le=1e3)] = 0.1
-    """Leak σ₀ in 1/(V² s) at twice that distance."""
+    """Leak rate σ₀ in 1/(V² s) of parameters at a distance of 2 `radius` from the prior's; it rises linearly from 0 at
+    `radius`."""
     filter: Annotated[float, Field(ge=0.005, le=2)] = 0.03
     """Time constant T in s of each of the two filters on voltage and motion."""
     hand_over: bool = False
@@ -136,15 +135,6 @@ MRAC = np.dtype(
 
 
 @kernel
-def times(P: Array, x: Array, out: Array) -> None:
-    """P x."""
-    for i in range(INPUTS):
-        out[i] = 0.0
-        for j in range(INPUTS):
-            out[i] += P[i, j] * x[j]
-
-
-@kernel
 def predict(s: Row) -> None:
     """The prediction error: one step of least squares with bounded-gain forgetting, the same gain for both channels.
 
@@ -162,7 +152,7 @@ def predict(s: Row) -> None:
     for i in range(INPUTS):
         for j in range(INPUTS):
             s.P[i, j] *= growth
-    times(s.P, s.w, s.direction)
+    symmetric_product(s.P, s.w, s.direction)
     total = s.r
     for i in range(INPUTS):
         total += s.w[i] * s.direction[i]
@@ -185,7 +175,7 @@ def track(k: int, s: Row) -> None:
         k: Channel.
         s: In and out: a record of `MRAC`.
     """
-    times(s.P, s.phi_c, s.direction)
+    symmetric_product(s.P, s.phi_c, s.direction)
     for i in range(INPUTS):
         s.b[i, k] += s.tracking[k] * s.direction[i] * s.error[k]
 
@@ -208,7 +198,7 @@ def confine(k: int, s: Row) -> None:
         square += b[i] * b[i]
     if square <= radius * radius:
         return
-    times(s.P, b, s.direction)
+    symmetric_product(s.P, b, s.direction)
     size, power = np.sqrt(square), 0.0
     for i in range(INPUTS):
         power += b[i] * s.direction[i]

@@ -27,7 +27,7 @@ HORIZON = 10.0  # s over which responses are added up, rounded up to 2ⁿ period
 
 
 class Peaks(NamedTuple):
-    """Peak-to-peak gains of a channel, or the largest errors that follow from given initial errors.
+    """Peak-to-peak gains of a channel.
 
     Attributes:
         velocity: From a disturbance in V (rad/s on a steering channel) to the error of the velocity for the same
@@ -71,39 +71,6 @@ def _rejection(
             velocity = max(velocity, Loop(*parts, alone, speed, delay, period).sums()[0])
             position = max(position, Loop(*parts, motion, speed, delay, period).sums()[1])
         found.append(Peaks(velocity, position))
-    return found[0], found[1]
-
-
-def recovery(
-    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], motion: Motion, delay: float, period: float,
-    limits: tuple[dict[str, float], dict[str, float]],
-) -> tuple[Peaks, Peaks]:  # fmt: skip
-    """Returns the largest errors of each channel that follow from any state within limits, at any of several speeds.
-
-        |e(t)| ≤ maxₜ Σ limit · |response of e to that state alone|
-
-    Args:
-        robot: The nominal robot in its steering arrangement.
-        rigid: Whether the second channel is steering.
-        gains: PI gains of both channels.
-        motion: The motion controller.
-        delay: Delay from measurement to voltage in s.
-        period: Control period in s.
-        limits: For each channel the largest error of the velocity in m/s or rad/s, of the `integral` in V (rad/s on a
-            steering channel), of the `position` in m and of the `heading` in rad.
-    """
-    found = []
-    for channel in range(2):
-        errors = np.zeros(2)
-        for speed, plant in points(robot, rigid, channel):
-            loop = Loop(robot, rigid, channel, plant, gains[channel], motion, speed, delay, period)
-            total = 0.0
-            for name, limit in limits[channel].items():
-                state = np.zeros(len(loop.step))
-                state[loop.state[name]] = limit
-                total = total + np.abs(loop.response(state))
-            errors = np.maximum(errors, np.max(total, axis=1))
-        found.append(Peaks(float(errors[0]), float(errors[1])))
     return found[0], found[1]
 
 

@@ -93,10 +93,10 @@ class AgentMotion:
 class EpisodeCourses:
     """The references of robots whose clocks start at different ticks."""
 
-    def __init__(self, scenarios: Sequence[Scenario], lead: int) -> None:
-        """Samples every course once, to the end of the longest episode and `lead` ticks beyond."""
+    def __init__(self, scenarios: Sequence[Scenario], preview: int) -> None:
+        """Samples every course once, to the end of the longest episode and `preview` ticks beyond."""
         ticks = max(s.ticks for s in scenarios)
-        self._last = ticks + lead
+        self._last = ticks + preview
         distinct, self._place = distinct_courses(scenarios)
         whole, end = range(ticks), range(ticks, self._last + 1)
         self._table = np.stack([np.append(course(s, whole), course(s, end)) for s in distinct], axis=1)
@@ -165,7 +165,7 @@ class Episodes(Simulation):
         )
         self._given, self._draw = [s.perturbation for s in self.scenarios], draw
         self._squares = np.zeros((len(scenarios), 3))
-        self.courses: EpisodeCourses = EpisodeCourses(scenarios, self.lead)  # type: ignore[assignment]
+        self.courses: EpisodeCourses = EpisodeCourses(scenarios, self.preview)  # type: ignore[assignment]
         self.log = Log(1, len(scenarios))
         self.sizes = dict(OBSERVATIONS)
         self.limits = np.full(sum(OBSERVATIONS.values()), -np.inf), np.full(sum(OBSERVATIONS.values()), np.inf)

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from mrctl.envs.episodes import Episodes
 from mrctl.physics import mjcf
 from mrctl.physics.car import CarPhysics
-from mrctl.physics.pictures import REFERENCE_COLOUR, draw_line
+from mrctl.physics.pictures import REFERENCE_COLOUR, SHADOW, draw_line
 from mrctl.record import InputError
 
 WIDTH, HEIGHT = 640, 480  # pixels
-SHADOW = 1024  # pixels along each side of the shadow map
 POINTS = 200  # number of points of the reference
 VIEW = 5.0  # distance of the camera as a multiple of the size of the robot
 AZIMUTH, ELEVATION = 60.0, -35.0  # of the camera's view, in degrees

@@ -354,8 +354,8 @@ def autograd_loop(ticks: int, stretches: int) -> Iterator[tuple[float, float]]:
         features = np.array([v, omega, *derivative, v * omega, omega**2, *wheels]) / scale
         output = network(torch.from_numpy(features.astype(np.float32)))
         feedforward = 6.0 * output.detach().numpy()
-        common, apart = feedback + feedforward
-        voltage = np.clip([common - apart, common + apart], -robot.supply, robot.supply)
+        common, differential = feedback + feedforward
+        voltage = np.clip([common - differential, common + differential], -robot.supply, robot.supply)
         angle = steering_angle(command, robot)
         physics.set_control([*voltage, angle, (angle - fork) / period])
         fork = angle

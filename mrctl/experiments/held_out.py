@@ -187,13 +187,13 @@ def compare(name: str, found: Mapping[str, Laps]) -> list[dict[str, Any]]:
 def _standing(mine: NDArray[np.float64], theirs: NDArray[np.float64], floor: suite.Floor) -> dict[str, Any]:
     lost, lost_by_rival = (int((~np.isfinite(one)).sum()) for one in (mine, theirs))
     both = np.isfinite(mine) & np.isfinite(theirs)
-    apart = bootstrap_interval((mine - theirs)[both])._asdict()
-    close = not both.any() or apart["value"] <= floor.difference
+    difference = bootstrap_interval((mine - theirs)[both])._asdict()
+    close = not both.any() or difference["value"] <= floor.difference
     means = {"mine": float(mine[both].mean()), "theirs": float(theirs[both].mean())} if both.any() else {}
     return {
-        **means, "apart": apart, "floor": floor._asdict(), "failed": lost, "rival_failed": lost_by_rival,
+        **means, "difference": difference, "floor": floor._asdict(), "failed": lost, "rival_failed": lost_by_rival,
         "at_or_below": bool(lost < lost_by_rival or (lost == lost_by_rival and close)),
-        "tie": bool(lost == lost_by_rival and both.any() and abs(apart["value"]) <= floor.difference),
+        "tie": bool(lost == lost_by_rival and both.any() and abs(difference["value"]) <= floor.difference),
     }  # fmt: skip
 
 
@@ -214,7 +214,7 @@ def summarised(name: str, rows: Sequence[dict[str, Any]], count: int) -> Table:
     above = [row for row in rows if row["metric"] == "position_rmse" and not row["at_or_below"]]
     listed = "; ".join(
         f"{row['course']}, {row['plant']}, {WINDOWS[row['window']]}: above {row['rival']} by "
-        f"{interval(row['apart'])} mm (floor {number(1e3 * row['floor']['difference'])} mm)"
+        f"{interval(row['difference'])} mm (floor {number(1e3 * row['floor']['difference'])} mm)"
         + (f", {row['failed']} runs failed against {row['rival_failed']}" if row["failed"] else "")
         for row in above
     )

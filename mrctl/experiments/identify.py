@@ -41,7 +41,7 @@ from mrctl.physics.plant import Plant, build
 from mrctl.record import InputError
 from mrctl.results.dataset import versions
 from mrctl.sensing.sensors import Sensors
-from mrctl.sensing.tiers import Sensing
+from mrctl.sensing.tiers import LAB, Sensing
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import CAR, Robot, RobotFile
 
@@ -55,7 +55,7 @@ TICK = 0.005  # s, for which a voltage is held
 FINE = 100  # physics steps per time constant; the first-order engine adds damping times half a step to the mass
 MODEL = 0.015  # relative error that effects outside equation (3) may cause
 TOLERANCE = 0.1  # largest half of the interval of an identifiable constant, as a share of its value; chosen
-LAB, NOMINAL = Sensing(tier="lab"), Perturbation()
+NOMINAL = Perturbation()
 NOT_IDENTIFIABLE = """\
 For c, the mass m is taken from a scale. These drives do not identify m, J_w and J_m, which enter only M_e and J_e;
 I_0, gear loss and rolling loss, which enter only F_c; N and k_M, which enter only N k (k_E equals k_M in SI units)."""

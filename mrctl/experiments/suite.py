@@ -252,9 +252,9 @@ def standing(name: str, errors: Mapping[str, NDArray[np.float64]], floor: Floor,
             beaten = superiority(errors[name], theirs, floor=floor.difference)
             found[f"beats_{titled(rival)}"] = beaten._asdict()
             if rival in YARDSTICKS:
-                apart = (errors[name] - theirs)[np.isfinite(errors[name] - theirs)]
+                paired = (errors[name] - theirs)[np.isfinite(errors[name] - theirs)]
                 centre = np.median if median else np.mean
-                found[f"less_{titled(rival)}"] = float(centre(apart)) if len(apart) else np.nan
+                found[f"less_{titled(rival)}"] = float(centre(paired)) if len(paired) else np.nan
     return found
 
 

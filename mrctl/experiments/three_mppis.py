@@ -40,7 +40,7 @@ from mrctl.theory.timing import RESERVE
 
 
 class Entry(NamedTuple):
-    """One of the three."""
+    """One compared MPPI: the model of its roll-outs, and the velocity controller below."""
 
     feedforward: FeedforwardName
     lagging: bool

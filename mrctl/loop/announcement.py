@@ -1,4 +1,4 @@
-"""What is said while laws are compiled."""
+"""Reports that Numba compiles kernels, once."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from mrctl.kernel import Kernel
 
 
 class Announcement(Listener):
-    """Tells the user that laws are being compiled, for which a first simulation waits.
+    """Tells the user that Numba compiles kernels, for which a first simulation waits.
 
-    On a terminal, a bar shows how many of the laws are done that the law in work calls.
+    On a terminal, a bar counts the compiled callees of the current kernel.
 
     Attributes:
         said: Whether the message was printed.
-        bar: The bar of the law in work or of the last one.
+        bar: The bar of the current kernel, or of the last one.
     """
 
     said = False
@@ -32,7 +32,7 @@ class Announcement(Listener):
         self._depth, self._left = 0, set[str]()
 
     def on_start(self, event: Event) -> None:
-        """Prints the message at the first compilation; begins a bar for a law that no other one called."""
+        """Prints the message at the first compilation; begins a bar for a kernel that no other one called."""
         law = _law(event)
         if not self.said:
             self.said = True
@@ -44,7 +44,7 @@ class Announcement(Listener):
         self._depth += 1
 
     def on_end(self, event: Event) -> None:
-        """Moves the bar on, and clears it with the law that began it."""
+        """Advances the bar, and clears it when the kernel that began it is compiled."""
         name = _name(_law(event))
         self._depth -= 1
         # The same law may be compiled for several types, and Numba compiles functions of its own.

@@ -46,9 +46,9 @@ def distinct_courses(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], NDA
 class Courses:
     """The references of a uniform group of scenarios; robots with the same reference share its samples."""
 
-    def __init__(self, scenarios: Sequence[Scenario], lead: int = 0) -> None:
+    def __init__(self, scenarios: Sequence[Scenario], preview: int = 0) -> None:
         """Takes the scenario of each robot, and the largest argument `ahead` of `at`, in control ticks."""
-        self._ticks, self._lead = max(s.ticks for s in scenarios), lead
+        self._ticks, self._preview = max(s.ticks for s in scenarios), preview
         self._courses, self._place = distinct_courses(scenarios)
         self._own = len(self._courses) == len(scenarios)  # whether no two robots share a course
         self._block = range(0)
@@ -58,7 +58,7 @@ class Courses:
         if tick not in self._block:  # only one block of samples is held, (ticks of a block, courses)
             first = tick // BLOCK * BLOCK
             self._block = range(first, min(first + BLOCK, self._ticks))
-            whole = range(first, self._block.stop + self._lead)
+            whole = range(first, self._block.stop + self._preview)
             self._samples = np.stack([course(s, whole) for s in self._courses], axis=1)
         now = self._samples[tick + ahead - self._block.start]
         return now if self._own else now[self._place]

@@ -35,9 +35,9 @@ from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.references import check, enlarged
 from mrctl.theory.robot import ANY_ANGLE, Tyres
+from mrctl.theory.timing import RESERVE
 
 LEAST = 8  # smallest number of robots for which a thread pays
-RESERVE = 0.9  # share of the robot's limits that an adapted reference uses
 LIMITS = ("max_speed", "max_rotation", "max_acceleration", "max_rotation_acceleration", "steering_limit")
 
 
@@ -203,7 +203,7 @@ class Simulation:
     Attributes:
         scenarios: Scenario of each run, with the events that were added.
         model: The compiled world with the nominal robot.
-        lead: Number of control periods until a voltage acts; the controllers receive the reference of that time.
+        preview: Number of control periods that the reference is taken ahead, because a voltage acts that much later.
         courses: The references that the robots follow.
         sensors: The sensors of the robots.
         estimator: The estimator of the posture and the twist that the controllers use.
@@ -244,8 +244,8 @@ class Simulation:
         self._feedforward = named(first.prior, names.pop("feedforward", first.learner))
         self._label = " + ".join([self._feedforward, *names.values()])
 
-        self.lead = first.sensing.periods("delay", self.period)
-        self.courses = Courses(scenarios, self.lead)
+        self.preview = first.sensing.periods("delay", self.period)
+        self.courses = Courses(scenarios, self.preview)
         self.plant: Plant = build(
             self.model, robot, size, round(self.period / first.physics_step), worthwhile(threads, size), first.obstacles
         )
@@ -300,8 +300,8 @@ class Simulation:
         """
         if event.tick(self.period) < self.tick:
             raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self.period:g} s")
-        if event.reference is not None and event.tick(self.period) < self.tick + self.lead:
-            raise InputError(f"time: a reference must be known {self.lead * self.period:g} s before it begins")
+        if event.reference is not None and event.tick(self.period) < self.tick + self.preview:
+            raise InputError(f"time: a reference must be known {self.preview * self.period:g} s before it begins")
         if event.perturbation is not None:
             self.plant.check(event.perturbation)
         if event.reference is not None:
@@ -309,7 +309,7 @@ class Simulation:
         self.scenarios = [scenario.with_event(event) for scenario in self.scenarios]
         self.events.add(event)
         if event.reference is not None:
-            self.courses = Courses(self.scenarios, self.lead)
+            self.courses = Courses(self.scenarios, self.preview)
 
     def step(self) -> None:
         """Computes one control period, as in figure 3."""
@@ -327,7 +327,7 @@ class Simulation:
             self._sensed = self.tick
             self.events.apply(self.tick)
             self._goal = self.courses.at(self.tick)
-            self._wanted = self.courses.at(self.tick, self.lead) if self.lead else self._goal
+            self._wanted = self.courses.at(self.tick, self.preview) if self.preview else self._goal
             self.sensors.measure(self.tick, self.plant.state)
             self.estimator.estimate(self.tick, self.plant.state)
         return self.estimator.seen, self._wanted

@@ -46,7 +46,7 @@ def cellular(seed: int, fill: float = 0.2, steps: int = 3, cell: float = 0.15, c
     for _ in range(steps):
         neighbours = _neighbours(filled)
         filled = (filled | (neighbours >= 5)) & (neighbours > 1)
-    filled &= _neighbours(filled) < 8  # what is inside nobody touches
+    filled &= _neighbours(filled) < 8  # drops cells that are surrounded on all sides
     half = cells * cell / 2
     rows, columns = np.nonzero(filled)
     at = (np.column_stack([columns, rows]) + 0.5) * cell - half

@@ -208,7 +208,7 @@ class Reactive(ABC):
 
 
 @kernel
-def apart(x: float, y: float, c: float, s: float, time: float, reach: float, discs: Array, movers: Array) -> float:
+def clearance(x: float, y: float, c: float, s: float, time: float, reach: float, discs: Array, movers: Array) -> float:
     """Returns the distance in m of the discs of a robot from the obstacles that move, or `KEPT` where it is larger.
 
     Args:
@@ -296,7 +296,7 @@ def roll_out(
                     px, py = x + c * discs[d, 0] - s * discs[d, 1], y + s * discs[d, 0] + c * discs[d, 1]
                     free = min(free, value(distance, left, low, resolution, px, py) - discs[d, 2])
             if len(movers) > 0:
-                free = min(free, apart(x, y, c, s, (k + 1) * step, reach, discs, movers))
+                free = min(free, clearance(x, y, c, s, (k + 1) * step, reach, discs, movers))
             if free <= 0:
                 touched = True
                 cost += TOUCH * (1 + (steps - k) / steps)  # the earlier, the worse

@@ -23,12 +23,12 @@ from mrctl.physics.bounds import compiling
 from mrctl.physics.elements import FRONTS, MOTORS, NUMERICS, REAR, RIGID, has
 from mrctl.physics.files import robot_path
 from mrctl.record import InputError
+from mrctl.theory.kinematics import UP
 from mrctl.theory.robot import RobotFile
 
 Array = NDArray[np.float64]
 
 PREFIX = "robot/"  # put before each name of the robot's file that is not replaced
-UP = np.array([0.0, 0.0, 1.0])
 LEVEL = 0.1  # share of the wheel radius: a caster this near to the floor touches it, and two this close are one
 HINGE = mujoco.mjtJoint.mjJNT_HINGE
 DCMOTOR = '<dcmotor joint="{}" gear="N" motorconst="k k" resistance="R" armature="J" ctrlrange="-U U"/>'

@@ -239,7 +239,7 @@ def _requests(element: ElementTree.Element, file: Path) -> Iterator[tuple[str, f
     elif tag == "numeric":
         yield "values", len(given.get("data", "").split()), 500
     elif tag == "lengthrange":
-        duration, step = (_amount(element, file, name, usual) for name, usual in LENGTHRANGE.items())
+        duration, step = (_amount(element, file, name, default) for name, default in LENGTHRANGE.items())
         yield "steps", duration / step if step else math.inf, MOST_STEPS
     elif tag == "mesh" and "params" in given:
         kind, first = given.get("builtin"), _number(given["params"].split()[:1], file, "mesh> params")
@@ -253,9 +253,9 @@ def _requests(element: ElementTree.Element, file: Path) -> Iterator[tuple[str, f
         yield str(given["key"]), _amount(element, file, "value"), 1e5
 
 
-def _amount(element: ElementTree.Element, file: Path, name: str, usual: float = 1.0) -> float:
-    """Returns the product of the magnitudes of the numbers in an attribute, or what it usually is."""
-    return _number(element.attrib[name].split(), file, f"{element.tag}> {name}") if name in element.attrib else usual
+def _amount(element: ElementTree.Element, file: Path, name: str, default: float = 1.0) -> float:
+    """Returns the product of the magnitudes of the numbers in an attribute, or `default` if it is absent."""
+    return _number(element.attrib[name].split(), file, f"{element.tag}> {name}") if name in element.attrib else default
 
 
 def _number(texts: list[str], file: Path, where: str) -> float:

@@ -29,10 +29,8 @@ from mrctl.physics.hull import footprint
 from mrctl.physics.parameters import load_torques, read_robot
 from mrctl.physics.units import derived_limits
 from mrctl.record import InputError
-from mrctl.theory.obstacles import Obstacles
+from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles
 from mrctl.theory.robot import CAR, STEERINGS, Robot, RobotFile, Steering
-
-NONE = Obstacles()
 
 INCLUDED = f'<include file="{CAR.path}.xml"/>'
 """The line with which a world includes the default robot."""
@@ -51,7 +49,7 @@ def build(
     steering: Steering | None = None,
     timestep: float | None = None,
     robot: RobotFile = CAR,
-    obstacles: Obstacles = NONE,
+    obstacles: Obstacles = NO_OBSTACLES,
 ) -> tuple[mujoco.MjModel, Robot]:
     """Compiles a world with a robot in one of its steering arrangements.
 
@@ -136,7 +134,7 @@ def load(
     steering: Steering | None = None,
     timestep: float | None = None,
     robot: RobotFile = CAR,
-    obstacles: Obstacles = NONE,
+    obstacles: Obstacles = NO_OBSTACLES,
 ) -> mujoco.MjModel:
     """Returns the compiled model alone; see `build` for the arguments and errors."""
     return build(world, steering, timestep, robot, obstacles)[0]

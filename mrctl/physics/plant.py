@@ -28,13 +28,12 @@ from mrctl.physics.perturb import fields, limit_current, perturb, write
 from mrctl.physics.readout import READING, addresses, current_limits, imu_motion, inputs, motor_parameters, read
 from mrctl.physics.stand import stand
 from mrctl.theory.drive import DRIVER, SERVO, Driver, SteeringServo, chop, drive, turn
-from mrctl.theory.obstacles import Obstacles, Surroundings
+from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles, Surroundings
 from mrctl.theory.perturbation import LONGEST_DELAY, Perturbation
 from mrctl.theory.robot import Robot
 
 TILT = float(np.cos(np.radians(30)))  # least cosine of the tilt; a robot that tilts further has failed
 IDEAL_DRIVER, IDEAL_SERVO = Driver(), SteeringServo()
-NONE = Obstacles()
 
 PLANT = np.dtype(
     [
@@ -149,7 +148,7 @@ class Plant(ABC):
     mocap: tuple[Array, Array]
 
     def __init__(
-        self, model: mujoco.MjModel, robot: Robot, size: int, substeps: int, obstacles: Obstacles = NONE
+        self, model: mujoco.MjModel, robot: Robot, size: int, substeps: int, obstacles: Obstacles = NO_OBSTACLES
     ) -> None:
         """Takes the nominal model, its robot, the number of robots, physics steps per control period, and obstacles."""
         self.size, self.substeps = size, substeps
@@ -388,7 +387,7 @@ class PhysicsPlant(Plant):
         physics: The `CarPhysics`, for rendering and inspection.
     """
 
-    def __init__(self, model: mujoco.MjModel, robot: Robot, substeps: int, obstacles: Obstacles = NONE) -> None:
+    def __init__(self, model: mujoco.MjModel, robot: Robot, substeps: int, obstacles: Obstacles = NO_OBSTACLES) -> None:
         """Takes a compiled world, its robot, physics steps in a control period, and obstacles."""
         super().__init__(model, robot, 1, substeps, obstacles)
         self.physics = CarPhysics.from_compiled(mjcf.clone(model))
@@ -427,7 +426,7 @@ class BatchPlant(Plant):
         size: int,
         substeps: int,
         threads: int = 0,
-        obstacles: Obstacles = NONE,
+        obstacles: Obstacles = NO_OBSTACLES,
     ) -> None:
         """Takes the arguments of `build`."""
         super().__init__(model, robot, size, substeps, obstacles)
@@ -466,7 +465,7 @@ class BatchPlant(Plant):
 
 
 def build(
-    model: mujoco.MjModel, robot: Robot, size: int, substeps: int, threads: int = 0, obstacles: Obstacles = NONE
+    model: mujoco.MjModel, robot: Robot, size: int, substeps: int, threads: int = 0, obstacles: Obstacles = NO_OBSTACLES
 ) -> Plant:
     """Builds the plant for a number of robots: dm_control for one, the batch engine for more.
 

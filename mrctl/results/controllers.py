@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from itertools import count
 
+CONTROLLER = ("prior", "learner")
+"""Fields of a scenario that choose its controller."""
+
 # Display name and colour, by the name in tables. The first six have colours of Okabe and Ito (2008).
 CONTROLLERS: dict[str, tuple[str, str]] = {
     "none": ("PID alone", "#D55E00"),

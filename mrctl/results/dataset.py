@@ -86,8 +86,8 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "pitch_angle": ("rad", "pitch, positive nose down; after the heading"),
 }
 
-# Variables with the first tick at which a stage of the user answered what is not finite, "" if none did, and what then
-# happens to the robot, which drives on.
+# Variables that hold the first tick at which the user's stage returned NaN or infinity ("" if it never did), and what
+# drives the robot from then on.
 FAULTS = {
     "estimator_fault": "the robot coasts on odometry",
     "feedforward_fault": "the guard lets PID and nominal model drive it",

@@ -58,7 +58,7 @@ EKF = np.dtype(
         ("mean", "f8", N),  # estimate of x, in the order and units above
         ("P", "f8", (N, N)),  # its covariance
         ("kept_mean", "f8", (KEPT, N)),  # estimates at the ticks of fixes that have not arrived
-        ("kept_P", "f8", (KEPT, N, N)),
+        ("kept_P", "f8", (KEPT, N, N)),  # their covariances, in the squared units above
         ("kept_tick", "i8", KEPT),  # these ticks
         ("g", "f8", N),  # scratch: covariance of the state with a measurement, or its derivative by an input
         ("encoder_variance", "f8"),  # rad²

@@ -19,7 +19,7 @@ from mrctl.sensing.prediction import SEEN, front, predict, wrapped
 from mrctl.sensing.sensors import Sensors
 from mrctl.sensing.slip import slip_ratio
 from mrctl.sensing.tiers import Sensing
-from mrctl.theory.obstacles import Obstacles
+from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles
 from mrctl.theory.robot import Robot, Tyres
 
 MOTION = np.dtype(
@@ -131,7 +131,6 @@ def estimate(
             s.fix[k] = taken.fix[k] if arrives else np.nan
 
 
-NONE = Obstacles()
 ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
     "truth": (truth, MOTION),
     "odometry": (odometry, MOTION),
@@ -165,7 +164,7 @@ class Estimator:
         imu: Array,
         skew: float,
         tyres: Tyres,
-        obstacles: Obstacles = NONE,
+        obstacles: Obstacles = NO_OBSTACLES,
     ) -> None:
         """Builds the estimator.
 

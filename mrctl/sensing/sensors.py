@@ -16,21 +16,21 @@ SENSOR = np.dtype(
     [
         ("quantum", "f8"),  # angle of one encoder count, rad; 0 for an exact encoder
         ("phase", "f8", 2),  # angle of each encoder at which a count begins, in counts from 0 to 1
-        ("encoder_every", "i8"),  # control periods from one sample to the next; likewise for the other sensors
-        ("encoder_latency", "i8"),  # age of a sample at its arrival, control periods; likewise for the other sensors
+        ("encoder_every", "i8"),  # time from one encoder sample to the next, control periods
+        ("encoder_latency", "i8"),  # age of an encoder sample at its arrival, control periods
         ("gyro_sigma", "f8"),  # standard deviation of the noise of a sample, rad/s
         ("gyro_bias", "f8"),  # bias now, rad/s
         ("gyro_step", "f8"),  # standard deviation of the change of the bias in a control period, rad/s
-        ("gyro_every", "i8"),
-        ("gyro_latency", "i8"),
+        ("gyro_every", "i8"),  # time from one gyro sample to the next, control periods
+        ("gyro_latency", "i8"),  # age of a gyro sample at its arrival, control periods
         ("accelerometer_sigma", "f8"),  # standard deviation of the noise of a sample, m/s²
         ("accelerometer_bias", "f8", 2),  # biases now, forward and to the left, m/s²
         ("accelerometer_step", "f8"),  # standard deviation of the change of a bias in a control period, m/s²
-        ("accelerometer_every", "i8"),
-        ("accelerometer_latency", "i8"),
+        ("accelerometer_every", "i8"),  # time from one accelerometer sample to the next, control periods
+        ("accelerometer_latency", "i8"),  # age of an accelerometer sample at its arrival, control periods
         ("fix_sigma", "f8", 2),  # standard deviations of the noise of position in m and heading in rad
-        ("fix_every", "i8"),
-        ("fix_latency", "i8"),
+        ("fix_every", "i8"),  # time from one fix to the next, control periods
+        ("fix_latency", "i8"),  # age of a fix at its arrival, control periods
         ("fix_lost", "f8"),  # share of fixes that never arrive
         ("fix_outliers", "f8"),  # share of fixes that are outliers
         ("start", "i8"),  # tick at which the run of this robot began
@@ -48,7 +48,7 @@ SAMPLE = np.dtype(
         ("rate", "f8", 2),  # their measured rates, rad/s; of an encoder that counts, a difference quotient
         ("encoder_new", "?"),  # whether the encoders were sampled in this tick; else the last sample is repeated
         ("gyro", "f8"),  # measured θ̇, rad/s
-        ("gyro_new", "?"),
+        ("gyro_new", "?"),  # whether the gyro was sampled in this tick; else the last sample is repeated
         ("acceleration", "f8", 2),  # measured specific force, forward and to the left, m/s²
         ("fix", "f8", 3),  # measured posture, m, m, rad
         ("fix_taken", "?"),  # whether a fix was taken in this tick

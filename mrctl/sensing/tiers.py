@@ -227,3 +227,7 @@ class Sensing(Record):
             raise ValueError(f"sensing.fix_latency: more than {IN_FLIGHT} fixes would be on their way at the same time")
         if latency * control_period >= duration:
             raise ValueError(f"sensing.fix_latency: {self['fix_latency']:g} s, but the run takes {duration:g} s")
+
+
+LAB = Sensing(tier="lab")
+"""The default tier."""

@@ -27,7 +27,7 @@ DRIVER = np.dtype(
     [
         # Settings, as in `Driver`
         ("dead_zone", "f8"),  # V
-        ("pwm_steps", "f8"),
+        ("pwm_steps", "f8"),  # number of steps of the pulse width from zero to `supply`; 0 for a continuous one, 1
         ("current_limit", "f8", 2),  # of the motors left and right, A; infinite for none
         ("battery_resistance", "f8"),  # Ω
         ("supply", "f8"),  # nominal supply voltage U_n, the command for the full pulse width, V

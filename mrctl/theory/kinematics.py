@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mrctl.theory.robot import Robot
 
+UP = np.array([0.0, 0.0, 1.0])
+"""Unit vector against gravity."""
+
 
 def split(array: ArrayLike) -> NDArray[np.float64]:
     """Moves the last axis to the front, so that the components along it can be unpacked."""

@@ -139,6 +139,10 @@ class Obstacles(Record):
         return whole.min(axis=0), whole.max(axis=0)
 
 
+NO_OBSTACLES = Obstacles()
+"""The default world, which is empty."""
+
+
 def _cross(a: Array, b: Array) -> Array:
     """Returns the cross products of plane vectors, `(n, 2)` each."""
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

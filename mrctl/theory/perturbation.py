@@ -76,7 +76,7 @@ class Perturbation(Record):
     dead_zone: DeadZone = 0.0
     """Voltage in V that is added to the dead zone of the motor driver, below which a command has no effect."""
     pwm_steps: PwmSteps = 0
-    """Number of steps of the pulse width to the full supply, if the driver has more steps or none; 0 for no change."""
+    """Upper bound on the driver's PWM steps up to the full supply; 0 keeps the driver's own."""
     current_limit: CurrentLimit = NO_LIMIT
     """Current limit of each motor in A, if that of the driver is higher; 1000 A, the default, stands for no limit."""
     battery_resistance: BatteryResistance = 0.0

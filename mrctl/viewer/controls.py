@@ -14,7 +14,7 @@ from pydantic.fields import FieldInfo
 from mrctl.record import Record
 from mrctl.sensing.tiers import VALUES, Sensing
 from mrctl.theory.robot import Robot
-from mrctl.viewer.usual import Interval, usual
+from mrctl.viewer.slider_ranges import Interval, slider_range
 
 OnChange = Callable[[tuple[str, ...], Any], None]
 WORLDS = ("flat", "slope", "rough", "patch")
@@ -61,8 +61,8 @@ class Controls:
     The input of a field that is not set and follows from the design shows the designed value, and its label says so; a
     field that is set has a button that returns it to the design.
 
-    A slider shows what is usual for the present robot. A number that is typed beyond its ends is accepted up to the
-    limits of the record, and moves an end there until the value is within the usual interval again.
+    A slider shows the range that suits the present robot. A number that is typed beyond its ends is accepted up to the
+    limits of the record, and moves an end there until the value is within that range again.
 
     Attributes:
         designed: Values by path, in the units of the fields, that fields have while they are not set; those that have
@@ -81,7 +81,7 @@ class Controls:
         self._gui, self._on_change, self._changeable = gui, on_change, changeable
         self._robot = robot
         self._limits: dict[tuple[str, ...], Interval] = {}  # of the record
-        self._sliders: dict[tuple[str, ...], tuple[FieldInfo, Interval]] = {}  # and what is usual
+        self._sliders: dict[tuple[str, ...], tuple[FieldInfo, Interval]] = {}  # and the range of the slider
         self._inputs: dict[tuple[str, ...], Any] = {}
         self._folders: dict[tuple[str, ...], viser.GuiFolderHandle] = {}
         self._buttons: dict[tuple[str, ...], viser.GuiButtonHandle] = {}
@@ -136,7 +136,7 @@ class Controls:
             self._limits[path] = low, high
             # Whole numbers are floats too: viser accepts an int of any size from a page, and then fails to pack it for
             # the other pages.
-            if kind is field and path != SEED and (ends := usual(path, field, (low, high), self._robot)):
+            if kind is field and path != SEED and (ends := slider_range(path, field, (low, high), self._robot)):
                 self._sliders[path] = field, ends
                 first, last = min(ends[0], value), max(ends[1], value)
                 step = step if kind.annotation is int else _step(last - first, value)
@@ -227,16 +227,16 @@ class Controls:
             handle.value = value
 
     def suit(self, robot: Robot) -> None:
-        """Gives the sliders the ends that are usual for a robot."""
+        """Gives the sliders the ranges that suit a robot."""
         if robot == self._robot:
             return
         self._robot = robot
         for path, (field, ends) in self._sliders.items():
-            self._sliders[path] = field, usual(path, field, self._limits[path], robot) or ends
+            self._sliders[path] = field, slider_range(path, field, self._limits[path], robot) or ends
             self._fit(path, self._inputs[path].value)
 
     def _fit(self, path: tuple[str, ...], value: float) -> None:
-        """Gives a slider its usual ends, or moves one to a value beyond it."""
+        """Gives a slider its own range, or moves one end to a value beyond it."""
         handle, (low, high) = self._inputs[path], self._sliders[path][1]
         handle.min, handle.max = min(low, value), max(high, value)
 

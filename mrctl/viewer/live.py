@@ -21,7 +21,7 @@ from mrctl.loop.simulation import arranged, suited
 from mrctl.navigation.mission import Avoid
 from mrctl.physics.files import SHIPPED
 from mrctl.record import InputError
-from mrctl.results.controllers import title_of
+from mrctl.results.controllers import CONTROLLER, title_of
 from mrctl.scenario import FEEDFORWARDS, Event, FeedforwardName, Scenario
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.obstacles import Pose
@@ -63,7 +63,6 @@ from mrctl.scenario import Scenario
 '''
 KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of each group
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
-CONTROLLER = ("prior", "learner")  # what the ghosts differ in
 NOTHING = np.zeros((0, 2, 2))
 PLANNED = ("world", "steering", "reference")  # what a plan was made for
 KEPT = ("prior", "learner", "seed")  # by another robot, and the tier of the sensors
@@ -619,7 +618,7 @@ class Live(Page):
         driven = self.session.driven()
         ticks = np.minimum(np.round(np.array(self._event_times()) / self.session.period).astype(int), len(driven) - 1)
         self._scene.show_events(driven[ticks[ticks >= 0]])
-        soon = self.time + self.session.lead * self.session.period
+        soon = self.time + self.session.preview * self.session.period
         self._ends = ends(scenario, soon)
         self._scene.show_ends(self._ends)
         way = followed(scenario, soon)

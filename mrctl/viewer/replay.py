@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
-from mrctl.results.controllers import title_of
+from mrctl.results.controllers import CONTROLLER, title_of
 from mrctl.results.metrics import METRICS
 from mrctl.viewer.looks import Colour, looks
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
@@ -33,7 +33,6 @@ DOT = 0.035  # size of a run in the scatter plot, as a share of its height
 DROVE, FAILED, CHOSEN, GRID = (71, 85, 105), (185, 28, 28), (17, 24, 39), (150, 155, 160)
 # Unit and words of the columns of a table that are not in `METRICS`.
 KNOWN = {"lap_time": ("s", "time of a lap"), "failure_time": ("s", "failed after"), "laps": ("1", "laps")}
-CONTROLLER = ("prior", "learner")  # axes of a sweep that choose the controller
 DECADES, TINY = 30.0, 1e-300  # ratio of largest to least beyond which an axis is logarithmic; what stands for 0 there
 
 

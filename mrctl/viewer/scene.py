@@ -26,7 +26,7 @@ from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.physics.stand import ground
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
-from mrctl.theory.obstacles import Obstacles, Surroundings
+from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles, Surroundings
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Reference
 from mrctl.theory.robot import GRAVITY
@@ -64,7 +64,6 @@ LINE_WIDTH = 0.004  # of the reference, as a share of the width of the view; tra
 REACH = 0.03  # distance from a trail of clicks on it, as a share of the width of the view
 LEAST_VIEW = 1.2  # m, least width of the view
 SEEN = 2  # last visible geom group, as in MuJoCo's own viewer
-NONE = Obstacles()
 GOAL_COLOUR: Colour = (22, 163, 74)
 OUTLINE = 0.02  # m, width of the outlines at start and goal
 SCAN_POINT, SCAN_HEIGHT = 0.03, HEIGHT + 0.01  # m, size of the points of a scan, which lie on top of the walls
@@ -102,7 +101,7 @@ class Scene:
         server: Server,
         model: mujoco.MjModel,
         robots: Sequence[Look],
-        obstacles: Obstacles = NONE,
+        obstacles: Obstacles = NO_OBSTACLES,
         fog: bool = True,
     ) -> None:
         """Draws the world and its robots.

@@ -9,6 +9,7 @@ import viser
 from numpy.typing import NDArray
 
 from mrctl.kernel import Row, Rows
+from mrctl.theory.kinematics import UP
 from mrctl.viewer.shapes import disc, ribbons
 
 Array = NDArray[np.float64]
@@ -19,7 +20,6 @@ MAX_FIXES = 20  # number of fixes that are shown of a robot
 MAGNIFICATIONS = (1, 10, 100)
 WIDEST = 0.5  # m, to which errors are magnified at the beginning
 RIM = 0.06  # width of the rim of an ellipse, as a share of its half axes
-UP = np.array([0.0, 0.0, 1.0])
 TURN = np.linspace(0, 2 * np.pi, 49)
 # Height in m of the first robot's marks over the ground, above the trails, and from one robot's marks to the next, and
 # from one kind of mark to the next; at the same height they would flicker.

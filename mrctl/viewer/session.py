@@ -47,7 +47,7 @@ class Session:
         avoid: What keeps the robots from obstacles that move.
         simulations: Indices of the robots in each simulation, and the simulation.
         period: Control period in s.
-        lead: Number of control periods until a new reference is followed, the longest delay of a robot.
+        preview: Number of control periods until all robots follow a new reference, the largest of the simulations.
         tick: Number of control periods done.
     """
 
@@ -81,7 +81,7 @@ class Session:
             (rows, Simulation([long[row] for row in rows], threads=1, **stages)) for rows in uniform(long)
         ]
         self._place = {row: (sim, k) for rows, sim in self.simulations for k, row in enumerate(rows)}
-        self.lead = max(sim.lead for _, sim in self.simulations)
+        self.preview = max(sim.preview for _, sim in self.simulations)
         self.tick = 0
         self._surroundings = Surroundings(scenarios[0].obstacles)
         self._footprint = footprint(self.simulations[0][1].model) if scenarios[0].obstacles.shapes else np.zeros((0, 2))
@@ -139,7 +139,7 @@ class Session:
         """
         other = Session(scenarios, self.avoid)
         for event in self.added:
-            known = self.lead if event.reference else 0  # a reference acts that long before its time
+            known = self.preview if event.reference else 0  # a reference acts that long before its time
             if event.tick(self.period) - known < tick:
                 for _, sim in other.simulations:
                     sim.add(event)
@@ -156,8 +156,8 @@ class Session:
         Raises:
             InputError: The event is refused; then nothing changes.
         """
-        lead = self.lead if "reference" in change else 0
-        event = Event.from_dict({"time": (self.tick + lead) * self.period, **change})
+        preview = self.preview if "reference" in change else 0
+        event = Event.from_dict({"time": (self.tick + preview) * self.period, **change})
         for _, sim in self.simulations:
             if sim.tick == self.tick:  # the others have stopped
                 sim.add(event)

@@ -21,7 +21,7 @@ from tqdm import tqdm
 from mrctl.physics import mjcf
 from mrctl.physics.obstacles import quaternion
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.pictures import REFERENCE_COLOUR, draw_line
+from mrctl.physics.pictures import REFERENCE_COLOUR, SHADOW, draw_line
 from mrctl.record import InputError
 from mrctl.theory.obstacles import Surroundings
 from mrctl.viewer.deviation import extent
@@ -39,7 +39,6 @@ LINE_POINTS, TRAIL_POINTS = 200, 100
 TRAIL = 12.0  # s that a trail shows
 GHOST_OPACITY = 0.25
 NEARER = 0.8  # distance of the camera from the track, relative to that in the page
-SHADOW = 1024  # pixels of the map of shadows
 WIDTH = 0.003  # of trails, as a share of the width of the view; the reference is twice as wide
 
 

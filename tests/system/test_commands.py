@@ -272,7 +272,7 @@ def help_texts(capsys: pytest.CaptureFixture, *arguments: str) -> dict[str, str]
     texts: dict[str, list[str]] = {}
     flag = ""
     for line in capsys.readouterr().out.splitlines():  # in boxes, or with spaces in their place
-        if begin := re.match(r"[│ ] (--?[a-z].*?|[A-Z]{5,}.*?)(?:  +(.*))?$", line.rstrip("│ ")):
+        if begin := re.match(r"[│ ] (--?[a-z].*?|\[?[A-Z]{5,}.*?)(?:  +(.*))?$", line.rstrip("│ ")):
             flag = begin[1]
             texts[flag] = [begin[2] or ""]
         elif not re.match(r"[│ ]   ", line):
@@ -300,7 +300,7 @@ def test_short_help_of_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     monkeypatch.setenv("COLUMNS", "80")
     short = help_texts(capsys, "run", "--help")
     for flag in (
-        "SCENARIO.toml",
+        "[SCENARIO.toml",
         "--laps",
         "--prior",
         "--learner",
@@ -315,7 +315,7 @@ def test_short_help_of_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
         cli.main(["run", "--kanayama.k-x", "2", "--help"])
     screen = capsys.readouterr().out
     assert len(screen.splitlines()) < 100
-    assert "reference:circle" in screen and "mrctl run --help-all" in screen
+    assert "mrctl run reference:circle --help" in screen and "mrctl run --help-all" in screen
     every = help_texts(capsys, "run", "--help-all")
     assert len(every) > 80
     for flag in every.keys() - short.keys():
@@ -323,12 +323,25 @@ def test_short_help_of_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
         assert re.search(rf"^  {re.escape(re.sub(r'[.].*', '.*', name))} ", screen, re.MULTILINE), flag
 
 
+def test_short_help_of_identify(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """The short help of `identify` is one screen; it names the groups of the flags that it leaves out."""
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        cli.main(["identify", "--perturbation.payload", "2", "--help"])
+    screen = capsys.readouterr().out
+    assert len(screen.splitlines()) < 30 and "mrctl identify --help-all" in screen
+    short, every = (help_texts(capsys, "identify", flag) for flag in ("--help", "--help-all"))
+    assert len(short) == 3 + 3 and len(every) > 60  # flags and groups of flags
+    for flag in every.keys() - short.keys():
+        assert f"  {flag.partition('.')[0]}.* " in screen, flag
+
+
 def test_short_help_has_the_defaults_of_the_file(capsys: pytest.CaptureFixture, scenario: Path) -> None:
     """The help of `run` on a scenario file shows the file's values as defaults."""
     with pytest.raises(SystemExit):
         cli.main(["run", str(scenario), "--help"])
     out = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "(default: rls)" in out and "Number of laps. (default: 1)" in out
+    assert "(default: rls)" in out and "The robot drives this number of laps. (default: 1)" in out
 
 
 def test_version(capsys: pytest.CaptureFixture) -> None:

@@ -130,11 +130,11 @@ def test_reference_within_the_delay():
     session = Session([BASE, BASE.model_copy(update={"sensing": Sensing(tier="field")})])
     drive(session, 10)
     late, other = session.simulations[1][1], Circle(radius=0.6, period=5.0)
-    assert late.lead == session.lead > session.simulations[0][1].lead > 0
+    assert late.preview == session.preview > session.simulations[0][1].preview > 0
     with pytest.raises(InputError, match=r"time: a reference must be known 0.0\d s before"):
         late.add(Event(time=0.1, reference=other))
     session.apply(reference=other)
-    assert [s.events[0].tick(0.01) for s in session.saved()] == [10 + session.lead] * 2
+    assert [s.events[0].tick(0.01) for s in session.saved()] == [10 + session.preview] * 2
     drive(session, 100)
     results = simulate(session.saved())
     same(session, [results.isel(run=k) for k in range(2)])

@@ -158,7 +158,7 @@ def test_marks(live):
 
 
 def test_sliders(live):
-    """A slider shows what is usual for the robot; a number beyond its ends is accepted up to the record's limits."""
+    """A slider shows the range that suits the robot; a number beyond its ends is accepted up to the record's limits."""
     payload, size = ("perturbation", "payload"), ("reference", "lemniscate", "size")
     shown = {}
     for name in ("turtlebot", "racecar", "car"):

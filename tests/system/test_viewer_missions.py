@@ -162,7 +162,7 @@ def test_goals_of_a_session(driven):
     assert [e.time for e in first.events] == pytest.approx([1.51, 3.01]) and first.events == other.events
     for event in first.events:
         start = event.reference.sample(np.zeros(1)).pose[0]
-        here = log[round(event.time / 0.01) - driven.lead, 0]
+        here = log[round(event.time / 0.01) - driven.preview, 0]
         assert start[:2] == pytest.approx([here["x"], here["y"]], abs=1e-9)
     goal = np.array([-0.5, -1.0, np.pi])
     bound = ends(first, driven.time)
@@ -349,7 +349,7 @@ def test_clicks(server):
     live.refresh()
     goal = live._scene._ends[1]
     assert goal.visible and goal.position[:2] == pytest.approx([2, 1])
-    assert event.time == 0.01 * (1 + live.session.lead)
+    assert event.time == 0.01 * (1 + live.session.preview)
 
 
 TO_SCREEN = """([x, y]) => {

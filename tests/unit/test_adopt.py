@@ -159,8 +159,8 @@ def test_steered(file, body):
     assert robot.steering_limit == pytest.approx(limit)
     phi = 0.3
     omega = 0.4 * np.tan(phi) / 0.5
-    apart = robot.back_emf * robot.half_track * omega / robot.wheel_radius
-    v, omega = drive(model, robot, (5 - apart, 5 + apart), phi, 4.0, (0.4, omega))["twist"]
+    differential = robot.back_emf * robot.half_track * omega / robot.wheel_radius
+    v, omega = drive(model, robot, (5 - differential, 5 + differential), phi, 4.0, (0.4, omega))["twist"]
     assert v / omega == pytest.approx(0.5 / np.tan(phi), rel=0.01)
     if body is CAR:
         qpos = np.zeros(model.nq)

@@ -173,7 +173,7 @@ def test_blame_fades():
 
 def test_position_bounds_the_deviation():
     """Where the position is the weaker, D follows from it."""
-    assert Bench(gains=((0.001, 0.05), (0.5, 0.01))).g["harmless"][0] == pytest.approx(module.APART / 0.05)
+    assert Bench(gains=((0.001, 0.05), (0.5, 0.01))).g["harmless"][0] == pytest.approx(module.TOLERATED / 0.05)
 
 
 def test_unstable_loop():

@@ -40,8 +40,8 @@ def both(robot, mean, turn):
 
 def drives(robot, count, random, turns, quantum=0.0, noise=0.0):
     """Drives of several robots, the second period of two; encoders with counts, and a noisy gyro that drifts."""
-    common, apart = np.moveaxis(np.stack([signals(robot, random, turns) for _ in range(count)], 1), -1, 0)
-    volts = np.tile(np.stack([common - apart, common + apart], -1), (2, 1, 1))
+    common, differential = np.moveaxis(np.stack([signals(robot, random, turns) for _ in range(count)], 1), -1, 0)
+    volts = np.tile(np.stack([common - differential, common + differential], -1), (2, 1, 1))
     v, omega, way, heading = integrate(robot, volts, np.tile([robot.max_speed / 2, 0.0], (count, 1)))[1:].T
     current = (volts - robot.back_emf * both(robot, v, omega).swapaxes(0, 1)) / robot.resistance
     encoders = both(robot, way, heading).swapaxes(0, 1)
@@ -156,8 +156,8 @@ def test_signals(robot):
     """Predicted from equation (3), the drive keeps to the robot's limits, and both wheels turn forwards."""
     for turns in (False, True):
         period = np.stack([signals(robot, np.random.default_rng([4, k]), turns) for k in range(3)], axis=1)
-        common, apart = np.moveaxis(period, -1, 0)
-        volts = np.tile(np.stack([common - apart, common + apart], -1), (2, 1, 1))
+        common, differential = np.moveaxis(period, -1, 0)
+        volts = np.tile(np.stack([common - differential, common + differential], -1), (2, 1, 1))
         path = integrate(robot, volts, np.tile([robot.max_speed / 2, 0.0], (3, 1)))[len(period) :]
         v, omega = path[..., 0], path[..., 1]
         v_dot, omega_dot = (np.diff(one, axis=0) / TICK for one in (v, omega))

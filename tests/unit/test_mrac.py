@@ -7,7 +7,8 @@ import pytest
 
 from mrctl.control.features import feature_matrix, feature_scale
 from mrctl.control.feedforward import Prior
-from mrctl.control.mrac import MRAC, SETTLED, ModelReferenceAdaptive, Mrac, confine, predict, track
+from mrctl.control.matching import SETTLED
+from mrctl.control.mrac import MRAC, ModelReferenceAdaptive, Mrac, confine, predict, track
 from mrctl.theory.dynamics import accelerations, inverse_coefficients, left_right
 
 PERIOD = 0.01

@@ -159,8 +159,8 @@ def test_rigid_voltages(stiff, feedback, correction, feedforward, twist):
     voltage = allocation(twist, feedback=feedback, feedforward=feedforward)[:2]
     # A robot that neither rolls with losses nor has its mass off P needs just these to turn steadily.
     light = stiff.model_copy(update={"rolling_coefficient": 0.0, "com_offset": 0.0})
-    apart = common_differential(inverse_dynamics(twist, ZERO, light, 0.05))[1]
-    expected = [feedback[0]] * 2 + [feedforward[0] - apart, feedforward[0] + apart]
+    differential = common_differential(inverse_dynamics(twist, ZERO, light, 0.05))[1]
+    expected = [feedback[0]] * 2 + [feedforward[0] - differential, feedforward[0] + differential]
     np.testing.assert_allclose(allocation.parts, expected, atol=1e-9)
     asked = allocation.parts[:2] + allocation.parts[2:]
     np.testing.assert_allclose(voltage, np.clip(asked, -24, 24), atol=1e-12)

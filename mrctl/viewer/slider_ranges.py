@@ -1,4 +1,4 @@
-"""What is usual for a robot: the intervals that the sliders of its inputs show."""
+"""Ranges of the sliders: the interval of each number that suits a robot."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LEAST = 1e-3  # a default below which a number does not fit into the box beside 
 LENGTHS = ("length", "radius", "size", "side", "distance")  # of references
 
 
-def usual(path: tuple[str, ...], field: FieldInfo, limits: Interval, robot: Robot) -> Interval | None:
+def slider_range(path: tuple[str, ...], field: FieldInfo, limits: Interval, robot: Robot) -> Interval | None:
     """Returns the ends of the slider of a number for a robot, in the unit of the field, within its limits.
 
     Args:
@@ -29,7 +29,7 @@ def usual(path: tuple[str, ...], field: FieldInfo, limits: Interval, robot: Robo
     """
     low, high = limits
     name = path[-1].removeprefix("left_").removeprefix("right_")
-    known = {"perturbation": _plant, "reference": _reference}.get(path[0])
+    known = {"perturbation": _perturbation_ranges, "reference": _reference_ranges}.get(path[0])
     default = field.default
     if known and (ends := known(robot).get(name)):
         first, last = ends
@@ -43,8 +43,8 @@ def usual(path: tuple[str, ...], field: FieldInfo, limits: Interval, robot: Robo
     return max(low, float(digits.format(first))), min(high, float(digits.format(last)))
 
 
-def _plant(robot: Robot) -> dict[str, Interval]:
-    """Returns intervals of the fields of a perturbation, by name; what is on the left or on the right has no side."""
+def _perturbation_ranges(robot: Robot) -> dict[str, Interval]:
+    """Returns the ranges of the fields of a perturbation, by name without the prefix `left_` or `right_`."""
     length = abs(robot.wheelbase)
     return {
         "mass_factor": (0.5, 3.0),
@@ -69,8 +69,8 @@ def _plant(robot: Robot) -> dict[str, Interval]:
     }
 
 
-def _reference(robot: Robot) -> dict[str, Interval]:
-    """Returns intervals of the fields of references, by name."""
+def _reference_ranges(robot: Robot) -> dict[str, Interval]:
+    """Returns the ranges of the fields of references, by name."""
     size = hypot(robot.wheelbase, 2 * robot.half_track)
     return {
         **dict.fromkeys(LENGTHS, (size / 2, 20 * size)),
