@@ -54,88 +54,22 @@ NOTHING = 1e-9  # V² or (rad/s)²; features whose φᵀ P φ is smaller explain
 # 20 mrad/s in θ̇, behind filters of 0.03 s, at a control period of 10 ms.
 SCATTER = 300.0
 UNKNOWN = 6.0  # V, standard deviation of the weights of the eight features without a model
-SIGNALS = 6  # filtered signals: voltage of the two channels, twist, cosine and sine of the heading
-
-
-class Composite(Record):
-    """Settings of the learner `composite`; one setting serves every robot, steering and perturbation."""
-
-    moved = {"weights": "features are no longer trained; save_learned and `learned` keep what a run has adapted"}
-
-    noise: Annotated[float, Field(gt=0, le=100)] = 0.2
-    """Standard deviation of one sample of the regression in V, if the motion is measured without noise; the noise that
-    the measured motion shows is added. On a steering channel it is a tenth of this number in rad/s."""
-    gain: Annotated[float, Field(ge=0, le=100)] = 0.3
-    """Standard deviation over plants of a factor on the whole model, as from supply, motor constant or resistance."""
-    spread: Annotated[float, Field(ge=0, le=1e3)] = 1.0
-    """Standard deviation of each weight over plants in V; on a steering channel a tenth of this number in rad/s."""
-    memory: Annotated[float, Field(ge=1, le=1e6)] = 1000.0
-    """Correlation time of the weights in s, in which they wander by as much as plants differ."""
-    disturbance: Annotated[float, Field(ge=0, le=100)] = 0.05
-    """Standard deviation of the disturbance in V; on a steering channel it is 3 % of this number in rad/s."""
-    disturbance_memory: Annotated[float, Field(ge=0.01, le=1e6)] = 0.15
-    """Correlation time of the disturbance in s, in which it wanders by its standard deviation."""
-    filter: Annotated[float, Field(ge=0.01, le=2)] = 0.03
-    """Time constant in s of each of the two filters on voltage and motion."""
-    step: Annotated[float, Field(ge=0, le=1)] = 0.005
-    """Share of the feedback that the tracking term moves into the feedforward in each control period; on a steering
-    channel a tenth of this number."""
-    dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
-    """Feedback in V below which the tracking term is zero; on a steering channel, a tenth of this number in rad/s."""
-
-
-COMPOSITE = np.dtype(
-    [
-        # Settings, for the two channels; the second is in rad/s where it is steering.
-        ("f", "f8", (CHANNELS, FEATURES + 1)),  # diagonal of F: decay of a and, last, of d in a period
-        ("stationary", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)),  # P₀, V²
-        ("step", "f8", CHANNELS),  # share of the feedback that the tracking term moves into the feedforward
-        ("dead_zone", "f8", CHANNELS),  # feedback below which the tracking term is zero, V
-        ("noise", "f8", CHANNELS),  # standard deviation of a sample, V
-        ("scatter", "f8", CHANNELS),  # further noise of a sample for each m/s or rad/s of noise in the twist, V
-        ("brief", "f8"),  # weight of a new sample in the brief mean square of the innovations
-        ("lasting", "f8"),  # weight of a new sample in the lasting mean square, and in the variance of the twist
-        ("filter", "f8"),  # weight of a new sample in the two filters
-        # Motion
-        ("age", "f8"),  # time since the start in time constants of the filters
-        ("heading", "f8"),  # by dead reckoning, rad
-        ("signals", "f8", SIGNALS),  # input of the first filter
-        ("once", "f8", SIGNALS),  # output of the first filter
-        ("twice", "f8", SIGNALS),  # output of the second filter
-        ("last", "f8", (2, CHANNELS)),  # the last two measured twists, m/s and rad/s
-        ("variance", "f8", CHANNELS),  # variance of the noise of the measured twist, (m/s)² and (rad/s)²
-        ("rate", "f8", CHANNELS),  # filtered acceleration, m/s² and rad/s²
-        ("phi", "f8", FEATURES + 1),  # (φ, 1) at the filtered motion
-        ("phi_c", "f8", FEATURES + 1),  # (φ, 1) at the command
-        ("tick", "i8"),  # number of ticks so far
-        ("past", "f8", FEATURES + 1),  # φ_c of the output that the feedback answers
-        ("residual", "f8", CHANNELS),  # filtered voltage less the prior's, V
-        # What is learned
-        ("a", "f8", (CHANNELS, FEATURES + 1)),  # weights of φ and, last, the disturbance d, V
-        ("P", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)),  # their covariance, V²
-        ("Pphi", "f8", FEATURES + 1),  # P φ
-        ("power", "f8", (CHANNELS, 2)),  # brief and lasting mean square of the innovations, V²
-        ("since", "f8"),  # time since the plant was found to have changed, s
-        ("norm", "f8"),  # ‖a‖ of both channels, V
-    ],
-    align=True,
-)
 
 
 @kernel
-def regressor(twist: Array, rate: Array, heading: Array, half_track: float, scale: Array, phi: Array) -> None:
+def regressor(twist: Array, rate: Array, direction: Array, half_track: float, scale: Array, phi: Array) -> None:
     """The ten features φ of a motion, followed by a one for the disturbance.
 
     Args:
         twist: V in m/s and θ̇ in rad/s, `(2,)`.
         rate: V̇ in m/s² and θ̈ in rad/s², `(2,)`.
-        heading: Cosine and sine of the heading, `(2,)`.
+        direction: Cosine and sine of the heading, `(2,)`.
         half_track: D in m.
         scale: Scales of the first eight features, as from `feature_scale`, `(8,)`.
         phi: Out: φ and 1, `(11,)`.
     """
     features(twist, rate, half_track, scale, phi[:INPUTS])
-    phi[INPUTS], phi[INPUTS + 1], phi[FEATURES] = heading[0], heading[1], 1.0
+    phi[INPUTS], phi[INPUTS + 1], phi[FEATURES] = direction[0], direction[1], 1.0
 
 
 @kernel
@@ -235,6 +169,21 @@ def learned_voltage(a: Array, phi: Array) -> float:
 
 
 @kernel
+def filter_twice(signal: Array, once: Array, twice: Array, share: float, begins: bool) -> None:
+    """Passes a signal of two components through two first-order filters, which begin at its first value.
+
+        once ← once + share (signal − once),    twice ← twice + share (once − twice)
+
+    The share is that of a new sample, one period over the time constant.
+    """
+    for k in range(2):
+        if begins:
+            once[k] = twice[k] = signal[k]
+        once[k] += share * (signal[k] - once[k])
+        twice[k] += share * (once[k] - twice[k])
+
+
+@kernel
 def filter_motion(command: Array, twist: Array, voltage: Array, period: float, robot: Row, s: Row) -> None:
     """Passes voltage, twist and heading through the two filters, and estimates the noise of the twist.
 
@@ -243,23 +192,22 @@ def filter_motion(command: Array, twist: Array, voltage: Array, period: float, r
     The second difference of independent noise has six times the variance of that noise.
     """
     s.heading += period * twist[1]
-    s.signals[2], s.signals[3] = twist[0], twist[1]
-    s.signals[4], s.signals[5] = np.cos(s.heading), np.sin(s.heading)
-    for j in range(SIGNALS):
-        if s.age == 0:
-            s.once[j] = s.twice[j] = s.signals[j]
-        s.once[j] += s.filter * (s.signals[j] - s.once[j])
-        s.twice[j] += s.filter * (s.once[j] - s.twice[j])
+    now, once, twice = s.now, s.once, s.twice
+    now.twist[0], now.twist[1] = twist[0], twist[1]
+    now.direction[0], now.direction[1] = np.cos(s.heading), np.sin(s.heading)
+    filter_twice(now.voltage, once.voltage, twice.voltage, s.filter, s.age == 0)
+    filter_twice(now.twist, once.twist, twice.twist, s.filter, s.age == 0)
+    filter_twice(now.direction, once.direction, twice.direction, s.filter, s.age == 0)
     for k in range(CHANNELS):
         if s.age == 0:
             s.last[0, k] = s.last[1, k] = twist[k]
         difference = twist[k] - 2 * s.last[0, k] + s.last[1, k]
         s.variance[k] += s.lasting * (difference * difference / 6 - s.variance[k])
         s.last[1, k], s.last[0, k] = s.last[0, k], twist[k]
-        s.rate[k] = (s.once[2 + k] - s.twice[2 + k]) * s.filter / (1 - s.filter) / period
-        s.signals[k] = voltage[k]  # it acts in the coming period
+        s.rate[k] = (once.twist[k] - twice.twist[k]) * s.filter / (1 - s.filter) / period
+        now.voltage[k] = voltage[k]  # it acts in the coming period
     if robot.rigid:
-        s.signals[1] += command[1]  # a steering channel adds a correction to the commanded rotation
+        now.voltage[1] += command[1]  # a steering channel adds a correction to the commanded rotation
     s.age += s.filter
 
 
@@ -268,7 +216,7 @@ def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple
     """U = φ(x_c)ᵀ a + d at the commanded motion x_c."""
     rows, scale, _ = arrays
     s = rows[i]
-    regressor(command, derivative, s.signals[4:], robot.half_track, scale, s.phi_c)
+    regressor(command, derivative, s.now.direction, robot.half_track, scale, s.phi_c)
     for k in range(CHANNELS):
         voltage[k] = learned_voltage(s.a[k], s.phi_c) + s.a[k, FEATURES]
 
@@ -287,12 +235,13 @@ def learn(
     answered = recall(s.phi_c, queue[i], s)
     filter_motion(command, twist, voltage, period, robot, s)
     added[0] = added[1] = 0.0
-    moves = abs(s.twice[2]) + robot.half_track * abs(s.twice[3]) > SLOW
+    motion = s.twice
+    moves = abs(motion.twist[0]) + robot.half_track * abs(motion.twist[1]) > SLOW
     if moves and s.age > SETTLED and frozen == 0:
-        regressor(s.twice[2:4], s.rate, s.twice[4:], robot.half_track, scale, s.phi)
-        explained(s.twice[2:4], s.rate, robot.rigid, prior, s.residual)
+        regressor(motion.twist, s.rate, motion.direction, robot.half_track, scale, s.phi)
+        explained(motion.twist, s.rate, robot.rigid, prior, s.residual)
         for k in range(CHANNELS):
-            s.residual[k] = s.twice[k] - s.residual[k]
+            s.residual[k] = motion.voltage[k] - s.residual[k]
             added[k] = learned_voltage(s.a[k], s.phi_c)
             predict(k, s)
             if answered:
@@ -305,6 +254,79 @@ def learn(
             s.a[k, FEATURES] *= s.f[k, FEATURES]
     s.norm = np.sqrt((s.a[:, :FEATURES] ** 2).sum())
     return s.norm
+
+
+class Composite(Record):
+    """Settings of the learner `composite`; one setting serves every robot, steering and perturbation."""
+
+    moved = {"weights": "features are no longer trained; save_learned and `learned` keep what a run has adapted"}
+
+    noise: Annotated[float, Field(gt=0, le=100)] = 0.2
+    """Standard deviation of one sample of the regression in V, if the motion is measured without noise; the noise that
+    the measured motion shows is added. On a steering channel it is a tenth of this number in rad/s."""
+    gain: Annotated[float, Field(ge=0, le=100)] = 0.3
+    """Standard deviation over plants of a factor on the whole model, as from supply, motor constant or resistance."""
+    spread: Annotated[float, Field(ge=0, le=1e3)] = 1.0
+    """Standard deviation of each weight over plants in V; on a steering channel a tenth of this number in rad/s."""
+    memory: Annotated[float, Field(ge=1, le=1e6)] = 1000.0
+    """Correlation time of the weights in s, in which they wander by as much as plants differ."""
+    disturbance: Annotated[float, Field(ge=0, le=100)] = 0.05
+    """Standard deviation of the disturbance in V; on a steering channel it is 3 % of this number in rad/s."""
+    disturbance_memory: Annotated[float, Field(ge=0.01, le=1e6)] = 0.15
+    """Correlation time of the disturbance in s, in which it wanders by its standard deviation."""
+    filter: Annotated[float, Field(ge=0.01, le=2)] = 0.03
+    """Time constant in s of each of the two filters on voltage and motion."""
+    step: Annotated[float, Field(ge=0, le=1)] = 0.005
+    """Share of the feedback that the tracking term moves into the feedforward in each control period; on a steering
+    channel a tenth of this number."""
+    dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
+    """Feedback in V below which the tracking term is zero; on a steering channel, a tenth of this number in rad/s."""
+
+
+MOTION = np.dtype(
+    [
+        ("voltage", "f8", CHANNELS),  # of the two channels, V (rad/s on a steering channel)
+        ("twist", "f8", CHANNELS),  # measured, m/s and rad/s
+        ("direction", "f8", 2),  # cosine and sine of the heading
+    ]
+)
+
+COMPOSITE = np.dtype(
+    [
+        # Settings, for the two channels; the second is in rad/s where it is steering.
+        ("f", "f8", (CHANNELS, FEATURES + 1)),  # diagonal of F: decay of a and, last, of d in a period
+        ("stationary", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)),  # P₀, V²
+        ("step", "f8", CHANNELS),  # share of the feedback that the tracking term moves into the feedforward
+        ("dead_zone", "f8", CHANNELS),  # feedback below which the tracking term is zero, V
+        ("noise", "f8", CHANNELS),  # standard deviation of a sample, V
+        ("scatter", "f8", CHANNELS),  # further noise of a sample for each m/s or rad/s of noise in the twist, V
+        ("brief", "f8"),  # weight of a new sample in the brief mean square of the innovations
+        ("lasting", "f8"),  # weight of a new sample in the lasting mean square, and in the variance of the twist
+        ("filter", "f8"),  # weight of a new sample in the two filters
+        # Motion
+        ("age", "f8"),  # time since the start in time constants of the filters
+        ("heading", "f8"),  # by dead reckoning, rad
+        ("now", MOTION),  # input of the first filter
+        ("once", MOTION),  # output of the first filter
+        ("twice", MOTION),  # output of the second filter
+        ("last", "f8", (2, CHANNELS)),  # the last two measured twists, m/s and rad/s
+        ("variance", "f8", CHANNELS),  # variance of the noise of the measured twist, (m/s)² and (rad/s)²
+        ("rate", "f8", CHANNELS),  # filtered acceleration, m/s² and rad/s²
+        ("phi", "f8", FEATURES + 1),  # (φ, 1) at the filtered motion
+        ("phi_c", "f8", FEATURES + 1),  # (φ, 1) at the command
+        ("tick", "i8"),  # number of ticks so far
+        ("past", "f8", FEATURES + 1),  # φ_c of the output that the feedback answers
+        ("residual", "f8", CHANNELS),  # filtered voltage less the prior's, V
+        # What is learned
+        ("a", "f8", (CHANNELS, FEATURES + 1)),  # weights of φ and, last, the disturbance d, V
+        ("P", "f8", (CHANNELS, FEATURES + 1, FEATURES + 1)),  # their covariance, V²
+        ("Pphi", "f8", FEATURES + 1),  # P φ
+        ("power", "f8", (CHANNELS, 2)),  # brief and lasting mean square of the innovations, V²
+        ("since", "f8"),  # time since the plant was found to have changed, s
+        ("norm", "f8"),  # ‖a‖ of both channels, V
+    ],
+    align=True,
+)
 
 
 def stationary(settings: Composite, robot: Robot, rigid: bool, prior: bool) -> Array:

@@ -32,61 +32,6 @@ HIDDEN_GAIN, BIAS_GAIN = 0.15, 0.1
 REGULARISATION = 1e-3  # ε: keeps the normalised step finite at rest, where the regressor vanishes
 
 
-class Fel(Record):
-    """Settings of the learner `fel`; one setting serves every robot, steering arrangement and perturbation."""
-
-    hidden: Annotated[int, Field(ge=1, le=256)] = 24
-    """Number of hidden tanh units."""
-    step: Annotated[float, Field(ge=0, le=1)] = 0.01
-    """Normalised step μ: share of the feedback voltage that one control period moves into the feedforward; on a
-    steering channel a tenth of this number. The default is what `mrctl tune --search` found in `lab`, with and without
-    the model as prior."""
-    dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.03
-    """Feedback in V below which nothing is learned; on a steering channel, a tenth of this number in rad/s."""
-    leak: Annotated[float, Field(ge=0, le=0.1)] = 1e-6
-    """Share of the distance to the initial weights that the weights go back with each step of learning."""
-    weight_bound: Annotated[float, Field(gt=0, le=1e4)] = 30.0
-    """Largest Euclidean distance of the weights from the initial ones, dimensionless; a projection keeps it."""
-    output_scale: Annotated[float, Field(gt=0, le=100)] = 6.0
-    """Feedforward in V for a network output of one; on a steering channel, a tenth of this number in rad/s."""
-    weights: str | None = None
-    """File of initial weights, `.safetensors` or a torch state dict; by default the hidden layer is random, the rest
-    zero."""
-    frozen: bool = False
-    """Whether the weights stay as they are, so that nothing is learned."""
-
-
-FEL = np.dtype(
-    [
-        ("scale", "f8", OUTPUTS),  # feedforward for a network output of one, V (rad/s on a steering channel)
-        ("dead_zone", "f8", OUTPUTS),  # feedback below which nothing is learned, V (rad/s)
-        ("share", "f8", OUTPUTS),  # factor on the step in the two channels; a steering channel learns more slowly
-        ("step", "f8"),  # μ; 0 keeps the weights as they are
-        ("leak", "f8"),  # share of W − W₀ that is subtracted with each step
-        ("bound", "f8"),  # largest ‖W − W₀‖
-        ("x", "f8", INPUTS),  # scaled features of the commanded motion
-        ("output", "f8", OUTPUTS),  # feedforward at x, V (rad/s)
-        ("tick", "i8"),  # number of ticks so far
-        ("past", "f8", INPUTS),  # delayed features: x of the output that the feedback answers
-        ("error", "f8", OUTPUTS),  # e: feedback in units of the network's output
-        ("norm", "f8"),  # ‖W − W₀‖
-    ],
-    align=True,
-)
-
-
-def fresh(settings: list[Fel], rigid: bool) -> Rows:
-    """Returns a record of `FEL` for each robot; `rigid` says whether channel two is steering."""
-    rows = np.zeros(len(settings), FEL)
-    second = STEERING_SCALE if rigid else 1.0
-    rows["scale"] = [(s.output_scale, s.output_scale * second) for s in settings]
-    rows["dead_zone"] = [(s.dead_zone, s.dead_zone * second) for s in settings]
-    rows["share"] = 1.0, STEERING_SHARE if rigid else 1.0
-    rows["step"] = [0.0 if s.frozen else s.step for s in settings]
-    rows["leak"], rows["bound"] = [0.0 if s.frozen else s.leak for s in settings], [s.weight_bound for s in settings]
-    return rows
-
-
 @kernel
 def layers(w: Array, units: int) -> tuple[Array, Array, Array, Array, Array]:
     """W₁ `(units, 8)`, b₁ `(units,)`, W₂ `(2, units)`, b₂ `(2,)` and W₃ `(2, 8)` as views of the flat weights."""
@@ -240,6 +185,61 @@ def learn(
         if s.norm < s.bound:
             added[0], added[1] = s.output[0] - before, s.output[1] - before_second
     return s.norm
+
+
+class Fel(Record):
+    """Settings of the learner `fel`; one setting serves every robot, steering arrangement and perturbation."""
+
+    hidden: Annotated[int, Field(ge=1, le=256)] = 24
+    """Number of hidden tanh units."""
+    step: Annotated[float, Field(ge=0, le=1)] = 0.01
+    """Normalised step μ: share of the feedback voltage that one control period moves into the feedforward; on a
+    steering channel a tenth of this number. The default is what `mrctl tune --search` found in `lab`, with and without
+    the model as prior."""
+    dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.03
+    """Feedback in V below which nothing is learned; on a steering channel, a tenth of this number in rad/s."""
+    leak: Annotated[float, Field(ge=0, le=0.1)] = 1e-6
+    """Share of the distance to the initial weights that the weights go back with each step of learning."""
+    weight_bound: Annotated[float, Field(gt=0, le=1e4)] = 30.0
+    """Largest Euclidean distance of the weights from the initial ones, dimensionless; a projection keeps it."""
+    output_scale: Annotated[float, Field(gt=0, le=100)] = 6.0
+    """Feedforward in V for a network output of one; on a steering channel, a tenth of this number in rad/s."""
+    weights: str | None = None
+    """File of initial weights, `.safetensors` or a torch state dict; by default the hidden layer is random, the rest
+    zero."""
+    frozen: bool = False
+    """Whether the weights stay as they are, so that nothing is learned."""
+
+
+FEL = np.dtype(
+    [
+        ("scale", "f8", OUTPUTS),  # feedforward for a network output of one, V (rad/s on a steering channel)
+        ("dead_zone", "f8", OUTPUTS),  # feedback below which nothing is learned, V (rad/s)
+        ("share", "f8", OUTPUTS),  # factor on the step in the two channels; a steering channel learns more slowly
+        ("step", "f8"),  # μ; 0 keeps the weights as they are
+        ("leak", "f8"),  # share of W − W₀ that is subtracted with each step
+        ("bound", "f8"),  # largest ‖W − W₀‖
+        ("x", "f8", INPUTS),  # scaled features of the commanded motion
+        ("output", "f8", OUTPUTS),  # feedforward at x, V (rad/s)
+        ("tick", "i8"),  # number of ticks so far
+        ("past", "f8", INPUTS),  # delayed features: x of the output that the feedback answers
+        ("error", "f8", OUTPUTS),  # e: feedback in units of the network's output
+        ("norm", "f8"),  # ‖W − W₀‖
+    ],
+    align=True,
+)
+
+
+def fresh(settings: list[Fel], rigid: bool) -> Rows:
+    """Returns a record of `FEL` for each robot; `rigid` says whether channel two is steering."""
+    rows = np.zeros(len(settings), FEL)
+    second = STEERING_SCALE if rigid else 1.0
+    rows["scale"] = [(s.output_scale, s.output_scale * second) for s in settings]
+    rows["dead_zone"] = [(s.dead_zone, s.dead_zone * second) for s in settings]
+    rows["share"] = 1.0, STEERING_SHARE if rigid else 1.0
+    rows["step"] = [0.0 if s.frozen else s.step for s in settings]
+    rows["leak"], rows["bound"] = [0.0 if s.frozen else s.leak for s in settings], [s.weight_bound for s in settings]
+    return rows
 
 
 class FeedbackErrorLearning(Learner):

@@ -65,110 +65,6 @@ BACK_OFF = 3.0  # factor by which each attempt learns more slowly, and waits lon
 UNSURE = 0.1  # further factor on the learning gain of a stage that cannot be reset to its initial weights
 
 
-class Guard(Record):
-    """Settings of the guard, the watchdog on every learner."""
-
-    moved = {
-        "share": "the learner's output is limited to the supply alone",
-        "weights": "the bound on the errors limits the learner; norms of weights are no longer looked at",
-    }
-
-    on: bool = True
-    """Whether the guard watches the learner, and may replace it."""
-    velocity: Annotated[float, Field(gt=0, le=10)] = 0.28
-    """Largest errors of V and θ̇, as a share of the robot's largest ones, with which a learner may go on; at least
-    0.27 m/s and 0.75 rad/s."""
-    oscillation: Annotated[float, Field(gt=0, le=1)] = 0.25
-    """Share of D by which the PID's output must swing, and the learner deviate, for an oscillation to count; D is the
-    deviation from the fallback in V (rad/s on a steering channel) that keeps the errors within their bounds."""
-    growth: Annotated[float, Field(ge=1, le=100)] = 3.0
-    """Factor by which the posture error may exceed the smallest one so far; 0.15 m are tolerated in any case."""
-    hold: Annotated[float, Field(gt=0, le=100)] = 1.0
-    """Shortest duration of the first fallback in s; each later one lasts three times as long as the last."""
-    retries: Annotated[int, Field(ge=0, le=20)] = 4
-    """Number of times that the learner may resume, from the second on with a third of the gain each time; then the
-    fallback stays."""
-    fade: Annotated[float, Field(gt=0, le=2)] = 0.1
-    """Time constant in s with which the step in voltage at the beginning of a fallback fades; the step is limited to D,
-    the deviation that `oscillation` explains."""
-    fallback: Literal["model", "none"] = "model"
-    """Feedforward during a fallback: the nominal inverse dynamics (`model`), or PID alone (`none`)."""
-
-
-GUARD = np.dtype(
-    [
-        # Settings, as in `Guard`
-        ("on", "?"),  # whether the guard watches the learner
-        ("oscillation", "f8"),  # share of D beyond which a half-wave and a deviation count, 1
-        ("growth", "f8"),  # factor by which the posture error may exceed the smallest one so far, 1
-        ("hold", "f8"),  # duration of the first fallback, s
-        ("retries", "f8"),  # number of times that the learner may resume, 1
-        ("fade", "f8"),  # time constant with which the step in voltage at the beginning of a fallback fades, s
-        ("model", "?"),  # whether the fallback is the nominal model, not PID alone
-        ("range", "f8", 2),  # largest command of a channel: the supply in V, or the largest θ̇ in rad/s
-        ("region", "f8", 2),  # ē: largest errors of V and θ̇ with which a learner may go on, m/s and rad/s
-        ("harmless", "f8", 2),  # D: deviation of a channel that cannot leave that region, V (rad/s)
-        # Oscillation of the PID's output in the two channels
-        ("low_pass", "f8", 2),  # the signal without noise, V (rad/s)
-        ("slow_mean", "f8", 2),  # its slow mean, V (rad/s)
-        ("sign", "f8", 2),  # of the present half-wave
-        ("peak", "f8", 2),  # its amplitude, V (rad/s)
-        ("half_wave_time", "f8", 2),  # its duration so far, s
-        ("waves", "f8", 2),  # consecutive half-waves above the threshold
-        # What is compared with a bound
-        ("deviation", "f8", 2),  # peak of the deviation from the fallback, which decays, V (rad/s)
-        ("nearest", "f8"),  # smallest posture error so far, m
-        ("model_error", "f8", 2),  # mean of the voltage sent less that of the nominal model, V
-        # Decisions
-        ("action", "f8"),  # index into `GUARD_ACTIONS`
-        ("reason", "f8"),  # index into `REASONS`
-        ("hold_left", "f8"),  # time until the learner may resume, s
-        ("strikes", "f8"),  # number of failed attempts of the learner
-        ("gain", "f8"),  # factor on the feedback that the learner is taught with
-        ("authority", "f8"),  # share of the learner in the output; the rest is the fallback's
-        ("bump", "f8", 2),  # step in voltage at the beginning of a fallback, as far as it has not faded yet, V
-        ("broken", "?"),  # whether the learner itself is not finite, as its caller found
-        ("forget", "?"),  # whether the learner is to be reset to its initial weights
-        ("frozen", "?"),  # whether the learner must not learn now
-        ("limited", "f8", 2),  # output of the learner, limited to the supply, V
-        ("output", "f8", 2),  # the feedforward to apply, V
-        ("teaching", "f8", 2),  # the feedback to learn from, V
-    ],
-    align=True,
-)
-
-
-def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
-    """Returns records of `GUARD` at the start of a run, `(B,)`.
-
-    Args:
-        settings: Settings of each robot.
-        robot: The nominal robot, as from `nominal`.
-        gains: Peak-to-peak gains from a voltage of each channel to its velocity error and to the position, `(B, 2, 2)`.
-    """
-    rows = np.zeros(len(settings), GUARD)
-    for name in ("on", "oscillation", "growth", "hold", "retries", "fade"):
-        rows[name] = [getattr(s, name) for s in settings]
-    supply, rotation = float(robot["supply"][0]), float(robot["max_twist"][0, 1])
-    rows["model"] = [s.fallback == "model" for s in settings]
-    rows["range"] = supply, rotation if robot["rigid"][0] else supply
-    rows["region"] = np.maximum(np.array([[s.velocity] for s in settings]) * robot["max_twist"], LEAST)
-    rows["harmless"] = harmless(rows["region"], gains)
-    rows["nearest"] = np.inf
-    rows["gain"] = rows["authority"] = 1.0
-    return rows
-
-
-def harmless(region: Array, gains: Array) -> Array:
-    """Returns the deviation D = min(ē/‖G_e‖₁, ρ̄/‖G_ρ‖₁) of each channel, which cannot leave the region, `(…, 2)`.
-
-    Args:
-        region: ē in m/s and rad/s, `(…, 2)`.
-        gains: ‖G_e‖₁ and ‖G_ρ‖₁ of each channel, `(…, 2, 2)`.
-    """
-    return np.minimum(region / gains[..., 0], TOLERATED / gains[..., 1])
-
-
 @kernel
 def guard(
     g: Row, feedforward: Array, nominal: Array, error: Array, command: Array, twist: Array, voltage: Array,
@@ -294,3 +190,107 @@ def fall_back(g: Row, trouble: int, nominal: Array, integral: Array, feedback: A
         g.output[k] = fallback + g.bump[k]
         feedback[k] += target - integral[k]  # the feedback contains the old integral
         integral[k] = target
+
+
+class Guard(Record):
+    """Settings of the guard, the watchdog on every learner."""
+
+    moved = {
+        "share": "the learner's output is limited to the supply alone",
+        "weights": "the bound on the errors limits the learner; norms of weights are no longer looked at",
+    }
+
+    on: bool = True
+    """Whether the guard watches the learner, and may replace it."""
+    velocity: Annotated[float, Field(gt=0, le=10)] = 0.28
+    """Largest errors of V and θ̇, as a share of the robot's largest ones, with which a learner may go on; at least
+    0.27 m/s and 0.75 rad/s."""
+    oscillation: Annotated[float, Field(gt=0, le=1)] = 0.25
+    """Share of D by which the PID's output must swing, and the learner deviate, for an oscillation to count; D is the
+    deviation from the fallback in V (rad/s on a steering channel) that keeps the errors within their bounds."""
+    growth: Annotated[float, Field(ge=1, le=100)] = 3.0
+    """Factor by which the posture error may exceed the smallest one so far; 0.15 m are tolerated in any case."""
+    hold: Annotated[float, Field(gt=0, le=100)] = 1.0
+    """Shortest duration of the first fallback in s; each later one lasts three times as long as the last."""
+    retries: Annotated[int, Field(ge=0, le=20)] = 4
+    """Number of times that the learner may resume, from the second on with a third of the gain each time; then the
+    fallback stays."""
+    fade: Annotated[float, Field(gt=0, le=2)] = 0.1
+    """Time constant in s with which the step in voltage at the beginning of a fallback fades; the step is limited to D,
+    the deviation that `oscillation` explains."""
+    fallback: Literal["model", "none"] = "model"
+    """Feedforward during a fallback: the nominal inverse dynamics (`model`), or PID alone (`none`)."""
+
+
+GUARD = np.dtype(
+    [
+        # Settings, as in `Guard`
+        ("on", "?"),  # whether the guard watches the learner
+        ("oscillation", "f8"),  # share of D beyond which a half-wave and a deviation count, 1
+        ("growth", "f8"),  # factor by which the posture error may exceed the smallest one so far, 1
+        ("hold", "f8"),  # duration of the first fallback, s
+        ("retries", "f8"),  # number of times that the learner may resume, 1
+        ("fade", "f8"),  # time constant with which the step in voltage at the beginning of a fallback fades, s
+        ("model", "?"),  # whether the fallback is the nominal model, not PID alone
+        ("range", "f8", 2),  # largest command of a channel: the supply in V, or the largest θ̇ in rad/s
+        ("region", "f8", 2),  # ē: largest errors of V and θ̇ with which a learner may go on, m/s and rad/s
+        ("harmless", "f8", 2),  # D: deviation of a channel that cannot leave that region, V (rad/s)
+        # Oscillation of the PID's output in the two channels
+        ("low_pass", "f8", 2),  # the signal without noise, V (rad/s)
+        ("slow_mean", "f8", 2),  # its slow mean, V (rad/s)
+        ("sign", "f8", 2),  # of the present half-wave
+        ("peak", "f8", 2),  # its amplitude, V (rad/s)
+        ("half_wave_time", "f8", 2),  # its duration so far, s
+        ("waves", "f8", 2),  # consecutive half-waves above the threshold
+        # What is compared with a bound
+        ("deviation", "f8", 2),  # peak of the deviation from the fallback, which decays, V (rad/s)
+        ("nearest", "f8"),  # smallest posture error so far, m
+        ("model_error", "f8", 2),  # mean of the voltage sent less that of the nominal model, V
+        # Decisions
+        ("action", "f8"),  # index into `GUARD_ACTIONS`
+        ("reason", "f8"),  # index into `REASONS`
+        ("hold_left", "f8"),  # time until the learner may resume, s
+        ("strikes", "f8"),  # number of failed attempts of the learner
+        ("gain", "f8"),  # factor on the feedback that the learner is taught with
+        ("authority", "f8"),  # share of the learner in the output; the rest is the fallback's
+        ("bump", "f8", 2),  # step in voltage at the beginning of a fallback, as far as it has not faded yet, V
+        ("broken", "?"),  # whether the learner itself is not finite, as its caller found
+        ("forget", "?"),  # whether the learner is to be reset to its initial weights
+        ("frozen", "?"),  # whether the learner must not learn now
+        ("limited", "f8", 2),  # output of the learner, limited to the supply, V
+        ("output", "f8", 2),  # the feedforward to apply, V
+        ("teaching", "f8", 2),  # the feedback to learn from, V
+    ],
+    align=True,
+)
+
+
+def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
+    """Returns records of `GUARD` at the start of a run, `(B,)`.
+
+    Args:
+        settings: Settings of each robot.
+        robot: The nominal robot, as from `nominal`.
+        gains: Peak-to-peak gains from a voltage of each channel to its velocity error and to the position, `(B, 2, 2)`.
+    """
+    rows = np.zeros(len(settings), GUARD)
+    for name in ("on", "oscillation", "growth", "hold", "retries", "fade"):
+        rows[name] = [getattr(s, name) for s in settings]
+    supply, rotation = float(robot["supply"][0]), float(robot["max_twist"][0, 1])
+    rows["model"] = [s.fallback == "model" for s in settings]
+    rows["range"] = supply, rotation if robot["rigid"][0] else supply
+    rows["region"] = np.maximum(np.array([[s.velocity] for s in settings]) * robot["max_twist"], LEAST)
+    rows["harmless"] = harmless(rows["region"], gains)
+    rows["nearest"] = np.inf
+    rows["gain"] = rows["authority"] = 1.0
+    return rows
+
+
+def harmless(region: Array, gains: Array) -> Array:
+    """Returns the deviation D = min(ē/‖G_e‖₁, ρ̄/‖G_ρ‖₁) of each channel, which cannot leave the region, `(…, 2)`.
+
+    Args:
+        region: ē in m/s and rad/s, `(…, 2)`.
+        gains: ‖G_e‖₁ and ‖G_ρ‖₁ of each channel, `(…, 2, 2)`.
+    """
+    return np.minimum(region / gains[..., 0], TOLERATED / gains[..., 1])

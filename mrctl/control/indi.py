@@ -52,31 +52,6 @@ from mrctl.record import Record
 from mrctl.theory.robot import Robot
 
 
-class Indi(Record):
-    """Settings of the learner `indi`."""
-
-    time_constant: Annotated[float, Field(ge=0.005, le=2)] = 0.03
-    """Time constant T in s of each of the two filters on voltage and acceleration. With the default PID the sensitivity
-    at the voltage is at most 1.9 in `lab`, where 0.01 s give 2.4; a robot of half the mass then oscillates."""
-
-
-INDI = np.dtype(
-    [
-        ("share", "f8"),  # weight of a new sample in the two filters
-        ("matched", MATCHED),
-        ("prior", PRIOR),  # the model; its coefficients of the accelerations are M
-        ("derivative", "f8", 2),  # commanded acceleration, m/s² and rad/s²
-        ("sent", "f8", 2),  # voltage of the coming period, V (rad/s on a steering channel)
-        ("zero", "f8", 2),  # no acceleration, m/s² and rad/s²
-        ("rest", "f8", 2),  # f̂ at the measured or the commanded motion, V
-        ("once", "f8", 2),  # U − M ẋ after the first filter, V
-        ("twice", "f8", 2),  # U_f − M ẋ_f, V
-        ("started", "?"),  # whether a voltage has acted whose motion is known
-    ],
-    align=True,
-)
-
-
 @kernel
 def measure(twist: Array, rigid: bool, period: float, queue: Array, s: Row) -> None:
     """Measures U_f − M ẋ_f; until a voltage has acted, it is f̂ of the model, so that the law starts without a bump.
@@ -128,6 +103,31 @@ def learn(
     measure(twist, robot.rigid, period, queue[i], s)
     added[0] = added[1] = 0.0
     return 0.0
+
+
+class Indi(Record):
+    """Settings of the learner `indi`."""
+
+    time_constant: Annotated[float, Field(ge=0.005, le=2)] = 0.03
+    """Time constant T in s of each of the two filters on voltage and acceleration. With the default PID the sensitivity
+    at the voltage is at most 1.9 in `lab`, where 0.01 s give 2.4; a robot of half the mass then oscillates."""
+
+
+INDI = np.dtype(
+    [
+        ("share", "f8"),  # weight of a new sample in the two filters
+        ("matched", MATCHED),
+        ("prior", PRIOR),  # the model; its coefficients of the accelerations are M
+        ("derivative", "f8", 2),  # commanded acceleration, m/s² and rad/s²
+        ("sent", "f8", 2),  # voltage of the coming period, V (rad/s on a steering channel)
+        ("zero", "f8", 2),  # no acceleration, m/s² and rad/s²
+        ("rest", "f8", 2),  # f̂ at the measured or the commanded motion, V
+        ("once", "f8", 2),  # U − M ẋ after the first filter, V
+        ("twice", "f8", 2),  # U_f − M ẋ_f, V
+        ("started", "?"),  # whether a voltage has acted whose motion is known
+    ],
+    align=True,
+)
 
 
 class IncrementalInversion(Learner):

@@ -40,35 +40,6 @@ from mrctl.theory.linear import steering
 from mrctl.theory.robot import Robot
 
 
-class L1(Record):
-    """Settings of the learner `l1`."""
-
-    bandwidth: Annotated[float, Field(gt=0, le=200)] = 4.0
-    """Bandwidth of the low-pass C in rad/s. `mrctl tune --search` found that in `lab` all bandwidths up to 4 rad/s are
-    equal within 1 %; the default is the largest of them."""
-    predictor: Annotated[float, Field(gt=0, le=200)] = 5.0
-    """Rate a in 1/s with which the predictor's error decays by itself."""
-
-
-PREDICTOR = np.dtype(
-    [
-        ("decay", "f8"),  # e^(−a h)
-        ("phi", "f8"),  # Φ, s
-        ("share", "f8"),  # weight of a new sample in C
-        ("lag", "f8"),  # lag of the steering under `rigid`, at least a period, s
-        ("matched", MATCHED),
-        ("derivative", "f8", 2),  # commanded acceleration, m/s² and rad/s²
-        ("sent", "f8", 2),  # voltage of the coming period, V (rad/s on a steering channel)
-        ("zero", "f8", 2),  # no acceleration, m/s² and rad/s²
-        ("rest", "f8", 2),  # f of the model at the measured motion, V
-        ("predicted", "f8", 2),  # x̂, m/s and rad/s
-        ("sigma", "f8", 2),  # σ̂, V
-        ("filtered", "f8", 2),  # C σ̂, V
-    ],
-    align=True,
-)
-
-
 @kernel
 def adapt(error: float, inertia: float, decay: float, phi: float) -> float:
     """Returns σ̂ = −M Φ⁻¹ e^(−a h) (x̂ − x).
@@ -132,6 +103,35 @@ def learn(
     step(twist, robot.rigid, prior, period, queue[i], s)
     added[0] = added[1] = 0.0
     return 0.0
+
+
+class L1(Record):
+    """Settings of the learner `l1`."""
+
+    bandwidth: Annotated[float, Field(gt=0, le=200)] = 4.0
+    """Bandwidth of the low-pass C in rad/s. `mrctl tune --search` found that in `lab` all bandwidths up to 4 rad/s are
+    equal within 1 %; the default is the largest of them."""
+    predictor: Annotated[float, Field(gt=0, le=200)] = 5.0
+    """Rate a in 1/s with which the predictor's error decays by itself."""
+
+
+PREDICTOR = np.dtype(
+    [
+        ("decay", "f8"),  # e^(−a h)
+        ("phi", "f8"),  # Φ, s
+        ("share", "f8"),  # weight of a new sample in C
+        ("lag", "f8"),  # lag of the steering under `rigid`, at least a period, s
+        ("matched", MATCHED),
+        ("derivative", "f8", 2),  # commanded acceleration, m/s² and rad/s²
+        ("sent", "f8", 2),  # voltage of the coming period, V (rad/s on a steering channel)
+        ("zero", "f8", 2),  # no acceleration, m/s² and rad/s²
+        ("rest", "f8", 2),  # f of the model at the measured motion, V
+        ("predicted", "f8", 2),  # x̂, m/s and rad/s
+        ("sigma", "f8", 2),  # σ̂, V
+        ("filtered", "f8", 2),  # C σ̂, V
+    ],
+    align=True,
+)
 
 
 class L1Adaptive(Learner):

@@ -71,69 +71,6 @@ from mrctl.theory.robot import Robot
 SIGNALS = INPUTS + 2  # filtered signals: the features and the voltage of the two channels
 
 
-class Mrac(Record):
-    """Settings of the learner `mrac`; one setting serves every robot, steering and perturbation.
-
-    They were chosen on a circle, a rounded square, the lemniscate and three random splines, in `lab`. The position
-    error of the last of three laps changes by at most 4 % when one of `noise`, `memory`, `spread`, `tracking` and
-    `filter` is changed by a factor of 2 to 5.
-    """
-
-    noise: Annotated[float, Field(gt=0, le=10)] = 0.02
-    """Noise density ρ of the prediction error in V √s; the smaller, the faster the prediction error is followed."""
-    memory: Annotated[float, Field(ge=0.1, le=1e6)] = 20.0
-    """Memory 1/λ₀ of least squares in s."""
-    spread: Annotated[float, Field(gt=0, le=100)] = 3.0
-    """Standard deviation of the parameters at the start in V; its square is the diagonal of P₀."""
-    tracking: Annotated[float, Field(ge=0, le=1e3)] = 2.0
-    """Weight η of the tracking error in 1/(V² s), per volt of back-EMF of that error."""
-    radius: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """Distance R of the scaled parameters of a channel from those of the prior, beyond which they leak back, as a share
-    of the supply (of a tenth of that number in rad/s on a steering channel); the projection acts at twice that
-    distance."""
-    leak: Annotated[float, Field(ge=0, le=1e3)] = 0.1
-    """Leak rate σ₀ in 1/(V² s) of parameters at a distance of 2 `radius` from the prior's; it rises linearly from 0 at
-    `radius`."""
-    filter: Annotated[float, Field(ge=0.005, le=2)] = 0.03
-    """Time constant T in s of each of the two filters on voltage and motion."""
-    hand_over: bool = False
-    """Whether the PID's integral gives up a part of what learning adds, as with the other learners; the theorem does
-    not cover it."""
-
-
-MRAC = np.dtype(
-    [
-        ("r", "f8"),  # variance ρ²/h of a sample, V²
-        ("forgetting", "f8"),  # λ₀ h
-        ("trace", "f8"),  # tr P₀, V²
-        ("tracking", "f8", 2),  # η_k h of the two channels, 1/V per m/s (1/V² on a steering channel)
-        ("leak", "f8"),  # σ₀ h, 1/V²
-        ("radius", "f8", 2),  # R of the two channels, V (rad/s on a steering channel)
-        ("share", "f8"),  # weight of a new sample in the two filters
-        ("hand_over", "f8"),  # 1 where the PID's integral gives up a part of what learning adds, else 0
-        ("matched", MATCHED),
-        ("derivative", "f8", 2),  # commanded acceleration, m/s² and rad/s²
-        ("sent", "f8", 2),  # voltage of the coming period, V (rad/s on a steering channel)
-        ("zero", "f8", 2),  # no acceleration, m/s² and rad/s²
-        ("output", "f8", 2),  # φ(x_c, ẋ_c)ᵀ b after a step, V
-        ("x", "f8", INPUTS),  # scaled features of the measured twist without acceleration
-        ("before", "f8", INPUTS),  # the same one period ago
-        ("once", "f8", SIGNALS),  # features and voltages after the first filter
-        ("twice", "f8", SIGNALS),  # H of features and voltages
-        ("age", "f8"),  # time since the filters began, in their time constants
-        ("w", "f8", INPUTS),  # filtered features
-        ("phi_c", "f8", INPUTS),  # scaled features of the commanded motion
-        ("residual", "f8", 2),  # filtered voltage less that of the prior, V
-        ("error", "f8", 2),  # x_c − x, m/s and rad/s
-        ("b", "f8", (INPUTS, 2)),  # â − a_0, V
-        ("P", "f8", (INPUTS, INPUTS)),  # gain of least squares, V²
-        ("direction", "f8", INPUTS),  # scratch: P times a vector, V² and V
-        ("norm", "f8"),  # ‖â − a_0‖ of both channels, V
-    ],
-    align=True,
-)
-
-
 @kernel
 def predict(s: Row) -> None:
     """The prediction error: one step of least squares with bounded-gain forgetting, the same gain for both channels.
@@ -291,6 +228,69 @@ def learn(
             added[k] = s.hand_over * (s.output[k] - added[k])
     s.norm = np.sqrt((s.b**2).sum())
     return s.norm
+
+
+class Mrac(Record):
+    """Settings of the learner `mrac`; one setting serves every robot, steering and perturbation.
+
+    They were chosen on a circle, a rounded square, the lemniscate and three random splines, in `lab`. The position
+    error of the last of three laps changes by at most 4 % when one of `noise`, `memory`, `spread`, `tracking` and
+    `filter` is changed by a factor of 2 to 5.
+    """
+
+    noise: Annotated[float, Field(gt=0, le=10)] = 0.02
+    """Noise density ρ of the prediction error in V √s; the smaller, the faster the prediction error is followed."""
+    memory: Annotated[float, Field(ge=0.1, le=1e6)] = 20.0
+    """Memory 1/λ₀ of least squares in s."""
+    spread: Annotated[float, Field(gt=0, le=100)] = 3.0
+    """Standard deviation of the parameters at the start in V; its square is the diagonal of P₀."""
+    tracking: Annotated[float, Field(ge=0, le=1e3)] = 2.0
+    """Weight η of the tracking error in 1/(V² s), per volt of back-EMF of that error."""
+    radius: Annotated[float, Field(gt=0, le=10)] = 1.0
+    """Distance R of the scaled parameters of a channel from those of the prior, beyond which they leak back, as a share
+    of the supply (of a tenth of that number in rad/s on a steering channel); the projection acts at twice that
+    distance."""
+    leak: Annotated[float, Field(ge=0, le=1e3)] = 0.1
+    """Leak rate σ₀ in 1/(V² s) of parameters at a distance of 2 `radius` from the prior's; it rises linearly from 0 at
+    `radius`."""
+    filter: Annotated[float, Field(ge=0.005, le=2)] = 0.03
+    """Time constant T in s of each of the two filters on voltage and motion."""
+    hand_over: bool = False
+    """Whether the PID's integral gives up a part of what learning adds, as with the other learners; the theorem does
+    not cover it."""
+
+
+MRAC = np.dtype(
+    [
+        ("r", "f8"),  # variance ρ²/h of a sample, V²
+        ("forgetting", "f8"),  # λ₀ h
+        ("trace", "f8"),  # tr P₀, V²
+        ("tracking", "f8", 2),  # η_k h of the two channels, 1/V per m/s (1/V² on a steering channel)
+        ("leak", "f8"),  # σ₀ h, 1/V²
+        ("radius", "f8", 2),  # R of the two channels, V (rad/s on a steering channel)
+        ("share", "f8"),  # weight of a new sample in the two filters
+        ("hand_over", "f8"),  # 1 where the PID's integral gives up a part of what learning adds, else 0
+        ("matched", MATCHED),
+        ("derivative", "f8", 2),  # commanded acceleration, m/s² and rad/s²
+        ("sent", "f8", 2),  # voltage of the coming period, V (rad/s on a steering channel)
+        ("zero", "f8", 2),  # no acceleration, m/s² and rad/s²
+        ("output", "f8", 2),  # φ(x_c, ẋ_c)ᵀ b after a step, V
+        ("x", "f8", INPUTS),  # scaled features of the measured twist without acceleration
+        ("before", "f8", INPUTS),  # the same one period ago
+        ("once", "f8", SIGNALS),  # features and voltages after the first filter
+        ("twice", "f8", SIGNALS),  # H of features and voltages
+        ("age", "f8"),  # time since the filters began, in their time constants
+        ("w", "f8", INPUTS),  # filtered features
+        ("phi_c", "f8", INPUTS),  # scaled features of the commanded motion
+        ("residual", "f8", 2),  # filtered voltage less that of the prior, V
+        ("error", "f8", 2),  # x_c − x, m/s and rad/s
+        ("b", "f8", (INPUTS, 2)),  # â − a_0, V
+        ("P", "f8", (INPUTS, INPUTS)),  # gain of least squares, V²
+        ("direction", "f8", INPUTS),  # scratch: P times a vector, V² and V
+        ("norm", "f8"),  # ‖â − a_0‖ of both channels, V
+    ],
+    align=True,
+)
 
 
 class ModelReferenceAdaptive(Learner):

@@ -30,30 +30,6 @@ from mrctl.record import Record
 from mrctl.theory.robot import Robot
 
 
-class Observer(Record):
-    """Settings of the learner `observer`."""
-
-    time_constant: Annotated[float, Field(ge=0.02, le=10)] = 0.35
-    """Time constant T of the filter Q in s. `mrctl tune --search` found that in `lab` all values from 0.35 s on are
-    equal within 1 %; the default is the shortest of them. With λ = 0.15 s and exact measurements 0.055 s would do: that
-    keeps the sensitivity below 2 with a delay of 20 ms."""
-
-
-OBSERVER = np.dtype(
-    [
-        ("time_constant", "f8"),  # T of Q, s
-        ("twist", "f8", 2),  # Q of the measured V and θ̇, m/s and rad/s
-        ("voltage", "f8", 2),  # Q of the voltage less the model's at zero acceleration, V
-        ("sent", "f8", 2),  # voltage that was applied in the last period, V
-        ("disturbance", "f8", 2),  # d̂ of the two channels, V
-        ("started", "?"),  # whether there was a last period
-        ("steady", "f8", 2),  # voltage of the model at the measured twist, without acceleration, V
-        ("rate", "f8", 2),  # Q of its acceleration, m/s² and rad/s²
-    ],
-    align=True,
-)
-
-
 @kernel
 def observe(twist: Array, sent: Array, rigid: bool, prior: Row, period: float, s: Row) -> None:
     """One step of the observer, for the model c · x = c_V V + c_ω ω + c_V̇ V̇ + c_ω̇ ω̇ + ….
@@ -107,6 +83,30 @@ def learn(
     observe(twist, sent, robot.rigid, prior, period, rows[i])
     added[0] = added[1] = 0.0
     return 0.0
+
+
+class Observer(Record):
+    """Settings of the learner `observer`."""
+
+    time_constant: Annotated[float, Field(ge=0.02, le=10)] = 0.35
+    """Time constant T of the filter Q in s. `mrctl tune --search` found that in `lab` all values from 0.35 s on are
+    equal within 1 %; the default is the shortest of them. With λ = 0.15 s and exact measurements 0.055 s would do: that
+    keeps the sensitivity below 2 with a delay of 20 ms."""
+
+
+OBSERVER = np.dtype(
+    [
+        ("time_constant", "f8"),  # T of Q, s
+        ("twist", "f8", 2),  # Q of the measured V and θ̇, m/s and rad/s
+        ("voltage", "f8", 2),  # Q of the voltage less the model's at zero acceleration, V
+        ("sent", "f8", 2),  # voltage that was applied in the last period, V
+        ("disturbance", "f8", 2),  # d̂ of the two channels, V
+        ("started", "?"),  # whether there was a last period
+        ("steady", "f8", 2),  # voltage of the model at the measured twist, without acceleration, V
+        ("rate", "f8", 2),  # Q of its acceleration, m/s² and rad/s²
+    ],
+    align=True,
+)
 
 
 class DisturbanceObserver(Learner):

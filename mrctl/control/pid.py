@@ -16,20 +16,6 @@ from mrctl.theory.robot import Robot
 
 Pair = tuple[float, float]
 
-PID = np.dtype(
-    [
-        ("k_p", "f8", 2),  # gains of the two channels: V/(m/s) and V/(rad/s) (rad/s per rad/s on a steering channel)
-        ("k_i", "f8", 2),  # the same per second
-        ("k_d", "f8", 2),  # the same times seconds
-        ("filter", "f8", 2),  # time constant of the derivative's filter, s
-        ("integral", "f8", 2),  # integral part of the output, V (rad/s on a steering channel)
-        ("slope", "f8", 2),  # filtered derivative of the error, m/s² and rad/s²
-        ("error", "f8", 2),  # last error, m/s and rad/s
-        ("started", "?"),  # whether there is a last error
-    ],
-    align=True,
-)
-
 
 @kernel
 def pid(command: Array, twist: Array, excess: Array, period: float, s: Row, feedback: Array) -> None:
@@ -57,6 +43,21 @@ def pid(command: Array, twist: Array, excess: Array, period: float, s: Row, feed
         s.error[k] = error
         feedback[k] = s.k_p[k] * error + s.integral[k] + s.k_d[k] * s.slope[k]
     s.started = True
+
+
+PID = np.dtype(
+    [
+        ("k_p", "f8", 2),  # gains of the two channels: V/(m/s) and V/(rad/s) (rad/s per rad/s on a steering channel)
+        ("k_i", "f8", 2),  # the same per second
+        ("k_d", "f8", 2),  # the same times seconds
+        ("filter", "f8", 2),  # time constant of the derivative's filter, s
+        ("integral", "f8", 2),  # integral part of the output, V (rad/s on a steering channel)
+        ("slope", "f8", 2),  # filtered derivative of the error, m/s² and rad/s²
+        ("error", "f8", 2),  # last error, m/s and rad/s
+        ("started", "?"),  # whether there is a last error
+    ],
+    align=True,
+)
 
 
 class Pid(Record):

@@ -15,24 +15,6 @@ from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot
 
-RLS = np.dtype(
-    [
-        ("step", "f8"),  # largest share of the feedback that one period moves into the feedforward
-        ("drift", "f8"),  # variance that a coefficient gains with each step
-        ("bound", "f8"),  # diagonal element of P above which it gains no more
-        ("dead_zone", "f8"),  # feedback below which nothing is learned, V (rad/s on a steering channel)
-        ("share", "f8", 2),  # factor on the gain in the two channels; a steering channel learns more slowly
-        ("x", "f8", 8),  # scaled features of the commanded motion
-        ("tick", "i8"),  # number of ticks so far
-        ("past", "f8", 8),  # x of the output that the feedback answers
-        ("theta", "f8", (8, 2)),  # θ: coefficients of the features in the two channels, V
-        ("P", "f8", (8, 8)),  # covariance of θ over the variance of the feedback
-        ("gain", "f8", 8),  # P x
-        ("norm", "f8"),  # ‖θ‖, V
-    ],
-    align=True,
-)
-
 
 @kernel
 def update(x: Array, feedback: Array, s: Row) -> None:
@@ -69,25 +51,6 @@ def update(x: Array, feedback: Array, s: Row) -> None:
     s.norm = np.sqrt((s.theta**2).sum())
 
 
-class Rls(Record):
-    """Settings of the learner `rls`."""
-
-    step: Annotated[float, Field(gt=0, le=1)] = 0.02
-    """Largest share of the feedback that one control period moves into the feedforward; on a steering channel a tenth
-    of this number. With a larger share, the adaptation is a second integral action that is fast enough to make the loop
-    oscillate."""
-    initial_covariance: Annotated[float, Field(gt=0, le=1e3)] = 0.2
-    """Diagonal of the initial covariance of the coefficients, as a ratio to the variance of the feedback."""
-    drift: Annotated[float, Field(ge=0, le=1)] = 3e-5
-    """Variance that every coefficient gains with each step of learning, as a ratio to the variance of the feedback; it
-    states how fast the true coefficients wander."""
-    covariance_bound: Annotated[float, Field(gt=0, le=1e3)] = 0.2
-    """Ratio of a diagonal element of the covariance to the variance of the feedback, above which that element gains no
-    more; without excitation it would grow for ever."""
-    dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
-    """Feedback in V (rad/s on a steering channel) below which nothing is learned."""
-
-
 @kernel
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
     """U = θᵀ x at the commanded motion."""
@@ -112,6 +75,44 @@ def learn(
     added[0] -= before
     added[1] -= before_second
     return s.norm
+
+
+RLS = np.dtype(
+    [
+        ("step", "f8"),  # largest share of the feedback that one period moves into the feedforward
+        ("drift", "f8"),  # variance that a coefficient gains with each step
+        ("bound", "f8"),  # diagonal element of P above which it gains no more
+        ("dead_zone", "f8"),  # feedback below which nothing is learned, V (rad/s on a steering channel)
+        ("share", "f8", 2),  # factor on the gain in the two channels; a steering channel learns more slowly
+        ("x", "f8", 8),  # scaled features of the commanded motion
+        ("tick", "i8"),  # number of ticks so far
+        ("past", "f8", 8),  # x of the output that the feedback answers
+        ("theta", "f8", (8, 2)),  # θ: coefficients of the features in the two channels, V
+        ("P", "f8", (8, 8)),  # covariance of θ over the variance of the feedback
+        ("gain", "f8", 8),  # P x
+        ("norm", "f8"),  # ‖θ‖, V
+    ],
+    align=True,
+)
+
+
+class Rls(Record):
+    """Settings of the learner `rls`."""
+
+    step: Annotated[float, Field(gt=0, le=1)] = 0.02
+    """Largest share of the feedback that one control period moves into the feedforward; on a steering channel a tenth
+    of this number. With a larger share, the adaptation is a second integral action that is fast enough to make the loop
+    oscillate."""
+    initial_covariance: Annotated[float, Field(gt=0, le=1e3)] = 0.2
+    """Diagonal of the initial covariance of the coefficients, as a ratio to the variance of the feedback."""
+    drift: Annotated[float, Field(ge=0, le=1)] = 3e-5
+    """Variance that every coefficient gains with each step of learning, as a ratio to the variance of the feedback; it
+    states how fast the true coefficients wander."""
+    covariance_bound: Annotated[float, Field(gt=0, le=1e3)] = 0.2
+    """Ratio of a diagonal element of the covariance to the variance of the feedback, above which that element gains no
+    more; without excitation it would grow for ever."""
+    dead_zone: Annotated[float, Field(ge=0, le=5)] = 0.02
+    """Feedback in V (rad/s on a steering channel) below which nothing is learned."""
 
 
 class RecursiveLeastSquares(Learner):

@@ -279,7 +279,7 @@ def test_interrupt_while_importing(name: str) -> None:
 @pytest.mark.parametrize("wait", [0.05, 0.2, 0.5, 1.0, 2.0])
 def test_interrupt_of_a_program(wait: float) -> None:
     """Ctrl-C at any moment after the program has begun; until then Python has no handler and ends without a word."""
-    code = "print(flush=True); from mrctl.__main__ import main; raise SystemExit(main())"
+    code = "from mrctl.__main__ import main; print(flush=True); raise SystemExit(main())"
     command = [sys.executable, "-c", code, "run", "--learner", "none", "--laps", "200"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
         assert program.stdout and program.stdout.readline()
