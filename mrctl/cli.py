@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = lambda message, *_: print(f"mrctl: {printable(str(message))}", file=sys.stderr)
     try:
         try:
-            command = _parse(_written_out(arguments))
+            command = _parse(_expanded(arguments))
             for name in ("absl", "asyncio"):  # of failing runs and damaged files, whose own message says why
                 logging.getLogger(name).addFilter(lambda _: False)
             try:
@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _known(world: str, robot: RobotFile = CAR) -> None:
+def _check_world(world: str, robot: RobotFile = CAR) -> None:
     """Refuses a world or a robot without a file that can be read, before physics is imported, which takes seconds."""
     from mrctl.physics.files import robot_path, world_path
 
@@ -119,14 +119,14 @@ def _known(world: str, robot: RobotFile = CAR) -> None:
         robot_path(robot)
 
 
-def _there(file: Path) -> None:
+def _check_exists(file: Path) -> None:
     """Refuses a file or folder that does not exist, before what reads it is imported."""
     with reading(file):
         if not file.exists():
             raise InputError(f"{file}: no such file or folder")
 
 
-def _some(workers: int | None) -> None:
+def _check_workers(workers: int | None) -> None:
     """Refuses a number of processes below 1."""
     if workers is not None and workers < 1:
         raise InputError(f"workers: {workers} is below 1")
@@ -136,7 +136,7 @@ class _Incomplete(Exception):
     """A command has ended, but a part of its work failed; the message says which part."""
 
 
-def _written_out(arguments: list[str]) -> list[str]:
+def _expanded(arguments: list[str]) -> list[str]:
     """Expands short flags into full ones.
 
     `--perturbation NAME` becomes the flags of that perturbation, which later flags override, a flag of `SHORT` the
@@ -265,14 +265,14 @@ def _is_short_help(arguments: Sequence[str]) -> bool:
     )
 
 
-def _given(arguments: Sequence[str]) -> set[str]:
+def _fields_set(arguments: Sequence[str]) -> set[str]:
     """Returns the fields that a command line sets; of nested ones the outermost, such as `robot` for --robot.path."""
     return {re.split("[.:=]", argument.removeprefix("--"))[0] for argument in arguments[1:]}
 
 
 def _suited(scenario: Scenario, arguments: Sequence[str], scenario_file: str | None) -> Scenario:
     """Adapts the reference of a scenario to its robot, if the command line names a robot and no reference."""
-    given = _given(arguments)
+    given = _fields_set(arguments)
     if scenario_file or "robot" not in given or "reference" in given:
         return scenario
     from mrctl.loop.simulation import suited
@@ -280,7 +280,7 @@ def _suited(scenario: Scenario, arguments: Sequence[str], scenario_file: str | N
     return suited(scenario)
 
 
-def _part(scenario: Scenario, names: Sequence[str]) -> Record:
+def _partial_record(scenario: Scenario, names: Sequence[str]) -> Record:
     """Returns a record of some fields of a scenario, from which tyro makes flags."""
     types = typing.get_type_hints(Scenario, include_extras=True)
     helps = {name: field.description for name, field in Scenario.model_fields.items()}
@@ -343,7 +343,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             raise InputError(f"run: {file} is a folder; for a run of a sweep's store give its number with --run")
         if file is not None and str(file) != scenario_file:
             raise InputError(f"run: {file} is not a scenario file, whose name ends in .toml; see mrctl run --help")
-        _known(scenario.world, scenario.robot)
+        _check_world(scenario.world, scenario.robot)
         from mrctl.experiments import single
 
         text, failure = single.run(_suited(scenario, arguments, scenario_file), out, json, controller)
@@ -352,7 +352,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             raise _Incomplete(f"the run failed {failure}")
 
     if _is_short_help(arguments):
-        short = _part(default, FIRST)
+        short = _partial_record(default, FIRST)
         run.__annotations__["scenario"] = Annotated[type(short), tyro.conf.arg(name="")]
         run.__defaults__ = (None, short, *(run.__defaults__ or ())[2:])
     return run
@@ -361,8 +361,8 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
 def _navigate_with(arguments: list[str]) -> Callable[..., None]:
     """Returns the `navigate` command, whose short help leaves out the same fields as that of `run`."""
     names = FIRST if _is_short_help(arguments) else Scenario.model_fields
-    default = Scenario() if {"prior", "learner"} & _given(arguments) else Scenario(**FEEDFORWARDS[BEST])
-    part = _part(default, [name for name in names if name not in NOT_OF_MISSIONS])
+    default = Scenario() if {"prior", "learner"} & _fields_set(arguments) else Scenario(**FEEDFORWARDS[BEST])
+    part = _partial_record(default, [name for name in names if name not in NOT_OF_MISSIONS])
 
     def navigate(
         world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[MAP|GENERATOR:SEED|MISSION]")] = "",
@@ -413,7 +413,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         """
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
         if suite:
-            taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _given(arguments)
+            taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _fields_set(arguments)
             if taken or world or goal or start or compare or speed or avoid != "none" or json or view:
                 raise InputError("suite: has its own worlds, controllers and speeds; give only flags of the robot")
             from mrctl.experiments import feeding_up, mission_suite, three_mppis
@@ -440,7 +440,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             raise InputError("view: a live session has no --out and --json")
         if ":" not in world and not Path(world).is_file():
             raise InputError(f"world: no file {world}; mrctl navigate --help names the generators, such as doorway:3")
-        _known(chosen.world, chosen.robot)
+        _check_world(chosen.world, chosen.robot)
         if view:
             from mrctl.navigation.mission import task_of
             from mrctl.viewer import view as viewing
@@ -492,7 +492,7 @@ def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code:
     """Runs one run of a sweep again and compares it with the store: `mrctl run STORE --run K`."""
     if store is None:
         raise InputError("run: --run needs the store of a sweep, as in mrctl run STORE --run 3")
-    _there(store)
+    _check_exists(store)
     from mrctl.experiments import single
     from mrctl.sweep import jobs
     from mrctl.sweep.store import Store
@@ -523,8 +523,8 @@ def sweep(
         workers: Use this number of processes on this machine; by default one for each core.
         scheduler: Use the Dask scheduler at this address instead, such as tcp://127.0.0.1:8786.
     """
-    _there(file)
-    _some(workers)
+    _check_exists(file)
+    _check_workers(workers)
     from mrctl.sweep import jobs
     from mrctl.sweep.plan import Sweep
 
@@ -577,7 +577,7 @@ def suite(
         out: Folder for report.html, the tables in Markdown and JSON, the figures and the runs; by default suite,
             suite_quick, suite_full or held_out.
     """
-    _some(workers)
+    _check_workers(workers)
     if seeds is not None and seeds < 1:
         raise InputError("seeds: the suite needs at least one run of at least one feedforward")
     if random is not None and random < 0:
@@ -651,7 +651,7 @@ def tune(
 
         print(find(search, tier, out, json))
         return
-    _known(world, RobotFile.from_dict({"path": robot}, "robot"))
+    _check_world(world, RobotFile.from_dict({"path": robot}, "robot"))
     from mrctl.experiments import tuning
     from mrctl.physics.mjcf import load_robot
 
@@ -684,7 +684,7 @@ def _identify_with(arguments: list[str]) -> Callable[..., None]:
             seed: This seed determines the test signals and the noise of the sensors.
             json: Print JSON instead of a table.
         """
-        _known(world, robot)
+        _check_world(world, robot)
         from mrctl.experiments import identify as identification
 
         print(identification.run(world, robot, perturbation, sensing, seed, json))
@@ -717,9 +717,9 @@ def check(
     from mrctl.physics.files import SHIPPED
 
     if robot in SHIPPED or wheels or steering or chassis:
-        _known("flat", RobotFile.from_dict({"path": robot}, "robot"))
+        _check_world("flat", RobotFile.from_dict({"path": robot}, "robot"))
     else:
-        _known(robot)
+        _check_world(robot)
     from mrctl.checks import command as checking
 
     text, verdict = checking.run(robot, wheels, steering, chassis, json)
@@ -748,7 +748,7 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
     """
     asked = arguments[0] == "view"
     scenario_file = _scenario_file(arguments) if asked else None
-    chosen = scenario_file is not None or bool(_given(arguments) & {"prior", "learner", "compare"})
+    chosen = scenario_file is not None or bool(_fields_set(arguments) & {"prior", "learner", "compare"})
     default = Scenario() if chosen else Scenario(**FEEDFORWARDS[BEST])
     if scenario_file:
         default = Scenario.from_toml(scenario_file)
@@ -783,20 +783,20 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
         if file is not None and str(file) != scenario_file:
             if scenario != default:
                 raise InputError(f"view: {file} has its own scenarios; flags of a scenario need a live session")
-            _there(file)
+            _check_exists(file)
             from mrctl.viewer import view as viewing
 
             return viewing.replay(file, compare, number, export, host, port, code)
         if number is not None:
             raise InputError("run: chooses a run of a result or a sweep; a live session has none")
-        _known(scenario.world, scenario.robot)
+        _check_world(scenario.world, scenario.robot)
         from mrctl.viewer import view as viewing
 
         scenario = _suited(scenario, arguments, scenario_file)
         viewing.live(scenario, compare if chosen else ("none",), export, host, port)
 
     if not asked or _is_short_help(arguments):
-        short = _part(default, FIRST)
+        short = _partial_record(default, FIRST)
         view.__annotations__["scenario"] = Annotated[type(short), tyro.conf.arg(name="")]
         view.__defaults__ = (None, short, *(view.__defaults__ or ())[2:])
     return view
@@ -818,7 +818,7 @@ def record(
             others as ghosts, and of more runs only the first one.
         code: Whether a sweep may run the Python files of the controller that it names.
     """
-    _there(file)
+    _check_exists(file)
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # which mujoco reads when it is imported
     from mrctl.viewer import video
@@ -842,7 +842,7 @@ def export(
         out: File to write.
         number: Number of the run to write; by default all runs, whose numbers are in a column or before each topic.
     """
-    _there(file)
+    _check_exists(file)
     from mrctl.results import export as exporting
     from mrctl.sweep import jobs, store
 

@@ -111,7 +111,7 @@ def inverse_dynamics_of_rows(command: Array, derivative: Array, prior: Rows, vol
 
 
 class Prior:
-    """What the feedforward of B robots starts from.
+    """Prior models of the feedforwards of B robots.
 
     Attributes:
         rows: One record of `PRIOR` a robot.

@@ -104,7 +104,7 @@ class Tracking(control.Task):
 
 
 class Navigation(Tracking):
-    """A task in which one robot with a lidar is told a goal; its seeds are those of `Tracking`."""
+    """A task in which one robot with a lidar gets a goal; its seeds are those of `Tracking`."""
 
     def __init__(
         self, scenario: Scenario, random: int | np.random.RandomState | None = None, draw: Draw | None = None

@@ -145,7 +145,7 @@ class TrackingEnv(gymnasium.Env):
 
 
 class NavigationEnv(TrackingEnv):
-    """An environment in which one robot with a lidar is told a goal."""
+    """An environment in which one robot with a lidar gets a goal."""
 
     def __init__(
         self,

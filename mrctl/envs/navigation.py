@@ -1,4 +1,4 @@
-"""Navigation as episodes: a robot with a lidar is told a goal, and an agent asks for its twists."""
+"""Navigation as episodes: a robot with a lidar gets a goal, and an agent requests its twists."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Navigating(Episodes):
         self._reward = np.where(self._drives, np.nan_to_num(before - self._away) + end, 0.0)
 
     def metrics(self, row: int) -> dict[str, float]:
-        """Returns no metrics, since a robot that is told a goal follows no reference."""
+        """Returns no metrics, since a robot that gets a goal follows no reference."""
         return {}
 
     def _distance(self) -> Array:

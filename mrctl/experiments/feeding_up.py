@@ -168,7 +168,7 @@ def _driven(
 
 
 def table(runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
-    """How the robots followed the plans on each plant, and the sentence that follows."""
+    """Returns the table of the tracking of the plans on each plant, with a sentence that sums it up."""
     rows, verdicts = [], []
     for plant, of in runs.items():
         errors = {name: np.array([run.error for run in own]) for name, own in of.items()}

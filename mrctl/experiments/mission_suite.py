@@ -78,9 +78,9 @@ class Found(NamedTuple):
     on_reference: Array
     """At the largest speed, if the estimate were always on the reference, `(controllers, plants, draws)`."""
     plans: Array
-    """Of the plans themselves, `(draws,)`."""
+    """Widths that the plans themselves need, `(draws,)`."""
     speeds: list[float]
-    """In m/s."""
+    """Speeds at which the corridors are driven, in m/s."""
     impassable: int
     """Number of corridors that were left out, for no plan goes through them."""
 
@@ -244,7 +244,7 @@ def critical_speeds(found: Found, shown: str) -> Table:
 
 
 def budget(found: Found, shown: str) -> Table:
-    """What is left of the allowance when one source of error is taken away."""
+    """Returns the table of the allowance that remains when one source of error is removed."""
     rows, gains = [], {}
     for p, plant in enumerate(PLANTS):
         for c, name in enumerate(CONTROLLERS):

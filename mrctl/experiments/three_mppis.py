@@ -76,7 +76,7 @@ class Run(NamedTuple):
     """How a run ended."""
 
     outcome: str
-    """As in `mrctl.navigation.mission.outcomes`."""
+    """Outcome, one of those of `mrctl.navigation.mission.outcomes`."""
     lateness: float
     """Time at which the robot arrived beyond that of the plan in s; infinite where it did not arrive."""
     clearance: float
@@ -192,7 +192,7 @@ def ended(result: xr.Dataset, one: World) -> Run:
 
 
 def table(lag: float, runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
-    """How each of the three fared on each plant, and the sentence that follows."""
+    """Returns the table of the results of the three MPPIs on each plant, with a sentence that sums it up."""
     rows, verdicts = [], {SECOND: [], FIRST: []}
     for plant in PLANTS:
         late = {name: np.array([run.lateness for run in of[plant]]) for name, of in runs.items()}

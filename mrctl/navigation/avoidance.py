@@ -31,7 +31,7 @@ BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, fo
 
 
 class Barrier(NamedTuple):
-    """What the filter keeps."""
+    """Parameters of the braking filter of one robot."""
 
     discs: Array
     """Discs that cover the robot: x and y of the centre in its frame and radius in m, `(k, 3)`; see `cover`."""

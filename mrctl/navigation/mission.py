@@ -1,4 +1,4 @@
-"""A mission: in a world a robot gets a goal, a plan is made, the robot drives it, and the outcome is told."""
+"""Missions: a robot gets a goal in a world, plans a path, drives it, and reports the outcome."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Mission(NamedTuple):
     result: xr.Dataset
     """Result of one robot or several, until the last of them has ended; NaN after the end of each."""
     table: pd.DataFrame
-    """What `outcomes` returns."""
+    """Outcomes of missions, as `outcomes` returns them."""
     planning_time: float
     """Wall time of the first plan, its checks and its time law in s; unlike all else, it differs from call to call."""
 
@@ -101,7 +101,7 @@ class Order(Record):
     margin: float = MARGIN
     """Clearance that the plan keeps in m."""
     avoid: Avoid = "none"
-    """What keeps the robot from obstacles that move."""
+    """Law that keeps the robot from obstacles that move."""
 
 
 def order_of(folder: str | Path) -> Order:

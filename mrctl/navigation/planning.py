@@ -41,7 +41,7 @@ MOST_CELLS = 1_000_000  # of the plane, for a search takes 288 bytes for each, a
 
 
 class Space(NamedTuple):
-    """What a robot moves in, for planning."""
+    """Free space in which a robot plans."""
 
     outlines: Outlines
     """The obstacles."""

@@ -37,7 +37,7 @@ RETRY = 1.0  # s, least time between two plans
 
 
 class Bounds(NamedTuple):
-    """What twists a robot can drive."""
+    """Limits on the twists of a robot."""
 
     speed: float
     """Largest V in m/s."""
@@ -64,7 +64,7 @@ class Bounds(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What a roll-out is held against."""
+    """Targets and obstacles by which roll-outs are judged."""
 
     targets: Array
     """Where the plan is after each of n steps, counted from its place nearest to the robot: x and y in m, cos θ, sin θ,
@@ -78,7 +78,7 @@ class Scene(NamedTuple):
 
 
 class Considered(NamedTuple):
-    """What a stage considered in a motion period."""
+    """Roll-outs that a stage considered in a motion period."""
 
     pose: Array
     """Where the robot was by its estimate, x and y in m and θ in rad, `(3,)`."""

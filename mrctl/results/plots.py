@@ -410,7 +410,7 @@ class InverseMap(NamedTuple):
     learned: np.ndarray
     """U_Σ and U_Δ in V (m, n, 2)."""
     true: np.ndarray
-    """The same for the true inverse dynamics."""
+    """U_Σ and U_Δ of the true inverse dynamics in V (m, n, 2)."""
     path: np.ndarray
     """Commanded twists of the lap in which it was trained last, in m/s and rad/s, (T, 2)."""
 

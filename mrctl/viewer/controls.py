@@ -25,7 +25,7 @@ ANEW, ANEW_HINT = " ↻", "A change begins another run."  # behind the label of 
 SEED = ("seed",)  # a number that no slider suits
 STEERING = ("steering_offset", "steering_backlash")
 # Fields of large records in groups, by the name of the field that holds the record. The first group of a perturbation
-# is open; what is in no group stands above them.
+# is open; fields without a group stand above the groups.
 GROUPS: dict[str, dict[str, tuple[str, ...]]] = {
     "perturbation": {
         "mass and payload": ("mass_factor", "inertia_factor", "payload", "payload_x", "payload_y", "payload_z"),

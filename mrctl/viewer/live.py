@@ -64,8 +64,8 @@ from mrctl.scenario import Scenario
 KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of each group
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering
 NOTHING = np.zeros((0, 2, 2))
-PLANNED = ("world", "steering", "reference")  # what a plan was made for
-KEPT = ("prior", "learner", "seed")  # by another robot, and the tier of the sensors
+PLANNED = ("world", "steering", "reference")  # fields on which a plan depends
+KEPT = ("prior", "learner", "seed")  # fields that stay when the robot changes, as the tier of the sensors does
 # Fields of a scenario whose change needs a new run, on their own tab; and fields without an input.
 NEW_RUN = ("world", "steering", "sensing", "reference", "seed", "prefilter")
 HIDDEN = (

@@ -1,4 +1,4 @@
-"""How robots are told apart in a page: label and colour."""
+"""Labels and colours that identify the robots of a page."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ TOGETHER, LABEL_ABOVE, TARGET_ABOVE = 0.7, 0.4, 0.15
 CLEARANCE = 0.05  # m, least height of a camera above the floor
 # Initial camera, relative to the middle of the reference and in units of its size.
 CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])
-# Of the scatter plot behind the track, likewise: along x, y and z.
+# Corner and size of the scatter plot behind the track along x, y and z, in the same frame and units.
 BOARD_CORNER, BOARD_SIZE = np.array([-0.65, 0.75, 0.15]), np.array([1.35, 0.0, 0.6])
 GHOST_OPACITY, GLASS_OPACITY = 0.5, 0.55
 THICK = 0.012  # thickness of the lines from targets to robots, in diagonals of the robot's outline
