@@ -12,9 +12,6 @@ from pydantic import ValidationError
 
 from mrctl.control.kanayama import posture_error
 from mrctl.kernel import Array, Rows, kernel
-from mrctl.loop.courses import course, distinct_courses, start_pose
-from mrctl.loop.goals import Goals, arrived
-from mrctl.loop.log import Log
 from mrctl.loop.simulation import Simulation, group_of
 from mrctl.record import InputError, describe
 from mrctl.scenario import Scenario
@@ -90,25 +87,8 @@ class AgentMotion:
         return self.request
 
 
-class EpisodeCourses:
-    """The references of robots whose clocks start at different ticks."""
-
-    def __init__(self, scenarios: Sequence[Scenario], preview: int) -> None:
-        """Samples every course once, to the end of the longest episode and `preview` ticks beyond."""
-        ticks = max(s.ticks for s in scenarios)
-        self._last = ticks + preview
-        distinct, self._place = distinct_courses(scenarios)
-        whole, end = range(ticks), range(ticks, self._last + 1)
-        self._table = np.stack([np.append(course(s, whole), course(s, end)) for s in distinct], axis=1)
-        self.start = np.zeros(len(scenarios), int)
-
-    def at(self, tick: int, ahead: int = 0) -> Rows:
-        """Returns the references `ahead` ticks after a tick of the simulation, records of `GOAL`, `(B,)`."""
-        return self._table[np.minimum(tick + ahead - self.start, self._last), self._place]
-
-
-class Episodes(Simulation):
-    """A `Simulation` with an action in each tick; each robot's clock has its own start, and only one tick is logged.
+class Episodes:
+    """A closed loop with an action in each tick; each robot's clock has its own start, and only one tick is logged.
 
     An episode has the same bits as its scenario under `simulate`, whatever its neighbours do and whenever it begins.
 
@@ -117,6 +97,12 @@ class Episodes(Simulation):
     - `residual`: voltages left and right in V that are added to those of the controllers.
 
     Attributes:
+        loop: The simulation, of which this class takes a tick apart: `sense`, `send`, the physics, `settle`.
+        plant: Its physics.
+        log: Its log, which keeps the last tick.
+        period: Control period in s.
+        start: Tick at which the episode of each robot began, `(B,)`.
+        goals: Goals of the scenarios in m, m, rad, `(B, 3)`; NaN for none.
         bound: Largest action of each component, `(2,)`.
         scale: Divisors that bring the numbers of an observation to about 1, `(n,)`: 5 cm for the posture error (of the
             rear wheels, for its angle), the robot's limits for twists, reference, wheels and steering, and its supply
@@ -151,7 +137,9 @@ class Episodes(Simulation):
         if action == "voltage":  # a learner must not learn from feedback that does not act
             scenarios = [s.model_copy(update={"prior": "none", "learner": "none"}) for s in scenarios]
         self._agent: AgentMotion | None = None
-        super().__init__(scenarios, threads=threads, motion=self._make_agent if action == "twist" else None)
+        motion = self._make_agent if action == "twist" else None
+        self.loop = Simulation(scenarios, threads=threads, restarting=True, motion=motion)
+        self.plant, self.log, self.period = self.loop.plant, self.loop.log, self.loop.period
         self._kind = action
         self._action = np.zeros((len(scenarios), 2)) if self._agent is None else self._agent.request
         robot = self.plant.robot
@@ -165,17 +153,25 @@ class Episodes(Simulation):
         )
         self._given, self._draw = [s.perturbation for s in self.scenarios], draw
         self._squares = np.zeros((len(scenarios), 3))
-        self.courses: EpisodeCourses = EpisodeCourses(scenarios, self.preview)  # type: ignore[assignment]
-        self.log = Log(1, len(scenarios))
+        self.start = np.zeros(len(scenarios), int)
         self.sizes = dict(OBSERVATIONS)
         self.limits = np.full(sum(OBSERVATIONS.values()), -np.inf), np.full(sum(OBSERVATIONS.values()), np.inf)
-        self._goals = Goals(scenarios, timed=False)  # episodes that end early begin again instead of stopping
         self._lengths = np.array([s.ticks for s in scenarios])
-        self._targets = np.array([(np.nan,) * 3 if s.goal is None else s.goal for s in scenarios])
+        self.goals = np.array([(np.nan,) * 3 if s.goal is None else s.goal for s in scenarios])
 
     def _make_agent(self, robot: Robot, size: int) -> AgentMotion:
         self._agent = AgentMotion(robot, size)
         return self._agent
+
+    @property
+    def tick(self) -> int:
+        """Number of control periods done."""
+        return self.loop.tick
+
+    @property
+    def scenarios(self) -> list[Scenario]:
+        """Scenario of each robot, with the seed and the perturbation of its episode."""
+        return self.loop.scenarios
 
     def _next(self, row: int, seed: int, perturbation: object) -> Scenario:
         """Returns the scenario of a robot's next episode."""
@@ -202,21 +198,8 @@ class Episodes(Simulation):
         Raises:
             InputError: The perturbation is invalid, or the robot could not stand.
         """
-        scenario = self._next(row, seed, perturbation)
-        if scenario.perturbation != self.scenarios[row].perturbation:
-            self.events.perturb(row, scenario.perturbation)
-        self.scenarios[row] = scenario
-        self.courses.start[row] = self.tick
-        self.hierarchy.renew(row, scenario)
-        self.events.restart(row, scenario, self.tick)
-        goal, plant = self.courses.at(self.tick), self.plant
-        plant.restart(row, start_pose(scenario, goal["pose"][row]), goal["twist"][row])
-        self.hierarchy.reset(goal["twist"], goal["acceleration"], plant.reading["steering_angle"], row)
-        self.sensors.restart(row, seed, self.tick)
-        self.estimator.start(row, plant.reading[row], seed, self.tick)
-        self._failure_time[row] = np.nan
-        self._goals.restart(row, self.tick)
-        self._learned.pop(row, None)
+        self.loop.restart(row, self._next(row, seed, perturbation))
+        self.start[row] = self.tick
         self._action[row] = self._squares[row] = 0.0
 
     def begin_all(self, seeds: Sequence[int], perturbations: Sequence[object] | None = None) -> None:
@@ -224,9 +207,8 @@ class Episodes(Simulation):
         perturbations = [None] * len(seeds) if perturbations is None else perturbations
         if len(perturbations) != len(seeds):
             raise InputError(f"perturbation: {len(perturbations)} of them for {len(seeds)} robots")
-        self._sensed = -1
         if len(seeds) == 1:
-            self.hierarchy.restart_clock()
+            self.loop.hierarchy.restart_clock()
         for row, seed in enumerate(seeds):
             self.begin(row, seed, perturbations[row])
 
@@ -234,14 +216,26 @@ class Episodes(Simulation):
         """Sets the action of the coming tick, `(B, 2)`."""
         self._action[:] = action
 
-    def decide(self) -> Array:
-        """Decides as `Simulation.decide`, with the action in place of the commanded voltages or added to them."""
-        command, supply = super().decide(), self.plant.robot.supply
+    def step(self) -> None:
+        """Computes one control period; if others advance the physics, `send` comes before it, the rest after it."""
+        self.send()
+        self.plant.advance()
+        self.plant.look()
+        self.settle()
+
+    def sense(self) -> tuple[Rows, Rows]:
+        """Measures; see `Simulation.sense`."""
+        return self.loop.sense()
+
+    def send(self) -> None:
+        """Sends the commands of the hierarchy, with the action in place of their voltages or added to them."""
+        hierarchy, supply = self.loop.hierarchy, self.plant.robot.supply
+        command = hierarchy.update(*self.sense())
         if self._kind == "voltage":
             command[:, :2] = np.clip(self._action, -supply, supply)
         elif self._kind == "residual":
             command[:, :2] = np.clip(command[:, :2] + self._action, -supply, supply)
-        return command
+        self.plant.send(command, hierarchy.faults)
 
     def observe(self) -> tuple[Array, Array]:
         """Returns the observations for the coming tick, and the rewards for the present state.
@@ -252,31 +246,34 @@ class Episodes(Simulation):
             root mean square over the two wheels, √(e_x² + e_y² + (D e_θ)²), of the true posture.
         """
         seen, wanted = self.sense()
-        size, robot = len(self.scenarios), self.plant.robot
+        loop, size, robot = self.loop, len(self.scenarios), self.plant.robot
+        now, _ = loop.courses.at(self.tick)
         constants = robot.wheel_radius, robot.half_track
         observation, reward = np.empty((size, sum(OBSERVATIONS.values()))), np.empty(size)
-        observe(self.plant.state, seen, wanted, self._goal, self.hierarchy.state, *constants, observation, reward)
+        observe(self.plant.state, seen, wanted, now, loop.hierarchy.state, *constants, observation, reward)
         return observation, reward
 
     def settle(self) -> None:
-        """Settles as `Simulation.settle`, and adds up the squared errors."""
-        super().settle()
-        add_squares.compiled(self.log.at(self.tick - 1), self._squares)
+        """Does what comes after the physics: the record, the squared errors and the failures."""
+        loop, tick = self.loop, self.tick
+        seen, now = loop.estimator.seen, loop.courses.at(tick)[0]
+        self.log.record(tick, self.plant.state, seen, now, loop.hierarchy.state)
+        loop.judge()
+        add_squares.compiled(self.log.now, self._squares)
 
     def metrics(self, row: int) -> dict[str, float]:
         """Returns the `EPISODE_METRICS` of a robot's episode so far, by name; NaN if the robot has failed."""
-        means = self._squares[row] / (self.tick - self.courses.start[row])
+        means = self._squares[row] / (self.tick - self.start[row])
         return dict(zip(EPISODE_METRICS, np.sqrt(means).tolist(), strict=True))
 
     def arrived(self) -> NDArray[np.bool]:
         """Tells which robots stood at the goals of their scenarios in the last tick, `(B,)`."""
-        last = self.log.at(self.tick - 1)
-        return arrived(np.stack([last["x"], last["y"], last["theta"]], -1), last["v"], self._targets)
+        return self.loop.goals.there.copy()
 
     def ended(self) -> tuple[NDArray[np.bool], NDArray[np.bool]]:
         """Tells which episodes ended by a failure or at a goal, and which at the end of their scenario, `(B,)` each."""
         terminated = self.plant.failed.copy()
-        return terminated, (self.tick - self.courses.start >= self._lengths) & ~terminated
+        return terminated, (self.tick - self.start >= self._lengths) & ~terminated
 
 
 def read(scenario: Scenario | str | Path | None) -> Scenario:

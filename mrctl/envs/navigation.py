@@ -67,23 +67,23 @@ class Navigating(Episodes):
         self._away[row], self._reward[row] = self._distance()[row], 0.0
 
     def sense(self) -> tuple[Rows, Rows]:
-        """Measures as `Simulation.sense`, and scans with the lidars that are due."""
+        """Measures as `Episodes.sense`, and scans with the lidars that are due."""
         found = super().sense()
         if self._scanned != self.tick:
-            self._scanned, since = self.tick, self.tick - self.courses.start
+            self._scanned, since = self.tick, self.tick - self.start
             for row in np.flatnonzero((since % self._every == 0) & ~self.plant.failed):
                 around = self._surroundings.at(float(since[row] * self.period))
                 ranges = self._lidar.scan(self.plant.reading["pose"][row], around, self._random[row])
                 self._scans[row] = np.minimum(ranges, self._lidar.range)
         return found
 
-    def decide(self) -> Array:
-        """Decides as `Episodes.decide`, and notes which robots still drive."""
+    def send(self) -> None:
+        """Sends as `Episodes.send`, and notes which robots still drive."""
         self._drives = ~self.plant.failed
-        return super().decide()
+        super().send()
 
     def settle(self) -> None:
-        """Settles as `Simulation.settle`, and computes the reward of the tick."""
+        """Settles as `Episodes.settle`, and computes the reward of the tick."""
         super().settle()
         before, self._away = self._away, self._distance()
         end = np.where(self.arrived(), END, -END) * self.ended()[0]
@@ -95,7 +95,7 @@ class Navigating(Episodes):
 
     def _distance(self) -> Array:
         """Returns the straight-line distances of the robots from their goals in m, `(B,)`."""
-        return np.hypot(*(self.plant.reading["pose"][:, :2] - self._targets[:, :2]).T)
+        return np.hypot(*(self.plant.reading["pose"][:, :2] - self.goals[:, :2]).T)
 
     def observe(self) -> tuple[Array, Array]:
         """Returns the observations for the coming tick, and the rewards of the last one.
@@ -109,7 +109,7 @@ class Navigating(Episodes):
         seen, _ = self.sense()
         found = np.empty((len(self.scenarios), len(self.limits[0])))
         for row, own in enumerate(found):
-            posture_error.compiled(seen["pose"][row], self._targets[row], own[:3])
+            posture_error.compiled(seen["pose"][row], self.goals[row], own[:3])
         found[:, 3:5], found[:, 5:] = seen["twist"], self._scans
         found[self.plant.failed] = np.nan_to_num(found[self.plant.failed], posinf=0, neginf=0)  # may have diverged
         return found, self._reward.copy()

@@ -28,7 +28,7 @@ class Pictures:
     def __init__(self, episodes: Episodes) -> None:
         """Takes the episodes."""
         self._episodes = episodes
-        self._physics = CarPhysics.from_compiled(mjcf.clone(episodes.model))
+        self._physics = CarPhysics.from_compiled(mjcf.clone(episodes.loop.model))
         looks = self._physics.model.ptr.vis
         looks.global_.offwidth, looks.global_.offheight = WIDTH, HEIGHT
         # Larger values take most of the time without a GPU.

@@ -46,22 +46,57 @@ def distinct_courses(scenarios: Sequence[Scenario]) -> tuple[list[Scenario], NDA
 class Courses:
     """The references of a uniform group of scenarios; robots with the same reference share its samples."""
 
-    def __init__(self, scenarios: Sequence[Scenario], preview: int = 0) -> None:
-        """Takes the scenario of each robot, and the largest argument `ahead` of `at`, in control ticks."""
+    def __init__(self, scenarios: Sequence[Scenario], preview: int) -> None:
+        """Takes the scenario of each robot, and the number of control ticks until a voltage acts."""
         self._ticks, self._preview = max(s.ticks for s in scenarios), preview
         self._courses, self._place = distinct_courses(scenarios)
         self._own = len(self._courses) == len(scenarios)  # whether no two robots share a course
         self._block = range(0)
 
-    def at(self, tick: int, ahead: int = 0) -> Rows:
-        """Returns the references `ahead` ticks after a control tick, one record of `GOAL` for each robot, `(B,)`."""
+    def at(self, tick: int) -> tuple[Rows, Rows]:
+        """Returns the references at a control tick, and those at the time when the voltage of that tick acts.
+
+        Returns:
+            Two times a record of `GOAL` of each robot, `(B,)`.
+        """
         if tick not in self._block:  # only one block of samples is held, (ticks of a block, courses)
             first = tick // BLOCK * BLOCK
             self._block = range(first, min(first + BLOCK, self._ticks))
             whole = range(first, self._block.stop + self._preview)
             self._samples = np.stack([course(s, whole) for s in self._courses], axis=1)
-        now = self._samples[tick + ahead - self._block.start]
-        return now if self._own else now[self._place]
+        row = tick - self._block.start
+        now = self._samples[row] if self._own else self._samples[row][self._place]
+        if not self._preview:
+            return now, now
+        later = self._samples[row + self._preview]
+        return now, later if self._own else later[self._place]
+
+
+class RestartingCourses:
+    """The references of robots that begin again, so that their clocks start at different ticks."""
+
+    def __init__(self, scenarios: Sequence[Scenario], preview: int) -> None:
+        """Samples every course once, to the end of the longest run and `preview` ticks beyond; see `Courses`."""
+        ticks = max(s.ticks for s in scenarios)
+        self._last, self._preview = ticks + preview, preview
+        distinct, self._place = distinct_courses(scenarios)
+        whole, end = range(ticks), range(ticks, self._last + 1)
+        self._table = np.stack([np.append(course(s, whole), course(s, end)) for s in distinct], axis=1)
+        self._start = np.zeros(len(scenarios), int)
+        self._tick, self._now = -1, (self._table[0], self._table[0])  # what `at` returned last
+
+    def restart(self, row: int, tick: int) -> None:
+        """Begins the course of one robot again at a control tick."""
+        self._start[row], self._tick = tick, -1
+
+    def at(self, tick: int) -> tuple[Rows, Rows]:
+        """Returns what `Courses.at` returns, and beyond the end of a course its last sample."""
+        if tick != self._tick:
+            since, place = tick - self._start, self._place
+            now = self._table[np.minimum(since, self._last), place]
+            later = self._table[np.minimum(since + self._preview, self._last), place] if self._preview else now
+            self._tick, self._now = tick, (now, later)
+        return self._now
 
 
 def start_pose(scenario: Scenario, reference: Array) -> Array:

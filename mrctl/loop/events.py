@@ -28,6 +28,7 @@ class Events:
         self._plant, self._hierarchy, self._period = plant, hierarchy, period
         self._sensing = [s.sensing for s in scenarios]
         self._schedule: dict[int, list[tuple[int, Event]]] = defaultdict(list)
+        self._applied = -1  # last tick whose events were applied
         for row, scenario in enumerate(scenarios):
             self.perturb(row, scenario.perturbation)
             self._enter(row, scenario, 0)
@@ -46,7 +47,7 @@ class Events:
         If some of them perturb the plant, the perturbation of the scenario itself is applied anew.
         """
         coming = {t: [e for e in entries if e[0] != row] for t, entries in self._schedule.items() if t >= tick}
-        self._schedule = defaultdict(list, coming)
+        self._schedule, self._applied = defaultdict(list, coming), -1
         self._enter(row, scenario, tick)
         if any(event.perturbation for event in scenario.events):
             self.perturb(row, scenario.perturbation)
@@ -54,7 +55,10 @@ class Events:
             self._hierarchy.set_truth(row, self._plant.truth[row])
 
     def apply(self, tick: int) -> None:
-        """Applies the events of a control tick."""
+        """Applies the events of a control tick; further calls in the same tick do nothing."""
+        if tick == self._applied:
+            return
+        self._applied = tick
         for row, event in self._schedule.get(tick, ()):
             if event.perturbation is not None:
                 self.perturb(row, event.perturbation)

@@ -7,11 +7,52 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mrctl.kernel import Array, Rows
+from mrctl.kernel import Array, Rows, kernel
 from mrctl.scenario import Scenario
 
 NEAR, TURNED, RESTING = 0.1, 0.2, 0.05  # m, rad and m/s, within which a robot has arrived
 HEADWAY, STUCK = 0.05, 5.0  # m and s: a robot that moves no farther than that within this time is stuck
+
+ENDING = np.dtype(
+    [
+        ("goal", "f8", 3),  # x and y in m, θ in rad; NaN for none
+        ("ticks", "f8"),  # number of control ticks after which the run ends by itself; infinite where it does not
+        ("start", "i8"),  # tick at which the run began
+        ("place", "f8", 2),  # where the robot last made headway, x and y in m
+        ("since", "i8"),  # tick at which it did so
+        ("there", "?"),  # whether it stands at its goal, see `arrived`
+        ("over", "?"),  # whether it does, or the run has come to its own end
+        ("stuck", "?"),  # whether it has a goal, and has made no headway for too long
+    ],
+    align=True,
+)
+
+
+@kernel
+def end(tick: int, patience: int, now: Rows, endings: Rows) -> bool:
+    """Judges which runs end at a control tick; returns whether any does.
+
+    Args:
+        tick: The control tick.
+        patience: Number of control ticks without headway after which a robot is stuck.
+        now: Record of `TICK` of each robot at this tick; NaN for a robot whose run has ended.
+        endings: In and out: record of `ENDING` of each robot.
+    """
+    found = False
+    for i in range(len(endings)):
+        t, s = now[i], endings[i]
+        if np.hypot(t.x - s.place[0], t.y - s.place[1]) > HEADWAY:
+            s.place[0], s.place[1], s.since = t.x, t.y, tick
+        turn = t.theta - s.goal[2]
+        s.there = (
+            np.hypot(t.x - s.goal[0], t.y - s.goal[1]) < NEAR
+            and abs(np.arctan2(np.sin(turn), np.cos(turn))) < TURNED
+            and abs(t.v) < RESTING
+        )
+        s.over = s.there or tick + 1 - s.start >= s.ticks
+        s.stuck = np.isfinite(t.x + s.goal[0]) and tick - s.since >= patience
+        found |= s.over or s.stuck
+    return found
 
 
 def arrived(pose: Array, v: ArrayLike, goal: Array) -> NDArray[np.bool]:
@@ -28,23 +69,28 @@ def arrived(pose: Array, v: ArrayLike, goal: Array) -> NDArray[np.bool]:
 
 
 class Goals:
-    """The goals of a group of runs."""
+    """The goals of a group of runs.
+
+    Attributes:
+        any: Whether a robot has a goal.
+        there: Which robots stood at their goals when `ended` was last called, `(B,)`.
+    """
 
     def __init__(self, scenarios: Sequence[Scenario], timed: bool = True) -> None:
         """Takes the scenario of each robot, and whether a run that is shorter than the longest one ends by itself."""
         none = (np.nan, np.nan, np.nan)
-        self._goals = np.array([none if s.goal is None else s.goal for s in scenarios])
-        self.any = bool(np.isfinite(self._goals).any())
+        self._endings = endings = np.zeros(len(scenarios), ENDING)
+        endings["goal"] = [none if s.goal is None else s.goal for s in scenarios]
         ticks = np.array([s.ticks for s in scenarios])
-        self._ticks = np.where(timed & (ticks < ticks.max()), ticks, np.inf)  # of runs that end before the group does
+        endings["ticks"] = np.where(timed & (ticks < ticks.max()), ticks, np.inf)  # of runs that end before the group
+        endings["place"] = np.inf
+        self.any, self.there = bool(np.isfinite(endings["goal"]).any()), endings["there"]
         self._patience = round(STUCK / scenarios[0].control_period)
-        self._place = np.full((len(scenarios), 2), np.inf)  # m, where each robot last made headway
-        self._start = np.zeros(len(scenarios), int)
-        self._since = np.zeros(len(scenarios), int)
+        self._end = end.repeated()
 
     def restart(self, row: int, tick: int) -> None:
         """Begins the run of one robot again at a control tick."""
-        self._place[row], self._start[row] = np.inf, tick
+        self._endings["place"][row], self._endings["start"][row] = np.inf, tick
 
     def ended(self, tick: int, now: Rows) -> dict[int, str]:
         """Returns the robots whose runs end, each with the reason of its failure: `stuck`, or "" where it did not fail.
@@ -53,10 +99,8 @@ class Goals:
             tick: The control tick.
             now: Record of `TICK` of each robot at this tick, `(B,)`; NaN for a robot whose run has ended.
         """
-        x, y = now["x"], now["y"]
-        farther = np.hypot(x - self._place[:, 0], y - self._place[:, 1]) > HEADWAY
-        self._place[farther, 0], self._place[farther, 1], self._since[farther] = x[farther], y[farther], tick
-        there = arrived(np.stack([x, y, now["theta"]], -1), now["v"], self._goals)
-        stuck = np.isfinite(x + self._goals[:, 0]) & (tick - self._since >= self._patience)
-        over = there | (tick + 1 - self._start >= self._ticks)
-        return {int(row): "" if over[row] else "stuck" for row in np.flatnonzero(over | stuck)}
+        endings = self._endings
+        if not self._end(tick, self._patience, now, endings):
+            return {}
+        over = endings["over"]
+        return {int(row): "" if over[row] else "stuck" for row in np.flatnonzero(over | endings["stuck"])}

@@ -211,7 +211,14 @@ class Hierarchy:
         output: Voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
         saturated: Whether a limit acted, `(B,)`.
         weight_norm: Norm of the learner's weights, `(B,)`.
-        finite: Whether all voltages of the last tick were finite numbers.
+        faults: For each robot whose commands of the last tick cannot be used, the reason why it fails.
+        tick: Number of control ticks done.
+        started: Tick at which the clock of the motion controller was last started.
+        robot: The nominal robot.
+        rigid: Whether its steering is `rigid`, so that the second channel is steering.
+        nominal: Its parameters for the kernels, one record of `NOMINAL`, `(1,)`.
+        model: Its inverse dynamics for each robot.
+        period: Control period in s.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], robot: Robot, feedforward: Feedforward | None = None) -> None:
@@ -226,9 +233,10 @@ class Hierarchy:
             InputError: What was learned or the weights cannot be read, or do not suit the learner.
         """
         first, size = scenarios[0], len(scenarios)
-        self._robot, self._rigid = robot, first.steering == "rigid"
+        self.robot, self.rigid = robot, first.steering == "rigid"
+        self.tick, self.period = 0, first.control_period
         self.learner: Learner | Feedforward = learner_of(scenarios, robot) if feedforward is None else feedforward
-        self.prior = Prior([None if first.prior == "none" else robot] * size, self._rigid)  # `set_truth` follows
+        self.prior = Prior([None if first.prior == "none" else robot] * size, self.rigid)  # `set_truth` follows
         self._knows_truth = first.prior == "true_model"
         self._learned = {row: load_learned(s) for row, s in enumerate(scenarios) if s.learned}
         if isinstance(self.learner, Learner):
@@ -236,31 +244,30 @@ class Hierarchy:
             self._adopt(range(size))
         elif self._learned:
             raise InputError("learned: a feedforward of your own has to load what it learned itself")
-        self._period = first.control_period
         self._every = round(first.motion_period / first.control_period)
-        self._tick = 0
-        self._record = nominal(robot, self._rigid)
-        self._model = Prior([robot] * size, self._rigid)
+        self.started = 0
+        self.nominal = nominal(robot, self.rigid)
+        self.model = Prior([robot] * size, self.rigid)
         self.state = state = np.zeros(size, CONTROL)
-        self._delays = [s.sensing.loop_delay(self._period) * self._period for s in scenarios]
+        self._delays = [s.sensing.loop_delay(self.period) * self.period for s in scenarios]
         self._pids = [s.pid for s in scenarios]
         self._motions: list[Motion] = []
         for row, scenario in enumerate(scenarios):
-            gains = scenario.pid.channels(robot, self._rigid, self._delays[row], self._period)
-            designed = motion(robot, self._rigid, gains, self._delays[row], self._period, scenario.prefilter)
+            gains = scenario.pid.channels(robot, self.rigid, self._delays[row], self.period)
+            designed = motion(robot, self.rigid, gains, self._delays[row], self.period, scenario.prefilter)
             self._motions.append(designed)
             state["limiter"]["time_constant"][row] = designed.prefilter
             self.set_kanayama(row, scenario.kanayama)
             self.set_pid(row, scenario.pid)
         rejected = np.array([self._rejection(row) for row in range(size)])
-        state["guard"] = guarding.fresh([s.guard for s in scenarios], self._record, rejected)
+        state["guard"] = guarding.fresh([s.guard for s in scenarios], self.nominal, rejected)
         if not getattr(self.learner, "guarded", True):
             state["guard"]["on"] = False
         self.command, self.derivative = state["limiter"]["command"], state["limiter"]["derivative"]
         self.feedback, self.weight_norm = state["feedback"], state["weight_norm"]
         self.output, self.saturated = state["allocation"]["command"], state["allocation"]["saturated"]
         self._update = (update_with(type(self.learner)) if isinstance(self.learner, Learner) else update).repeated()
-        self.finite = True
+        self.faults: dict[int, str] = {}
 
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
         """Changes the motion controller of one robot; gains that are not set are designed for its PID at the start."""
@@ -274,7 +281,7 @@ class Hierarchy:
     def set_pid(self, row: int, design: Pid) -> None:
         """Changes the PID of one robot."""
         self._pids[row] = design
-        for name, value in design.gains(self._robot, self._rigid, self._delays[row], self._period).items():
+        for name, value in design.gains(self.robot, self.rigid, self._delays[row], self.period).items():
             self.state["pid"][name][row] = value
         self._tolerate(row)
 
@@ -289,8 +296,8 @@ class Hierarchy:
         kanayama = Kanayama(k_x=k["k_x"], k_y=k["k_y"], k_theta=k["k_theta"])
         prefilter = float(self.state["limiter"]["time_constant"][row])
         around = Motion(kanayama, prefilter, self._motions[row].lag)
-        gains = self._pids[row].channels(self._robot, self._rigid, delay, self._period)
-        return rejection(self._robot, self._rigid, gains, around, delay, self._period)
+        gains = self._pids[row].channels(self.robot, self.rigid, delay, self.period)
+        return rejection(self.robot, self.rigid, gains, around, delay, self.period)
 
     def set_learning(self, row: int, on: bool) -> None:
         """Switches learning of one robot on or off."""
@@ -308,7 +315,7 @@ class Hierarchy:
             row: Index of the robot.
             scenario: A scenario that fits the group.
         """
-        renewed = Hierarchy([scenario], self._robot)
+        renewed = Hierarchy([scenario], self.robot)
         self.state[row] = renewed.state[0]
         self.prior.rows[row] = renewed.prior.rows[0]
         self._pids[row], self._motions[row], self._delays[row] = scenario.pid, renewed._motions[0], renewed._delays[0]
@@ -321,7 +328,17 @@ class Hierarchy:
 
     def restart_clock(self) -> None:
         """Starts a motion period at the coming tick."""
-        self._tick = 0
+        self.started = self.tick
+
+    @property
+    def motion_period(self) -> float:
+        """Time between two requests of the motion controller in s."""
+        return self.period * self._every
+
+    @property
+    def moves(self) -> bool:
+        """Whether the motion controller acts in the coming tick."""
+        return (self.tick - self.started) % self._every == 0
 
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
         """Bumpless start: the integral holds the voltage that the nominal robot needs for its initial motion.
@@ -334,11 +351,11 @@ class Hierarchy:
         """
         self.command[rows] = twist[rows]
         self.state["allocation"]["angle"][rows] = steering_angle[rows]
-        self.state["pid"]["integral"][rows] = self._steady(twist, acceleration)[rows]
+        self.state["pid"]["integral"][rows] = self.steady(twist, acceleration)[rows]
 
-    def _steady(self, twist: Array, acceleration: Array) -> Array:
+    def steady(self, twist: Array, acceleration: Array) -> Array:
         """Returns the voltage that the nominal robot needs for a motion, less that of the feedforward, `(B, 2)`."""
-        return self._model.output(twist, acceleration) - self.feedforward(twist, acceleration)
+        return self.model.output(twist, acceleration) - self.feedforward(twist, acceleration)
 
     def feedforward(self, command: Array, derivative: Array) -> Array:
         """Returns the feedforward of prior and learner at a motion, `(B, 2)`."""
@@ -355,28 +372,27 @@ class Hierarchy:
             `output`, `(B, 4)`.
         """
         stage: Any = self.learner  # a Learner: a user's feedforward has a hierarchy of its own
-        moves = self._tick % self._every == 0
-        self._tick += 1
-        self.finite, forget = self._update(
-            moves, seen, goal, self._record, self._model.rows, self._period, self.prior.rows, stage.arrays, self.state
-        )
+        constants = self.nominal, self.model.rows, self.period
+        finite, forget = self._update(self.moves, seen, goal, *constants, self.prior.rows, stage.arrays, self.state)
         if forget:
-            self._forget()
+            self.forget()
+        self.faults = {} if finite else self.non_finite()  # the voltage limit would turn NaN into the full voltage
+        self.tick += 1
         return self.output
 
-    def non_finite(self) -> list[int]:
-        """Returns the indices of the robots whose voltages of the last tick are not finite."""
+    def non_finite(self) -> dict[int, str]:
+        """Returns the faults of the robots whose voltages of the last tick are not finite."""
         a = self.state["allocation"]
         finite = np.isfinite(a["feedback"]).all(axis=1) & np.isfinite(a["feedforward"]).all(axis=1)
-        return np.flatnonzero(~finite).tolist()
+        return dict.fromkeys(np.flatnonzero(~finite).tolist(), "non-finite voltage")
 
-    def _forget(self) -> None:
+    def forget(self) -> None:
         """Resets the learners that their guards stopped; one that cannot be reset learns more slowly instead."""
         rows = np.flatnonzero(self.state["guard"]["forget"])
-        if not self._restore(rows):
+        if not self.restore(rows):
             self.state["guard"]["gain"][rows] *= UNSURE
 
-    def _restore(self, rows: NDArray[np.intp]) -> bool:
+    def restore(self, rows: NDArray[np.intp]) -> bool:
         """Resets the learners of these robots; returns whether the stage can be reset."""
         assert isinstance(self.learner, Learner)
         self.learner.restore(rows)

@@ -67,12 +67,15 @@ class Log:
 
     Attributes:
         ticks: Record of `TICK` of each tick and robot, `(length, B)`; after `length` ticks the oldest are overwritten.
+        now: The records of the tick that was written last, a view, `(B,)`.
+        near: Whether in that tick all robots that had not failed were within `DIVERGED` of their references.
     """
 
     def __init__(self, length: int, size: int) -> None:
         """Takes the number of ticks to keep, and the number of robots."""
         # The records of a tick lie side by side, so that the loop writes one block of memory for any number of robots.
         self.ticks = np.empty((length, size), TICK)
+        self.now, self.near = self.ticks[0], True
         self._error = np.zeros(3)
         self._record = record.repeated()
 
@@ -82,8 +85,10 @@ class Log:
 
     def blank(self, tick: int, rows: NDArray[np.bool] | slice) -> None:
         """Replaces the records of robots at one tick by NaN."""
-        self.at(tick).view(float).reshape(-1, len(SIGNALS))[rows] = np.nan
+        self.now = self.at(tick)
+        self.now.view(float).reshape(-1, len(SIGNALS))[rows] = np.nan
 
-    def record(self, tick: int, plant: Rows, seen: Rows, goal: Rows, control: Rows) -> bool:
-        """Records a tick; the arguments and the result are those of the kernel `record`."""
-        return self._record(plant, seen, goal, control, self._error, self.at(tick))
+    def record(self, tick: int, plant: Rows, seen: Rows, goal: Rows, control: Rows) -> None:
+        """Records a tick; the arguments are those of the kernel `record`."""
+        self.now = self.at(tick)
+        self.near = self._record(plant, seen, goal, control, self._error, self.now)

@@ -17,7 +17,7 @@ from mrctl.control.features import feature_scale
 from mrctl.control.feedforward import Learner
 from mrctl.control.stages import Stages
 from mrctl.kernel import Array, Rows
-from mrctl.loop.courses import Courses, start_pose
+from mrctl.loop.courses import Courses, RestartingCourses, start_pose
 from mrctl.loop.events import Events
 from mrctl.loop.goals import Goals
 from mrctl.loop.hierarchy import Hierarchy
@@ -211,16 +211,21 @@ class Simulation:
         plant: The physics.
         events: The perturbations, pushes and other changes during the run.
         log: The recorded signals; the records from `tick` on are not written yet.
+        goals: Where the runs end before their time.
         tick: Number of control periods done.
         ticks: Number of control periods in the whole run, in the longest where they differ.
     """
 
-    def __init__(self, scenarios: Sequence[Scenario], *, threads: int = 0, **stages: Unpack[Stages]) -> None:
+    def __init__(
+        self, scenarios: Sequence[Scenario], *, threads: int = 0, restarting: bool = False, **stages: Unpack[Stages]
+    ) -> None:
         """Compiles the world, and sets the robots on their references with the twist of the reference.
 
         Args:
             scenarios: Scenarios of one group, see `group_of`.
             threads: Largest number of threads of the batch engine; 0 for all cores. Control runs on one.
+            restarting: Whether robots begin again on their own, with `restart`. Then no run ends at its own time, and
+                the log keeps the last tick only.
             stages: As in `simulate`.
 
         Raises:
@@ -245,7 +250,7 @@ class Simulation:
         self._label = " + ".join([self._feedforward, *names.values()])
 
         self.preview = first.sensing.periods("delay", self.period)
-        self.courses = Courses(scenarios, self.preview)
+        self.courses = (RestartingCourses if restarting else Courses)(scenarios, self.preview)
         self.plant: Plant = build(
             self.model, robot, size, round(self.period / first.physics_step), worthwhile(threads, size), first.obstacles
         )
@@ -262,13 +267,12 @@ class Simulation:
         parts = sensing, robot, self.sensors, self.plant.imu, skew, self._tyres(first), first.obstacles
         self.estimator = UserEstimator(own, *parts) if own else Estimator(first.sensing.source, *parts)
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period)
-        self.log = Log(self.ticks, size)
+        self.log = Log(1 if restarting else self.ticks, size)
         self._failure_time = np.full(size, np.nan)
-        self._goals = Goals(scenarios)
+        self.goals = Goals(scenarios, timed=not restarting)
         self._learned: dict[int, Array] = {}  # what each robot had adapted when its run ended, flat
-        self._sensed = -1  # last tick whose sensors were read
 
-        goal = self.courses.at(0)
+        goal, _ = self.courses.at(0)
         poses = np.stack([start_pose(s, goal["pose"][row]) for row, s in enumerate(scenarios)])
         self.plant.reset(poses, goal["twist"])
         self.hierarchy.reset(goal["twist"], goal["acceleration"], self.plant.reading["steering_angle"])
@@ -312,57 +316,42 @@ class Simulation:
             self.courses = Courses(self.scenarios, self.preview)
 
     def step(self) -> None:
-        """Computes one control period, as in figure 3."""
-        self.plant.step(self.decide())
-        self.settle()
+        """Computes one control period, as in figure 3; an error of a user's stage fails all robots, which share it."""
+        try:
+            self.events.apply(self.tick)
+            now, goal = self.courses.at(self.tick)
+            seen = self.estimator.measure(self.tick, self.plant.state, self.hierarchy.derivative)
+            self.plant.step(self.hierarchy.update(seen, goal), self.hierarchy.faults)
+            self.log.record(self.tick, self.plant.state, seen, now, self.hierarchy.state)
+        except StageError as error:
+            self._abort(f"{error}, tick {self.tick}")
+        self.judge()
 
     def sense(self) -> tuple[Rows, Rows]:
-        """Applies the events of this tick and measures; further calls in the same tick only return the result.
+        """Does the first three lines of `step` before it; further calls in the same tick only return the result.
 
         Returns:
             Estimate of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each; both are
             predicted to the time at which the voltage of this tick acts.
+
+        Raises:
+            StageError: The user's estimator raised, or returned something of another shape.
         """
-        if self._sensed != self.tick:
-            self._sensed = self.tick
-            self.events.apply(self.tick)
-            self._goal = self.courses.at(self.tick)
-            self._wanted = self.courses.at(self.tick, self.preview) if self.preview else self._goal
-            self.sensors.measure(self.tick, self.plant.state)
-            self.estimator.estimate(self.tick, self.plant.state)
-        return self.estimator.seen, self._wanted
+        self.events.apply(self.tick)
+        _, goal = self.courses.at(self.tick)
+        return self.estimator.measure(self.tick, self.plant.state, self.hierarchy.derivative), goal
 
-    def decide(self) -> Array:
-        """Does what comes before the physics: events, measurement and control.
+    def _abort(self, reason: str) -> None:
+        """Fails all robots before the physics; the records until now are kept."""
+        for row in range(self.plant.size):
+            self.plant.fail(row, reason)
+        self.log.blank(self.tick, slice(None))
 
-        Returns:
-            Commanded voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
-        """
-        hierarchy = self.hierarchy
-        try:
-            command = hierarchy.update(*self.sense())
-        except StageError as error:  # it concerns the whole group; the records until now are kept
-            self._fail(dict.fromkeys(range(self.plant.size), str(error)))
-            return hierarchy.output
-        if isinstance(hierarchy, UserHierarchy):
-            self._fail(hierarchy.faults)
-        if not hierarchy.finite:  # the voltage limit would turn NaN into the full voltage
-            for row in hierarchy.non_finite():
-                self.plant.fail(row, "non-finite voltage")
-        self.sensors.command(self.tick, hierarchy.derivative)
-        return command
-
-    def _fail(self, faults: dict[int, str]) -> None:
-        """Fails robots, for the reason that a user's stage gave for each."""
-        for row, fault in faults.items():
-            self.plant.fail(row, f"{fault}, tick {self.tick}")
-
-    def settle(self) -> None:
-        """Does what comes after the physics: the record and the failures."""
-        plant, tick = self.plant, self.tick
-        near = self.log.record(tick, plant.state, self.estimator.seen, self._goal, self.hierarchy.state)
-        if not near:
-            for row in np.flatnonzero(np.abs(self.log.at(tick)["lateral_error"]) > DIVERGED):
+    def judge(self) -> None:
+        """Ends the tick: fails robots that have left their references, and ends runs at their goals, stuck or over."""
+        plant, log, tick = self.plant, self.log, self.tick
+        if not log.near:
+            for row in np.flatnonzero(np.abs(log.now["lateral_error"]) > DIVERGED):
                 if self.scenarios[row].goal is None:  # a robot with a goal may wait, or leave its reference
                     plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
         self.tick += 1
@@ -370,14 +359,45 @@ class Simulation:
             new = plant.failed & np.isnan(self._failure_time)
             new[list(self._learned)] = False
             self._failure_time[new] = self.tick * self.period
-            self.log.blank(tick, plant.failed)
-        if self._goals.any:
+            log.blank(tick, plant.failed)
+        if self.goals.any:
             self._end(tick)
+
+    def restart(self, row: int, scenario: Scenario) -> None:
+        """Begins the run of one robot again at the coming tick.
+
+        The tick must not be sensed yet, unless all robots begin again in it.
+
+        Args:
+            row: Index of the robot.
+            scenario: Its scenario from now on, which fits the group and differs in seed and perturbation at most.
+
+        Raises:
+            InputError: The robot could not stand.
+            ValueError: The simulation was not made with `restarting`.
+        """
+        if not isinstance(self.courses, RestartingCourses):
+            raise ValueError("restart: the simulation was not made with `restarting`")
+        plant, tick = self.plant, self.tick
+        if scenario.perturbation != self.scenarios[row].perturbation:
+            self.events.perturb(row, scenario.perturbation)
+        self.scenarios[row] = scenario
+        self.courses.restart(row, tick)
+        self.hierarchy.renew(row, scenario)
+        self.events.restart(row, scenario, tick)
+        goal, _ = self.courses.at(tick)
+        plant.restart(row, start_pose(scenario, goal["pose"][row]), goal["twist"][row])
+        self.hierarchy.reset(goal["twist"], goal["acceleration"], plant.reading["steering_angle"], row)
+        self.sensors.restart(row, scenario.seed, tick)
+        self.estimator.start(row, plant.reading[row], scenario.seed, tick)
+        self._failure_time[row] = np.nan
+        self.goals.restart(row, tick)
+        self._learned.pop(row, None)
 
     def _end(self, tick: int) -> None:
         """Ends the runs that are at their goals, stuck or at their own end; the record of the tick is kept."""
         stage = self.hierarchy.learner
-        for row, reason in self._goals.ended(tick, self.log.at(tick)).items():
+        for row, reason in self.goals.ended(tick, self.log.now).items():
             self.plant.fail(row, reason)
             self._learned[row] = stage.adapted()[row] if isinstance(stage, Learner) else np.zeros(0)
             if reason:

@@ -137,8 +137,8 @@ class UserHierarchy(Hierarchy):
     """The hierarchy with stages of a user; a tick calls them between compiled loops over the built-in laws.
 
     Attributes:
-        faults: Message for each robot for which a stage returned a number that is not finite in the last tick, except
-            for those whose guard replaces the feedforward.
+        faults: As for `Hierarchy`, and a message for each robot for which a stage returned a number that is not finite,
+            except for those whose guard replaces the feedforward.
         feedforward_faults: For each robot the message of the first tick at which its guard did so, or "".
     """
 
@@ -148,37 +148,39 @@ class UserHierarchy(Hierarchy):
         self._feedforward_stage = stages.get("feedforward")
         self._wanted: Rows | None = None  # reference of the user's motion controller, until its next call
         super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
-        self.faults: dict[int, str] = {}
         self.feedforward_faults = [""] * len(scenarios)
 
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
         """Bumpless start; see `Hierarchy.reset`."""
         self.command[rows] = twist[rows]
         self.state["allocation"]["angle"][rows] = steering_angle[rows]
-        integral = self._steady(twist, acceleration)
+        integral = self.steady(twist, acceleration)
         self.state["pid"]["integral"][rows] = integral[rows]
         if stage := self._stages.get("feedback"):
-            stage.call("reset", integral, self._period)
+            stage.call("reset", integral, self.period)
         if stage := self._stages.get("steering"):
-            stage.call("reset", steering_angle, self._period)
+            stage.call("reset", steering_angle, self.period)
 
     def update(self, seen: Rows, goal: Rows) -> Array:
-        """Computes the commands of one control tick; see `Hierarchy.update`."""
-        self.faults.clear()
-        state, constants = self.state, (self._record, self._period)
-        if self._tick % self._every == 0:
+        """Computes the commands of one control tick; see `Hierarchy.update`.
+
+        Raises:
+            StageError: A stage raised, or returned something of another shape.
+        """
+        self.faults = {}
+        state, constants = self.state, (self.nominal, self.period)
+        if self.moves:
             if stage := self._stages.get("motion"):
                 self._wanted = self._request(stage, seen, goal)
             else:
                 request_all(seen, goal, state)
-        self._tick += 1
         command_all(seen, goal if self._wanted is None else self._wanted, *constants, state)
         feedback = self._stages.get("feedback")
         if feedback:
             self._feed_back(feedback, seen["twist"])
         state["feedforward"] = self.feedforward(self.command, self.derivative)
         self._read_weight_norm()
-        self.finite, forget = apply_all(seen, self._model.rows, *constants, state)
+        finite, forget = apply_all(seen, self.model.rows, *constants, state)
         if stage := self._stages.get("steering"):
             self._steer(stage, seen["lost"].any(axis=1))
         if (added := self._learn(seen["twist"])) is not None:
@@ -187,16 +189,19 @@ class UserHierarchy(Hierarchy):
         if feedback and (integral := getattr(feedback.stage, "integral", None)) is not None:
             integral[:] = state["pid"]["integral"]
         if forget:
-            self._forget()
+            self.forget()
         self._read_weight_norm()
+        if not finite:
+            self.faults = self.non_finite() | self.faults
+        self.tick += 1
         return self.output
 
     def _request(self, stage: UserStage, seen: Rows, goal: Rows) -> Rows | None:
         """Calls the user's motion controller; returns the reference that it follows, if it has one of its own."""
         state = self.state
         reference = goal.view(float).reshape(len(goal), -1)
-        if self._tick == 0:
-            stage.call("reset", seen["pose"], reference, self._period * self._every)
+        if self.tick == self.started:
+            stage.call("reset", seen["pose"], reference, self.motion_period)
         request = self._finite_rows(stage, stage.output(seen["pose"], seen["twist"], reference))
         own = getattr(stage.stage, "followed", None)
         if own is not None:
@@ -230,24 +235,24 @@ class UserHierarchy(Hierarchy):
             return answer
         guard["broken"] |= broken
         for row in np.flatnonzero(broken):
-            fault = f"{stage.title}: not finite, tick {max(self._tick - 1, 0)}"
+            fault = f"{stage.title}: not finite, tick {self.tick}"
             self.feedforward_faults[row] = self.feedforward_faults[row] or fault
         return np.where(broken[:, None], 0.0, answer)
 
     def _steer(self, stage: UserStage, lost: NDArray[np.bool]) -> None:
         """Calls the user's steering, and limits it as `allocate` does; `lost` are the robots with a limited current."""
-        state, limit = self.state, self._robot.steering_limit
+        state, limit = self.state, self.robot.steering_limit
         allocation, command = state["allocation"], self.command.copy()
-        if self._rigid:
+        if self.rigid:
             command[:, 1] += self.feedback[:, 1] + state["guard"]["output"][:, 1]
         answer = self._finite_rows(stage, stage.output(command, self.derivative))
         angle = np.clip(answer[:, 0], -limit, limit)
         beyond = angle != answer[:, 0]
         rate = np.where(beyond, 0.0, answer[:, 1])
-        self.output[:, 2], self.output[:, 3] = np.clip(angle + rate * self._period / 2, -limit, limit), rate
-        if self._rigid:  # the fork makes θ̇, so its limit acts on the second channel
+        self.output[:, 2], self.output[:, 3] = np.clip(angle + rate * self.period / 2, -limit, limit), rate
+        if self.rigid:  # the fork makes θ̇, so its limit acts on the second channel
             clipped = (self.output[:, :2] != allocation["feedback"] + allocation["feedforward"]).any(axis=1)
-            made = command[:, 0] * np.tan(angle) / self._robot.wheelbase
+            made = command[:, 0] * np.tan(angle) / self.robot.wheelbase
             allocation["excess"][:, 1] = np.where(beyond, made - command[:, 1], 0.0)
             allocation["saturated"] = beyond | clipped | lost
             state["voltage"][:, 1] = command[:, 1] - self.command[:, 1] + allocation["excess"][:, 1]
@@ -275,11 +280,16 @@ class UserHierarchy(Hierarchy):
         stage = self._feedforward_stage
         self.weight_norm[:] = stage.checked(norm, self.weight_norm.shape, "`weight_norm`") if stage else norm
 
-    def _restore(self, rows: NDArray[np.intp]) -> bool:
+    def restore(self, rows: NDArray[np.intp]) -> bool:
+        """Resets the learners of these robots, see `Hierarchy.restore`, or the user's feedforward.
+
+        Raises:
+            StageError: The stage raised.
+        """
         if not getattr(self.learner, "restore", None):
             return False
         if self._feedforward_stage is None:
-            return super()._restore(rows)
+            return super().restore(rows)
         self._feedforward_stage.call("restore", rows)
         return True
 
@@ -287,7 +297,7 @@ class UserHierarchy(Hierarchy):
         """Returns an answer with zeros in the rows that are not finite, and notes these robots in `faults`."""
         broken = np.any(~np.isfinite(answer), axis=1)
         for row in np.flatnonzero(broken):
-            self.faults.setdefault(int(row), f"{stage.title}: not finite")
+            self.faults.setdefault(int(row), f"{stage.title}: not finite, tick {self.tick}")
         return np.where(broken[:, None], 0.0, answer) if broken.any() else answer
 
 
@@ -308,7 +318,7 @@ class UserEstimator(Estimator):
     def estimate(self, tick: int, plant: Rows) -> Rows:
         """Estimates posture and twist of all robots; see `Estimator.estimate`."""
         self.locate(tick, plant)
-        memory, sensors = self.memory, self._sensors
+        memory, sensors = self.memory, self.sensors
         if not self._started:
             self._stage.call("reset", memory["mean"][:, :3], memory["mean"][:, 3:], sensors.period)
             self._started = True

@@ -11,6 +11,7 @@ a batch is a substep old.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -292,18 +293,22 @@ class Plant(ABC):
         self.wrench[robot, self._chassis] = force[0], force[1], 0.0, 0.0, 0.0, force[2]
         self._pushes[robot] = self._tick + periods
 
-    def step(self, command: Array) -> None:
+    def step(self, command: Array, faults: Mapping[int, str] | None = None) -> None:
         """Holds a command for one control period: `send`, `advance`, `look`."""
-        self.send(command)
+        self.send(command, faults)
         self.advance()
         self.look()
 
-    def send(self, command: Array) -> None:
+    def send(self, command: Array, faults: Mapping[int, str] | None = None) -> None:
         """Queues a command, and sends the actuators the one whose delay is over.
 
         Args:
             command: Commanded voltages left and right in V, steering angle in rad and rate in rad/s, `(B, 4)`.
+            faults: Robots that fail because their command cannot be used, each with the reason.
         """
+        if faults:
+            for robot, reason in faults.items():
+                self.fail(robot, reason)
         if command.shape != (self.size, 4):
             raise ValueError(f"command: shape {command.shape}, expected {(self.size, 4)}")
         # The engine would silently replace NaN by 0 V.

@@ -152,6 +152,7 @@ class Estimator:
     Attributes:
         seen: Estimates and samples that the controllers receive, a record of `SEEN` of each robot, `(B,)`.
         memory: State of the estimator, a record of each robot, `(B,)`.
+        sensors: The sensors whose samples it receives.
         localiser: Localisation that makes posture fixes from a lidar, or None.
     """
 
@@ -183,11 +184,11 @@ class Estimator:
             InputError: Localisation needs a map, and no obstacle stands still, or the map is too large.
         """
         self._law, memory = estimate_with(name).repeated(), ESTIMATORS[name][1]
-        self._name, self._sensing, self._sensors = name, list(sensing), sensors
+        self._name, self._sensing, self.sensors = name, list(sensing), sensors
         self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew, *tyres])
         self.seen = np.zeros(len(sensing), SEEN)
         self.memory = np.zeros(len(sensing), memory)
-        self._located = -1
+        self._located = self._measured = -1  # last tick in which the method of this name was called
         scans = any(s.localisation != "fixes" for s in sensing)
         self.localiser = Localiser(sensing, sensors, robot.wheel_radius, obstacles) if scans else None
 
@@ -200,7 +201,8 @@ class Estimator:
             seed: Seed of the errors of the first fix and twist.
             tick: The coming control tick.
         """
-        sensing, sensor, period = self._sensing[row], self._sensors.sensors[row], self._sensors.period
+        self._measured = -1  # a tick is measured again if all robots of an environment begin again in it
+        sensing, sensor, period = self._sensing[row], self.sensors.sensors[row], self.sensors.period
         random, seen = np.random.default_rng([seed, 3]), self.seen[row]
         self.seen[row], self.memory[row] = np.zeros((), SEEN), np.zeros((), self.memory.dtype)
         seen["start"], seen["delay"] = tick, sensing.periods("delay", period)
@@ -226,6 +228,25 @@ class Estimator:
             memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
             memory["inertial"] = memory["mean"][3]
 
+    def measure(self, tick: int, plant: Rows, derivative: Array) -> Rows:
+        """Samples the sensors and estimates; further calls in the same tick only return the result.
+
+        Args:
+            tick: Control tick.
+            plant: Record of `PLANT` of each robot, `(B,)`.
+            derivative: Derivative of the twist that was commanded in the last tick, in m/s² and rad/s², `(B, 2)`, with
+                which estimates are predicted.
+
+        Returns:
+            `seen`, `(B,)`.
+        """
+        if tick != self._measured:
+            self._measured = tick
+            self.sensors.command(tick - 1, derivative)
+            self.sensors.measure(tick, plant)
+            self.estimate(tick, plant)
+        return self.seen
+
     def locate(self, tick: int, plant: Rows) -> None:
         """Makes the fixes of a tick from a lidar, where there is one; further calls in the same tick do nothing."""
         if self.localiser and tick != self._located:
@@ -242,7 +263,7 @@ class Estimator:
         Returns:
             `seen`, `(B,)`.
         """
-        sensors = self._sensors
+        sensors = self.sensors
         if self.localiser:
             self.locate(tick, plant)
         self._law(tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen)

@@ -39,7 +39,7 @@ def measure(size: int) -> None:
     steps = (loop.step, lambda: env.step(zero), lambda: short.step(zero))
     env.reset(seed=0), short.reset(seed=0)
     for row in range(size):  # ends that are spread over the steps
-        short.episodes.courses.start[row] -= row % 100
+        short.episodes.start[row] -= row % 100
     for step in steps:
         seconds(step, ticks)
     turns = [[seconds(step, ticks) for step in steps] for _ in range(TURNS)]

@@ -90,11 +90,11 @@ def test_renewed(files):
     start = BASE.model_copy(update=FEEDFORWARDS["model+rls"] | {"learned": first})
     hierarchy = Simulation([start, start]).hierarchy
     hierarchy.renew(1, start.model_copy(update={"learned": None}))
-    hierarchy._restore(np.arange(2))
+    hierarchy.restore(np.arange(2))
     kept, fresh = hierarchy.learner.adapted()
     assert np.array_equal(kept, load_learned(start)) and not fresh[:16].any()
     own = Simulation([start], motion=Still).hierarchy  # with a stage of the user beside it
-    own._restore(np.arange(1))
+    own.restore(np.arange(1))
     assert np.array_equal(own.learner.adapted()[0], load_learned(start))
     with pytest.raises(InputError, match="theta is missing"):
         hierarchy.renew(0, start.model_copy(update={"learned": second}))

@@ -8,6 +8,7 @@ import sys
 import time
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -98,6 +99,85 @@ def test_no_circles() -> None:
     while free := {name for name, others in graph.items() if not others & graph.keys()}:
         graph = {name: others for name, others in graph.items() if name not in free}
     assert not graph
+
+
+class Class(NamedTuple):
+    """A class of the package: its module, the names of its bases, and the private names that it defines."""
+
+    module: str
+    bases: set[str]
+    own: set[str]
+
+
+def private(name: str) -> bool:
+    """Whether a name is private, but none of those that named tuples give to everybody."""
+    return name.startswith("_") and not name.startswith("__") and name not in {"_asdict", "_fields", "_replace"}
+
+
+def owns(node: ast.expr) -> bool:
+    """Whether an expression is the object of the method itself: `self`, `cls` or `super()`."""
+    return ast.unparse(node) in {"self", "cls", "super()"}
+
+
+def classes() -> dict[tuple[str, str], Class]:
+    """Every class of the package, by module and name."""
+    found = {}
+    for module, path in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.ClassDef):
+                continue
+            own = {part.name for part in node.body if isinstance(part, ast.FunctionDef)}
+            for part in ast.walk(node):
+                if isinstance(part, ast.Attribute) and isinstance(part.ctx, ast.Store) and owns(part.value):
+                    own.add(part.attr)
+            for part in node.body:
+                if isinstance(part, ast.Assign | ast.AnnAssign):
+                    targets = part.targets if isinstance(part, ast.Assign) else [part.target]
+                    own |= {target.id for target in targets if isinstance(target, ast.Name)}
+            bases = {ast.unparse(base).split("[")[0].rpartition(".")[2] for base in node.bases}
+            found[module, node.name] = Class(module, bases, {name for name in own if private(name)})
+    return found
+
+
+def touched(module: str, code: ast.AST, known: dict[tuple[str, str], Class]) -> set[str]:
+    """Where code of a module touches what is private to a class of another file, or imports what is private."""
+    everywhere, found = set().union(*(other.own for other in known.values())), set()
+
+    def inherited(name: str, here: bool) -> set[str]:
+        """What is private to a class and its bases: those in this file, which are one piece of work, or all of them."""
+        found = set()
+        for (home, own), other in known.items():
+            if own == name and (home == module or not here):
+                found |= other.own.union(*(inherited(base, here) for base in other.bases - {name}))
+        return found
+
+    def look(node: ast.AST, family: set[str], ancestors: set[str]) -> None:
+        for part in ast.iter_child_nodes(node):
+            if isinstance(part, ast.Attribute) and private(part.attr) and part.attr not in family:
+                if part.attr in (ancestors if owns(part.value) else everywhere):
+                    found.add(f"{module}:{part.lineno} {ast.unparse(part)}")
+            elif isinstance(part, ast.ImportFrom):
+                found.update(f"{module}:{part.lineno} {alias.name}" for alias in part.names if private(alias.name))
+            if isinstance(part, ast.ClassDef):
+                look(part, family | inherited(part.name, True), inherited(part.name, False))
+            else:
+                look(part, family, ancestors)
+
+    look(code, set(), set())
+    return found
+
+
+def test_private() -> None:
+    """A private attribute is touched by its class and by subclasses in the same file, by nobody else."""
+    known = classes()
+    assert {"_every", "_adopt"} <= known["loop.hierarchy", "Hierarchy"].own
+    for module, path in MODULES.items():
+        assert not touched(module, ast.parse(path.read_text()), known)
+    mine = "class Mine(Hierarchy):\n    def f(self, run):\n        return self._every, self._own, run._asdict()"
+    other = {**known, ("loop.other", "Mine"): Class("loop.other", {"Hierarchy"}, {"_own"})}
+    assert touched("loop.other", ast.parse(mine), other) == {"loop.other:3 self._every"}
+    assert touched("loop.other", ast.parse("simulation._learned"), known) == {"loop.other:1 simulation._learned"}
+    assert not touched("loop.hierarchy", ast.parse("class Hierarchy:\n    def f(self, of):\n        of._every"), known)
 
 
 def test_rooms() -> None:

@@ -114,6 +114,7 @@ def test_promise_of_repeated(monkeypatch):
         ]
         for group in (several[:1], several[2:], several[:2], several):
             simulate(group)
+        simulate([scenario.replace(goal=(0.8, 0.0, 0.0)) for scenario in several[:2]])
         added = Simulation(several)
         run([added], ticks=20)
         added.add(Event(time=1.0, reference=there))
