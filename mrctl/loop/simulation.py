@@ -402,7 +402,12 @@ class Simulation:
             "half_track": ("run", np.full(size, robot.half_track), {"units": "m"}),
             "feature_scale": (("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         }
-        return found.assign(self._parameters() | self._clearance(length) | faults | constants)
+        gains = {
+            name: (("run", "channel")[: values.ndim], values, dict(zip(("units", "long_name"), text, strict=True)))
+            for name, text in dataset.GAINS.items()
+            for values in (self.hierarchy.gains[name].copy(),)
+        }
+        return found.assign(self._parameters() | self._clearance(length) | faults | constants | gains)
 
     @property
     def faults(self) -> dict[str, list[str]]:
