@@ -19,7 +19,7 @@ FIGURES = (
     "figure4c_tracking_errors", "figure5_pid_against_network", "figure6_feedforward_outputs", "path", "voltages",
     "learning_curve",
 )  # fmt: skip
-PINNED = {  # plant, lap in s, feedforward: V in mm/s, θ̇ in mrad/s, position in mm; as RESULTS.md and version 0.1.0 have it
+PINNED = {  # plant, lap in s and feedforward: V in mm/s, θ̇ in mrad/s and position in mm, as RESULTS.md prints them
     ("nominal", 12, "none"): (24.0, 75.0, 18.9),
     ("nominal", 12, "model"): (0.558, 2.80, 0.406),
     ("nominal", 12, "true_model"): (0.558, 2.80, 0.406),
