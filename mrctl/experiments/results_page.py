@@ -41,7 +41,7 @@ def main(
     suite: Path | None = None,
     random: Path | None = None,
     held_out: Path | None = None,
-    tune: Path | None = None,
+    tune: tuple[Path, ...] = (),
     search: tuple[Path, ...] = (),
     navigate: tuple[Path, ...] = (),
     mppi: tuple[Path, ...] = (),
@@ -57,7 +57,8 @@ def main(
         suite: Folder that `mrctl suite --out` wrote.
         random: Folder that `mrctl suite --full --random 1000 --out` wrote, for its random worlds alone.
         held_out: Folder that `mrctl suite --held-out` wrote.
-        tune: Folder that `mrctl tune --out` wrote.
+        tune: Folders that `mrctl tune --out` wrote: one for each robot, for its designed PID, and one with
+            `--time-constant`, for where learning is safe.
         search: Folders that `mrctl tune --search` wrote, one for each entry.
         navigate: Folders that `mrctl navigate --suite` wrote, one for each robot, for what it found in corridors.
         mppi: The same folders, for what it found with MPPI.
@@ -89,9 +90,13 @@ def main(
         table = _read(held_out / "table.json", "cells", "entry")
         text = held_out_text(_text(held_out / "table.md"), _text(held_out / LOG))
         written["The held-out cells"] = _section(f"mrctl suite --held-out {table['entry']}", table, text)
-    if tune is not None:
-        table = _read(tune / "table.json", "loops", "motion")
-        written["Where learning is safe"] = _section("mrctl tune", table, tune_text(table))
+    tables = [_read(folder / "table.json", "loops", "motion", "robot", "time_constant") for folder in tune]
+    if designed := [t | {"time_constant": None} for t in tables if np.isnan(t["time_constant"])]:
+        parts = [_section(_tuned(t), t, tuning.default_text(t)) for t in designed]
+        written["The designed PID"] = "\n\n".join([*parts, tuning.GAINS_UNITS])
+    for table in tables:
+        if not np.isnan(table["time_constant"]):
+            written["Where learning is safe"] = _section(_tuned(table), table, tune_text(table))
     if search:
         tables = [_read(folder / "table.json", "entry", "shipped", "tiers") for folder in search]
         written["The search of settings"] = _section("mrctl tune --search NAME", tables[0], search_text(tables))
@@ -189,6 +194,13 @@ def tune_text(table: Table) -> str:
     return f"```text\n{design}\n```\n\n{rest}"
 
 
+def _tuned(table: Table) -> str:
+    """Returns the command that wrote a table of `mrctl tune`, but for the lag and another world."""
+    delays = " ".join(f"{delay:g}" for delay in dict.fromkeys(row["delay"] for row in table["loops"]))
+    rule = "" if table["time_constant"] is None else f" --time-constant {table['time_constant']:g}"
+    return f"mrctl tune {table['robot']['path']}{rule} --delay {delays}"
+
+
 def search_text(tables: Sequence[Table]) -> str:
     """Returns a table of settings before and after each search, with their errors: a row for each entry and tier."""
     header = [
@@ -251,7 +263,7 @@ def _text(path: Path) -> str:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
 
 
-def _read(path: Path, *keys: str) -> Table:
+def _read(path: Path, *keys: str) -> dict[str, Any]:
     """Reads the JSON that a command wrote, with NaN in place of null.
 
     Raises:

@@ -23,6 +23,7 @@ from mrctl.record import InputError
 from mrctl.results import plots
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
+from mrctl.sensing.tiers import TIERS, Sensing
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import CAR, RobotFile
 
@@ -49,6 +50,9 @@ GAINS = ("plant gain", "plant lag, s", "K_p", "K_i", "learning ratio")
 UNITS = """\
 Units: common m/s, V/(m/s), V/m; second rad/s, V/(rad/s), V/rad; of rigid steering 1, 1, 1/s. Learning without delay and
 hold converges with a first-order plant if the ratio K_p (1 + K K_p)/(τ K_i) is above 1."""
+GAINS_UNITS = """\
+Units of K_p and K_i: common V/(m/s), V/m; second V/(rad/s), V/rad; of rigid steering 1, 1/s. Each tier is beside the
+delay of its loop, for which its runs design the PID."""
 MOTION = (
     *("steering", "delay, ms", "lag of V, ms", "lag of θ̇, ms", "prefilter, ms"),
     *("K_x, 1/s", "K_y, 1/m²", "K_θ, 1/m", "max \\|S\\| common", "max \\|S\\| second"),
@@ -212,6 +216,33 @@ def text(table: dict[str, Any]) -> str:
         ADVICE,
     ]
     return "\n\n".join(parts)
+
+
+def default_text(table: dict[str, Any]) -> str:
+    """Returns gains, bandwidth and margins of the velocity loops, designed and measured, as a statement and a table.
+
+    Args:
+        table: What `design` returns for a designed PID.
+    """
+    loops = table["loops"]
+    apart = max(abs(row["measured"]["bandwidth"] / row["design"]["bandwidth"] - 1) for row in loops)
+    designed, measured = (max(row[kind]["sensitivity"] for row in loops) for kind in ("design", "measured"))
+    says = (
+        f"{_rule(table)}: the measured bandwidth is within {100 * apart:.2g} % of the designed one, and max |S| is at "
+        f"most {number(designed)} as designed and {number(measured)} as measured."
+    )
+    period = Scenario().control_period
+    tiers = {round(1e3 * period * Sensing(tier=tier).loop_delay(period)): tier for tier in TIERS}
+    cells = [
+        [
+            *(_name(row), f"{1e3 * row['delay']:g}", tiers.get(round(1e3 * row["delay"]), "")),
+            *(number(row["k_p"]), number(row["k_i"])),
+            *(" / ".join(_cell(row[kind][name]) for kind in ("design", "measured")) for name in MARGINS),
+        ]
+        for row in loops
+    ]
+    header = ["loop", "delay, ms", "tier", "K_p", "K_i", *MARGINS.values()]
+    return "\n\n".join([says, "Designed / measured:", markdown(header, cells)])
 
 
 def _rule(table: dict[str, Any]) -> str:

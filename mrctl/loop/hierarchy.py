@@ -219,6 +219,8 @@ class Hierarchy:
         nominal: Its parameters for the kernels, one record of `NOMINAL`, `(1,)`.
         model: Its inverse dynamics for each robot.
         period: Control period in s.
+        gains: Gains of each robot before any event, by the names and in the units of `dataset.GAINS`: `(B, 2)` for
+            `k_p` and `k_i`, `(B,)` for the others.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], robot: Robot, feedforward: Feedforward | None = None) -> None:
@@ -259,6 +261,9 @@ class Hierarchy:
             state["limiter"]["time_constant"][row] = designed.prefilter
             self.set_kanayama(row, scenario.kanayama)
             self.set_pid(row, scenario.pid)
+        self.gains: dict[str, Array] = {name: state["pid"][name].copy() for name in ("k_p", "k_i")}
+        self.gains |= {name: state["kanayama"][name].copy() for name in ("k_x", "k_y", "k_theta")}
+        self.gains["prefilter"] = state["limiter"]["time_constant"].copy()
         rejected = np.array([self._rejection(row) for row in range(size)])
         state["guard"] = guarding.fresh([s.guard for s in scenarios], self.nominal, rejected)
         if not getattr(self.learner, "guarded", True):
@@ -319,6 +324,8 @@ class Hierarchy:
         self.state[row] = renewed.state[0]
         self.prior.rows[row] = renewed.prior.rows[0]
         self._pids[row], self._motions[row], self._delays[row] = scenario.pid, renewed._motions[0], renewed._delays[0]
+        for name, values in self.gains.items():
+            values[row] = renewed.gains[name][0]
         self._learned.pop(row, None)
         if 0 in renewed._learned:
             self._learned[row] = renewed._learned[0]

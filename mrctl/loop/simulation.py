@@ -398,6 +398,8 @@ class Simulation:
         """Ends the runs that are at their goals, stuck or at their own end; the record of the tick is kept."""
         stage = self.hierarchy.learner
         for row, reason in self.goals.ended(tick, self.log.now).items():
+            if row in self._learned:
+                continue
             self.plant.fail(row, reason)
             self._learned[row] = stage.adapted()[row] if isinstance(stage, Learner) else np.zeros(0)
             if reason:
@@ -422,7 +424,12 @@ class Simulation:
             "half_track": ("run", np.full(size, robot.half_track), {"units": "m"}),
             "feature_scale": (("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         }
-        return found.assign(self._parameters() | self._clearance(length) | faults | constants)
+        gains = {
+            name: (("run", "channel")[: values.ndim], values, dict(zip(("units", "long_name"), text, strict=True)))
+            for name, text in dataset.GAINS.items()
+            for values in (self.hierarchy.gains[name].copy(),)
+        }
+        return found.assign(self._parameters() | self._clearance(length) | faults | constants | gains)
 
     @property
     def faults(self) -> dict[str, list[str]]:

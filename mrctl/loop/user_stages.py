@@ -20,6 +20,9 @@ from mrctl.scenario import Scenario
 from mrctl.sensing.estimators import Estimator
 from mrctl.theory.robot import Robot
 
+REPLACED = {"motion": ("k_x", "k_y", "k_theta"), "feedback": ("k_p", "k_i")}
+"""Gains of `dataset.GAINS` that have no effect where the user has a stage of this name; a result has NaN for them."""
+
 
 class StageError(InputError):
     """A user's stage raised or returned something wrong; the message is one line that names the stage."""
@@ -148,6 +151,8 @@ class UserHierarchy(Hierarchy):
         self._feedforward_stage = stages.get("feedforward")
         self._wanted: Rows | None = None  # reference of the user's motion controller, until its next call
         super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
+        for name in (name for stage in stages for name in REPLACED.get(stage, ())):
+            self.gains[name][:] = np.nan
         self.feedforward_faults = [""] * len(scenarios)
 
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:

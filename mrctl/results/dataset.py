@@ -86,6 +86,17 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "pitch_angle": ("rad", "pitch, positive nose down; after the heading"),
 }
 
+# Variables with the gains of each run at its start, before any event: name: (unit, meaning). `k_p` and `k_i` have the
+# dimensions run and channel, common and second; a steering channel (`rigid`) has K_p without unit and K_i in 1/s.
+GAINS: dict[str, tuple[str, str]] = {
+    "k_p": ("V/(m/s), V/(rad/s)", "K_p of the PID for the common and the second channel; 1 on a steering channel"),
+    "k_i": ("V/m, V/rad", "K_i of the PID for the common and the second channel; 1/s on a steering channel"),
+    "k_x": ("1/s", "K_x of the motion controller"),
+    "k_y": ("1/m2", "K_y of the motion controller"),
+    "k_theta": ("1/m", "K_θ of the motion controller"),
+    "prefilter": ("s", "time constant of the prefilter on the velocities that the motion controller adds"),
+}
+
 # Variables that hold the first tick at which the user's stage returned NaN or infinity ("" if it never did), and what
 # drives the robot from then on.
 FAULTS = {

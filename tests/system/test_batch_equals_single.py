@@ -235,11 +235,17 @@ def first_half(path: str, job: int) -> Outcome:
     return Outcome(job, error="half", fatal=True) if job >= Store(path).jobs // 2 else jobs.compute(path, job)
 
 
-@pytest.mark.parametrize("count", [12, pytest.param(100, marks=pytest.mark.full)])
-def test_sweep(count, tmp_path):
-    """A sweep that is interrupted after half of its jobs has the bits of runs alone in the end, and so has a repeat."""
-    drawn = [equipped(seed) if seed % 4 < 2 else scenario(seed) for seed in range(count)]
-    sweep, store = Sweep.of(drawn, record="full", chunk=3), tmp_path / "store"
+SWEPT = (6, 6), pytest.param((100, 50), marks=pytest.mark.full)
+
+
+@pytest.mark.parametrize("counts", SWEPT, ids=lambda counts: "-".join(map(str, counts)))
+def test_sweep(counts, tmp_path):
+    """A sweep that is interrupted after half of its jobs has the bits of runs alone in the end, and so has a repeat.
+
+    The counts are those of runs with all sensors and all effects of the driver, and with a random subset of them.
+    """
+    drawn = [make(seed) for make, number in zip((equipped, scenario), counts, strict=True) for seed in range(number)]
+    sweep, store, count = Sweep.of(drawn, record="full", chunk=3), tmp_path / "store", len(drawn)
     with pytest.raises(InputError, match="half"):
         jobs.run(sweep, store, 1, work=first_half)
     assert len(Store(store).done()) == Store(store).jobs // 2 > 0

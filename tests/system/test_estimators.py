@@ -66,8 +66,9 @@ def test_consistent(tier, runs):
     """The errors of nominal robots are as large as the filter says; `pytest -m full` takes 100 runs.
 
     Errors squared over their covariance (NEES) of posture and twist are of chi-square with 3 and 5 degrees of freedom.
-    Of the looks, 3.37 s apart, so that a lap of 12 s is seen at other places, most means over the runs are in the band
-    of 95 %. Innovations of the fixes (NIS) are white: their means are in the band at nearly every fix.
+    Of the looks, 3.37 s apart, so that a lap of 12 s is seen at other places, nearly all means over the runs are in the
+    band of 95 %, and so is the mean over all ticks. Innovations of the fixes (NIS) are white: their means are in the
+    band at nearly every fix.
     """
     errors, covariances, innovations, failed = nominal(tier, runs)
     assert not failed.any()
@@ -77,12 +78,15 @@ def test_consistent(tier, runs):
         found = normalised(errors, covariances, states)
         low, high = chi2.ppf((0.025, 0.975), runs * len(states)) / runs
         means = found.mean(1)
-        assert np.mean((means > low) & (means < high)) >= 0.7, (low, high, means)
-        if runs == 100:  # at every tick; the share is 0.83 and 0.83 in `lab`, 0.88 and 0.95 in `field`
-            every = normalised(*whole, states)[SETTLED:].mean(1)
-            assert np.mean((every > low) & (every < high)) > 0.8
-        # All looks together, which are not independent: the errors of a run last for some seconds.
-        assert 0.75 < means.mean() / len(states) < 1.25
+        # Of the 7 looks all are inside with 24 runs; with 100 runs one look at the posture is not.
+        assert np.sum((means < low) | (means > high)) <= 1, (low, high, means)
+        # At every tick the share is 0.825 and 0.819 in `lab`, 0.876 and 0.948 in `field` (100 runs); with 24 runs,
+        # whose bands are wider, it is at least 0.91.
+        every = normalised(*whole, states)[SETTLED:].mean(1)
+        least = {24: 0.88, 100: {"lab": 0.8, "field": 0.85}[tier]}[runs]
+        assert np.mean((every > low) & (every < high)) > least
+        # All looks and all ticks together, which are not independent: the errors of a run last for some seconds.
+        assert low < means.mean() < high and low < every.mean() < high
         assert np.mean(found < chi2.ppf(0.95, len(states))) > 0.9
     for k, name in enumerate(STATES):
         found = normalised(errors, covariances, [k])

@@ -14,6 +14,7 @@ from mrctl.control.steering import ALLOCATION, allocate
 from mrctl.experiments.paper import IDEAL
 from mrctl.kernel import over_rows
 from mrctl.loop.simulation import simulate
+from mrctl.results.dataset import GAINS as RECORDED
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
 
@@ -137,6 +138,10 @@ def test_same_law(own, steering):
             np.testing.assert_allclose(found[name], builtin[name], rtol=1e-9, atol=1e-9, err_msg=name)
     else:
         same(found, builtin)
+    replaced = {"motion": {"k_x", "k_y", "k_theta"}, "feedback": {"k_p", "k_i"}}
+    unused = {name for stage in own for name in replaced.get(stage, ())}
+    assert {name for name in RECORDED if found[name].isnull().all()} == unused
+    assert all(np.array_equal(found[name], builtin[name]) for name in set(RECORDED) - unused)
 
 
 def test_slow_motion():

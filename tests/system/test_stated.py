@@ -18,7 +18,7 @@ from mrctl.theory.references import random_spline
     ],
 )
 def test_estimate_adds_as_independent_errors_do(draws, plants, feedforwards):
-    """Position error in the last lap: at most 1.25 √(a² + b²) from true measurements a and from the estimate b.
+    """Position and yaw-rate errors in the last lap: each below 1.25 √(a² + b²), with true measurements a, estimate's b.
 
     That of `model+composite` is at most 1.5 mm, and that of its yaw rate at most 10 mrad/s, in every draw.
     """
@@ -32,9 +32,13 @@ def test_estimate_adds_as_independent_errors_do(draws, plants, feedforwards):
             found, true = (summary(run) for run in estimators.values())
             assert not found.failed.any()
             last = estimators["ekf"].isel(time=slice(-round(12 / 0.01), None))
-            estimate = np.square(last.x_measured - last.x) + np.square(last.y_measured - last.y)
-            parts = np.mean(true.position_rmse**2) + float(estimate.mean())
-            assert np.sqrt(np.mean(found.position_rmse**2)) < 1.25 * np.sqrt(parts), (plant, feedforward)
+            estimate = {
+                "position_rmse": np.square(last.x_measured - last.x) + np.square(last.y_measured - last.y),
+                "omega_rmse": np.square(last.omega_measured - last.omega),
+            }
+            for error, squared in estimate.items():
+                parts = np.mean(true[error] ** 2) + float(squared.mean())
+                assert np.sqrt(np.mean(found[error] ** 2)) < 1.25 * np.sqrt(parts), (plant, feedforward, error)
             if feedforward == "model+composite":
                 assert found.position_rmse.max() < 1.5e-3 and found.omega_rmse.max() < 10e-3
 

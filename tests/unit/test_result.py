@@ -11,10 +11,12 @@ import pytest
 import xarray as xr
 
 import mrctl
-from mrctl import Circle, Event, Fel, Perturbation, Scenario
-from mrctl.loop.simulation import simulate
+from mrctl import Circle, Event, Fel, Perturbation, Pid, Scenario
+from mrctl.control.design import motion
+from mrctl.loop.simulation import arranged, simulate
+from mrctl.physics import mjcf
 from mrctl.record import InputError
-from mrctl.results.dataset import SIGNALS, open_result, save, scenarios_of, versions
+from mrctl.results.dataset import GAINS, SIGNALS, open_result, save, scenarios_of, versions
 from mrctl.sensing.tiers import Sensing
 from mrctl.viewer.recording import Library
 
@@ -58,6 +60,31 @@ def test_labels(result):
     assert result.failed.values.tolist() == [False, False, True]
     assert list(result.failure.values[:2]) == ["", ""] and result.failure.values[2]
     assert np.isnan(result.failure_time[:2]).all() and 1 < result.failure_time[2] < 2
+
+
+def test_gains(result):
+    """A result has the gains of each run before any event, as the scenario's records design them."""
+    for run, scenario in enumerate(map(arranged, SCENARIOS)):
+        _, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
+        design = robot, scenario.steering == "rigid"
+        delay = scenario.sensing.loop_delay(0.01) * 0.01
+        gains, both = scenario.pid.gains(*design, delay), scenario.pid.channels(*design, delay)
+        around = motion(*design, both, delay)
+        expected = {"k_p": gains["k_p"], "k_i": gains["k_i"], "prefilter": around.prefilter}
+        expected |= {name: getattr(around.kanayama, name) for name in ("k_x", "k_y", "k_theta")}
+        assert set(expected) == set(GAINS)
+        for name, value in expected.items():
+            found = result[name].isel(run=run)
+            assert found.values.tolist() == np.array(value).tolist(), (run, name)
+            assert (found.attrs["units"], found.attrs["long_name"]) == GAINS[name]
+    assert len(np.unique(result.k_p.values, axis=0)) == 3  # three delays or arrangements
+    assert result.k_i.dims == ("run", "channel")
+    given = Scenario(reference=CIRCLE, laps=1, pid={"time_constant": 0.2}, kanayama={"k_x": 3.0}, prefilter=0.05)
+    changed = given.replace(events=(Event(time=0.5, pid=Pid(time_constant=0.3)),))
+    runs = simulate([given, changed])
+    assert np.ptp(runs.k_p.values, axis=0).tolist() == [0, 0] and runs.k_x.values.tolist() == [3, 3]
+    assert simulate(given).k_p.values.tolist() == runs.k_p[0].values.tolist()
+    assert runs.prefilter.values.tolist() == [0.05, 0.05]
 
 
 def test_meaning(result):

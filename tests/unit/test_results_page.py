@@ -55,8 +55,17 @@ def tune(tmp_path: Path) -> Path:
     names = ("k_x", "k_y", "k_theta", "prefilter", "v_lag", "omega_lag")
     motion = {"steering": "caster", "delay": 0.02} | {name: 0.05 for name in names}
     motion["sensitivity"] = [1.6, 1.75]
-    values = {"time_constant": None, "lag": 0.0, "loops": [loop], "motion": [motion]}
+    values = {"time_constant": 0.15, "lag": 0.0, "loops": [loop], "motion": [motion], "robot": {"path": "car"}}
     return written(tmp_path / "tune", values)
+
+
+@pytest.fixture
+def designed(tune: Path, tmp_path: Path) -> Path:
+    values = json.loads((tune / "table.json").read_text()) | {"time_constant": None, "robot": {"path": "racecar"}}
+    (loop,) = values["loops"]
+    for name, bandwidth, peak in (("design", 20.0, 1.6), ("measured", 21.0, 1.63)):
+        loop[name] = loop[name] | {"bandwidth": bandwidth, "sensitivity": peak}
+    return written(tmp_path / "designed", values)
 
 
 @pytest.fixture
@@ -108,8 +117,8 @@ def figures(tmp_path: Path) -> Path:
 
 
 def test_sections(
-    suite: Path, reproduction: Path, tune: Path, searched: Path, navigated: Path, identified: Path, figures: Path,
-    tmp_path: Path,
+    suite: Path, reproduction: Path, tune: Path, designed: Path, searched: Path, navigated: Path, identified: Path,
+    figures: Path, tmp_path: Path,
 ) -> None:  # fmt: skip
     """Every input becomes a section with its numbers, and with the versions and the machine that it names."""
     out = tmp_path / "RESULTS.md"
@@ -117,9 +126,11 @@ def test_sections(
     inputs |= {"navigate": navigated, "mppi": navigated, "limits": navigated}
     inputs |= {"identify": identified, "bench": figures}
     words = [word for name, path in inputs.items() for word in (f"--{name}", str(path))]
+    words.insert(words.index("--tune") + 1, str(designed))
     assert results_page.command([*words, "--out", str(out)]) == 0
     page = results_page.sections(out.read_text())
-    titles = ["The paper", "The uncertainty suite", "Where learning is safe", "The search of settings"]
+    titles = ["The paper", "The uncertainty suite", "The designed PID", "Where learning is safe"]
+    titles += ["The search of settings"]
     titles += ["How narrow and how fast", "Three MPPIs", "Feeding up", "Identification", "Speed"]
     assert list(page) == ["", *titles]
     assert all(MADE in page[title] and "on Abacus with 3 cores." in page[title] for title in titles)
@@ -133,7 +144,12 @@ def test_sections(
     assert "| fel         | 3.21    | 3.21       | 3.21         | PID fails |" in page["The paper"]
     assert "| lab     | " in page["The paper"] and "| 1.00         | 0.25 " in page["The paper"]
     assert "2.00 → 1.00" in page["The paper"] and "| an offset | 9.1 %" in page["The paper"]
-    assert "| caster, second | 20 " in page["Where learning is safe"] and "88.5" in page["Where learning is safe"]
+    safe, pid = page["Where learning is safe"], page["The designed PID"]
+    assert safe.startswith("`mrctl tune car --time-constant 0.15 --delay 0.02` made this") and "λ = 0.15 s" in safe
+    assert "| caster, second | 20 " in safe and "88.5" in safe
+    assert pid.startswith("`mrctl tune racecar --delay 0.02` made this") and "within 5 % of the designed" in pid
+    assert "1.60 as designed and 1.63 as measured" in pid and "| field | 16.0 " in pid
+    assert "| 20.0 / 21.0 " in pid and "| 1.60 / 1.63 " in pid
     (row,) = (line for line in page["The search of settings"].splitlines() if "model+fel" in line)
     cells = [
         "",
