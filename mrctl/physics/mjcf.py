@@ -32,6 +32,10 @@ from mrctl.record import InputError
 from mrctl.theory.obstacles import Obstacles
 from mrctl.theory.robot import CAR, STEERINGS, Robot, RobotFile, Steering
 
+# MuJoCo would print a line for each warning, and write it to MUJOCO_LOG.TXT in the user's folder. Who drives a robot
+# looks at its state and says why a run failed; what MjSpec warns of is a warning of Python, too.
+mujoco.set_mju_user_warning(lambda _: None)
+
 NONE = Obstacles()
 
 INCLUDED = f'<include file="{CAR.path}.xml"/>'
