@@ -348,6 +348,9 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         if file is not None and str(file) != scenario_file:
             raise InputError(f"run: {file} is not a scenario file, whose name ends in .toml; see mrctl run --help")
         _known(scenario.world, scenario.robot)
+        from mrctl.kernel import announced_early
+
+        announced_early()
         from mrctl.experiments import single
 
         text, failure = single.run(_suited(scenario, arguments, scenario_file), out, json, controller)
