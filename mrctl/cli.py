@@ -80,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             os.environ.setdefault(f"TQDM_{name}", value)  # which tqdm reads when it is imported
     if isinstance(sys.stdout, io.TextIOWrapper):  # a file may have a name that is not UTF-8
         sys.stdout.reconfigure(errors="replace")
-    warnings.showwarning = lambda message, *_: print(f"mrctl: {printable(str(message))}", file=sys.stderr)
+    warnings.showwarning = _once()
     try:
         try:
             command = _parse(_expanded(arguments))
@@ -108,6 +108,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"mrctl: {printable(str(error))}", file=sys.stderr)
         return 1
     return 0
+
+
+def _once() -> Callable[..., None]:
+    """Returns a function that prints the text of a warning in one line, and every text only once."""
+    said = set[str]()
+
+    def show(message: Warning | str, *_: object) -> None:
+        text = printable(str(message))
+        if text not in said:
+            said.add(text)
+            print(f"mrctl: {text}", file=sys.stderr)
+
+    return show
 
 
 def _check_world(world: str, robot: RobotFile = CAR) -> None:
@@ -344,6 +357,9 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         if file is not None and str(file) != scenario_file:
             raise InputError(f"run: {file} is not a scenario file, whose name ends in .toml; see mrctl run --help")
         _check_world(scenario.world, scenario.robot)
+        from mrctl.kernel import announced_early
+
+        announced_early()
         from mrctl.experiments import single
 
         text, failure = single.run(_suited(scenario, arguments, scenario_file), out, json, controller)
@@ -703,7 +719,7 @@ def check(
     chassis: str = "",
     json: bool = False,
 ) -> None:
-    """Runs the physics checks on a robot in less than a minute, and names the likely cause of a failure in its model.
+    """Runs the physics checks on a robot in at most 30 s, and names the likely cause of a failure in its model.
 
     The exit status is 1 if a check fails.
 

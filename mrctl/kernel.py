@@ -12,6 +12,8 @@ kernel that calls it, wherever that is written. Constants that a kernel uses mus
 from __future__ import annotations
 
 import hashlib
+import os
+import sys
 from collections.abc import Callable
 from functools import cache, cached_property, update_wrapper
 from pathlib import Path
@@ -26,6 +28,8 @@ Row = Any
 """One record of a structured array; type checkers cannot know its fields, which its dtype names."""
 Rows = Any
 """A structured array, one record a robot, `(B,)`."""
+
+COMPILING = "mrctl: compiling the laws that this needs for the first time, up to half a minute"
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -97,6 +101,23 @@ class Kernel(Generic[P, T]):
 def kernel(law: Callable[P, T]) -> Kernel[P, T]:
     """Decorates a function that is compiled when it is first called."""
     return Kernel(law)
+
+
+@cache
+def announced_early() -> bool:
+    """Says that laws will be compiled, before the import of Numba and MuJoCo, which takes seconds, if none is on disk.
+
+    Returns:
+        Whether it was said. It is not where Numba is there already, nor where it would choose a folder of its own.
+    """
+    if "numba" in sys.modules:
+        return False
+    package = Path(__file__).parent
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or package)
+    if (folder == package and not os.access(package, os.W_OK)) or any(folder.rglob("*.nbi")):
+        return False
+    print(COMPILING, file=sys.stderr, flush=True)
+    return True
 
 
 @cache

@@ -26,9 +26,9 @@ import mujoco
 import numpy as np
 
 from mrctl.checks.catalogue import CHECKS, Check
-from mrctl.checks.comparison import Comparison, Report
+from mrctl.checks.comparison import Comparison, Report, compare
 from mrctl.checks.inspections import Suspect, suspects
-from mrctl.checks.open_loop import limited
+from mrctl.checks.open_loop import ended, limited
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.units import bounds, mistake
 from mrctl.record import InputError
@@ -117,6 +117,8 @@ class Examination:
         for prerequisite in (c for c in self.checks if c.name in earlier):
             if self.examine(prerequisite).causes:
                 return Finding(check, [], reason=f"waits for {prerequisite.name}")
+        if ended():
+            return Finding(check, [compare("the check can be done (1: yes), TooLong: its time is up", 0.0, 1.0)])
         model = self._load(check.steering)
         if reason := check.unsuited(model):
             return Finding(check, [], reason=reason)
@@ -136,7 +138,7 @@ class Examination:
 
     def _explain(self, check: Check, report: Report) -> tuple[Explanation, ...]:
         """Returns the suspects whose repair is necessary, or else those whose repair alone is enough."""
-        if self._left <= 0:
+        if self._left <= 0 or ended():
             return ()
         worst = max((c for c in report if not c.passed), key=excess)
         suspected = self.suspects
@@ -155,7 +157,9 @@ class Examination:
         return tuple(Explanation(suspect.cause, suspect.text, str(evidence)) for suspect in causes)
 
     def _repaired(self, check: Check, repairs: list[Suspect]) -> Report:
-        """Measures a check after some repairs; returns nothing if the repaired model is not a valid robot."""
+        """Measures a check after some repairs; returns nothing if the robot is then not valid, or the time is up."""
+        if ended():
+            return []
         model = self._load(check.steering)
         for suspect in repairs:
             suspect.repair(model)

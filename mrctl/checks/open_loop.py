@@ -48,10 +48,11 @@ class Unstable(Exception):
 
 
 class TooLong(Exception):
-    """A check would simulate for too long, or its processor time is up; the message says which."""
+    """A check would simulate for too long, or its time is up; the message says which."""
 
 
-_deadline: ContextVar[float] = ContextVar("deadline", default=math.inf)
+_deadline: ContextVar[float] = ContextVar("deadline", default=math.inf)  # s of processor time
+_end: ContextVar[float] = ContextVar("end", default=math.inf)  # s of the clock
 
 
 @contextlib.contextmanager
@@ -62,6 +63,21 @@ def limited(seconds: float) -> Iterator[None]:
         yield
     finally:
         _deadline.reset(token)
+
+
+@contextlib.contextmanager
+def ending(seconds: float) -> Iterator[None]:
+    """Limits the time by the clock on the wall that all checks together may take from now on, in s."""
+    token = _end.set(time.monotonic() + seconds)
+    try:
+        yield
+    finally:
+        _end.reset(token)
+
+
+def ended() -> bool:
+    """Tells whether the time by the clock is up."""
+    return time.monotonic() > _end.get()
 
 
 @dataclass(frozen=True)
@@ -125,7 +141,7 @@ class Car:
         qpos, qvel = np.empty((ticks + 1, self.model.nq)), np.empty((ticks + 1, self.model.nv))
         qpos[0], qvel[0] = self.data.qpos, self.data.qvel
         for k in range(ticks):
-            if time.process_time() > _deadline.get():
+            if time.process_time() > _deadline.get() or ended():
                 raise TooLong("its time is up")
             self.control(law(k * hold))
             mujoco.mj_step(self.model, self.data, substeps)

@@ -11,7 +11,7 @@ from typing import Any
 from numba.core.event import Event, Listener, register
 from tqdm import tqdm
 
-from mrctl.kernel import Kernel
+from mrctl.kernel import COMPILING, Kernel, announced_early
 
 
 class Announcement(Listener):
@@ -36,7 +36,7 @@ class Announcement(Listener):
         law = _law(event)
         if not self.said:
             self.said = True
-            print("mrctl: compiling the laws that this needs for the first time, up to half a minute", file=sys.stderr)
+            print(COMPILING, file=sys.stderr)
         if self._depth == 0:
             self._left = called(law)
             name = f"{law.__module__.removeprefix('mrctl.')}.{law.__name__}"
@@ -81,6 +81,7 @@ def _name(law: Callable[..., Any]) -> str:
 def announced() -> Announcement:
     """Lets this process announce compilations; the workers of a sweep, one of many, stay silent."""
     announcement = Announcement()
+    announcement.said = announced_early()
     if parent_process() is None:
         register("numba:compile", announcement)
     return announcement

@@ -32,6 +32,10 @@ from mrctl.record import InputError
 from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles
 from mrctl.theory.robot import CAR, STEERINGS, Robot, RobotFile, Steering
 
+# MuJoCo would print a line for each warning, and write it to MUJOCO_LOG.TXT in the user's folder. Who drives a robot
+# looks at its state and says why a run failed; what MjSpec warns of is a warning of Python, too.
+mujoco.set_mju_user_warning(lambda _: None)
+
 INCLUDED = f'<include file="{CAR.path}.xml"/>'
 """The line with which a world includes the default robot."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import count
+from itertools import cycle
 
 CONTROLLER = ("prior", "learner")
 """Fields of a scenario that choose its controller."""
@@ -26,6 +26,9 @@ CONTROLLERS: dict[str, tuple[str, str]] = {
     "mrac": ("PID + MRAC", "#5B21B6"),
 }
 
+LIGHTER = (0.0, 0.45, -0.4, 0.7, -0.65, 0.25, -0.2)
+"""Shares by which the curves or robots of one controller differ from its colour."""
+
 
 def title_of(controller: str) -> str:
     """Returns the display name of a controller; a user's own controller keeps its name."""
@@ -35,16 +38,26 @@ def title_of(controller: str) -> str:
 def colours_of(controllers: Iterable[str]) -> list[str]:
     """Returns a colour for each of several curves or robots, such as `#0072B2`.
 
-    The first curve of a controller has the controller's colour. Further ones, and those of the user's own controllers,
-    take the free colours in order; when these run out, colours repeat.
+    The first curve of a controller has the controller's colour; further ones are lighter or darker. The user's own
+    controllers take the colours that none of the others has, in order; when these run out, colours repeat.
     """
     controllers = list(controllers)
+    names = list(dict.fromkeys(controllers))
     palette = [colour for _, colour in CONTROLLERS.values()]
-    own = {name: row for row, name in reversed(list(enumerate(controllers))) if name in CONTROLLERS}
-    taken = {CONTROLLERS[name][1] for name in own}
-    free = [colour for colour in palette if colour not in taken] or palette
-    others = count()
-    return [
-        CONTROLLERS[name][1] if own.get(name) == row else free[next(others) % len(free)]
-        for row, name in enumerate(controllers)
-    ]
+    taken = {CONTROLLERS[name][1] for name in names if name in CONTROLLERS}
+    free = cycle([colour for colour in palette if colour not in taken] or palette)
+    own = {name: CONTROLLERS[name][1] if name in CONTROLLERS else next(free) for name in names}
+    before, found = dict.fromkeys(names, 0), []
+    for name in controllers:
+        found.append(_shaded(own[name], LIGHTER[before[name] % len(LIGHTER)]))
+        before[name] += 1
+    return found
+
+
+def _shaded(colour: str, lighter: float) -> str:
+    """Returns a colour nearer to white, or for a negative share nearer to black."""
+    if not lighter:
+        return colour
+    end = 255 if lighter > 0 else 0
+    parts = (round(c + abs(lighter) * (end - c)) for c in bytes.fromhex(colour.removeprefix("#")))
+    return f"#{bytes(parts).hex().upper()}"

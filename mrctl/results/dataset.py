@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import json
 import os
 import shutil
@@ -108,6 +109,7 @@ WHOLE = (
     "variables"  # attribute of a saved result: its variables, each of whose files holds all chunks, even with only NaN
 )
 WHOLE_BEFORE_0_10_2 = "all_chunks"  # the same without their names
+CHECKSUMS = "checksums"  # attribute of a saved result: what `_checksums` returns; older results lack it
 CODECS = {"bytes", "vlen-utf8", "zstd", "blosc", "crc32c", "sharding_indexed"}  # all that mrctl ever wrote
 SINCE_0_4_2 = ("z", "roll_angle", "pitch_angle")  # signals that older results lack
 
@@ -241,11 +243,45 @@ def save(result: xr.Dataset, path: str | Path) -> None:
         checked = {str(name): {"compressors": (ZstdCodec(), Crc32cCodec())} for name in result.variables}
         result = result.assign_attrs({WHOLE: sorted(map(str, result.variables))})
         result.to_zarr(partial, mode="w", zarr_format=3, consolidated=False, encoding=checked, write_empty_chunks=True)
+        _seal(partial)
         partial.rename(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _seal(folder: Path) -> None:
+    """Adds the checksums of its metadata to a result; its chunks have checksums of their own."""
+    about = json.loads((folder / "zarr.json").read_bytes())
+    about["attributes"][CHECKSUMS] = _checksums(folder)
+    (folder / "zarr.json").write_text(json.dumps(about, indent=2))
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    """Returns the SHA-256 of each `zarr.json` of a result, by its path in the folder.
+
+    It is that of the content, as JSON with sorted keys and without spaces. The checksums in the root are left out.
+    """
+    found = {}
+    for file in sorted([folder / "zarr.json", *folder.glob("*/zarr.json")]):
+        about = json.loads(read_file(file))
+        if file.parent == folder:
+            about["attributes"].pop(CHECKSUMS, None)
+        text = json.dumps(about, sort_keys=True, separators=(",", ":"))
+        found[file.relative_to(folder).as_posix()] = hashlib.sha256(text.encode()).hexdigest()
+    return found
+
+
+def _check_sums(folder: Path, saved: dict[str, str]) -> None:
+    """Compares the metadata of a result with the checksums that were saved; other functions look for missing files.
+
+    Raises:
+        InputError: A file holds something else than what was saved; the message names it.
+    """
+    for name, checksum in _checksums(folder).items():
+        if saved.get(name) != checksum:
+            raise InputError(f"{folder / name}: damaged: its checksum is that of another text")
 
 
 def only_files(folder: Path) -> int:
@@ -343,6 +379,8 @@ def open_result(path: str | Path) -> xr.Dataset:
     check_declared(Path(path), sum(array.nbytes for array in arrays.values()), stored)
     with reading(f"{path}: not a saved result"):
         result = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
+        if CHECKSUMS in result.attrs:
+            _check_sums(Path(path), dict(result.attrs.pop(CHECKSUMS)))
     if gone := set(result.attrs.get(WHOLE, ())) - set(result.variables):
         raise InputError(f"{Path(path) / min(gone)}: missing")
     for folder, array in arrays.items():

@@ -484,7 +484,7 @@ def _curves(result: xr.Dataset, window: tuple[float, float] | None, lap: int | N
 
 
 def _colours(runs: xr.Dataset) -> dict[str, str]:
-    """Returns the colour of each label: that of its first run's controller, unless an earlier label has it."""
+    """Returns the colour of each label: that of its first run's controller, or another shade of it."""
     labels = [str(label) for label in runs["label"].values]
     controllers = runs["feedforward"].values if "feedforward" in runs.coords else labels
     first = dict(zip(reversed(labels), reversed([str(name) for name in controllers]), strict=True))

@@ -8,7 +8,8 @@
 
 `mrctl.open` reads a store that another version of mrctl wrote, in this format or an older one: a metric that the
 old version did not compute is NaN. Only the version that began a sweep continues it. Format 1 did not list its signals;
-formats 1 and 2 had checksums of the signals alone, format 3 has them in every file.
+formats 1 and 2 had checksums of the signals alone, format 3 has them in every file. What the `zarr.json` of its signals
+must hold follows from `sweep.json`, with which it is compared.
 
 One job owns one shard and one part. Each file is written under a temporary name, synchronised and renamed, the part
 last: the existence of a part says that its job is done. A job that is computed twice writes the same bytes twice.
@@ -39,6 +40,8 @@ import zarr
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from zarr.codecs import BloscCodec, Crc32cCodec
+from zarr.core.buffer import default_buffer_prototype
+from zarr.storage import MemoryStore
 
 from mrctl import __version__
 from mrctl.record import InputError, Record, read_file, reading
@@ -322,8 +325,12 @@ class Store:
         check_codecs(path)
         with reading(self.path / "signals.zarr"):
             found = zarr.open_array(path, mode="r+", zarr_format=3)
-        if (found.shape, found.shards, found.chunks) != self._layout(found.shape[-1] if found.shape else 0):
+            signals = len(self.manifest.get("signals", ())) or (found.shape[-1] if found.shape else 0)
+            expected = self._array(MemoryStore(), signals)
+        if (found.shape, found.shards, found.chunks) != self._layout(signals):
             raise InputError(f"{path}: of shape {found.shape}, which is not that of the sweep")
+        if self.manifest[KIND] > 2 and _written(found) != _written(expected):
+            raise InputError(f"{path}/zarr.json: damaged: it does not describe the signals of this sweep")
         return found
 
     def _layout(self, signals: int) -> tuple[tuple[int, ...], ...]:
@@ -350,8 +357,12 @@ class Store:
         check_declared(self.path, 8 * values, stored)
 
     def _create_signals(self) -> None:
-        shape, shards, chunks = self._layout(len(self.signal_names))
-        zarr.open_group(self.path / "signals.zarr", mode="a").create_array(
+        self._array(self.path / "signals.zarr", len(self.signal_names))
+
+    def _array(self, place: Path | MemoryStore, signals: int) -> zarr.Array:
+        """Creates the array of all signals `(runs, samples, signals)` in a folder, or in memory to compare with it."""
+        shape, shards, chunks = self._layout(signals)
+        return zarr.open_group(place, mode="a").create_array(
             "signals",
             shape=shape,
             shards=shards,
@@ -485,6 +496,11 @@ def _synchronise(path: Path) -> None:
 def _checksum(manifest: dict[str, Any]) -> str:
     """Returns the SHA-256 of what `sweep.json` holds besides its checksum."""
     return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
+
+
+def _written(array: zarr.Array) -> object:
+    """Returns what this version of zarr would write to the `zarr.json` of an array."""
+    return json.loads(array.metadata.to_buffer_dict(default_buffer_prototype())["zarr.json"].to_bytes())
 
 
 def _temporary(path: Path) -> bool:

@@ -7,8 +7,10 @@ import shutil
 import subprocess
 import sys
 
+import mujoco
 import pytest
 
+from mrctl.checks import command
 from mrctl.checks.catalogue import CHECKS
 from mrctl.checks.command import examination
 from mrctl.checks.examination import PREREQUISITES, Examination
@@ -293,3 +295,33 @@ def test_all_checks():
     assert {check.name for check in CHECKS} - {check.name for check in Examination.checks} == {
         "slope", "tilted_gravity", "patch", "rough",
     }  # fmt: skip
+
+
+def test_the_whole_ends_by_the_clock(monkeypatch, capsys):
+    """However little processor time a busy machine gives, checks that are left after 28 s fail with their text."""
+    now = iter(range(0, 10_000_000, 5))  # every look at the clock takes 5 s
+    monkeypatch.setattr("mrctl.checks.open_loop.time.monotonic", lambda: float(next(now)))
+    text, verdict = command.run("flat", json=True)
+    checks = json.loads(text)["checks"]
+    late = [check for check in checks if any("its time is up" in value["quantity"] for value in check["values"])]
+    assert late[-1] == checks[-1] and len(late) > 15 and verdict.startswith(f"{len(late)} of")
+    assert all(check["status"] == "failed" and not check["causes"] for check in late)
+    monkeypatch.undo()
+    with pytest.raises(SystemExit):
+        main(["check", "--help"])
+    assert "in at most 30 s" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+
+
+def test_a_warning_is_said_once(tmp_path, monkeypatch, capfd):
+    """Of a robot file with options of its own, MuJoCo warns at each of 28 compilations: one line, and no log file."""
+    text = (models_folder() / "turtlebot.xml").read_text()
+    (tmp_path / "b1.xml").write_text(text.replace('<option timestep="0.002"', '<option timestep="0.02"'))
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", "b1.xml"]) == 0
+    (said,) = messages(capfd.readouterr().err)
+    assert said.startswith("mrctl: Attach conflict") and [file.name for file in tmp_path.iterdir()] == ["b1.xml"]
+    model = load("flat")
+    data = mujoco.MjData(model)
+    data.qacc_warmstart[:] = data.qvel[:] = 1e30
+    mujoco.mj_step(model, data)
+    assert data.warning.number.any() and not capfd.readouterr().err and len(list(tmp_path.iterdir())) == 1

@@ -84,11 +84,22 @@ def edited(sign: bool = True, **changes: object) -> Callable[[Path], None]:
     return damage
 
 
+def replaced(old: str, new: str) -> Callable[[Path], None]:
+    """Changes a passage of a file by hand."""
+
+    def replaced(path: Path) -> None:
+        assert old in path.read_text()
+        path.write_text(path.read_text().replace(old, new, 1))
+
+    return replaced
+
+
 def cleared(path: Path) -> None:
     path.write_text("{")
 
 
 SHARD = "store/signals.zarr/signals/c/1/0/0"
+ROOT = "result.zarr/zarr.json: damaged: its checksum"
 DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     (SHARD, flipped, "signals/c/1/0/0"),
     (SHARD, cut, "signals/c/1/0/0"),
@@ -112,6 +123,13 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("out/result.zarr/x/c/0/0", flipped, "result.zarr/x"),
     ("out/result.zarr/x/zarr.json", cleared, "result.zarr"),
     ("out/result.zarr/zarr.json", cleared, "result.zarr: not a saved result"),
+    ("out/result.zarr/zarr.json", replaced('"control_period": 0.01', '"control_period": 0.03'), f"out/{ROOT}"),
+    ("out/result.zarr/zarr.json", replaced(r"\"seed\": 0", r"\"seed\": 1"), f"out/{ROOT}"),
+    ("out/result.zarr/zarr.json", replaced(r"\"radius\": 0.5", r"\"radius\": 0.6"), f"out/{ROOT}"),
+    ("out/result.zarr/x/zarr.json", replaced("little", "big"), "out/result.zarr/x/zarr.json: damaged: its checksum"),
+    ("out/result.zarr/x/zarr.json", replaced('"units": "m"', '"units": "mm"'), "result.zarr/x/zarr.json: damaged"),
+    ("store/signals.zarr/signals/zarr.json", replaced("little", "big"), "signals/zarr.json: damaged: it does not"),
+    ("store/signals.zarr/signals/zarr.json", replaced('"NaN"', "0.0"), "signals/zarr.json: damaged: it does not"),
 ]
 
 
@@ -127,6 +145,21 @@ def test_damage_is_one_line(
     said = capsys.readouterr().err
     assert says in said.replace("not a sweep's store", "not a saved result, nor a sweep") and said.count("\n") == 1
     assert sorted(p.name for p in tmp_path.iterdir()) == [name]
+
+
+def test_older_results_open(whole: Path, tmp_path: Path) -> None:
+    """A result of mrctl 0.10.2 or older, whose metadata have no checksums, opens as before; so does a resaved one."""
+    shutil.copytree(whole / "out", tmp_path / "out")
+    root = tmp_path / "out/result.zarr/zarr.json"
+    about = json.loads(root.read_text())
+    assert sorted(about["attributes"].pop("checksums")) == sorted(
+        str(file.relative_to(root.parent)) for file in root.parent.rglob("zarr.json")
+    )
+    root.write_text(json.dumps(about))
+    found = mrctl.open(tmp_path / "out")
+    assert found.identical(mrctl.open(whole / "out"))
+    mrctl.save(found, tmp_path / "again.zarr")
+    assert mrctl.open(tmp_path / "again.zarr").identical(found)
 
 
 def test_damaged_shard_is_named_when_it_is_used(whole: Path, tmp_path: Path) -> None:

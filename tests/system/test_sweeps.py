@@ -561,6 +561,19 @@ def test_ctrl_c(long, tmp_path):
     assert {k: v for k, v in kept.items() if "signals" in k} == {k: expected[k] for k in kept if "signals" in k}
 
 
+@pytest.mark.parametrize("moment", [0.6, 1.2, 1.9])
+def test_early_ctrl_c(tmp_path, moment):
+    """In the first two seconds too, while modules are imported and workers begin: one line and status 130."""
+    (tmp_path / "sweep.toml").write_text('runs = 4000\n[base]\nlaps = 2\nlearner = "none"\n')
+    command = [sys.executable, "-m", "mrctl", "sweep", str(tmp_path / "sweep.toml"), "--out", str(tmp_path / "store")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    time.sleep(moment)
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    lines = [line for line in stderr.splitlines() if "compiling the laws" not in line]
+    assert process.returncode == 130 and len(lines) == 1 and lines[0].startswith("mrctl: interrupted"), stderr
+
+
 def test_finished_jobs_are_kept(sweep, tmp_path, whole):
     """A job that is done is not computed again, nor is a sweep."""
     store = tmp_path / "store"

@@ -330,6 +330,29 @@ def test_first_line_before_compiling(tmp_path: Path) -> None:
     assert out.returncode == 0, out
 
 
+EARLY = """
+import os, sys
+from mrctl import cli
+
+def first(text):
+    heavy = [name for name in ("numba", "mujoco", "dm_control", "torch", "xarray", "zarr") if name in sys.modules]
+    os.write(1, repr([text.strip(), heavy]).encode())
+    os._exit(0)
+
+sys.stderr.write = first
+cli.main(["run", "--laps", "1"])
+"""
+
+
+def test_first_line_before_imports(tmp_path: Path) -> None:
+    """Where nothing was compiled yet, a run says so before it imports Numba and MuJoCo, which takes seconds."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", EARLY]
+    out = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    said = "mrctl: compiling the laws that this needs for the first time, up to half a minute"
+    assert out.stdout == repr([said, []]), out
+
+
 INTERRUPTED = """
 import os, signal, sys
 

@@ -13,7 +13,7 @@ from matplotlib.image import imread
 
 from mrctl.record import InputError
 from mrctl.results import metrics, plots
-from mrctl.results.controllers import CONTROLLERS
+from mrctl.results.controllers import CONTROLLERS, colours_of
 from mrctl.scenario import FEEDFORWARDS
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.viewer.looks import looks
@@ -100,6 +100,11 @@ def test_colours():
     hue = lambda look: colorsys.rgb_to_hsv(*(c / 255 for c in look.colour))[0]  # noqa: E731
     assert hue(again) == pytest.approx(hue(pid), abs=0.01) and abs(hue(own) - hue(pid)) > 0.02
     assert len({look.colour for look in looks("abcde", ["fel"] * 5)}) == 5
+    for controllers in (["fel", "fel"], ["mine", "none", "mine", "model+rls", "none"], ["fel"] * 5):
+        colours = colours_of(controllers)
+        assert [f"#{bytes(look.colour).hex().upper()}" for look in looks(controllers, controllers)] == colours
+        others = {colour for name, (_, colour) in CONTROLLERS.items() if name not in controllers}
+        assert controllers[0] == "mine" or not others & set(colours)
     assert set(CONTROLLERS) == set(FEEDFORWARDS) and len(set(CONTROLLERS.values())) == len(FEEDFORWARDS)
 
 
