@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrctl import Line, Scenario
+from mrctl import Line, Scenario, simulate
 from mrctl.loop.goals import HEADWAY, NEAR, RESTING, STUCK, TURNED, Goals, arrived
 from mrctl.results.dataset import TICK
 
@@ -52,3 +52,11 @@ def test_ends(timed):
     if timed:
         group.restart(1, 700)
         assert 1 not in group.ended(700, now) or group.there[1]
+
+
+def test_what_was_learned_when_a_run_ended():
+    """A run that ends before its batch keeps the weights of its own end, as when it runs alone."""
+    short = TASK.replace(goal=(0.8, 0.0, 0.0), learner="rls", laps=1)
+    long = short.replace(reference=Line(length=2.4), goal=(2.4, 0.0, 0.0))
+    both, alone = simulate([short, long]), simulate(short)
+    assert np.array_equal(both.weights[0], alone.weights) and not np.array_equal(both.weights[1], alone.weights)
