@@ -206,7 +206,7 @@ def test_live(browser, tmp_path):
         assert moved(still, picture(page, tmp_path / "live_payload.png")) > 300
         t, _, without, marks = until(lambda: curves(page, "position error, mm") or None, "the curves")[0]
         dropped = live.session.saved()[1].events[0].time
-        assert t[marks == 1] == pytest.approx([dropped], abs=0.05)
+        assert t[marks == 1] == pytest.approx([dropped], abs=0.051)  # a sample of the curves, in float32
         post = places(page, "/world/events")[:, :2].mean(axis=0)
         now = live.session.driven()[round(dropped / live.session.period)]
         assert post == pytest.approx([now["x_ref"], now["y_ref"]], abs=0.01)  # within a tick
@@ -226,11 +226,17 @@ def test_live(browser, tmp_path):
         tick = live.session.tick
         page.get_by_text("step", exact=True).click()
         until(lambda: live.session.tick == tick + 1, "a single step")
+        page.keyboard.press("ArrowRight")
+        until(lambda: live.session.tick == tick + 2, "a step by the key →")
+        page.keyboard.press("f")
+        until(lambda: live._follow.value and abs(node(page, "/world")[0]) > 0.1, "the camera to follow by the key F")
+        page.keyboard.press("f")
+        until(lambda: np.allclose(node(page, "/world"), 0), "the camera to let go")
         page.get_by_label("Camera follows").click()  # the robot stays, and the world moves
         until(lambda: np.allclose(node(page, "/world")[:2], -node(page, ROBOT)[:2], atol=1e-3), "the world to move")
         page.get_by_label("Camera follows").click()
         until(lambda: np.allclose(node(page, "/world"), 0), "the world to be back")
-        assert live.session.tick == tick + 1
+        assert live.session.tick == tick + 2
         assert all(page.evaluate(VISIBLE, f"{robot}/payload") for robot in (ROBOT, GHOST))
 
         with page.expect_download(timeout=PATIENCE) as download:
@@ -263,7 +269,8 @@ def test_live(browser, tmp_path):
         until(lambda: np.allclose(middle(), [390 / 2, 844 / 4], atol=30), "the circle above the panel")
         page.screenshot(path=tmp_path / "phone.png", timeout=PATIENCE)
         page.set_viewport_size({"width": 1280, "height": 800})
-        page.get_by_text("reset", exact=True).click()
+        page.keyboard.press("r")
+        until(lambda: live.session.tick == 0, "a reset by the key R")
         emptied = lambda drawn, marks: np.isnan(drawn).all() and (marks < 0).all()  # noqa: E731
         until(lambda: emptied((now := curves(page, "V, m/s")[0])[1:-1], now[-1]), "the old curves to go")
         until(
@@ -291,6 +298,8 @@ def test_inputs(browser, tmp_path):
         mass_factor = lambda: live.session.state()["perturbation"].mass_factor  # noqa: E731
         shown = lambda: float(slider.get_attribute("aria-valuenow"))  # noqa: E731
         until(lambda: mass_factor() > 1.05 and mass_factor() == pytest.approx(shown()), "the slider's last value")
+        # The drag takes half a second, in which the slider rests at most now and then: not an event a movement, of 8.
+        assert 1 <= len(live.session.saved()[0].events) <= 3
         typed = slider.locator("xpath=ancestor::*[.//input[@inputmode]][1]").locator("input[inputmode]")
         assert float(slider.get_attribute("aria-valuemax")) == 3
         typed.fill("4.5")
