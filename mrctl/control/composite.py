@@ -288,7 +288,8 @@ MOTION = np.dtype(
         ("voltage", "f8", CHANNELS),  # of the two channels, V (rad/s on a steering channel)
         ("twist", "f8", CHANNELS),  # measured, m/s and rad/s
         ("direction", "f8", 2),  # cosine and sine of the heading
-    ]
+    ],
+    align=True,
 )
 
 COMPOSITE = np.dtype(
