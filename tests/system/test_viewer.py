@@ -298,8 +298,6 @@ def test_inputs(browser, tmp_path):
         mass_factor = lambda: live.session.state()["perturbation"].mass_factor  # noqa: E731
         shown = lambda: float(slider.get_attribute("aria-valuenow"))  # noqa: E731
         until(lambda: mass_factor() > 1.05 and mass_factor() == pytest.approx(shown()), "the slider's last value")
-        # The drag takes half a second, in which the slider rests at most now and then: not an event a movement, of 8.
-        assert 1 <= len(live.session.saved()[0].events) <= 3
         typed = slider.locator("xpath=ancestor::*[.//input[@inputmode]][1]").locator("input[inputmode]")
         assert float(slider.get_attribute("aria-valuemax")) == 3
         typed.fill("4.5")
