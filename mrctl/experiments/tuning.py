@@ -225,11 +225,11 @@ def default_text(table: dict[str, Any]) -> str:
         table: What `design` returns for a designed PID.
     """
     loops = table["loops"]
-    apart = max(abs(row["measured"]["bandwidth"] / row["design"]["bandwidth"] - 1) for row in loops)
+    deviation = max(abs(row["measured"]["bandwidth"] / row["design"]["bandwidth"] - 1) for row in loops)
     designed, measured = (max(row[kind]["sensitivity"] for row in loops) for kind in ("design", "measured"))
     says = (
-        f"{_rule(table)}: the measured bandwidth is within {100 * apart:.2g} % of the designed one, and max |S| is at "
-        f"most {number(designed)} as designed and {number(measured)} as measured."
+        f"{_rule(table)}: the measured bandwidth is within {100 * deviation:.2g} % of the designed one, and max |S| is "
+        f"at most {number(designed)} as designed and {number(measured)} as measured."
     )
     period = Scenario().control_period
     tiers = {round(1e3 * period * Sensing(tier=tier).loop_delay(period)): tier for tier in TIERS}

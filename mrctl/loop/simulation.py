@@ -424,11 +424,10 @@ class Simulation:
             "half_track": ("run", np.full(size, robot.half_track), {"units": "m"}),
             "feature_scale": (("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         }
-        gains = {
-            name: (("run", "channel")[: values.ndim], values, dict(zip(("units", "long_name"), text, strict=True)))
-            for name, text in dataset.GAINS.items()
-            for values in (self.hierarchy.gains[name].copy(),)
-        }
+        gains = {}
+        for name, (unit, meaning) in dataset.GAINS.items():
+            values = self.hierarchy.gains[name].copy()
+            gains[name] = ("run", "channel")[: values.ndim], values, {"units": unit, "long_name": meaning}
         return found.assign(self._parameters() | self._clearance(length) | faults | constants | gains)
 
     @property

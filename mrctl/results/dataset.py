@@ -258,18 +258,22 @@ def _seal(folder: Path) -> None:
     (folder / "zarr.json").write_text(json.dumps(about, indent=2))
 
 
-def _checksums(folder: Path) -> dict[str, str]:
-    """Returns the SHA-256 of each `zarr.json` of a result, by its path in the folder.
+def checksum(values: dict[str, object]) -> str:
+    """Returns the SHA-256 of plain data, as JSON with sorted keys."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
-    It is that of the content, as JSON with sorted keys and without spaces. The checksums in the root are left out.
+
+def _checksums(folder: Path) -> dict[str, str]:
+    """Returns the checksum of each `zarr.json` of a result, by its path in the folder.
+
+    The checksums in the root are left out.
     """
     found = {}
     for file in sorted([folder / "zarr.json", *folder.glob("*/zarr.json")]):
         about = json.loads(read_file(file))
         if file.parent == folder:
             about["attributes"].pop(CHECKSUMS, None)
-        text = json.dumps(about, sort_keys=True, separators=(",", ":"))
-        found[file.relative_to(folder).as_posix()] = hashlib.sha256(text.encode()).hexdigest()
+        found[file.relative_to(folder).as_posix()] = checksum(about)
     return found
 
 

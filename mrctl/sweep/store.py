@@ -18,7 +18,6 @@ last: the existence of a part says that its job is done. A job that is computed 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import math
 import os
@@ -45,14 +44,23 @@ from zarr.storage import MemoryStore
 
 from mrctl import __version__
 from mrctl.record import InputError, Record, read_file, reading
-from mrctl.results.dataset import FAULTS, SIGNALS, check_codecs, check_declared, only_files, open_result, reading_chunks
+from mrctl.results.dataset import (
+    FAULTS,
+    SIGNALS,
+    check_codecs,
+    check_declared,
+    checksum,
+    only_files,
+    open_result,
+    reading_chunks,
+)
 from mrctl.results.metrics import METRICS
 from mrctl.scenario import LONGEST
 from mrctl.sweep.signals import DIMENSIONS, lazily
 
 LARGEST = 2**28  # largest size of sweep.json in bytes
 KIND, FORMAT = "mrctl sweep", 3
-CHECKSUM = "checksum"  # key in sweep.json: what `_checksum` returns of all others
+CHECKSUM = "checksum"  # key in sweep.json: the checksum of all others
 ROW_GROUP = 16384  # number of rows of the table that are written at once
 INNER = 16  # runs that are compressed together, signal by signal
 COMPLETE = b"complete"  # key in the metadata of the table; b"1" if it holds every job
@@ -112,7 +120,7 @@ class Store:
                 f"{path}: mrctl {self.writer} wrote this store in format {found}; "
                 f"mrctl {__version__} reads formats up to {FORMAT}"
             )
-        if self.manifest.pop(CHECKSUM, None) != _checksum(self.manifest) and found > 2:
+        if self.manifest.pop(CHECKSUM, None) != checksum(self.manifest) and found > 2:
             raise InputError(f"{path}/sweep.json: damaged: its checksum is that of another text")
 
     @staticmethod
@@ -147,7 +155,7 @@ class Store:
         manifest = json.loads(json.dumps({KIND: FORMAT, **manifest}))
         if not (path / "sweep.json").exists():
             with _whole(path / "sweep.json") as file:
-                file.write(json.dumps(manifest | {CHECKSUM: _checksum(manifest)}, indent=1).encode())
+                file.write(json.dumps(manifest | {CHECKSUM: checksum(manifest)}, indent=1).encode())
         store = cls(path)
         if store.writer != __version__:
             raise InputError(
@@ -491,11 +499,6 @@ def _synchronise(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _checksum(manifest: dict[str, Any]) -> str:
-    """Returns the SHA-256 of what `sweep.json` holds besides its checksum."""
-    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
 def _written(array: zarr.Array) -> object:
