@@ -35,7 +35,7 @@ from mrctl.theory.robot import CAR, RobotFile
 FIRST = ("name", "world", "steering", "reference", "laps", "prior", "learner", "seed")
 """Fields of `Scenario` that `mrctl run --help` explains; it lists the others, which `mrctl run --help-all` explains."""
 
-FROM_FILES = ("events", "obstacles")
+FROM_FILES = ("events", "obstacles", "map")
 """Fields of `Scenario` that have no flags, because they come from a scenario file."""
 NOT_OF_MISSIONS = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
 """Fields of `Scenario` without flags in `mrctl navigate`: they come from files, or the mission sets them."""
@@ -381,11 +381,12 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
     part = _partial_record(default, [name for name in names if name not in NOT_OF_MISSIONS])
 
     def navigate(
-        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[MAP|GENERATOR:SEED|MISSION]")] = "",
+        world: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[WORLD|GENERATOR:SEED|MISSION]")] = "",
         /,
         scenario: Record = part,
         goal: tuple[float, float, float] | None = None,
         start: tuple[float, float, float] | None = None,
+        known: Annotated[str | None, tyro.conf.arg(name="map")] = None,
         compare: Annotated[tuple[FeedforwardName, ...], tyro.conf.arg(metavar="NAME ...")] = (),
         speed: float | None = None,
         margin: float = 0.05,
@@ -410,12 +411,14 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             scenario: The scenario.
             goal: Drive to this pose, x and y in m and θ in rad, as in 2 0 0 or 2,0,0; by default to the generator's.
             start: Start at this pose, written as for --goal; by default at that of the generator, or the origin.
+            known: Plan and localise on the map in this file, which may differ from the world and is written as one; by
+                default the map has all that stands still in the world.
             compare: Feedforwards of further robots, such as none or model, which drive the same plan.
             speed: Limit the plan to this speed in m/s; by default to 0.9 of the robot's largest.
             margin: Keep this clearance in m in the plan.
-            avoid: Law that keeps the robot from obstacles that move, which the first plan does not know: none, a filter
-                that brakes (`barrier`), or a controller that follows the plan at its own pace and drives around what is
-                in the way (`window`, `mppi`).
+            avoid: Law that keeps the robot from what its lidar sees beside the map, such as obstacles that move: none,
+                a filter that brakes (`barrier`), or a controller that follows the plan at its own pace and drives
+                around what is in the way (`window`, `mppi`).
             out: Write the result, the table in JSON and the figures to this folder.
             json: Print JSON instead of a table.
             view: Instead of a table, show the mission live in the browser; without --avoid, further goals can be set
@@ -430,7 +433,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
         if suite:
             taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _fields_set(arguments)
-            if taken or world or goal or start or compare or speed or avoid != "none" or json or view:
+            if taken or world or goal or start or known or compare or speed or avoid != "none" or json or view:
                 raise InputError("suite: has its own worlds, controllers and speeds; give only flags of the robot")
             from mrctl.experiments import feeding_up, mission_suite, three_mppis
 
@@ -461,11 +464,11 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             from mrctl.navigation.mission import task_of
             from mrctl.viewer import view as viewing
 
-            task = task_of(world, chosen, start, goal)
+            task = task_of(world, chosen, start, goal, known)
             return viewing.mission(task, chosen, compare, speed, margin, avoid, "127.0.0.1", port)
         from mrctl.experiments import mission
 
-        text, outcome = mission.run(world, chosen, goal, start, compare, speed, margin, avoid, out, json)
+        text, outcome = mission.run(world, chosen, goal, start, known, compare, speed, margin, avoid, out, json)
         _report(text, out, json)
         if outcome != "arrived":
             raise _Incomplete(f"the robot did not arrive: {outcome}")

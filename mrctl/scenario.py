@@ -96,6 +96,9 @@ class Scenario(Record):
     obstacles: Obstacles = Obstacles()
     """Obstacles that stand in the world or move in it, or the path of a TOML file of them; a run ends when the robot
     touches one."""
+    map: Obstacles | None = None
+    """Obstacles on the map, with which missions plan and a lidar is localised, or the path of a TOML file of them; by
+    default those that stand still in the world."""
     robot: RobotFile = CAR
     """Robot that drives; by default the world's own."""
     steering: Steering | None = None
@@ -172,6 +175,8 @@ class Scenario(Record):
         changes += [(f"events.{i}.perturbation", e.perturbation) for i, e in enumerate(self.events) if e.perturbation]
         for name, perturbation in changes:
             whole(perturbation.control_delay, self.control_period, f"{name}.control_delay", "control_period")
+        if self.map is not None and self.map.moving:
+            raise ValueError("map: an obstacle on it has a course, but a map does not move")
         if self.learner in MODEL_BASED and self.prior == "none":
             raise ValueError(f"prior: the learner {self.learner} compares the robot with a model; set prior to model")
         if self.learned and self.learner in ("none", "indi"):
@@ -188,6 +193,11 @@ class Scenario(Record):
             InputError: The event does not fit the run.
         """
         return self.replace(events=(*self.events, event))
+
+    @property
+    def known(self) -> Obstacles:
+        """Obstacles on the map."""
+        return self.obstacles.still if self.map is None else self.map
 
     @property
     def feedforward(self) -> str:

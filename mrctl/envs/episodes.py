@@ -109,7 +109,10 @@ class Episodes:
             for voltages.
         sizes: Names and sizes of the parts of an observation, in their order.
         limits: Least and largest value of each number of an observation, `(n,)` each.
+        agent: Motion controller through which an agent requests twists.
     """
+
+    agent: type[AgentMotion] = AgentMotion
 
     def __init__(
         self, scenarios: Sequence[Scenario], action: Action, *, draw: Draw | None = None, threads: int = 0
@@ -160,7 +163,7 @@ class Episodes:
         self.goals = np.array([(np.nan,) * 3 if s.goal is None else s.goal for s in scenarios])
 
     def _make_agent(self, robot: Robot, size: int) -> AgentMotion:
-        self._agent = AgentMotion(robot, size)
+        self._agent = self.agent(robot, size)
         return self._agent
 
     @property

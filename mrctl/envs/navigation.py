@@ -8,24 +8,32 @@ from pathlib import Path
 import numpy as np
 
 from mrctl.control.kanayama import posture_error
-from mrctl.envs.episodes import Draw, Episodes, read
+from mrctl.envs.episodes import AgentMotion, Draw, Episodes, read
 from mrctl.kernel import Array, Rows
 from mrctl.navigation.mission import prepared, task_of
 from mrctl.record import InputError
-from mrctl.scenario import Scenario, whole
-from mrctl.theory.obstacles import Surroundings
+from mrctl.scenario import Scenario
 
 END = 1.0  # reward of an arrival, and minus that of a failure
 WORLD = "doorway:3"  # of the default mission
+
+
+class Looking(AgentMotion):
+    """An agent with a lidar, whose scans are parts of its observations."""
+
+    def see(self, row: int, ranges: Array, angles: Array, place: Array, time: float) -> None:
+        """Takes no scan, because the observation before this tick contains it."""
 
 
 class Navigating(Episodes):
     """Episodes in which an action is a requested twist, and which end at the goal of the scenario.
 
     The reference of the scenario determines only how long an episode may last, and with what twist it begins. The lidar
-    is `sensing.lidar`. It scans from the true pose at the first tick of an episode and then at its rate, with the
-    random numbers of the localisation: where `sensing.localisation` uses the lidar, the agent gets the same scans.
+    is `sensing.lidar`. It scans at the first tick of an episode and then at its rate; where `sensing.localisation` uses
+    the lidar, the agent gets the same scans.
     """
+
+    agent = Looking
 
     def __init__(self, scenarios: Sequence[Scenario], *, draw: Draw | None = None, threads: int = 0) -> None:
         """Stands the robots at their starts.
@@ -39,42 +47,32 @@ class Navigating(Episodes):
             InputError: As `Episodes`; or a scenario has no goal, the lidars differ, or the time between two scans is
                 not a whole number of control periods.
         """
-        first, self._lidar = scenarios[0], scenarios[0].sensing.lidar
+        self._lidar = scenarios[0].sensing.lidar
         if any(s.goal is None for s in scenarios):
             raise InputError("goal: navigation needs one")
         if any(s.sensing.lidar != self._lidar for s in scenarios):
             raise InputError("sensing.lidar: the robots of one environment must have the same lidar")
-        try:
-            self._every = whole(1 / self._lidar.rate, first.control_period, "sensing.lidar.rate", "control_period")
-        except ValueError as error:
-            raise InputError(str(error)) from None
         super().__init__(scenarios, "twist", draw=draw, threads=threads)
         beams, free = self._lidar.beams, np.full(5, np.inf)
         self.sizes = {"goal": 3, "twist": 2, "scan": beams}
         self.limits = np.append(-free, np.zeros(beams)), np.append(free, np.full(beams, self._lidar.range))
         far = self._lidar.range
         self.scale = np.array([far, far, np.pi, *self.bound, *[far] * beams])
-        self._surroundings = Surroundings(first.obstacles)
-        self._random = [np.random.default_rng([s.seed, 6]) for s in scenarios]
-        self._scans, self._scanned = np.zeros((len(scenarios), beams)), -1  # ranges in m, and the tick of the last scan
+        self._scans = np.zeros((len(scenarios), beams))  # ranges in m
         self._away, self._drives = self._distance(), np.ones(len(scenarios), bool)
         self._reward = np.zeros(len(scenarios))
 
     def begin(self, row: int, seed: int, perturbation: object = None) -> None:
         """Begins another episode of one robot; the arguments are those of `Episodes.begin`."""
         super().begin(row, seed, perturbation)
-        self._random[row], self._scanned = np.random.default_rng([seed, 6]), -1
         self._away[row], self._reward[row] = self._distance()[row], 0.0
 
     def sense(self) -> tuple[Rows, Rows]:
-        """Measures as `Episodes.sense`, and scans with the lidars that are due."""
-        found = super().sense()
-        if self._scanned != self.tick:
-            self._scanned, since = self.tick, self.tick - self.start
-            for row in np.flatnonzero((since % self._every == 0) & ~self.plant.failed):
-                around = self._surroundings.at(float(since[row] * self.period))
-                ranges = self._lidar.scan(self.plant.reading["pose"][row], around, self._random[row])
-                self._scans[row] = np.minimum(ranges, self._lidar.range)
+        """Measures as `Episodes.sense`, and takes the scans of this tick."""
+        found, scanner = super().sense(), self.loop.estimator.scanner
+        assert scanner is not None
+        for row in np.flatnonzero(scanner.taken == self.tick):
+            self._scans[row] = np.minimum(scanner.scans[row], self._lidar.range)  # pyright: ignore[reportArgumentType]
         return found
 
     def send(self) -> None:

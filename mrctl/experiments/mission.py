@@ -36,6 +36,7 @@ def run(
     scenario: Scenario,
     goal: Pose | None,
     start: Pose | None,
+    known: str | None,
     compare: Sequence[FeedforwardName],
     speed: float | None,
     margin: float,
@@ -46,10 +47,11 @@ def run(
     """Drives a mission.
 
     Args:
-        world: World of the mission; see `mrctl.navigation.mission.task_of`, also for start and goal.
+        world: World of the mission; see `mrctl.navigation.mission.task_of`, also for start, goal and `known`.
         scenario: Scenario of the robots; see `mrctl.navigation.mission.navigate`, also for `compare` to `avoid`.
         goal: Pose of the goal in m, m, rad, or None.
         start: Pose of the start in m, m, rad, or None.
+        known: File of the robot's map, or None.
         compare: Further feedforwards.
         speed: Largest speed in m/s, or None.
         margin: Clearance of the plan in m.
@@ -64,7 +66,7 @@ def run(
         InputError: As `task_of` and `navigate`, or the folder cannot be written or holds a result already.
     """
     with output_folder(out, FILES):
-        task = task_of(world, scenario, start, goal)
+        task = task_of(world, scenario, start, goal, known)
         driven = navigate(task, scenario, compare, speed, margin, avoid, progress=True)
     order = Order(task=task, scenario=scenario, compare=tuple(compare), speed=speed, margin=margin, avoid=avoid)
     return _report(world, order, driven, out, as_json)

@@ -43,6 +43,7 @@ from mrctl.kernel import Array, Kernel, Row, Rows, kernel
 from mrctl.loop.learned import load_learned
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
+from mrctl.sensing.scanner import Scanner
 from mrctl.theory.robot import Robot
 
 SLIPS = 0.1  # slip ratio above which the voltage does not explain the motion, and nothing is learned
@@ -212,6 +213,7 @@ class Hierarchy:
         saturated: Whether a limit acted, `(B,)`.
         weight_norm: Norm of the learner's weights, `(B,)`.
         faults: For each robot whose commands of the last tick cannot be used, the reason why it fails.
+        scanner: The lidars, for stages that take their scans, or None.
         tick: Number of control ticks done.
         started: Tick at which the clock of the motion controller was last started.
         robot: The nominal robot.
@@ -273,6 +275,12 @@ class Hierarchy:
         self.output, self.saturated = state["allocation"]["command"], state["allocation"]["saturated"]
         self._update = (update_with(type(self.learner)) if isinstance(self.learner, Learner) else update).repeated()
         self.faults: dict[int, str] = {}
+        self.scanner: Scanner | None = None
+
+    @property
+    def looks(self) -> bool:
+        """Whether a stage takes the scans of a lidar, which none of the built-in ones does."""
+        return False
 
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
         """Changes the motion controller of one robot; gains that are not set are designed for its PID at the start."""

@@ -29,6 +29,7 @@ from mrctl.record import InputError
 from mrctl.results import dataset
 from mrctl.scenario import Event, Scenario, named
 from mrctl.sensing.estimators import Estimator
+from mrctl.sensing.scanner import Scanner
 from mrctl.sensing.sensors import Sensors
 from mrctl.theory.clearance import clearances
 from mrctl.theory.dynamics import inverse_coefficients
@@ -194,7 +195,7 @@ def group_of(s: Scenario) -> Hashable:
     rates = s.ticks if s.goal is None else None, s.physics_step, s.control_period, s.motion_period
     sensing, period = s.sensing, s.control_period
     chain = sensing.source, sensing.periods("delay", period), sensing.loop_delay(period)
-    return s.world, s.obstacles, s.robot, s.steering, s.prior, s.learner, s.fel.hidden, *rates, *chain
+    return s.world, s.obstacles, s.map, s.robot, s.steering, s.prior, s.learner, s.fel.hidden, *rates, *chain
 
 
 class Simulation:
@@ -259,12 +260,15 @@ class Simulation:
             if perturbation is not None and perturbation not in later[:k]:
                 self.plant.check(perturbation)
         own = users.pop("estimator", None)
+        sensing, scanner = [s.sensing for s in scenarios], None
         self.hierarchy = UserHierarchy(scenarios, robot, users) if users else Hierarchy(scenarios, robot)
-        sensing = [s.sensing for s in scenarios]
+        if self.hierarchy.looks or any(s.localisation != "fixes" for s in sensing):
+            scanner = Scanner(sensing, self.period, first.obstacles)
+        self.hierarchy.scanner = scanner
         self.sensors = Sensors(sensing, [s.seed for s in scenarios], self.period)
         # The engine integrates positions with the velocities at the end of a step: velocities are half a step behind.
         skew = first.physics_step / 2
-        parts = sensing, robot, self.sensors, self.plant.imu, skew, self._tyres(first), first.obstacles
+        parts = sensing, robot, self.sensors, self.plant.imu, skew, self._tyres(first), scanner, first.known
         self.estimator = UserEstimator(own, *parts) if own else Estimator(first.sensing.source, *parts)
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period)
         self.log = Log(1 if restarting else self.ticks, size)

@@ -68,8 +68,16 @@ class UserStage:
         """
         floats = [isinstance(v, np.ndarray) and v.dtype.kind == "f" for v in values]
         copies = [np.where(np.isfinite(v), v, 0.0) if real else v for v, real in zip(values, floats, strict=True)]
+        return self.ask(method, *copies)
+
+    def ask(self, method: str, *values: Any) -> Any:  # noqa: ANN401
+        """Calls a method with values that are the stage's own.
+
+        Raises:
+            StageError: The method raised.
+        """
         try:
-            answer = getattr(self.stage, method)(*copies)
+            answer = getattr(self.stage, method)(*values)
             return answer.detach() if hasattr(answer, "detach") else answer
         except Exception as error:  # noqa: BLE001
             raise self._raised(error) from error
@@ -174,11 +182,14 @@ class UserHierarchy(Hierarchy):
         """
         self.faults = {}
         state, constants = self.state, (self.nominal, self.period)
-        if self.moves:
-            if stage := self._stages.get("motion"):
+        if stage := self._stages.get("motion"):
+            if self.tick == self.started:
+                stage.call("reset", seen["pose"], _numbers(goal), self.motion_period)
+            self._show(stage, seen["estimate"])
+            if self.moves:
                 self._wanted = self._request(stage, seen, goal)
-            else:
-                request_all(seen, goal, state)
+        elif self.moves:
+            request_all(seen, goal, state)
         command_all(seen, goal if self._wanted is None else self._wanted, *constants, state)
         feedback = self._stages.get("feedback")
         if feedback:
@@ -201,12 +212,26 @@ class UserHierarchy(Hierarchy):
         self.tick += 1
         return self.output
 
+    @property
+    def looks(self) -> bool:
+        """Whether the user's motion controller takes the scans of a lidar."""
+        stage = self._stages.get("motion")
+        return stage is not None and callable(getattr(stage.stage, "see", None))
+
+    def _show(self, stage: UserStage, estimate: Array) -> None:
+        """Hands the scans of this tick to the user's motion controller, with the poses that are estimated for it."""
+        scanner = self.scanner
+        if scanner is None or not self.looks:
+            return
+        for row in np.flatnonzero(scanner.taken == self.tick).tolist():
+            lidar, ranges = scanner.lidars[row], scanner.scans[row]
+            assert ranges is not None
+            place, time = lidar.place(estimate[row, :3]), (self.tick - self.started) * self.period
+            stage.ask("see", row, ranges.copy(), lidar.angles, place, time)
+
     def _request(self, stage: UserStage, seen: Rows, goal: Rows) -> Rows | None:
         """Calls the user's motion controller; returns the reference that it follows, if it has one of its own."""
-        state = self.state
-        reference = goal.view(float).reshape(len(goal), -1)
-        if self.tick == self.started:
-            stage.call("reset", seen["pose"], reference, self.motion_period)
+        state, reference = self.state, _numbers(goal)
         request = self._finite_rows(stage, stage.output(seen["pose"], seen["twist"], reference))
         own = getattr(stage.stage, "followed", None)
         if own is not None:
@@ -304,6 +329,11 @@ class UserHierarchy(Hierarchy):
         for row in np.flatnonzero(broken):
             self.faults.setdefault(int(row), f"{stage.title}: not finite, tick {self.tick}")
         return np.where(broken[:, None], 0.0, answer) if broken.any() else answer
+
+
+def _numbers(goal: Rows) -> Array:
+    """Returns records of `GOAL` as the reference of `mrctl.control.stages.Motion`, `(B, 7)`."""
+    return goal.view(float).reshape(len(goal), -1)
 
 
 class UserEstimator(Estimator):

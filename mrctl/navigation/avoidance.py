@@ -8,6 +8,8 @@ always among the twists that are allowed.
 
 A robot that follows a plan in time is not helped by the nearest twist: the plan goes on without it, and its controller
 then asks for a way across obstacles. `Pacing` therefore slows the plan itself.
+
+What the robot avoids is what it knows: its map, and what its lidar sees beside the map (`Sight`).
 """
 
 from __future__ import annotations
@@ -22,12 +24,25 @@ from mrctl.control.kanayama import GAINS, kanayama, posture_error
 from mrctl.control.stages import Motion
 from mrctl.kernel import Array, kernel
 from mrctl.loop.simulation import arranged
+from mrctl.navigation.planning import room
+from mrctl.navigation.rollouts import Replan
+from mrctl.navigation.sight import Sight
 from mrctl.scenario import Scenario
-from mrctl.theory.clearance import outside, point_to_segment
-from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings, moved
+from mrctl.theory.clearance import clearance, outside, point_to_segment, rim
+from mrctl.theory.obstacles import Obstacles, Outlines, moved
+from mrctl.theory.references import Waypoints
 from mrctl.theory.robot import Robot
 
 BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
+RIM = 0.02  # m, radius of the discs around the robot for `Pacing`, which reach as far beyond its footprint
+KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from what stands still and from what moves; chosen
+# m, what a plan on the way keeps beyond its own margin from what the map does not have, and what it leaves of the
+# clearance that the robot has where that is smaller; chosen
+ROUND, LEFT = 0.13, 0.03
+TRACKED = 0.01  # m, by which the margin KEPT is smaller than what the discs have on the plan, at least
+STANDOFF = 1.0  # m before a blocked place of its plan, where the robot stops, so that it can drive around it; chosen
+STOPPED, WAITED = 0.02, 1.0  # pace below which a robot waits, and for how many s before it makes another plan; chosen
+SPACING = 0.05  # m, of the places of a plan that are looked at
 
 
 class Barrier(NamedTuple):
@@ -68,7 +83,7 @@ class Avoiding:
         robot: Robot,
         size: int,
         motion: Callable[[Robot, int], Motion],
-        obstacles: Obstacles,
+        known: Obstacles,
         barrier: Barrier,
     ) -> None:
         """Makes the stage.
@@ -77,21 +92,27 @@ class Avoiding:
             robot: Nominal robot.
             size: Number of robots.
             motion: Factory of the motion stage that makes the requests.
-            obstacles: The obstacles; those that move are taken where they are, as if they stood.
+            known: Obstacles on the map; the others are seen by the lidar, and taken where they are, as if they stood.
             barrier: Discs, margin and braking of the robot.
         """
-        self._motion, self._around, self._barrier = motion(robot, size), Surroundings(obstacles), barrier
+        self._motion, self._sight, self._barrier = motion(robot, size), Sight(known, size), barrier
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         self._motion.reset(pose, reference, period)
         self._time, self._period = 0.0, period
+        self._sight.forget()
+
+    def see(self, row: int, ranges: Array, angles: Array, place: Array, time: float) -> None:
+        """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.Motion`."""
+        self._sight.see(row, ranges, angles, place, time)
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
-        requests, outlines = np.asarray(self._motion.output(pose, twist, reference)), self._around.at(self._time)
+        requests = np.asarray(self._motion.output(pose, twist, reference))
+        around = [self._sight.outlines(row, self._time) for row in range(len(pose))]
         self._time += self._period
-        return np.stack([avoid(r, p, outlines, self._barrier) for r, p in zip(requests, pose, strict=True)])
+        return np.stack([avoid(*own, self._barrier) for own in zip(requests, pose, around, strict=True)])
 
 
 class Following:
@@ -131,48 +152,78 @@ class Pacing:
     drives the curvature that the plan asks for, and in the time s its error of posture obeys the same equations as
     without obstacles. λ changes no faster than the robot can follow.
 
+    Where something that stands and is not on the map blocks the plan, the robot stops `STANDOFF` before it, and drives
+    on along another plan.
+
     Attributes:
         followed: What the robots follow, as in `mrctl.control.stages.Motion`, `(B, 7)`.
     """
 
-    def __init__(self, robot: Robot, size: int, scenario: Scenario, discs: Array, still: float, moving: float) -> None:
+    def __init__(self, robot: Robot, size: int, scenario: Scenario, footprint: Array, replan: Replan) -> None:
         """Makes the stage.
 
         Args:
             robot: Nominal robot.
             size: Number of robots.
-            scenario: The scenario of all, with obstacles and the plan as its reference.
-            discs: Discs that cover at least the outline of the robot, as in `Barrier`; see `rim`.
-            still: Clearance of the discs from obstacles that stand still in m, less than what they have on the plan;
-                negative where they touch some there.
-            moving: Clearance of the discs in m from obstacles that move, which are taken as if they stood where they
-                are.
+            scenario: The scenario of all, with its map and the plan as its reference.
+            footprint: Corners of the robot in its frame in m, `(n, 2)`.
+            replan: Makes a plan to the goal.
         """
         self._follow, self._robot, self._scenario = Following(robot, size, scenario), robot, scenario
-        deceleration, obstacles = BRAKING * robot.max_acceleration, scenario.obstacles
-        self._kept = [
-            (Surroundings(Obstacles(shapes=shapes)), Barrier(discs, margin, deceleration, scenario.motion_period))
-            for shapes, margin in ((obstacles.standing, still), (obstacles.moving, moving))
-        ]
+        self._sight, self._footprint, self._replan = Sight(scenario.known, size), footprint, replan
+        self._brakes = BRAKING * robot.max_acceleration
+        self._near, self._away = self._barrier(KEPT), self._barrier(AWAY)
+
+    def _barrier(self, margin: float) -> Barrier:
+        """Returns the filter that keeps this clearance in m."""
+        return Barrier(rim(self._footprint, RIM), margin, self._brakes, self._scenario.motion_period)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
-        plan, step, sensing = self._scenario.reference, self._scenario.control_period, self._scenario.sensing
-        ticks = round(period / step) * np.arange(int(plan.period / period) + 2) + sensing.periods("delay", step)
-        self._plan = np.hstack(
-            plan.sample(np.asarray(step * ticks, float))
-        )  # as `output` gets it, for each motion period
-        self._clock, self._pace = np.zeros(len(pose)), np.ones(len(pose))  # s in motion periods, and λ
+        plan, size = self._scenario.reference, len(pose)
+        assert isinstance(plan, Waypoints)
         self._period, self._tick, self.followed = period, 0, reference
+        self._clock, self._pace = np.zeros(size), np.ones(size)  # s in motion periods, and λ
+        self._plans, self._kept = [self._sampled(plan)] * size, [self._margin(plan)] * size
+        self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
+        self._since = np.full(size, np.inf)  # when robots began to wait for another plan in s
+        self._sight.forget()
+
+    def _sampled(self, plan: Waypoints) -> Array:
+        """Returns a plan as `output` gets it, for each motion period, `(n, 7)`."""
+        step, sensing, period = self._scenario.control_period, self._scenario.sensing, self._period
+        ticks = round(period / step) * np.arange(int(plan.period / period) + 2) + sensing.periods("delay", step)
+        return np.hstack(plan.sample(np.asarray(step * ticks, float)))
+
+    def _margin(self, plan: Waypoints) -> Barrier:
+        """Returns the filter for the map, with less clearance than a plan has; it is negative where discs touch it."""
+        return self._barrier(min(KEPT, room(self._footprint, plan, self._sight.map) - RIM - TRACKED))
+
+    def see(self, row: int, ranges: Array, angles: Array, place: Array, time: float) -> None:
+        """Takes a scan of one robot, and looks whether its plan is free; for the arguments see `stages.Motion`."""
+        self._sight.see(row, ranges, angles, place, time)
+        standing = self._sight.standing(row)
+        self._blocked[row] = np.inf
+        if not len(standing.discs):
+            return
+        plan = self._plans[row]
+        first = min(int(self._clock[row]), len(plan) - 2)
+        way = np.cumsum(np.abs(plan[first:, 3])) * self._period
+        ahead = first + np.searchsorted(way, np.arange(0.0, way[-1], SPACING))
+        free = [clearance(self._footprint, plan[k, :3], standing) for k in ahead]
+        if len(blocked := ahead[np.array(free) < KEPT + RIM]):
+            self._blocked[row] = blocked[0]
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
-        first = np.minimum(self._clock.astype(int), len(self._plan) - 2)
-        part = np.minimum(self._clock - first, 1.0)[:, None]
-        now = self._plan[first] + part * (self._plan[first + 1] - self._plan[first])
+        for row in np.flatnonzero(np.isfinite(self._blocked)):
+            self._wait(int(row), pose[row])
+        now = np.empty((len(pose), 7))
+        for row, plan in enumerate(self._plans):
+            first = min(int(self._clock[row]), len(plan) - 2)
+            now[row] = plan[first] + min(self._clock[row] - first, 1.0) * (plan[first + 1] - plan[first])
         requests, twists = self._follow.output(pose, twist, now), now[:, 3:5].copy()
-        around = [(surroundings.at(self._period * self._tick), barrier) for surroundings, barrier in self._kept]
-        free = [min(share(*own, *kept) for kept in around) for own in zip(requests, pose, strict=True)]
+        free = [self._share(row, *own) for row, own in enumerate(zip(requests, pose, strict=True))]
         change = self._period * self._robot.max_acceleration / np.maximum(np.abs(twists[:, 0]), 1e-9)
         pace = np.minimum(np.clip(free, self._pace - change, self._pace + BRAKING * change), 1.0)[:, None]
         now[:, 3:5] = pace * twists
@@ -180,6 +231,35 @@ class Pacing:
         self._pace, self._clock = pace[:, 0], self._clock + pace[:, 0]
         self._tick, self.followed = self._tick + 1, now
         return pace * requests
+
+    def _share(self, row: int, request: Array, pose: Array) -> float:
+        """Returns λ of one robot."""
+        sight, allowed = self._sight, 1.0
+        if np.isfinite(self._blocked[row]):
+            part = self._plans[row][int(self._clock[row]) : int(self._blocked[row]), 3]
+            left = self._period * float(np.abs(part).sum()) - STANDOFF
+            allowed = approach.compiled(left, self._brakes, self._period) / max(abs(float(request[0])), 1e-9)
+        return min(
+            allowed,
+            share(request, pose, sight.map, self._kept[row]),
+            share(request, pose, sight.standing(row), self._near),
+            share(request, pose, sight.moving(row, self._period * self._tick), self._away),
+        )
+
+    def _wait(self, row: int, pose: Array) -> None:
+        """Gives a robot that has waited before its blocked plan another one, if there is one."""
+        now = self._period * self._tick
+        if self._pace[row] > STOPPED:
+            self._since[row] = np.inf
+            return
+        self._since[row] = min(self._since[row], now)
+        if now - self._since[row] < WAITED:
+            return
+        self._since[row] = now  # where there is no other plan, it tries again later
+        free = clearance(self._footprint, pose, self._sight.standing(row))
+        if plan := self._replan(pose, self._sight.outlines(row, now, min(ROUND, max(0.0, free - LEFT)))):
+            self._plans[row], self._kept[row] = self._sampled(plan), self._margin(plan)
+            self._clock[row], self._blocked[row], self._since[row] = 0.0, np.inf, np.inf
 
 
 def share(request: Array, pose: Array, outlines: Outlines, barrier: Barrier) -> float:

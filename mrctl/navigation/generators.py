@@ -21,10 +21,17 @@ class Task(Record):
 
     obstacles: Obstacles
     """Obstacles of the world."""
+    map: Obstacles | None = None
+    """Obstacles on the map of the robot; by default those that stand still."""
     start: Pose
     """Pose at the start: x and y in m, θ in rad."""
     goal: Pose
     """Pose at which the robot has to arrive: x and y in m, θ in rad."""
+
+    @property
+    def known(self) -> Obstacles:
+        """Obstacles on the map."""
+        return self.obstacles.still if self.map is None else self.map
 
 
 def cellular(seed: int, fill: float = 0.2, steps: int = 3, cell: float = 0.15, cells: int = 30) -> Task:

@@ -21,7 +21,7 @@ from mrctl.navigation.avoidance import Pacing
 from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
 from mrctl.navigation.mppi import Mppi
-from mrctl.navigation.planning import Plan, plan, shortcut, space
+from mrctl.navigation.planning import Plan, plan, room, shortcut, space
 from mrctl.navigation.sdf import read_sdf
 from mrctl.navigation.window import Window
 from mrctl.physics import mjcf
@@ -29,7 +29,6 @@ from mrctl.physics.hull import footprint
 from mrctl.record import InputError, Record, read_file
 from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
-from mrctl.theory.clearance import clearance, rim
 from mrctl.theory.obstacles import Obstacles, Outlines, Pose, Surroundings
 from mrctl.theory.references import Waypoints, check
 from mrctl.theory.robot import ANY_ANGLE, Robot
@@ -61,14 +60,13 @@ PATIENCE, WAITING = 2, 4  # time of a mission over that of its plan; WAITING whe
 MARGIN = 0.05  # m, margin of a plan
 SLIM = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
 PERIOD = 0.05  # s, motion period of `window` and `mppi`
-RIM = 0.02  # m, radius of the discs around the robot for `barrier`, which reach as far beyond its footprint
-KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from obstacles that stand still and from those that move; chosen
-TRACKED = 0.01  # m, by which the margin KEPT is smaller than what the discs have on the plan, at least
 
 JERKED = 0.1  # s, step of the differences whose third is the jerk; chosen
 LARGEST = 64 * 2**20  # bytes of a `mission.json`, which holds the obstacles of its world
 
 Avoid = Literal["none", "barrier", "window", "mppi"]
+REACTIVE = "window", "mppi"
+"""Motion stages that go along a plan at their own pace, forward only."""
 
 
 class Mission(NamedTuple):
@@ -101,7 +99,7 @@ class Order(Record):
     margin: float = MARGIN
     """Clearance that the plan keeps in m."""
     avoid: Avoid = "none"
-    """Law that keeps the robot from obstacles that move."""
+    """Law that keeps the robot from obstacles that its map does not have."""
 
 
 def order_of(folder: str | Path) -> Order:
@@ -128,7 +126,13 @@ def again(folder: str | Path, progress: bool = False) -> Mission:
     return navigate(**{name: getattr(order, name) for name in Order.model_fields}, progress=progress)
 
 
-def task_of(world: str, scenario: Scenario, start: Pose | None = None, goal: Pose | None = None) -> Task:
+def task_of(
+    world: str,
+    scenario: Scenario,
+    start: Pose | None = None,
+    goal: Pose | None = None,
+    known: str | None = None,
+) -> Task:
     """Reads or makes a world.
 
     Args:
@@ -136,26 +140,40 @@ def task_of(world: str, scenario: Scenario, start: Pose | None = None, goal: Pos
         scenario: Scenario with the robot, whose size sets the openings of all generators but `cellular`.
         start: x and y in m and θ in rad; by default that of the generator, or the origin.
         goal: x and y in m and θ in rad; by default that of the generator.
+        known: File of the obstacles on the robot's map, as for a world; by default those that stand still.
 
     Raises:
-        InputError: The world cannot be read, no generator has that name, or there is no goal.
+        InputError: The world or the map cannot be read, no generator has that name, or there is no goal.
     """
+    chart = None if known is None else obstacles_of(known, "map")
     name, colon, seed = world.partition(":")
     if colon and name in GENERATORS:
         if not (seed.isdecimal() and len(seed) < 10):
             raise InputError(f"world: {world}: the seed must be a number below 10⁹, as in {name}:3")
         length, width = np.ptp(robot_of(scenario)[0], axis=0).tolist()
         made = GENERATORS[name](length, width, int(seed))
-        return made.replace(start=start or made.start, goal=goal or made.goal)
-    if not (read := READERS.get(Path(world).suffix.lower())):
-        raise InputError(
-            f"world: {world} is neither a file that ends in {', '.join(READERS)} nor a generator with a seed, "
-            f"such as {':3, '.join(GENERATORS)}:3"
-        )
-    obstacles = read(world)
+        return made.replace(start=start or made.start, goal=goal or made.goal, map=chart)
+    obstacles = obstacles_of(world, "world", f" nor a generator with a seed, such as {':3, '.join(GENERATORS)}:3")
     if goal is None:
         raise InputError("goal: a world from a file needs one: x and y in m, θ in rad")
-    return Task.from_dict({"obstacles": obstacles, "start": start or (0.0, 0.0, 0.0), "goal": goal})
+    return Task.from_dict({"obstacles": obstacles, "start": start or (0.0, 0.0, 0.0), "goal": goal, "map": chart})
+
+
+def obstacles_of(path: str, what: str, other: str = "") -> Obstacles:
+    """Reads obstacles from a file of one of the `READERS`.
+
+    Args:
+        path: The file.
+        what: Name of the argument, for messages.
+        other: What else the argument may be, for the message.
+
+    Raises:
+        InputError: The file cannot be read, or its name has another ending.
+    """
+    if not (read := READERS.get(Path(path).suffix.lower())):
+        neither = "neither" if other else "not"
+        raise InputError(f"{what}: {path} is {neither} a file that ends in {', '.join(READERS)}{other}")
+    return read(path)
 
 
 def navigate(
@@ -167,20 +185,20 @@ def navigate(
     avoid: Avoid = "none",
     progress: bool = False,
 ) -> Mission:
-    """Plans a way among the obstacles that stand still, and drives it with the hierarchy.
+    """Plans a way among the obstacles on the map, and drives it with the hierarchy.
 
     A robot that can be driven backwards reverses where there is no way forward, but not with `window` and `mppi`.
 
     Args:
-        task: World, start and goal.
-        scenario: The robot and all else. Reference, laps, goal, obstacles and initial pose are those of the mission,
-            and with `window` and `mppi` the motion period is 0.05 s and the prefilter, unless set, the shortest.
+        task: World, map, start and goal.
+        scenario: The robot and all else. Reference, laps, goal, obstacles, map and initial pose are those of the
+            mission; with `window` and `mppi` the motion period is 0.05 s and the prefilter, unless set, the shortest.
         compare: Feedforwards of further robots, which drive the same plan, each alone.
         speed: Largest speed in m/s; by default 0.9 of the robot's.
         margin: Clearance that the plan keeps in m.
-        avoid: What keeps the robot from obstacles that move, which the first plan does not know: nothing, so that it
-            follows the plan in time (`none`), a filter that slows the time of the plan (`barrier`), or a motion stage
-            that goes along the plan at its own pace (`window`, `mppi`).
+        avoid: What keeps the robot from obstacles that are not on the map, or move, and which its lidar sees: nothing,
+            so that it follows the plan in time (`none`), a filter that slows the time of the plan (`barrier`), or a
+            motion stage that goes along the plan at its own pace (`window`, `mppi`).
         progress: Whether to show a progress bar.
 
     Raises:
@@ -202,16 +220,10 @@ def prepared(
     task: Task, scenario: Scenario, speed: float | None = None, margin: float = MARGIN, avoid: Avoid = "none"
 ) -> tuple[Plan, Scenario]:
     """Returns a plan, and the scenario that drives it; arguments and errors are those of `navigate`."""
-    reactive = avoid in ("window", "mppi")
-    model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
-    try:
-        found, reference = planned(task, scenario, speed, margin)
-    except InputError:
-        if reactive or not mjcf.reverses(model, scenario.steering):
-            raise
-        found, reference = planned(task, scenario, speed, margin, reverse=True)
+    reactive = avoid in REACTIVE
+    found, reference = either_way(task, scenario, speed, margin, avoid)
     laps = PATIENCE if avoid == "none" else WAITING
-    own = {"obstacles": task.obstacles, "reference": reference, "laps": laps}
+    own = {"obstacles": task.obstacles, "map": task.map, "reference": reference, "laps": laps}
     if reactive:  # the designed prefilter is that of Kanayama's controller, whose loop is faster
         shortest = max(scenario.control_period, 0.01)  # s, that a scenario takes
         own |= {"motion_period": PERIOD, "prefilter": scenario.prefilter or shortest}
@@ -229,24 +241,35 @@ def avoiding(avoid: Avoid, scenario: Scenario, lag: float = 0.0) -> Callable[[Ro
     if avoid == "none":
         return None
     corners, robot = robot_of(scenario)
-    plan, obstacles = scenario.reference, scenario.obstacles
+    plan, known = scenario.reference, scenario.known
     assert isinstance(plan, Waypoints)
 
     def replan(pose: Array, outlines: Outlines) -> Waypoints | None:
-        start = Task.from_dict({"obstacles": obstacles, "start": pose.tolist(), "goal": scenario.goal})
+        start = Task.from_dict({"obstacles": known, "start": pose.tolist(), "goal": scenario.goal})
         with contextlib.suppress(InputError):  # it waits, and tries again
-            return planned(start, scenario, plan.speed, SLIM, outlines)[1]
+            return either_way(start, scenario, plan.speed, SLIM, avoid, outlines)[1]
 
     def made(robot: Robot, size: int) -> Pacing | Window | Mppi:
         if avoid == "barrier":
-            free = room(corners, plan, Surroundings(Obstacles(shapes=obstacles.standing)).at(0.0))
-            kept = min(KEPT, free - RIM - TRACKED)
-            return Pacing(robot, size, scenario, rim(corners, RIM), kept, AWAY)
-        parts = robot, size, plan, obstacles, corners, replan
+            return Pacing(robot, size, scenario, corners, replan)
+        parts = robot, size, plan, known, corners, replan
         return Window(*parts) if avoid == "window" else Mppi(*parts, lag)
 
     made.__name__ = avoid
     return made
+
+
+def either_way(
+    task: Task, scenario: Scenario, speed: float | None, margin: float, avoid: Avoid, outlines: Outlines | None = None
+) -> tuple[Plan, Waypoints]:
+    """Returns `planned`, with a plan that reverses where there is no other and the robot can drive it."""
+    model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
+    try:
+        return planned(task, scenario, speed, margin, outlines)
+    except InputError:
+        if avoid in REACTIVE or not mjcf.reverses(model, scenario.steering):
+            raise
+        return planned(task, scenario, speed, margin, outlines, reverse=True)
 
 
 def planned(
@@ -259,22 +282,22 @@ def planned(
 ) -> tuple[Plan, Waypoints]:
     """Returns the plan and its reference; arguments and errors are those of `navigate`.
 
-    The outlines are by default those of the obstacles that stand still, and the plan reverses only if it may.
+    The outlines are by default those of the obstacles on the map, and the plan reverses only if it may.
     """
     if arrived(np.array(task.start), 0.0, np.array(task.goal)):
         raise InputError("goal: the robot starts there")
     if not 0 <= margin <= 10:
         raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
     corners, robot = robot_of(scenario)
-    still = Obstacles(shapes=task.obstacles.standing)
-    outlines = Surroundings(still).at(0.0) if outlines is None else outlines
+    known = task.known
+    outlines = Surroundings(known).at(0.0) if outlines is None else outlines
     radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (
         WIDER if reverse else 1
     )
     ends = np.array([task.start[:2], task.goal[:2]])
     low, high = ends.min(axis=0) - 3 * radius, ends.max(axis=0) + 3 * radius  # room to turn
-    if still.shapes:
-        low, high = np.minimum(low, still.bounds[0]), np.maximum(high, still.bounds[1])
+    if known.shapes:
+        low, high = np.minimum(low, known.bounds[0]), np.maximum(high, known.bounds[1])
     where = space(outlines, corners, low, high, cell=float(np.ptp(corners[:, 1])) / CELLS, margin=margin)
 
     def attempt(arc: float) -> tuple[Plan, Waypoints]:
@@ -295,12 +318,6 @@ def planned(
     if room(corners, reference, outlines) <= 0:
         raise InputError(f"plan: its smooth path touches an obstacle in spite of the margin of {margin:g} m; set more")
     return found, reference
-
-
-def room(footprint: Array, plan: Waypoints, outlines: Outlines) -> float:
-    """Returns the smallest clearance along a plan in m; `footprint` has the corners of the robot in m, `(n, 2)`."""
-    times = np.linspace(0, plan.period, max(2, round(plan.speed * plan.period / 0.01)))
-    return min(clearance(footprint, pose, outlines) for pose in plan.sample(times).pose)
 
 
 def robot_of(scenario: Scenario) -> tuple[Array, Robot]:

@@ -31,7 +31,7 @@ class Mppi(Reactive):
         robot: Robot,
         size: int,
         plan: Waypoints,
-        obstacles: Obstacles,
+        known: Obstacles,
         footprint: Array,
         replan: Replan,
         lag: float = 0.0,
@@ -42,7 +42,7 @@ class Mppi(Reactive):
             robot: The nominal robot.
             size: Number of robots.
             plan: The way, which each robot goes along at its own pace.
-            obstacles: As in `Reactive`.
+            known: As in `Reactive`.
             footprint: As in `Reactive`.
             replan: As in `Reactive`.
             lag: Time constant in s with which V and θ̇ follow what is requested; 0: at once.
@@ -52,7 +52,7 @@ class Mppi(Reactive):
         """
         if not 0 <= lag <= MOST_LAG:
             raise InputError(f"lag: must be between 0 and {MOST_LAG:g} s, not {lag:g}")
-        super().__init__(robot, size, plan, obstacles, footprint, replan)
+        super().__init__(robot, size, plan, known, footprint, replan)
         self._lag = lag
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:

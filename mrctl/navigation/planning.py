@@ -526,3 +526,9 @@ def _traced(tree: Tree, count: int, last: int, radius: float, reverse: bool, exp
     made = np.flatnonzero((tree.parents[:count] >= 0) & (tree.turns[:count] != SHOT))
     searched = np.stack([tree.poses[tree.parents[made], :2], tree.poses[made, :2]], axis=1)
     return Plan(poses, ways, float(tree.costs[last]), expanded, searched)
+
+
+def room(footprint: Array, plan: Waypoints, outlines: Outlines) -> float:
+    """Returns the smallest clearance along a plan in m; `footprint` has the corners of the robot in m, `(n, 2)`."""
+    times = np.linspace(0, plan.period, max(2, round(plan.speed * plan.period / 0.01)))
+    return min(clearance(footprint, pose, outlines) for pose in plan.sample(times).pose)

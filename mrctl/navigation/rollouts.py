@@ -15,9 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from mrctl.kernel import Array, kernel
+from mrctl.navigation.sight import Sight
 from mrctl.theory.clearance import cover
 from mrctl.theory.grid import Field, field_of, value
-from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings
+from mrctl.theory.obstacles import Obstacles, Outlines
 from mrctl.theory.references import Waypoints
 from mrctl.theory.robot import Robot
 from mrctl.theory.timing import RESERVE
@@ -26,6 +27,7 @@ STEPS = 56  # of a roll-out, each a motion period
 KNOTS = 8  # of a roll-out, between which what is added to its twists changes linearly
 PLACE, HEADING, NEAR, TOUCH = 10.0, 1.0, 5.0, 1000.0  # costs in 1/(m² s), 1/s, 1/s and for a collision; chosen
 KEPT = 0.1  # m from obstacles, below which it costs
+DEEPER = 0.005  # m, by which discs that touch an obstacle already may come nearer
 CELL = 0.04  # m, of the distance field
 AROUND = 3.0  # m around the plan, which the field covers
 DISCS = 4  # that cover the robot
@@ -72,9 +74,9 @@ class Scene(NamedTuple):
     discs: Array
     """Discs that cover the robot, as of `cover`, `(k, 3)`."""
     field: Field
-    """Distance from the obstacles that stand still."""
+    """Distance from the obstacles on the map."""
     movers: Array
-    """Circles around those that move: x and y in m, their velocities in m/s, radius in m, `(M, 5)`."""
+    """Discs around the others that it has seen: x and y in m, their velocities in m/s, radius in m, `(M, 5)`."""
 
 
 class Considered(NamedTuple):
@@ -119,7 +121,7 @@ class Reactive(ABC):
     """
 
     def __init__(
-        self, robot: Robot, size: int, plan: Waypoints, obstacles: Obstacles, footprint: Array, replan: Replan
+        self, robot: Robot, size: int, plan: Waypoints, known: Obstacles, footprint: Array, replan: Replan
     ) -> None:
         """Makes the stage.
 
@@ -127,18 +129,16 @@ class Reactive(ABC):
             robot: Nominal robot.
             size: Number of robots B.
             plan: The plan with its time law.
-            obstacles: All obstacles; those that move are seen with their place and velocity, but not their course.
+            known: Obstacles on the map; the others are seen by the lidar.
             footprint: Corners of the robot in its frame in m, `(n, 2)`.
             replan: Makes a plan to the goal.
         """
-        self._replan, self._around = replan, Surroundings(obstacles)
+        self._replan, self._sight = replan, Sight(known, size)
         self.bounds = Bounds.of(robot, plan.speed)
         self._size, self._plan, self._discs = size, plan, cover(footprint, DISCS)
-        still = tuple(shape for shape in obstacles.shapes if shape.course is None)
+        self._body = float((np.hypot(self._discs[:, 0], self._discs[:, 1]) + self._discs[:, 2]).max())
         places = plan.sample(np.linspace(0, plan.period, 200)).pose[:, :2]
-        outlines = Surroundings(Obstacles(shapes=still)).at(0.0)
-        self._field = field_of(outlines, places.min(axis=0) - AROUND, places.max(axis=0) + AROUND, CELL)
-        self._moving = Surroundings(Obstacles(shapes=obstacles.moving))
+        self._field = field_of(self._sight.map, places.min(axis=0) - AROUND, places.max(axis=0) + AROUND, CELL)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
@@ -146,6 +146,7 @@ class Reactive(ABC):
         self._tables = [self._sampled(self._plan)] * self._size
         self._anchor, self._since, self._tried = pose[:, :2].copy(), np.zeros(self._size), np.zeros(self._size)
         self.last = np.zeros((self._size, 2))
+        self._sight.forget()
         self.considered: list[Considered | None] = [None] * self._size
 
     def _sampled(self, plan: Waypoints) -> Array:
@@ -154,19 +155,22 @@ class Reactive(ABC):
         poses = plan.sample(self._period / FINE * np.arange(count + 1.0)).pose
         return np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
+    def see(self, row: int, ranges: Array, angles: Array, place: Array, time: float) -> None:
+        """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.Motion`."""
+        self._sight.see(row, ranges, angles, place, time)
+
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns twists that the robots can drive, `(B, 2)`; arguments are those of `mrctl.control.stages.Motion`."""
-        movers = self._movers()
         self.begin(self._tick)
         for row in range(self._size):
             table, first = self._tables[row], self._place[row]
             away = np.hypot(*(table[first : first + AHEAD, :2] - pose[row, :2]).T)
             self._place[row] = first + int(away.argmin())
-            if self._lost(row, pose[row], float(away.min())) and (other := self._planned(pose[row])):
+            if self._lost(row, pose[row], float(away.min())) and (other := self._planned(row, pose[row])):
                 table, self._place[row] = self._sampled(other), 0
                 self._tables[row] = table
             targets = table[np.minimum(self._place[row] + FINE * np.arange(1, STEPS + 1), len(table) - 1)]
-            scene = Scene(targets, self._discs, self._field, movers)
+            scene = Scene(targets, self._discs, self._field, self._near(row, pose[row]))
             self.last[row] = self.choose(row, pose[row], twist[row], self.last[row], self._period, scene)
         self._tick += 1
         return self.last.copy()
@@ -181,8 +185,8 @@ class Reactive(ABC):
             self._tried[row] = now
         return lost
 
-    def _planned(self, pose: Array) -> Waypoints | None:
-        return self._replan(pose, self._around.at(self._period * self._tick))
+    def _planned(self, row: int, pose: Array) -> Waypoints | None:
+        return self._replan(pose, self._sight.outlines(row, self._period * self._tick))
 
     def begin(self, tick: int) -> None:  # noqa: B027 (most have nothing to do)
         """Is called once in a motion period, before `choose` for each robot."""
@@ -200,28 +204,39 @@ class Reactive(ABC):
             scene: What it sees.
         """
 
-    def _movers(self) -> Array:
-        """Returns the circles around the obstacles that move, with the velocities of the last period, `(M, 5)`."""
-        times = self._period * self._tick, self._period * max(0, self._tick - 1)
-        now, before = (np.concatenate([o.discs, o.rings]) for o in map(self._moving.at, times))
-        return np.column_stack([now[:, :2], (now[:, :2] - before[:, :2]) / self._period, now[:, 2]])
+    def _near(self, row: int, pose: Array) -> Array:
+        """Returns the discs that a robot has found and could meet within a roll-out, as in `Scene.movers`."""
+        found, horizon = self._sight.discs(row, self._period * self._tick), self._period * STEPS
+        reach = (self._body + KEPT) + horizon * (self.bounds.speed + np.hypot(found[:, 2], found[:, 3]))
+        return found[np.hypot(*(found[:, :2] - pose[:2]).T) < reach + found[:, 4]]
 
 
 @kernel
-def clearance(x: float, y: float, c: float, s: float, time: float, reach: float, discs: Array, movers: Array) -> float:
-    """Returns the distance in m of the discs of a robot from the obstacles that move, or `KEPT` where it is larger.
+def clearance(
+    x: float, y: float, c: float, s: float, time: float, reach: float, discs: Array, distance: Array, left: float,
+    low: float, resolution: float, movers: Array,
+) -> float:  # fmt: skip
+    """Returns the distance in m of the discs of a robot from all that it knows, or `KEPT` where it is larger.
 
     Args:
         x: x of the robot in m.
         y: y of the robot in m.
         c: Cosine of its heading.
         s: Sine of its heading.
-        time: Time in s, from now on, for which the obstacles go on as they do now.
+        time: Time in s, from now on, for which what moves goes on as it does now.
         reach: Radius in m of a circle around the robot's own point that holds all its discs.
         discs: `Scene.discs`.
+        distance: Distances of `Scene.field`, which is taken apart as for `value`.
+        left: x of its origin in m.
+        low: y of its origin in m.
+        resolution: Side of its cells in m.
         movers: `Scene.movers`.
     """
     free = KEPT
+    if value(distance, left, low, resolution, x, y) < reach + KEPT:  # else no disc can be nearer
+        for d in range(len(discs)):
+            px, py = x + c * discs[d, 0] - s * discs[d, 1], y + s * discs[d, 0] + c * discs[d, 1]
+            free = min(free, value(distance, left, low, resolution, px, py) - discs[d, 2])
     for m in range(len(movers)):
         mx, my = movers[m, 0] + time * movers[m, 2] - x, movers[m, 1] + time * movers[m, 3] - y
         if mx * mx + my * my < (movers[m, 4] + reach + KEPT) ** 2:
@@ -256,6 +271,10 @@ def roll_out(
     steps, reach = len(nominal), 0.0
     for d in range(len(discs)):
         reach = max(reach, np.hypot(discs[d, 0], discs[d, 1]) + discs[d, 2])
+    # The discs reach beyond the robot, and what it finds is noisy: where they touch it already, deeper is a collision.
+    x, y, c, s = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2])
+    least = clearance(x, y, c, s, 0.0, reach, discs, distance, left, low, resolution, movers)
+    least = least - DEEPER if least <= 0 else 0.0
     # While a request is held, what is missing of it decays: to `rest` at the end of a step, to `mean` on its average.
     rest = np.exp(-step / lag) if lag > 0 else 0.0
     mean = (1 - rest) * lag / step
@@ -290,14 +309,8 @@ def roll_out(
             c, s = c * ch - s * sh, s * ch + c * sh
             dx, dy = targets[k, 0] - x, targets[k, 1] - y
             cost += step * (PLACE * (dx * dx + dy * dy) + HEADING * (1 - c * targets[k, 2] - s * targets[k, 3]))
-            free = KEPT
-            if value(distance, left, low, resolution, x, y) < reach + KEPT:  # else no disc can be nearer
-                for d in range(len(discs)):
-                    px, py = x + c * discs[d, 0] - s * discs[d, 1], y + s * discs[d, 0] + c * discs[d, 1]
-                    free = min(free, value(distance, left, low, resolution, px, py) - discs[d, 2])
-            if len(movers) > 0:
-                free = min(free, clearance(x, y, c, s, (k + 1) * step, reach, discs, movers))
-            if free <= 0:
+            free = clearance(x, y, c, s, (k + 1) * step, reach, discs, distance, left, low, resolution, movers)
+            if free <= least:
                 touched = True
                 cost += TOUCH * (1 + (steps - k) / steps)  # the earlier, the worse
             elif free < KEPT:

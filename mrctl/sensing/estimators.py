@@ -16,6 +16,7 @@ from mrctl.kernel import Array, Kernel, Row, Rows, kernel
 from mrctl.sensing.ekf import EKF, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
 from mrctl.sensing.localisation import Localiser
 from mrctl.sensing.prediction import SEEN, front, predict, wrapped
+from mrctl.sensing.scanner import Scanner
 from mrctl.sensing.sensors import Sensors
 from mrctl.sensing.slip import slip_ratio
 from mrctl.sensing.tiers import Sensing
@@ -153,6 +154,7 @@ class Estimator:
         seen: Estimates and samples that the controllers receive, a record of `SEEN` of each robot, `(B,)`.
         memory: State of the estimator, a record of each robot, `(B,)`.
         sensors: The sensors whose samples it receives.
+        scanner: The lidars, or None.
         localiser: Localisation that makes posture fixes from a lidar, or None.
     """
 
@@ -165,7 +167,8 @@ class Estimator:
         imu: Array,
         skew: float,
         tyres: Tyres,
-        obstacles: Obstacles = NO_OBSTACLES,
+        scanner: Scanner | None = None,
+        known: Obstacles = NO_OBSTACLES,
     ) -> None:
         """Builds the estimator.
 
@@ -178,10 +181,11 @@ class Estimator:
             skew: Time in s by which velocities lag behind positions: half a physics step, because the engine integrates
                 positions with the velocities at the end of the step.
             tyres: The tyres of the nominal robot.
-            obstacles: Obstacles that a lidar sees; those that stand still are on its map.
+            scanner: The lidars, which localisation needs; None if there are none.
+            known: Obstacles on the map that localisation uses.
 
         Raises:
-            InputError: Localisation needs a map, and no obstacle stands still, or the map is too large.
+            InputError: Localisation needs a map, and there is none, or it is too large.
         """
         self._law, memory = estimate_with(name).repeated(), ESTIMATORS[name][1]
         self._name, self._sensing, self.sensors = name, list(sensing), sensors
@@ -189,8 +193,9 @@ class Estimator:
         self.seen = np.zeros(len(sensing), SEEN)
         self.memory = np.zeros(len(sensing), memory)
         self._located = self._measured = -1  # last tick in which the method of this name was called
-        scans = any(s.localisation != "fixes" for s in sensing)
-        self.localiser = Localiser(sensing, sensors, robot.wheel_radius, obstacles) if scans else None
+        self.scanner, self.localiser = scanner, None
+        if scanner and any(s.localisation != "fixes" for s in sensing):
+            self.localiser = Localiser(sensing, sensors, scanner, robot.wheel_radius, known)
 
     def start(self, row: int, reading: Row, seed: int, tick: int) -> None:
         """Starts the estimate of one robot from a first fix and an uncertain twist.
@@ -213,9 +218,11 @@ class Estimator:
             deviation[4] = START_TWIST[1] if sensor["gyro_sigma"] else 0.0
         memory, size = self.memory[row], 5
         memory["mean"][:size] = np.append(reading["pose"], reading["twist"]) + deviation * random.standard_normal(size)
+        if self.scanner:
+            self.scanner.start(row, seed, tick)
+            self._located = -1  # the tick may have been located before a robot of an environment began again in it
         if self.localiser:
             self.localiser.start(row, memory["mean"][:3], seed)
-            self._located = -1  # the tick may have been located before a robot of an environment began again in it
         if self._name == "ekf":
             offset = sensing["accelerometer_bias"] ** 2 + START_OFFSET**2
             count = sensor["quantum"] ** 2 / 12
@@ -248,10 +255,12 @@ class Estimator:
         return self.seen
 
     def locate(self, tick: int, plant: Rows) -> None:
-        """Makes the fixes of a tick from a lidar, where there is one; further calls in the same tick do nothing."""
-        if self.localiser and tick != self._located:
+        """Scans, and makes fixes from the scans, where there are lidars; further calls in the same tick do nothing."""
+        if self.scanner and tick != self._located:
             self._located = tick
-            self.localiser.locate(tick, plant, self.seen["estimate"])
+            self.scanner.scan(tick, plant)
+            if self.localiser:
+                self.localiser.locate(tick, self.seen["estimate"])
 
     def estimate(self, tick: int, plant: Rows) -> Rows:
         """Estimates posture and twist of all robots.
@@ -264,7 +273,7 @@ class Estimator:
             `seen`, `(B,)`.
         """
         sensors = self.sensors
-        if self.localiser:
+        if self.scanner:
             self.locate(tick, plant)
         self._law(tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen)
         return self.seen

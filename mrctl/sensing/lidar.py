@@ -41,6 +41,26 @@ class Lidar(Record):
         """Direction of the first beam from straight ahead in rad."""
         return (self.step - self.view) / 2
 
+    @property
+    def angles(self) -> Array:
+        """Directions of the beams from straight ahead in rad, counter-clockwise, `(beams,)`."""
+        return self.first + self.step * np.arange(self.beams)
+
+    def every(self, period: float) -> int:
+        """Returns the time between two scans in control periods of this duration in s.
+
+        Raises:
+            ValueError: It is not a whole number of them.
+        """
+        count = 1 / (self.rate * period)
+        if round(count) < 1 or abs(count - round(count)) > 1e-6:
+            raise ValueError(f"sensing.lidar.rate: {self.rate:g} Hz is no whole fraction of the control rate")
+        return round(count)
+
+    def place(self, pose: Array) -> Array:
+        """Returns the pose of the lidar in m, m, rad, `(3,)`, where P is at this pose."""
+        return np.append(turned(np.array([[self.x, 0.0]]), pose)[0], pose[2])
+
     def scan(self, pose: Array, outlines: Outlines, random: np.random.Generator) -> Array:
         """Takes a scan.
 
@@ -53,8 +73,7 @@ class Lidar(Record):
             Ranges in m, `(beams,)`; infinite where nothing returns, as in ROS (REP 117).
         """
         ranges = np.empty(self.beams)
-        sensor = np.append(turned(np.array([[self.x, 0.0]]), pose)[0], pose[2])
-        cast.compiled(sensor, self.first, self.step, self.range, outlines, ranges)
+        cast.compiled(self.place(pose), self.first, self.step, self.range, outlines, ranges)
         noise, chance = random.standard_normal(self.beams), random.uniform(size=self.beams)
         ranges[(ranges >= self.range) | (chance < self.lost)] = np.inf
         return np.maximum(ranges + self.noise * noise, 0.0)

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mrctl.kernel import Array, Rows
+from mrctl.kernel import Array
 from mrctl.record import InputError
-from mrctl.sensing.lidar import Lidar
 from mrctl.sensing.particles import Particles
 from mrctl.sensing.scan_matching import match
+from mrctl.sensing.scanner import Scanner
 from mrctl.sensing.sensors import Sensors
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.grid import MOST_CELLS, field_of
@@ -23,38 +23,34 @@ AGREES = 0.5  # share of the points of a scan that must lie on the map for a fix
 
 
 class Localiser:
-    """Lidar and localisation of B robots, which share a map.
+    """Localisation of B robots by their lidars on the same map.
 
     Attributes:
-        scans: Last scan of each robot, ranges in m, `(beams,)`; None before the first one, and without a lidar.
-        taken: Control tick at which each of them was taken, `(B,)`.
         filters: Particle filter of each robot, or None.
     """
 
-    def __init__(self, sensing: Sequence[Sensing], sensors: Sensors, wheel_radius: float, obstacles: Obstacles) -> None:
+    def __init__(
+        self, sensing: Sequence[Sensing], sensors: Sensors, scanner: Scanner, wheel_radius: float, known: Obstacles
+    ) -> None:
         """Makes the map.
 
         Args:
             sensing: Sensing of each robot.
             sensors: The sensors, whose encoders and gyros are read and whose fixes are replaced.
+            scanner: The lidars.
             wheel_radius: Nominal radius of the driven wheels in m.
-            obstacles: The obstacles.
+            known: Obstacles on the map.
 
         Raises:
-            InputError: No obstacle stands still, or the map is too large.
+            InputError: There are none, or the map is too large.
         """
-        self._sensing, self._sensors, self._radius = list(sensing), sensors, wheel_radius
-        self._surroundings = Surroundings(obstacles)
-        still = Obstacles(shapes=tuple(shape for shape in obstacles.shapes if shape.course is None))
-        if not still.shapes:
+        self._sensing, self._sensors, self._scanner, self._radius = list(sensing), sensors, scanner, wheel_radius
+        if not known.shapes:
             raise InputError("sensing.localisation: no obstacle stands still, so there is no map to localise on")
-        low, high = (corner + side * MARGIN for corner, side in zip(still.bounds, (-1, 1), strict=True))
+        low, high = (corner + side * MARGIN for corner, side in zip(known.bounds, (-1, 1), strict=True))
         cell = max(CELL, float(np.sqrt(np.prod(high - low) / MOST_CELLS)) * 1.01)
-        self._map = field_of(Surroundings(still).at(0.0), low, high, cell)
-        self.scans: list[Array | None] = [None] * len(sensing)
-        self.taken = np.zeros(len(sensing), int)
+        self._map = field_of(Surroundings(known).at(0.0), low, high, cell)
         self.filters: list[Particles | None] = [None] * len(sensing)
-        self._random = [np.random.default_rng()] * len(sensing)
         self._odometry = np.zeros((len(sensing), 2))  # distance in m and turn in rad since the last scan
 
     def start(self, row: int, pose: Array, seed: int) -> None:
@@ -63,18 +59,17 @@ class Localiser:
         Args:
             row: Index of the robot.
             pose: x and y in m and θ in rad, `(3,)`.
-            seed: Seed of its lidar and its particles.
+            seed: Seed of its particles.
         """
-        self._random[row], self._odometry[row] = np.random.default_rng([seed, 6]), 0.0
+        self._odometry[row] = 0.0
         if self._sensing[row].localisation == "particles":
             self.filters[row] = Particles(self._map, seed, pose.copy())
 
-    def locate(self, tick: int, plant: Rows, estimate: Array) -> None:
-        """Adds up the odometry and, in the ticks in which fixes are taken, takes scans and makes the fixes from them.
+    def locate(self, tick: int, estimate: Array) -> None:
+        """Adds up the odometry, and makes the fixes from the scans of this tick.
 
         Args:
             tick: Control tick.
-            plant: Record of `PLANT` of each robot, `(B,)`; the lidar scans from its true pose.
             estimate: Estimate of a period ago, x, y in m, θ in rad, V in m/s and θ̇ in rad/s, `(B, 5)`.
         """
         sensors, period = self._sensors, self._sensors.period
@@ -82,18 +77,14 @@ class Localiser:
         begun = tick > sensors.sensors["start"]
         self._odometry[:, 0] += begun * self._radius * (now["encoder"] - last["encoder"]).mean(axis=1)
         self._odometry[:, 1] += begun * period * (now["gyro"] + last["gyro"]) / 2
-        for row in np.flatnonzero(now["fix_taken"] & ~plant["failed"]):
-            sensing, since = self._sensing[row], tick - sensors.sensors["start"][row]
-            if sensing.localisation == "fixes":
+        for row in np.flatnonzero(self._scanner.taken == tick):
+            sensing, scan = self._sensing[row], self._scanner.scans[row]
+            if sensing.localisation == "fixes" or scan is None:
                 continue
-            lidar: Lidar = sensing.lidar
-            around = self._surroundings.at(since * period)
-            scan = lidar.scan(plant["reading"]["pose"][row], around, self._random[row])
-            self.scans[row], self.taken[row] = scan, tick
-            points = lidar.points(scan, BEAMS[sensing.localisation])
+            points = sensing.lidar.points(scan, BEAMS[sensing.localisation])
             if particles := self.filters[row]:
                 found = particles.update(float(self._odometry[row, 0]), float(self._odometry[row, 1]), points)
-            elif since == 0:
+            elif not begun[row]:
                 continue  # there is no estimate yet
             else:
                 x, y, theta, v, omega = estimate[row]

@@ -85,7 +85,7 @@ class Sensing(Record):
     """Source of posture and twist: the `truth`, `odometry` from encoders and gyro, or an extended Kalman filter, `ekf`;
     by default the truth in the ideal tier and the filter in the others."""
     localisation: Localisation = "fixes"
-    """Source of posture fixes: the `fixes` below, or a lidar and a map of the obstacles that stand still, by matching
+    """Source of posture fixes: the `fixes` below, or a lidar and the map of the scenario, by matching
     each `scan` with the map or by a filter of `particles`."""
     lidar: Lidar = Lidar()
     """Lidar, which only `scan` and `particles` of `localisation` use."""
@@ -217,8 +217,7 @@ class Sensing(Record):
         if self.localisation != "fixes":
             if self.fix_rate is not None:
                 raise ValueError("sensing.fix_rate: with a lidar the rate of fixes is that of its scans, lidar.rate")
-            if abs(1 / (self.lidar.rate * control_period) % 1 - 0.5) < 0.5 - 1e-6:
-                raise ValueError(f"sensing.lidar.rate: {self.lidar.rate:g} Hz is no whole fraction of the control rate")
+            self.lidar.every(control_period)
         for name in VALUES:
             if name.endswith(("_rate", "_latency")) or name == "delay":
                 self.periods(name, control_period)

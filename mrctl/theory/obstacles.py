@@ -120,6 +120,11 @@ class Obstacles(Record):
         return tuple(shape for shape in self.shapes if shape.course is None)
 
     @property
+    def still(self) -> Obstacles:
+        """World of the obstacles that stand still alone."""
+        return Obstacles(shapes=self.standing)
+
+    @property
     def moving(self) -> tuple[Disc | Box | Polygon, ...]:
         """Obstacles that move."""
         return tuple(shape for shape in self.shapes if shape.course is not None)
@@ -131,7 +136,7 @@ class Obstacles(Record):
         Raises:
             InputError: No obstacle stands still.
         """
-        outlines = Surroundings(Obstacles(shapes=tuple(s for s in self.shapes if s.course is None))).at(0.0)
+        outlines = Surroundings(self.still).at(0.0)
         points = [outlines.edges[:, :2], *(outlines.discs[:, :2] + s * outlines.discs[:, 2:] for s in (-1, 1))]
         whole = np.concatenate(points)
         if not len(whole):

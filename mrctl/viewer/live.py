@@ -73,6 +73,7 @@ HIDDEN = (
     "laps",
     "events",
     "obstacles",
+    "map",
     "initial_pose",
     "goal",
     "initial_spread",

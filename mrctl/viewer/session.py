@@ -32,7 +32,7 @@ from mrctl.theory.timing import RESERVE, Limits
 
 HOUR = 3600.0  # s of simulated time after which a session ends
 SEEN_PUSH = 0.5  # s, for which a push is drawn, at least
-SHARED_FIELDS = ("world", "obstacles", "robot", "steering", "control_period", "physics_step")
+SHARED_FIELDS = ("world", "obstacles", "map", "robot", "steering", "control_period", "physics_step")
 # Fields of a scenario that can change in the middle of a run; a change of another field needs a new run.
 CHANGEABLE = [name for name in ("perturbation", "kanayama", "pid") if name in Event.model_fields]
 
@@ -165,7 +165,7 @@ class Session:
     def head_for(self, goal: Pose) -> Plan:
         """Plans a way for the first robot from where it is, and gives it to every robot as an event.
 
-        The plan keeps 5 cm from obstacles that stand still, or 2 cm where the robot is nearer than that now.
+        The plan keeps 5 cm from obstacles on the map, or 2 cm where the robot is nearer than that now.
 
         Args:
             goal: x and y in m and θ in rad.
@@ -176,11 +176,12 @@ class Session:
         """
         x, y, theta = self._pose("goal")
         first = self.start[0]
-        task = {"obstacles": first.obstacles, "start": (x, y, remainder(theta, 2 * pi)), "goal": goal}
-        near = clearance(self._footprint, np.array([x, y, theta]), self._surroundings.at(self.time))
+        start = x, y, remainder(theta, 2 * pi)
+        task = Task.from_dict({"obstacles": first.obstacles, "map": first.map, "start": start, "goal": goal})
+        near = clearance(self._footprint, np.array(start), Surroundings(first.known).at(0.0))
         plan = followed(self.saved()[0], self.time)
         speed = plan.speed if isinstance(plan, Waypoints) else None
-        found, driven = prepared(Task.from_dict(task), first, speed, MARGIN if near > MARGIN else SLIM)
+        found, driven = prepared(task, first, speed, MARGIN if near > MARGIN else SLIM)
         self.apply(reference=driven.reference)
         return found
 
@@ -301,17 +302,17 @@ class Session:
         return self._clearance[first:now]
 
     def scan(self, row: int) -> tuple[Array, Array] | None:
-        """Returns what the localisation of a robot has of the last scan; None where no lidar has scanned yet.
+        """Returns what a robot has of its last scan; None where no lidar has scanned yet.
 
         Returns:
             Places in the world that the beams met, as seen from the true pose, in m, `(n, 2)`; and the particles, poses
             in m, m, rad, `(k, 3)`, none with scan matching.
         """
         sim, k = self._place[row]
-        localiser = sim.estimator.localiser
-        if localiser is None or (ranges := localiser.scans[k]) is None or localiser.taken[k] >= sim.tick:
+        scanner, localiser = sim.estimator.scanner, sim.estimator.localiser
+        if scanner is None or (ranges := scanner.scans[k]) is None or scanner.taken[k] >= sim.tick:
             return None
-        then, particles = sim.log.ticks[localiser.taken[k], k], localiser.filters[k]
+        then, particles = sim.log.ticks[scanner.taken[k], k], localiser.filters[k] if localiser else None
         pose = np.array([then["x"], then["y"], then["theta"]])
         met = turned(self.start[row].sensing.lidar.points(ranges), pose)
         return met, np.zeros((0, 3)) if particles is None else particles.particles

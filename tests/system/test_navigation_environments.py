@@ -100,7 +100,7 @@ def test_bits():
         assert info == {"failure": "collision"} and len(signals) > 200
         for k, name in enumerate(NAMES):
             assert np.array_equal(signals[:, k], expected[name].values[: len(signals)], equal_nan=True), name
-        scan = env.episodes.loop.estimator.localiser.scans[0]
+        scan = env.episodes.loop.estimator.scanner.scans[0]
         assert np.array_equal(seen[-1, 5:], np.minimum(scan, 4.0))
 
 

@@ -194,7 +194,7 @@ def test_paced_plan_is_driven_whole() -> None:
     footprint = np.array([[-0.1, -0.225], [0.44, -0.225], [0.44, 0.225], [-0.1, 0.225]])
     outlines, pose, period = Surroundings(scenario.obstacles).at(0.0), np.zeros((2, 3)), 0.01
     pose[:] = plan.sample(np.zeros(1)).pose
-    stage = Pacing(robot, 2, scenario, rim(footprint, 0.02), -0.01, 0.1)
+    stage = Pacing(robot, 2, scenario, footprint, lambda pose, outlines: None)
     stage.reset(pose, np.zeros((2, 7)), period)
     way, ticks = plan.sample(np.linspace(0, plan.period, 4000)).pose, 0
     least = min(clearance(footprint, place, outlines) for place in way)

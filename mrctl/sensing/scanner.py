@@ -1,0 +1,62 @@
+"""The lidars of B robots, whose scans serve localisation, motion controllers that avoid obstacles, and agents."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mrctl.kernel import Array, Rows
+from mrctl.record import InputError
+from mrctl.sensing.tiers import Sensing
+from mrctl.theory.obstacles import Obstacles, Surroundings
+
+
+class Scanner:
+    """Lidars that scan from the true poses of their robots, at the first tick of a run and then at their own rates.
+
+    Attributes:
+        lidars: Lidar of each robot.
+        scans: Last scan of each robot, ranges in m, `(beams,)`; None before the first one.
+        taken: Control tick at which each of them was taken, `(B,)`; −1 before the first one.
+    """
+
+    def __init__(self, sensing: Sequence[Sensing], period: float, obstacles: Obstacles) -> None:
+        """Takes what the lidars need.
+
+        Args:
+            sensing: Sensing of each robot.
+            period: Control period in s.
+            obstacles: Obstacles that the beams meet.
+
+        Raises:
+            InputError: The time between two scans is not a whole number of control periods.
+        """
+        self.lidars, self._period, self._surroundings = [s.lidar for s in sensing], period, Surroundings(obstacles)
+        try:
+            self._every = [lidar.every(period) for lidar in self.lidars]
+        except ValueError as error:
+            raise InputError(str(error)) from None
+        size = len(self.lidars)
+        self.scans: list[Array | None] = [None] * size
+        self.taken, self._start = np.full(size, -1), np.zeros(size, int)
+        self._random = [np.random.default_rng()] * size
+
+    def start(self, row: int, seed: int, tick: int) -> None:
+        """Starts the lidar of one robot; the seed determines its noise, and its first scan is at the coming tick."""
+        self._random[row], self._start[row] = np.random.default_rng([seed, 6]), tick
+        self.scans[row], self.taken[row] = None, -1
+
+    def scan(self, tick: int, plant: Rows) -> None:
+        """Takes the scans that are due in a tick, once.
+
+        Args:
+            tick: Control tick.
+            plant: Record of `PLANT` of each robot, `(B,)`; one that has failed does not scan.
+        """
+        for row, lidar in enumerate(self.lidars):
+            since = int(tick - self._start[row])
+            if since % self._every[row] == 0 and self.taken[row] != tick and not plant["failed"][row]:
+                around = self._surroundings.at(since * self._period)
+                self.scans[row] = lidar.scan(plant["reading"]["pose"][row], around, self._random[row])
+                self.taken[row] = tick

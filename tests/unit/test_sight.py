@@ -1,0 +1,130 @@
+"""What a robot knows of its surroundings: finds beside the map, their velocities, and what is forgotten."""
+
+import numpy as np
+import pytest
+import shapely
+
+from mrctl import Box, Disc, Line, Obstacles
+from mrctl.navigation.sight import RADIUS, SPACING, Sight, through
+from mrctl.sensing.lidar import Lidar
+from mrctl.theory.obstacles import Surroundings
+
+LIDAR = Lidar()
+WALLS = tuple(Box(x=x, y=y, length=0.2 + 6 * (x == 0), width=0.2 + 6 * (y == 0)) for x, y in ((3, 0), (-3, 0), (0, 3)))
+PILLAR = Disc(x=-1.5, y=1.5, radius=0.2)
+
+
+def scanned(sight: Sight, world: Obstacles, pose: np.ndarray, time: float, seed: int = 0, error: float = 0.0) -> None:
+    """Hands a scan from a pose to one robot, which believes to be `error` metres ahead of where it is along x."""
+    ranges = LIDAR.scan(pose, Surroundings(world).at(time), np.random.default_rng([seed, round(10 * time)]))
+    sight.see(0, ranges, LIDAR.angles, LIDAR.place(pose + [error, 0.0, 0.0]), time)
+
+
+def discs(sight: Sight, time: float) -> np.ndarray:
+    return sight.discs(0, time)
+
+
+def test_a_map_that_is_right_hides_nothing_and_shows_nothing() -> None:
+    """From 40 poses, with the noise of the lidar and 2 cm of error in the estimate, nothing is found beside the map."""
+    known, random = Obstacles(shapes=(*WALLS, PILLAR)), np.random.default_rng(1)
+    sight = Sight(known, 1)
+    for k in range(40):
+        pose = np.append(random.uniform(-2.2, 2.2, 2), random.uniform(-3, 3))
+        scanned(sight, known, pose, 0.1 * k, error=0.02)
+        assert not len(discs(sight, 0.1 * k))
+
+
+@pytest.mark.parametrize(
+    ("shape", "outline"),
+    [
+        (Disc(x=1.2, y=0.4, radius=0.25), shapely.Point(1.2, 0.4).buffer(0.25, 64)),
+        (Box(x=1.2, y=-0.5, angle=0.4, length=0.3, width=1.2), None),
+    ],
+)
+def test_what_the_map_lacks_is_found(shape: Disc | Box, outline: shapely.Polygon | None) -> None:
+    """Discs lie along the side of it that beams meet, without gaps, and nowhere else."""
+    outline = outline or shapely.Polygon(shape.vertices)
+    sight = Sight(Obstacles(shapes=WALLS), 1)
+    scanned(sight, Obstacles(shapes=(*WALLS, shape)), np.array([0.0, 0.0, 0.3]), 0.0)
+    found = discs(sight, 0.0)
+    edge = [shapely.Point(x, y).distance(outline.exterior) for x, y in found[:, :2]]
+    assert len(found) >= 4 and max(edge) < 3 * LIDAR.noise and np.all(found[:, 2:4] == 0)
+    exact = Lidar(noise=0.0)
+    ranges = exact.scan(np.zeros(3), Surroundings(Obstacles(shapes=(shape,))).at(0.0), np.random.default_rng(0))
+    met = exact.points(ranges)
+    gaps = np.hypot(*(met[:, None] - found[None, :, :2]).transpose(2, 0, 1)).min(axis=1)
+    assert gaps.max() < SPACING + 3 * LIDAR.noise
+    assert len(sight.outlines(0, 0.0).discs) == len(found) and not len(sight.moving(0, 0.0).discs)
+
+
+@pytest.mark.parametrize("speed", [0.3, 0.5, 0.8])
+def test_velocity(speed: float) -> None:
+    """A disc that crosses 2 m ahead has its velocity to 0.12 m/s after a second, and is where it would be between."""
+    course = Line(heading=np.pi / 2, speed=speed, length=20.0)
+    world = Obstacles(shapes=(*WALLS[:1], Disc(x=-1.5, y=-2.0, radius=0.15, course=course)))
+    sight = Sight(Obstacles(shapes=WALLS[:1]), 1)
+    for k in range(int(2.5 / speed * 10)):
+        scanned(sight, world, np.zeros(3), 0.1 * k)
+        if k >= 10:
+            later = 0.1 * k + 0.05
+            place, now = Surroundings(world).at(later).discs[0], discs(sight, later)
+            assert np.abs(now[:, 2:4] - [0.0, speed]).max() < 0.12
+            assert np.hypot(*(now[:, :2] - place[:2]).T).max() < 0.15 + 4 * LIDAR.noise
+
+
+def test_what_stands_stands() -> None:
+    """A robot that drives past a pillar and along a wall at 1 m/s takes neither for something that moves."""
+    world = Obstacles(shapes=(PILLAR, Box(x=0.0, y=-1.0, length=4.0, width=0.1)))
+    sight = Sight(Obstacles(), 1)
+    for k in range(30):
+        scanned(sight, world, np.array([-3.0 + 0.1 * k, 1.0, 0.0]), 0.1 * k)
+        assert np.all(discs(sight, 0.1 * k)[:, 2:4] == 0)
+
+
+def test_memory() -> None:
+    """What something hides is remembered, what has gone is forgotten when it is seen to have gone."""
+    pillar, screen = Disc(x=2.0, radius=0.15), Box(x=1.0, length=0.1, width=2.0)
+    sight, pose = Sight(Obstacles(), 1), np.zeros(3)
+
+    def near(place: float) -> bool:
+        return bool((np.abs(discs(sight, 0.0)[:, 0] - place) < 0.3).any())
+
+    scanned(sight, Obstacles(shapes=(pillar,)), pose, 0.0)
+    assert near(2.0)
+    scanned(sight, Obstacles(shapes=(pillar, screen)), pose, 0.1)
+    assert near(2.0) and near(1.0)
+    scanned(sight, Obstacles(shapes=(screen,)), pose, 0.2)
+    assert near(2.0)
+    scanned(sight, Obstacles(), pose, 0.3)
+    assert not near(2.0) and not near(1.0)
+
+
+def test_seen_through() -> None:
+    """A place is seen through if every beam that would meet the disc around it goes on beyond, by geometry."""
+    random = np.random.default_rng(2)
+    wall = Obstacles(shapes=(Box(x=2.0, y=0.5, length=0.1, width=1.0),))
+    exact, verdicts = Lidar(noise=0.0), []
+    ranges = exact.scan(np.zeros(3), Surroundings(wall).at(0.0), random)
+    points = np.column_stack([random.uniform(0.3, 5.0, 400), random.uniform(-2.0, 3.0, 400)])
+    seen = through(points, ranges, exact.angles, np.zeros(3))
+    shape = shapely.box(1.95, 0.0, 2.05, 1.0)
+    for point, clear in zip(points, seen, strict=True):
+        away = np.hypot(*point)
+        behind = point * (1 + (0.1 + 0.02 * away) / away)
+        swept = shapely.LineString([(0, 0), behind]).buffer(RADIUS, cap_style="flat")
+        narrow = shapely.LineString([(0, 0), behind]).buffer(0.2 * RADIUS, cap_style="flat")
+        if not swept.buffer(0.05).intersects(shape):
+            assert clear
+        if narrow.intersects(shape):
+            assert not clear
+        verdicts.append(clear)
+    assert 0.2 < np.mean(verdicts) < 0.95
+
+
+def test_robots_do_not_mix() -> None:
+    """A scan of one robot of two changes nothing for the other, and a robot that begins again knows its map alone."""
+    sight = Sight(Obstacles(), 2)
+    scanned(sight, Obstacles(shapes=(PILLAR,)), np.zeros(3), 0.0)
+    assert len(sight.discs(0, 0.0)) and not len(sight.discs(1, 0.0))
+    sight.forget()
+    assert not len(sight.discs(0, 0.0))
