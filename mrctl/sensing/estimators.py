@@ -16,7 +16,7 @@ from mrctl.kernel import Array, Kernel, Row, Rows, kernel
 from mrctl.sensing.ekf import EKF, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
 from mrctl.sensing.localisation import Localiser
 from mrctl.sensing.prediction import SEEN, front, predict, wrapped
-from mrctl.sensing.sensors import Sensors
+from mrctl.sensing.sensors import Sensors, command_all, sample_all
 from mrctl.sensing.slip import slip_ratio
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles
@@ -131,6 +131,30 @@ def estimate(
             s.fix[k] = taken.fix[k] if arrives else np.nan
 
 
+@kernel
+def sense(
+    tick: int, derivative: Array, plant: Rows, noise: Rows, ring: Rows, sensors: Rows, geometry: Array, period: float,
+    memory: Rows, seen: Rows,
+) -> None:  # fmt: skip
+    """Stores the commands of the last tick, samples the sensors and estimates, for all robots.
+
+    Args:
+        tick: Control tick.
+        derivative: Derivative of the twist that was commanded in the last tick, in m/s² and rad/s², `(B, 2)`.
+        plant: Record of `PLANT` of each robot.
+        noise: Random numbers of the sensors, as in `sample_all`.
+        ring: In and out: samples and commands, as in `Sensors`, `(N, B)`.
+        sensors: In and out: record of `SENSOR` of each robot.
+        geometry: As for `truth`.
+        period: Control period in s.
+        memory: In and out: state of the estimator for each robot.
+        seen: Out: record of `SEEN` of each robot.
+    """
+    command_all(tick - 1, derivative, ring)
+    sample_all(tick, plant, noise, period, sensors, ring)
+    estimate(tick, plant, ring, sensors, geometry, period, memory, seen)
+
+
 ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
     "truth": (truth, MOTION),
     "odometry": (odometry, MOTION),
@@ -144,6 +168,12 @@ ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
 def estimate_with(name: str) -> Kernel:
     """Returns the kernel `estimate` with the law of an estimator, cached because compiled code is never freed."""
     return estimate.calling(observe=ESTIMATORS[name][0])
+
+
+@cache
+def sense_with(name: str) -> Kernel:
+    """Returns the kernel `sense` with the law of an estimator."""
+    return sense.calling(estimate=estimate_with(name))
 
 
 class Estimator:
@@ -183,14 +213,15 @@ class Estimator:
         Raises:
             InputError: Localisation needs a map, and no obstacle stands still, or the map is too large.
         """
-        self._law, memory = estimate_with(name).repeated(), ESTIMATORS[name][1]
+        self._sense, self._estimate = sense_with(name).repeated(), estimate_with(name).repeated()
         self._name, self._sensing, self.sensors = name, list(sensing), sensors
         self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew, *tyres])
         self.seen = np.zeros(len(sensing), SEEN)
-        self.memory = np.zeros(len(sensing), memory)
+        self.memory = np.zeros(len(sensing), ESTIMATORS[name][1])
         self._located = self._measured = -1  # last tick in which the method of this name was called
         scans = any(s.localisation != "fixes" for s in sensing)
         self.localiser = Localiser(sensing, sensors, robot.wheel_radius, obstacles) if scans else None
+        self._compiled = not scans and name != "user"  # else Python comes between the samples and the estimate
 
     def start(self, row: int, reading: Row, seed: int, tick: int) -> None:
         """Starts the estimate of one robot from a first fix and an uncertain twist.
@@ -241,10 +272,16 @@ class Estimator:
             `seen`, `(B,)`.
         """
         if tick != self._measured:
-            self._measured = tick
-            self.sensors.command(tick - 1, derivative)
-            self.sensors.measure(tick, plant)
-            self.estimate(tick, plant)
+            self._measured, sensors = tick, self.sensors
+            if self._compiled:
+                records = sensors.noise(tick), sensors.ring, sensors.sensors
+                self._sense(
+                    tick, derivative, plant, *records, self._geometry, sensors.period, self.memory, self.seen
+                )
+            else:
+                sensors.command(tick - 1, derivative)
+                sensors.measure(tick, plant)
+                self.estimate(tick, plant)
         return self.seen
 
     def locate(self, tick: int, plant: Rows) -> None:
@@ -264,7 +301,8 @@ class Estimator:
             `seen`, `(B,)`.
         """
         sensors = self.sensors
-        if self.localiser:
-            self.locate(tick, plant)
-        self._law(tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen)
+        self.locate(tick, plant)
+        self._estimate(
+            tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen
+        )
         return self.seen

@@ -118,6 +118,14 @@ def sample_all(tick: int, plant: Rows, noise: Rows, period: float, sensors: Rows
         sample(tick, plant[i], errors[i], period, sensors[i], last[i], now[i])
 
 
+@kernel
+def command_all(tick: int, derivative: Array, ring: Rows) -> None:
+    """Stores the derivatives of the commanded twists that were computed in a tick, in m/s² and rad/s², `(B, 2)`."""
+    computed = ring[tick % len(ring)]
+    for i in range(len(computed)):
+        computed[i].command[0], computed[i].command[1] = derivative[i, 0], derivative[i, 1]
+
+
 class Sensors:
     """The sensors of B robots.
 
@@ -137,7 +145,6 @@ class Sensors:
         """
         size = len(sensing)
         self.period, self._sensing = period, list(sensing)
-        self._sample = sample_all.repeated()
         self.sensors = np.zeros(size, SENSOR)
         waits = [
             max(s.periods(f"{name}_latency", period) for name in ("encoder", "gyro", "accelerometer", "fix"))
@@ -145,7 +152,6 @@ class Sensors:
             for s in sensing
         ]
         self.ring = np.zeros((max(waits) + 2, size), SAMPLE)
-        self._commands = self.ring["command"]  # a view, made once because that is slow
         self._noise = np.zeros((1, size), NOISE)
         self._random: list[dict[str, np.random.Generator]] = [{} for _ in range(size)]
         for row, seed in enumerate(seeds):
@@ -203,11 +209,15 @@ class Sensors:
             tick: The control tick.
             plant: Record of `PLANT` of each robot, `(B,)`.
         """
+        sample_all.compiled(tick, plant, self.noise(tick), self.period, self.sensors, self.ring)
+
+    def noise(self, tick: int) -> Rows:
+        """Returns the random numbers of a block of ticks, records of `NOISE`, which are drawn in its first tick."""
         if tick % BLOCK == 0:
             for row in range(len(self.sensors)):
                 self._draw(row, 0, tick)
-        self._sample(tick, plant, self._noise, self.period, self.sensors, self.ring)
+        return self._noise
 
     def command(self, tick: int, derivative: Array) -> None:
         """Stores the derivative of the commanded twist that was computed in a tick, in m/s² and rad/s², `(B, 2)`."""
-        self._commands[tick % len(self._commands)] = derivative
+        command_all.compiled(tick, derivative, self.ring)
