@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
 
-from mrctl.kernel import Array, Kernel, Row, Rows, kernel
+from mrctl.kernel import Array, Held, Kernel, Row, Rows, kernel
 from mrctl.sensing.ekf import EKF, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
 from mrctl.sensing.localisation import Localiser
 from mrctl.sensing.prediction import SEEN, front, predict, wrapped
@@ -131,25 +132,23 @@ def estimate(
             s.fix[k] = taken.fix[k] if arrives else np.nan
 
 
+def held(place: int) -> tuple[Any, ...]:
+    """Returns the arrays of `sense`; the reader of a `Held` replaces it."""
+    raise NotImplementedError
+
+
 @kernel
-def sense(
-    tick: int, derivative: Array, plant: Rows, noise: Rows, ring: Rows, sensors: Rows, geometry: Array, period: float,
-    memory: Rows, seen: Rows,
-) -> None:  # fmt: skip
+def sense(tick: int, plant: Rows, derivative: Array, period: float, place: int) -> None:
     """Stores the commands of the last tick, samples the sensors and estimates, for all robots.
 
     Args:
         tick: Control tick.
-        derivative: Derivative of the twist that was commanded in the last tick, in m/s² and rad/s², `(B, 2)`.
         plant: Record of `PLANT` of each robot.
-        noise: Random numbers of the sensors, as in `sample_all`.
-        ring: In and out: samples and commands, as in `Sensors`, `(N, B)`.
-        sensors: In and out: record of `SENSOR` of each robot.
-        geometry: As for `truth`.
+        derivative: Derivative of the twist that was commanded in the last tick, in m/s² and rad/s², `(B, 2)`.
         period: Control period in s.
-        memory: In and out: state of the estimator for each robot.
-        seen: Out: record of `SEEN` of each robot.
+        place: Address of the other arrays that `sample_all` and `estimate` take (see `Held`).
     """
+    noise, ring, sensors, geometry, memory, seen = held(place)
     command_all(tick - 1, derivative, ring)
     sample_all(tick, plant, noise, period, sensors, ring)
     estimate(tick, plant, ring, sensors, geometry, period, memory, seen)
@@ -171,9 +170,9 @@ def estimate_with(name: str) -> Kernel:
 
 
 @cache
-def sense_with(name: str) -> Kernel:
-    """Returns the kernel `sense` with the law of an estimator."""
-    return sense.calling(estimate=estimate_with(name))
+def sense_with(name: str, reader: Any) -> Kernel:  # noqa: ANN401
+    """Returns the kernel `sense` with the law of an estimator, and with the reader of a `Held`."""
+    return sense.calling(estimate=estimate_with(name), held=reader)
 
 
 class Estimator:
@@ -213,7 +212,7 @@ class Estimator:
         Raises:
             InputError: Localisation needs a map, and no obstacle stands still, or the map is too large.
         """
-        self._sense, self._estimate = sense_with(name).repeated(), estimate_with(name).repeated()
+        self._estimate = estimate_with(name).repeated()
         self._name, self._sensing, self.sensors = name, list(sensing), sensors
         self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew, *tyres])
         self.seen = np.zeros(len(sensing), SEEN)
@@ -221,6 +220,9 @@ class Estimator:
         self._located = self._measured = -1  # last tick in which the method of this name was called
         scans = any(s.localisation != "fixes" for s in sensing)
         self.localiser = Localiser(sensing, sensors, robot.wheel_radius, obstacles) if scans else None
+        arrays = sensors.noise, sensors.ring, sensors.sensors, self._geometry, self.memory, self.seen
+        self._held = Held(*arrays)
+        self._sense = sense_with(name, self._held.reader).repeated()
         self._compiled = not scans and name != "user"  # else Python comes between the samples and the estimate
 
     def start(self, row: int, reading: Row, seed: int, tick: int) -> None:
@@ -274,10 +276,8 @@ class Estimator:
         if tick != self._measured:
             self._measured, sensors = tick, self.sensors
             if self._compiled:
-                records = sensors.noise(tick), sensors.ring, sensors.sensors
-                self._sense(
-                    tick, derivative, plant, *records, self._geometry, sensors.period, self.memory, self.seen
-                )
+                sensors.draw(tick)
+                self._sense(tick, plant, derivative, sensors.period, self._held.place)
             else:
                 sensors.command(tick - 1, derivative)
                 sensors.measure(tick, plant)
