@@ -38,7 +38,6 @@ from mrctl.physics.stand import stand
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
 from mrctl.sensing.estimators import Estimator
-from mrctl.sensing.sensors import Sensors
 from mrctl.sensing.tiers import Sensing, Tier
 from mrctl.theory.kinematics import steering_angle
 
@@ -49,8 +48,7 @@ WARM = 20  # control periods before the measurement begins
 CONTROLS = ["voltage_left", "voltage_right", "steering_command", "steering_rate_command"]
 PARTS: dict[str, tuple[Any, str]] = {
     "physics": (BatchPlant, "_advance"),
-    "sensors": (Sensors, "measure"),
-    "estimator": (Estimator, "estimate"),
+    "sensors and estimator": (Estimator, "measure"),
     "control and learning": (Hierarchy, "update"),
     "actuation (delay, supply)": (Plant, "send"),
     "readout, currents": (Plant, "look"),
@@ -96,7 +94,7 @@ def run(
         "threads": [_compare(middle, count, repetitions, chunk) for count in tqdm(threads, desc="threads")],
         "lab": _compare(middle, 1, repetitions, chunk, "lab"),
         "parts": parts,
-        "sensing_share": {size: (p["sensors"] + p["estimator"]) / sum(p.values()) for size, p in parts.items()},
+        "sensing_share": {size: p["sensors and estimator"] / sum(p.values()) for size, p in parts.items()},
         "today": _today(repetitions, chunk),
         "navigation": bench_navigation.run(repetitions, worlds),
     }

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
 
-from mrctl.kernel import Array, Kernel, Row, Rows, kernel
+from mrctl.kernel import Array, Held, Kernel, Row, Rows, kernel
 from mrctl.sensing.ekf import EKF, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
 from mrctl.sensing.localisation import Localiser
 from mrctl.sensing.prediction import SEEN, front, predict, wrapped
 from mrctl.sensing.scanner import Scanner
-from mrctl.sensing.sensors import Sensors
+from mrctl.sensing.sensors import Sensors, command_all, sample_all
 from mrctl.sensing.slip import slip_ratio
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles
@@ -132,6 +133,28 @@ def estimate(
             s.fix[k] = taken.fix[k] if arrives else np.nan
 
 
+def held(place: int) -> tuple[Any, ...]:
+    """Returns the arrays of `sense`; the reader of a `Held` replaces it."""
+    raise NotImplementedError
+
+
+@kernel
+def sense(tick: int, plant: Rows, derivative: Array, period: float, place: int) -> None:
+    """Stores the commands of the last tick, samples the sensors and estimates, for all robots.
+
+    Args:
+        tick: Control tick.
+        plant: Record of `PLANT` of each robot.
+        derivative: Derivative of the twist that was commanded in the last tick, in m/s² and rad/s², `(B, 2)`.
+        period: Control period in s.
+        place: Address of the other arrays that `sample_all` and `estimate` take (see `Held`).
+    """
+    noise, ring, sensors, geometry, memory, seen = held(place)
+    command_all(tick - 1, derivative, ring)
+    sample_all(tick, plant, noise, period, sensors, ring)
+    estimate(tick, plant, ring, sensors, geometry, period, memory, seen)
+
+
 ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
     "truth": (truth, MOTION),
     "odometry": (odometry, MOTION),
@@ -145,6 +168,12 @@ ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
 def estimate_with(name: str) -> Kernel:
     """Returns the kernel `estimate` with the law of an estimator, cached because compiled code is never freed."""
     return estimate.calling(observe=ESTIMATORS[name][0])
+
+
+@cache
+def sense_with(name: str, reader: Any) -> Kernel:  # noqa: ANN401
+    """Returns the kernel `sense` with the law of an estimator, and with the reader of a `Held`."""
+    return sense.calling(estimate=estimate_with(name), held=reader)
 
 
 class Estimator:
@@ -187,15 +216,19 @@ class Estimator:
         Raises:
             InputError: Localisation needs a map, and there is none, or it is too large.
         """
-        self._law, memory = estimate_with(name).repeated(), ESTIMATORS[name][1]
+        self._estimate = estimate_with(name).repeated()
         self._name, self._sensing, self.sensors = name, list(sensing), sensors
         self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew, *tyres])
         self.seen = np.zeros(len(sensing), SEEN)
-        self.memory = np.zeros(len(sensing), memory)
+        self.memory = np.zeros(len(sensing), ESTIMATORS[name][1])
         self._located = self._measured = -1  # last tick in which the method of this name was called
         self.scanner, self.localiser = scanner, None
         if scanner and any(s.localisation != "fixes" for s in sensing):
             self.localiser = Localiser(sensing, sensors, scanner, robot.wheel_radius, known)
+        arrays = sensors.noise, sensors.ring, sensors.sensors, self._geometry, self.memory, self.seen
+        self._held = Held(*arrays)
+        self._sense = sense_with(name, self._held.reader).repeated()
+        self._compiled = scanner is None and name != "user"  # else Python comes between the samples and the estimate
 
     def start(self, row: int, reading: Row, seed: int, tick: int) -> None:
         """Starts the estimate of one robot from a first fix and an uncertain twist.
@@ -248,10 +281,14 @@ class Estimator:
             `seen`, `(B,)`.
         """
         if tick != self._measured:
-            self._measured = tick
-            self.sensors.command(tick - 1, derivative)
-            self.sensors.measure(tick, plant)
-            self.estimate(tick, plant)
+            self._measured, sensors = tick, self.sensors
+            if self._compiled:
+                sensors.draw(tick)
+                self._sense(tick, plant, derivative, sensors.period, self._held.place)
+            else:
+                sensors.command(tick - 1, derivative)
+                sensors.measure(tick, plant)
+                self.estimate(tick, plant)
         return self.seen
 
     def locate(self, tick: int, plant: Rows) -> None:
@@ -273,7 +310,8 @@ class Estimator:
             `seen`, `(B,)`.
         """
         sensors = self.sensors
-        if self.scanner:
-            self.locate(tick, plant)
-        self._law(tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen)
+        self.locate(tick, plant)
+        self._estimate(
+            tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen
+        )
         return self.seen

@@ -42,6 +42,12 @@ NOISE = np.dtype([("gyro", "f8", 2), ("accelerometer", "f8", 4), ("fix", "f8", 3
 # Standard normal numbers of one tick: noise of the gyro and step of its bias; noise of the accelerometer's two axes and
 # steps of their biases; noise of a fix. `chance` is uniform in [0, 1): loss of a fix, outlier, its errors in x and y.
 
+RANDOM = (
+    "gyro_noise", "gyro_walk", "accelerometer_noise", "accelerometer_walk", "fix_position_noise", "fix_heading_noise",
+    "fix_lost", "fix_outliers",
+)  # fmt: skip
+"""Settings of `Sensing` with which a tick needs random numbers."""
+
 SAMPLE = np.dtype(
     [
         ("encoder", "f8", 2),  # measured angles of the rear wheels, left and right, rad
@@ -118,11 +124,20 @@ def sample_all(tick: int, plant: Rows, noise: Rows, period: float, sensors: Rows
         sample(tick, plant[i], errors[i], period, sensors[i], last[i], now[i])
 
 
+@kernel
+def command_all(tick: int, derivative: Array, ring: Rows) -> None:
+    """Stores the derivatives of the commanded twists that were computed in a tick, in m/s² and rad/s², `(B, 2)`."""
+    computed = ring[tick % len(ring)]
+    for i in range(len(computed)):
+        computed[i].command[0], computed[i].command[1] = derivative[i, 0], derivative[i, 1]
+
+
 class Sensors:
     """The sensors of B robots.
 
     Attributes:
         period: Control period in s.
+        noise: Random numbers of a block of ticks, records of `NOISE`, `(BLOCK, B)`; `(1, B)` zeros if none are needed.
         ring: Samples of the last N ticks, records of `SAMPLE`, `(N, B)`; row tick % N holds those of a tick.
         sensors: Constants and biases of each robot's sensors, a record of `SENSOR`, `(B,)`.
     """
@@ -137,7 +152,6 @@ class Sensors:
         """
         size = len(sensing)
         self.period, self._sensing = period, list(sensing)
-        self._sample = sample_all.repeated()
         self.sensors = np.zeros(size, SENSOR)
         waits = [
             max(s.periods(f"{name}_latency", period) for name in ("encoder", "gyro", "accelerometer", "fix"))
@@ -145,8 +159,8 @@ class Sensors:
             for s in sensing
         ]
         self.ring = np.zeros((max(waits) + 2, size), SAMPLE)
-        self._commands = self.ring["command"]  # a view, made once because that is slow
-        self._noise = np.zeros((1, size), NOISE)
+        self._noisy = [any(s[name] for name in RANDOM) for s in sensing]
+        self.noise = np.zeros((BLOCK if any(self._noisy) else 1, size), NOISE)
         self._random: list[dict[str, np.random.Generator]] = [{} for _ in range(size)]
         for row, seed in enumerate(seeds):
             self.restart(row, seed, 0)
@@ -181,13 +195,9 @@ class Sensors:
 
     def _draw(self, row: int, first: int, tick: int) -> None:
         """Draws the noise of one robot for the rest of a block, from index `first` on, which belongs to `tick`."""
-        s, random, noise = self.sensors[row], self._random[row], self._noise
-        if not any(s[name] for name in ("gyro_sigma", "gyro_step", "accelerometer_sigma", "accelerometer_step")) and (
-            not s["fix_sigma"].any() and not s["fix_lost"] and not s["fix_outliers"]
-        ):
+        if not self._noisy[row]:
             return
-        if len(noise) < BLOCK:
-            self._noise = noise = np.zeros((BLOCK, len(self.sensors)), NOISE)
+        s, random, noise = self.sensors[row], self._random[row], self.noise
         count = BLOCK - first
         for name in ("gyro", "accelerometer"):
             noise[name][first:, row] = random[name].standard_normal((count, noise[name].shape[-1]))
@@ -203,11 +213,15 @@ class Sensors:
             tick: The control tick.
             plant: Record of `PLANT` of each robot, `(B,)`.
         """
+        self.draw(tick)
+        sample_all.compiled(tick, plant, self.noise, self.period, self.sensors, self.ring)
+
+    def draw(self, tick: int) -> None:
+        """Draws the noise of a block of ticks, if the tick is the first one of it."""
         if tick % BLOCK == 0:
             for row in range(len(self.sensors)):
                 self._draw(row, 0, tick)
-        self._sample(tick, plant, self._noise, self.period, self.sensors, self.ring)
 
     def command(self, tick: int, derivative: Array) -> None:
         """Stores the derivative of the commanded twist that was computed in a tick, in m/s² and rad/s², `(B, 2)`."""
-        self._commands[tick % len(self._commands)] = derivative
+        command_all.compiled(tick, derivative, self.ring)

@@ -17,7 +17,7 @@ from numba import njit
 import mrctl
 from mrctl import Event, Line, Scenario, Sensing
 from mrctl.envs.gym import TrackingEnv, TrackingVectorEnv
-from mrctl.kernel import Kernel, kernel, over_rows
+from mrctl.kernel import Held, Kernel, kernel, over_rows
 from mrctl.loop.announcement import announced, called
 from mrctl.loop.simulation import Simulation, run, simulate
 from mrctl.physics.files import models_folder
@@ -86,6 +86,32 @@ def test_repeated():
         again(1.0, row)
     with pytest.raises(TypeError):  # records of another size are noticed, others with the same size are not
         again(1.0, np.zeros(1), sums)
+
+
+def held(place):
+    """The arrays of `turned`; the reader of a `Held` replaces it."""
+
+
+@kernel
+def turned(factor: float, place: int) -> None:
+    """Writes a matrix times a factor, with its axes exchanged, to the places of records."""
+    matrix, rows = held(place)
+    for k in range(2):
+        for i in range(len(rows)):
+            rows[i].place[k] = factor * matrix[k, i]
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_held(size):
+    """A kernel finds arrays where they are, also views that are not contiguous, and what is written to them later."""
+    whole, rows = np.arange(4.0 * size).reshape(size, 4), np.zeros(size, [("name", "i8"), ("place", "f8", 2)])
+    matrix = whole[:, 1:3].T
+    arrays = Held(matrix, rows)
+    law = turned.calling(held=arrays.reader).repeated()
+    for factor in (0.5, -3.0):
+        law(factor, arrays.place)
+        assert np.array_equal(rows["place"], factor * whole[:, 1:3])
+        whole += 1.0
 
 
 def checked(self):
