@@ -6,6 +6,9 @@ run in the open shows how wide the corridor must be for them to touch none: a ru
 width, and any other an infinite one. The critical width is what 95 % of the draws need at most, at the largest speed;
 the allowance is the same of the width beyond that of the plan, which perfect tracking needs. The critical speed is the
 largest at which, and at all slower ones, 95 % of the draws need no more than a given allowance.
+
+The error budget of the allowance takes away one source of error after the other: that of the map, on which the corridor
+is drawn `MAP_ERROR` beside its place (one standard deviation), that of the estimate, and that of tracking.
 """
 
 from __future__ import annotations
@@ -47,6 +50,7 @@ SPEEDS = (0.3, 0.45, 0.6, 0.75, RESERVE)  # over the robot's largest
 SHAPE: dict[str, Any] = {"pieces": 3, "length": 2.0, "turn": np.pi / 4}  # of the corridors, in m and rad
 ROOMY = 1.5  # width of the corridor of a plan over that of the robot
 MARGINS = (0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)  # of the plan, over half of the rest; the largest that it can keep
+MAP_ERROR = 0.01  # m, standard deviation of the offset of a corridor from its place on the map; chosen
 SLACK = 0.005  # m, the allowance for the critical speed; chosen
 MOST = 10  # corridors that are made, over the number of draws
 SHARE = 0.95
@@ -73,6 +77,8 @@ class Found(NamedTuple):
 
     needed: Array
     """At each speed, `(speeds, controllers, plants, draws)`."""
+    map_off: Array
+    """At the largest speed, if the map is wrong, `(controllers, plants, draws)`."""
     posture_known: Array
     """At the largest speed, where the true posture replaces the estimate, `(controllers, plants, draws)`."""
     on_reference: Array
@@ -125,22 +131,22 @@ def drive(base: Scenario, count: int) -> Found:
     runs = count * len(CONTROLLERS) * len(PLANTS) * (len(SPEEDS) + 1)
     print(f"{runs:,} runs, about {max(1, round(minutes))} min on {cores()} cores", flush=True)
     size = len(CONTROLLERS), len(PLANTS), count
-    needed, known, on_reference = np.empty((len(SPEEDS), *size)), np.empty(size), np.empty(size)
+    needed, known, on_reference, off = np.empty((len(SPEEDS), *size)), *(np.empty(size) for _ in range(3))
     with tqdm(total=len(CONTROLLERS) * (len(SPEEDS) + 1), unit="batch") as bar:
         for c, name in enumerate(CONTROLLERS):
             own = base.replace(**FEEDFORWARDS[name])
             for k in range(len(SPEEDS)):
-                needed[k, c], on_reference[c] = _widths(_simulated(own, draws, k), draws, corners)
+                needed[k, c], on_reference[c], off[c] = _widths(_simulated(own, draws, k), draws, corners)
                 bar.update()
             informed = own.replace(sensing=own.sensing.replace(estimator="truth"))
-            known[c], _ = _widths(_simulated(informed, draws, -1), draws, corners)
+            known[c] = _widths(_simulated(informed, draws, -1), draws, corners)[0]
             bar.update()
     plans = []
     for one in draws:
         fastest = one.references[-1]
         poses = fastest.sample(np.arange(0, fastest.period, 0.02)).pose
         plans.append(corridor_width(corners, poses, one.seed, **SHAPE))
-    return Found(needed, known, on_reference, np.array(plans), speeds, draws[-1].seed + 1 - count)
+    return Found(needed, off, known, on_reference, np.array(plans), speeds, draws[-1].seed + 1 - count)
 
 
 def draw(base: Scenario, seed: int, width: float, speeds: Sequence[float]) -> Draw | None:
@@ -177,24 +183,27 @@ def _simulated(own: Scenario, draws: Sequence[Draw], speed: int) -> xr.Dataset:
     return simulate([replicates(s, 1, draws[k % len(draws)].seed)[0] for k, s in enumerate(scenarios)])
 
 
-def _widths(result: xr.Dataset, draws: Sequence[Draw], corners: Array) -> tuple[Array, Array]:
-    """Returns the width that each run needs in m, and what it would if the estimate were always on the reference.
+def _widths(result: xr.Dataset, draws: Sequence[Draw], corners: Array) -> Array:
+    """Returns the width that each run needs in m, infinite where the robot did not arrive, `(3, plants, draws)`.
 
-    Both are infinite where the robot did not arrive, `(plants, draws)` each.
+    The second is what it would need if the estimate were always on the reference, the third if the map were wrong.
     """
     pose, seen, wanted = (
         np.stack([result[f"{name}{end}"].values for name in POSE], -1) for end in ("", "_measured", "_ref")
     )
     v, failure = result["v"].values, result["failure"].values
-    found = np.full((2, len(pose)), np.inf)
+    found = np.full((3, len(pose)), np.inf)
     for row in range(len(pose)):
         one, driven = draws[row % len(draws)], np.flatnonzero(np.isfinite(v[row]))
         if failure[row] == "" and arrived(pose[row, driven[-1]], v[row, driven[-1]], np.array(one.goal)):
             own = pose[row, driven[::EVERY]]
             on_reference = wanted[row, driven[::EVERY]] + own - seen[row, driven[::EVERY]]
-            found[:, row] = [corridor_width(corners, poses, one.seed, **SHAPE) for poses in (own, on_reference)]
-    first, second = found.reshape(2, len(PLANTS), -1)
-    return first, second
+            aside = float(np.random.default_rng([one.seed, 2]).normal(0.0, MAP_ERROR))
+            found[:, row] = [
+                corridor_width(corners, poses, one.seed, **SHAPE, aside=off)
+                for poses, off in ((own, 0.0), (on_reference, 0.0), (own, aside))
+            ]
+    return found.reshape(3, len(PLANTS), -1)
 
 
 def critical_widths(found: Found, shown: str) -> Table:
@@ -244,24 +253,32 @@ def critical_speeds(found: Found, shown: str) -> Table:
 
 
 def budget(found: Found, shown: str) -> Table:
-    """Returns the table of the allowance that remains when one source of error is removed."""
+    """Returns the table of the allowance with all sources of error, and when one of them after another is removed."""
     rows, gains = [], {}
     for p, plant in enumerate(PLANTS):
         for c, name in enumerate(CONTROLLERS):
-            every = found.needed[-1, c, p], found.posture_known[c, p], found.on_reference[c, p]
+            every = found.map_off[c, p], found.needed[-1, c, p], found.posture_known[c, p], found.on_reference[c, p]
             parts = [needed - found.plans for needed in every]
             rows.append([plant, TITLES.get(name, name), *(_quantile(part, 1e3) for part in parts)])
             value = [quantile_interval(part, SHARE).value for part in parts]
             if plant == "nominal" and np.isfinite(value).all():
-                gains[TITLES.get(name, name)] = (
-                    f"{1e3 * (value[0] - value[1]):.1f} and {1e3 * (value[0] - value[2]):.1f}"
+                off, right, *others = (1e3 * v for v in value)
+                gains[TITLES.get(name, name)] = ", ".join(
+                    f"{v:.1f}" for v in (off - right, *(right - v for v in others))
                 )
-    listed = "; ".join(f"`{name}` {gain} mm" for name, gain in gains.items())
+    listed = "; ".join(f"`{name}` {gain}" for name, gain in gains.items())
     says = (
-        "On the nominal plant a known posture takes from the allowance, and an estimate that is always on the "
-        f"reference: {listed}. The map has no errors here."
+        f"With a map that is {1e3 * MAP_ERROR:.0f} mm off, a right one takes from the allowance on the nominal plant, "
+        f"and then a known posture, and an estimate that is always on the reference: {listed} mm."
     )
-    header = ["plant", "controller", "allowance, mm", "with a known posture", "with the estimate on the reference"]
+    header = [
+        "plant",
+        "controller",
+        "allowance with a wrong map, mm",
+        "with the right map",
+        "and a known posture",
+        "or the estimate on the reference",
+    ]
     return Table(f"Error budget of the allowance ({shown})", says, _frame(rows, header))
 
 

@@ -113,7 +113,9 @@ def bent_line(seed: int, pieces: int, length: float, turn: float) -> tuple[Array
     return headings, middle, 1j * np.exp(1j * (np.append(headings, headings[-1]) - half)) / np.cos(half)
 
 
-def corridor_width(footprint: Array, poses: Array, seed: int, pieces: int, length: float, turn: float) -> float:
+def corridor_width(
+    footprint: Array, poses: Array, seed: int, pieces: int, length: float, turn: float, aside: float = 0.0
+) -> float:
     """Returns the width in m of the narrowest corridor in which a robot touches no wall.
 
     A wall at the offset h from the middle line is touched where a corner of the robot, or one of its sides at the
@@ -126,6 +128,7 @@ def corridor_width(footprint: Array, poses: Array, seed: int, pieces: int, lengt
         pieces: See there.
         length: See there.
         turn: See there.
+        aside: Offset in m of the middle of the corridor from the middle line of its map, to the left.
     """
     headings, middle, mitre = bent_line(seed, pieces, length, turn)
     corners = (poses[:, 0] + 1j * poses[:, 1])[:, None] + np.exp(1j * poses[:, 2:]) * (footprint @ [1, 1j])
@@ -142,7 +145,7 @@ def corridor_width(footprint: Array, poses: Array, seed: int, pieces: int, lengt
         ((every - bend) * left.conjugate()).imag < 0 for bend, left in zip(middle[1:-1], mitre[1:-1], strict=True)
     ]
     piece = np.sum(passed, axis=0, initial=0).astype(int)
-    return 2 * float(np.abs(((every - middle[piece]) * np.exp(-1j * headings[piece])).imag).max())
+    return 2 * float(np.abs(((every - middle[piece]) * np.exp(-1j * headings[piece])).imag - aside).max())
 
 
 def slalom(gap: float, seed: int = 0, gates: int = 5, spacing: float = 2.0, radius: float = 0.15) -> Task:

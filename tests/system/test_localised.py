@@ -36,6 +36,19 @@ def test_estimate_and_bits():
             assert np.array_equal(alone[name], together[name][row], equal_nan=True)
 
 
+def test_map_that_is_off():
+    """A robot that is localised on a map with everything shifted by (6, −4) cm is shifted like it."""
+    shift = np.array([0.06, -0.04])
+    shapes = tuple(shape.model_copy(update={"x": shape.x + 0.06, "y": shape.y - 0.04}) for shape in ROOM.standing)
+    runs = [run.replace(map=Obstacles(shapes=shapes)) for run in RUNS[:2]]
+    result = simulate(runs)
+    for name, wanted in zip("xy", shift, strict=True):
+        error = (result[f"{name}_measured"] - result[name])[:, 200:].mean("time")
+        assert np.abs(error - wanted).max() < 0.01
+    same = simulate(RUNS[0].replace(map=ROOM.still))
+    np.testing.assert_array_equal(same["x_measured"], simulate(RUNS[0])["x_measured"])
+
+
 class Listener:
     """An estimator that stays at its first estimate and keeps the fixes that it receives."""
 

@@ -27,7 +27,10 @@ HULL = footprint(mjcf.load())
 
 
 def test_corridor_width() -> None:
-    """A robot at random poses touches the walls of a narrower corridor, and not those of a wider one."""
+    """A robot at random poses touches the walls of a narrower corridor, and not those of a wider one.
+
+    So it is where the corridor is 5 cm beside the middle line, with walls of a wider and a narrower one.
+    """
     random = np.random.default_rng(0)
     for seed in range(100):
         shape = {"pieces": int(random.integers(1, 4)), "length": 2.0, "turn": 0.9}
@@ -37,6 +40,11 @@ def test_corridor_width() -> None:
         width = corridor_width(HULL, poses, seed, **shape)
         for wider in (1e-6, -1e-6):
             walls = Surroundings(corridor(width + wider, seed, **shape).obstacles)
+            assert (clearances(HULL, poses, np.zeros(5), walls).min() > 0) == (wider > 0)
+            aside = 0.05
+            moved = corridor_width(HULL, poses, seed, **shape, aside=aside) + wider
+            left, right = (corridor(moved + side * 2 * aside, seed, **shape).obstacles.shapes for side in (1, -1))
+            walls = Surroundings(Obstacles(shapes=(*left[shape["pieces"] :], *right[: shape["pieces"]])))
             assert (clearances(HULL, poses, np.zeros(5), walls).min() > 0) == (wider > 0)
 
 

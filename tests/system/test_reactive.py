@@ -103,13 +103,33 @@ def test_crossing(avoid: Avoid) -> None:
         np.testing.assert_array_equal(alone[name].values[0], values[0])
 
 
+@pytest.mark.parametrize("avoid", ["barrier", "window", "mppi"])
+def test_what_the_map_lacks(avoid: Avoid) -> None:
+    """A box that the map lacks is hit by a robot that looks at its map alone; the lidar shows it to the others."""
+    wall, box = Box(x=2.0, y=1.5, length=5.0, width=0.2), Box(x=2.0, y=0.1, length=0.3, width=0.8)
+    task = Task(obstacles=Obstacles(shapes=(wall, box)), map=Obstacles(shapes=(wall,)), start=(0, 0, 0), goal=(4, 0, 0))
+    assert navigate(task, PLANNED).table["outcome"].tolist() == ["collided"]
+    driven = navigate(task, PLANNED, avoid=avoid)
+    assert np.abs(driven.plan.poses[:, 1]).max() < 0.01  # straight through the box
+    assert driven.table["outcome"].tolist() == ["arrived"] and driven.table["clearance"].iloc[0] > 0.03
+
+
+def test_backs_off() -> None:
+    """A robot with rigid steering that stands close before a box that the map lacks reverses to go around it."""
+    box = Box(x=0.95, y=0.0, length=0.3, width=1.0)
+    task = Task(obstacles=Obstacles(shapes=(box,)), map=Obstacles(), start=(0, 0, 0), goal=(3, 0, 0))
+    driven = navigate(task, PLANNED.replace(steering="rigid"), avoid="barrier")
+    assert driven.table["outcome"].tolist() == ["arrived"] and float(driven.result["v"].min()) < -0.1
+
+
 def test_blocked_door() -> None:
-    """A door of two is blocked, which no map shows: the robot sees it, plans again, and takes the other one."""
-    creeping = mrctl.Line(speed=0.01)
+    """A door of two is blocked, and the map shows it open: the robot sees it, plans again, and takes the other one."""
     walls = [Box(x=2.0, y=y, length=0.1, width=width) for y, width in ((-2.3, 1.4), (0.0, 1.4), (2.3, 1.4))]
     outer = [Box(x=2.0, y=side * 3.0, length=6.0, width=0.1) for side in (-1, 1)]
-    plug = Box(x=1.9, y=-1.15, length=0.2, width=0.7, course=creeping)
-    task = Task(obstacles=Obstacles(shapes=(*walls, *outer, plug)), start=(0.0, -0.4, 0.0), goal=(4.0, -0.4, 0.0))
+    known, plug = Obstacles(shapes=(*walls, *outer)), Box(x=2.0, y=-1.15, length=0.2, width=0.7)
+    task = Task(
+        obstacles=Obstacles(shapes=(*known.shapes, plug)), map=known, start=(0.0, -0.4, 0.0), goal=(4.0, -0.4, 0.0)
+    )
     assert navigate(task, PLANNED, speed=0.8).table["outcome"].tolist() == ["collided"]
     driven = navigate(task, PLANNED, speed=0.8, avoid="mppi")
     run = driven.result.isel(run=0)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import mrctl
-from mrctl import Circle, InputError, Lemniscate, Scenario, Sweep
+from mrctl import Box, Circle, InputError, Lemniscate, Line, Scenario, Sweep
 from mrctl.cli import main
 from mrctl.control.kanayama import GAINS, kanayama, posture_error
 from mrctl.control.nominal import nominal
@@ -189,6 +189,51 @@ def test_followed():
 
     text = str(simulate(THREE, motion=Short).failure.values[0])
     assert text.startswith("motion Short: `followed` is shape (3, 3), expected shape (3, 7)")
+
+
+def test_scans():
+    """A motion controller with a method `see` gets the scans of `sensing.lidar`, at its rate, before `output`."""
+    wall, lidar = Box(x=3.0, length=0.2, width=4.0), {"rate": 20.0, "beams": 90, "x": 0.2, "noise": 0.0}
+    calls = []
+
+    class Sees(Kanayama):
+        def reset(self, pose, reference, period):
+            calls.append("reset")
+            super().reset(pose, reference, period)
+
+        def see(self, row, ranges, angles, place, time):
+            calls.append((row, ranges, angles, place, time))
+
+        def output(self, pose, twist, reference):
+            calls.append("output")
+            return super().output(pose, twist, reference)
+
+    runs = [
+        Scenario(
+            obstacles={"shapes": (wall.model_dump(),)}, reference=Line(length=1.0, speed=0.5), laps=1, learner="none",
+            sensing={"tier": "ideal", "lidar": lidar}, seed=seed,
+        )
+        for seed in range(2)
+    ]  # fmt: skip
+    result = simulate(runs, motion=Sees)
+    assert calls[0] == "reset" and [call[0] for call in calls[1:3]] == [0, 1] and calls[3] == "output"
+    scans = [call for call in calls if not isinstance(call, str)]
+    assert len(scans) == 2 * 40  # 2 s
+    for row, ranges, angles, place, time in scans:
+        run = result.isel(run=row, time=round(100 * time))
+        x, y, theta = (float(run[name]) for name in ("x", "y", "theta"))
+        np.testing.assert_allclose(place, [x + 0.2 * np.cos(theta), y + 0.2 * np.sin(theta), theta], atol=1e-12)
+        met = place[:2] + ranges[:, None] * np.column_stack([np.cos(theta + angles), np.sin(theta + angles)])
+        hits = np.isfinite(ranges)
+        assert 5 < hits.sum() < 60 and np.abs(met[hits, 0] - 2.9).max() < 1e-6 and np.abs(met[hits, 1]).max() < 2.0
+    assert not any(simulate(runs, motion=Kanayama)["failed"])
+
+    class Blinded(Sees):
+        def see(self, row, ranges, angles, place, time):
+            raise OSError("no lens")
+
+    with pytest.raises(InputError, match=r"motion Blinded: OSError: no lens"):
+        raise InputError(str(simulate(runs[0], motion=Blinded)["failure"].values))
 
 
 def test_stanley():
