@@ -35,13 +35,13 @@ from mrctl.theory.robot import Robot
 
 BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
 RIM = 0.02  # m, radius of the discs around the robot for `Pacing`, which reach as far beyond its footprint
-KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from what stands still and from what moves; chosen
+KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from what is on the map and from what moves; chosen
 # m, what a plan on the way keeps beyond its own margin from what the map does not have, and what it leaves of the
 # clearance that the robot has where that is smaller; chosen
 ROUND, LEFT = 0.13, 0.03
 TRACKED = 0.01  # m, by which the margin KEPT is smaller than what the discs have on the plan, at least
 STANDOFF = 1.0  # m before a blocked place of its plan, where the robot stops, so that it can drive around it; chosen
-STOPPED, WAITED = 0.02, 1.0  # pace below which a robot waits, and for how many s before it makes another plan; chosen
+SLOW, WAITED = 0.1, 1.0  # mean λ over so many s, below which a robot makes another plan; chosen
 SPACING = 0.05  # m, of the places of a plan that are looked at
 
 
@@ -172,7 +172,7 @@ class Pacing:
         self._follow, self._robot, self._scenario = Following(robot, size, scenario), robot, scenario
         self._sight, self._footprint, self._replan = Sight(scenario.known, size), footprint, replan
         self._brakes = BRAKING * robot.max_acceleration
-        self._near, self._away = self._barrier(KEPT), self._barrier(AWAY)
+        self._near, self._away = self._barrier(-RIM), self._barrier(AWAY)
 
     def _barrier(self, margin: float) -> Barrier:
         """Returns the filter that keeps this clearance in m."""
@@ -186,7 +186,7 @@ class Pacing:
         self._clock, self._pace = np.zeros(size), np.ones(size)  # s in motion periods, and λ
         self._plans, self._kept = [self._sampled(plan)] * size, [self._margin(plan)] * size
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
-        self._since = np.full(size, np.inf)  # when robots began to wait for another plan in s
+        self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
         self._sight.forget()
 
     def _sampled(self, plan: Waypoints) -> Array:
@@ -211,13 +211,13 @@ class Pacing:
         way = np.cumsum(np.abs(plan[first:, 3])) * self._period
         ahead = first + np.searchsorted(way, np.arange(0.0, way[-1], SPACING))
         free = [clearance(self._footprint, plan[k, :3], standing) for k in ahead]
-        if len(blocked := ahead[np.array(free) < KEPT + RIM]):
+        if len(blocked := ahead[np.array(free) <= 0]):
             self._blocked[row] = blocked[0]
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
-        for row in np.flatnonzero(np.isfinite(self._blocked)):
-            self._wait(int(row), pose[row])
+        for row in range(len(pose)):
+            self._get_on(row, pose[row])
         now = np.empty((len(pose), 7))
         for row, plan in enumerate(self._plans):
             first = min(int(self._clock[row]), len(plan) - 2)
@@ -246,20 +246,18 @@ class Pacing:
             share(request, pose, sight.moving(row, self._period * self._tick), self._away),
         )
 
-    def _wait(self, row: int, pose: Array) -> None:
-        """Gives a robot that has waited before its blocked plan another one, if there is one."""
-        now = self._period * self._tick
-        if self._pace[row] > STOPPED:
-            self._since[row] = np.inf
-            return
-        self._since[row] = min(self._since[row], now)
+    def _get_on(self, row: int, pose: Array) -> None:
+        """Gives a robot that has hardly got on along its plan another one, if what stands there is not on the map."""
+        now, standing = self._period * self._tick, self._sight.standing(row)
+        if self._clock[row] - self._anchor[row] > SLOW * WAITED / self._period or not len(standing.discs):
+            self._anchor[row], self._since[row] = self._clock[row], now
         if now - self._since[row] < WAITED:
             return
         self._since[row] = now  # where there is no other plan, it tries again later
-        free = clearance(self._footprint, pose, self._sight.standing(row))
-        if plan := self._replan(pose, self._sight.outlines(row, now, min(ROUND, max(0.0, free - LEFT)))):
+        left = clearance(self._footprint, pose, standing) - LEFT
+        if plan := self._replan(pose, self._sight.outlines(row, now, min(ROUND, max(0.0, left)))):
             self._plans[row], self._kept[row] = self._sampled(plan), self._margin(plan)
-            self._clock[row], self._blocked[row], self._since[row] = 0.0, np.inf, np.inf
+            self._clock[row], self._anchor[row], self._blocked[row] = 0.0, 0.0, np.inf
 
 
 def share(request: Array, pose: Array, outlines: Outlines, barrier: Barrier) -> float:

@@ -35,7 +35,7 @@ from mrctl.viewer.looks import Colour, Look, pale
 from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, path
 from mrctl.viewer.sensors import Marks, outline
 from mrctl.viewer.server import Server
-from mrctl.viewer.shapes import bar, disc, lowered, ribbons
+from mrctl.viewer.shapes import bar, disc, lowered, ribbons, sides
 
 Array = NDArray[np.float64]
 EVENT_COLOUR: Colour = (217, 119, 6)
@@ -70,6 +70,8 @@ SCAN_POINT, SCAN_HEIGHT = 0.03, HEIGHT + 0.01  # m, size of the points of a scan
 PARTICLE, MAX_PARTICLES = 0.015, 500  # m, size of a particle, and the number from which on only some are drawn
 
 SEARCH_COLOUR: Colour = (148, 163, 184)
+MAP_COLOUR: Colour = (30, 41, 59)
+MAP_HEIGHT = HEIGHT + 0.02  # m
 COARSE, FAN_HEIGHT, MAX_ARCS = 4, 0.03, 5000  # of the drawn steps of a roll-out; m; about the number that is drawn
 
 SHADE = 0.35  # opacity of shadows on the floor
@@ -185,6 +187,7 @@ class Scene:
         self._forces: list[viser.ArrowsHandle | None] = [None] * self.size
         self._grip: viser.MeshHandle | None = None
         self._search = self._draw_segments("/world/search", SEARCH_COLOUR, 1.0)
+        self._map = self._draw_segments("/world/map", MAP_COLOUR, 3.0)
         self._touches: list[list[viser.ArrowsHandle]] = []  # of each robot: forces and slips
         self._way: list[viser.MeshHandle] = []  # that a visitor draws: its points and the way
         self._factor = self._scene.add_label("/world/deviation", "", visible=False, font_screen_scale=0.8)
@@ -303,7 +306,12 @@ class Scene:
         return f"{before}/{self._model.body(body).name}"
 
     def show_reference(self, scenario: Scenario) -> None:
-        """Draws a lap of each reference of a scenario on the ground, and turns the cameras to show them."""
+        """Draws a lap of each reference of a scenario on the ground, and turns the cameras to show them.
+
+        A map that differs from the world is drawn on top of the obstacles, as the outlines of what it has.
+        """
+        known = None if scenario.map is None else sides(Surroundings(scenario.map).at(0.0))
+        _show_segments(self._map, known, MAP_HEIGHT)
         references = [scenario.reference, *(e.reference for e in scenario.events if e.reference)]
         lines = self._lines(references)
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))

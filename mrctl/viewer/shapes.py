@@ -6,6 +6,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from mrctl.theory.obstacles import Outlines
+
+ROUND = 24  # sides of a circle that is drawn with segments
 Array = NDArray[np.float64]
 Mesh = tuple[NDArray[np.float32], NDArray[np.uint32]]
 
@@ -69,3 +72,11 @@ def lowered(position: Array, target: Array, fov: float) -> tuple[Array, Array]:
     shift = -up / np.linalg.norm(up) * np.linalg.norm(forward) * np.tan(fov / 2) / 2
     below = (forward + shift)[:2] @ forward[:2] > 0
     return position if below else position + shift, target + shift
+
+
+def sides(outlines: Outlines) -> Array:
+    """Returns the sides of obstacles as segments, those of circles as polygons, ends in m, `(k, 2, 2)`."""
+    turn = np.linspace(0, 2 * np.pi, ROUND + 1)
+    rims = outlines.discs[:, None, :2] + outlines.discs[:, None, 2:] * np.column_stack([np.cos(turn), np.sin(turn)])
+    round_ones = np.stack([rims[:, :-1], rims[:, 1:]], axis=2).reshape(-1, 2, 2)
+    return np.concatenate([round_ones, outlines.edges.reshape(-1, 2, 2)])
