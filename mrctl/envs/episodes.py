@@ -201,6 +201,8 @@ class Episodes:
         Raises:
             InputError: The perturbation is invalid, or the robot could not stand.
         """
+        if len(self.scenarios) == 1:
+            self.loop.hierarchy.restart_clock()
         self.loop.restart(row, self._next(row, seed, perturbation))
         self.start[row] = self.tick
         self._action[row] = self._squares[row] = 0.0
@@ -210,8 +212,6 @@ class Episodes:
         perturbations = [None] * len(seeds) if perturbations is None else perturbations
         if len(perturbations) != len(seeds):
             raise InputError(f"perturbation: {len(perturbations)} of them for {len(seeds)} robots")
-        if len(seeds) == 1:
-            self.loop.hierarchy.restart_clock()
         for row, seed in enumerate(seeds):
             self.begin(row, seed, perturbations[row])
 

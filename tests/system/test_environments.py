@@ -129,6 +129,21 @@ def test_vector_bits(feedforward):
             assert np.array_equal(found, expected(scenarios[row], seed)[: len(found)], equal_nan=True), (row, seed)
 
 
+def test_slow_motion_controller():
+    """Where the motion controller is slower than the others, an episode that begins on its own has its run's bits, too."""
+    scenario = EXACT.model_copy(update={"motion_period": 0.03})  # 220 ticks are not a whole number of its periods
+    env = TrackingVectorEnv(1, scenario)
+    env.reset(seed=[4])
+    for episode in range(2):
+        if episode:
+            env.step(np.zeros((1, 2)))  # begins it
+        seed, found, over = env.episodes.scenarios[0].seed, [], [False]
+        while not over[0]:
+            *_, over, _ = env.step(np.zeros((1, 2)))
+            found.append(last(env.episodes))
+        assert np.array_equal(found, expected(scenario, seed), equal_nan=True)
+
+
 def drive(env, **reset):
     """Drives a single environment through an episode with zero actions; returns its signals and the last dictionary."""
     env.reset(**reset)
