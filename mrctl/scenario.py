@@ -23,7 +23,7 @@ from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
 from mrctl.record import Record
 from mrctl.sensing.tiers import Sensing
-from mrctl.theory.obstacles import Obstacles
+from mrctl.theory.obstacles import Map, Obstacles
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Lemniscate, Reference
 from mrctl.theory.robot import CAR, RobotFile, Steering
@@ -96,7 +96,7 @@ class Scenario(Record):
     obstacles: Obstacles = Obstacles()
     """Obstacles that stand in the world or move in it, or the path of a TOML file of them; a run ends when the robot
     touches one."""
-    map: Obstacles | None = None
+    map: Map | None = None
     """Obstacles on the map, with which missions plan and a lidar is localised, or the path of a TOML file of them; by
     default those that stand still in the world."""
     robot: RobotFile = CAR
@@ -175,8 +175,6 @@ class Scenario(Record):
         changes += [(f"events.{i}.perturbation", e.perturbation) for i, e in enumerate(self.events) if e.perturbation]
         for name, perturbation in changes:
             whole(perturbation.control_delay, self.control_period, f"{name}.control_delay", "control_period")
-        if self.map is not None and self.map.moving:
-            raise ValueError("map: an obstacle on it has a course, but a map does not move")
         if self.learner in MODEL_BASED and self.prior == "none":
             raise ValueError(f"prior: the learner {self.learner} compares the robot with a model; set prior to model")
         if self.learned and self.learner in ("none", "indi"):

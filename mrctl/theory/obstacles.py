@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from mrctl.kernel import Array, kernel
 from mrctl.record import InputError, Record
@@ -146,6 +146,16 @@ class Obstacles(Record):
 
 NO_OBSTACLES = Obstacles()
 """The default world, which is empty."""
+
+
+def _still(known: Obstacles) -> Obstacles:
+    if known.moving:
+        raise ValueError("an obstacle on it has a course, but a map does not move")
+    return known
+
+
+Map = Annotated[Obstacles, AfterValidator(_still)]
+"""Obstacles on a map, none of which moves."""
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -130,7 +130,7 @@ def test_vector_bits(feedforward):
 
 
 def test_slow_motion_controller():
-    """Where the motion controller is slower than the others, an episode that begins on its own has its run's bits, too."""
+    """Where the motion controller is slower than the others, an episode that begins on its own has its run's bits."""
     scenario = EXACT.model_copy(update={"motion_period": 0.03})  # 220 ticks are not a whole number of its periods
     env = TrackingVectorEnv(1, scenario)
     env.reset(seed=[4])

@@ -12,7 +12,7 @@ import mrctl
 from mrctl import Box, Disc, Obstacles, Scenario, cli
 from mrctl.navigation.avoidance import Avoiding, Barrier
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import Avoid, again, jerk_of, navigate, task_of
+from mrctl.navigation.mission import Avoid, again, jerk_of, navigate, order_of, task_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.theory.clearance import cover
@@ -162,6 +162,9 @@ def test_ends() -> None:
         (["doorway:3", "--localise", "--json"], "localise: needs a value"),
         (["doorway:x"], "the seed must be a number"),
         (["maze:3"], "maze:3 is neither a file"),
+        (["doorway:3", "--map", "none.toml"], "none.toml"),
+        (["doorway:3", "--map", "plan.png"], "map: plan.png is not a file that ends in .toml, "),
+        (["doorway:3", "--map", "moves.toml"], "map: an obstacle on it has a course"),
         (["doorway:3", "--perturbation.control-delay", "0.013"], "control_delay"),
     ],
 )
@@ -171,6 +174,7 @@ def test_bad_input_is_one_line(
     """Every kind of bad mission ends with one line, before anything runs."""
     monkeypatch.chdir(tmp_path)
     Path("yard.toml").write_text('[[shapes]]\nkind = "disc"\nx = 1.5\ny = 0.8\nradius = 0.2\n')
+    Path("moves.toml").write_text('[[shapes]]\nkind = "disc"\ncourse = { kind = "circle", radius = 1.0 }\n')
     assert says in refused(capsys, "navigate", *arguments)
 
 
@@ -237,6 +241,22 @@ def test_short_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         found[-1]["robots"][0].pop("planning_time")
     assert found[0] == found[1] and found[0]["scenario"]["robot"]["path"] == "turtlebot"
     assert found[0]["task"]["goal"] == [1.0, -0.1, 0.0] and found[0]["robots"][0]["outcome"] == "arrived"
+
+
+def test_map_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """With a map that lacks a box the plan goes through it; the mission keeps the map, and is repeated with it."""
+    monkeypatch.chdir(tmp_path)
+    wall = '[[shapes]]\nkind = "box"\nx = 1.5\ny = 1.2\nlength = 3.0\nwidth = 0.2\n'
+    Path("map.toml").write_text(wall)
+    Path("world.toml").write_text(wall + '[[shapes]]\nkind = "box"\nx = 2.0\nlength = 0.2\nwidth = 0.4\n')
+    flags = "navigate", "world.toml", "--goal", "4,0,0", "--map", "map.toml"
+    assert cli.main([*flags, "--json"]) == 1
+    blind = json.loads(capsys.readouterr().out)
+    assert blind["robots"][0]["outcome"] == "collided" and len(blind["task"]["map"]["shapes"]) == 1
+    assert cli.main([*flags, "--avoid", "mppi", "--out", "driven"]) == 0
+    Path("map.toml").unlink()
+    assert cli.main(["navigate", "driven"]) == 0 and "driven: bit-identical" in capsys.readouterr().out
+    assert order_of("driven").task.known == Obstacles.from_dict({"shapes": blind["task"]["map"]["shapes"]})
 
 
 class Blind:
