@@ -64,12 +64,24 @@ def sweep(file):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """The bytes of the sweep, run without incident."""
+def finished(tmp_path_factory):
+    """The store of the sweep, run without incident."""
     folder = tmp_path_factory.mktemp("whole")
     (folder / "sweep.toml").write_text(FILE)
     jobs.run(Sweep.from_toml(folder / "sweep.toml"), folder / "store", workers=1)
-    return content(folder / "store")
+    return folder / "store"
+
+
+@pytest.fixture(scope="module")
+def whole(finished):
+    """The bytes of the sweep."""
+    return content(finished)
+
+
+@pytest.fixture
+def store(finished, tmp_path):
+    """A copy of the finished store."""
+    return shutil.copytree(finished, tmp_path / "store")
 
 
 def content(store):
@@ -101,14 +113,13 @@ def failures(sweep):
     return [run for run in range(sweep.size) if sweep.valid(run) is None]
 
 
-def test_open(sweep, tmp_path):
+def test_open(sweep, finished):
     """One labelled dataset and one table, which hold what `simulate` and `summary` return for the same scenarios."""
-    jobs.run(sweep, tmp_path / "store", 2)
-    table = pd.read_parquet(tmp_path / "store" / "runs.parquet")
+    table = pd.read_parquet(finished / "runs.parquet")
     runs, lost = [run for run in range(24) if run not in failures(sweep)], failures(sweep)
     assert 0 < len(lost) < 12 and list(table["run"]) == list(range(24))
     direct = simulate([sweep.scenario(run) for run in runs]).assign_coords(run=runs)
-    opened = mrctl.open(tmp_path / "store")
+    opened = mrctl.open(finished)
     for name in SIGNALS:
         assert opened[name].dims == ("run", "time") and opened[name].attrs["units"] == SIGNALS[name][0]
         np.testing.assert_array_equal(opened[name].sel(run=runs), direct[name][:, ::10])
@@ -178,10 +189,8 @@ def test_full_with_runs_of_different_length(tmp_path):
 # --- one run again --------------------------------------------------------------------------------
 
 
-def test_run_again(sweep, tmp_path, capsys):
+def test_run_again(sweep, store, tmp_path, capsys):
     """Bit-identical as it is, within tolerance when a bit is off, and where it departs when more is."""
-    store = tmp_path / "store"
-    jobs.run(sweep, store, 2)
     for run in (0, 14, failures(sweep)[0]):
         assert cli.main(["run", str(store), "--run", str(run)]) == 0
         assert capsys.readouterr().out == f"run {run}: bit-identical\n"
@@ -201,10 +210,8 @@ def test_run_again(sweep, tmp_path, capsys):
 # --- refusals -------------------------------------------------------------------------------------
 
 
-def test_changed_sweep(file, sweep, tmp_path, capsys, whole):
+def test_changed_sweep(file, store, capsys, whole):
     """A store goes on only with the file and the versions that began it."""
-    store = tmp_path / "store"
-    jobs.run(sweep, store, 1)
     file.write_text(FILE.replace("runs = 12", "runs = 13"))
     assert "begun with another sweep.runs (12, now 13)" in refused(capsys, "sweep", file, "--out", store)
     file.write_text("# a remark changes nothing\n" + FILE)
@@ -275,10 +282,8 @@ def test_store_of_an_older_version(file, tmp_path, capsys, record):
     assert f"mrctl 0.1.0 began this sweep and this is mrctl {mrctl.__version__}" in line
 
 
-def test_store_that_cannot_be_read(sweep, tmp_path, capsys, whole):
+def test_store_that_cannot_be_read(store, capsys):
     """A newer format, signals without names, an unknown field: one line that names the version that wrote it."""
-    store = tmp_path / "store"
-    jobs.run(sweep, store, 1)
     aged(store, "9.1", **{KIND: 99})
     with pytest.raises(InputError, match=f"mrctl 9.1 wrote this store in format 99; mrctl {mrctl.__version__} reads"):
         mrctl.open(store)
@@ -295,20 +300,16 @@ def test_store_that_cannot_be_read(sweep, tmp_path, capsys, whole):
     assert "(written by mrctl 0.0.9): base.former: Extra inputs" in line
 
 
-def test_signals_keep_their_names(sweep, tmp_path):
+def test_signals_keep_their_names(store):
     """A store says which signals it holds: one that a later version adds or moves changes no name of the others."""
-    store = tmp_path / "store"
-    jobs.run(sweep, store, 1)
     before = mrctl.open(store).load()
     later = {"new": ("1", "a signal that came later"), **dict(reversed(SIGNALS.items()))}
     with mock.patch("mrctl.sweep.store.SIGNALS", later):
         xr.testing.assert_identical(mrctl.open(store).load(), before)
 
 
-def test_repeat_names_another_version(sweep, tmp_path, capsys):
+def test_repeat_names_another_version(store, capsys):
     """Where a run departs from a store that another version began, the line names both versions."""
-    store = tmp_path / "store"
-    jobs.run(sweep, store, 1)
     Store(store)._signals[14, 7, 3] = 3.0
     aged(store, **{KIND: 2})
     line = refused(capsys, "run", store, "--run", 14, status=1)
@@ -341,10 +342,8 @@ def test_bad_input(file, tmp_path, capsys):
     assert not (store / "sweep.json").exists()
 
 
-def test_two_at_once(file, sweep, tmp_path, capsys):
+def test_two_at_once(file, sweep, store, capsys):
     """The second is told who is first; a killed process leaves no lock behind."""
-    store = tmp_path / "store"
-    store.mkdir()
     with Store.locked(store):
         message = refused(capsys, "sweep", file, "--out", store)
     assert f"process {os.getpid()} on" in message and "is running this sweep" in message
@@ -465,8 +464,9 @@ def test_disk_full_at_the_start_and_the_end(file, sweep, tmp_path, whole, capsys
 
 # --- interruptions --------------------------------------------------------------------------------
 
-# Long enough to be hit: 60 jobs.
-LONG = FILE.replace("runs = 12", "runs = 60").replace("chunk = 5", "chunk = 2").replace("length = 0.8", "length = 1.6")
+# Long enough to be hit in its first half: 24 jobs.
+LONG = FILE.replace("runs = 12", "runs = 24").replace("chunk = 5", "chunk = 2").replace("length = 0.8", "length = 1.6")
+LONG_SWEEP = pytest.mark.xdist_group("long_sweep")  # whose tests share one
 
 
 @pytest.fixture(scope="module")
@@ -502,13 +502,14 @@ def until(condition, seconds=60.0):
     return value
 
 
+@LONG_SWEEP
 @pytest.mark.parametrize("moment", KILLS)
 @pytest.mark.parametrize("victim", ["sweep", "worker"])
 def test_kill(long, tmp_path, moment, victim):
     """Kill −9 at a random moment: all runs are there in the end, with the same bytes."""
     file, expected = long
     store, chance = tmp_path / "store", random.Random(f"{victim} {moment}")
-    process, enough = start(file, store), chance.randrange(55)
+    process, enough = start(file, store), chance.randrange(13)
     until(lambda: (store / "parts").exists() and len(Store(store).done()) >= enough)
     time.sleep(chance.uniform(0, 0.1))
     done = len(Store(store).done())
@@ -524,12 +525,11 @@ def test_kill(long, tmp_path, moment, victim):
         _, stderr = process.communicate(timeout=120)
         assert process.returncode == 0 and "Traceback" not in stderr, stderr
     assert content(store) == expected
-    print(f"killed the {victim} after {done} of 60 jobs")
+    print(f"killed the {victim} after {done} of 24 jobs")
 
 
-def test_fork_server_killed(long, tmp_path):
+def test_fork_server_killed(file, tmp_path, whole):
     """The process that forks the workers is replaced as it is killed before it has forked one."""
-    file, expected = long
     process = start(file, tmp_path / "store")
 
     def forks():
@@ -539,9 +539,10 @@ def test_fork_server_killed(long, tmp_path):
     os.kill(until(forks)[0], signal.SIGKILL)
     _, stderr = process.communicate(timeout=120)
     assert process.returncode == 0 and "Traceback" not in stderr, stderr
-    assert content(tmp_path / "store") == expected
+    assert content(tmp_path / "store") == whole
 
 
+@LONG_SWEEP
 def test_ctrl_c(long, tmp_path):
     """One line, status 130, and the same command goes on."""
     file, expected = long
@@ -553,8 +554,8 @@ def test_ctrl_c(long, tmp_path):
     assert process.returncode == 130 and "Traceback" not in stderr
     done = len(Store(store).done())
     last = stderr.strip().splitlines()[-1]
-    assert last == f"mrctl: interrupted: {2 * done} of 120 runs are done; the same command goes on", stderr
-    assert mrctl.open(store).sizes["run"] == 2 * done < 120
+    assert last == f"mrctl: interrupted: {2 * done} of 48 runs are done; the same command goes on", stderr
+    assert mrctl.open(store).sizes["run"] == 2 * done < 48
     kept = content(store)
     jobs.run(Sweep.from_toml(file), store, 2)
     assert content(store) == expected
