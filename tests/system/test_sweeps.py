@@ -21,6 +21,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import victim
 import xarray as xr
 
 import mrctl
@@ -89,11 +90,16 @@ def content(store):
     return {str(f.relative_to(store)): f.read_bytes() for f in store.rglob("*") if f.is_file() and f.name != "lock"}
 
 
+def said(stderr):
+    """Lines beside those of a progress bar, which shows run/s or s/run."""
+    lines = stderr.replace("\r", "\n").splitlines()
+    return [line for line in lines if line.strip() and "run/s" not in line and "s/run" not in line]
+
+
 def refused(capsys, *arguments, status=2):
-    """Returns the one line that a command prints on stderr beside its progress bar, which shows run/s or s/run."""
+    """Returns the one line that a command prints on stderr beside its progress bar."""
     assert cli.main([str(a) for a in arguments]) == status
-    printed = capsys.readouterr().err.replace("\r", "\n").splitlines()
-    lines = [line for line in printed if line and "run/s" not in line and "s/run" not in line]
+    lines = said(capsys.readouterr().err)
     assert len(lines) == 1 and "Traceback" not in lines[0], lines
     return lines[0]
 
@@ -464,14 +470,13 @@ def test_disk_full_at_the_start_and_the_end(file, sweep, tmp_path, whole, capsys
 
 # --- interruptions --------------------------------------------------------------------------------
 
-# Long enough to be hit in its first half: 24 jobs.
 LONG = FILE.replace("runs = 12", "runs = 24").replace("chunk = 5", "chunk = 2").replace("length = 0.8", "length = 1.6")
 LONG_SWEEP = pytest.mark.xdist_group("long_sweep")  # whose tests share one
 
 
 @pytest.fixture(scope="module")
 def long(tmp_path_factory):
-    """A sweep file of some seconds, and the bytes of its store."""
+    """A file of a sweep of 24 jobs, and the bytes of its store."""
     folder = tmp_path_factory.mktemp("long")
     (folder / "sweep.toml").write_text(LONG)
     jobs.run(Sweep.from_toml(folder / "sweep.toml"), folder / "store", 2)
@@ -479,7 +484,8 @@ def long(tmp_path_factory):
 
 
 def start(file, store):
-    command = [sys.executable, "-m", "mrctl.cli", "sweep", str(file), "--out", str(store), "--workers", "2"]
+    """A sweep whose second half waits for a file `go` beside its store."""
+    command = [sys.executable, victim.__file__, "sweep", str(file), "--out", str(store), "--workers", "2"]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
@@ -504,16 +510,16 @@ def until(condition, seconds=60.0):
 
 @LONG_SWEEP
 @pytest.mark.parametrize("moment", KILLS)
-@pytest.mark.parametrize("victim", ["sweep", "worker"])
-def test_kill(long, tmp_path, moment, victim):
-    """Kill −9 at a random moment: all runs are there in the end, with the same bytes."""
+@pytest.mark.parametrize("hit", ["sweep", "worker"])
+def test_kill(long, tmp_path, moment, hit):
+    """Kill −9 at a random moment of the first half: all runs are there in the end, with the same bytes."""
     file, expected = long
-    store, chance = tmp_path / "store", random.Random(f"{victim} {moment}")
+    store, chance = tmp_path / "store", random.Random(f"{hit} {moment}")
     process, enough = start(file, store), chance.randrange(13)
     until(lambda: (store / "parts").exists() and len(Store(store).done()) >= enough)
     time.sleep(chance.uniform(0, 0.1))
     done = len(Store(store).done())
-    if victim == "sweep":
+    if hit == "sweep":
         below = [pid for one in children(process.pid) for pid in (one, *children(one))]
         process.kill()
         process.communicate()
@@ -522,14 +528,16 @@ def test_kill(long, tmp_path, moment, victim):
     else:
         helpers = children(process.pid)
         os.kill(chance.choice([worker for one in helpers for worker in children(one)]), signal.SIGKILL)
+        (tmp_path / "go").touch()
         _, stderr = process.communicate(timeout=120)
         assert process.returncode == 0 and "Traceback" not in stderr, stderr
     assert content(store) == expected
-    print(f"killed the {victim} after {done} of 24 jobs")
+    print(f"killed the {hit} after {done} of 24 jobs")
 
 
 def test_fork_server_killed(file, tmp_path, whole):
     """The process that forks the workers is replaced as it is killed before it has forked one."""
+    (tmp_path / "go").touch()
     process = start(file, tmp_path / "store")
 
     def forks():
@@ -571,7 +579,7 @@ def test_early_ctrl_c(tmp_path, moment):
     time.sleep(moment)
     os.killpg(process.pid, signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
-    lines = [line for line in stderr.splitlines() if "compiling the laws" not in line]
+    lines = [line for line in said(stderr) if "compiling the laws" not in line]
     assert process.returncode == 130 and len(lines) == 1 and lines[0].startswith("mrctl: interrupted"), stderr
 
 
