@@ -76,9 +76,13 @@ class Kernel(Generic[P, T]):
             nonlocal entry
             if entry is None:
                 compiled: Any = self.compiled
-                types = tuple(compiled.typeof_pyval(argument) for argument in arguments)
                 answer = compiled(*arguments)
-                entry = compiled.overloads[types].entry_point
+                overloads = compiled.overloads
+                if len(overloads) > 1:  # else it is not looked up which of them was called, which takes 2 ms
+                    types = tuple(compiled.typeof_pyval(argument) for argument in arguments)
+                    entry = overloads[types].entry_point
+                else:
+                    entry = next(iter(overloads.values())).entry_point
                 return answer
             return entry(*arguments)
 

@@ -47,7 +47,8 @@ def robot() -> Robot:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Marks what runs the whole system, so that `pytest -m "not system"` is a quick loop for developers.
 
-    Tests of the mark `full` are left out, unless `-m` asks for them.
+    Tests of the mark `full` are left out, unless `-m` asks for them. Groups, which one worker runs, come first, so that
+    no worker is left alone with one in the end.
     """
     for item in items:
         if "system" in item.path.parts:
@@ -56,6 +57,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         left_out = [item for item in items if item.get_closest_marker("full")]
         items[:] = [item for item in items if item not in left_out]
         config.hook.pytest_deselected(items=left_out)
+    items.sort(key=lambda item: item.get_closest_marker("xdist_group") is None)
 
 
 @pytest.hookimpl(tryfirst=True)

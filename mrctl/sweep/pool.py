@@ -21,6 +21,7 @@ from mrctl.record import InputError
 
 PAUSE = 1.0  # s until a killed process has ended on a busy machine
 PATIENCE = 30.0  # s to wait for a scheduler and its first worker
+LATER = "numba", "scipy.optimize", "dask.array"  # imported in a worker's first run; xarray looks for Dask's arrays
 
 
 class Outcome(NamedTuple):
@@ -75,7 +76,7 @@ class Processes:
         self._work, self._path, self._workers = work, path, workers
         # Workers are forked from a process that has done the imports and has no threads.
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["mrctl.sweep.jobs"])
+        self._context.set_forkserver_preload(["mrctl.sweep.jobs", *LATER])
         self._idle: list[tuple[BaseProcess, Connection]] = []
         self._busy: dict[Connection, tuple[BaseProcess, int]] = {}
 

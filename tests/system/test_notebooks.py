@@ -88,8 +88,7 @@ def test_notebook(path, tmp_path):
         scene = curves.wait_for_selector("#scene", timeout=PATIENCE).content_frame()
         scene.wait_for_function(ROBOT, timeout=PATIENCE)
         curves.evaluate("seek(1)")  # and pause, wherever it has come meanwhile
-        seen.wait_for_timeout(3000)
-        x, y, _ = scene.evaluate(ROBOT)
+        x, y, _ = rest(seen, lambda: scene.evaluate(ROBOT))
         curves.evaluate("seek(4)")
         scene.wait_for_function(f"Math.hypot({ROBOT}[0] - {x}, {ROBOT}[1] - {y}) > 0.5", timeout=PATIENCE)
         curves.wait_for_function("document.getElementById('time').textContent.startsWith('4.0')", timeout=PATIENCE)
@@ -100,6 +99,15 @@ def test_notebook(path, tmp_path):
         for start in (left, left + 430):  # the curves, and the scene beside them, are drawn
             part = shown[top:, start : start + 400].reshape(-1, 3)
             assert len(np.unique(part, axis=0)) > 100
+
+
+def rest(page, place):
+    """Returns a place when it has stayed the same for half a second."""
+    last = None
+    while (now := place()) != last:
+        last = now
+        page.wait_for_timeout(500)
+    return now
 
 
 @contextmanager

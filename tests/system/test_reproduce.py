@@ -39,6 +39,7 @@ PINNED = {  # plant, lap in s and feedforward: V in mm/s, θ̇ in mrad/s and pos
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("reproduction")
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper, "PAPER", ("none", "model", "true_model", "fel"))  # those that the tests below ask for
         patch.setattr(paper, "DRAWS", 1)  # replicates in the table of the tiers; one shows what its test asks for
         tier_runs = paper.real
         patch.setattr(paper, "real", lambda tier: [run.replace(laps=4) for run in tier_runs(tier)])

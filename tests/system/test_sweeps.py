@@ -21,6 +21,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import victim
 import xarray as xr
 
 import mrctl
@@ -64,12 +65,24 @@ def sweep(file):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """The bytes of the sweep, run without incident."""
+def finished(tmp_path_factory):
+    """The store of the sweep, run without incident."""
     folder = tmp_path_factory.mktemp("whole")
     (folder / "sweep.toml").write_text(FILE)
     jobs.run(Sweep.from_toml(folder / "sweep.toml"), folder / "store", workers=1)
-    return content(folder / "store")
+    return folder / "store"
+
+
+@pytest.fixture(scope="module")
+def whole(finished):
+    """The bytes of the sweep."""
+    return content(finished)
+
+
+@pytest.fixture
+def store(finished, tmp_path):
+    """A copy of the finished store."""
+    return shutil.copytree(finished, tmp_path / "store")
 
 
 def content(store):
@@ -77,11 +90,16 @@ def content(store):
     return {str(f.relative_to(store)): f.read_bytes() for f in store.rglob("*") if f.is_file() and f.name != "lock"}
 
 
+def said(stderr):
+    """Lines beside those of a progress bar, which shows run/s or s/run."""
+    lines = stderr.replace("\r", "\n").splitlines()
+    return [line for line in lines if line.strip() and "run/s" not in line and "s/run" not in line]
+
+
 def refused(capsys, *arguments, status=2):
-    """Returns the one line that a command prints on stderr beside its progress bar, which shows run/s or s/run."""
+    """Returns the one line that a command prints on stderr beside its progress bar."""
     assert cli.main([str(a) for a in arguments]) == status
-    printed = capsys.readouterr().err.replace("\r", "\n").splitlines()
-    lines = [line for line in printed if line and "run/s" not in line and "s/run" not in line]
+    lines = said(capsys.readouterr().err)
     assert len(lines) == 1 and "Traceback" not in lines[0], lines
     return lines[0]
 
@@ -101,14 +119,13 @@ def failures(sweep):
     return [run for run in range(sweep.size) if sweep.valid(run) is None]
 
 
-def test_open(sweep, tmp_path):
+def test_open(sweep, finished):
     """One labelled dataset and one table, which hold what `simulate` and `summary` return for the same scenarios."""
-    jobs.run(sweep, tmp_path / "store", 2)
-    table = pd.read_parquet(tmp_path / "store" / "runs.parquet")
+    table = pd.read_parquet(finished / "runs.parquet")
     runs, lost = [run for run in range(24) if run not in failures(sweep)], failures(sweep)
     assert 0 < len(lost) < 12 and list(table["run"]) == list(range(24))
     direct = simulate([sweep.scenario(run) for run in runs]).assign_coords(run=runs)
-    opened = mrctl.open(tmp_path / "store")
+    opened = mrctl.open(finished)
     for name in SIGNALS:
         assert opened[name].dims == ("run", "time") and opened[name].attrs["units"] == SIGNALS[name][0]
         np.testing.assert_array_equal(opened[name].sel(run=runs), direct[name][:, ::10])
@@ -178,10 +195,8 @@ def test_full_with_runs_of_different_length(tmp_path):
 # --- one run again --------------------------------------------------------------------------------
 
 
-def test_run_again(sweep, tmp_path, capsys):
+def test_run_again(sweep, store, tmp_path, capsys):
     """Bit-identical as it is, within tolerance when a bit is off, and where it departs when more is."""
-    store = tmp_path / "store"
-    jobs.run(sweep, store, 2)
     for run in (0, 14, failures(sweep)[0]):
         assert cli.main(["run", str(store), "--run", str(run)]) == 0
         assert capsys.readouterr().out == f"run {run}: bit-identical\n"
@@ -201,10 +216,8 @@ def test_run_again(sweep, tmp_path, capsys):
 # --- refusals -------------------------------------------------------------------------------------
 
 
-def test_changed_sweep(file, sweep, tmp_path, capsys, whole):
+def test_changed_sweep(file, store, capsys, whole):
     """A store goes on only with the file and the versions that began it."""
-    store = tmp_path / "store"
-    jobs.run(sweep, store, 1)
     file.write_text(FILE.replace("runs = 12", "runs = 13"))
     assert "begun with another sweep.runs (12, now 13)" in refused(capsys, "sweep", file, "--out", store)
     file.write_text("# a remark changes nothing\n" + FILE)
@@ -275,10 +288,8 @@ def test_store_of_an_older_version(file, tmp_path, capsys, record):
     assert f"mrctl 0.1.0 began this sweep and this is mrctl {mrctl.__version__}" in line
 
 
-def test_store_that_cannot_be_read(sweep, tmp_path, capsys, whole):
+def test_store_that_cannot_be_read(store, capsys):
     """A newer format, signals without names, an unknown field: one line that names the version that wrote it."""
-    store = tmp_path / "store"
-    jobs.run(sweep, store, 1)
     aged(store, "9.1", **{KIND: 99})
     with pytest.raises(InputError, match=f"mrctl 9.1 wrote this store in format 99; mrctl {mrctl.__version__} reads"):
         mrctl.open(store)
@@ -295,20 +306,16 @@ def test_store_that_cannot_be_read(sweep, tmp_path, capsys, whole):
     assert "(written by mrctl 0.0.9): base.former: Extra inputs" in line
 
 
-def test_signals_keep_their_names(sweep, tmp_path):
+def test_signals_keep_their_names(store):
     """A store says which signals it holds: one that a later version adds or moves changes no name of the others."""
-    store = tmp_path / "store"
-    jobs.run(sweep, store, 1)
     before = mrctl.open(store).load()
     later = {"new": ("1", "a signal that came later"), **dict(reversed(SIGNALS.items()))}
     with mock.patch("mrctl.sweep.store.SIGNALS", later):
         xr.testing.assert_identical(mrctl.open(store).load(), before)
 
 
-def test_repeat_names_another_version(sweep, tmp_path, capsys):
+def test_repeat_names_another_version(store, capsys):
     """Where a run departs from a store that another version began, the line names both versions."""
-    store = tmp_path / "store"
-    jobs.run(sweep, store, 1)
     Store(store)._signals[14, 7, 3] = 3.0
     aged(store, **{KIND: 2})
     line = refused(capsys, "run", store, "--run", 14, status=1)
@@ -341,10 +348,8 @@ def test_bad_input(file, tmp_path, capsys):
     assert not (store / "sweep.json").exists()
 
 
-def test_two_at_once(file, sweep, tmp_path, capsys):
+def test_two_at_once(file, sweep, store, capsys):
     """The second is told who is first; a killed process leaves no lock behind."""
-    store = tmp_path / "store"
-    store.mkdir()
     with Store.locked(store):
         message = refused(capsys, "sweep", file, "--out", store)
     assert f"process {os.getpid()} on" in message and "is running this sweep" in message
@@ -465,13 +470,13 @@ def test_disk_full_at_the_start_and_the_end(file, sweep, tmp_path, whole, capsys
 
 # --- interruptions --------------------------------------------------------------------------------
 
-# Long enough to be hit: 60 jobs.
-LONG = FILE.replace("runs = 12", "runs = 60").replace("chunk = 5", "chunk = 2").replace("length = 0.8", "length = 1.6")
+LONG = FILE.replace("runs = 12", "runs = 24").replace("chunk = 5", "chunk = 2").replace("length = 0.8", "length = 1.6")
+LONG_SWEEP = pytest.mark.xdist_group("long_sweep")  # whose tests share one
 
 
 @pytest.fixture(scope="module")
 def long(tmp_path_factory):
-    """A sweep file of some seconds, and the bytes of its store."""
+    """A file of a sweep of 24 jobs, and the bytes of its store."""
     folder = tmp_path_factory.mktemp("long")
     (folder / "sweep.toml").write_text(LONG)
     jobs.run(Sweep.from_toml(folder / "sweep.toml"), folder / "store", 2)
@@ -479,7 +484,8 @@ def long(tmp_path_factory):
 
 
 def start(file, store):
-    command = [sys.executable, "-m", "mrctl.cli", "sweep", str(file), "--out", str(store), "--workers", "2"]
+    """A sweep whose second half waits for a file `go` beside its store."""
+    command = [sys.executable, victim.__file__, "sweep", str(file), "--out", str(store), "--workers", "2"]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
@@ -502,17 +508,18 @@ def until(condition, seconds=60.0):
     return value
 
 
+@LONG_SWEEP
 @pytest.mark.parametrize("moment", KILLS)
-@pytest.mark.parametrize("victim", ["sweep", "worker"])
-def test_kill(long, tmp_path, moment, victim):
-    """Kill −9 at a random moment: all runs are there in the end, with the same bytes."""
+@pytest.mark.parametrize("hit", ["sweep", "worker"])
+def test_kill(long, tmp_path, moment, hit):
+    """Kill −9 at a random moment of the first half: all runs are there in the end, with the same bytes."""
     file, expected = long
-    store, chance = tmp_path / "store", random.Random(f"{victim} {moment}")
-    process, enough = start(file, store), chance.randrange(55)
+    store, chance = tmp_path / "store", random.Random(f"{hit} {moment}")
+    process, enough = start(file, store), chance.randrange(13)
     until(lambda: (store / "parts").exists() and len(Store(store).done()) >= enough)
     time.sleep(chance.uniform(0, 0.1))
     done = len(Store(store).done())
-    if victim == "sweep":
+    if hit == "sweep":
         below = [pid for one in children(process.pid) for pid in (one, *children(one))]
         process.kill()
         process.communicate()
@@ -521,15 +528,16 @@ def test_kill(long, tmp_path, moment, victim):
     else:
         helpers = children(process.pid)
         os.kill(chance.choice([worker for one in helpers for worker in children(one)]), signal.SIGKILL)
+        (tmp_path / "go").touch()
         _, stderr = process.communicate(timeout=120)
         assert process.returncode == 0 and "Traceback" not in stderr, stderr
     assert content(store) == expected
-    print(f"killed the {victim} after {done} of 60 jobs")
+    print(f"killed the {hit} after {done} of 24 jobs")
 
 
-def test_fork_server_killed(long, tmp_path):
+def test_fork_server_killed(file, tmp_path, whole):
     """The process that forks the workers is replaced as it is killed before it has forked one."""
-    file, expected = long
+    (tmp_path / "go").touch()
     process = start(file, tmp_path / "store")
 
     def forks():
@@ -539,9 +547,10 @@ def test_fork_server_killed(long, tmp_path):
     os.kill(until(forks)[0], signal.SIGKILL)
     _, stderr = process.communicate(timeout=120)
     assert process.returncode == 0 and "Traceback" not in stderr, stderr
-    assert content(tmp_path / "store") == expected
+    assert content(tmp_path / "store") == whole
 
 
+@LONG_SWEEP
 def test_ctrl_c(long, tmp_path):
     """One line, status 130, and the same command goes on."""
     file, expected = long
@@ -553,8 +562,8 @@ def test_ctrl_c(long, tmp_path):
     assert process.returncode == 130 and "Traceback" not in stderr
     done = len(Store(store).done())
     last = stderr.strip().splitlines()[-1]
-    assert last == f"mrctl: interrupted: {2 * done} of 120 runs are done; the same command goes on", stderr
-    assert mrctl.open(store).sizes["run"] == 2 * done < 120
+    assert last == f"mrctl: interrupted: {2 * done} of 48 runs are done; the same command goes on", stderr
+    assert mrctl.open(store).sizes["run"] == 2 * done < 48
     kept = content(store)
     jobs.run(Sweep.from_toml(file), store, 2)
     assert content(store) == expected
@@ -570,7 +579,7 @@ def test_early_ctrl_c(tmp_path, moment):
     time.sleep(moment)
     os.killpg(process.pid, signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
-    lines = [line for line in stderr.splitlines() if "compiling the laws" not in line]
+    lines = [line for line in said(stderr) if "compiling the laws" not in line]
     assert process.returncode == 130 and len(lines) == 1 and lines[0].startswith("mrctl: interrupted"), stderr
 
 

@@ -45,10 +45,26 @@ def browser():
 DRAG_ERROR = "Unable to preventDefault inside passive event listener invocation."  # of viser's page, with any drag
 
 
+# Chromium draws in software, and would keep both cores busy. For tests that do not click or drag in the scene.
+SLOWLY = """{
+    const draw = window.requestAnimationFrame.bind(window), waiting = new Set();
+    let number = 0;
+    window.requestAnimationFrame = (callback) => {
+        waiting.add(++number);
+        const mine = number, once = (time) => waiting.delete(mine) && callback(time);
+        setTimeout(() => draw(once), 70);
+        return mine;
+    };
+    window.cancelAnimationFrame = (given) => waiting.delete(given);
+}"""
+
+
 @contextmanager
-def visit(browser, url, offline=False, known=()):
-    """A page; no error on its console is tolerated, but those that are known."""
+def visit(browser, url, offline=False, known=(), slowly=False):
+    """A page, drawn slowly or as often as it can be; no error on its console is tolerated, but those that are known."""
     context = browser.new_context(viewport={"width": 1280, "height": 800}, offline=offline)
+    if slowly:
+        context.add_init_script(SLOWLY)
     page = context.new_page()
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
@@ -161,7 +177,7 @@ def test_live(browser, tmp_path):
     """Two robots drive along the reference, pause holds them, a payload is dropped, seen, listed, and felt."""
     quiet = BASE.model_copy(update={"sensing": Sensing(tier="ideal")})  # errors of noise would hide that of a payload
     scenarios = [quiet, quiet.model_copy(update={"prior": "none", "learner": "none"})]
-    with serving(lambda server: Live(scenarios, server)) as (live, url), visit(browser, url) as page:
+    with serving(lambda server: Live(scenarios, server)) as (live, url), visit(browser, url, slowly=True) as page:
         until(lambda: node(page, ROBOT) is not None, "the scene")
         start = node(page, ROBOT)
         until(lambda: np.linalg.norm(node(page, ROBOT) - start) > 0.3, "the robot to move")
@@ -358,7 +374,7 @@ def test_inputs(browser, tmp_path):
 def test_many_robots(browser, tmp_path):
     """Beyond four robots the legend says what is left out; labels of robots together are one; numbers fit."""
     robots = [BASE.replace(seed=k, name=f"seed {k}") for k in range(6)]
-    with serving(lambda server: Live(robots, server)) as (live, url), visit(browser, url) as page:
+    with serving(lambda server: Live(robots, server)) as (live, url), visit(browser, url, slowly=True) as page:
         until(lambda: live.session.time > 1 and curves(page, "V, m/s"), "the curves")
         live.ask(live._command, "pause")
         until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
@@ -491,9 +507,9 @@ def test_visitors_come_and_go(browser):
     Each has a camera of its own.
     """
     with serving(lambda server: Live([BASE], server)) as (live, url):
-        with visit(browser, url) as page:
+        with visit(browser, url, slowly=True) as page:
             until(lambda: node(page, ROBOT) is not None, "the scene")
-            with visit(browser, url) as other:
+            with visit(browser, url, slowly=True) as other:
                 until(lambda: node(other, ROBOT) is not None, "the other page")
                 camera = page.evaluate(CAMERA)
                 other.get_by_role("button", name="chase", exact=True).click()
@@ -522,7 +538,10 @@ def test_replay(browser, tmp_path):
     assert result.failure.values.tolist() == ["", "tilt over 30°"]
     save(result, tmp_path / "result.zarr")
     library = Library(tmp_path / "result.zarr")
-    with serving(lambda server: Replay(library, [0, 1], server)) as (replay, url), visit(browser, url) as page:
+    with (
+        serving(lambda server: Replay(library, [0, 1], server)) as (replay, url),
+        visit(browser, url, slowly=True) as page,
+    ):
         until(lambda: node(page, ROBOT) is not None, "the scene")
 
         def on_the_way():
@@ -645,7 +664,7 @@ FIELD = BASE.model_copy(update={"sensing": Sensing(tier="field"), "prior": "mode
 
 def test_estimate_live(browser, tmp_path):
     """What a robot with cheap sensors knows of its posture stands beside the truth, and its V in the same chart."""
-    with serving(lambda server: Live([FIELD], server)) as (live, url), visit(browser, url) as page:
+    with serving(lambda server: Live([FIELD], server)) as (live, url), visit(browser, url, slowly=True) as page:
         until(lambda: live.session.time > 2.5 and node(page, f"{MARKS}/estimate") is not None, "the robot to drive")
         live.ask(live._command, "pause")
         until(lambda: "paused" in page.inner_text("#mrctl-status"), "the pause")
@@ -676,7 +695,10 @@ def test_estimate_replay(browser, tmp_path):
     result = simulate([FIELD.model_copy(update={"laps": 1})])
     save(result, tmp_path / "result.zarr")
     library = Library(tmp_path / "result.zarr")
-    with serving(lambda server: Replay(library, [0], server)) as (replay, url), visit(browser, url) as page:
+    with (
+        serving(lambda server: Replay(library, [0], server)) as (replay, url),
+        visit(browser, url, slowly=True) as page,
+    ):
         until(lambda: node(page, f"{MARKS}/estimate") is not None, "the scene")
         replay.ask(replay._scrub, 3.1)
         replay.ask(setattr, replay.magnified, "value", "1×")
