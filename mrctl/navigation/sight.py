@@ -5,8 +5,9 @@ scan. A cluster is followed from scan to scan by its centre c, and an α–β fi
 
     v ← v + β (c − ĉ) / Δt,    ĉ = c_before + v Δt
 
-The centre of what is seen also shifts while a robot drives past something that stands. A cluster therefore counts as
-moving only from when on beams pass through the place where it was a moment ago, and until it is slow.
+The centre of what is seen also shifts while a robot drives past something that stands, or sees it come out from behind
+something else. A cluster therefore counts as moving only from when on it is where beams passed a moment ago, and until
+it is slow; and its velocity stays as it is while something hides a part of it, or all for a moment.
 
 A cluster becomes a row of small discs along its points, which go on with its velocity until the next scan. Discs that a
 scan does not show are remembered as long as something may hide them, those that move for a moment.
@@ -31,10 +32,10 @@ LEAST = 2  # points of a cluster
 SPACING, RADIUS = 0.1, 0.05  # m, of the discs along a cluster; RADIUS covers the noise of the lidar
 GATE = 0.5  # m between the centre of a cluster and where it was expected, at most
 GAIN = 0.4  # β
-PAST = 10  # scans ago, the place that must be empty now if a cluster begins to move
-EMPTY = 0.3  # share of that place that must be
+PAST = 10  # scans, in one of which the place of a cluster must have been empty if it moves
+EMPTY = 0.3  # share of its points at which it must have been
 SLOW = 0.1  # m/s, below which a cluster stands
-HIDDEN = 1.0  # s, for which a disc that moves is remembered
+HIDDEN = 1.0  # s, for which a cluster, and a disc that moves, is remembered
 NOTHING = Surroundings(Obstacles()).at(0.0)
 
 
@@ -47,10 +48,10 @@ class Cluster(NamedTuple):
     """Velocity of the centre along x and y in m/s, `(2,)`."""
     time: float
     """Time of the scan in s."""
-    past: tuple[Array, ...]
-    """Points of the cluster in the last scans, the oldest first, `(k, 2)` each in m."""
     moves: bool
     """Whether it moves."""
+    whole: bool
+    """Whether nothing hides a part of it."""
 
 
 class Sight:
@@ -73,6 +74,7 @@ class Sight:
         """Forgets all that scans have shown."""
         self._found = [np.zeros((0, 5))] * self._size  # discs: x, y, their velocities, and when they were seen
         self._clusters: list[list[Cluster]] = [[] for _ in range(self._size)]
+        self._scans: list[list[tuple[Array, Array, Array]]] = [[] for _ in range(self._size)]  # arguments of `through`
 
     def see(self, row: int, ranges: Array, angles: Array, place: Array, time: float) -> None:
         """Takes a scan of one robot.
@@ -84,24 +86,28 @@ class Sight:
             place: Estimated pose of the lidar in m, m, rad, `(3,)`.
             time: Time of the scan in s.
         """
-        before, now, discs = list(self._clusters[row]), [], [np.zeros((0, 5))]
-        for points in self._unknown(ranges, angles, place):
-            centre, velocity, past, moves = points.mean(axis=0), np.zeros(2), (points,), False
+        scan, before, now, discs = (ranges, angles, place), list(self._clusters[row]), [], [np.zeros((0, 5))]
+        self._scans[row] = [*self._scans[row][-PAST:], scan]
+        for points, whole in self._unknown(*scan):
+            centre, velocity = points.mean(axis=0), np.zeros(2)
+            was_empty = np.any([through(points, *past) for past in self._scans[row]], axis=0)
+            moves = bool(was_empty.mean() >= EMPTY)
             expected = [c.centre + (time - c.time) * c.velocity for c in before]
             away = [float(np.hypot(*(centre - there))) for there in expected]
             if away and min(away) < GATE:
                 same = int(np.argmin(away))
                 old = before.pop(same)  # one cluster goes on in one
-                velocity = old.velocity + GAIN * (centre - expected[same]) / (time - old.time)
-                past = (*old.past[-PAST:], points)
-                moves = old.moves or through(past[0], ranges, angles, place).mean() >= EMPTY
-                moves &= bool(np.hypot(*velocity) >= SLOW)
-            now.append(Cluster(centre, velocity, time, past, moves))
+                velocity = old.velocity
+                if whole and old.whole:
+                    velocity = velocity + GAIN * (centre - expected[same]) / (time - old.time)
+                moves |= old.moves
+            moves &= bool(np.hypot(*velocity) >= SLOW)
+            now.append(Cluster(centre, velocity, time, moves, whole))
             own = velocity if moves else np.zeros(2)
             discs.append(np.array([(*point, *own, time) for point in _thinned(points)]))
         new = np.concatenate(discs)
-        self._clusters[row] = now
-        self._found[row] = np.concatenate([new, self._hidden(self._found[row], new, ranges, angles, place, time)])
+        self._clusters[row] = now + [cluster for cluster in before if time - cluster.time < HIDDEN]
+        self._found[row] = np.concatenate([new, self._hidden(self._found[row], new, scan, time)])
 
     def discs(self, row: int, time: float) -> Array:
         """Returns discs around what one robot has found beside the map.
@@ -131,8 +137,11 @@ class Sight:
         found = _outlines(self.discs(row, time)).discs + [0.0, 0.0, margin]
         return self.map._replace(discs=np.concatenate([self.map.discs, found]))
 
-    def _unknown(self, ranges: Array, angles: Array, place: Array) -> list[Array]:
-        """Returns the points of each cluster beside the map in m, `(k, 2)`; the arguments are those of `see`."""
+    def _unknown(self, ranges: Array, angles: Array, place: Array) -> list[tuple[Array, bool]]:
+        """Returns the points of each cluster beside the map in m, `(k, 2)`, and whether nothing hides a part of it.
+
+        The arguments are those of `see`.
+        """
         met = np.flatnonzero(np.isfinite(ranges))
         direction = place[2] + angles[met]
         points = place[:2] + ranges[met, None] * np.column_stack([np.cos(direction), np.sin(direction)])
@@ -146,15 +155,21 @@ class Sight:
         near = np.hypot(*(points - np.roll(points, 1, axis=0)).T) < GAP + 2 * _step(angles) * ranges[met]
         joined = near & ((met - np.roll(met, 1)) % len(ranges) <= 2)  # with the point before; the first with the last
         first = np.flatnonzero(~joined)
-        parts = np.split(np.roll(points, -first[0], axis=0), first[1:] - first[0]) if len(first) else [points]
-        return [part for part in parts if len(part) >= LEAST]
+        if len(first):
+            met, points = np.roll(met, -first[0]), np.roll(points, -first[0], axis=0)
+        found = []
+        for part in np.split(np.arange(len(met)), first[1:] - first[0] if len(first) else []):
+            ends = met[part[[0, -1]]]
+            beyond = ranges[(ends + [-1, 1]) % len(ranges)]
+            found.append((points[part], bool(np.all(beyond > ranges[ends] - GAP))))
+        return [(part, whole) for part, whole in found if len(part) >= LEAST]
 
-    def _hidden(self, old: Array, new: Array, ranges: Array, angles: Array, place: Array, time: float) -> Array:
+    def _hidden(self, old: Array, new: Array, scan: tuple[Array, Array, Array], time: float) -> Array:
         """Returns the discs of before, `(k, 5)`, that the scan neither shows nor sees through."""
         if not len(old):
             return old
         places = _placed(old, time)
-        gone = through(places, ranges, angles, place) | (_moves(old) & (time - old[:, 4] > HIDDEN))
+        gone = through(places, *scan) | (_moves(old) & (time - old[:, 4] > HIDDEN))
         if len(new):
             gone |= np.hypot(*(places[:, None] - new[None, :, :2]).transpose(2, 0, 1)).min(axis=1) < 2 * SPACING
         return old[~gone]
