@@ -411,8 +411,8 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             scenario: The scenario.
             goal: Drive to this pose, x and y in m and θ in rad, as in 2 0 0 or 2,0,0; by default to the generator's.
             start: Start at this pose, written as for --goal; by default at that of the generator, or the origin.
-            known: Plan and localise on the map in this file, which may differ from the world and is written as one; by
-                default the map has all that stands still in the world.
+            known: Plan and localise on the map in this file, which may differ from the world and has one of the same
+                formats; by default the map has all that stands still in the world.
             compare: Feedforwards of further robots, such as none or model, which drive the same plan.
             speed: Limit the plan to this speed in m/s; by default to 0.9 of the robot's largest.
             margin: Keep this clearance in m in the plan.

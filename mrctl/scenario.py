@@ -23,7 +23,7 @@ from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
 from mrctl.record import Record
 from mrctl.sensing.tiers import Sensing
-from mrctl.theory.obstacles import Map, Obstacles
+from mrctl.theory.obstacles import Known, Obstacles
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Lemniscate, Reference
 from mrctl.theory.robot import CAR, RobotFile, Steering
@@ -96,7 +96,7 @@ class Scenario(Record):
     obstacles: Obstacles = Obstacles()
     """Obstacles that stand in the world or move in it, or the path of a TOML file of them; a run ends when the robot
     touches one."""
-    map: Map | None = None
+    map: Known | None = None
     """Obstacles on the map, with which missions plan and a lidar is localised, or the path of a TOML file of them; by
     default those that stand still in the world."""
     robot: RobotFile = CAR

@@ -30,10 +30,9 @@ from mrctl.theory.robot import Robot
 class Motion(Protocol):
     """The motion controller: it requests the twist that brings the robot to its reference, once in a motion period.
 
-    It may have a method `see(row, ranges, angles, place, time)`, which gets each scan of the lidar of one robot before
-    the `output` of the same tick: the index of the robot; ranges in m, infinite where nothing returned, and directions
-    of the beams from straight ahead in rad, `(n,)` each; the estimated pose of the lidar in m, m, rad, `(3,)`; and the
-    time since `reset` in s. The robots have lidars, `sensing.lidar`, where there is such a method.
+    It may have a method `see(row, scan)`, which gets the index of a robot and a `mrctl.theory.rays.Scan` in each tick
+    in which the lidar of that robot has scanned, before `output` if that is called in the same tick. The robots have
+    lidars, `sensing.lidar`, where there is such a method.
 
     It may have a member `followed`, a float64 array `(B, 7)`: the reference that it follows in place of the given one,
     in the same units. Its twist then passes the prefilter without lag, as that of the given one does otherwise. It is

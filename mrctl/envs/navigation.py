@@ -13,6 +13,7 @@ from mrctl.kernel import Array, Rows
 from mrctl.navigation.mission import prepared, task_of
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
+from mrctl.theory.rays import Scan
 
 END = 1.0  # reward of an arrival, and minus that of a failure
 WORLD = "doorway:3"  # of the default mission
@@ -21,8 +22,8 @@ WORLD = "doorway:3"  # of the default mission
 class Looking(AgentMotion):
     """An agent with a lidar, whose scans are parts of its observations."""
 
-    def see(self, row: int, ranges: Array, angles: Array, place: Array, time: float) -> None:
-        """Takes no scan, because the observation before this tick contains it."""
+    def see(self, row: int, scan: Scan) -> None:
+        """Does nothing, because the observation already contains the scan."""
 
 
 class Navigating(Episodes):

@@ -7,8 +7,8 @@ width, and any other an infinite one. The critical width is what 95 % of the dra
 the allowance is the same of the width beyond that of the plan, which perfect tracking needs. The critical speed is the
 largest at which, and at all slower ones, 95 % of the draws need no more than a given allowance.
 
-The error budget of the allowance takes away one source of error after the other: that of the map, on which the corridor
-is drawn `MAP_ERROR` beside its place (one standard deviation), that of the estimate, and that of tracking.
+The error budget of the allowance takes away the error of the map, on which the corridor is drawn `MAP_ERROR` beside its
+place (one standard deviation), and then that of the estimate or that of tracking.
 """
 
 from __future__ import annotations
@@ -253,7 +253,7 @@ def critical_speeds(found: Found, shown: str) -> Table:
 
 
 def budget(found: Found, shown: str) -> Table:
-    """Returns the table of the allowance with all sources of error, and when one of them after another is removed."""
+    """Returns the table of the allowance with all errors, without the map's, and without one of the others too."""
     rows, gains = [], {}
     for p, plant in enumerate(PLANTS):
         for c, name in enumerate(CONTROLLERS):
@@ -268,8 +268,9 @@ def budget(found: Found, shown: str) -> Table:
                 )
     listed = "; ".join(f"`{name}` {gain}" for name, gain in gains.items())
     says = (
-        f"With a map that is {1e3 * MAP_ERROR:.0f} mm off, a right one takes from the allowance on the nominal plant, "
-        f"and then a known posture, and an estimate that is always on the reference: {listed} mm."
+        f"On the nominal plant with a map that is {1e3 * MAP_ERROR:.0f} mm off, a right map lowers the allowance by "
+        "the first of three numbers, and then a known posture by the second, or an estimate that is always on the "
+        f"reference by the third: {listed} mm."
     )
     header = [
         "plant",

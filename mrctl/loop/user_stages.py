@@ -18,6 +18,7 @@ from mrctl.loop.hierarchy import Hierarchy, apply_voltages, command_motion, hand
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.sensing.estimators import Estimator
+from mrctl.theory.rays import Scan
 from mrctl.theory.robot import Robot
 
 REPLACED = {"motion": ("k_x", "k_y", "k_theta"), "feedback": ("k_p", "k_i")}
@@ -227,7 +228,7 @@ class UserHierarchy(Hierarchy):
             lidar, ranges = scanner.lidars[row], scanner.scans[row]
             assert ranges is not None
             place, time = lidar.place(estimate[row, :3]), (self.tick - self.started) * self.period
-            stage.ask("see", row, ranges.copy(), lidar.angles, place, time)
+            stage.ask("see", row, Scan(ranges.copy(), lidar.angles, lidar.range, place, time))
 
     def _request(self, stage: UserStage, seen: Rows, goal: Rows) -> Rows | None:
         """Calls the user's motion controller; returns the reference that it follows, if it has one of its own."""

@@ -30,14 +30,15 @@ from mrctl.navigation.sight import Sight
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance, outside, point_to_segment, rim
 from mrctl.theory.obstacles import Obstacles, Outlines, moved
+from mrctl.theory.rays import Scan
 from mrctl.theory.references import Waypoints
 from mrctl.theory.robot import Robot
 
 BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
 RIM = 0.02  # m, radius of the discs around the robot for `Pacing`, which reach as far beyond its footprint
 KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from what is on the map and from what moves; chosen
-# m, what a plan on the way keeps beyond its own margin from what the map does not have, and what it leaves of the
-# clearance that the robot has where that is smaller; chosen
+# m, extra margin of a new plan around what is not on the map; and what a robot that is nearer than that already keeps
+# of its present clearance as the margin of the plan itself; chosen
 ROUND, LEFT = 0.13, 0.03
 TRACKED = 0.01  # m, by which the margin KEPT is smaller than what the discs have on the plan, at least
 STANDOFF = 1.0  # m before a blocked place of its plan, where the robot stops, so that it can drive around it; chosen
@@ -103,9 +104,16 @@ class Avoiding:
         self._time, self._period = 0.0, period
         self._sight.forget()
 
-    def see(self, row: int, ranges: Array, angles: Array, place: Array, time: float) -> None:
-        """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.Motion`."""
-        self._sight.see(row, ranges, angles, place, time)
+    def see(self, row: int, scan: Scan) -> None:
+        """Takes a scan of one robot, for the filter and for the motion stage, if that takes scans."""
+        self._sight.see(row, scan)
+        if look := getattr(self._motion, "see", None):
+            look(row, scan)
+
+    @property
+    def followed(self) -> Array | None:
+        """What the robots follow, as in `mrctl.control.stages.Motion`."""
+        return getattr(self._motion, "followed", None)
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
@@ -187,6 +195,7 @@ class Pacing:
         self._plans, self._kept = [self._sampled(plan)] * size, [self._margin(plan)] * size
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
         self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
+        self._looked = np.zeros(size, bool)  # which robots have a scan that is new
         self._sight.forget()
 
     def _sampled(self, plan: Waypoints) -> Array:
@@ -196,12 +205,16 @@ class Pacing:
         return np.hstack(plan.sample(np.asarray(step * ticks, float)))
 
     def _margin(self, plan: Waypoints) -> Barrier:
-        """Returns the filter for the map, with less clearance than a plan has; it is negative where discs touch it."""
+        """Returns the filter for the map, with less clearance than the plan has.
+
+        The clearance is negative where the discs would overlap the map on the plan.
+        """
         return self._barrier(min(KEPT, room(self._footprint, plan, self._sight.map) - RIM - TRACKED))
 
-    def see(self, row: int, ranges: Array, angles: Array, place: Array, time: float) -> None:
+    def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot, and looks whether its plan is free; for the arguments see `stages.Motion`."""
-        self._sight.see(row, ranges, angles, place, time)
+        self._sight.see(row, scan)
+        self._looked[row] = True
         standing = self._sight.standing(row)
         self._blocked[row] = np.inf
         if not len(standing.discs):
@@ -216,8 +229,9 @@ class Pacing:
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
-        for row in range(len(pose)):
-            self._get_on(row, pose[row])
+        for row in np.flatnonzero(self._looked):  # robots that have failed do not look
+            self._get_on(int(row), pose[row])
+        self._looked[:] = False
         now = np.empty((len(pose), 7))
         for row, plan in enumerate(self._plans):
             first = min(int(self._clock[row]), len(plan) - 2)

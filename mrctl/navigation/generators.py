@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mrctl.kernel import Array
 from mrctl.record import InputError, Record
-from mrctl.theory.obstacles import Box, Disc, Map, Obstacle, Obstacles, Polygon, Pose
+from mrctl.theory.obstacles import Box, Disc, Known, Obstacle, Obstacles, Polygon, Pose
 
 THICK = 0.1  # m, thickness of walls
 
@@ -21,7 +21,7 @@ class Task(Record):
 
     obstacles: Obstacles
     """Obstacles of the world."""
-    map: Map | None = None
+    map: Known | None = None
     """Obstacles on the map of the robot; by default those that stand still."""
     start: Pose
     """Pose at the start: x and y in m, θ in rad."""

@@ -17,8 +17,9 @@ import numpy as np
 from mrctl.kernel import Array, kernel
 from mrctl.navigation.sight import Sight
 from mrctl.theory.clearance import cover
-from mrctl.theory.grid import Field, field_of, value
+from mrctl.theory.grid import Field, near_field, value
 from mrctl.theory.obstacles import Obstacles, Outlines
+from mrctl.theory.rays import Scan
 from mrctl.theory.references import Waypoints
 from mrctl.theory.robot import Robot
 from mrctl.theory.timing import RESERVE
@@ -138,7 +139,8 @@ class Reactive(ABC):
         self._size, self._plan, self._discs = size, plan, cover(footprint, DISCS)
         self._body = float((np.hypot(self._discs[:, 0], self._discs[:, 1]) + self._discs[:, 2]).max())
         places = plan.sample(np.linspace(0, plan.period, 200)).pose[:, :2]
-        self._field = field_of(self._sight.map, places.min(axis=0) - AROUND, places.max(axis=0) + AROUND, CELL)
+        low, high = places.min(axis=0) - AROUND, places.max(axis=0) + AROUND
+        self._field = near_field(self._sight.map, low, high, CELL, self._body + KEPT + 2 * CELL)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
@@ -147,6 +149,7 @@ class Reactive(ABC):
         self._anchor, self._since, self._tried = pose[:, :2].copy(), np.zeros(self._size), np.zeros(self._size)
         self.last = np.zeros((self._size, 2))
         self._sight.forget()
+        self._looked = np.zeros(self._size, bool)  # which robots have a scan that is new; those that failed have none
         self.considered: list[Considered | None] = [None] * self._size
 
     def _sampled(self, plan: Waypoints) -> Array:
@@ -155,9 +158,10 @@ class Reactive(ABC):
         poses = plan.sample(self._period / FINE * np.arange(count + 1.0)).pose
         return np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
-    def see(self, row: int, ranges: Array, angles: Array, place: Array, time: float) -> None:
+    def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.Motion`."""
-        self._sight.see(row, ranges, angles, place, time)
+        self._sight.see(row, scan)
+        self._looked[row] = True
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns twists that the robots can drive, `(B, 2)`; arguments are those of `mrctl.control.stages.Motion`."""
@@ -181,6 +185,7 @@ class Reactive(ABC):
         if np.hypot(*(pose[:2] - self._anchor[row])) > WAITED[1]:
             self._anchor[row], self._since[row] = pose[:2], now
         lost = (away > OFF or now - self._since[row] > WAITED[0]) and now - self._tried[row] > RETRY
+        lost, self._looked[row] = lost and self._looked[row], False
         if lost:
             self._tried[row] = now
         return lost

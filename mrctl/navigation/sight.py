@@ -3,11 +3,12 @@
 Points of a scan that lie too far from the map to belong to it are joined to clusters, as they follow each other in the
 scan. A cluster is followed from scan to scan by its centre c, and an α–β filter with α = 1 estimates its velocity:
 
-    v ← v + β (c − ĉ) / Δt,    ĉ = c_before + v Δt
+    v ← v + β (c − ĉ) / Δt,    ĉ = c_before + v Δt,    β = Δt / (τ + Δt)
 
 The centre of what is seen also shifts while a robot drives past something that stands, or sees it come out from behind
-something else. A cluster therefore counts as moving only from when on it is where beams passed a moment ago, and until
-it is slow; and its velocity stays as it is while something hides a part of it, or all for a moment.
+something else. A cluster therefore begins to count as moving when it occupies a place through which beams passed a
+moment ago, and stops when it is slow. Its velocity is kept while something hides a part of it, or for a moment all of
+it.
 
 A cluster becomes a row of small discs along its points, which go on with its velocity until the next scan. Discs that a
 scan does not show are remembered as long as something may hide them, those that move for a moment.
@@ -21,18 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
-from mrctl.theory.grid import MOST_CELLS, Field, at, field_of
+from mrctl.theory.grid import Field, at, map_area, near_field
 from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings
+from mrctl.theory.rays import Scan
 
-CELL = 0.05  # m, of the distance field of the map
-MARGIN = 1.0  # m, by which it extends beyond the obstacles
 BESIDE = 0.1, 0.02  # m, and share of the range: distance beyond which a point does not belong to a place; chosen
+FAR = 0.5  # m, beyond which it never does
 GAP = 0.3  # m between two points of a cluster, at most
 LEAST = 2  # points of a cluster
 SPACING, RADIUS = 0.1, 0.05  # m, of the discs along a cluster; RADIUS covers the noise of the lidar
 GATE = 0.5  # m between the centre of a cluster and where it was expected, at most
-GAIN = 0.4  # β
-PAST = 10  # scans, in one of which the place of a cluster must have been empty if it moves
+SMOOTH = 0.15  # s, τ; chosen
+PAST, APART = 1.0, 0.1  # s, in which the place of a cluster must have been empty if it moves; between two such scans
 EMPTY = 0.3  # share of its points at which it must have been
 SLOW = 0.1  # m/s, below which a cluster stands
 HIDDEN = 1.0  # s, for which a cluster, and a disc that moves, is remembered
@@ -65,41 +66,35 @@ class Sight:
         """Takes the obstacles on the map, and the number of robots."""
         self.map, self._field, self._size = Surroundings(known).at(0.0), None, size
         if known.shapes:
-            low, high = (corner + side * MARGIN for corner, side in zip(known.bounds, (-1, 1), strict=True))
-            cell = max(CELL, float(np.sqrt(np.prod(high - low) / MOST_CELLS)) * 1.01)
-            self._field: Field | None = field_of(self.map, low, high, cell)
+            low, high, cell = map_area(known)
+            self._field: Field | None = near_field(self.map, low, high, cell, FAR + 2 * cell)
         self.forget()
 
     def forget(self) -> None:
         """Forgets all that scans have shown."""
         self._found = [np.zeros((0, 5))] * self._size  # discs: x, y, their velocities, and when they were seen
         self._clusters: list[list[Cluster]] = [[] for _ in range(self._size)]
-        self._scans: list[list[tuple[Array, Array, Array]]] = [[] for _ in range(self._size)]  # arguments of `through`
+        self._scans: list[list[Scan]] = [[] for _ in range(self._size)]
 
-    def see(self, row: int, ranges: Array, angles: Array, place: Array, time: float) -> None:
-        """Takes a scan of one robot.
-
-        Args:
-            row: Index of the robot.
-            ranges: Ranges in m, `(n,)`; infinite where nothing returned.
-            angles: Directions of the beams from straight ahead in rad, evenly spaced, counter-clockwise, `(n,)`.
-            place: Estimated pose of the lidar in m, m, rad, `(3,)`.
-            time: Time of the scan in s.
-        """
-        scan, before, now, discs = (ranges, angles, place), list(self._clusters[row]), [], [np.zeros((0, 5))]
-        self._scans[row] = [*self._scans[row][-PAST:], scan]
-        for points, whole in self._unknown(*scan):
+    def see(self, row: int, scan: Scan) -> None:
+        """Takes a scan of one robot, whose index is `row`."""
+        time, past = scan.time, [other for other in self._scans[row] if scan.time - other.time < PAST + 1e-9]
+        if not past or time - past[-1].time > APART - 1e-9:
+            past.append(scan)
+        self._scans[row] = past
+        before, now, discs = list(self._clusters[row]), [], [np.zeros((0, 5))]
+        for points, whole in self._unknown(scan):
             centre, velocity = points.mean(axis=0), np.zeros(2)
-            was_empty = np.any([through(points, *past) for past in self._scans[row]], axis=0)
+            was_empty = np.any([through(points, other) for other in past], axis=0)
             moves = bool(was_empty.mean() >= EMPTY)
             expected = [c.centre + (time - c.time) * c.velocity for c in before]
             away = [float(np.hypot(*(centre - there))) for there in expected]
             if away and min(away) < GATE:
                 same = int(np.argmin(away))
-                old = before.pop(same)  # one cluster goes on in one
+                old = before.pop(same)  # each is found again at most once
                 velocity = old.velocity
                 if whole and old.whole:
-                    velocity = velocity + GAIN * (centre - expected[same]) / (time - old.time)
+                    velocity = velocity + (centre - expected[same]) / (SMOOTH + time - old.time)
                 moves |= old.moves
             moves &= bool(np.hypot(*velocity) >= SLOW)
             now.append(Cluster(centre, velocity, time, moves, whole))
@@ -107,7 +102,7 @@ class Sight:
             discs.append(np.array([(*point, *own, time) for point in _thinned(points)]))
         new = np.concatenate(discs)
         self._clusters[row] = now + [cluster for cluster in before if time - cluster.time < HIDDEN]
-        self._found[row] = np.concatenate([new, self._hidden(self._found[row], new, scan, time)])
+        self._found[row] = np.concatenate([new, self._hidden(self._found[row], new, scan)])
 
     def discs(self, row: int, time: float) -> Array:
         """Returns discs around what one robot has found beside the map.
@@ -123,32 +118,30 @@ class Sight:
         return np.column_stack([_placed(found, time), found[:, 2:4], np.full(len(found), RADIUS)])
 
     def standing(self, row: int) -> Outlines:
-        """Returns what one robot has found beside the map that stands."""
+        """Returns those finds of one robot that stand."""
         found = self.discs(row, 0.0)
         return _outlines(found[~_moves(found)])
 
     def moving(self, row: int, time: float) -> Outlines:
-        """Returns what one robot has found that moves, where it would be at a time in s."""
+        """Returns those finds of one robot that move, where they would be at a time in s."""
         found = self.discs(row, time)
         return _outlines(found[_moves(found)])
 
     def outlines(self, row: int, time: float, margin: float = 0.0) -> Outlines:
-        """Returns the map with what one robot has found, at a time in s, the latter with a margin in m around it."""
+        """Returns the map and the finds of one robot at a time in s; the finds are enlarged by a margin in m."""
         found = _outlines(self.discs(row, time)).discs + [0.0, 0.0, margin]
         return self.map._replace(discs=np.concatenate([self.map.discs, found]))
 
-    def _unknown(self, ranges: Array, angles: Array, place: Array) -> list[tuple[Array, bool]]:
-        """Returns the points of each cluster beside the map in m, `(k, 2)`, and whether nothing hides a part of it.
-
-        The arguments are those of `see`.
-        """
+    def _unknown(self, scan: Scan) -> list[tuple[Array, bool]]:
+        """Returns the points of each cluster beside the map in m, `(k, 2)`, and whether nothing hides a part of it."""
+        ranges, angles, place = scan.ranges, scan.angles, scan.place
         met = np.flatnonzero(np.isfinite(ranges))
         direction = place[2] + angles[met]
         points = place[:2] + ranges[met, None] * np.column_stack([np.cos(direction), np.sin(direction)])
         if self._field is not None:
             away = np.empty(len(points))
             from_map.compiled(self._field, points, away)
-            beside = away > BESIDE[0] + BESIDE[1] * ranges[met]
+            beside = away > np.minimum(BESIDE[0] + BESIDE[1] * ranges[met], FAR)
             met, points = met[beside], points[beside]
         if not len(met):
             return []
@@ -164,32 +157,40 @@ class Sight:
             found.append((points[part], bool(np.all(beyond > ranges[ends] - GAP))))
         return [(part, whole) for part, whole in found if len(part) >= LEAST]
 
-    def _hidden(self, old: Array, new: Array, scan: tuple[Array, Array, Array], time: float) -> Array:
+    def _hidden(self, old: Array, new: Array, scan: Scan) -> Array:
         """Returns the discs of before, `(k, 5)`, that the scan neither shows nor sees through."""
         if not len(old):
             return old
-        places = _placed(old, time)
-        gone = through(places, *scan) | (_moves(old) & (time - old[:, 4] > HIDDEN))
+        places = _placed(old, scan.time)
+        gone = through(places, scan) | (_moves(old) & (scan.time - old[:, 4] > HIDDEN))
         if len(new):
             gone |= np.hypot(*(places[:, None] - new[None, :, :2]).transpose(2, 0, 1)).min(axis=1) < 2 * SPACING
         return old[~gone]
 
 
-def through(points: Array, ranges: Array, angles: Array, place: Array) -> NDArray[np.bool]:
-    """Tells for which points, `(k, 2)` in m, all beams pass that would meet a disc of `RADIUS` around them, `(k,)`.
-
-    The other arguments are those of `Sight.see`.
-    """
+def through(points: Array, scan: Scan) -> NDArray[np.bool]:
+    """Tells for which points, `(k, 2)` in m, all beams pass that would meet a disc of `RADIUS` around them, `(k,)`."""
     found = np.empty(len(points), bool)
-    pass_through.compiled(np.ascontiguousarray(points), ranges, angles[0], _step(angles), place, found)
+    beams = scan.ranges, float(scan.angles[0]), _step(scan.angles), scan.reach
+    pass_through.compiled(np.ascontiguousarray(points), *beams, scan.place, found)
     return found
 
 
 @kernel
 def pass_through(
-    points: Array, ranges: Array, first: float, step: float, place: Array, found: NDArray[np.bool]
+    points: Array, ranges: Array, first: float, step: float, most: float, place: Array, found: NDArray[np.bool]
 ) -> None:
-    """Writes what `through` returns into `found`; the beams begin at `first` and are `step` apart, in rad."""
+    """Writes what `through` returns into `found`.
+
+    Args:
+        points: The points in m, `(k, 2)`.
+        ranges: Ranges in m, `(n,)`; infinite where nothing returned.
+        first: Direction of the first beam from straight ahead in rad.
+        step: Angle from one beam to the next in rad.
+        most: Largest range in m, beyond which nothing is seen.
+        place: Pose of the lidar in m, m, rad, `(3,)`.
+        found: Out: whether the beams pass, `(k,)`.
+    """
     n = len(ranges)
     for k in range(len(points)):
         dx, dy = points[k, 0] - place[0], points[k, 1] - place[1]
@@ -197,7 +198,7 @@ def pass_through(
         half = np.arctan2(RADIUS, away)
         beam = ((np.arctan2(dy, dx) - place[2] - first + step / 2) % (2 * np.pi)) / step
         reach, wide = away + BESIDE[0] + BESIDE[1] * away, half / step
-        found[k] = True
+        found[k] = reach <= most
         for i in range(int(np.floor(beam - wide)), int(np.floor(beam + wide)) + 1):
             around = i % max(n, int(np.round(2 * np.pi / step)))
             found[k] &= around < n and ranges[min(around, n - 1)] > reach

@@ -13,11 +13,9 @@ from mrctl.sensing.scan_matching import match
 from mrctl.sensing.scanner import Scanner
 from mrctl.sensing.sensors import Sensors
 from mrctl.sensing.tiers import Sensing
-from mrctl.theory.grid import MOST_CELLS, field_of
+from mrctl.theory.grid import field_of, map_area
 from mrctl.theory.obstacles import Obstacles, Surroundings
 
-CELL = 0.05  # m, side of a cell of the map
-MARGIN = 1.0  # m, by which the map extends beyond the obstacles
 BEAMS = {"scan": 120, "particles": 60}  # largest number of beams of a scan that are used
 AGREES = 0.5  # share of the points of a scan that must lie on the map for a fix
 
@@ -46,10 +44,8 @@ class Localiser:
         """
         self._sensing, self._sensors, self._scanner, self._radius = list(sensing), sensors, scanner, wheel_radius
         if not known.shapes:
-            raise InputError("sensing.localisation: no obstacle stands still, so there is no map to localise on")
-        low, high = (corner + side * MARGIN for corner, side in zip(known.bounds, (-1, 1), strict=True))
-        cell = max(CELL, float(np.sqrt(np.prod(high - low) / MOST_CELLS)) * 1.01)
-        self._map = field_of(Surroundings(known).at(0.0), low, high, cell)
+            raise InputError("sensing.localisation: there is no obstacle on the map, and none to localise by")
+        self._map = field_of(Surroundings(known).at(0.0), *map_area(known))
         self.filters: list[Particles | None] = [None] * len(sensing)
         self._odometry = np.zeros((len(sensing), 2))  # distance in m and turn in rad since the last scan
 

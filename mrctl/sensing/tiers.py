@@ -88,7 +88,7 @@ class Sensing(Record):
     """Source of posture fixes: the `fixes` below, or a lidar and the map of the scenario, by matching
     each `scan` with the map or by a filter of `particles`."""
     lidar: Lidar = Lidar()
-    """Lidar, which only `scan` and `particles` of `localisation` use."""
+    """Lidar, for localisation by `scan` or `particles`, for motion controllers that avoid obstacles, and for agents."""
     encoder_counts: Annotated[int, Field(ge=0, le=10**9)] | None = None
     """Counts of a wheel's encoder in one turn; 0 reads exact angles and rates."""
     encoder_rate: Rate | None = None

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from mrctl.kernel import Array, kernel
 from mrctl.record import InputError
 from mrctl.theory.clearance import point_to_polygon
-from mrctl.theory.obstacles import Outlines
+from mrctl.theory.obstacles import Obstacles, Outlines
 
 MOST_CELLS = 20_000_000
+MAP_CELL, MAP_MARGIN = 0.05, 1.0  # m, side of a cell of the field of a map, which extends so far beyond its obstacles
 
 
 class Grid(NamedTuple):
@@ -123,6 +124,45 @@ def field_of(outlines: Outlines, low: Array, high: Array, resolution: float) -> 
     field = Field(np.empty(grid.occupied.shape), grid.origin, grid.resolution)
     measure.compiled(outlines, field)
     return field
+
+
+def map_area(known: Obstacles) -> tuple[Array, Array, float]:
+    """Returns the rectangle of the field of a map, lower left and upper right corner, `(2,)`, and its cell, in m."""
+    low, high = (corner + side * MAP_MARGIN for corner, side in zip(known.bounds, (-1, 1), strict=True))
+    return low, high, max(MAP_CELL, float(np.sqrt(np.prod(high - low) / MOST_CELLS)) * 1.01)
+
+
+def near_field(outlines: Outlines, low: Array, high: Array, resolution: float, reach: float) -> Field:
+    """Returns `field_of` up to a distance `reach` in m, which stands for every larger one.
+
+    The time is that of the cells near each obstacle, and not that of all cells with all obstacles.
+    """
+    grid = _empty(low, high, resolution)
+    field = Field(np.full(grid.occupied.shape, float(reach)), grid.origin, grid.resolution)
+    measure_near.compiled(outlines, reach, field)
+    return field
+
+
+@kernel
+def measure_near(outlines: Outlines, reach: float, field: Field) -> None:
+    """Lowers the distances of the field to those of `near_field`."""
+    discs, edges, first, rings = outlines
+    distance, origin, resolution = field
+    rows, columns = distance.shape
+    for shape in range(len(discs) + len(rings)):
+        ring = shape - len(discs)
+        x, y, radius = discs[shape] if ring < 0 else rings[ring]
+        around = radius + reach
+        left, right = (x - around - origin[0]) / resolution - 0.5, (x + around - origin[0]) / resolution - 0.5
+        bottom, top = (y - around - origin[1]) / resolution - 0.5, (y + around - origin[1]) / resolution - 0.5
+        for i in range(max(0, int(np.ceil(bottom))), min(rows - 1, int(np.floor(top))) + 1):
+            for k in range(max(0, int(np.ceil(left))), min(columns - 1, int(np.floor(right))) + 1):
+                px, py = origin[0] + (k + 0.5) * resolution, origin[1] + (i + 0.5) * resolution
+                if ring < 0:
+                    away = np.hypot(x - px, y - py) - radius
+                else:
+                    away = point_to_polygon(px, py, edges[first[ring] : first[ring + 1]])
+                distance[i, k] = min(distance[i, k], away)
 
 
 @kernel

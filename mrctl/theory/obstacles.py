@@ -121,7 +121,7 @@ class Obstacles(Record):
 
     @property
     def still(self) -> Obstacles:
-        """World of the obstacles that stand still alone."""
+        """Only the obstacles that stand still."""
         return Obstacles(shapes=self.standing)
 
     @property
@@ -154,7 +154,7 @@ def _still(known: Obstacles) -> Obstacles:
     return known
 
 
-Map = Annotated[Obstacles, AfterValidator(_still)]
+Known = Annotated[Obstacles, AfterValidator(_still)]
 """Obstacles on a map, none of which moves."""
 
 

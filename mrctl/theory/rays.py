@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mrctl.kernel import Array, kernel
 from mrctl.theory.obstacles import Outlines
 
 SLACK = 1e-9  # rad, by which a beam may miss the end of an edge and still meet it, so that none slips through
+
+
+class Scan(NamedTuple):
+    """A scan of a planar lidar, as a robot knows it."""
+
+    ranges: Array
+    """Ranges in m, `(n,)`; infinite where nothing returned."""
+    angles: Array
+    """Directions of the beams from straight ahead in rad, evenly spaced, counter-clockwise, `(n,)`."""
+    reach: float
+    """Largest range in m."""
+    place: Array
+    """Estimated pose of the lidar in m, m, rad, `(3,)`."""
+    time: float
+    """Time since the start of the run in s."""
 
 
 @kernel

@@ -114,7 +114,7 @@ class Live(Page):
         Args:
             scenarios: Scenario of each robot; the first one is solid, the others are ghosts.
             server: Server of the page.
-            avoid: What keeps robots on a mission from obstacles that move.
+            avoid: What keeps robots on a mission from obstacles that the map lacks or that move.
             searched: The arcs of the search for their plan, as of `Plan`.
 
         Raises:

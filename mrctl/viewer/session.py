@@ -44,7 +44,7 @@ class Session:
 
     Attributes:
         start: Scenarios at the start of the session.
-        avoid: What keeps the robots from obstacles that move.
+        avoid: What keeps the robots from obstacles that the map lacks or that move.
         simulations: Indices of the robots in each simulation, and the simulation.
         period: Control period in s.
         preview: Number of control periods until all robots follow a new reference, the largest of the simulations.
@@ -56,7 +56,7 @@ class Session:
 
         Args:
             scenarios: Scenario of each robot; their laps are ignored, since a session lasts up to an hour.
-            avoid: What keeps robots on a mission from obstacles that move.
+            avoid: What keeps robots on a mission from obstacles that the map lacks or that move.
 
         Raises:
             InputError: A scenario is refused, as by `mrctl.simulate`, or robots differ in a field of `SHARED_FIELDS`.

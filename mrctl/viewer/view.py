@@ -60,12 +60,12 @@ def mission(
     """Shows a mission live in the browser; at the goal the robots wait for another one, but end with an avoider.
 
     Args:
-        task: World, start and goal.
+        task: World, map, start and goal.
         scenario: As in `mrctl.navigation.mission.navigate`.
         compare: Feedforwards of the ghosts.
         speed: Largest speed in m/s; by default 0.9 of the robot's.
         margin: Clearance that the plan keeps in m.
-        avoid: What keeps the robots from obstacles that move, as in `navigate`.
+        avoid: What keeps the robots from obstacles that the map lacks or that move, as in `navigate`.
         host: Address to listen on.
         port: Port to listen on.
 

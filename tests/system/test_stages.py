@@ -201,8 +201,8 @@ def test_scans():
             calls.append("reset")
             super().reset(pose, reference, period)
 
-        def see(self, row, ranges, angles, place, time):
-            calls.append((row, ranges, angles, place, time))
+        def see(self, row, scan):
+            calls.append((row, scan))
 
         def output(self, pose, twist, reference):
             calls.append("output")
@@ -219,17 +219,18 @@ def test_scans():
     assert calls[0] == "reset" and [call[0] for call in calls[1:3]] == [0, 1] and calls[3] == "output"
     scans = [call for call in calls if not isinstance(call, str)]
     assert len(scans) == 2 * 40  # 2 s
-    for row, ranges, angles, place, time in scans:
+    for row, (ranges, angles, reach, place, time) in scans:
         run = result.isel(run=row, time=round(100 * time))
         x, y, theta = (float(run[name]) for name in ("x", "y", "theta"))
         np.testing.assert_allclose(place, [x + 0.2 * np.cos(theta), y + 0.2 * np.sin(theta), theta], atol=1e-12)
         met = place[:2] + ranges[:, None] * np.column_stack([np.cos(theta + angles), np.sin(theta + angles)])
         hits = np.isfinite(ranges)
+        assert reach == 12.0
         assert 5 < hits.sum() < 60 and np.abs(met[hits, 0] - 2.9).max() < 1e-6 and np.abs(met[hits, 1]).max() < 2.0
     assert not any(simulate(runs, motion=Kanayama)["failed"])
 
     class Blinded(Sees):
-        def see(self, row, ranges, angles, place, time):
+        def see(self, row, scan):
             raise OSError("no lens")
 
     with pytest.raises(InputError, match=r"motion Blinded: OSError: no lens"):

@@ -54,6 +54,24 @@ def check_movers(scene, time):
     assert disc.position == pytest.approx([0.5 * time, 0, 0], abs=1e-9)
 
 
+def test_map(server):
+    """A map that differs from the world is drawn as the outlines of what it has; without one nothing is."""
+    known = Obstacles(shapes=(Box(x=3.0, y=1.5, length=0.4, width=0.2), Disc(x=1.0, y=-1.0, radius=0.3)))
+    live = Live([DRIVE.replace(map=known)], server)
+    drawn = live._scene._map
+    rims = [
+        shapely.box(2.8, 1.4, 3.2, 1.6).exterior,
+        shapely.Point(1.0, -1.0).buffer(0.3, 256).exterior,
+    ]
+    points = drawn.points.reshape(-1, 3)
+    away = np.array([[rim.distance(shapely.Point(*point[:2])) for rim in rims] for point in points])
+    assert drawn.visible and away.min(axis=1).max() < 1e-3 and set(away.argmin(axis=1)) == {0, 1}
+    assert shapely.unary_union([shapely.LineString(ends) for ends in drawn.points[..., :2]]).length == pytest.approx(
+        sum(rim.length for rim in rims), rel=0.01
+    )
+    assert not Live([DRIVE], server)._scene._map.visible
+
+
 def test_obstacles_move(server, tmp_path):
     """Live and in a replay they are where the physics has them, at the start and later."""
     live = Live([DRIVE], server)

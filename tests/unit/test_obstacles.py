@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from mrctl import Box, Circle, Disc, InputError, Line, Obstacles, Polygon, Scenario
 from mrctl.theory.clearance import clearance, clearances, cover, rim
-from mrctl.theory.grid import at, distance_field, occupancy, rectangles, value
+from mrctl.theory.grid import at, distance_field, field_of, near_field, occupancy, rectangles, value
 from mrctl.theory.obstacles import Surroundings, turned
 
 FOOTPRINT = np.array([[-0.1, -0.2], [0.4, -0.2], [0.45, 0.0], [0.4, 0.2], [-0.1, 0.2]])
@@ -118,6 +118,16 @@ def test_grid():
             assert grid.occupied[row, column]
         if grid.occupied[row, column]:
             assert cell.distance(union) < resolution / np.sqrt(2)
+
+
+def test_near_field():
+    """Up to its reach the field is that of all cells and all obstacles, bit for bit; beyond it is the reach."""
+    random = np.random.default_rng(5)
+    outlines = Surroundings(random_shapes(random, 40)).at(0.0)
+    low, high = np.array([-4.0, -3.0]), np.array([4.0, 5.0])
+    whole = field_of(outlines, low, high, 0.05).distance
+    near = near_field(outlines, low, high, 0.05, 0.4).distance
+    assert np.array_equal(near, np.minimum(whole, 0.4)) and 0.1 < np.mean(near < 0.4) < 0.99
 
 
 def test_distance_field():
