@@ -60,7 +60,10 @@ def test_what_the_map_lacks_is_found(shape: Disc | Box, outline: shapely.Polygon
 
 @pytest.mark.parametrize(("speed", "rate"), [(0.3, 10), (0.5, 10), (0.8, 10), (0.5, 5), (0.5, 50), (0.8, 200)])
 def test_velocity(speed: float, rate: int) -> None:
-    """A disc that crosses 2 m ahead has its velocity to 0.12 m/s (0.25 with a fast lidar) after a second, and is where it would be between scans."""
+    """A disc that crosses 2 m ahead has its velocity after a second, to 0.12 m/s, or 0.25 with a fast lidar.
+
+    Between scans it is where it would be with that.
+    """
     course = Line(heading=np.pi / 2, speed=speed, length=20.0)
     world = Obstacles(shapes=(*WALLS[:1], Disc(x=-1.5, y=-2.0, radius=0.15, course=course)))
     sight, errors = Sight(Obstacles(shapes=WALLS[:1]), 1), []
