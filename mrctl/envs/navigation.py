@@ -73,7 +73,9 @@ class Navigating(Episodes):
         found, scanner = super().sense(), self.loop.estimator.scanner
         assert scanner is not None
         for row in np.flatnonzero(scanner.taken == self.tick):
-            self._scans[row] = np.minimum(scanner.scans[row], self._lidar.range)  # pyright: ignore[reportArgumentType]
+            ranges = scanner.scans[row]
+            assert ranges is not None
+            self._scans[row] = np.minimum(ranges, self._lidar.range)
         return found
 
     def send(self) -> None:

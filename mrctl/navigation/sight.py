@@ -96,7 +96,7 @@ class Sight:
                 if whole and old.whole:
                     velocity = velocity + (centre - expected[same]) / (SMOOTH + time - old.time)
                 moves |= old.moves
-            moves &= bool(np.hypot(*velocity) >= SLOW)
+            moves &= bool(np.hypot(velocity[0], velocity[1]) >= SLOW)
             now.append(Cluster(centre, velocity, time, moves, whole))
             own = velocity if moves else np.zeros(2)
             discs.append(np.array([(*point, *own, time) for point in _thinned(points)]))

@@ -44,7 +44,7 @@ class Lidar(Record):
     @property
     def angles(self) -> Array:
         """Directions of the beams from straight ahead in rad, counter-clockwise, `(beams,)`."""
-        return self.first + self.step * np.arange(self.beams)
+        return self.first + self.step * np.arange(float(self.beams))
 
     def every(self, period: float) -> int:
         """Returns the time between two scans in control periods of this duration in s.

@@ -44,7 +44,7 @@ class Localiser:
         """
         self._sensing, self._sensors, self._scanner, self._radius = list(sensing), sensors, scanner, wheel_radius
         if not known.shapes:
-            raise InputError("sensing.localisation: there is no obstacle on the map, and none to localise by")
+            raise InputError("sensing.localisation: the map has no obstacles to localise by")
         self._map = field_of(Surroundings(known).at(0.0), *map_area(known))
         self.filters: list[Particles | None] = [None] * len(sensing)
         self._odometry = np.zeros((len(sensing), 2))  # distance in m and turn in rad since the last scan

@@ -81,7 +81,7 @@ def test_user_receives_the_same_fixes():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"obstacles": Obstacles()}, "sensing.localisation: no obstacle stands still"),
+        ({"obstacles": Obstacles()}, "sensing.localisation: the map has no obstacles"),
         ({"sensing": {"localisation": "scan", "lidar": {"rate": 30}}}, "sensing.lidar.rate: 30 Hz is no whole"),
         ({"sensing": {"localisation": "scan", "fix_rate": 10}}, "sensing.fix_rate: with a lidar"),
         ({"sensing": {"localisation": "scan", "lidar": {"beams": 0}}}, "sensing.lidar.beams: "),
