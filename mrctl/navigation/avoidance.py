@@ -253,11 +253,10 @@ class Pacing:
             part = self._plans[row][int(self._clock[row]) : int(self._blocked[row]), 3]
             left = self._period * float(np.abs(part).sum()) - STANDOFF
             allowed = approach.compiled(left, self._brakes, self._period) / max(abs(float(request[0])), 1e-9)
+        moving = sight.moving(row, self._period * self._tick)
+        around = (sight.map, self._kept[row]), (sight.standing(row), self._near), (moving, self._away)
         return min(
-            allowed,
-            share(request, pose, sight.map, self._kept[row]),
-            share(request, pose, sight.standing(row), self._near),
-            share(request, pose, sight.moving(row, self._period * self._tick), self._away),
+            allowed, *(share(request, pose, *each) for each in around if len(each[0].discs) + len(each[0].rings))
         )
 
     def _get_on(self, row: int, pose: Array) -> None:

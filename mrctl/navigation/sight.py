@@ -75,6 +75,7 @@ class Sight:
         self._found = [np.zeros((0, 5))] * self._size  # discs: x, y, their velocities, and when they were seen
         self._clusters: list[list[Cluster]] = [[] for _ in range(self._size)]
         self._scans: list[list[Scan]] = [[] for _ in range(self._size)]
+        self._standing = [NOTHING] * self._size
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot, whose index is `row`."""
@@ -102,7 +103,8 @@ class Sight:
             discs.append(np.array([(*point, *own, time) for point in _thinned(points)]))
         new = np.concatenate(discs)
         self._clusters[row] = now + [cluster for cluster in before if time - cluster.time < HIDDEN]
-        self._found[row] = np.concatenate([new, self._hidden(self._found[row], new, scan)])
+        self._found[row] = found = np.concatenate([new, self._hidden(self._found[row], new, scan)])
+        self._standing[row] = _outlines(found[~_moves(found)])
 
     def discs(self, row: int, time: float) -> Array:
         """Returns discs around what one robot has found beside the map.
@@ -119,17 +121,17 @@ class Sight:
 
     def standing(self, row: int) -> Outlines:
         """Returns those finds of one robot that stand."""
-        found = self.discs(row, 0.0)
-        return _outlines(found[~_moves(found)])
+        return self._standing[row]
 
     def moving(self, row: int, time: float) -> Outlines:
         """Returns those finds of one robot that move, where they would be at a time in s."""
-        found = self.discs(row, time)
-        return _outlines(found[_moves(found)])
+        found = self._found[row]
+        moving = found[_moves(found)]
+        return _outlines(_placed(moving, time)) if len(moving) else NOTHING
 
     def outlines(self, row: int, time: float, margin: float = 0.0) -> Outlines:
         """Returns the map and the finds of one robot at a time in s; the finds are enlarged by a margin in m."""
-        found = _outlines(self.discs(row, time)).discs + [0.0, 0.0, margin]
+        found = _outlines(_placed(self._found[row], time)).discs + [0.0, 0.0, margin]
         return self.map._replace(discs=np.concatenate([self.map.discs, found]))
 
     def _unknown(self, scan: Scan) -> list[tuple[Array, bool]]:
@@ -226,9 +228,9 @@ def _moves(discs: Array) -> NDArray[np.bool]:
     return (discs[:, 2:4] != 0).any(axis=1)
 
 
-def _outlines(discs: Array) -> Outlines:
-    """Returns discs, as `Sight.discs` returns them, as outlines."""
-    return NOTHING._replace(discs=np.ascontiguousarray(discs[:, [0, 1, 4]]))
+def _outlines(places: Array) -> Outlines:
+    """Returns discs around places, x and y in m first, as outlines."""
+    return NOTHING._replace(discs=np.column_stack([places[:, :2], np.full(len(places), RADIUS)]))
 
 
 def _thinned(points: Array) -> Array:
