@@ -1,6 +1,7 @@
 """Fixtures for every test."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -14,6 +15,10 @@ from mrctl.theory.robot import Robot
 # other there: an exponential of a 2 × 2 matrix took 3 ms instead of 0.02.
 for threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(threads, "1")
+
+# A shell lets what runs in its background ignore Ctrl-C, and all processes that the tests start would inherit that.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 COMPILE = """
 import sys
