@@ -173,6 +173,8 @@ def obstacles_of(path: str, what: str, other: str = "") -> Obstacles:
     if not (read := READERS.get(Path(path).suffix.lower())):
         neither = "neither" if other else "not"
         raise InputError(f"{what}: {path} is {neither} a file that ends in {', '.join(READERS)}{other}")
+    if not Path(path).is_file():
+        raise InputError(f"{what}: no file {path}")
     return read(path)
 
 

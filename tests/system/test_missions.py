@@ -162,7 +162,7 @@ def test_ends() -> None:
         (["doorway:3", "--localise", "--json"], "localise: needs a value"),
         (["doorway:x"], "the seed must be a number"),
         (["maze:3"], "maze:3 is neither a file"),
-        (["doorway:3", "--map", "none.toml"], "none.toml"),
+        (["doorway:3", "--map", "none.toml"], "map: no file none.toml"),
         (["doorway:3", "--map", "plan.png"], "map: plan.png is not a file that ends in .toml, "),
         (["doorway:3", "--map", "moves.toml"], "map: an obstacle on it has a course"),
         (["doorway:3", "--perturbation.control-delay", "0.013"], "control_delay"),
