@@ -265,10 +265,10 @@ def either_way(
     task: Task, scenario: Scenario, speed: float | None, margin: float, avoid: Avoid, outlines: Outlines | None = None
 ) -> tuple[Plan, Waypoints]:
     """Returns `planned`, with a plan that reverses where there is no other and the robot can drive it."""
-    model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
     try:
         return planned(task, scenario, speed, margin, outlines)
     except InputError:
+        model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
         if avoid in REACTIVE or not mjcf.reverses(model, scenario.steering):
             raise
         return planned(task, scenario, speed, margin, outlines, reverse=True)

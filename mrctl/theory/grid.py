@@ -62,9 +62,9 @@ def occupancy(outlines: Outlines, low: Array, high: Array, resolution: float) ->
     Raises:
         InputError: The rectangle is empty, or has too many cells.
     """
-    grid = _empty(low, high, resolution)
-    occupy.compiled(outlines, grid)
-    return grid
+    reach = resolution / np.sqrt(2.0)
+    field = near_field(outlines, low, high, resolution, 2 * reach)
+    return Grid(field.distance <= reach, field.origin, field.resolution)
 
 
 def _empty(low: Array, high: Array, resolution: float) -> Grid:
@@ -74,29 +74,6 @@ def _empty(low: Array, high: Array, resolution: float) -> Grid:
         raise InputError("grid: the rectangle is empty")
     check_size(rows, columns, "grid")
     return Grid(np.zeros((rows, columns), bool), np.array(low, float), float(resolution))
-
-
-@kernel
-def occupy(outlines: Outlines, grid: Grid) -> None:
-    """Marks the cells of a grid that obstacles may touch; see `occupancy`."""
-    discs, edges, first, rings = outlines
-    occupied, origin, resolution = grid
-    rows, columns = occupied.shape
-    reach = resolution / np.sqrt(2.0)
-    for shape in range(len(discs) + len(rings)):
-        ring = shape - len(discs)
-        x, y, radius = discs[shape] if ring < 0 else rings[ring]
-        left, right = (x - radius - reach - origin[0]) / resolution, (x + radius + reach - origin[0]) / resolution
-        low, high = (y - radius - reach - origin[1]) / resolution, (y + radius + reach - origin[1]) / resolution
-        for i in range(max(0, int(np.floor(low))), min(rows - 1, int(np.floor(high))) + 1):
-            for k in range(max(0, int(np.floor(left))), min(columns - 1, int(np.floor(right))) + 1):
-                px, py = origin[0] + (k + 0.5) * resolution, origin[1] + (i + 0.5) * resolution
-                if ring < 0:
-                    distance = np.hypot(px - x, py - y) - radius
-                else:
-                    distance = point_to_polygon(px, py, edges[first[ring] : first[ring + 1]])
-                if distance <= reach:
-                    occupied[i, k] = True
 
 
 def distance_field(grid: Grid) -> Field:

@@ -96,9 +96,11 @@ def test_unmapped(robot: str, avoid: Avoid, count: int) -> None:
 
 @pytest.mark.parametrize(("robot", "avoid", "count"), cases([("car", "mppi")], ("none", *AVOIDERS), 30))
 def test_crossed(robot: str, avoid: Avoid, count: int) -> None:
-    """Robots that go their own way around what crosses theirs arrive; those that wait are hit more often."""
+    """Robots that look wait for what crosses their way, or go around it, and arrive; most of the others are hit."""
     found, _ = driven("crossed", robot, avoid, count)
-    if avoid in ("window", "mppi"):
+    if avoid == "none":
+        assert found["collided"] > 0.7 * count
+    else:
         assert found["arrived"] >= 0.9 * count
 
 

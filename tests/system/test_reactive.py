@@ -63,6 +63,21 @@ def test_roll_out() -> None:
     assert 20 < sum(verdicts) < len(verdicts) - 20
 
 
+def test_touching_already() -> None:
+    """A robot whose discs touch something already may go on beside it or away, and not deeper."""
+    empty = field_of(Surroundings(Obstacles()).at(0.0), np.array([-3.0, -3.0]), np.array([3.0, 3.0]), 0.1)
+    targets, body = np.tile([1.0, 0.0, 1.0, 0.0], (STEPS, 1)), np.array([[0.0, 0.0, 0.3]])
+    twists, costs = np.empty((2, STEPS, 2)), np.empty(2)
+    knots = np.zeros((2, KNOTS, 2))
+    knots[1, :, 0] = -1.0  # stands
+    for x, y, deeper in ((-0.25, 0.0, False), (0.25, 0.0, True)):  # 5 cm into the robot, behind it and ahead of it
+        scene = Scene(targets, body, empty, np.array([[x, y, 0.0, 0.0, 0.0]]))
+        last = np.array([0.5, 0.0])
+        state = np.zeros(3), last, last, 0.0, 0.05, BOUNDS, scene
+        roll_out(knots, np.tile(last, (STEPS, 1)), *state, twists, costs)
+        assert (costs[0] >= 1000) == deeper
+
+
 def test_lag() -> None:
     """A roll-out with a lag goes where a fine integration of the lag and the unicycle goes, and not where none goes."""
     lag, start, began, last = 0.15, np.array([0.3, -0.2, 0.5]), np.array([0.4, 0.0]), np.array([1.0, 0.6])

@@ -11,10 +11,11 @@ from test_obstacles import judged, random_shapes
 from mrctl import Box, Obstacles, Scenario, Sensing, Waypoints
 from mrctl.control.kanayama import kanayama, posture_error
 from mrctl.loop.hierarchy import Hierarchy
-from mrctl.navigation.avoidance import Barrier, Following, Pacing, approach, avoid, nearest, share
+from mrctl.navigation.avoidance import Avoiding, Barrier, Following, Pacing, approach, avoid, nearest, share
 from mrctl.physics import mjcf
 from mrctl.theory.clearance import clearance, cover, rim
 from mrctl.theory.obstacles import Surroundings, turned
+from mrctl.theory.rays import Scan
 
 FOOTPRINT = np.array([[-0.1, -0.2], [0.44, -0.2], [0.44, 0.2], [-0.1, 0.2]])
 BARRIER = Barrier(cover(FOOTPRINT, 4), margin=0.01, deceleration=1.0, period=0.02, lever=0.3)
@@ -210,3 +211,28 @@ def test_paced_plan_is_driven_whole() -> None:
         ticks += 1
         assert ticks < 3 * plan.period / period
     assert ticks > 1.02 * plan.period / period
+
+
+def test_wrapped_stage_sees() -> None:
+    """The filter hands scans on to the stage that it wraps, and says what that one follows."""
+
+    class Looks:
+        followed, seen = np.zeros((1, 7)), 0
+
+        def __init__(self, robot, size):
+            pass
+
+        def reset(self, pose, reference, period):
+            pass
+
+        def see(self, row, scan):
+            self.seen += 1
+
+        def output(self, pose, twist, reference):
+            return np.zeros((1, 2))
+
+    made = []
+    stage = Avoiding(mjcf.build()[1], 1, lambda *robots: made.append(Looks(*robots)) or made[0], Obstacles(), BARRIER)
+    stage.reset(np.zeros((1, 3)), np.zeros((1, 7)), 0.02)
+    stage.see(0, Scan(np.full(8, np.inf), np.arange(8) * np.pi / 4, 5.0, np.zeros(3), 0.0))
+    assert made[0].seen == 1 and stage.followed is Looks.followed
