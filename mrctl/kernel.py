@@ -61,7 +61,8 @@ class Kernel(Generic[P, T]):
             code, law.__globals__ | self._laws, law.__name__, law.__defaults__, (CellType(version),)
         )
         update_wrapper(versioned, law)
-        return njit(cache=True, nogil=True)(versioned)
+        # Between kernels a call of a small one takes longer than its law, because each array is handed over in parts.
+        return njit(cache=True, nogil=True, forceinline=True)(versioned)
 
     def repeated(self) -> Callable[..., T]:
         """Returns the compiled function for one caller, who promises that the types of its arguments never change.

@@ -84,6 +84,8 @@ def run(
         share of sensors and estimator in it; `today`, the dm_control and autograd loop; and
         `navigation`, what `bench_navigation.run` returns.
     """
+    gc.collect()
+    gc.freeze()  # as in the workers of a sweep
     threads = [1, 2] if (os.cpu_count() or 1) > 1 else [1]
     middle = sizes[len(sizes) // 2]
     rows = [_compare(size, 1, repetitions, chunk) for size in tqdm(sizes, unit="size")]

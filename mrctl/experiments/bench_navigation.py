@@ -18,7 +18,7 @@ from mrctl.experiments.tables import markdown, number
 from mrctl.loop.simulation import simulate
 from mrctl.navigation import mission
 from mrctl.navigation.mission import Avoid, avoiding, prepared, robot_of, task_of
-from mrctl.navigation.mppi import SAMPLES, SPREAD, Mppi
+from mrctl.navigation.mppi import SAMPLES, SPREAD, WORTH, Mppi
 from mrctl.navigation.planning import around, plan, space
 from mrctl.navigation.rollouts import KNOTS, STEPS, roll_out
 from mrctl.physics.obstacles import multi_ray
@@ -161,9 +161,8 @@ def _mppi(turns: int) -> dict[str, Any]:
     knots = np.random.default_rng(0).standard_normal((SAMPLES, KNOTS, 2)) * spread
     nominal, period, scene = np.zeros((STEPS, 2)), own.motion_period, arguments[-1]
     twists, costs = np.empty((SAMPLES, STEPS, 2)), np.empty(SAMPLES)
-    bare = partial(
-        roll_out.compiled, knots, nominal, pose[0], twist[0], twist[0], 0.0, period, stage.bounds, scene, twists, costs
-    )
+    state = pose[0], twist[0], twist[0], 0.0, period, stage.bounds, scene
+    bare = partial(roll_out.compiled, knots, nominal, *state, WORTH, twists, costs)
     name = f"MPPI, {SAMPLES:,} samples of {STEPS} steps"
     return _pair(name, partial(stage.choose, *arguments), "its roll-outs alone", bare, turns)
 

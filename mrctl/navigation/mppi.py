@@ -18,6 +18,7 @@ from mrctl.theory.robot import Robot
 
 SAMPLES = 2000
 TEMPERATURE = 0.05  # λ, in units of the cost; chosen
+WORTH = 40 * TEMPERATURE  # what a sample may cost more than another one and still weigh something: exp(−40) is 4e-18
 KEPT = 40  # of the samples, which are kept to be looked at
 SPREAD = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
 MOST_LAG = 10.0  # s
@@ -73,12 +74,12 @@ class Mppi(Reactive):
         nominal, twists, costs = self._nominal[row], self._twists, self._costs
         nominal[:-1] = nominal[1:].copy()  # a period has passed
         state = pose, twist, last, self._lag, period, self.bounds, scene
-        roll_out.compiled(self._knots, nominal, *state, twists, costs)
+        roll_out.compiled(self._knots, nominal, *state, WORTH, twists, costs)
         weights = np.exp((costs.min() - costs) / TEMPERATURE)
         mean = (weights[:, None, None] / weights.sum() * twists).sum(axis=0)  # BLAS adds in an order of its own
         cheapest, some = twists[costs.argmin()].copy(), twists[:: SAMPLES // KEPT].copy()
         touches = costs.min() >= TOUCH
-        roll_out.compiled(self._knots[:1], mean, *state, twists[:1], costs[:1])
+        roll_out.compiled(self._knots[:1], mean, *state, WORTH, twists[:1], costs[:1])
         nominal[:] = mean if touches or costs[0] < TOUCH else cheapest
         self.considered[row] = Considered(pose.copy(), some, nominal.copy())
         return nominal[0]

@@ -218,8 +218,8 @@ class Reactive(ABC):
 
 @kernel
 def clearance(
-    x: float, y: float, c: float, s: float, time: float, reach: float, discs: Array, distance: Array, left: float,
-    low: float, resolution: float, movers: Array,
+    x: float, y: float, c: float, s: float, time: float, circle: tuple[float, float, float], discs: Array,
+    distance: Array, left: float, low: float, resolution: float, movers: Array,
 ) -> float:  # fmt: skip
     """Returns the distance in m of the discs of a robot from all that it knows, or `KEPT` where it is larger.
 
@@ -229,7 +229,7 @@ def clearance(
         c: Cosine of its heading.
         s: Sine of its heading.
         time: Time in s, from now on, for which what moves goes on as it does now.
-        reach: Radius in m of a circle around the robot's own point that holds all its discs.
+        circle: x and y of the centre in the robot's frame and radius in m of a circle that holds all its discs.
         discs: `Scene.discs`.
         distance: Distances of `Scene.field`, which is taken apart as for `value`.
         left: x of its origin in m.
@@ -237,24 +237,34 @@ def clearance(
         resolution: Side of its cells in m.
         movers: `Scene.movers`.
     """
-    free = KEPT
-    if value(distance, left, low, resolution, x, y) < reach + KEPT:  # else no disc can be nearer
+    free, far = KEPT, circle[2] + KEPT
+    px, py = x + c * circle[0] - s * circle[1], y + s * circle[0] + c * circle[1]
+    if value(distance, left, low, resolution, px, py) < far:  # else no disc can be nearer than KEPT
         for d in range(len(discs)):
             px, py = x + c * discs[d, 0] - s * discs[d, 1], y + s * discs[d, 0] + c * discs[d, 1]
             free = min(free, value(distance, left, low, resolution, px, py) - discs[d, 2])
     for m in range(len(movers)):
         mx, my = movers[m, 0] + time * movers[m, 2] - x, movers[m, 1] + time * movers[m, 3] - y
-        if mx * mx + my * my < (movers[m, 4] + reach + KEPT) ** 2:
+        mx, my = c * mx + s * my, c * my - s * mx
+        if (mx - circle[0]) ** 2 + (my - circle[1]) ** 2 < (movers[m, 4] + far) ** 2:
             for d in range(len(discs)):
-                ahead, aside = c * mx + s * my - discs[d, 0], c * my - s * mx - discs[d, 1]
+                ahead, aside = mx - discs[d, 0], my - discs[d, 1]
                 free = min(free, np.sqrt(ahead * ahead + aside * aside) - movers[m, 4] - discs[d, 2])
     return free
 
 
 @kernel
+def around(discs: Array) -> tuple[float, float, float]:
+    """Returns x and y of the centre and the radius in m of a circle that holds discs, `(k, 3)`."""
+    x = (np.min(discs[:, 0] - discs[:, 2]) + np.max(discs[:, 0] + discs[:, 2])) / 2
+    y = (np.min(discs[:, 1] - discs[:, 2]) + np.max(discs[:, 1] + discs[:, 2])) / 2
+    return x, y, np.max(np.hypot(discs[:, 0] - x, discs[:, 1] - y) + discs[:, 2])
+
+
+@kernel
 def roll_out(
     knots: Array, nominal: Array, pose: Array, twist: Array, last: Array, lag: float, step: float, bounds: Bounds,
-    scene: Scene, twists: Array, costs: Array,
+    scene: Scene, worth: float, twists: Array, costs: Array,
 ) -> None:  # fmt: skip
     """Adds knots to nominal twists, limits the sums to what the robot can drive, and returns the cost of each roll-out.
 
@@ -268,17 +278,17 @@ def roll_out(
         step: Duration of a step in s.
         bounds: What twists the robot can drive.
         scene: Plan and obstacles.
+        worth: What a roll-out may cost more than the cheapest before it; one that costs more is not judged to its end,
+            and its cost is what it was until then.
         twists: Out: the twists of K roll-outs of n steps, `(K, n, 2)`.
         costs: Out: their costs, `(K,)`.
     """
     targets, discs, field, movers = scene
     distance, left, low, resolution = field.distance, field.origin[0], field.origin[1], field.resolution
-    steps, reach = len(nominal), 0.0
-    for d in range(len(discs)):
-        reach = max(reach, np.hypot(discs[d, 0], discs[d, 1]) + discs[d, 2])
+    steps, circle = len(nominal), around(discs)
     # The discs reach beyond the robot, and what it finds is noisy: where they touch it already, deeper is a collision.
     x, y, c, s = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2])
-    least = clearance(x, y, c, s, 0.0, reach, discs, distance, left, low, resolution, movers)
+    least = clearance(x, y, c, s, 0.0, circle, discs, distance, left, low, resolution, movers)
     least = least - DEEPER if least <= 0 else 0.0
     # While a request is held, what is missing of it decays: to `rest` at the end of a step, to `mean` on its average.
     rest = np.exp(-step / lag) if lag > 0 else 0.0
@@ -288,9 +298,10 @@ def roll_out(
         along = k * (knots.shape[1] - 1) / (steps - 1)
         before[k] = min(int(along), knots.shape[1] - 2)
         shares[k] = along - before[k]
+    cheapest = np.inf
     for n in range(len(knots)):
         x, y, c, s, v, omega, cost = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]), last[0], last[1], 0.0
-        drives, turns, touched = twist[0], twist[1], False
+        drives, turns, judged = twist[0], twist[1], False
         for k in range(steps):
             i, share = before[k], shares[k]
             wanted = nominal[k, 0] + (1 - share) * knots[n, i, 0] + share * knots[n, i + 1, 0]
@@ -302,7 +313,7 @@ def roll_out(
             most = min(bounds.rotation, bounds.curvature * v)
             omega = min(max(omega, -most), most)
             twists[n, k, 0], twists[n, k, 1] = v, omega
-            if touched:
+            if judged:
                 continue
             speed, rotation = v + mean * (drives - v), omega + mean * (turns - omega)
             drives, turns = v + rest * (drives - v), omega + rest * (turns - omega)
@@ -314,10 +325,12 @@ def roll_out(
             c, s = c * ch - s * sh, s * ch + c * sh
             dx, dy = targets[k, 0] - x, targets[k, 1] - y
             cost += step * (PLACE * (dx * dx + dy * dy) + HEADING * (1 - c * targets[k, 2] - s * targets[k, 3]))
-            free = clearance(x, y, c, s, (k + 1) * step, reach, discs, distance, left, low, resolution, movers)
+            free = clearance(x, y, c, s, (k + 1) * step, circle, discs, distance, left, low, resolution, movers)
             if free <= least:
-                touched = True
+                judged = True
                 cost += TOUCH * (1 + (steps - k) / steps)  # the earlier, the worse
             elif free < KEPT:
                 cost += step * NEAR * (1 - free / KEPT) ** 2
+            judged |= cost > cheapest + worth
         costs[n] = cost
+        cheapest = min(cheapest, cost)

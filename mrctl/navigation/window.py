@@ -31,11 +31,11 @@ class Window(Reactive):
         constant, rest = np.repeat(grid, KNOTS, axis=1), np.zeros((STEPS, 2))
         ahead, costs = np.empty((len(grid), LOOK, 2)), np.empty(len(grid))
         near = scene._replace(targets=scene.targets[:LOOK])
-        roll_out.compiled(constant, rest[:LOOK], pose, twist, last, 0.0, period, bounds, near, ahead, costs)
+        roll_out.compiled(constant, rest[:LOOK], pose, twist, last, 0.0, period, bounds, near, np.inf, ahead, costs)
         stops, braking = np.empty((len(grid), STEPS, 2)), np.empty(len(grid))
         falling = constant * np.array([1.0, *[0.0] * (KNOTS - 1)])[:, None]
         falling[:, :, 1] = constant[:, :, 1]  # the curvature bounds θ̇ as V falls
-        roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, scene, stops, braking)
+        roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, scene, np.inf, stops, braking)
         costs[braking >= TOUCH] = np.inf
         best = int(costs.argmin())
         chosen = ahead[best] if np.isfinite(costs[best]) else stops[int(braking.argmin())]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import multiprocessing
 import os
@@ -156,6 +157,7 @@ def _uninterrupted() -> Iterator[None]:
 
 def _serve(work: Work, path: str, pipe: Connection) -> None:
     """Runs the loop of a worker: receives jobs and sends their outcomes until the pipe is closed."""
+    gc.freeze()  # else the collector looks through all that was imported, again and again
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logging.getLogger("absl").addFilter(lambda _: False)  # it warns of failing runs, whose failure says why
     multiprocessing.set_start_method("fork", force=True)  # locks of this method do not outlive a kill

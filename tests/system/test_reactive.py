@@ -38,7 +38,7 @@ def test_roll_out() -> None:
     twists, costs = np.empty((200, STEPS, 2)), np.empty(200)
     start, last = np.zeros(3), np.array([1.0, 0.0])
     scene = Scene(targets, discs, field, mover)
-    roll_out(knots, np.tile(last, (STEPS, 1)), start, last, last, 0.0, 0.05, BOUNDS, scene, twists, costs)
+    roll_out(knots, np.tile(last, (STEPS, 1)), start, last, last, 0.0, 0.05, BOUNDS, scene, np.inf, twists, costs)
     v, omega = twists[..., 0], twists[..., 1]
     assert v.min() >= 0 and v.max() <= BOUNDS.speed and np.abs(omega).max() <= BOUNDS.rotation
     assert np.all(np.abs(omega) <= BOUNDS.curvature * v + 1e-12)
@@ -61,6 +61,14 @@ def test_roll_out() -> None:
             verdicts.append(free < 0)
             assert (cost >= 1000) == (free < 0)
     assert 20 < sum(verdicts) < len(verdicts) - 20
+    judged, same = costs.copy(), twists.copy()
+    roll_out(knots, np.tile(last, (STEPS, 1)), start, last, last, 0.0, 0.05, BOUNDS, scene, 20.0, twists, costs)
+    np.testing.assert_array_equal(twists, same)
+    cheapest = np.minimum.accumulate(np.concatenate([[np.inf], judged[:-1]]))  # before each
+    worth = judged <= cheapest + 20.0
+    np.testing.assert_array_equal(costs[worth], judged[worth])
+    assert np.all((cheapest + 20.0 < costs)[~worth] & (costs <= judged)[~worth])
+    assert worth.sum() > 10 and (costs < judged).sum() > 10
 
 
 def test_touching_already() -> None:
@@ -74,7 +82,7 @@ def test_touching_already() -> None:
         scene = Scene(targets, body, empty, np.array([[x, y, 0.0, 0.0, 0.0]]))
         last = np.array([0.5, 0.0])
         state = np.zeros(3), last, last, 0.0, 0.05, BOUNDS, scene
-        roll_out(knots, np.tile(last, (STEPS, 1)), *state, twists, costs)
+        roll_out(knots, np.tile(last, (STEPS, 1)), *state, np.inf, twists, costs)
         assert (costs[0] >= 1000) == deeper
 
 
@@ -95,7 +103,8 @@ def test_lag() -> None:
     scene = Scene(targets, cover(FOOTPRINT, 4), field, np.empty((0, 5)))
     twists, costs, found = np.empty((1, STEPS, 2)), np.empty(1), []
     for tried in (lag, 0.0, 0.5 * lag):
-        roll_out(np.zeros((1, KNOTS, 2)), request, start, began, last, tried, 0.05, BOUNDS, scene, twists, costs)
+        state = start, began, last, tried, 0.05, BOUNDS, scene
+        roll_out(np.zeros((1, KNOTS, 2)), request, *state, np.inf, twists, costs)
         np.testing.assert_allclose(twists[0], request, atol=1e-12)
         found.append(costs[0])
     assert found[0] < 1e-5 and found[1] > 0.1 and found[2] > 0.01
