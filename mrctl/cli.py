@@ -427,7 +427,8 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
                 model, fel and model+composite, on three plants; then drive MPPI around obstacles, with and without a
                 lag in its model, over PID and over model+composite; then plan with what model+composite has learned.
-                Each part prints first how long it takes. The tables are written to --out, by default navigate_suite.
+                Each part prints first how long it takes. The tables are written to --out, by default navigate_suite,
+                where the same command goes on if it was stopped.
             quick: With --suite, drive fewer draws; some confidence intervals then have no upper end.
         """
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})

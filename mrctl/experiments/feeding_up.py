@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -21,6 +22,7 @@ import xarray as xr
 from tqdm import tqdm
 
 from mrctl.control.features import INPUTS, feature_scale
+from mrctl.experiments.journal import Journal
 from mrctl.experiments.mission_suite import PATIENCE, ROOMY, SHAPE, TIE, Mode
 from mrctl.experiments.mission_suite import PLANTS as SHARED
 from mrctl.experiments.suite_tables import Table
@@ -83,18 +85,27 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     Raises:
         InputError: The folder cannot be written, or the robot does not fit most corridors.
     """
+    source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
     with output_folder(out):
-        runs = drive(base, DRAWS[mode])
+        runs = drive(base, DRAWS[mode], Journal(out / "limits.jsonl", source))
     text = table(runs, f"{base.robot.path}, {mode}").markdown
     (out / "limits.md").write_text(text)
-    source = {"versions": versions(), "machine": machine(), "mode": mode, "scenario": base.model_dump(mode="json")}
     rows = {plant: {name: [run._asdict() for run in own] for name, own in of.items()} for plant, of in runs.items()}
-    write_json(out / "limits.json", source | {"limits": rows})
+    write_json(out / "limits.json", source | {"machine": machine(), "limits": rows})
     return text
 
 
-def drive(base: Scenario, count: int) -> dict[str, dict[str, list[Run]]]:
-    """Drives so many draws on all plants; says first how long that takes. Returns the runs by plant and limits."""
+def drive(base: Scenario, count: int, journal: Journal) -> dict[str, dict[str, list[Run]]]:
+    """Drives so many draws on all plants; says first how long that takes.
+
+    Args:
+        base: Robot, steering, sensing and all else that is the same for all.
+        count: Number of draws.
+        journal: What was driven already, by plant, which is kept there.
+
+    Returns:
+        The runs by plant and limits.
+    """
     corners, robot = robot_of(base)
     width, speed, draws = ROOMY * float(np.ptp(corners[:, 1])), RESERVE * robot.max_speed, []
     for seed in range(MOST * count):
@@ -105,26 +116,38 @@ def drive(base: Scenario, count: int) -> dict[str, dict[str, list[Run]]]:
             break
     else:
         raise InputError(f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m")
-    times = sum(one.reference.period for one in draws) * (1 + len(LIMITS)) * len(PLANTS)
-    minutes = max(1, round(times / PACE / cores() / 60))
-    print(f"{(1 + len(LIMITS)) * len(PLANTS) * count} runs that feed up, about {minutes} min", flush=True)
+    left = sum(plant not in journal for plant in PLANTS) * (1 + len(LIMITS))
+    minutes = max(1, round(left * sum(one.reference.period for one in draws) / PACE / cores() / 60))
+    print(f"{left * count} runs that feed up, about {minutes} min", flush=True)
     own = base.replace(**FEEDFORWARDS["model+composite"], laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
     found = {}
     for plant, perturbation in tqdm(PLANTS.items(), unit="plant"):
-        ill = own.replace(perturbation=perturbation)
-        first = simulate([_replicate(ill, one, one.reference) for one in draws])
-        with TemporaryDirectory() as folder:
-            files, references = [], []
-            for k, one in enumerate(draws):
-                run, path, limits = first.isel(run=k), str(Path(folder) / f"{k}.safetensors"), Limits.of(robot)
-                with suppress(InputError):  # a run that failed teaches nothing
-                    save_learned(path, run)
-                    limits = limits_of(run, robot)
-                files.append(path if Path(path).exists() else None)
-                references.append(one.plan.reference(speed, limits))
-            ways = {"nominal": [one.reference for one in draws], "learned": references}
-            found[plant] = {name: _driven(ill, draws, way, files) for name, way in ways.items()}
+        driven = journal.once(plant, partial(_fed, own.replace(perturbation=perturbation), draws, robot, speed))
+        found[plant] = {name: [Run(*run) for run in runs] for name, runs in driven.items()}
     return found
+
+
+def _fed(ill: Scenario, draws: Sequence[Draw], robot: Robot, speed: float) -> dict[str, list[Run]]:
+    """Drives all draws, then plans with what was learned and drives both plans of each; returns the runs by limits.
+
+    Args:
+        ill: The robot with its velocity controller.
+        draws: The draws.
+        robot: The nominal robot.
+        speed: Largest speed of the plans in m/s.
+    """
+    first = simulate([_replicate(ill, one, one.reference) for one in draws])
+    with TemporaryDirectory() as folder:
+        files, references = [], []
+        for k, one in enumerate(draws):
+            run, path, limits = first.isel(run=k), str(Path(folder) / f"{k}.safetensors"), Limits.of(robot)
+            with suppress(InputError):  # a run that failed teaches nothing
+                save_learned(path, run)
+                limits = limits_of(run, robot)
+            files.append(path if Path(path).exists() else None)
+            references.append(one.plan.reference(speed, limits))
+        ways = {"nominal": [one.reference for one in draws], "learned": references}
+        return {name: _driven(ill, draws, way, files) for name, way in ways.items()}
 
 
 def limits_of(run: xr.Dataset, robot: Robot) -> Limits:

@@ -14,6 +14,7 @@ place (one standard deviation), and then that of the estimate or that of trackin
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -24,6 +25,7 @@ import xarray as xr
 from tqdm import tqdm
 
 from mrctl.experiments.cases import HARD
+from mrctl.experiments.journal import Journal
 from mrctl.experiments.suite_tables import TITLES, Table
 from mrctl.experiments.tables import machine, number, output_folder, write_json
 from mrctl.kernel import Array
@@ -105,20 +107,27 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     Raises:
         InputError: The folder cannot be written, or the robot does not fit most corridors.
     """
+    source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
     with output_folder(out):
-        found = drive(base, DRAWS[mode])
+        found = drive(base, DRAWS[mode], Journal(out / "table.jsonl", source))
     shown = f"{base.robot.path}, {mode}"
     tables = [critical_widths(found, shown), critical_speeds(found, shown), budget(found, shown)]
     text = "\n".join(table.markdown for table in tables)
     (out / "table.md").write_text(text)
     values = {name: np.asarray(part).tolist() for name, part in found._asdict().items()}
-    source = {"versions": versions(), "machine": machine(), "mode": mode, "scenario": base.model_dump(mode="json")}
-    write_json(out / "table.json", source | {"controllers": CONTROLLERS, "plants": list(PLANTS)} | values)
+    source |= {"machine": machine(), "controllers": CONTROLLERS, "plants": list(PLANTS)}
+    write_json(out / "table.json", source | values)
     return text
 
 
-def drive(base: Scenario, count: int) -> Found:
-    """Drives so many draws at all speeds with all controllers on all plants; says first how long that takes."""
+def drive(base: Scenario, count: int, journal: Journal) -> Found:
+    """Drives so many draws at all speeds with all controllers on all plants; says first how long that takes.
+
+    Args:
+        base: Robot, steering, sensing and all else that is the same for all.
+        count: Number of draws.
+        journal: What was driven already, by controller and speed, which is kept there.
+    """
     corners, robot = robot_of(base)
     width = ROOMY * float(np.ptp(corners[:, 1]))
     speeds = [share * robot.max_speed for share in SPEEDS]
@@ -126,21 +135,24 @@ def drive(base: Scenario, count: int) -> Found:
     draws = list(islice(filter(None, every), count))
     if len(draws) < count:
         raise InputError(f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m")
-    times = sum(reference.period for one in draws for reference in (*one.references, one.references[-1]))
-    minutes = times * len(CONTROLLERS) * len(PLANTS) / PACE / cores() / 60
-    runs = count * len(CONTROLLERS) * len(PLANTS) * (len(SPEEDS) + 1)
+    size, shares = (len(CONTROLLERS), len(PLANTS), count), [*SPEEDS, "true posture"]
+    times = [sum(one.references[k].period for one in draws) for k in (*range(len(SPEEDS)), -1)]
+    cases = [(c, k) for c in range(len(CONTROLLERS)) for k in range(len(shares))]
+    left = [(c, k) for c, k in cases if [CONTROLLERS[c], shares[k]] not in journal]
+    minutes = sum(times[k] for _, k in left) * len(PLANTS) / PACE / cores() / 60
+    runs = count * len(PLANTS) * len(left)
     print(f"{runs:,} runs, about {max(1, round(minutes))} min on {cores()} cores", flush=True)
-    size = len(CONTROLLERS), len(PLANTS), count
     needed, known, on_reference, off = np.empty((len(SPEEDS), *size)), *(np.empty(size) for _ in range(3))
-    with tqdm(total=len(CONTROLLERS) * (len(SPEEDS) + 1), unit="batch") as bar:
-        for c, name in enumerate(CONTROLLERS):
-            own = base.replace(**FEEDFORWARDS[name])
-            for k in range(len(SPEEDS)):
-                needed[k, c], on_reference[c], off[c] = _widths(_simulated(own, draws, k), draws, corners)
-                bar.update()
-            informed = own.replace(sensing=own.sensing.replace(estimator="truth"))
-            known[c] = _widths(_simulated(informed, draws, -1), draws, corners)[0]
-            bar.update()
+    for c, k in tqdm(cases, unit="batch"):
+        own = base.replace(**FEEDFORWARDS[CONTROLLERS[c]])
+        if k == len(SPEEDS):
+            own, k = own.replace(sensing=own.sensing.replace(estimator="truth")), -1
+        driven = partial(_driven, own, draws, k, corners)
+        widths = np.array(journal.once([CONTROLLERS[c], shares[k]], driven), float)
+        if k < 0:
+            known[c] = widths[0]
+        else:
+            needed[k, c], on_reference[c], off[c] = widths
     plans = []
     for one in draws:
         fastest = one.references[-1]
@@ -170,6 +182,11 @@ def draw(base: Scenario, seed: int, width: float, speeds: Sequence[float]) -> Dr
             continue
         return Draw(seed, [*(found.reference(speed, limits) for speed in speeds[:-1]), fastest], task.goal)
     return None
+
+
+def _driven(own: Scenario, draws: Sequence[Draw], speed: int, corners: Array) -> list[Any]:
+    """Drives all draws on all plants at one speed; returns the widths that they need in m, as `_widths` does."""
+    return _widths(_simulated(own, draws, speed), draws, corners).tolist()
 
 
 def _simulated(own: Scenario, draws: Sequence[Draw], speed: int) -> xr.Dataset:

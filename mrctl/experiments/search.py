@@ -27,7 +27,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import json as jsonlib
 import sys
 from collections.abc import Callable, Sequence
 from functools import cache, partial
@@ -40,6 +39,7 @@ from tqdm import tqdm
 
 from mrctl.control.stages import Stages
 from mrctl.experiments.cases import GRIP, MARGIN, TUNING_SEEDS, slowed
+from mrctl.experiments.journal import Journal
 from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder
 from mrctl.kernel import Array
 from mrctl.loop import user_files
@@ -265,50 +265,35 @@ def score(errors: Array, yardstick: Array) -> Array:
 
 
 class Memory:
-    """A file with the errors of settings that were driven already: a line for each setting in each set of worlds."""
+    """The errors of settings that were driven already, by entry, settings and first seed of the worlds."""
 
     def __init__(self, file: Path, head: dict[str, Any], threads: int = 0) -> None:
         """Opens the file of a search or begins it.
 
         Args:
-            file: The file; an unfinished last line is dropped.
-            head: Everything that the search depends on, which is the first line of the file.
+            file: The file.
+            head: Everything that the search depends on.
             threads: Number of threads; 0 for all cores.
 
         Raises:
             InputError: The file belongs to another search.
         """
-        self._file, self._threads = file, threads
-        begun = file.read_text() if file.exists() else ""
-        lines = [jsonlib.loads(line) for line in begun[: begun.rfind("\n") + 1].splitlines()]
-        head = jsonlib.loads(jsonlib.dumps(head))
-        if lines and lines[0] != head:
-            other = next((name for name in head if lines[0].get(name) != head[name]), "it")
-            raise InputError(f"out: {file} holds another search ({other} differs); choose another folder")
-        lines = lines or [head]
-        file.write_text("".join(jsonlib.dumps(line) + "\n" for line in lines))
-        self._known = {_key(line): np.array(line["errors"]) for line in lines[1:]}
+        self._journal, self._threads = Journal(file, head), threads
 
     def drive(self, entry: Entry, settings: Sequence[dict[str, float]], among: Sequence[Scenario]) -> list[Array]:
         """Returns the errors of each of the settings in the worlds, `(worlds, 3)`; drives settings that are new."""
-        lines = [{"entry": entry.title, "settings": one, "first": among[0].seed} for one in settings]
-        missing = {_key(line): line for line in lines if _key(line) not in self._known}
+        keys = [[entry.title, one, among[0].seed] for one in settings]
+        missing = [key for k, key in enumerate(keys) if key not in self._journal and key not in keys[:k]]
         simulations = []
-        for line in missing.values():
-            runs, stages = entry.tried(line["settings"], among)
+        for _, own, _ in missing:
+            runs, stages = entry.tried(own, among)
             simulations.append(Simulation(runs, threads=1, **stages))
         if simulations:
             run(simulations, threads=self._threads)
-        for (key, line), simulation in zip(missing.items(), simulations, strict=True):
+        for key, simulation in zip(missing, simulations, strict=True):
             laps = metrics.per_lap(simulation.result())
-            self._known[key] = np.stack([metrics.over_laps(laps, name).values for name in METRICS], axis=-1)
-            with self._file.open("a") as file:
-                file.write(jsonlib.dumps(line | {"errors": self._known[key].tolist()}) + "\n")
-        return [self._known[_key(line)] for line in lines]
-
-
-def _key(line: dict[str, Any]) -> str:
-    return jsonlib.dumps([line["entry"], line["settings"], line["first"]])
+            self._journal[key] = np.stack([metrics.over_laps(laps, name).values for name in METRICS], axis=-1).tolist()
+        return [np.array(self._journal[key]) for key in keys]
 
 
 def search(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ import xarray as xr
 from scipy.optimize import fminbound
 from tqdm import tqdm
 
+from mrctl.experiments.journal import Journal
 from mrctl.experiments.mission_suite import PLANTS, Mode
 from mrctl.experiments.suite_tables import Table
 from mrctl.experiments.tables import machine, output_folder, write_json
@@ -97,18 +99,23 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     Raises:
         InputError: The folder cannot be written, or the robot finds no way through most worlds.
     """
+    source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
     with output_folder(out):
-        lag, runs = drive(base, WORLDS[mode])
+        lag, runs = drive(base, WORLDS[mode], Journal(out / "mppi.jsonl", source))
     text = table(lag, runs, f"{base.robot.path}, {mode}").markdown
     (out / "mppi.md").write_text(text)
-    source = {"versions": versions(), "machine": machine(), "mode": mode, "scenario": base.model_dump(mode="json")}
     rows = {entry: {plant: [run._asdict() for run in own] for plant, own in of.items()} for entry, of in runs.items()}
-    write_json(out / "mppi.json", source | {"lag": lag, "runs": rows})
+    write_json(out / "mppi.json", source | {"machine": machine(), "lag": lag, "runs": rows})
     return text
 
 
-def drive(base: Scenario, count: int) -> tuple[float, dict[str, dict[str, list[Run]]]]:
+def drive(base: Scenario, count: int, journal: Journal) -> tuple[float, dict[str, dict[str, list[Run]]]]:
     """Drives so many worlds with all three on all plants; says first how long that takes.
+
+    Args:
+        base: Robot, steering, sensing and all else that is the same for all.
+        count: Number of worlds.
+        journal: What was driven already, by entry and plant, which is kept there.
 
     Returns:
         The lag in s, and the runs by entry and plant, in the order of the worlds.
@@ -116,28 +123,45 @@ def drive(base: Scenario, count: int) -> tuple[float, dict[str, dict[str, list[R
     worlds = list(islice(filter(None, (world(base, seed) for seed in range(MOST * count))), count))
     if len(worlds) < count:
         raise InputError(f"suite: {base.robot.path} finds no way through most slaloms")
-    cases = [(plant, one) for plant in PLANTS for one in worlds]
-    seconds = len(ENTRIES) * sum(one.scenario.reference.period for _, one in cases)
+    left = sum([name, plant] not in journal for name in ENTRIES for plant in PLANTS)
+    seconds = left * sum(one.scenario.reference.period for one in worlds)
     minutes = max(1, round(seconds / PACE / cores() / 60))
-    print(f"{len(ENTRIES) * len(cases)} runs with MPPI, about {minutes} min on {cores()} cores", flush=True)
-    lag, found = 0.0, {}
-    with ThreadPoolExecutor(cores()) as pool, tqdm(total=len(ENTRIES) * len(cases), unit="run") as bar:
+    print(f"{left * count} runs with MPPI, about {minutes} min on {cores()} cores", flush=True)
+    lag, found = 0.0, {name: {} for name in ENTRIES}
+    with tqdm(total=len(ENTRIES) * len(PLANTS) * count, unit="run") as bar:
         for name, (feedforward, lagging) in ENTRIES.items():
-            own = FEEDFORWARDS[feedforward]
-
-            def driven(case: tuple[str, World], own: Any = own, lag: float = lag * lagging) -> xr.Dataset:  # noqa: ANN401
-                plant, one = case
-                (scenario,) = replicates(one.scenario.replace(**own, perturbation=PLANTS[plant]), 1, one.seed)
-                result = simulate([scenario], threads=1, motion=avoiding("mppi", one.scenario, lag))
-                bar.update()
-                return result
-
-            results = list(pool.map(driven, cases))
-            if name == FIRST:
-                lag = fitted([result for (plant, _), result in zip(cases, results, strict=True) if plant == "nominal"])
-            ends = [ended(result, one) for (_, one), result in zip(cases, results, strict=True)]
-            found[name] = {plant: ends[k * count : (k + 1) * count] for k, plant in enumerate(PLANTS)}
+            for plant, perturbation in PLANTS.items():
+                case = {**FEEDFORWARDS[feedforward], "perturbation": perturbation}
+                driven = journal.once([name, plant], partial(_driven, worlds, case, lag * lagging, bar))
+                found[name][plant] = [Run(*run) for run in driven["runs"]]
+                if (name, plant) == (FIRST, "nominal"):
+                    lag = driven["lag"]
+                bar.update(sum(map(len, (own for of in found.values() for own in of.values()))) - bar.n)
     return lag, found
+
+
+def _driven(worlds: Sequence[World], changes: dict[str, Any], lag: float, bar: tqdm) -> dict[str, Any]:
+    """Drives all worlds.
+
+    Args:
+        worlds: The worlds.
+        changes: What replaces the velocity controller and the robot of their scenarios.
+        lag: Lag of the roll-outs in s.
+        bar: Progress bar.
+
+    Returns:
+        `runs`, and the `lag` in s that fits them, `fitted`.
+    """
+
+    def driven(one: World) -> xr.Dataset:
+        (scenario,) = replicates(one.scenario.replace(**changes), 1, one.seed)
+        result = simulate([scenario], threads=1, motion=avoiding("mppi", one.scenario, lag))
+        bar.update()
+        return result
+
+    with ThreadPoolExecutor(cores()) as pool:
+        results = list(pool.map(driven, worlds))
+    return {"runs": [ended(*case) for case in zip(results, worlds, strict=True)], "lag": fitted(results)}
 
 
 def world(base: Scenario, seed: int) -> World | None:

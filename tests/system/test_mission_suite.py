@@ -91,6 +91,23 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     (before,), (after,) = json.loads((tmp_path / "limits.json").read_text())["limits"]["all"].values()
     assert before["arrived"] and after["arrived"] and before["plan"] < after["plan"] < 1.1 * before["plan"]
     assert after["error"] < before["error"]
+    # Stopped half-way, it goes on where it was; with everything driven, it drives nothing.
+    first = {name: (tmp_path / name).read_bytes() for name in ("table.json", "mppi.json", "limits.json")}
+    for name, lines in (("table.jsonl", 5), ("mppi.jsonl", 2), ("limits.jsonl", 1)):
+        kept = (tmp_path / name).read_text().splitlines(keepends=True)
+        (tmp_path / name).write_text("".join(kept[:lines]) + kept[lines][:30])
+    assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("24 runs, about") and "\n2 runs with MPPI" in printed and "\n3 runs that feed" in printed
+    assert {name: (tmp_path / name).read_bytes() for name in first} == first
+    for part in (suite, three, feeding):
+        monkeypatch.setattr(part, "simulate", None)
+    assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
+    assert {name: (tmp_path / name).read_bytes() for name in first} == first
+    capsys.readouterr()
+    assert "other results (scenario differs)" in refused(
+        capsys, "navigate", "--suite", "--quick", "--robot.path", "turtlebot", "--out", str(tmp_path)
+    )
 
 
 def test_learned_limits() -> None:

@@ -122,7 +122,7 @@ def test_same_twice_and_resumed(tmp_path, brief):
     assert len(lines) == 1 + (1 + 1 + 8) + fresh  # head; model and 9 settings; those in fresh worlds
     found = table["tiers"]["lab"]["fresh"]
     assert found["lab"]["to_shipped"]["value"] == pytest.approx(found["lab"]["to_model"] / found["shipped"]["to_model"])
-    with pytest.raises(mrctl.InputError, match="holds another search .entry differs"):
+    with pytest.raises(mrctl.InputError, match="holds other results .entry differs"):
         search.search("model+fel", ("lab",), once, True, TINY)
 
 

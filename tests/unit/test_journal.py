@@ -1,0 +1,51 @@
+"""Results that are kept as they come."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import mrctl
+from mrctl.experiments.journal import Journal
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.floats(allow_nan=False) | st.integers() | st.text(),
+    lambda values: st.lists(values) | st.dictionaries(st.text(), values),
+)
+
+
+@given(results=st.lists(st.tuples(st.lists(st.text() | st.integers()), VALUES)), cut=st.integers(1, 60))
+def test_kept(results, cut, tmp_path_factory):
+    """Another journal of the same file has the same results to the last bit, but for one whose line is torn."""
+    file = tmp_path_factory.mktemp("kept") / "results.jsonl"
+    journal, expected = Journal(file, {"seed": 1}), {}
+    for key, value in results:
+        journal[key] = value
+        expected[json.dumps(key)] = value
+    again = Journal(file, {"seed": 1})
+    assert all(again[json.loads(key)] == value for key, value in expected.items())
+    assert all(again.once(key, pytest.fail) == again[key] for key, _ in results)
+    whole = file.read_bytes()
+    journal["last"] = "x" * 60
+    file.write_bytes(file.read_bytes()[:-cut])
+    torn = Journal(file, {"seed": 1})
+    assert "last" not in torn and file.read_bytes() == whole
+    assert torn.once("last", lambda: 2) == 2 and Journal(file, {"seed": 1})["last"] == 2
+
+
+def test_refused(tmp_path):
+    """Results that depend on something else, a damaged file and a folder are refused, and stay as they are."""
+    file = tmp_path / "results.jsonl"
+    Journal(file, {"seed": 1, "mode": "quick"})["a"] = 1.5
+    kept = file.read_bytes()
+    with pytest.raises(mrctl.InputError, match=r"^out: .*holds other results \(mode differs\)"):
+        Journal(file, {"seed": 1, "mode": "core"})
+    assert file.read_bytes() == kept
+    for damaged in (b"[1, 2]\n", b'{"seed": 1}\n7\n', b"{]\n", b"\xff\n"):
+        file.write_bytes(damaged)
+        with pytest.raises(mrctl.InputError, match="^out: .*(is damaged|holds other)"):
+            Journal(file, {"seed": 1})
+        assert file.read_bytes() == damaged
+    with pytest.raises(mrctl.InputError, match="^out: .*directory"):
+        Journal(tmp_path, {})
