@@ -62,7 +62,7 @@ RADIUS = 0.2  # m, of the discs
 PATIENCE = 2  # time of a run over that of its plan, after which it is out of time
 MOST = 10  # worlds that are made, over the number that is driven
 MOST_LAG = 1.0  # s
-PACE = 2.2  # simulated s in a s of one core
+PACE = 8  # simulated s in a s of one core
 TIE = PERIOD
 
 

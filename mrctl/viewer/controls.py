@@ -202,7 +202,7 @@ class Controls:
                     kind = type(value).model_fields["kind"].default
                     self._set(where, kind)
                     for other in _kinds(field):
-                        self._folders[*where, other].visible = other == kind
+                        _update(self._folders[*where, other], visible=other == kind)
                     where = (*where, kind)
                 self.show(value, where)
             elif where in self._inputs:
@@ -213,18 +213,16 @@ class Controls:
 
     def _show_design(self, path: tuple[str, ...], value: float | None, own: bool) -> None:
         """Says whether a field has a value of its own or that of the design, which may be beyond what may be set."""
-        handle, self._buttons[path].visible = self._inputs[path], own
-        handle.label = self._label(path) if own else f"{self._label(path)} (designed)"
-        handle.visible = value is not None
+        handle, label = self._inputs[path], self._label(path)
+        _update(self._buttons[path], visible=own)
+        _update(handle, label=label if own else f"{label} (designed)", visible=value is not None)
         if value is not None:  # a page would move a value that is beyond the limits of its input
-            handle.min, handle.max = min(handle.min, value), max(handle.max, value)
+            _update(handle, min=min(handle.min, value), max=max(handle.max, value))
 
     def _set(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
-        handle = self._inputs[path]
         if path in self._sliders:
             self._fit(path, value)
-        if handle.value != value:
-            handle.value = value
+        _update(self._inputs[path], value=value)
 
     def suit(self, robot: Robot) -> None:
         """Gives the sliders the ranges that suit a robot."""
@@ -237,8 +235,8 @@ class Controls:
 
     def _fit(self, path: tuple[str, ...], value: float) -> None:
         """Gives a slider its own range, or moves one end to a value beyond it."""
-        handle, (low, high) = self._inputs[path], self._sliders[path][1]
-        handle.min, handle.max = min(low, value), max(high, value)
+        low, high = self._sliders[path][1]
+        _update(self._inputs[path], min=min(low, value), max=max(high, value))
 
     def _shown(self, record: Record, path: tuple[str, ...]) -> Any:  # noqa: ANN401
         """Returns the value of a field; one that is not set has the value of the tier or of the design."""
@@ -248,6 +246,13 @@ class Controls:
         if isinstance(record, Sensing):
             return record.source if name == "estimator" else record[name]
         return self.designed.get(path)
+
+
+def _update(handle: Any, **properties: Any) -> None:  # noqa: ANN401
+    """Sets those properties of a handle that differ; viser takes 20 µs for one, and an event shows some two hundred."""
+    for name, value in properties.items():
+        if getattr(handle, name) != value:
+            setattr(handle, name, value)
 
 
 def _words(path: tuple[str, ...]) -> str:
