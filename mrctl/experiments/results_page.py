@@ -1,6 +1,7 @@
 """The developers' command that writes `RESULTS.md` from the output of the commands of mrctl.
 
     python -m mrctl.experiments.results_page --suite suite --bench bench.json --out mrctl/experiments/RESULTS.md
+    python -m mrctl.experiments.results_page --everything results --out mrctl/experiments/RESULTS.md
 
 The page is a list of sections, each under a heading of the second level. A section whose input is given is rewritten;
 every other section of an existing page stays as it is. So one table can be renewed without the half hour of the suite,
@@ -10,21 +11,24 @@ and the paragraphs that people wrote about the tables survive.
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
 
+from mrctl import __version__
 from mrctl.experiments import bench as benchmark
 from mrctl.experiments import identify as identification
 from mrctl.experiments import paper, tuning
 from mrctl.experiments.cases import REPLICATES
 from mrctl.experiments.held_out import LOG
 from mrctl.experiments.suite_tables import COLUMNS, TITLES, interval
-from mrctl.experiments.tables import markdown, number
+from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.record import InputError
 
 BEGINNING = """# Results
@@ -32,6 +36,27 @@ BEGINNING = """# Results
 `python -m mrctl.experiments.results_page` writes the tables of this page from what the commands leave behind."""
 BENCHMARK = ("nominal", "all")
 """Cases of the suite in the short table at the beginning of its section."""
+
+ROBOTS = "racecar", "car", "turtlebot"
+SEARCHED = (
+    "none", "model+observer", "model+indi", "model+l1", "fel", "model+fel", "rls", "model+rls", "model+mrac",
+    "model+composite",
+)  # fmt: skip
+SOURCES: dict[str, tuple[str, ...]] = {
+    "reproduce": ("reproduce --out reproduction",),
+    "suite": ("suite --out suite",),
+    "random": ("suite --full --feedforward none fel --seeds 1 --random 1000 --out worlds",),
+    "held_out": ("suite --held-out model+composite --out held_out",),
+    "tune": (
+        *(f"tune {robot} --delay 0 0.01 0.02 --out tune/{robot}" for robot in ROBOTS),
+        "tune --time-constant 0.15 --delay 0 0.02 0.04 --out tune/imc",
+    ),
+    "search": tuple(f"tune --search {name} --out search/{name}" for name in SEARCHED),
+    "navigate": tuple(f"navigate --suite --robot.path {robot} --out corridors/{robot}" for robot in ROBOTS),
+    "identify": tuple(f"identify --robot.path {robot} --json > identify_{robot}.json" for robot in ROBOTS),
+    "bench": ("bench --json > bench.json",),
+}
+"""The commands whose output is each input of this one; each ends with where it writes."""
 
 Table = Mapping[str, Any]
 
@@ -48,6 +73,7 @@ def main(
     limits: tuple[Path, ...] = (),
     identify: tuple[Path, ...] = (),
     bench: Path | None = None,
+    everything: Path | None = None,
     out: Path = Path("RESULTS.md"),
 ) -> None:
     """Writes the sections whose inputs are given into the page of results; the other sections stay as they are.
@@ -65,11 +91,20 @@ def main(
         limits: The same folders, for what it found with learned limits.
         identify: Files with the output of `mrctl identify --json`, one for each robot.
         bench: File with the output of `mrctl bench --json`.
+        everything: Instead, run all these commands in this folder, which takes some five hours of two cores, and take what
+            they write. Those that this version of mrctl has ended there already are not run again, so that the same
+            command goes on where it was stopped.
         out: The page to write.
 
     Raises:
-        InputError: No input is given, or one cannot be read or was not written by its command.
+        InputError: No input is given, or one cannot be read or was not written by its command, or a command fails.
     """
+    if everything is not None:
+        found = drive(everything)
+        (reproduce,), (suite,), (random,) = found["reproduce"], found["suite"], found["random"]
+        (held_out,), (bench,) = found["held_out"], found["bench"]
+        tune, search, identify = found["tune"], found["search"], found["identify"]
+        navigate = mppi = limits = found["navigate"]
     written: dict[str, str] = {}
     if reproduce is not None:
         table = _read(reproduce / "table.json", "last_lap", "endurance", "tiers", "kanayama")
@@ -122,6 +157,39 @@ def main(
         out.write_text("\n\n".join(parts) + "\n")
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from None
+
+
+def drive(folder: Path) -> dict[str, tuple[Path, ...]]:
+    """Runs the commands of `SOURCES` in a folder, but those that this version has ended there.
+
+    Returns:
+        The folders and files that they wrote, by input of `main`.
+
+    Raises:
+        InputError: A command fails, or the folder cannot be made.
+    """
+    with output_folder(folder):
+        found = {name: tuple(_driven(folder, command) for command in own) for name, own in SOURCES.items()}
+    return found
+
+
+def _driven(folder: Path, command: str) -> Path:
+    """Runs a command of `SOURCES`, if this version has not; returns where it wrote."""
+    words = command.split()
+    place = folder / words[-1]
+    with suppress(OSError, ValueError, LookupError):
+        table = json.loads((place if place.suffix else place / "table.json").read_text())
+        if (table.get("versions") or table["machine"])["mrctl"] == __version__:
+            return place
+    print(f"mrctl {command}", flush=True)
+    shown = subprocess.PIPE if ">" in words else None
+    arguments = words[: words.index(">")] if shown else words
+    done = subprocess.run([sys.executable, "-m", "mrctl", *arguments], cwd=folder, stdout=shown, check=False)
+    if done.returncode:
+        raise InputError(f"everything: mrctl {command} ended with status {done.returncode}")
+    if shown:
+        place.write_bytes(done.stdout)
+    return place
 
 
 def sections(page: str) -> dict[str, str]:

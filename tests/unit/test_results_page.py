@@ -1,11 +1,16 @@
 """The page of results, from inputs in the form in which the commands write them."""
 
+import inspect
 import json
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import mrctl
+from mrctl import cli
 from mrctl.experiments import bench, identify, paper, results_page, tuning
 from mrctl.experiments.tables import machine, write_json
 from mrctl.results.dataset import versions
@@ -169,6 +174,59 @@ def test_sections(
     assert "`mrctl identify --robot.path racecar`" in page["Identification"]
     assert "| 21.32    | 21 to 21.64   | 21.28 | +0.19 % |" in page["Identification"]
     assert "| 0.912 |" in page["Speed"] and bench.text(json.loads(figures.read_text())) in page["Speed"]
+
+
+def test_everything(
+    suite: Path, reproduction: Path, tune: Path, designed: Path, searched: Path, navigated: Path, identified: Path,
+    figures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture,
+) -> None:  # fmt: skip
+    """One command drives what its page shows, and only what this version has not driven; a failure keeps the rest."""
+    made = {
+        "reproduce": reproduction, "suite": suite, "random": suite, "tune": designed, "search": searched,
+        "navigate": navigated, "identify": identified, "bench": figures,
+    }  # fmt: skip
+    for name, source in (("suite", suite), ("reproduce", reproduction)):
+        table = json.loads((source / "table.json").read_text())
+        table["versions"]["mrctl"] = mrctl.__version__ if name == "suite" else "0.1.0"
+        (source / "table.json").write_text(json.dumps(table))
+    sources = {name: own[-1:] for name, own in results_page.SOURCES.items() if name in made}
+    monkeypatch.setattr(results_page, "SOURCES", {**sources, "held_out": ("suite --held-out none --out held_out",)})
+    shutil.copytree(suite, tmp_path / "all" / "suite")  # of this version
+    shutil.copytree(reproduction, tmp_path / "all" / "reproduction")  # of another
+    ran, failing = [], "suite --held-out"
+
+    def run(words: list[str], cwd: Path, stdout: int | None, **_: object) -> subprocess.CompletedProcess:
+        command = " ".join(words[3:])
+        ran.append(command)
+        if command.startswith(failing):
+            return subprocess.CompletedProcess(words, 1)
+        (source,) = (made[name] for name, (own,) in sources.items() if own.startswith(command))
+        if stdout is None:
+            shutil.copytree(source, cwd / words[-1], dirs_exist_ok=True)
+        return subprocess.CompletedProcess(words, 0, b"" if stdout is None else source.read_bytes())
+
+    monkeypatch.setattr(subprocess, "run", run)
+    words = ["--everything", str(tmp_path / "all"), "--out", str(tmp_path / "RESULTS.md")]
+    assert results_page.command(words) == 2
+    assert "mrctl suite --held-out none --out held_out ended with status 1" in capsys.readouterr().err
+    assert len(ran) == len(sources) and ran[0] == "reproduce --out reproduction" and "suite --out suite" not in ran
+
+
+@pytest.mark.parametrize("source", [*results_page.SOURCES, "mppi", "limits"])
+def test_sources(source: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """Each input of the page has its commands, whose flags are flags of mrctl."""
+    assert source in inspect.signature(results_page.main).parameters
+
+    def reached(*_: object, **__: object) -> None:
+        raise mrctl.InputError("reached")
+
+    for job in ("paper.reproduce", "suite.suite", "held_out.judge", "tuning.tune", "search.search"):
+        monkeypatch.setattr(f"mrctl.experiments.{job}", reached)
+    for job in ("mission_suite.suite", "identify.run", "bench.run"):
+        monkeypatch.setattr(f"mrctl.experiments.{job}", reached)
+    for command in results_page.SOURCES.get(source, ()):
+        assert cli.main(command.partition(" >")[0].split()) == 2
+        assert capsys.readouterr().err == "mrctl: reached\n"
 
 
 def test_random_worlds(suite: Path, tmp_path: Path) -> None:
