@@ -421,8 +421,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
                 around what is in the way (`window`, `mppi`).
             out: Write the result, the table in JSON and the figures to this folder.
             json: Print JSON instead of a table.
-            view: Instead of a table, show the mission live in the browser; without --avoid, further goals can be set
-                by clicks there.
+            view: Instead of a table, show the mission live in the browser, where clicks set further goals.
             port: Number of the port to listen on, with --view.
             suite: Instead of one mission, compare how narrow a corridor, and how fast, the robot can drive with PID,
                 model, fel and model+composite, on three plants; then drive MPPI around obstacles, with and without a

@@ -34,6 +34,10 @@ class Motion(Protocol):
     in which the lidar of that robot has scanned, before `output` if that is called in the same tick. The robots have
     lidars, `sensing.lidar`, where there is such a method.
 
+    It may have a method `follow(row, plan)`, which gets the index of a robot and the reference of an event, one of
+    `mrctl.theory.references`, before the first `output` that is given this reference. A motion controller with such a
+    method may go along its reference at its own pace: the run does not fail where the robot is far from it.
+
     It may have a member `followed`, a float64 array `(B, 7)`: the reference that it follows in place of the given one,
     in the same units. Its twist then passes the prefilter without lag, as that of the given one does otherwise. It is
     read after each `output`, and None stands for the given one.

@@ -1,9 +1,10 @@
-"""The events of a run: perturbations, pushes, new gains, and learning switched on or off."""
+"""The events of a run: perturbations, pushes, new gains, new references, and learning switched on or off."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,12 +12,17 @@ from mrctl.loop.hierarchy import Hierarchy
 from mrctl.physics.plant import Plant
 from mrctl.scenario import Event, Scenario
 from mrctl.theory.perturbation import Perturbation
+from mrctl.theory.references import Reference
+
+T = TypeVar("T")
 
 
 class Events:
-    """The events of a group of runs, by control tick; changes of the reference are in `Courses` instead."""
+    """The events of a group of runs, by control tick; `Courses` samples the references that they bring."""
 
-    def __init__(self, scenarios: Sequence[Scenario], plant: Plant, hierarchy: Hierarchy, period: float) -> None:
+    def __init__(
+        self, scenarios: Sequence[Scenario], plant: Plant, hierarchy: Hierarchy, period: float, preview: int
+    ) -> None:
         """Perturbs the robots as their scenarios demand, and schedules their events.
 
         Args:
@@ -24,10 +30,12 @@ class Events:
             plant: The physics, on which perturbations and pushes act.
             hierarchy: The controllers, whose gains change.
             period: Control period in s.
+            preview: Number of control ticks by which the controllers are given a reference ahead.
         """
-        self._plant, self._hierarchy, self._period = plant, hierarchy, period
+        self._plant, self._hierarchy, self._period, self._preview = plant, hierarchy, period, preview
         self._sensing = [s.sensing for s in scenarios]
         self._schedule: dict[int, list[tuple[int, Event]]] = defaultdict(list)
+        self._references: dict[int, list[tuple[int, Reference]]] = defaultdict(list)
         self._applied = -1  # last tick whose events were applied
         for row, scenario in enumerate(scenarios):
             self.perturb(row, scenario.perturbation)
@@ -36,18 +44,24 @@ class Events:
     def _enter(self, row: int, scenario: Scenario, tick: int) -> None:
         for event in sorted(scenario.events, key=lambda e: e.time):
             self._schedule[tick + event.tick(self._period)].append((row, event))
+            if event.reference is not None:
+                since = max(tick, tick + event.tick(self._period) - self._preview)
+                self._references[since].append((row, event.reference))
 
     def add(self, event: Event) -> None:
         """Schedules an event for every robot."""
-        self._schedule[event.tick(self._period)] += enumerate([event] * self._plant.size)
+        tick, rows = event.tick(self._period), range(self._plant.size)
+        self._schedule[tick] += [(row, event) for row in rows]
+        if event.reference is not None:
+            self._references[tick - self._preview] += [(row, event.reference) for row in rows]
 
     def restart(self, row: int, scenario: Scenario, tick: int) -> None:
         """Schedules the events of a new scenario for one robot, whose time begins at this tick.
 
         If some of them perturb the plant, the perturbation of the scenario itself is applied anew.
         """
-        coming = {t: [e for e in entries if e[0] != row] for t, entries in self._schedule.items() if t >= tick}
-        self._schedule, self._applied = defaultdict(list, coming), -1
+        self._schedule, self._references = _others(self._schedule, row, tick), _others(self._references, row, tick)
+        self._applied = -1
         self._enter(row, scenario, tick)
         if any(event.perturbation for event in scenario.events):
             self.perturb(row, scenario.perturbation)
@@ -59,6 +73,8 @@ class Events:
         if tick == self._applied:
             return
         self._applied = tick
+        for row, reference in self._references.get(tick, ()):
+            self._hierarchy.set_reference(row, reference)
         for row, event in self._schedule.get(tick, ()):
             if event.perturbation is not None:
                 self.perturb(row, event.perturbation)
@@ -77,3 +93,9 @@ class Events:
         delay = round(perturbation.control_delay / self._period) + sensing.periods("delay", self._period)
         self._plant.perturb(row, perturbation, delay, sensing.driver, sensing.servo)
         self._hierarchy.set_truth(row, self._plant.truth[row])
+
+
+def _others(schedule: dict[int, list[tuple[int, T]]], row: int, tick: int) -> dict[int, list[tuple[int, T]]]:
+    """Returns what a schedule has for other robots than one, from a tick on."""
+    coming = {t: [entry for entry in entries if entry[0] != row] for t, entries in schedule.items() if t >= tick}
+    return defaultdict(list, coming)

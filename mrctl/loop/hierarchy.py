@@ -44,6 +44,7 @@ from mrctl.loop.learned import load_learned
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.sensing.scanner import Scanner
+from mrctl.theory.references import Reference
 from mrctl.theory.robot import Robot
 
 SLIPS = 0.1  # slip ratio above which the voltage does not explain the motion, and nothing is learned
@@ -282,6 +283,11 @@ class Hierarchy:
         """Whether a stage takes the scans of a lidar, which none of the built-in ones does."""
         return False
 
+    @property
+    def roams(self) -> bool:
+        """Whether a stage goes along the reference at its own pace or leaves it, as none of the built-in ones does."""
+        return False
+
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
         """Changes the motion controller of one robot; gains that are not set are designed for its PID at the start."""
         designed = self._motions[row].kanayama.model_dump()
@@ -311,6 +317,9 @@ class Hierarchy:
         around = Motion(kanayama, prefilter, self._motions[row].lag)
         gains = self._pids[row].channels(self.robot, self.rigid, delay, self.period)
         return rejection(self.robot, self.rigid, gains, around, delay, self.period)
+
+    def set_reference(self, row: int, reference: Reference) -> None:
+        """Says that one robot is given another reference from this tick on, which is all that mrctl's stages need."""
 
     def set_learning(self, row: int, on: bool) -> None:
         """Switches learning of one robot on or off."""

@@ -270,7 +270,7 @@ class Simulation:
         skew = first.physics_step / 2
         parts = sensing, robot, self.sensors, self.plant.imu, skew, self._tyres(first), scanner, first.known
         self.estimator = UserEstimator(own, *parts) if own else Estimator(first.sensing.source, *parts)
-        self.events = Events(scenarios, self.plant, self.hierarchy, self.period)
+        self.events = Events(scenarios, self.plant, self.hierarchy, self.period, self.preview)
         self.log = Log(1 if restarting else self.ticks, size)
         self._failure_time = np.full(size, np.nan)
         self.goals = Goals(scenarios, timed=not restarting)
@@ -354,7 +354,7 @@ class Simulation:
     def judge(self) -> None:
         """Ends the tick: fails robots that have left their references, and ends runs at their goals, stuck or over."""
         plant, log, tick = self.plant, self.log, self.tick
-        if not log.near:
+        if not log.near and not self.hierarchy.roams:
             for row in np.flatnonzero(np.abs(log.now["lateral_error"]) > DIVERGED):
                 if self.scenarios[row].goal is None:  # a robot with a goal may wait, or leave its reference
                     plant.fail(int(row), f"lateral error over {DIVERGED:g} m")

@@ -19,6 +19,7 @@ from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.sensing.estimators import Estimator
 from mrctl.theory.rays import Scan
+from mrctl.theory.references import Reference
 from mrctl.theory.robot import Robot
 
 REPLACED = {"motion": ("k_x", "k_y", "k_theta"), "feedback": ("k_p", "k_i")}
@@ -159,6 +160,7 @@ class UserHierarchy(Hierarchy):
         self._stages = stages
         self._feedforward_stage = stages.get("feedforward")
         self._wanted: Rows | None = None  # reference of the user's motion controller, until its next call
+        self._new: dict[int, Reference] = {}  # references that it has not been told yet, by robot
         super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
         for name in (name for stage in stages for name in REPLACED.get(stage, ())):
             self.gains[name][:] = np.nan
@@ -186,6 +188,9 @@ class UserHierarchy(Hierarchy):
         if stage := self._stages.get("motion"):
             if self.tick == self.started:
                 stage.call("reset", seen["pose"], _numbers(goal), self.motion_period)
+            for row, reference in self._new.items():
+                stage.ask("follow", row, reference)
+            self._new = {}
             self._show(stage, seen["estimate"])
             if self.moves:
                 self._wanted = self._request(stage, seen, goal)
@@ -213,11 +218,25 @@ class UserHierarchy(Hierarchy):
         self.tick += 1
         return self.output
 
+    def set_reference(self, row: int, reference: Reference) -> None:
+        """Tells the user's motion controller, if it asks for that, that one robot has another reference."""
+        if self.roams:
+            self._new[row] = reference
+
     @property
     def looks(self) -> bool:
         """Whether the user's motion controller takes the scans of a lidar."""
+        return self._has("see")
+
+    @property
+    def roams(self) -> bool:
+        """Whether the user's motion controller goes along the reference at its own pace, or leaves it."""
+        return self._has("follow")
+
+    def _has(self, method: str) -> bool:
+        """Tells whether there is a motion controller of the user's with this method."""
         stage = self._stages.get("motion")
-        return stage is not None and callable(getattr(stage.stage, "see", None))
+        return stage is not None and callable(getattr(stage.stage, method, None))
 
     def _show(self, stage: UserStage, estimate: Array) -> None:
         """Hands the scans of this tick to the user's motion controller, with the poses that are estimated for it."""

@@ -193,6 +193,7 @@ class Pacing:
         self._period, self._tick, self.followed = period, 0, reference
         self._clock, self._pace = np.zeros(size), np.ones(size)  # s in motion periods, and λ
         self._plans, self._kept = [self._sampled(plan)] * size, [self._margin(plan)] * size
+        self._given: list[Waypoints | None] = [None] * size  # plans that came since the start
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
         self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
         self._looked = np.zeros(size, bool)  # which robots have a scan that is new
@@ -210,6 +211,16 @@ class Pacing:
         The clearance is negative where the discs would overlap the map on the plan.
         """
         return self._barrier(min(KEPT, room(self._footprint, plan, self._sight.map) - RIM - TRACKED))
+
+    def follow(self, row: int, plan: Waypoints) -> None:
+        """Takes another plan for one robot, which is a way to another goal."""
+        self._given[row] = plan
+        self._begin(row, plan)
+
+    def _begin(self, row: int, plan: Waypoints) -> None:
+        """Lets a robot drive a plan from its beginning."""
+        self._plans[row], self._kept[row] = self._sampled(plan), self._margin(plan)
+        self._clock[row], self._anchor[row], self._blocked[row] = 0.0, 0.0, np.inf
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot, and looks whether its plan is free; for the arguments see `stages.Motion`."""
@@ -268,9 +279,9 @@ class Pacing:
             return
         self._since[row] = now  # where there is no other plan, it tries again later
         left = clearance(self._footprint, pose, standing) - LEFT
-        if plan := self._replan(pose, self._sight.outlines(row, now, min(ROUND, max(0.0, left)))):
-            self._plans[row], self._kept[row] = self._sampled(plan), self._margin(plan)
-            self._clock[row], self._anchor[row], self._blocked[row] = 0.0, 0.0, np.inf
+        around = self._sight.outlines(row, now, min(ROUND, max(0.0, left)))
+        if plan := self._replan(pose, around, self._given[row]):
+            self._begin(row, plan)
 
 
 def share(request: Array, pose: Array, outlines: Outlines, barrier: Barrier) -> float:

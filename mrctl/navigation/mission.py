@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Callable, Sequence
+from math import pi, remainder
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal, NamedTuple
@@ -246,8 +247,9 @@ def avoiding(avoid: Avoid, scenario: Scenario, lag: float = 0.0) -> Callable[[Ro
     plan, known = scenario.reference, scenario.known
     assert isinstance(plan, Waypoints)
 
-    def replan(pose: Array, outlines: Outlines) -> Waypoints | None:
-        start = Task.from_dict({"obstacles": known, "start": pose.tolist(), "goal": scenario.goal})
+    def replan(pose: Array, outlines: Outlines, given: Waypoints | None) -> Waypoints | None:
+        goal = scenario.goal if given is None else end_of(given)
+        start = Task.from_dict({"obstacles": known, "start": pose.tolist(), "goal": goal or end_of(plan)})
         with contextlib.suppress(InputError):  # it waits, and tries again
             return either_way(start, scenario, plan.speed, SLIM, avoid, outlines)[1]
 
@@ -259,6 +261,12 @@ def avoiding(avoid: Avoid, scenario: Scenario, lag: float = 0.0) -> Callable[[Ro
 
     made.__name__ = avoid
     return made
+
+
+def end_of(plan: Waypoints) -> Pose:
+    """Returns the pose at the end of a plan, x and y in m and θ in rad."""
+    x, y, theta = plan.sample(np.array([plan.period])).pose[0].tolist()
+    return x, y, remainder(theta, 2 * pi)
 
 
 def either_way(

@@ -108,8 +108,9 @@ def _path(pose: Array, twists: Array, step: float) -> Array:
     return pose[:2] + np.pad(np.cumsum(moves, axis=-2), [(0, 0), (1, 0), (0, 0)])
 
 
-Replan = Callable[[Array, Outlines], Waypoints | None]
-"""Plans from a pose in m, m, rad, `(3,)`, among obstacles as they are now; None where there is no way."""
+Replan = Callable[[Array, Outlines, Waypoints | None], Waypoints | None]
+"""Plans from a pose in m, m, rad, `(3,)`, among obstacles as they are now, to the end of a plan that an event brought,
+or else to the goal of the mission; None where there is no way."""
 
 
 class Reactive(ABC):
@@ -138,14 +139,19 @@ class Reactive(ABC):
         self.bounds = Bounds.of(robot, plan.speed)
         self._size, self._plan, self._discs = size, plan, cover(footprint, DISCS)
         self._body = float((np.hypot(self._discs[:, 0], self._discs[:, 1]) + self._discs[:, 2]).max())
+        self._field = self._field_around(plan)
+
+    def _field_around(self, plan: Waypoints) -> Field:
+        """Returns the distance from the map around a plan."""
         places = plan.sample(np.linspace(0, plan.period, 200)).pose[:, :2]
         low, high = places.min(axis=0) - AROUND, places.max(axis=0) + AROUND
-        self._field = near_field(self._sight.map, low, high, CELL, self._body + KEPT + 2 * CELL)
+        return near_field(self._sight.map, low, high, CELL, self._body + KEPT + 2 * CELL)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         self._period, self._tick, self._place = period, 0, np.zeros(self._size, int)
-        self._tables = [self._sampled(self._plan)] * self._size
+        self._tables, self._fields = [self._sampled(self._plan)] * self._size, [self._field] * self._size
+        self._given: list[Waypoints | None] = [None] * self._size  # plans that came since the start
         self._anchor, self._since, self._tried = pose[:, :2].copy(), np.zeros(self._size), np.zeros(self._size)
         self.last = np.zeros((self._size, 2))
         self._sight.forget()
@@ -157,6 +163,11 @@ class Reactive(ABC):
         count = int(np.ceil(plan.period / self._period)) * FINE + 1
         poses = plan.sample(self._period / FINE * np.arange(count + 1.0)).pose
         return np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+
+    def follow(self, row: int, plan: Waypoints) -> None:
+        """Takes another plan for one robot, which is a way to another goal."""
+        self._given[row], self._fields[row] = plan, self._field_around(plan)
+        self._tables[row], self._place[row] = self._sampled(plan), 0
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.Motion`."""
@@ -174,7 +185,7 @@ class Reactive(ABC):
                 table, self._place[row] = self._sampled(other), 0
                 self._tables[row] = table
             targets = table[np.minimum(self._place[row] + FINE * np.arange(1, STEPS + 1), len(table) - 1)]
-            scene = Scene(targets, self._discs, self._field, self._near(row, pose[row]))
+            scene = Scene(targets, self._discs, self._fields[row], self._near(row, pose[row]))
             self.last[row] = self.choose(row, pose[row], twist[row], self.last[row], self._period, scene)
         self._tick += 1
         return self.last.copy()
@@ -191,7 +202,7 @@ class Reactive(ABC):
         return lost
 
     def _planned(self, row: int, pose: Array) -> Waypoints | None:
-        return self._replan(pose, self._sight.outlines(row, self._period * self._tick))
+        return self._replan(pose, self._sight.outlines(row, self._period * self._tick), self._given[row])
 
     def begin(self, tick: int) -> None:  # noqa: B027 (most have nothing to do)
         """Is called once in a motion period, before `choose` for each robot."""

@@ -361,7 +361,7 @@ class Live(Page):
             value = round(value / self.session.period) * self.session.period
         if name in PLANNED and self.session.avoid != "none":
             raise InputError(
-                f"{name}: with --avoid {self.session.avoid} the robots keep to the plan that they were given"
+                f"{name}: with --avoid {self.session.avoid} the robots take another goal, but no other {name}"
             )
         if path == ("reference",):
             value = {"kind": value}

@@ -171,8 +171,7 @@ class Session:
             goal: x and y in m and θ in rad.
 
         Raises:
-            InputError: The robot has stopped, the goal is in an obstacle, or there is no way; or the robots keep to the
-                plan of their mission.
+            InputError: The robot has stopped, the goal is in an obstacle, or there is no way.
         """
         x, y, theta = self._pose("goal")
         first = self.start[0]
@@ -181,7 +180,7 @@ class Session:
         near = clearance(self._footprint, np.array(start), Surroundings(first.known).at(0.0))
         plan = followed(self.saved()[0], self.time)
         speed = plan.speed if isinstance(plan, Waypoints) else None
-        found, driven = prepared(task, first, speed, MARGIN if near > MARGIN else SLIM)
+        found, driven = prepared(task, first, speed, MARGIN if near > MARGIN else SLIM, self.avoid)
         self.apply(reference=driven.reference)
         return found
 
@@ -194,8 +193,10 @@ class Session:
 
         Raises:
             InputError: The robot has stopped, cannot follow such a way, or would touch an obstacle as they are now; or
-                the robots keep to the plan of their mission.
+                it has an avoider, which takes goals alone.
         """
+        if self.avoid != "none":
+            raise InputError(f"way: with --avoid {self.avoid} the robots take goals alone")
         x, y, theta = self._pose("way")
         reach = abs(self.robot.wheelbase)
         ahead = x + reach * np.cos(theta), y + reach * np.sin(theta)
@@ -216,9 +217,7 @@ class Session:
         return found
 
     def _pose(self, what: str) -> Array:
-        """Returns where the first robot is, x and y in m and θ in rad; refuses robots that take no other reference."""
-        if self.avoid != "none":
-            raise InputError(f"{what}: with --avoid {self.avoid} the robots keep to their plan")
+        """Returns where the first robot is, x and y in m and θ in rad; refuses one that has stopped."""
         sim, k = self._place[0]
         if sim.plant.failed[k]:
             raise InputError(f"{what}: the first robot has stopped; a reset starts again")

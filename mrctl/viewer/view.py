@@ -57,7 +57,7 @@ def mission(
     host: str,
     port: int,
 ) -> None:
-    """Shows a mission live in the browser; at the goal the robots wait for another one, but end with an avoider.
+    """Shows a mission live in the browser; at the goal the robots wait for another one.
 
     Args:
         task: World, map, start and goal.
@@ -75,8 +75,7 @@ def mission(
     from mrctl.viewer.live import Live
 
     plan, own = prepare(task, scenario, speed, margin, avoid)
-    if avoid == "none":
-        own = own.replace(goal=None)
+    own = own.replace(goal=None)
     others = [own.replace(name="", **FEEDFORWARDS[name]) for name in compare]
     _serve(lambda server: Live([own, *others], server, avoid, plan.searched), host, port)
 

@@ -191,6 +191,36 @@ def test_followed():
     assert text.startswith("motion Short: `followed` is shape (3, 3), expected shape (3, 7)")
 
 
+def test_follow():
+    """A motion controller with a method `follow` gets each new reference once, with the first sample of it."""
+
+    class Told(Kanayama):
+        told = []
+
+        def __init__(self, robot, size):
+            super().__init__(robot, size)
+            self.new, self.calls = {}, 0
+
+        def follow(self, row, plan):
+            self.new[row] = plan
+
+        def output(self, pose, twist, reference):
+            for row, plan in self.new.items():
+                self.told.append((self.calls, row, plan.kind))
+                expected = np.hstack(plan.sample(np.array([0.0])))[0]
+                np.testing.assert_array_equal(reference[row], expected)
+            self.new, self.calls = {}, self.calls + 1
+            return super().output(pose, twist, reference)
+
+    for tier, preview in (("ideal", 0), ("field", 2)):
+        Told.told = []
+        events = [{"time": 0.5, "reference": Circle(radius=0.7, period=5)}, {"time": 0.8, "push": (1.0, 0, 0)}]
+        changes = {"sensing": {"tier": tier}, "initial_spread": (0.0, 0.0, 0.0)}
+        plain, other = (Scenario(laps=1, seed=k, **changes) for k in range(2))
+        simulate([plain.replace(events=events), other], motion=Told)
+        assert Told.told == [(50 - preview, 0, "circle")]
+
+
 def test_scans():
     """A motion controller with a method `see` gets the scans of `sensing.lidar`, at its rate, before `output`."""
     wall, lidar = Box(x=3.0, length=0.2, width=4.0), {"rate": 20.0, "beams": 90, "x": 0.2, "noise": 0.0}
