@@ -47,20 +47,20 @@ from pydantic import Field
 from mrctl.control.features import INPUTS
 from mrctl.control.feedforward import PRIOR, Learner, Prior, explained, inverse_dynamics
 from mrctl.control.matching import MATCHED, low_pass, match, queues
-from mrctl.kernel import Array, Row, kernel
+from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot
 
 
 @kernel
-def measure(twist: Array, rigid: bool, period: float, queue: Array, s: Row) -> None:
+def measure(twist: Array, rigid: bool, period: float, queue: Rows, s: Row) -> None:
     """Measures U_f − M ẋ_f; until a voltage has acted, it is f̂ of the model, so that the law starts without a bump.
 
     Args:
         twist: Predicted V in m/s and θ̇ in rad/s, `(2,)`.
         rigid: Whether the second channel is steering.
         period: Control period in s.
-        queue: Memory of `match`.
+        queue: In and out: that of `match`, `(d + 1,)`.
         s: In and out: a record of `INDI`, whose `twice` is the result.
     """
     m, c = s.matched, s.prior.c

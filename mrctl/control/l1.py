@@ -34,7 +34,7 @@ from pydantic import Field
 
 from mrctl.control.feedforward import Learner, explained
 from mrctl.control.matching import MATCHED, match, queues
-from mrctl.kernel import Array, Row, kernel
+from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.linear import steering
 from mrctl.theory.robot import Robot
@@ -54,7 +54,7 @@ def adapt(error: float, inertia: float, decay: float, phi: float) -> float:
 
 
 @kernel
-def step(twist: Array, rigid: bool, prior: Row, period: float, queue: Array, s: Row) -> None:
+def step(twist: Array, rigid: bool, prior: Row, period: float, queue: Rows, s: Row) -> None:
     """One period of the predictor, the adaptation and the low-pass.
 
     Args:
@@ -62,7 +62,7 @@ def step(twist: Array, rigid: bool, prior: Row, period: float, queue: Array, s: 
         rigid: Whether the second channel is steering.
         prior: The model, a record of `PRIOR`.
         period: Control period in s.
-        queue: Memory of `match`.
+        queue: In and out: that of `match`, `(d + 1,)`.
         s: In and out: a record of `PREDICTOR`, whose `filtered` is the result.
     """
     m = s.matched

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mrctl.kernel import Array, Row, kernel
+from mrctl.kernel import Array, Row, Rows, kernel
 
 SETTLED = 6.0  # time constants until the two filters of `low_pass` have forgotten their initial state
 LAG = 2  # periods, hold and sampling, *chosen*; with one the worst robots in `field` do worse
@@ -40,13 +40,22 @@ MATCHED = np.dtype(
 )
 
 
-def queues(size: int, delay: int) -> Array:
-    """Returns empty queues for `match`, `(B, delay + 1, 4)`; the delay is in control periods."""
-    return np.zeros((size, delay + 1, 4))
+SENT = np.dtype(
+    [
+        ("voltage", "f8", 2),  # that was computed in a tick, after the limits, V (rad/s on a steering channel)
+        ("acceleration", "f8", 2),  # that was commanded in it, m/s² and rad/s²
+    ],
+    align=True,
+)
+
+
+def queues(size: int, delay: int) -> Rows:
+    """Returns empty queues for `match`, records of `SENT`, `(B, delay + 1)`; the delay is in control periods."""
+    return np.zeros((size, delay + 1), SENT)
 
 
 @kernel
-def match(twist: Array, derivative: Array, sent: Array, period: float, queue: Array, s: Row) -> bool:
+def match(twist: Array, derivative: Array, sent: Array, period: float, queue: Rows, s: Row) -> bool:
     """Finds the voltage that acted in the period that ends now, and the motion that it made.
 
     Args:
@@ -54,7 +63,7 @@ def match(twist: Array, derivative: Array, sent: Array, period: float, queue: Ar
         derivative: Commanded V̇ in m/s² and θ̈ in rad/s² of this tick, `(2,)`.
         sent: Voltage that is computed in this tick, after the limits, `(2,)`.
         period: Control period in s.
-        queue: In and out: voltages and commanded accelerations of the last d + 1 ticks, `(d + 1, 4)`.
+        queue: In and out: records of `SENT` of the last d + 1 ticks, `(d + 1,)`.
         s: In and out: a record of `MATCHED`, whose `twist`, `last`, `rate` and `acted` are the result.
 
     Returns:
@@ -66,11 +75,11 @@ def match(twist: Array, derivative: Array, sent: Array, period: float, queue: Ar
         now = twist[k]
         for p in range(size):
             if p != oldest:
-                now -= period * queue[p, 2 + k]
+                now -= period * queue[p].acceleration[k]
         s.last[k] = s.twist[k] if s.tick > 0 else now
         s.twist[k], s.rate[k] = now, (now - s.last[k]) / period
-        s.acted[k] = queue[oldest, k]
-        queue[oldest, k], queue[oldest, 2 + k] = sent[k], derivative[k]
+        s.acted[k] = queue[oldest].voltage[k]
+        queue[oldest].voltage[k], queue[oldest].acceleration[k] = sent[k], derivative[k]
     s.tick += 1
     return s.tick > size
 

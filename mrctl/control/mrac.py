@@ -63,7 +63,7 @@ from pydantic import Field
 from mrctl.control.features import INPUTS, SLOW, feature_scale, features, linear, symmetric_product
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner
 from mrctl.control.matching import MATCHED, SETTLED, low_pass, match, queues
-from mrctl.kernel import Array, Row, kernel
+from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
@@ -148,14 +148,14 @@ def confine(k: int, s: Row) -> None:
 
 
 @kernel
-def filter_motion(command: Array, twist: Array, period: float, queue: Array, scale: Array, robot: Row, s: Row) -> bool:
+def filter_motion(command: Array, twist: Array, period: float, queue: Rows, scale: Array, robot: Row, s: Row) -> bool:
     """Passes the mean features of the period that ends now, and the voltage that acted in it, through the two filters.
 
     Args:
         command: Commanded twist in m/s and rad/s, `(2,)`.
         twist: Predicted twist in m/s and rad/s, `(2,)`.
         period: Control period in s.
-        queue: Memory of `match`.
+        queue: In and out: that of `match`, `(d + 1,)`.
         scale: Scales of the features, `(8,)`.
         robot: The nominal robot.
         s: In and out: a record of `MRAC`, whose `w` and `twice` are the result.

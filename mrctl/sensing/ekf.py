@@ -89,7 +89,7 @@ def excite(variance: float, s: Row) -> None:
 
 @kernel
 def propagate(
-    v_dot: float, omega_dot: float, growth: float, jolt: float, grip: Array, geometry: Array, period: float, s: Row
+    v_dot: float, omega_dot: float, growth: float, jolt: float, grip: Array, geometry: Row, period: float, s: Row
 ) -> None:
     """Predicts the state over one period: P ← F P Fᵀ + Q + g_a g_aᵀ σ_a² + g_θ g_θᵀ σ_θ².
 
@@ -106,14 +106,14 @@ def propagate(
         s: In and out: a record of `EKF`.
     """
     m, P, T = s.mean, s.P, period
-    r, D = geometry[0], geometry[1]
-    middle = T / 2 + geometry[3]  # of the period as positions count it; velocities lag behind them
+    r, D = geometry.wheel_radius, geometry.half_track
+    middle = T / 2 + geometry.skew  # of the period as positions count it; velocities lag behind them
     v, omega = m[V] + v_dot * middle, m[OMEGA] + omega_dot * middle
     heading = m[THETA] + omega * (T / 2 - SIDE)  # direction of the motion, which v_y turns outwards
     c, sn = T * np.cos(heading), T * np.sin(heading)
     grow_left, grow_right = 1 + m[SCALE_LEFT] + growth, 1 + m[SCALE_RIGHT] - growth
     b_left, b_right = T / (r * grow_left), T / (r * grow_right)
-    rolled = middle - geometry[4]  # the same for the wheels, which lag behind their axles
+    rolled = middle - geometry.lag  # the same for the wheels, which lag behind their axles
     v_wheel, omega_wheel = m[V] + v_dot * rolled, m[OMEGA] + omega_dot * rolled
     turn_left, turn_right = b_left * (v_wheel - D * omega_wheel), b_right * (v_wheel + D * omega_wheel)
     m[X] += v * c
@@ -239,7 +239,7 @@ def absorb_fix(fix: Array, s: Row) -> None:
 
 
 @kernel
-def find_grip(now: Row, geometry: Array, period: float, sensor: Row, s: Row) -> None:
+def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> None:
     """Decides which wheels grip, from encoders, gyro and accelerometer, and writes the result into the samples.
 
     An observer follows the wheels' speed, with the accelerometer as its input:
@@ -257,9 +257,9 @@ def find_grip(now: Row, geometry: Array, period: float, sensor: Row, s: Row) -> 
         sensor: A record of `SENSOR`.
         s: In and out: a record of `EKF`.
     """
-    r, D = geometry[0], geometry[1]
+    r, D = geometry.wheel_radius, geometry.half_track
     omega = now.gyro - s.mean[BIAS]
-    ahead = s.inertial + period * (now.acceleration[0] + geometry[2] * omega * omega - s.offset)
+    ahead = s.inertial + period * (now.acceleration[0] + geometry.imu_x * omega * omega - s.offset)
     bound = GRIP + r * sensor.quantum / (period * sensor.encoder_every)
     left = r * (1 + s.mean[SCALE_LEFT]) * now.rate[0] - (ahead - D * omega)
     right = r * (1 + s.mean[SCALE_RIGHT]) * now.rate[1] - (ahead + D * omega)
@@ -282,11 +282,11 @@ def find_grip(now: Row, geometry: Array, period: float, sensor: Row, s: Row) -> 
 
 
 @kernel
-def step(t: int, ring: Rows, i: int, geometry: Array, period: float, delay: int, start: int, s: Row) -> None:
+def step(t: int, ring: Rows, i: int, geometry: Row, period: float, delay: int, start: int, s: Row) -> None:
     """Runs the filter from tick t − 1 to t."""
     now, p = ring[t % len(ring), i], t - 1 - delay
     omega_dot = ring[p % len(ring), i].command[1] if p >= start else 0.0
-    forward = now.acceleration[0] + geometry[2] * s.mean[OMEGA] ** 2  # the accelerometer is ahead of the rear axle
+    forward = now.acceleration[0] + geometry.imu_x * s.mean[OMEGA] ** 2  # the accelerometer is ahead of the rear axle
     jolt = abs(now.acceleration[0] - ring[(t - 1) % len(ring), i].acceleration[0])
     jolt = max(0.0, jolt - JUMP * np.sqrt(2 * s.acceleration_variance))
     if (t - start) * period < LOADING:
@@ -295,7 +295,7 @@ def step(t: int, ring: Rows, i: int, geometry: Array, period: float, delay: int,
         for i in range(N):
             s.P[OFFSET, i] = s.P[i, OFFSET] = 0.0
         s.mean[OFFSET], s.P[OFFSET, OFFSET] = s.offset, START_OFFSET**2
-    growth = geometry[5] * now.acceleration[1]
+    growth = geometry.load * now.acceleration[1]
     propagate(forward - s.mean[OFFSET], omega_dot, growth, jolt, now.grip, geometry, period, s)
     measure(now, s)
 
@@ -328,7 +328,7 @@ def go_back(k: int, s: Row) -> None:
 
 @kernel
 def ekf(
-    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Array, period: float, memory: Row, s: Row
+    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Row, period: float, memory: Row, s: Row
 ) -> None:
     """The estimator `ekf`; the arguments are those of `truth`, and `true` is not read."""
     f, now = memory, front(tick, sensor)

@@ -24,6 +24,17 @@ from mrctl.sensing.tiers import Sensing
 from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles
 from mrctl.theory.robot import Robot, Tyres
 
+GEOMETRY = np.dtype(
+    [
+        ("wheel_radius", "f8"),  # r in m
+        ("half_track", "f8"),  # D in m
+        ("imu_x", "f8"),  # distance of the accelerometer ahead of the rear axle in m
+        ("skew", "f8"),  # time in s by which velocities lag behind positions, see `Estimator`
+        ("lag", "f8"),  # slip of the tyres over their acceleration in s, see `Tyres`
+        ("load", "f8"),  # growth of the left wheel's radius over the specific force to the left in s²/m, see `Tyres`
+    ],
+    align=True,
+)
 MOTION = np.dtype(
     [
         ("mean", "f8", 5),  # x, y in m, θ in rad, V in m/s, θ̇ in rad/s, when the last samples were taken
@@ -36,7 +47,7 @@ MOTION = np.dtype(
 
 @kernel
 def truth(
-    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Array, period: float, memory: Row, s: Row
+    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Row, period: float, memory: Row, s: Row
 ) -> None:
     """The estimator `truth`: the true posture and twist.
 
@@ -46,9 +57,7 @@ def truth(
         ring: Samples and commands, as in `Sensors`, `(N, B)`.
         i: Index of the robot.
         sensor: Its record of `SENSOR`.
-        geometry: Wheel radius r, half track D and distance of the accelerometer ahead of the rear axle in m, and the
-            time `skew` in s by which velocities lag behind positions (see `Estimator`), lag κ in s and load ρ in s²/m
-            of the tyres, `(6,)`.
+        geometry: A record of `GEOMETRY`.
         period: Control period in s.
         memory: In and out: state of the estimator for this robot.
         s: In and out: its record of `SEEN`, of which an estimator writes `estimate` and `variance`.
@@ -60,7 +69,7 @@ def truth(
 
 @kernel
 def odometry(
-    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Array, period: float, memory: Row, s: Row
+    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Row, period: float, memory: Row, s: Row
 ) -> None:
     """The estimator `odometry`: distance from the encoders, heading from the gyro, without any correction.
 
@@ -72,12 +81,12 @@ def odometry(
     m = memory.mean
     if now > s.start:
         this, last = ring[now % len(ring), i], ring[(now - 1) % len(ring), i]
-        way = geometry[0] * (this.encoder[0] - last.encoder[0] + this.encoder[1] - last.encoder[1]) / 2
+        way = geometry.wheel_radius * (this.encoder[0] - last.encoder[0] + this.encoder[1] - last.encoder[1]) / 2
         turn = period * (this.gyro + last.gyro) / 2
         m[0] += way * np.cos(m[2] + turn / 2)
         m[1] += way * np.sin(m[2] + turn / 2)
         m[2] += turn
-        m[3], m[4] = geometry[0] * (this.rate[0] + this.rate[1]) / 2, this.gyro
+        m[3], m[4] = geometry.wheel_radius * (this.rate[0] + this.rate[1]) / 2, this.gyro
     predict(m, max(now, s.start), tick, ring, i, period, s)
     s.estimate[0], s.estimate[1], s.estimate[2] = s.pose[0], s.pose[1], wrapped(s.pose[2])
     s.estimate[3], s.estimate[4] = s.twist[0], s.twist[1]
@@ -85,7 +94,7 @@ def odometry(
 
 @kernel
 def user(
-    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Array, period: float, memory: Row, s: Row
+    tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Row, period: float, memory: Row, s: Row
 ) -> None:
     """The estimate of a user's estimator, or odometry from its last valid one; the arguments are those of `truth`."""
     odometry(tick, true, ring, i, sensor, geometry, period, memory, s)
@@ -100,7 +109,7 @@ observe = truth  # the estimator of `estimate`, which `Kernel.calling` replaces
 
 @kernel
 def estimate(
-    tick: int, plant: Rows, ring: Rows, sensors: Rows, geometry: Array, period: float, memory: Rows, seen: Rows
+    tick: int, plant: Rows, ring: Rows, sensors: Rows, geometry: Row, period: float, memory: Rows, seen: Rows
 ) -> None:
     """Estimates posture and twist of all robots with `observe`, and predicts them to the moment when the voltage acts.
 
@@ -125,8 +134,8 @@ def estimate(
         for k in range(2):
             s.encoder[k], s.acceleration[k] = wheels.encoder[k], force.acceleration[k]
             s.lost[k] = plant[i].lost[k]
-            s.wheel_speeds[k] = geometry[0] * wheels.rate[k]
-        s.slip = slip_ratio(s.wheel_speeds, s.estimate[3], s.estimate[4], geometry[1], period, s.slip)
+            s.wheel_speeds[k] = geometry.wheel_radius * wheels.rate[k]
+        s.slip = slip_ratio(s.wheel_speeds, s.estimate[3], s.estimate[4], geometry.half_track, period, s.slip)
         taken = ring[(tick - sensor.fix_latency) % len(ring), i]
         arrives = taken.fix_arrives and tick - sensor.fix_latency >= s.start
         for k in range(3):
@@ -152,7 +161,7 @@ def sense(tick: int, plant: Rows, derivative: Array, period: float, place: int) 
     noise, ring, sensors, geometry, memory, seen = held(place)
     command_all(tick - 1, derivative, ring)
     sample_all(tick, plant, noise, period, sensors, ring)
-    estimate(tick, plant, ring, sensors, geometry, period, memory, seen)
+    estimate(tick, plant, ring, sensors, geometry[0], period, memory, seen)
 
 
 ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
@@ -218,7 +227,7 @@ class Estimator:
         """
         self._estimate = estimate_with(name).repeated()
         self._name, self._sensing, self.sensors = name, list(sensing), sensors
-        self._geometry = np.array([robot.wheel_radius, robot.half_track, imu[0], skew, *tyres])
+        self._geometry = np.array([(robot.wheel_radius, robot.half_track, imu[0], skew, *tyres)], GEOMETRY)
         self.seen = np.zeros(len(sensing), SEEN)
         self.memory = np.zeros(len(sensing), ESTIMATORS[name][1])
         self._located = self._measured = -1  # last tick in which the method of this name was called
@@ -312,6 +321,6 @@ class Estimator:
         sensors = self.sensors
         self.locate(tick, plant)
         self._estimate(
-            tick, plant, sensors.ring, sensors.sensors, self._geometry, sensors.period, self.memory, self.seen
+            tick, plant, sensors.ring, sensors.sensors, self._geometry[0], sensors.period, self.memory, self.seen
         )
         return self.seen

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mrctl.physics.plant import PLANT
 from mrctl.sensing import ekf as laws
 from mrctl.sensing.ekf import EKF, FIX_GATE, LOST
-from mrctl.sensing.estimators import Estimator
+from mrctl.sensing.estimators import GEOMETRY, Estimator
 from mrctl.sensing.prediction import wrapped
 from mrctl.sensing.sensors import SAMPLE, Sensors
 from mrctl.sensing.tiers import Sensing
@@ -19,7 +19,7 @@ X, Y, THETA, V, OMEGA, BIAS, OFFSET, LEFT, RIGHT, SCALE_LEFT, SCALE_RIGHT = rang
 T, SKEW = 0.01, 0.001
 RADIUS, HALF, AHEAD = 0.098, 0.188, 0.1
 LAG, LOAD = 0.3e-3, 2e-4  # of the tyres
-GEOMETRY = np.array([RADIUS, HALF, AHEAD, SKEW, LAG, LOAD])
+CAR = np.array([(RADIUS, HALF, AHEAD, SKEW, LAG, LOAD)], GEOMETRY)[0]
 MIDDLE = T / 2 + SKEW  # velocities are half a physics step behind positions
 
 
@@ -143,7 +143,7 @@ def test_step(seed, grip, theta_dot_dot, loading):
     now, before = sample_of(s, rng, grip), np.zeros(1, SAMPLE)[0]
     before["command"], before["acceleration"] = (0.0, theta_dot_dot), rng.normal(size=2)
     mean, P = textbook(s, now, before, theta_dot_dot, loading)
-    laws.step(1, ring_of(before, now), 0, GEOMETRY, T, 0, 0 if loading else -20, s)
+    laws.step(1, ring_of(before, now), 0, CAR, T, 0, 0 if loading else -20, s)
     deviation = np.sqrt(np.diag(P))
     near(s["mean"], mean, np.maximum(deviation, np.abs(mean)))
     near(s["P"], P, np.outer(deviation, deviation))
@@ -177,7 +177,7 @@ def test_jacobian(seed, v_dot, omega_dot):
     def moved(mean):
         other = s.copy()
         other["mean"] = mean
-        laws.propagate(v_dot - (mean[OFFSET] - s["mean"][OFFSET]), omega_dot, 1e-3, 0.3, grip, GEOMETRY, T, other)
+        laws.propagate(v_dot - (mean[OFFSET] - s["mean"][OFFSET]), omega_dot, 1e-3, 0.3, grip, CAR, T, other)
         return other["mean"]
 
     scale = np.array([1, 1, 1, 1, 1, 1, 1, 10, 10, 1, 1]) * 1e-5
@@ -185,8 +185,8 @@ def test_jacobian(seed, v_dot, omega_dot):
     P = s["P"].copy()
     quiet = s.copy()
     quiet["P"] = 0
-    laws.propagate(v_dot, omega_dot, 1e-3, 0.3, grip, GEOMETRY, T, s)
-    laws.propagate(v_dot, omega_dot, 1e-3, 0.3, grip, GEOMETRY, T, quiet)  # leaves Q
+    laws.propagate(v_dot, omega_dot, 1e-3, 0.3, grip, CAR, T, s)
+    laws.propagate(v_dot, omega_dot, 1e-3, 0.3, grip, CAR, T, quiet)  # leaves Q
     expected = F @ P @ F.T
     deviation = np.sqrt(np.diag(expected))
     near(s["P"] - quiet["P"], expected, np.outer(deviation, deviation), 1e-6)
