@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from mrctl.control.features import INPUTS, feature_scale
 from mrctl.experiments.journal import Journal
-from mrctl.experiments.mission_suite import PATIENCE, ROOMY, SHAPE, TIE, Mode
+from mrctl.experiments.mission_suite import PATIENCE, ROOMY, SHAPE, TIE, Mode, titled
 from mrctl.experiments.mission_suite import PLANTS as SHARED
 from mrctl.experiments.suite_tables import Table
 from mrctl.experiments.tables import machine, output_folder, write_json
@@ -88,7 +88,7 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
     with output_folder(out):
         runs = drive(base, DRAWS[mode], Journal(out / "limits.jsonl", source))
-    text = table(runs, f"{base.robot.path}, {mode}").markdown
+    text = table(runs, titled(base, mode)).markdown
     (out / "limits.md").write_text(text)
     rows = {plant: {name: [run._asdict() for run in own] for name, own in of.items()} for plant, of in runs.items()}
     write_json(out / "limits.json", source | {"machine": machine(), "limits": rows})

@@ -110,7 +110,7 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
     with output_folder(out):
         found = drive(base, DRAWS[mode], Journal(out / "table.jsonl", source))
-    shown = f"{base.robot.path}, {mode}"
+    shown = titled(base, mode)
     tables = [critical_widths(found, shown), critical_speeds(found, shown), budget(found, shown)]
     text = "\n".join(table.markdown for table in tables)
     (out / "table.md").write_text(text)
@@ -118,6 +118,11 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     source |= {"machine": machine(), "controllers": CONTROLLERS, "plants": list(PLANTS)}
     write_json(out / "table.json", source | values)
     return text
+
+
+def titled(base: Scenario, mode: Mode) -> str:
+    """Returns what the titles of the tables say of robot, sensing tier and mode."""
+    return f"{base.robot.path}, {base.sensing.tier}, {mode}"
 
 
 def drive(base: Scenario, count: int, journal: Journal) -> Found:

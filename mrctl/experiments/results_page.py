@@ -86,7 +86,8 @@ def main(
         tune: Folders that `mrctl tune --out` wrote: one for each robot, for its designed PID, and one with
             `--time-constant`, for where learning is safe.
         search: Folders that `mrctl tune --search` wrote, one for each entry.
-        navigate: Folders that `mrctl navigate --suite` wrote, one for each robot, for what it found in corridors.
+        navigate: Folders that `mrctl navigate --suite` wrote, one for each robot and tier, for what it found in
+            corridors.
         mppi: The same folders, for what it found with MPPI.
         limits: The same folders, for what it found with learned limits.
         identify: Files with the output of `mrctl identify --json`, one for each robot.
@@ -314,12 +315,14 @@ def _section(command: str, table: Table, text: str) -> str:
 
 
 def _navigated(folders: Sequence[Path], name: str, key: str) -> str:
-    """One part of what `mrctl navigate --suite` wrote for each robot."""
+    """One part of what `mrctl navigate --suite` wrote for each robot and sensing tier."""
     parts = []
     for folder in folders:
         table = _read(folder / f"{name}.json", "scenario", "mode", key)
         flags = " --quick" if table["mode"] == "quick" else ""
         flags += f" --robot.path {table['scenario']['robot']['path']}"
+        tier = table["scenario"]["sensing"]["tier"]
+        flags += f" --sensing.tier {tier}" if tier != "lab" else ""
         parts.append(_section(f"mrctl navigate --suite{flags}", table, _text(folder / f"{name}.md").strip()))
     return "\n\n".join(parts).replace("\n## ", "\n### ")
 

@@ -23,7 +23,7 @@ from scipy.optimize import fminbound
 from tqdm import tqdm
 
 from mrctl.experiments.journal import Journal
-from mrctl.experiments.mission_suite import PLANTS, Mode
+from mrctl.experiments.mission_suite import PLANTS, Mode, titled
 from mrctl.experiments.suite_tables import Table
 from mrctl.experiments.tables import machine, output_folder, write_json
 from mrctl.kernel import Array
@@ -102,7 +102,7 @@ def suite(base: Scenario, mode: Mode, out: Path) -> str:
     source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
     with output_folder(out):
         lag, runs = drive(base, WORLDS[mode], Journal(out / "mppi.jsonl", source))
-    text = table(lag, runs, f"{base.robot.path}, {mode}").markdown
+    text = table(lag, runs, titled(base, mode)).markdown
     (out / "mppi.md").write_text(text)
     rows = {entry: {plant: [run._asdict() for run in own] for plant, own in of.items()} for entry, of in runs.items()}
     write_json(out / "mppi.json", source | {"machine": machine(), "lag": lag, "runs": rows})

@@ -87,7 +87,7 @@ def searched(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def navigated(tmp_path: Path) -> Path:
-    values = {"scenario": {"robot": {"path": "racecar"}}, "mode": "quick", "needed": []}
+    values = {"scenario": {"robot": {"path": "racecar"}, "sensing": {"tier": "field"}}, "mode": "quick", "needed": []}
     folder = written(tmp_path / "navigated", values, "## Critical width\n\nAll tie.\n\n| plant |\n| --- |\n")
     write_json(folder / "mppi.json", SOURCE | values | {"runs": {}})
     write_json(folder / "limits.json", SOURCE | values | {"limits": {}})
@@ -168,7 +168,7 @@ def test_sections(
     ]
     assert [cell.strip() for cell in row.split("|")] == cells and "best of 121" in page["The search of settings"]
     corridors = page["How narrow and how fast"]
-    assert corridors.startswith("`mrctl navigate --suite --quick --robot.path racecar` made this")
+    assert corridors.startswith("`mrctl navigate --suite --quick --robot.path racecar --sensing.tier field` made this")
     assert "\n\n### Critical width\n\nAll tie." in corridors
     assert "\n\n### Three\n\nNone differs." in page["Three MPPIs"] and "### Up" in page["Feeding up"]
     assert "`mrctl identify --robot.path racecar`" in page["Identification"]
