@@ -52,7 +52,14 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "tune --time-constant 0.15 --delay 0 0.02 0.04 --out tune/imc",
     ),
     "search": tuple(f"tune --search {name} --out search/{name}" for name in SEARCHED),
-    "navigate": tuple(f"navigate --suite --robot.path {robot} --out corridors/{robot}" for robot in ROBOTS),
+    "navigate": (
+        *(f"navigate --suite --robot.path {robot} --out corridors/{robot}" for robot in ROBOTS),
+        *(
+            f"navigate --suite --robot.path {robot} --sensing.tier {tier} --out corridors/{robot}_{tier}"
+            for robot in ROBOTS[:2]
+            for tier in ("ideal", "field")
+        ),
+    ),
     "identify": tuple(f"identify --robot.path {robot} --json > identify_{robot}.json" for robot in ROBOTS),
     "bench": ("bench --json > bench.json",),
 }
@@ -105,7 +112,8 @@ def main(
         (reproduce,), (suite,), (random,) = found["reproduce"], found["suite"], found["random"]
         (held_out,), (bench,) = found["held_out"], found["bench"]
         tune, search, identify = found["tune"], found["search"], found["identify"]
-        navigate = mppi = limits = found["navigate"]
+        navigate = found["navigate"]
+        mppi = limits = navigate[: len(ROBOTS)]
     written: dict[str, str] = {}
     if reproduce is not None:
         table = _read(reproduce / "table.json", "last_lap", "endurance", "tiers", "kanayama")
