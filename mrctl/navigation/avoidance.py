@@ -25,13 +25,13 @@ from mrctl.control.stages import Motion
 from mrctl.kernel import Array, kernel
 from mrctl.loop.simulation import arranged
 from mrctl.navigation.planning import room
-from mrctl.navigation.rollouts import Replan
+from mrctl.navigation.rollouts import Replan, opened
 from mrctl.navigation.sight import Sight
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance, outside, point_to_segment, rim
 from mrctl.theory.obstacles import Obstacles, Outlines, moved
 from mrctl.theory.rays import Scan
-from mrctl.theory.references import Waypoints
+from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
 
 BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
@@ -212,9 +212,9 @@ class Pacing:
         """
         return self._barrier(min(KEPT, room(self._footprint, plan, self._sight.map) - RIM - TRACKED))
 
-    def follow(self, row: int, plan: Waypoints) -> None:
+    def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
-        self._given[row] = plan
+        self._given[row] = plan = opened(plan)
         self._begin(row, plan)
 
     def _begin(self, row: int, plan: Waypoints) -> None:

@@ -248,8 +248,8 @@ def avoiding(avoid: Avoid, scenario: Scenario, lag: float = 0.0) -> Callable[[Ro
     assert isinstance(plan, Waypoints)
 
     def replan(pose: Array, outlines: Outlines, given: Waypoints | None) -> Waypoints | None:
-        goal = scenario.goal if given is None else end_of(given)
-        start = Task.from_dict({"obstacles": known, "start": pose.tolist(), "goal": goal or end_of(plan)})
+        goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
+        start = Task.from_dict({"obstacles": known, "start": pose.tolist(), "goal": goal})
         with contextlib.suppress(InputError):  # it waits, and tries again
             return either_way(start, scenario, plan.speed, SLIM, avoid, outlines)[1]
 

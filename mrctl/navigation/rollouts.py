@@ -16,11 +16,12 @@ import numpy as np
 
 from mrctl.kernel import Array, kernel
 from mrctl.navigation.sight import Sight
+from mrctl.record import InputError
 from mrctl.theory.clearance import cover
 from mrctl.theory.grid import Field, near_field, value
 from mrctl.theory.obstacles import Obstacles, Outlines
 from mrctl.theory.rays import Scan
-from mrctl.theory.references import Waypoints
+from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
 from mrctl.theory.timing import RESERVE
 
@@ -113,6 +114,17 @@ Replan = Callable[[Array, Outlines, Waypoints | None], Waypoints | None]
 or else to the goal of the mission; None where there is no way."""
 
 
+def opened(reference: Reference) -> Waypoints:
+    """Returns the reference of an event if it is a way with an end, such as a plan.
+
+    Raises:
+        InputError: It is another one, which robots with an avoider do not follow.
+    """
+    if not isinstance(reference, Waypoints) or reference.closed:
+        raise InputError("reference: robots with an avoider follow open waypoints alone")
+    return reference
+
+
 class Reactive(ABC):
     """A motion stage that asks for twists along a plan, and makes another plan when it is off this one or waits.
 
@@ -164,10 +176,11 @@ class Reactive(ABC):
         poses = plan.sample(self._period / FINE * np.arange(count + 1.0)).pose
         return np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
-    def follow(self, row: int, plan: Waypoints) -> None:
+    def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
-        self._given[row], self._fields[row] = plan, self._field_around(plan)
-        self._tables[row], self._place[row] = self._sampled(plan), 0
+        self._given[row] = plan = opened(plan)
+        self._tables[row], self._place[row], self._fields[row] = self._sampled(plan), 0, self._field_around(plan)
+        self._since[row] = self._period * self._tick  # it may have waited at its goal, and is not stuck
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.Motion`."""

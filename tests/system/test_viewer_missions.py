@@ -9,7 +9,7 @@ import pytest
 import shapely
 from test_viewer import CHROMIUM, DRAG_ERROR, PATIENCE, ROBOT, SOFTWARE, node, serving, until, visit
 
-from mrctl import Box, Circle, Disc, InputError, Line, Obstacles, Scenario, save, simulate
+from mrctl import Box, Circle, Disc, Event, InputError, Line, Obstacles, Scenario, save, simulate
 from mrctl.cli import main
 from mrctl.loop.goals import arrived
 from mrctl.navigation.generators import Task
@@ -281,6 +281,9 @@ def test_another_goal(avoid, tmp_path):
     for name in ("x", "theta", "voltage_left"):
         driven = session.log()[name][:, 0]
         assert again[name].values[: len(driven)].tobytes() == np.ascontiguousarray(driven).tobytes(), name
+    closed = saved.with_event(Event(time=0.5, reference=Circle())).replace(laps=1)
+    failure = simulate(closed, motion=avoiding(avoid, saved)).failure.item()
+    assert failure.startswith(f"motion {avoid}: InputError: reference: robots with an avoider follow open waypoints")
     if avoid == "mppi":
         with pytest.raises(InputError, match="^way: with --avoid mppi"):
             session.way([np.array([0.0, 0.0])], closed=False)
