@@ -259,7 +259,7 @@ def _one_line(box: str) -> str:
     lines = [line.strip("│| ") for line in box.splitlines() if not line.startswith(("╭", "╰", "+"))]
     parts = re.split(r"(?:^|\n)[-─]{8,}(?:\n|$)", "\n".join(lines).strip())
     parts = [" ".join(part.split()) for part in parts if part.strip()]
-    text = parts[min(titled, len(parts) - 1)] if parts else "bad arguments"
+    text = re.sub(r"\[/?bold\]", "", parts[min(titled, len(parts) - 1)]) if parts else "bad arguments"
     pattern = r"Error parsing (\S*): \d+ validation errors? for \w+ (?:([\w.]+) (?=[A-Z]))?(.*?) \[type="
     if not (match := re.match(pattern, text)):
         return text

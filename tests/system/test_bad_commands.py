@@ -174,4 +174,5 @@ def test_refused_in_one_line(
     said = capsys.readouterr().err
     assert said.startswith("mrctl: ") and said.count("\n") == 1, said
     assert said[:-1].isprintable() and len(said) < 2100 and "Error:" not in said.partition(":")[0]
+    assert "[bold]" not in said
     assert listed(folder) == before
