@@ -33,13 +33,15 @@ REGULARISATION = 1e-3  # ε: keeps the normalised step finite at rest, where the
 
 
 @kernel
-def layers(w: Array, units: int) -> tuple[Array, Array, Array, Array, Array]:
-    """W₁ `(units, 8)`, b₁ `(units,)`, W₂ `(2, units)`, b₂ `(2,)` and W₃ `(2, 8)` as views of the flat weights."""
-    a = units * INPUTS
-    b = a + units
-    c = b + OUTPUTS * units
-    d = c + OUTPUTS
-    return w[:a].reshape((units, INPUTS)), w[a:b], w[b:c].reshape((OUTPUTS, units)), w[c:d], w[d:].reshape((2, INPUTS))
+def places(units: int) -> tuple[int, int, int, int]:
+    """Where b₁ `(units,)`, W₂ `(2, units)`, b₂ `(2,)` and W₃ `(2, 8)` begin in the flat weights, behind W₁ `(units, 8)`.
+
+    The laws index the flat weights, since making views of five layers takes as long as the network itself.
+    """
+    b1 = units * INPUTS
+    W2 = b1 + units
+    b2 = W2 + OUTPUTS * units
+    return b1, W2, b2, b2 + OUTPUTS
 
 
 @kernel
@@ -48,26 +50,26 @@ def network(x: Array, w: Array, hidden: Array, scale: Array, output: Array) -> N
 
     Args:
         x: Scaled features, `(8,)`.
-        w: Flat weights, in the order of `layers`.
+        w: Flat weights, W₁ and then the layers at their `places`.
         hidden: Out: tanh(W₁ x + b₁), `(units,)`.
         scale: Output for a network output of one, V (rad/s on a steering channel), `(2,)`.
         output: Out: feedforward of the two channels in the same units, `(2,)`.
     """
     units = hidden.shape[0]
-    W1, b1, W2, b2, W3 = layers(w, units)
+    b1, W2, b2, W3 = places(units)
     for j in range(units):
-        z = b1[j]
+        z = w[b1 + j]
         for i in range(INPUTS):
-            z += W1[j, i] * x[i]
+            z += w[j * INPUTS + i] * x[i]
         hidden[j] = z
     for j in range(units):
         hidden[j] = 1 - 2 / (np.exp(2 * hidden[j]) + 1)  # tanh, in half the time of the library's
     for k in range(OUTPUTS):
-        y = BIAS_GAIN * b2[k]
+        y = BIAS_GAIN * w[b2 + k]
         for i in range(INPUTS):
-            y += W3[k, i] * x[i]
+            y += w[W3 + k * INPUTS + i] * x[i]
         for j in range(units):
-            y += W2[k, j] * (HIDDEN_GAIN * hidden[j])
+            y += w[W2 + k * units + j] * (HIDDEN_GAIN * hidden[j])
         output[k] = scale[k] * y
 
 
@@ -83,21 +85,20 @@ def backpropagate(x: Array, w: Array, hidden: Array, error: Array, gradient: Arr
         gradient: Out: Jᵀe, `(n,)`.
     """
     units = hidden.shape[0]
-    _, _, W2, _, _ = layers(w, units)
-    G1, g1, G2, g2, G3 = layers(gradient, units)
+    b1, W2, b2, W3 = places(units)
     for k in range(OUTPUTS):
-        g2[k] = BIAS_GAIN * error[k]
+        gradient[b2 + k] = BIAS_GAIN * error[k]
         for i in range(INPUTS):
-            G3[k, i] = error[k] * x[i]
+            gradient[W3 + k * INPUTS + i] = error[k] * x[i]
     for j in range(units):
         back = 0.0
         for k in range(OUTPUTS):
-            G2[k, j] = HIDDEN_GAIN * error[k] * hidden[j]
-            back += error[k] * W2[k, j]
+            gradient[W2 + k * units + j] = HIDDEN_GAIN * error[k] * hidden[j]
+            back += error[k] * w[W2 + k * units + j]
         back *= HIDDEN_GAIN * (1 - hidden[j] * hidden[j])
-        g1[j] = back
+        gradient[b1 + j] = back
         for i in range(INPUTS):
-            G1[j, i] = back * x[i]
+            gradient[j * INPUTS + i] = back * x[i]
 
 
 @kernel
