@@ -727,7 +727,7 @@ def check(
     The exit status is 1 if a check fails.
 
     Args:
-        robot: The car, turtlebot or racecar, or the MJCF file of a robot, with or without a level floor; by default car.
+        robot: The car, turtlebot or racecar, or the MJCF file of a robot, with or without a floor; by default the car.
         wheels: Joints of the two driven wheels, left and right; by default the two with a <dcmotor>.
         steering: Joints of the steered wheels, at most two; by default the upright joints with an actuator.
         chassis: Body that carries the wheels; by default the one at their root.

@@ -101,8 +101,11 @@ class Kernel(Generic[P, T]):
         return self.compiled(*arguments, **options)
 
     def calling(self, **laws: Any) -> Kernel[P, T]:  # noqa: ANN401
-        """The same function with other kernels or readers of `Held` in place of the global names of these keywords."""
-        return Kernel(self.law, laws)
+        """The same function with other kernels or readers of `Held` in place of the global names of these keywords.
+
+        For the same ones it is the same kernel, because compiled code is never freed.
+        """
+        return _calling(self.law, *laws.items())
 
 
 class Held:
@@ -117,15 +120,33 @@ class Held:
             replaces.
     """
 
-    def __init__(self, *arrays: Array | Rows) -> None:
-        """Describes the arrays as Numba does: owners (none), number of items, bytes of one, address, shape, strides."""
-        from numba import typeof, types
+    def __init__(self, *arrays: Array | Rows | tuple[Any, ...]) -> None:
+        """Takes arrays and nested tuples of arrays.
+
+        They are described as Numba does: owners (none), number of items, bytes of one, address, shape, strides.
+        """
+        from numba import typeof
 
         self._arrays = arrays
-        described = [(0, 0, a.size, a.itemsize, a.ctypes.data, *a.shape, *a.strides) for a in arrays]
+        described = [(0, 0, a.size, a.itemsize, a.ctypes.data, *a.shape, *a.strides) for a in flat(arrays)]
         self._description = np.concatenate(described, dtype=np.intp)
         self.place: int = self._description.ctypes.data
-        self.reader = _reader(types.BaseTuple.from_types([typeof(array) for array in arrays]))
+        self.reader = _reader(typeof(arrays))
+
+
+def flat(arrays: tuple[Any, ...]) -> list[NDArray[Any]]:
+    """Returns the arrays of a nested tuple of arrays."""
+    return [a for entry in arrays for a in (flat(entry) if isinstance(entry, tuple) else [entry])]
+
+
+def held(place: int) -> tuple[Any, ...]:
+    """Returns, in a kernel, the arrays at the address of a `Held`, whose reader must replace this function."""
+    raise NotImplementedError
+
+
+@cache
+def _calling(law: Callable[P, T], *laws: tuple[str, Any]) -> Kernel[P, T]:
+    return Kernel(law, dict(laws))
 
 
 @cache

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 
 from mrctl.control.features import features, linear
 from mrctl.control.nominal import nominal
-from mrctl.kernel import Array, Kernel, Row, Rows, kernel
+from mrctl.kernel import Array, Kernel, Row, Rows, flat, kernel
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
@@ -197,43 +196,29 @@ class Learner(ABC):
         """Copies the memory of a learner of the same kind, for one robot, into a row of this one."""
         size = len(self.weight_norm)
         self.weight_norm[row] = other.weight_norm[0]
-        for mine, theirs in zip(_flat(self.arrays), _flat(other.arrays), strict=True):
+        for mine, theirs in zip(flat(self.arrays), flat(other.arrays), strict=True):
             if len(mine) == size and len(theirs) == 1:
                 mine[row] = theirs[0]
 
     def output(self, command: Array, derivative: Array) -> Array:
         """Returns the feedforward of all robots; see `Feedforward.output`."""
         self._command[:] = command
-        _respond_all(type(self))(self._command, _own(derivative), self.robot, self.arrays, self._voltage)
+        law = respond_all.calling(respond=self.respond)
+        law(self._command, _own(derivative), self.robot, self.arrays, self._voltage)
         return self._voltage
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
         """Lets all robots learn; see `Feedforward.learn`."""
-        _learn_all(type(self))(
+        learn_all.calling(learn_one=self.learn_one)(
             self._command, _own(feedback), _own(saturated), _own(twist), _own(voltage), self.period, self.robot,
             self.prior.rows, self.arrays, self._added, self.weight_norm,
         )  # fmt: skip
         return self._added
 
 
-def _flat(arrays: tuple[Any, ...]) -> list[NDArray[Any]]:
-    """Returns the arrays of a nested tuple of arrays."""
-    return [a for entry in arrays for a in (_flat(entry) if isinstance(entry, tuple) else [entry])]
-
-
 def _own(values: Array) -> Array:
     """Returns the values as contiguous float64, so that the loops below are compiled once."""
     return np.ascontiguousarray(values, float)
-
-
-@cache
-def _respond_all(stage: type[Learner]) -> Kernel:
-    return respond_all.calling(respond=stage.respond)
-
-
-@cache
-def _learn_all(stage: type[Learner]) -> Kernel:
-    return learn_all.calling(learn_one=stage.learn_one)
 
 
 @kernel

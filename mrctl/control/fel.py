@@ -34,9 +34,9 @@ REGULARISATION = 1e-3  # ε: keeps the normalised step finite at rest, where the
 
 @kernel
 def places(units: int) -> tuple[int, int, int, int]:
-    """Where b₁ `(units,)`, W₂ `(2, units)`, b₂ `(2,)` and W₃ `(2, 8)` begin in the flat weights, behind W₁ `(units, 8)`.
+    """Returns where b₁ `(units,)`, W₂ `(2, units)`, b₂ `(2,)` and W₃ `(2, 8)` begin, after W₁ `(units, 8)`.
 
-    The laws index the flat weights, since making views of five layers takes as long as the network itself.
+    The laws index the flat weights: to make views of the five layers would take as long as the network itself.
     """
     b1 = units * INPUTS
     W2 = b1 + units

@@ -8,8 +8,6 @@ With built-in stages a control tick of all robots is one compiled call.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +37,7 @@ from mrctl.control.pid import PID, Pid, pid
 from mrctl.control.rejection import Peaks, rejection
 from mrctl.control.rls import RecursiveLeastSquares
 from mrctl.control.steering import ALLOCATION, allocate, take_loss
-from mrctl.kernel import Array, Kernel, Row, Rows, kernel
+from mrctl.kernel import Array, Held, Row, Rows, held, kernel
 from mrctl.loop.learned import load_learned
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
@@ -126,26 +124,22 @@ def hand_over(s: Row) -> None:
 
 
 @kernel
-def update(
-    moves: bool, seen: Rows, goal: Rows, robot: Rows, model: Rows, period: float, prior: Rows,
-    arrays: tuple[Any, ...], control: Rows,
-) -> tuple[bool, bool]:  # fmt: skip
+def update(moves: bool, seen: Rows, goal: Rows, period: float, place: int) -> tuple[bool, bool]:
     """One control tick of all robots, with the learner `respond` and `learn_one`.
 
     Args:
         moves: Whether the motion controller acts in this tick.
         seen: Record of `SEEN` of each robot.
         goal: Record of `GOAL` of each robot.
-        robot: The nominal robot, one record of `NOMINAL`.
-        model: Its inverse dynamics, records of `PRIOR`, of which the first is read.
         period: Control period in s.
-        prior: Record of `PRIOR` of each robot.
-        arrays: Memory and constants of the learner.
-        control: In and out: record of `CONTROL` of each robot.
+        place: Address (see `Held`) of the nominal robot, one record of `NOMINAL`; its inverse dynamics, records of
+            `PRIOR`, of which the first is read; a record of `PRIOR` and one of `CONTROL` of each robot; and a tuple of
+            what the learner keeps.
 
     Returns:
         Whether all voltages are finite, and whether a guard demands that a learner is reset.
     """
+    robot, model, prior, control, arrays = held(place)
     finite, forget = True, False
     for i in range(len(control)):
         s, measured, wanted = control[i], seen[i], goal[i]
@@ -166,12 +160,6 @@ def update(
         hand_over(s)
         forget |= s.guard.forget
     return finite, forget
-
-
-@cache
-def update_with(stage: type[Learner]) -> Kernel:
-    """Returns the kernel `update` with the two laws of a learner."""
-    return update.calling(respond=stage.respond, learn_one=stage.learn_one)
 
 
 def learner_of(scenarios: Sequence[Scenario], robot: Robot) -> Learner:
@@ -274,7 +262,10 @@ class Hierarchy:
         self.command, self.derivative = state["limiter"]["command"], state["limiter"]["derivative"]
         self.feedback, self.weight_norm = state["feedback"], state["weight_norm"]
         self.output, self.saturated = state["allocation"]["command"], state["allocation"]["saturated"]
-        self._update = (update_with(type(self.learner)) if isinstance(self.learner, Learner) else update).repeated()
+        if isinstance(self.learner, Learner):
+            self._held = Held(self.nominal, self.model.rows, self.prior.rows, state, self.learner.arrays)
+            laws = {"respond": self.learner.respond, "learn_one": self.learner.learn_one}
+            self._update = update.calling(**laws, held=self._held.reader).repeated()
         self.faults: dict[int, str] = {}
         self.scanner: Scanner | None = None
 
@@ -395,9 +386,7 @@ class Hierarchy:
         Returns:
             `output`, `(B, 4)`.
         """
-        stage: Any = self.learner  # a Learner: a user's feedforward has a hierarchy of its own
-        constants = self.nominal, self.model.rows, self.period
-        finite, forget = self._update(self.moves, seen, goal, *constants, self.prior.rows, stage.arrays, self.state)
+        finite, forget = self._update(self.moves, seen, goal, self.period, self._held.place)
         if forget:
             self.forget()
         self.faults = {} if finite else self.non_finite()  # the voltage limit would turn NaN into the full voltage

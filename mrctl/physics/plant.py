@@ -17,9 +17,8 @@ import mujoco
 import numpy as np
 from dm_control.rl.control import PhysicsError
 from mujoco import batch as mujoco_batch
-from numpy.typing import NDArray
 
-from mrctl.kernel import Array, Row, Rows, kernel
+from mrctl.kernel import Array, Held, Row, held, kernel
 from mrctl.physics import mjcf
 from mrctl.physics.car import CarPhysics
 from mrctl.physics.contacts import Contacts, contacts
@@ -62,8 +61,15 @@ PLANT = np.dtype(
 
 
 @kernel
-def send(command: Array, tick: int, queue: Array, inputs: NDArray[np.int64], plant: Rows, ctrl: Array) -> bool:
-    """Sends each robot the command of `delay` periods ago; returns whether those of all running robots are finite."""
+def send(command: Array, tick: int, place: int) -> bool:
+    """Sends each robot the command of `delay` periods ago; returns whether those of all running robots are finite.
+
+    Args:
+        command: Commands of this tick, `(B, 4)`.
+        tick: Control tick.
+        place: Address of the arrays of the plant (see `Held`).
+    """
+    plant, queue, ctrl, _, inputs = held(place)[:5]
     finite = True
     for i in range(len(plant)):
         p = plant[i]
@@ -90,16 +96,20 @@ def back_emf(p: Row) -> None:
 
 
 @kernel
-def look(
-    qpos: Array, qvel: Array, act: Array, address: NDArray[np.int64], acts: NDArray[np.int64], imu: Array,
-    period: float, plant: Rows,
-) -> bool:  # fmt: skip
+def look(first: int, last: int, period: float, place: int) -> bool:
     """Updates the readouts after a period; returns whether all running robots are upright and finite.
 
     The specific force is the mean acceleration in the period less gravity.
+
+    Args:
+        first: The first robot to look at.
+        last: The robot behind the last one.
+        period: Control period in s.
+        place: Address of the arrays of the plant (see `Held`).
     """
+    plant, _, _, acts, _, qpos, qvel, act, address, imu = held(place)
     upright, velocity, axes = True, np.empty(3), np.empty((2, 3))
-    for i in range(len(plant)):
+    for i in range(first, last):
         p = plant[i]
         read(qpos[i], qvel[i], address, p.reading)
         imu_motion(qpos[i], qvel[i], address, imu, velocity, axes)
@@ -168,8 +178,6 @@ class Plant(ABC):
         self._acts = np.array(acts, int)
         self.imu = model.site("imu").pos.copy() if has(model, "site", "imu") else np.zeros(3)
         self._period = substeps * model.opt.timestep
-        self._look_at = look.repeated()
-        self._constants = self._address, self._acts, self.imu, self._period
         state["resistance"], state["back_emf"], state["gravity"] = resistance, back_emf, model.opt.gravity
         state["driver"]["supply"], state["driver"]["gain"], state["driver"]["scale"] = robot.supply, 1.0, 1.0
         state["driver"]["current_limit"] = current_limits(model)
@@ -182,6 +190,13 @@ class Plant(ABC):
         self._surroundings = Surroundings(obstacles)
         self._began = np.zeros(size, int)  # tick at which each robot was placed on the ground
         self._poses = self._surroundings.poses(np.zeros(0))  # of the moving obstacles, by the ticks since then
+
+    def _hold(self) -> None:
+        """Lets the compiled calls of each tick find the arrays of the plant, which from then on stay where they are."""
+        own, engine = (self.state, self._queue, self.ctrl, self._acts, self._inputs), (self.qpos, self.qvel, self.act)
+        self._held = Held(*own, *engine, self._address, self.imu)
+        self._send = send.calling(held=self._held.reader).compiled
+        self._look = look.calling(held=self._held.reader).repeated()
 
     @abstractmethod
     def _write(self, robot: int, model: mujoco.MjModel) -> None:
@@ -251,7 +266,7 @@ class Plant(ABC):
         """
         for i in range(self.size):
             self.qpos[i], self.qvel[i] = stand(self._model_of(i), pose[i], twist[i], self.truth[i])
-        self._begin(slice(None))
+        self._begin(slice(0, self.size))
 
     def restart(self, robot: int, pose: Array, twist: Array) -> None:
         """Places one robot on the ground again, as `reset` does with all; clears its failure, push and commands.
@@ -312,7 +327,7 @@ class Plant(ABC):
         if command.shape != (self.size, 4):
             raise ValueError(f"command: shape {command.shape}, expected {(self.size, 4)}")
         # The engine would silently replace NaN by 0 V.
-        if not send.compiled(command, self._tick, self._queue, self._inputs, self.state, self.ctrl):
+        if not self._send(command, self._tick, self._held.place):
             sent = self._queue[(self._tick - self.state["delay"]) % len(self._queue), np.arange(self.size)]
             for robot in np.flatnonzero(~np.isfinite(sent).all(axis=1)):
                 self.fail(int(robot), "non-finite command")
@@ -345,7 +360,7 @@ class Plant(ABC):
             for robot in [r for r, end in self._pushes.items() if end == self._tick]:
                 self.wrench[robot, self._chassis] = 0.0
                 del self._pushes[robot]
-        if not self._look_at(self.qpos, self.qvel, self.act, *self._constants, self.state):
+        if not self._look(0, self.size, self._period, self._held.place):
             upright = self.reading["upright"]
             for robot in np.flatnonzero(~(upright > TILT)):
                 self.fail(int(robot), "tilt over 30°" if np.isfinite(upright[robot]) else "non-finite state")
@@ -379,7 +394,7 @@ class Plant(ABC):
         self._move(0)
         state, queue = self.state[rows], self._queue[:, rows]
         for _ in range(2):
-            look.compiled(self.qpos[rows], self.qvel[rows], self.act[rows], *self._constants, state)
+            self._look(rows.start, rows.stop, self._period, self._held.place)
         state["lost"] = queue[...] = 0.0
         queue[..., :2] = self.robot.back_emf * state["reading"]["wheel_rates"]
         queue[..., 2] = state["servo"]["play"] = state["reading"]["steering_angle"]
@@ -401,6 +416,7 @@ class PhysicsPlant(Plant):
         self.qpos, self.qvel, self.act, self.ctrl = data.qpos[None], data.qvel[None], data.act[None], data.ctrl[None]
         self.wrench, self.sensors = data.xfrc_applied[None], data.sensordata[None]
         self.mocap = data.mocap_pos[None], data.mocap_quat[None]
+        self._hold()
 
     def _model_of(self, robot: int) -> mujoco.MjModel:
         return self.physics.model.ptr
@@ -439,16 +455,17 @@ class BatchPlant(Plant):
         if self._collision < 0:
             quiet.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nothing reads them without obstacles
         self.batch = mujoco_batch.Batch(quiet, size, threads)
-        self._held = mjcf.clone(quiet)  # overwritten by `_model_of`
+        self._model = mjcf.clone(quiet)  # overwritten by `_model_of`
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.act, self.ctrl = self.batch.bind("act"), self.batch.bind("ctrl")
         self.wrench, self.sensors = self.batch.bind("xfrc_applied"), self.batch.bind("sensordata")
         self.mocap = self.batch.bind("mocap_pos"), self.batch.bind("mocap_quat")
+        self._hold()
         self._fields = fields(model)
         self._expanded: set[str] = set()
 
     def _model_of(self, robot: int) -> mujoco.MjModel:
-        return self.batch.get_model(robot, self._held)
+        return self.batch.get_model(robot, self._model)
 
     def _write(self, robot: int, model: mujoco.MjModel) -> None:
         for name, value in fields(model).items():

@@ -8,12 +8,10 @@ receive this prediction.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
-from typing import Any
 
 import numpy as np
 
-from mrctl.kernel import Array, Held, Kernel, Row, Rows, kernel
+from mrctl.kernel import Array, Held, Kernel, Row, Rows, held, kernel
 from mrctl.sensing.ekf import EKF, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
 from mrctl.sensing.localisation import Localiser
 from mrctl.sensing.prediction import SEEN, front, predict, wrapped
@@ -142,11 +140,6 @@ def estimate(
             s.fix[k] = taken.fix[k] if arrives else np.nan
 
 
-def held(place: int) -> tuple[Any, ...]:
-    """Returns the arrays of `sense`; the reader of a `Held` replaces it."""
-    raise NotImplementedError
-
-
 @kernel
 def sense(tick: int, plant: Rows, derivative: Array, period: float, place: int) -> None:
     """Stores the commands of the last tick, samples the sensors and estimates, for all robots.
@@ -171,18 +164,6 @@ ESTIMATORS: dict[str, tuple[Kernel, np.dtype]] = {
     "user": (user, MOTION),
 }
 """Kernel and state of each estimator; `user` passes on the estimate of a user's estimator."""
-
-
-@cache
-def estimate_with(name: str) -> Kernel:
-    """Returns the kernel `estimate` with the law of an estimator, cached because compiled code is never freed."""
-    return estimate.calling(observe=ESTIMATORS[name][0])
-
-
-@cache
-def sense_with(name: str, reader: Any) -> Kernel:  # noqa: ANN401
-    """Returns the kernel `sense` with the law of an estimator, and with the reader of a `Held`."""
-    return sense.calling(estimate=estimate_with(name), held=reader)
 
 
 class Estimator:
@@ -225,7 +206,8 @@ class Estimator:
         Raises:
             InputError: Localisation needs a map, and there is none, or it is too large.
         """
-        self._estimate = estimate_with(name).repeated()
+        law = estimate.calling(observe=ESTIMATORS[name][0])
+        self._estimate = law.repeated()
         self._name, self._sensing, self.sensors = name, list(sensing), sensors
         self._geometry = np.array([(robot.wheel_radius, robot.half_track, imu[0], skew, *tyres)], GEOMETRY)
         self.seen = np.zeros(len(sensing), SEEN)
@@ -236,7 +218,7 @@ class Estimator:
             self.localiser = Localiser(sensing, sensors, scanner, robot.wheel_radius, known)
         arrays = sensors.noise, sensors.ring, sensors.sensors, self._geometry, self.memory, self.seen
         self._held = Held(*arrays)
-        self._sense = sense_with(name, self._held.reader).repeated()
+        self._sense = sense.calling(estimate=law, held=self._held.reader).repeated()
         self._compiled = scanner is None and name != "user"  # else Python comes between the samples and the estimate
 
     def start(self, row: int, reading: Row, seed: int, tick: int) -> None:
