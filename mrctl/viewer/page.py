@@ -23,7 +23,7 @@ from mrctl.record import InputError
 from mrctl.viewer import deviation, sensors
 from mrctl.viewer.recording import Recording, looks_of
 from mrctl.viewer.scene import MAX_MARKED, Scene
-from mrctl.viewer.server import PHONE, Server
+from mrctl.viewer.server import MANNERS, PHONE, SOFT_LIGHT, Server
 
 FRAME, REFRESH = 1 / 25, 1 / 12  # s of wall time between two pictures, and between two updates of the plots
 CURVES_WIDTH, INPUTS_WIDTH = 340.0, 290.0  # px of the panels, of which 1280 px leave half to the scene
@@ -48,7 +48,7 @@ class Page(ABC):
     def __init__(self, server: Server) -> None:
         """Takes the server; a subclass builds the rest of the page."""
         self.server = server
-        server.gui.add_html(PHONE)
+        server.gui.add_html(PHONE + MANNERS)
         self._notice = server.gui.add_html("")  # above the tabs, so that it is seen on each of them
         self.message = ""
         self.playing = True
@@ -130,7 +130,7 @@ class Page(ABC):
         )  # fmt: skip
         self._sensed = gui.add_html("")
         self.on(gui.add_checkbox("Dark page", self.server.dark), self._set_dark)
-        self._soft = gui.add_checkbox("Soft light", self.server.soft, hint="Reflections and shadows, for a GPU.")
+        self._soft = gui.add_checkbox(SOFT_LIGHT, self.server.soft, hint="Reflections and shadows, for a GPU.")
         self.on(self._soft, self._set_soft)
 
     def add_download(self) -> None:

@@ -237,7 +237,8 @@ class Plots:
             return
         left = f"{100 * share:.3f}%"
         line = f"content:'';position:absolute;top:0;bottom:0;left:{left};border-left:1px solid rgb{CURSOR_COLOUR}"
-        self._cursor.content = f"<style>.u-over{{overflow:hidden}}.u-over::after{{{line}}}</style>"
+        over = ".uplot:has(.u-legend) .u-over"  # charts over time, which have legends
+        self._cursor.content = f"<style>{over}{{overflow:hidden}}{over}::after{{{line}}}</style>"
 
 
 def legend(robots: Sequence[Look]) -> str:

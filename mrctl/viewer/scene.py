@@ -53,8 +53,6 @@ TOGETHER, LABEL_ABOVE, TARGET_ABOVE = 0.7, 0.4, 0.15
 CLEARANCE = 0.05  # m, least height of a camera above the floor
 # Initial camera, relative to the middle of the reference and in units of its size.
 CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])
-# Corner and size of the scatter plot behind the track along x, y and z, in the same frame and units.
-BOARD_CORNER, BOARD_SIZE = np.array([-0.65, 0.75, 0.15]), np.array([1.35, 0.0, 0.6])
 GHOST_OPACITY, GLASS_OPACITY = 0.5, 0.55
 THICK = 0.012  # thickness of the lines from targets to robots, in diagonals of the robot's outline
 HALO = 1.04  # size of a ghost, of which only the far side is drawn: a rim around a robot that stands in it
@@ -104,7 +102,6 @@ class Scene:
         model: mujoco.MjModel,
         robots: Sequence[Look],
         obstacles: Obstacles = NO_OBSTACLES,
-        fog: bool = True,
     ) -> None:
         """Draws the world and its robots.
 
@@ -113,9 +110,8 @@ class Scene:
             model: Compiled world; it is not changed.
             robots: Look of each robot.
             obstacles: The obstacles that the world was compiled with, of which some may move.
-            fog: Whether the horizon fades; viser cannot draw meshes that are clicked on in fog.
         """
-        self.size, self._robots, self._fog = len(robots), list(robots), fog
+        self.size, self._robots = len(robots), list(robots)
         self._scene, self._number = server.scene, next(_NUMBERS)
         self._server = server
         self._model, self._data = mjcf.clone(model), mujoco.MjData(model)
@@ -381,7 +377,7 @@ class Scene:
             floor.cell_color, floor.section_color, floor.plane_color = colours
         near, far = HORIZON[0] * self._view, HORIZON[1] * self._view
         colour = (20, 20, 20) if dark else (255, 255, 255)
-        self._scene.configure_fog(near, far, color=colour, enabled=self._fog)
+        self._scene.configure_fog(near, far, color=colour, enabled=True)
 
     def show_events(self, rows: Rows) -> None:
         """Marks the events of a run with posts on the reference.
@@ -661,14 +657,6 @@ class Scene:
         """Draws the arcs of a search, ends in m, `(k, 2, 2)`; none hide them."""
         some = arcs[:: max(1, len(arcs) // MAX_ARCS)]
         _show_segments(self._search, some if len(some) else None, ABOVE)
-
-    def board(self) -> tuple[Array, Array]:
-        """Returns the lower left corner and the extent, in m, `(3,)` each, of an upright area behind the track.
-
-        The first view shows all of it, and what is written around it.
-        """
-        middle = np.array(self._server.initial_camera.look_at) - self._view * CAMERA_TARGET
-        return middle + self._view * BOARD_CORNER, self._view * BOARD_SIZE
 
     @property
     def reach(self) -> float:

@@ -19,8 +19,10 @@ from mrctl.sensing.tiers import Sensing
 from mrctl.sweep import jobs
 from mrctl.viewer.live import Live, buttons
 from mrctl.viewer.looks import looks
+from mrctl.viewer.plots import CURSOR_COLOUR
 from mrctl.viewer.recording import Library
 from mrctl.viewer.replay import Replay
+from mrctl.viewer.scatter import DROVE, RING
 from mrctl.viewer.server import Server
 
 CHROMIUM = shutil.which("chromium")
@@ -112,6 +114,12 @@ def picture(page, path):
     """The scene between the panels as pixels."""
     page.screenshot(path=path, timeout=PATIENCE)
     return np.asarray(Image.open(io.BytesIO(path.read_bytes())).convert("RGB"), float)[:, 450:900]
+
+
+def pixel(page, path, at):
+    """The colour of the page at a place in pixels, x and y."""
+    page.screenshot(path=path, timeout=PATIENCE)
+    return Image.open(path).convert("RGB").getpixel((round(at[0]), round(at[1])))
 
 
 def moved(before, after):
@@ -250,7 +258,7 @@ def test_live(browser, tmp_path):
         until(lambda: np.allclose(node(page, "/world"), 0), "the camera to let go")
         page.get_by_label("Camera follows").click()  # the robot stays, and the world moves
         until(lambda: np.allclose(node(page, "/world")[:2], -node(page, ROBOT)[:2], atol=1e-3), "the world to move")
-        page.get_by_label("Camera follows").click()
+        page.keyboard.press("f")  # a checkbox that was clicked on does not keep the key
         until(lambda: np.allclose(node(page, "/world"), 0), "the world to be back")
         assert live.session.tick == tick + 2
         assert all(page.evaluate(VISIBLE, f"{robot}/payload") for robot in (ROBOT, GHOST))
@@ -743,11 +751,39 @@ def test_export(browser, tmp_path):
     assert main(["view", str(scenario), "--export", str(file)]) == 2  # not overwritten
 
 
-TO_SCREEN = """([x, y, z]) => {
-    const m = window.__viserMutable, point = new m.camera.position.constructor(x, y, z);
-    m.nodeRefFromName['/board/runs'].parent.localToWorld(point).project(m.camera);
-    const r = m.canvas.getBoundingClientRect();
-    return [r.left + (point.x + 1) / 2 * r.width, r.top + (1 - point.y) / 2 * r.height];
+ON_A_GPU = """(() => {
+    const known = WebGL2RenderingContext.prototype.getParameter;
+    WebGL2RenderingContext.prototype.getParameter = function (name) {
+        return name === 0x9246 ? 'ANGLE (NVIDIA GeForce RTX)' : known.call(this, name);
+    };
+})()"""
+
+
+def test_soft_light(browser):
+    """A browser with a GPU switches soft light on, once; one without leaves it off."""
+    with serving(lambda server: Live([BASE], server)) as (live, url):
+        live.ask(live._command, "pause")
+        with visit(browser, url) as page:
+            until(lambda: node(page, ROBOT) is not None, "the scene")
+            time.sleep(1.0)
+            assert not live.server.soft and not page.get_by_label("Soft light").is_checked()
+        with visit(browser, url) as page:
+            page.add_init_script(ON_A_GPU)
+            page.reload()
+            until(lambda: live.server.soft, "soft light")
+            page.get_by_label("Soft light").click()
+            until(lambda: not live.server.soft, "even light again")
+            page.reload()
+            until(lambda: node(page, ROBOT) is not None, "the scene")
+            time.sleep(2.0)
+            assert not live.server.soft
+
+
+DOT = """(index) => {
+    const chart = Object.values(window.__viserTestpoints.uplots).map((u) => u.chart)
+        .find((c) => c.series[1].label === 'run');
+    const box = chart.over.getBoundingClientRect();
+    return [box.left + chart.valToPos(chart.data[0][index], 'x'), box.top + chart.valToPos(chart.data[2][index], 'y')];
 }"""
 
 
@@ -758,19 +794,23 @@ def test_colours_of_a_sweep(tmp_path):
         axes = [{"field": "perturbation.mass_factor", "values": [0.8, 1.0, 1.2]}, {"field": field, "values": values}]
         jobs.run(Sweep.from_dict({"base": base, "axes": axes}), tmp_path / field, workers=1)
         server = Server(port=0)
-        replay = Replay(Library(tmp_path / field), [0], server)
-        chosen, colours = replay._colours()
+        library = Library(tmp_path / field)
+        replay = Replay(library, [0], server)
+        scatter = replay._scatter
+        assert scatter is not None
+        chosen, colours = scatter.colours()
         assert chosen == column and len(set(colours.values())) == 2
-        drawn = replay._board[0].batched_colors
-        for name, colour in zip(replay.library.table[column], drawn, strict=True):
-            assert tuple(colour) == colours[name]
+        for name, dots, series in zip(colours, scatter.data[3:5], scatter._chart.series[3:5], strict=True):
+            assert series["points"]["fill"] == f"rgb{colours[name]}"
+            drawn = set(scatter.data[1][np.isfinite(dots)])
+            assert drawn == set(library.table.index[library.table[column] == name])
         own = looks(["a", "b"], ["none", "rls"])
         assert column == "world" or list(colours.values()) == [look.colour for look in own]
         server.stop()
 
 
 def test_sweep(browser, tmp_path):
-    """All runs of a sweep on a board behind the track: a click opens the one under the mouse, as `mrctl run` has it."""
+    """All runs of a sweep in the panel: a click opens the one under the mouse, as `mrctl run` has it."""
     base = {
         "laps": 1,
         "reference": {"kind": "circle", "period": 4.0, "radius": 0.5},
@@ -781,34 +821,29 @@ def test_sweep(browser, tmp_path):
     jobs.run(Sweep.from_dict({"runs": 6, "base": base, "axes": [axis]}), tmp_path / "store", workers=1)
     library = Library(tmp_path / "store")
     with serving(lambda server: Replay(library, [0], server)) as (replay, url), visit(browser, url) as page:
-        until(lambda: node(page, "/board/runs") is not None, "the board")
         page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
         page.get_by_role("tab", name="All runs").click()
+        scatter = replay._scatter
+        assert scatter is not None
         time.sleep(2.0)
-        picture(page, tmp_path / "sweep.png")
-        corner, size = replay._scene.board()
-        edges = [page.evaluate(TO_SCREEN, (corner + size * edge).tolist()) for edge in ((0, 0, 0), (1, 0, 1))]
-        assert all(344 < x < 986 and 30 < y < 770 for x, y in edges)  # between the panels
-        assert (
-            len(
-                {"0.6", "0.8", "1", "1.2", "1.4", "1.5"}
-                & {drawn.text for drawn in replay._board if hasattr(drawn, "text")}
-            )
-            > 1
-        )
-        at = page.evaluate(TO_SCREEN, [float(c) for c in replay._board[0].batched_positions[4]])
-        page.mouse.move(*at)
-        time.sleep(0.5)
-        page.mouse.click(*at)
+        factors = library.table["perturbation.mass_factor"].to_numpy()
+        np.testing.assert_array_equal(scatter.data[0], np.sort(factors))
+        order = np.argsort(factors)
+        np.testing.assert_allclose(scatter.data[2], 1e3 * library.table["position_rmse"].to_numpy()[order])
+        at = page.evaluate(DOT, order.tolist().index(4))
+        assert pixel(page, tmp_path / "sweep.png", at) == DROVE  # a dot is where the run is
+        page.mouse.click(at[0] + 3, at[1] - 3)
         until(lambda: replay.runs == [4], "the run to open")
-        points, ring = replay._board[:2]
-        until(lambda: np.allclose(ring.position, points.batched_positions[4]), "the mark of the run")
-        replay.library.table["energy"] = [0.1, 1.0, 10.0, 100.0, 1e3, 1e4]  # J
-        replay._axes[1].value = "electrical energy, J"
-        replay.ask(replay._scatter)
-        until(lambda: replay._board[0] is not points, "another axis")
-        assert np.ptp(np.diff(replay._board[0].batched_positions[:, 2])) < 1e-6  # decades, which are equally far
-        written = [drawn.text for drawn in replay._board if hasattr(drawn, "text")]
-        assert {"electrical energy, J, logarithmic", "0.1", "1", "10", "100", "1e+03", "1e+04"} <= set(written)
+        ring = at[0] + RING / 2 - 1, at[1]
+        until(lambda: pixel(page, tmp_path / "opened.png", ring) == CURSOR_COLOUR, "the ring")
+        assert page.get_by_label("Run to show").input_value() == "4"
+        library.table["energy"] = [0.1, 1.0, 10.0, 100.0, 1e3, 1e4]  # J
+        scatter.axes[1].value = "electrical energy, J"
+        replay.ask(scatter.draw)
+        until(lambda: scatter.logarithmic == [False, True], "another axis")
+        time.sleep(1.0)
+        heights = sorted(page.evaluate(DOT, k)[1] for k in range(6))
+        assert np.ptp(np.diff(heights)) < 0.1  # decades, which are equally far
+        page.screenshot(path=tmp_path / "logarithmic.png", timeout=PATIENCE)
     again = simulate(jobs.scenario_of(tmp_path / "store", 4))
     assert replay._log["x"][:, 0].tobytes() == again.x.values.tobytes()

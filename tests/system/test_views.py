@@ -100,7 +100,6 @@ def test_sweep(browser, tmp_path):
         serving(lambda server: Replay(Library(tmp_path / "store"), [0], server)) as (_, url),
         visit(browser, url) as page,
     ):
-        until(lambda: node(page, "/board/runs") is not None, "the board")
         page.locator(".mantine-Notification-closeButton").click()
         page.get_by_role("tab", name="All runs").click()
         look(page, tmp_path / "5_sweep.png")
