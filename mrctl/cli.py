@@ -348,7 +348,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             json: Print JSON instead of a table.
             controller: Use stages of your own: my_file.py:MyFeedforward or motion=my_file.py:MyMotion,feedback=...
             number: Run the run of this number in the store again, and compare it with what is stored.
-            code: Let a store run the Python files of the controller that it names.
+            code: Whether a sweep may run the Python files of the controller that it names.
         """
         if number is not None:
             return _repeat(file, number, out, json, code)
