@@ -206,7 +206,9 @@ def dataset(
 def combine(groups: Sequence[tuple[Sequence[int], xr.Dataset]], scenarios: Sequence[Scenario]) -> xr.Dataset:
     """Combines batches into one result, runs in the order of the scenarios; shorter runs are padded with NaN."""
     parts = [part.assign_coords(run=list(rows)) for rows, part in groups]
-    whole = xr.concat(parts, "run", join="outer", data_vars="minimal", coords="minimal").sortby("run")
+    whole = parts[0]  # one is not copied
+    if len(parts) > 1:
+        whole = xr.concat(parts, "run", join="outer", data_vars="minimal", coords="minimal").sortby("run")
     whole.attrs = {
         "scenarios": json.dumps([s.model_dump(mode="json") for s in scenarios]),
         "versions": json.dumps(versions()),

@@ -53,7 +53,7 @@ def resident(process: int) -> float:
         return 0.0
 
 
-def watch(folder: Path, runs: int, workers: int, every: float = 1.0) -> tuple[np.ndarray, float, pd.DataFrame]:
+def watch(folder: Path, runs: int, workers: int, every: float = 5.0) -> tuple[np.ndarray, float, pd.DataFrame]:
     """Runs the sweep; returns time in s and MiB of the whole family `(n, 2)`, seconds it took, and its table."""
     (folder / "sweep.toml").write_text(SWEEP.format(runs=runs))
     store = folder / "store"
