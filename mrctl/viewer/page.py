@@ -68,8 +68,6 @@ class Page(ABC):
         @server.on_client_connect
         async def _(client: viser.ClientHandle) -> None:
             client.camera.on_update(self._keep_above)
-            if client.camera.aspect < 1:
-                self.ask(self._place_camera, client, CAMERAS[0])
 
     async def _keep_above(self, camera: viser.CameraHandle) -> None:
         """Keeps a visitor's camera above the floor."""

@@ -35,7 +35,7 @@ from mrctl.viewer.looks import Colour, Look, pale
 from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, path
 from mrctl.viewer.sensors import Marks, outline
 from mrctl.viewer.server import Server
-from mrctl.viewer.shapes import bar, disc, lowered, ribbons, sides
+from mrctl.viewer.shapes import bar, disc, ribbons, sides
 
 Array = NDArray[np.float64]
 EVENT_COLOUR: Colour = (217, 119, 6)
@@ -344,9 +344,7 @@ class Scene:
             self.turn(client, position, target)
 
     def turn(self, client: viser.ClientHandle, position: Array, target: Array) -> None:
-        """Places a visitor's camera, in m, `(3,)` each; a page higher than wide shows the target above its panel."""
-        if client.camera.aspect < 1:
-            position, target = lowered(position, target, client.camera.fov)
+        """Places a visitor's camera, in m, `(3,)` each."""
         client.camera.position, client.camera.look_at = position, target
 
     def camera(self, top: bool) -> tuple[Array, Array]:

@@ -27,13 +27,14 @@ from mrctl.record import InputError
 LOCAL = ("localhost", "127.0.0.1", "::1")
 ANYWHERE = ("0.0.0.0", "::")
 
-# On a phone the panel is as wide as the screen and leaves half of it to the scene, and a finger finds the buttons. The
-# curves are above the inputs, open, and scroll on their own, so that both are at hand.
+# On a phone the panel is as wide as the screen and leaves the upper half of it to the scene, and a finger finds the
+# buttons. The curves are above the inputs, open, and scroll on their own, so that both are at hand.
 PHONE = """<style>@media (max-width: 576px) {
 .mantine-Button-root, .mantine-Tabs-tab, .mantine-Input-input, .mantine-ActionIcon-root, .mantine-CloseButton-root,
 [aria-label$="panel Curves"] { min-height: 44px !important }
 .mantine-ActionIcon-root, .mantine-CloseButton-root { min-width: 44px !important }
 .mantine-Checkbox-root { --checkbox-size: 44px !important }
+[style*="inset"]:has(> div > div > div > canvas) { bottom: 50% !important }
 [style*="width: 20em"] { width: 100vw !important; max-height: 50% !important }
 div:has(> div > .mantine-Tabs-root > [aria-label$="panel Curves"]) { display: flex; flex-direction: column }
 div:has(> .mantine-Tabs-root > [aria-label$="panel Curves"]) { order: -1 }

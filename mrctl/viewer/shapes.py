@@ -54,26 +54,6 @@ def bar(start: Array, end: Array, thickness: float) -> Mesh:
     return shape.vertices.astype(np.float32), shape.faces.astype(np.uint32)
 
 
-def lowered(position: Array, target: Array, fov: float) -> tuple[Array, Array]:
-    """Moves what a camera sees up by a quarter of the height of its picture.
-
-    The camera tilts down, or is shifted if it would tilt past the vertical.
-
-    Args:
-        position: Position of the camera in m, `(3,)`.
-        target: What it looks at, in m, not straight below it, `(3,)`.
-        fov: Vertical field of view in rad.
-
-    Returns:
-        The new position and what the camera then looks at, in m, `(3,)` each.
-    """
-    forward = target - position
-    up = np.cross(np.cross(forward, [0.0, 0.0, 1.0]), forward)
-    shift = -up / np.linalg.norm(up) * np.linalg.norm(forward) * np.tan(fov / 2) / 2
-    below = (forward + shift)[:2] @ forward[:2] > 0
-    return position if below else position + shift, target + shift
-
-
 def sides(outlines: Outlines) -> Array:
     """Returns the sides of obstacles as segments, those of circles as polygons, ends in m, `(k, 2, 2)`."""
     turn = np.linspace(0, 2 * np.pi, ROUND + 1)

@@ -220,6 +220,12 @@ def test_live(browser, tmp_path):
         assert node(page, "/world/target/1/ball")[0] == pytest.approx(factor * off, rel=1e-4) and factor == 100
         assert live._scene._factor.visible and live._scene._factor.text.endswith("× 100")
 
+        seen = lambda: page.evaluate(WORLD_TO_SCREEN, [0, 0.8, 0])  # noqa: E731 (the middle of the circle)
+        first = seen()
+        page.get_by_role("button", name="top", exact=True).click()
+        until(lambda: abs(seen()[1] - first[1]) > 5, "the camera to move")
+        page.get_by_role("button", name="overview", exact=True).click()
+        until(lambda: np.allclose(seen(), first, atol=1), "the first view again")
         page.get_by_text("drop payload").click()
         until(lambda: "payload 0 → 10" in page.inner_text("#mrctl-timeline"), "the payload in the timeline")
         page.keyboard.press("Space")
@@ -288,9 +294,7 @@ def test_live(browser, tmp_path):
         assert page.get_by_label("panel Curves").bounding_box()["height"] >= 44
         boxes = [box.bounding_box() for box in page.locator("input[type=checkbox]").all() if box.is_visible()]
         assert len(boxes) > 2 and all(min(box["width"], box["height"]) >= 44 for box in boxes)
-        page.get_by_role("button", name="overview", exact=True).click()
-        middle = lambda: page.evaluate(WORLD_TO_SCREEN, [0, 0.8, 0])  # noqa: E731 (of the circle that is driven)
-        until(lambda: np.allclose(middle(), [390 / 2, 844 / 4], atol=30), "the circle above the panel")
+        until(lambda: np.allclose(seen(), [390 / 2, 844 / 4], atol=30), "the circle above the panel")
         page.screenshot(path=tmp_path / "phone.png", timeout=PATIENCE)
         page.set_viewport_size({"width": 1280, "height": 800})
         page.keyboard.press("r")

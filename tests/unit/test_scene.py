@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mjviser.conversions import merge_geoms
@@ -11,7 +11,7 @@ from mjviser.conversions import merge_geoms
 from mrctl.physics import mjcf
 from mrctl.theory.robot import CAR, RobotFile
 from mrctl.viewer.scene import SEEN, _rough
-from mrctl.viewer.shapes import lowered, ribbons
+from mrctl.viewer.shapes import ribbons
 
 
 def test_ribbon_of_a_circle():
@@ -55,18 +55,3 @@ def test_ghosts(robot, steering):
             assert rough.volume == pytest.approx(fine.volume, rel=0.1)
             counts += len(fine.faces), len(rough.faces)
     assert counts[1] < counts[0]
-
-
-@given(arrays(float, 3, elements=st.floats(-5, 5)), arrays(float, 3, elements=st.floats(-5, 5)), st.floats(0.3, 2.5))
-def test_lowered(position, target, fov):
-    """The target is then straight above the middle of the picture, by a quarter of its height."""
-    assume(np.hypot(*(target - position)[:2]) > 0.1)
-    eye, seen = lowered(position, target, fov)
-    forward = seen - eye
-    assert forward[:2] @ (target - position)[:2] > 0
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    x, y, z = np.array([right, np.cross(right, forward), forward]) @ (target - eye)
-    assert abs(x) < 1e-9
-    assert y / z / np.tan(fov / 2) == pytest.approx(0.5)
