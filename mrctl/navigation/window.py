@@ -16,6 +16,9 @@ from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Reactive,
 SPEEDS, ROTATIONS = 9, 15  # of the window
 MOMENT = 0.25  # s, in which the twists of the window can be reached
 LOOK = 20  # steps, over which a constant twist is looked at
+# m, by which what the robot has found beside its map is enlarged: a roll-out neither knows the noise of the lidar, nor
+# how the robot departs from the twist, nor the side of an obstacle that no scan has shown yet. Chosen.
+RESERVE = 0.05
 
 
 class Window(Reactive):
@@ -30,6 +33,7 @@ class Window(Reactive):
         grid = np.stack(np.meshgrid(speeds, rotations), -1).reshape(-1, 1, 2)
         constant, rest = np.repeat(grid, KNOTS, axis=1), np.zeros((STEPS, 2))
         ahead, costs = np.empty((len(grid), LOOK, 2)), np.empty(len(grid))
+        scene = scene._replace(movers=scene.movers + np.array([0.0, 0.0, 0.0, 0.0, RESERVE]))
         near = scene._replace(targets=scene.targets[:LOOK])
         roll_out.compiled(constant, rest[:LOOK], pose, twist, last, 0.0, period, bounds, near, np.inf, ahead, costs)
         stops, braking = np.empty((len(grid), STEPS, 2)), np.empty(len(grid))

@@ -138,6 +138,15 @@ def test_what_the_map_lacks(avoid: Avoid) -> None:
     assert driven.table["outcome"].tolist() == ["arrived"] and driven.table["clearance"].iloc[0] > 0.03
 
 
+@pytest.mark.parametrize("start", [1.5, 1.8, 2.0])
+def test_keeps_off(start: float) -> None:
+    """`window` does not drive along a box that the map lacks at no distance, where it would hit the side it sees late."""
+    box = Box(x=2.3, y=2.2, length=0.5, width=0.5)
+    task = Task(obstacles=Obstacles(shapes=(box,)), map=Obstacles(), start=(start, 0.0, 0.0), goal=(2.3, 3.8, 1.5))
+    driven = navigate(task, PLANNED, avoid="window")
+    assert driven.table["outcome"].tolist() == ["arrived"] and driven.table["clearance"].iloc[0] > 0.03
+
+
 def test_backs_off() -> None:
     """A robot with rigid steering that stands close before a box that the map lacks reverses to go around it."""
     box = Box(x=0.95, y=0.0, length=0.3, width=1.0)
