@@ -140,7 +140,7 @@ def test_what_the_map_lacks(avoid: Avoid) -> None:
 
 @pytest.mark.parametrize("start", [1.5, 1.8, 2.0])
 def test_keeps_off(start: float) -> None:
-    """`window` does not drive along a box that the map lacks at no distance, where it would hit the side it sees late."""
+    """`window` keeps a distance from a box that the map lacks, whose far side the robot sees late."""
     box = Box(x=2.3, y=2.2, length=0.5, width=0.5)
     task = Task(obstacles=Obstacles(shapes=(box,)), map=Obstacles(), start=(start, 0.0, 0.0), goal=(2.3, 3.8, 1.5))
     driven = navigate(task, PLANNED, avoid="window")
