@@ -2,8 +2,9 @@
 
 Fox, Burgard and Thrun, "The dynamic window approach to collision avoidance", IEEE Robotics and Automation Magazine
 4(1), 1997. Their objective rewards heading, clearance and speed; here it is the cost of a roll-out along the plan. A
-twist is admissible if the robot can set out towards it and then brake without touching an obstacle. If none is, the
-robot does what it does first in the cheapest of these braking roll-outs.
+twist is admissible if the robot can set out towards it and then brake without touching an obstacle; those come first
+that also keep off what the map lacks. If none is admissible, the robot does what it does first in the cheapest of these
+braking roll-outs.
 """
 
 from __future__ import annotations
@@ -33,14 +34,17 @@ class Window(Reactive):
         grid = np.stack(np.meshgrid(speeds, rotations), -1).reshape(-1, 1, 2)
         constant, rest = np.repeat(grid, KNOTS, axis=1), np.zeros((STEPS, 2))
         ahead, costs = np.empty((len(grid), LOOK, 2)), np.empty(len(grid))
-        scene = scene._replace(movers=scene.movers + np.array([0.0, 0.0, 0.0, 0.0, RESERVE]))
         near = scene._replace(targets=scene.targets[:LOOK])
         roll_out.compiled(constant, rest[:LOOK], pose, twist, last, 0.0, period, bounds, near, np.inf, ahead, costs)
-        stops, braking = np.empty((len(grid), STEPS, 2)), np.empty(len(grid))
+        stops, braking, wide = np.empty((len(grid), STEPS, 2)), np.empty(len(grid)), np.empty(len(grid))
         falling = constant * np.array([1.0, *[0.0] * (KNOTS - 1)])[:, None]
         falling[:, :, 1] = constant[:, :, 1]  # the curvature bounds θ̇ as V falls
         roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, scene, np.inf, stops, braking)
         costs[braking >= TOUCH] = np.inf
+        if len(scene.movers):
+            off = scene._replace(movers=scene.movers + np.array([0.0, 0.0, 0.0, 0.0, RESERVE]))
+            roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, off, np.inf, stops, wide)
+            costs[wide >= TOUCH] += TOUCH
         best = int(costs.argmin())
         chosen = ahead[best] if np.isfinite(costs[best]) else stops[int(braking.argmin())]
         self.considered[row] = Considered(pose.copy(), ahead, chosen)
