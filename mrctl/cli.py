@@ -278,6 +278,14 @@ def _is_short_help(arguments: Sequence[str]) -> bool:
     )
 
 
+def _explained(arguments: Sequence[str]) -> Sequence[str]:
+    """Returns the fields of a scenario that the help which a command line asks for explains; none if it does not."""
+    if _is_short_help(arguments):
+        return FIRST
+    asked = {"--help", "--help-all", "-h"} & set(arguments)
+    return [name for name in Scenario.model_fields if name not in FROM_FILES] if asked else ()
+
+
 def _fields_set(arguments: Sequence[str]) -> set[str]:
     """Returns the fields that a command line sets; of nested ones the outermost, such as `robot` for --robot.path."""
     return {re.split("[.:=]", argument.removeprefix("--"))[0] for argument in arguments[1:]}
@@ -367,10 +375,10 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         if failure:
             raise _Incomplete(f"the run failed {failure}")
 
-    if _is_short_help(arguments):
-        short = _partial_record(default, FIRST)
-        run.__annotations__["scenario"] = Annotated[type(short), tyro.conf.arg(name="")]
-        run.__defaults__ = (None, short, *(run.__defaults__ or ())[2:])
+    if explained := _explained(arguments):
+        part = _partial_record(default, explained)
+        run.__annotations__["scenario"] = Annotated[type(part), tyro.conf.arg(name="")]
+        run.__defaults__ = (None, part, *(run.__defaults__ or ())[2:])
     return run
 
 
@@ -814,10 +822,10 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
         scenario = _suited(scenario, arguments, scenario_file)
         viewing.live(scenario, compare if chosen else ("none",), export, host, port)
 
-    if not asked or _is_short_help(arguments):
-        short = _partial_record(default, FIRST)
-        view.__annotations__["scenario"] = Annotated[type(short), tyro.conf.arg(name="")]
-        view.__defaults__ = (None, short, *(view.__defaults__ or ())[2:])
+    if explained := _explained(arguments) if asked else FIRST:
+        part = _partial_record(default, explained)
+        view.__annotations__["scenario"] = Annotated[type(part), tyro.conf.arg(name="")]
+        view.__defaults__ = (None, part, *(view.__defaults__ or ())[2:])
     return view
 
 
