@@ -6,6 +6,7 @@ The docstring of a field or argument is the help text of its flag.
 from __future__ import annotations
 
 import contextlib
+import inspect
 import io
 import json as jsonlib
 import logging
@@ -242,6 +243,8 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
 
 def _deferred(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
     """Wraps a command so that tyro, while stderr is captured, only binds its arguments; the result then runs it."""
+    # Where a line of the docstring ends within the text of an argument, tyro would begin a new one.
+    function.__doc__ = re.sub(r"\n {8,}(?=\S)", " ", inspect.cleandoc(function.__doc__ or ""))
 
     @wraps(function)
     def inner(*args: object, **kwargs: object) -> Callable[[], Any]:
