@@ -111,8 +111,8 @@ class Scenario(Record):
     prior: PriorName = "none"
     """The feedforward starts from no model, the nominal one or, for reference, the true one."""
     learner: LearnerName = "fel"
-    """This law learns and adds to the prior, which `observer`, `indi` and `l1` need; with `none` and prior `none` the PID
-    is alone."""
+    """This law learns and adds to the prior, which `observer`, `indi` and `l1` need; with `none` and prior `none` the
+    PID is alone."""
     sensing: Sensing = Sensing()
     """Sensors, estimator, motor driver, battery, steering servo and delay, which a tier sets."""
     kanayama: Kanayama = Kanayama()
