@@ -26,7 +26,7 @@ KNOWN = {"lap_time": ("s", "time of a lap"), "failure_time": ("s", "failed after
 DECADES = 30.0  # ratio of largest to least beyond which an axis is logarithmic
 AROUND = 0.06  # share of an axis that is left free at its ends
 RUN = "Run to show"  # label of a number field
-# A click writes the number of the nearest run into that field; see `plots.GO_TO`.
+# A click near a run writes its number into that field; see `plots.GO_TO`.
 OPEN = """<style onload="
 if (!window.mrctlOpen) window.addEventListener('click', window.mrctlOpen = (event) => {
     const over = event.target.closest && event.target.closest('.u-over');
@@ -34,12 +34,17 @@ if (!window.mrctlOpen) window.addEventListener('click', window.mrctlOpen = (even
     const chart = Object.values(window.__viserTestpoints.uplots).map((u) => u.chart).find((c) => c.over === over);
     if (!chart || chart.series[1].label !== 'run') return;
     const box = over.getBoundingClientRect(), [x, runs, y] = chart.data;
-    const away = Array.from(runs, (_, k) => Math.hypot(
-        chart.valToPos(x[k], 'x') - event.clientX + box.left, chart.valToPos(y[k], 'y') - event.clientY + box.top));
+    let best = 400, run = null; // within 20 pixels
+    for (let k = 0; k < runs.length; k++) {
+        const left = chart.valToPos(x[k], 'x') - event.clientX + box.left;
+        const top = chart.valToPos(y[k], 'y') - event.clientY + box.top;
+        if (left * left + top * top < best) { best = left * left + top * top; run = runs[k]; }
+    }
+    if (run === null) return;
     const label = [...document.querySelectorAll('label')].find((l) => l.textContent === 'RUN');
     const field = document.getElementById(label.htmlFor);
     const set = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set;
-    set.call(field, runs[away.indexOf(Math.min(...away))]);
+    set.call(field, run);
     field.dispatchEvent(new Event('input', { bubbles: true }));
 }, true);"></style>""".replace("RUN", RUN)
 
