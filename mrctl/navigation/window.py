@@ -43,6 +43,7 @@ class Window(Reactive):
         costs[braking >= TOUCH] = np.inf
         if len(scene.movers):
             off = scene._replace(movers=scene.movers + np.array([0.0, 0.0, 0.0, 0.0, RESERVE]))
+            # The twists of a roll-out do not depend on the scene: `stops` stays as it is.
             roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, off, np.inf, stops, wide)
             costs[wide >= TOUCH] += TOUCH
         best = int(costs.argmin())

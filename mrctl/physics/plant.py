@@ -195,7 +195,7 @@ class Plant(ABC):
         """Lets the compiled calls of each tick find the arrays of the plant, which from then on stay where they are."""
         own, engine = (self.state, self._queue, self.ctrl, self._acts, self._inputs), (self.qpos, self.qvel, self.act)
         self._held = Held(*own, *engine, self._address, self.imu)
-        self._send = send.calling(held=self._held.reader).compiled
+        self._send = send.calling(held=self._held.reader).compiled  # of commands in any memory layout
         self._look = look.calling(held=self._held.reader).repeated()
 
     @abstractmethod
