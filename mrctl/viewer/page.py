@@ -9,7 +9,7 @@ import threading
 import time
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from functools import partial
 from typing import Any
 
@@ -67,14 +67,25 @@ class Page(ABC):
 
         @server.on_client_connect
         async def _(client: viser.ClientHandle) -> None:
-            client.camera.on_update(self._keep_above)
+            client.camera.on_update(self._keep_above())
 
-    async def _keep_above(self, camera: viser.CameraHandle) -> None:
-        """Keeps a visitor's camera above the floor."""
-        here, target = np.array(camera.position), np.array(camera.look_at)
-        above = self._scene.above_floor(here)
-        if not np.array_equal(above, here):
-            camera.position, camera.look_at = above, target
+    def _keep_above(self) -> Callable[[viser.CameraHandle], Coroutine[Any, Any, None]]:
+        """Returns a callback that puts a visitor's camera back above the floor, whenever it gets below.
+
+        A slow browser reports its camera before it has placed it where the page begins; that one is not moved.
+        """
+        placed = False
+
+        async def called(camera: viser.CameraHandle) -> None:
+            nonlocal placed
+            here, target = np.array(camera.position), np.array(camera.look_at)
+            above = self._scene.above_floor(here)
+            if np.array_equal(above, here):
+                placed = True
+            elif placed:
+                camera.position, camera.look_at = above, target
+
+        return called
 
     def add_cameras(self) -> None:
         """Adds the buttons that place a visitor's own camera, in the present context of the GUI."""

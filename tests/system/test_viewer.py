@@ -262,6 +262,11 @@ def test_live(browser, tmp_path):
         page.keyboard.press("f")  # a checkbox that was clicked on does not keep the key
         until(lambda: np.allclose(node(page, "/world"), 0), "the world to be back")
         assert live.session.tick == tick + 2
+        first = live._scene.camera(False)[0]
+        assert page.evaluate(CAMERA) == pytest.approx(first, abs=1e-6)
+        for name, place in (("top", live._scene.camera(True)[0]), ("overview", first)):
+            page.get_by_text(name, exact=True).click()
+            until(lambda place=place: np.allclose(page.evaluate(CAMERA), place, atol=1e-6), f"the camera {name!r}")
         assert all(page.evaluate(VISIBLE, f"{robot}/payload") for robot in (ROBOT, GHOST))
 
         with page.expect_download(timeout=PATIENCE) as download:
