@@ -432,7 +432,8 @@ class Simulation:
         for name, (unit, meaning) in dataset.GAINS.items():
             values = self.hierarchy.gains[name].copy()
             gains[name] = ("run", "channel")[: values.ndim], values, {"units": unit, "long_name": meaning}
-        return found.assign(self._parameters() | self._clearance(length) | faults | constants | gains)
+        scanned = {"scanned": ("run", np.ones(size, bool))} if self.estimator.scanner else {}
+        return found.assign(self._parameters() | self._clearance(length) | scanned | faults | constants | gains)
 
     @property
     def faults(self) -> dict[str, list[str]]:

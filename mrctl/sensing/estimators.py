@@ -286,7 +286,7 @@ class Estimator:
         """Scans, and makes fixes from the scans, where there are lidars; further calls in the same tick do nothing."""
         if self.scanner and tick != self._located:
             self._located = tick
-            self.scanner.scan(tick, plant)
+            self.scanner.scan(tick, plant["reading"]["pose"], plant["failed"])
             if self.localiser:
                 self.localiser.locate(tick, self.seen["estimate"])
 

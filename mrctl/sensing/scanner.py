@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mrctl.kernel import Array, Rows
+from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.obstacles import Obstacles, Surroundings
@@ -47,16 +48,17 @@ class Scanner:
         self._random[row], self._start[row] = np.random.default_rng([seed, 6]), tick
         self.scans[row], self.taken[row] = None, -1
 
-    def scan(self, tick: int, plant: Rows) -> None:
+    def scan(self, tick: int, poses: Array, failed: NDArray[np.number]) -> None:
         """Takes the scans that are due in a tick, once.
 
         Args:
             tick: Control tick.
-            plant: Record of `PLANT` of each robot, `(B,)`; one that has failed does not scan.
+            poses: True x and y of P in m and θ in rad of each robot, `(B, 3)`.
+            failed: Whether each robot has failed, `(B,)`; one that has does not scan.
         """
         for row, lidar in enumerate(self.lidars):
             since = int(tick - self._start[row])
-            if since % self._every[row] == 0 and self.taken[row] != tick and not plant["failed"][row]:
+            if since % self._every[row] == 0 and self.taken[row] != tick and not failed[row]:
                 around = self._surroundings.at(since * self._period)
-                self.scans[row] = lidar.scan(plant["reading"]["pose"][row], around, self._random[row])
+                self.scans[row] = lidar.scan(poses[row], around, self._random[row])
                 self.taken[row] = tick

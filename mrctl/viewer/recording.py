@@ -24,8 +24,10 @@ from mrctl.results.controllers import title_of
 from mrctl.results.dataset import SIGNALS, blank, faults_of, scenarios_of
 from mrctl.results.metrics import as_runs, summary
 from mrctl.scenario import Scenario
+from mrctl.sensing.scanner import Scanner
 from mrctl.sweep import jobs, store
 from mrctl.sweep.store import Store
+from mrctl.theory.obstacles import turned
 from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.deviation import drawn
 from mrctl.viewer.looks import Look, looks
@@ -68,7 +70,13 @@ class Recording:
         self.log = log[: 1 + driven[-1]] if driven.size else log[:1]
         self.failure, self.faults = str(run["failure"].values), faults_of(run)
         near = bool(self.scenario.obstacles.shapes) and "clearance" in run
+        self._scanned = "scanned" in run and run["scanned"].values.item() is True
         self.clearance: Array | None = run["clearance"].values[: len(self.log)] if near else None
+
+    @property
+    def _first(self) -> int:
+        """Control tick of the first sample."""
+        return round(self.start / self.period)
 
     @property
     def duration(self) -> float:
@@ -92,6 +100,32 @@ class Recording:
         rates = {wheel: log[name] for wheel, name in WHEELS.items()}
         rates |= front_rates(self.model, robot, log["v"], log["omega"], log["steering_angle"])
         return {wheel: self.period * np.cumsum(rate) for wheel, rate in rates.items()}
+
+    @cached_property
+    def _scans(self) -> list[Array]:
+        """Places in the world that the beams of each scan met in m, `(n, 2)`."""
+        s, first = self.scenario, self._first
+        scanner, found, failed = Scanner([s.sensing], self.period, s.obstacles), [], np.zeros(1)
+        scanner.start(0, s.seed, 0)
+        for tick in range(first + len(self.log)):
+            now = self.log[max(0, tick - first)]  # before the interval only the noise is drawn
+            pose = np.array([now["x"], now["y"], now["theta"]])
+            scanner.scan(tick, pose[None], failed)
+            if first <= scanner.taken[0] == tick and (ranges := scanner.scans[0]) is not None:
+                found.append(turned(s.sensing.lidar.points(ranges), pose))
+        return found
+
+    def scan(self, index: int) -> Array | None:
+        """Returns where the beams of the last scan at a sample met something, x and y in m, `(n, 2)`; None without one.
+
+        A result holds no scans. They are taken again from the recorded poses with the noise of the seed of the run,
+        and have the same bits.
+        """
+        if not self._scanned:
+            return None
+        every = self.scenario.sensing.lidar.every(self.period)
+        last = (self._first + index) // every - -(-self._first // every)  # of the interval
+        return self._scans[last] if last >= 0 else None
 
     def perturbation(self, time: float) -> Perturbation:
         """Returns the perturbation of the plant at a time in s."""

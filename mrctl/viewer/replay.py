@@ -14,7 +14,7 @@ from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
 from mrctl.viewer.scatter import KNOWN, Scatter, in_words, numbers_of
-from mrctl.viewer.scene import Scene
+from mrctl.viewer.scene import MAX_MARKED, Scene
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
@@ -173,8 +173,10 @@ class Replay(Page):
             self._scene.show_payload(row, recording.perturbation(self.time))
             self._scene.show_force(row, pushed(recording.scenario, recording.start + self.time))
         self._scene.show_ends(ends(self.recordings[0].scenario, self.recordings[0].start + self.time))
-        period, logs = self.recordings[0].period, []
+        period, logs, scans = self.recordings[0].period, [], []
         if marked:
+            met = [recording.scan(recording.index(self.time)) for recording in self.recordings[:MAX_MARKED]]
+            scans = [None if places is None else (places, np.zeros((0, 3))) for places in met]
             ticks = round(FIX_AGE / period)
             for recording, latency in zip(self.recordings, self._latencies, strict=True):
                 index = recording.index(self.time)
@@ -184,6 +186,7 @@ class Replay(Page):
             self._scene.show_targets(now, self._deviation)
             self._scene.show_obstacles(self.recordings[0].start + self.time)
             self._scene.show_sensors(logs, period, self._latencies, magnified)
+            self._scene.show_scans(scans)
             self._scene.flush(self._follow.value)
         self.chase()
 

@@ -17,6 +17,7 @@ from mrctl.navigation.mission import avoiding, navigate, prepared, task_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.results.dataset import SIGNALS
+from mrctl.sensing.lidar import Lidar
 from mrctl.viewer import view as viewing
 from mrctl.viewer.export import _curves
 from mrctl.viewer.live import SAMPLES, WINDOW, Live
@@ -158,6 +159,52 @@ def test_scan(server, localisation):
     assert len(particles.points) == (500 if localisation == "particles" else 0)
     if localisation == "particles":
         assert particles.points[:, :2].mean(axis=0) == pytest.approx(live.session.qpos(0)[:2], abs=0.1)
+
+
+@pytest.mark.parametrize("who", ["particles", "window"])
+def test_scans_of_a_replay(who, server, tmp_path, monkeypatch):
+    """A replay, also of an interval, shows the scans that a localisation or an avoider got."""
+    taken, scan = [], Lidar.scan
+
+    def spy(lidar, pose, outlines, random):
+        ranges = scan(lidar, pose, outlines, random)
+        x, y = lidar.points(ranges).T
+        cos, sin = np.cos(pose[2]), np.sin(pose[2])
+        taken.append(np.column_stack([pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y]))
+        return ranges
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Lidar, "scan", spy)
+        if who == "particles":
+            sensing = {"tier": "field", "localisation": who, "lidar": {"beams": 60, "lost": 0.1}}
+            result = simulate(DRIVE.replace(sensing=sensing, obstacles=Obstacles(shapes=(*WALLS.shapes, PASSING))))
+        else:
+            result = navigate(ROOM, PID, avoid="window").result
+    scans, ticks = taken.copy(), result.sizes["time"]
+    assert len(scans) == -(-ticks // 10) > 10 and sum(map(len, scans)) > 300  # ten a second
+    for result in (result, result.isel(time=slice(77, 161))):
+        save(result, folder := tmp_path / f"from_{float(result.time[0])}.zarr")
+        library = Library(folder)
+        recording = library.recording(int(library.table.index[0]))
+        first = round(recording.start / recording.period)
+        for index in range(len(recording.log)):
+            last, found = (first + index) // 10, recording.scan(index)
+            if 10 * last < first:
+                assert found is None  # it was taken before the interval
+            else:
+                np.testing.assert_allclose(found, scans[last], rtol=0, atol=1e-13)  # m
+    replay = Replay(library, [int(library.table.index[0])], server)
+    replay.sensors.value = True
+    replay._scrub(0.5)
+    replay.draw()
+    points = replay._scene._scans[0]
+    assert points.visible and points.points[:, :2] == pytest.approx(scans[12], abs=1e-6)  # 1.27 s
+    replay.sensors.value = False
+    replay.draw()
+    assert not points.visible
+    other = simulate(DRIVE)  # nobody has a lidar
+    save(other, tmp_path / "other.zarr")
+    assert Library(tmp_path / "other.zarr").recording(0).scan(5) is None
 
 
 @pytest.fixture(scope="module")
