@@ -305,7 +305,10 @@ class Simulation:
 
         Raises:
             InputError: The event is in the past, or a scenario with it is refused; then nothing is added.
+            ValueError: It has a reference, and the simulation was made with `restarting`.
         """
+        if event.reference is not None and isinstance(self.courses, RestartingCourses):
+            raise ValueError("add: robots that begin again keep their references")
         if event.tick(self.period) < self.tick:
             raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self.period:g} s")
         if event.reference is not None and event.tick(self.period) < self.tick + self.preview:

@@ -59,7 +59,8 @@ class Recording:
         self.scenario: Scenario = scenarios_of(run)[0]
         self.controller = str(run["feedforward"].values) if "feedforward" in run.coords else self.scenario.feedforward
         label = str(run["label"].values)
-        self.label = title_of(label) if label == self.controller else label
+        name, plus, stages = label.partition(" + ")  # of the user
+        self.label = title_of(name) + plus + stages if name == self.controller else label
         self.period = float(run.attrs["control_period"])
         self.start = float(run["time"][0])
         log = blank(run.sizes["time"])

@@ -37,7 +37,7 @@ STORIES = {
         "At 6 s a load of two and a half times its mass falls on the racing car, and at 18 s it is pushed: PID alone "
         "gets ever further from the reference until its run ends, and the learner drives on, 2 to 3 cm off.",
     ),
-    "sagging battery": _story(
+    "draining battery": _story(
         Scenario(laps=5, events=_SAG),
         "From 14 s the battery loses 10 % every 2 s, down to 60 %: the error of PID alone grows to five times that of "
         "the learner, which stays as it is.",

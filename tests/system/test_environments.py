@@ -474,6 +474,10 @@ def test_actions():
             lambda: TrackingEnv(SHORT, draw=lambda r: Perturbation(payload=-r.random())).reset(),
             "perturbation.payload: ",
         ),
+        (
+            lambda: Episodes([SHORT], "twist").loop.add(Event(time=1.0, reference=SHORT.reference)),
+            "add: robots that begin again keep their references",
+        ),
     ],
 )
 def test_refused(make, message):

@@ -182,8 +182,8 @@ def test_scans_of_a_replay(who, server, tmp_path, monkeypatch):
             result = navigate(ROOM, PID, avoid="window").result
     scans, ticks = taken.copy(), result.sizes["time"]
     assert len(scans) == -(-ticks // 10) > 10 and sum(map(len, scans)) > 300  # ten a second
-    for result in (result, result.isel(time=slice(77, 161))):
-        save(result, folder := tmp_path / f"from_{float(result.time[0])}.zarr")
+    for part in (result, result.isel(time=slice(77, 161))):
+        save(part, folder := tmp_path / f"from_{float(part.time[0])}.zarr")
         library = Library(folder)
         recording = library.recording(int(library.table.index[0]))
         first = round(recording.start / recording.period)
@@ -194,6 +194,7 @@ def test_scans_of_a_replay(who, server, tmp_path, monkeypatch):
             else:
                 np.testing.assert_allclose(found, scans[last], rtol=0, atol=1e-13)  # m
     replay = Replay(library, [int(library.table.index[0])], server)
+    assert replay.recordings[0].label == {"particles": "PID alone", "window": "PID alone + window"}[who]
     replay.sensors.value = True
     replay._scrub(0.5)
     replay.draw()
