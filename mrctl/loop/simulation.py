@@ -366,6 +366,7 @@ class Simulation:
             new = plant.failed & np.isnan(self._failure_time)
             new[list(self._learned)] = False
             self._failure_time[new] = self.tick * self.period
+            self._keep_learned(np.flatnonzero(new).tolist())
             log.blank(tick, plant.failed)
         if self.goals.any:
             self._end(tick)
@@ -403,14 +404,19 @@ class Simulation:
 
     def _end(self, tick: int) -> None:
         """Ends the runs that are at their goals, stuck or at their own end; the record of the tick is kept."""
-        stage = self.hierarchy.learner
         for row, reason in self.goals.ended(tick, self.log.now).items():
             if row in self._learned:
                 continue
             self.plant.fail(row, reason)
-            self._learned[row] = stage.adapted()[row] if isinstance(stage, Learner) else np.zeros(0)
+            self._keep_learned([row])
             if reason:
                 self._failure_time[row] = self.tick * self.period
+
+    def _keep_learned(self, rows: Sequence[int]) -> None:
+        """Keeps what robots have learned at their ends, for their learners go on in the batch."""
+        stage = self.hierarchy.learner
+        for row in rows:
+            self._learned[row] = stage.adapted()[row] if isinstance(stage, Learner) else np.zeros(0)
 
     def result(self) -> xr.Dataset:
         """Returns the signals so far or, once every run has ended, those of the whole time, with NaN after the ends."""

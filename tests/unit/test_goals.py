@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrctl import Line, Scenario, simulate
+from mrctl import Event, Line, Scenario, simulate
 from mrctl.loop.goals import HEADWAY, NEAR, RESTING, STUCK, TURNED, Goals, arrived
 from mrctl.results.dataset import TICK
 
@@ -52,6 +52,16 @@ def test_ends(timed):
     if timed:
         group.restart(1, 700)
         assert 1 not in group.ended(700, now) or group.there[1]
+
+
+@pytest.mark.parametrize("learner", ["observer", "fel", "rls", "mrac", "l1", "composite"])
+def test_what_was_learned_when_a_run_failed(learner):
+    """A robot that fails before its batch keeps the weights of its own end too."""
+    long = Scenario(laps=1, reference=Line(length=2.4), prior="model", learner=learner)
+    short = long.replace(events=(Event(time=0.5, push=(0.0, 900.0, 0.0)),))
+    both, alone = simulate([short, long]), simulate(short)
+    assert alone.failed and np.array_equal(both.weights[0], alone.weights)
+    assert not np.array_equal(both.weights[1], alone.weights)
 
 
 def test_what_was_learned_when_a_run_ended():
