@@ -312,9 +312,8 @@ class Waypoints(Record):
             raise ValueError(f"points: {first} and {(first + 1) % len(self.points)} coincide")
         path = _spline(self.points, self.closed)
         # The parameter is chord length, so a regular curve has |dp/du| near one.
-        slow = np.abs(path.derivative(path.u, 1))
-        if slow.min() < 0.02:
-            where = path.derivative(path.u, 0)[slow.argmin()]
+        slow, where = path.slowest()
+        if slow < 0.02:
             raise ValueError(f"points: the curve turns on the spot near ({where.real:.2f}, {where.imag:.2f})")
         if self.timing == "limits":
             _ = self._law  # raises for limits with which the robot cannot move
@@ -428,6 +427,23 @@ class _Spline:
         """Returns the n-th derivative of x + i y with respect to u, for n = 0 to 3."""
         x, y = np.moveaxis(self.curves[n](u), -1, 0)
         return x + 1j * y
+
+    def slowest(self) -> tuple[float, complex]:
+        """Returns the least |dp/du| of the curve, also between the samples, and x + i y in m of the place."""
+
+        def falls(u: Array) -> NDArray[np.bool]:  # the sign of d|dp/du|²/du
+            return (np.conj(self.derivative(u, 1)) * self.derivative(u, 2)).real < 0
+
+        falling = falls(self.u)
+        (valley,) = np.nonzero(falling[:-1] & ~falling[1:])
+        low, high = self.u[valley], self.u[valley + 1]
+        for _ in range(12):  # bisections
+            middle = (low + high) / 2
+            before = falls(middle)
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        u = np.append(self.u, low)
+        slow = np.abs(self.derivative(u, 1))
+        return float(slow.min()), complex(self.derivative(u, 0)[slow.argmin()])
 
     def arc(self, start: Array, end: Array) -> Array:
         """Returns the arc length in m from u = start to u = end, shape (T,); both lie within one piece."""

@@ -278,6 +278,12 @@ def test_toml():
     assert KINDS.validate_python(tomllib.loads(text)) == Waypoints(points=((0, 0), (2, 0), (1, 2)), speed=0.4)
 
 
+NARROW = [
+    [0.561, 0.0], [0.68, 0.68], [0.0, 1.265], [-0.555, 0.555], [-1.594, 0.0], [-0.368, -0.368], [0.0, -1.137],
+    [0.972, -0.972],
+]  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("values", "words"),
     [
@@ -291,6 +297,8 @@ def test_toml():
         ({"kind": "waypoints", "points": [[0, 0], [1, 0], [1, 0], [0, 1]]}, "points: 1 and 2 coincide"),
         ({"kind": "waypoints", "points": [[0, 0], [1, 0], [0, 1], [0, 0]]}, "points: 3 and 0 coincide"),
         ({"kind": "waypoints", "points": [[0, 0], [1, 0], [2, 0]]}, "points: the curve turns on the spot near"),
+        # Here |dp/du| is above the least value at the 64 samples between two points, and below it between these.
+        ({"kind": "waypoints", "points": NARROW}, r"points: the curve turns on the spot near \(-1.60, -0.00\)"),
         ({"kind": "waypoints", "points": [[0, 0], [0.2, 0]], "closed": False}, "stop_time: too long to stop"),
     ],
 )
