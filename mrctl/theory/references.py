@@ -312,7 +312,7 @@ class Waypoints(Record):
             raise ValueError(f"points: {first} and {(first + 1) % len(self.points)} coincide")
         path = _spline(self.points, self.closed)
         # The parameter is chord length, so a regular curve has |dp/du| near one.
-        slow, where = path.slowest()
+        slow, where = path.slowest
         if slow < 0.02:
             raise ValueError(f"points: the curve turns on the spot near ({where.real:.2f}, {where.imag:.2f})")
         if self.timing == "limits":
@@ -428,8 +428,9 @@ class _Spline:
         x, y = np.moveaxis(self.curves[n](u), -1, 0)
         return x + 1j * y
 
+    @cached_property
     def slowest(self) -> tuple[float, complex]:
-        """Returns the least |dp/du| of the curve, also between the samples, and x + i y in m of the place."""
+        """The least |dp/du| of the curve, also between the samples, and x + i y in m of the place."""
 
         def falls(u: Array) -> NDArray[np.bool]:  # the sign of d|dp/du|²/du
             return (np.conj(self.derivative(u, 1)) * self.derivative(u, 2)).real < 0
