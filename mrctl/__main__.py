@@ -52,6 +52,10 @@ def main() -> int:
             raise
         print("mrctl: interrupted", file=sys.stderr)
         status = 130
+    if interrupts.caught:
+        # Python remembers an interrupt that left a string of code, as dataclasses run them, and would end `python -m`
+        # by the signal instead of the status; to run another string makes it forget.
+        exec("")
     return status
 
 

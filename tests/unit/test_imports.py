@@ -392,3 +392,18 @@ def test_interrupt_of_a_program(wait: float) -> None:
     # The announcement of a compilation may stand before it.
     assert program.returncode == 130 and said.splitlines()[-1] == "mrctl: interrupted"
     assert "Traceback" not in said
+
+
+def test_interrupt_of_a_string_of_code(tmp_path: Path) -> None:
+    """Ctrl-C in code that a library runs from a string, as dataclasses do, ends `python -m mrctl` with the status too.
+
+    Python would end by the signal, which `subprocess` reports as −2.
+    """
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, signal, sys, types\n"
+        "sys.modules['mrctl.cli'] = cli = types.ModuleType('mrctl.cli')\n"
+        "cli.main = lambda: exec('os.kill(os.getpid(), signal.SIGINT); [None for _ in range(10**6)]')\n"
+    )
+    command, paths = [sys.executable, "-m", "mrctl"], os.environ | {"PYTHONPATH": str(tmp_path)}
+    ended = subprocess.run(command, env=paths, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (130, "mrctl: interrupted\n")
