@@ -415,8 +415,9 @@ class Simulation:
     def _keep_learned(self, rows: Sequence[int]) -> None:
         """Keeps what robots have learned at their ends, for their learners go on in the batch."""
         stage = self.hierarchy.learner
-        for row in rows:
-            self._learned[row] = stage.adapted()[row] if isinstance(stage, Learner) else np.zeros(0)
+        if rows:
+            learned = stage.adapted() if isinstance(stage, Learner) else np.zeros((self.plant.size, 0))
+            self._learned |= {row: learned[row].copy() for row in rows}
 
     def result(self) -> xr.Dataset:
         """Returns the signals so far or, once every run has ended, those of the whole time, with NaN after the ends."""
@@ -441,7 +442,9 @@ class Simulation:
         for name, (unit, meaning) in dataset.GAINS.items():
             values = self.hierarchy.gains[name].copy()
             gains[name] = ("run", "channel")[: values.ndim], values, {"units": unit, "long_name": meaning}
-        scanned = {"scanned": ("run", np.ones(size, bool))} if self.estimator.scanner else {}
+        scanned = {}
+        if self.estimator.scanner:
+            scanned["scanned"] = "run", np.ones(size, bool), {"long_name": "whether its lidar scanned"}
         return found.assign(self._parameters() | self._clearance(length) | scanned | faults | constants | gains)
 
     @property
