@@ -1,34 +1,49 @@
 """Where the program `mrctl` and `python -m mrctl` begin: Ctrl-C ends them with one line, also while they import.
 
 Importing the commands takes a second, and what a command needs some more. Libraries that are interrupted in an import
-print tracebacks, or report the interrupt as an error of their own.
+print tracebacks, report the interrupt as an error of their own, or forget it, as compiled modules do.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
 
 
 class _Interrupts:
     """Handles SIGINT.
 
     Attributes:
-        importing: Whether the commands are still being imported, so that nothing needs to be tidied up.
         caught: Whether the program was interrupted.
     """
 
-    importing, caught = True, False
+    caught = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Ends the program, or lets the command tidy up and end it."""
+        """Ends the program at once if it is importing a module, and otherwise lets the command tidy up and end it."""
         self.caught = True
-        if self.importing:
-            print("mrctl: interrupted", file=sys.stderr, flush=True)
-            os._exit(130)
-        signal.default_int_handler(number, frame)
+        while frame:
+            if frame.f_code.co_filename.startswith("<frozen importlib"):
+                with contextlib.suppress(OSError):
+                    sys.stdout.flush()
+                print("mrctl: interrupted", file=sys.__stderr__, flush=True)  # sys.stderr may be captured just now
+                os._exit(130)
+            frame = frame.f_back
+        raise KeyboardInterrupt
+
+    def lost(self, error: UnraisableHookArgs) -> None:
+        """Interrupts again if compiled code that had called Python, as LLVM does, dropped the exception."""
+        if not self.caught:
+            sys.__unraisablehook__(error)
+        elif isinstance(error.exc_value, KeyboardInterrupt):
+            signal.setitimer(signal.ITIMER_REAL, 0.01)
 
 
 def main() -> int:
@@ -40,12 +55,11 @@ def main() -> int:
     interrupts = _Interrupts()
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a program in the background ignores Ctrl-C
         signal.signal(signal.SIGINT, interrupts)
-    report = sys.unraisablehook
-    sys.unraisablehook = lambda error: None if interrupts.caught else report(error)
+        signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    sys.unraisablehook = interrupts.lost
     try:
         from mrctl import cli
 
-        interrupts.importing = False
         status = cli.main()
     except BaseException as error:
         if not interrupts.caught or isinstance(error, SystemExit):
@@ -53,6 +67,7 @@ def main() -> int:
         print("mrctl: interrupted", file=sys.stderr)
         status = 130
     if interrupts.caught:
+        signal.setitimer(signal.ITIMER_REAL, 0)
         # Python remembers an interrupt that left a string of code, as dataclasses run them, and would end `python -m`
         # by the signal instead of the status; to run another string makes it forget.
         exec("")

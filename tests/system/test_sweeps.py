@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import random
+import re
 import resource
 import shutil
 import signal
@@ -579,7 +580,9 @@ def test_early_ctrl_c(tmp_path, moment):
     time.sleep(moment)
     os.killpg(process.pid, signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
-    lines = [line for line in said(stderr) if "compiling the laws" not in line]
+    # A process that glfw starts for a moment, to find its library, is interrupted too, and has its own words for that.
+    ours = re.sub(r"(?s)Traceback.*?File \"<string>\".*?\nKeyboardInterrupt\n", "", stderr)
+    lines = [line for line in said(ours) if "compiling the laws" not in line]
     assert process.returncode == 130 and len(lines) == 1 and lines[0].startswith("mrctl: interrupted"), stderr
 
 

@@ -354,12 +354,13 @@ def test_first_line_before_imports(tmp_path: Path) -> None:
 
 
 INTERRUPTED = """
-import os, signal, sys
+import contextlib, signal, sys
 
 class Interrupt:
     def find_spec(self, name, path=None, target=None):
         if name == {name!r}:
-            os.kill(os.getpid(), signal.SIGINT)
+            with contextlib.{treatment}:
+                signal.raise_signal(signal.SIGINT)
 
 sys.meta_path.insert(0, Interrupt())
 from mrctl.__main__ import main
@@ -368,13 +369,14 @@ sys.exit(main())
 """
 
 
+@pytest.mark.parametrize("treatment", ["nullcontext()", "suppress(KeyboardInterrupt)"])
 @pytest.mark.parametrize(
     "name",
     ["mrctl.cli", "pydantic", "tyro", "numpy", "mrctl.scenario", "xarray", "numba", "mujoco", "mrctl.loop.simulation"],
 )  # fmt: skip
-def test_interrupt_while_importing(name: str) -> None:
-    """Ctrl-C ends a command with one line, whatever it is importing."""
-    code = INTERRUPTED.format(name=name)
+def test_interrupt_while_importing(name: str, treatment: str) -> None:
+    """Ctrl-C ends a command with one line, whatever it is importing, also where a library drops the exception."""
+    code = INTERRUPTED.format(name=name, treatment=treatment)
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (out.returncode, out.stderr) == (130, "mrctl: interrupted\n"), out
 
@@ -392,6 +394,28 @@ def test_interrupt_of_a_program(wait: float) -> None:
     # The announcement of a compilation may stand before it.
     assert program.returncode == 130 and said.splitlines()[-1] == "mrctl: interrupted"
     assert "Traceback" not in said
+
+
+CALLED_BACK = """
+import ctypes, os, signal, sys, time, types
+
+def main():
+    called = ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGINT))
+    called()  # ctypes drops what its callback raises
+    time.sleep(5)
+    return 0
+
+sys.modules["mrctl.cli"] = cli = types.ModuleType("mrctl.cli")
+cli.main = main
+from mrctl.__main__ import main
+sys.exit(main())
+"""
+
+
+def test_interrupt_that_was_lost() -> None:
+    """Ctrl-C while compiled code calls Python, which LLVM does when numba loads a law, ends the program too."""
+    out = subprocess.run([sys.executable, "-c", CALLED_BACK], capture_output=True, text=True, check=False)
+    assert (out.returncode, out.stderr) == (130, "mrctl: interrupted\n"), out
 
 
 def test_interrupt_of_a_string_of_code(tmp_path: Path) -> None:
