@@ -37,9 +37,6 @@ from mrctl.theory.robot import Robot
 BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
 RIM = 0.02  # m, radius of the discs around the robot for `Pacing`, which reach as far beyond its footprint
 KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from what is on the map and from what moves; chosen
-# m, extra margin of a new plan around what is not on the map; and what a robot that is nearer than that already keeps
-# of its present clearance as the margin of the plan itself; chosen
-ROUND, LEFT = 0.13, 0.03
 TRACKED = 0.01  # m, by which the margin KEPT is smaller than what the discs have on the plan, at least
 STANDOFF = 1.0  # m before a blocked place of its plan, where the robot stops, so that it can drive around it; chosen
 SLOW, WAITED = 0.1, 1.0  # mean λ over so many s, below which a robot makes another plan; chosen
@@ -192,7 +189,7 @@ class Pacing:
         assert isinstance(plan, Waypoints)
         self._period, self._tick, self.followed = period, 0, reference
         self._clock, self._pace = np.zeros(size), np.ones(size)  # s in motion periods, and λ
-        self._plans, self._kept = [self._sampled(plan)] * size, [self._margin(plan)] * size
+        self._plans, self._kept = [self._sampled(plan)] * size, [self._margin(plan, 0)] * size
         self._given: list[Waypoints | None] = [None] * size  # plans that came since the start
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
         self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
@@ -205,12 +202,12 @@ class Pacing:
         ticks = round(period / step) * np.arange(int(plan.period / period) + 2) + sensing.periods("delay", step)
         return np.hstack(plan.sample(np.asarray(step * ticks, float)))
 
-    def _margin(self, plan: Waypoints) -> Barrier:
-        """Returns the filter for the map, with less clearance than the plan has.
+    def _margin(self, plan: Waypoints, row: int) -> Barrier:
+        """Returns the filter for the map of one robot, with less clearance than the plan has.
 
         The clearance is negative where the discs would overlap the map on the plan.
         """
-        return self._barrier(min(KEPT, room(self._footprint, plan, self._sight.map) - RIM - TRACKED))
+        return self._barrier(min(KEPT, room(self._footprint, plan, self._sight.map(row)) - RIM - TRACKED))
 
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
@@ -219,7 +216,7 @@ class Pacing:
 
     def _begin(self, row: int, plan: Waypoints) -> None:
         """Lets a robot drive a plan from its beginning."""
-        self._plans[row], self._kept[row] = self._sampled(plan), self._margin(plan)
+        self._plans[row], self._kept[row] = self._sampled(plan), self._margin(plan, row)
         self._clock[row], self._anchor[row], self._blocked[row] = 0.0, 0.0, np.inf
 
     def see(self, row: int, scan: Scan) -> None:
@@ -265,7 +262,7 @@ class Pacing:
             left = self._period * float(np.abs(part).sum()) - STANDOFF
             allowed = approach.compiled(left, self._brakes, self._period) / max(abs(float(request[0])), 1e-9)
         moving = sight.moving(row, self._period * self._tick)
-        around = (sight.map, self._kept[row]), (sight.standing(row), self._near), (moving, self._away)
+        around = (sight.map(row), self._kept[row]), (sight.standing(row), self._near), (moving, self._away)
         return min(
             allowed, *(share(request, pose, *each) for each in around if len(each[0].discs) + len(each[0].rings))
         )
@@ -278,8 +275,7 @@ class Pacing:
         if now - self._since[row] < WAITED:
             return
         self._since[row] = now  # where there is no other plan, it tries again later
-        left = clearance(self._footprint, pose, standing) - LEFT
-        around = self._sight.outlines(row, now, min(ROUND, max(0.0, left)))
+        around = self._sight.around(row, now, self._footprint, pose)
         if plan := self._replan(pose, around, self._given[row]):
             self._begin(row, plan)
 

@@ -256,7 +256,7 @@ def avoiding(avoid: Avoid, scenario: Scenario, lag: float = 0.0) -> Callable[[Ro
     def made(robot: Robot, size: int) -> Pacing | Window | Mppi:
         if avoid == "barrier":
             return Pacing(robot, size, scenario, corners, replan)
-        parts = robot, size, plan, known, corners, replan
+        parts = robot, size, plan, known, corners, replan, reverses(scenario)
         return Window(*parts) if avoid == "window" else Mppi(*parts, lag)
 
     made.__name__ = avoid
@@ -276,8 +276,7 @@ def either_way(
     try:
         return planned(task, scenario, speed, margin, outlines)
     except InputError:
-        model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
-        if avoid in REACTIVE or not mjcf.reverses(model, scenario.steering):
+        if avoid in REACTIVE or not reverses(scenario):
             raise
         return planned(task, scenario, speed, margin, outlines, reverse=True)
 
@@ -334,6 +333,12 @@ def robot_of(scenario: Scenario) -> tuple[Array, Robot]:
     """Returns the footprint of a scenario's robot, corners in m, `(n, 2)`, and its parameters."""
     model, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
     return footprint(model), robot
+
+
+def reverses(scenario: Scenario) -> bool:
+    """Tells whether a scenario's robot can be driven backwards."""
+    model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
+    return mjcf.reverses(model, scenario.steering)
 
 
 def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:

@@ -35,6 +35,7 @@ class Mppi(Reactive):
         known: Obstacles,
         footprint: Array,
         replan: Replan,
+        reverses: bool,
         lag: float = 0.0,
     ) -> None:
         """Takes the arguments of `Reactive`, and the lag that the roll-outs assume.
@@ -46,6 +47,7 @@ class Mppi(Reactive):
             known: As in `Reactive`.
             footprint: As in `Reactive`.
             replan: As in `Reactive`.
+            reverses: As in `Reactive`.
             lag: Time constant in s with which V and θ̇ follow what is requested; 0: at once.
 
         Raises:
@@ -53,7 +55,7 @@ class Mppi(Reactive):
         """
         if not 0 <= lag <= MOST_LAG:
             raise InputError(f"lag: must be between 0 and {MOST_LAG:g} s, not {lag:g}")
-        super().__init__(robot, size, plan, known, footprint, replan)
+        super().__init__(robot, size, plan, known, footprint, replan, reverses)
         self._lag = lag
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:

@@ -15,7 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from mrctl.kernel import Array, kernel
+from mrctl.navigation.chart import RADIUS
 from mrctl.navigation.sight import Sight
+from mrctl.navigation.trail import Trail
 from mrctl.record import InputError
 from mrctl.theory.clearance import cover
 from mrctl.theory.grid import Field, near_field, value
@@ -38,6 +40,11 @@ FINE = 5  # samples of the plan in a motion period
 OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen, like the next two
 WAITED = 1.0, 0.05  # s and m: so does one that within this time gets no farther than this
 RETRY = 1.0  # s, least time between two plans
+# How a robot goes back from where there is no way forward: m of a piece, after which it looks for another plan, m/s,
+# and number of pieces; chosen, as all that follows
+BACK, PIECES = (0.4, 0.4), 5
+SHORTER = 0.9  # duration of a plan over the rest of that before, below which it takes its place
+FREE = 0.02  # m, clearance that it then keeps from what is not on the map
 
 
 class Bounds(NamedTuple):
@@ -128,6 +135,9 @@ def opened(reference: Reference) -> Waypoints:
 class Reactive(ABC):
     """A motion stage that asks for twists along a plan, and makes another plan when it is off this one or waits.
 
+    Where a robot waits that can reverse, and another plan is not found or does not help, it goes back a little on its
+    `Trail`, and plans again.
+
     Attributes:
         bounds: What twists the robot can drive.
         last: The last twist of each robot, `(B, 2)`.
@@ -135,7 +145,14 @@ class Reactive(ABC):
     """
 
     def __init__(
-        self, robot: Robot, size: int, plan: Waypoints, known: Obstacles, footprint: Array, replan: Replan
+        self,
+        robot: Robot,
+        size: int,
+        plan: Waypoints,
+        known: Obstacles,
+        footprint: Array,
+        replan: Replan,
+        reverses: bool,
     ) -> None:
         """Makes the stage.
 
@@ -146,18 +163,19 @@ class Reactive(ABC):
             known: Obstacles on the map; the others are seen by the lidar.
             footprint: Corners of the robot in its frame in m, `(n, 2)`.
             replan: Makes a plan to the goal.
+            reverses: Whether the robot can be driven backwards.
         """
-        self._replan, self._sight = replan, Sight(known, size)
+        self._replan, self._sight, self._footprint, self._reverses = replan, Sight(known, size), footprint, reverses
         self.bounds = Bounds.of(robot, plan.speed)
         self._size, self._plan, self._discs = size, plan, cover(footprint, DISCS)
         self._body = float((np.hypot(self._discs[:, 0], self._discs[:, 1]) + self._discs[:, 2]).max())
-        self._field = self._field_around(plan)
+        self._field = self._field_around(plan, 0)
 
-    def _field_around(self, plan: Waypoints) -> Field:
-        """Returns the distance from the map around a plan."""
+    def _field_around(self, plan: Waypoints, row: int) -> Field:
+        """Returns the distance from the map of one robot around a plan."""
         places = plan.sample(np.linspace(0, plan.period, 200)).pose[:, :2]
         low, high = places.min(axis=0) - AROUND, places.max(axis=0) + AROUND
-        return near_field(self._sight.map, low, high, CELL, self._body + KEPT + 2 * CELL)
+        return near_field(self._sight.map(row), low, high, CELL, self._body + KEPT + 2 * CELL)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
@@ -165,8 +183,13 @@ class Reactive(ABC):
         self._tables, self._fields = [self._sampled(self._plan)] * self._size, [self._field] * self._size
         self._given: list[Waypoints | None] = [None] * self._size  # plans that came since the start
         self._anchor, self._since, self._tried = pose[:, :2].copy(), np.zeros(self._size), np.zeros(self._size)
+        self._waited = np.zeros(self._size, bool)  # which have made another plan where they are, in vain
+        self._pieces = np.zeros(self._size, int)  # of the way back from `_anchor`, for robots that go back
+        back = min(BACK[1], self.bounds.speed / 2), self.bounds.curvature
+        self._trails = [Trail(self._footprint, *back) for _ in range(self._size)]
         self.last = np.zeros((self._size, 2))
         self._sight.forget()
+        self._freer = np.zeros(self._size, bool)  # for which a shorter way may be free since their maps changed
         self._looked = np.zeros(self._size, bool)  # which robots have a scan that is new; those that failed have none
         self.considered: list[Considered | None] = [None] * self._size
 
@@ -179,13 +202,15 @@ class Reactive(ABC):
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
         self._given[row] = plan = opened(plan)
-        self._tables[row], self._place[row], self._fields[row] = self._sampled(plan), 0, self._field_around(plan)
+        self._tables[row], self._place[row], self._fields[row] = self._sampled(plan), 0, self._field_around(plan, row)
         self._since[row] = self._period * self._tick  # it may have waited at its goal, and is not stuck
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.Motion`."""
-        self._sight.see(row, scan)
         self._looked[row] = True
+        if self._sight.see(row, scan):
+            self._fields[row] = self._field_around(self._given[row] or self._plan, row)
+            self._freer[row] = True
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns twists that the robots can drive, `(B, 2)`; arguments are those of `mrctl.control.stages.Motion`."""
@@ -194,9 +219,10 @@ class Reactive(ABC):
             table, first = self._tables[row], self._place[row]
             away = np.hypot(*(table[first : first + AHEAD, :2] - pose[row, :2]).T)
             self._place[row] = first + int(away.argmin())
-            if self._lost(row, pose[row], float(away.min())) and (other := self._planned(row, pose[row])):
-                table, self._place[row] = self._sampled(other), 0
-                self._tables[row] = table
+            if self._goes_back(row, pose[row], float(away.min())):
+                self.considered[row] = None
+                continue
+            table = self._tables[row]
             targets = table[np.minimum(self._place[row] + FINE * np.arange(1, STEPS + 1), len(table) - 1)]
             scene = Scene(targets, self._discs, self._fields[row], self._near(row, pose[row]))
             self.last[row] = self.choose(row, pose[row], twist[row], self.last[row], self._period, scene)
@@ -207,15 +233,52 @@ class Reactive(ABC):
         """Tells whether a robot needs another plan: it is `away` m off its own, or has hardly moved for a while."""
         now = self._period * self._tick
         if np.hypot(*(pose[:2] - self._anchor[row])) > WAITED[1]:
-            self._anchor[row], self._since[row] = pose[:2], now
+            self._anchor[row], self._since[row], self._waited[row] = pose[:2], now, False
         lost = (away > OFF or now - self._since[row] > WAITED[0]) and now - self._tried[row] > RETRY
         lost, self._looked[row] = lost and self._looked[row], False
         if lost:
             self._tried[row] = now
         return lost
 
+    def _goes_back(self, row: int, pose: Array, away: float) -> bool:
+        """Gives a robot another plan if it needs one; tells whether it goes back instead, with the twist `last`."""
+        pieces = self._pieces[row]
+        if pieces:
+            gone = float(np.hypot(*(pose[:2] - self._anchor[row])))
+            if gone < pieces * BACK[0] and self._back(row, pose):
+                return True
+            self.last[row] = 0.0
+        else:
+            self._trails[row].add(pose)
+            if not self._lost(row, pose, away):
+                self._shorten(row, pose)
+                return False
+        other = self._planned(row, pose)
+        in_vain = not pieces and self._waited[row]  # what it got where it waits did not help it
+        self._waited[row], self._pieces[row] = away <= OFF, 0
+        if self._reverses and (pieces or away <= OFF) and (in_vain or not other) and pieces < PIECES:
+            self._pieces[row] = (pieces + 1) * self._back(row, pose)
+        elif other:
+            self._tables[row], self._place[row] = self._sampled(other), 0
+        return self._pieces[row] > 0
+
+    def _shorten(self, row: int, pose: Array) -> None:
+        """Gives a robot whose map has changed another plan, if that is shorter than the rest of its own."""
+        left = self._period / FINE * (len(self._tables[row]) - 1 - self._place[row])
+        if self._freer[row] and (other := self._planned(row, pose)) and other.period < SHORTER * left:
+            self._tables[row], self._place[row] = self._sampled(other), 0
+        self._freer[row] = False
+
+    def _back(self, row: int, pose: Array) -> bool:
+        """Lets `last` be the twist with which a robot goes back; returns whether it can."""
+        twist = self._trails[row].back(pose, self._sight.outlines(row, self._period * self._tick, FREE - RADIUS))
+        if twist is not None:
+            self.last[row] = twist
+        return twist is not None
+
     def _planned(self, row: int, pose: Array) -> Waypoints | None:
-        return self._replan(pose, self._sight.outlines(row, self._period * self._tick), self._given[row])
+        around = self._sight.around(row, self._period * self._tick, self._footprint, pose)
+        return self._replan(pose, around, self._given[row])
 
     def begin(self, tick: int) -> None:  # noqa: B027 (most have nothing to do)
         """Is called once in a motion period, before `choose` for each robot."""

@@ -22,21 +22,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
+from mrctl.navigation.chart import BESIDE, FAR, LEAST, RADIUS, Chart, through
+from mrctl.theory.clearance import clearance
 from mrctl.theory.grid import Field, at, map_area, near_field
 from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings
 from mrctl.theory.rays import Scan
 
-BESIDE = 0.1, 0.02  # m, and share of the range: distance beyond which a point does not belong to a place; chosen
-FAR = 0.5  # m, beyond which it never does
 GAP = 0.3  # m between two points of a cluster, at most
-LEAST = 2  # points of a cluster
-SPACING, RADIUS = 0.1, 0.05  # m, of the discs along a cluster; RADIUS covers the noise of the lidar
+SPACING = 0.1  # m, of the discs along a cluster; their RADIUS covers the noise of the lidar
 GATE = 0.5  # m between the centre of a cluster and where it was expected, at most
 SMOOTH = 0.15  # s, τ; chosen
 PAST, APART = 1.0, 0.1  # s, in which the place of a cluster must have been empty if it moves; between two such scans
 EMPTY = 0.3  # share of its points at which it must have been
 SLOW = 0.1  # m/s, below which a cluster stands
 HIDDEN = 1.0  # s, for which a cluster, and a disc that moves, is remembered
+# m, extra margin of a new plan around what is not on the map; and what a robot that is nearer than that already keeps
+# of its present clearance as the margin of the plan itself; chosen
+ROUND, LEFT = 0.13, 0.03
 NOTHING = Surroundings(Obstacles()).at(0.0)
 
 
@@ -56,18 +58,14 @@ class Cluster(NamedTuple):
 
 
 class Sight:
-    """Map and finds of B robots; a motion stage hands its scans to `see`.
-
-    Attributes:
-        map: Outlines of the obstacles on the map.
-    """
+    """Map and finds of B robots; a motion stage hands its scans to `see`."""
 
     def __init__(self, known: Obstacles, size: int) -> None:
         """Takes the obstacles on the map, and the number of robots."""
-        self.map, self._field, self._size = Surroundings(known).at(0.0), None, size
+        self._chart, self._field, self._size = Chart(known, size), None, size
         if known.shapes:
             low, high, cell = map_area(known)
-            self._field: Field | None = near_field(self.map, low, high, cell, FAR + 2 * cell)
+            self._field: Field | None = near_field(self._chart.known, low, high, cell, FAR + 2 * cell)
         self.forget()
 
     def forget(self) -> None:
@@ -76,9 +74,14 @@ class Sight:
         self._clusters: list[list[Cluster]] = [[] for _ in range(self._size)]
         self._scans: list[list[Scan]] = [[] for _ in range(self._size)]
         self._standing = [NOTHING] * self._size
+        self._chart.forget()
 
-    def see(self, row: int, scan: Scan) -> None:
-        """Takes a scan of one robot, whose index is `row`."""
+    def map(self, row: int) -> Outlines:
+        """Returns what is on the map of one robot, without what has turned out to be gone."""
+        return self._chart.outlines(row)
+
+    def see(self, row: int, scan: Scan) -> bool:
+        """Takes a scan of one robot, whose index is `row`; returns whether its map has changed."""
         time, past = scan.time, [other for other in self._scans[row] if scan.time - other.time < PAST + 1e-9]
         if not past or time - past[-1].time > APART - 1e-9:
             past.append(scan)
@@ -105,6 +108,7 @@ class Sight:
         self._clusters[row] = now + [cluster for cluster in before if time - cluster.time < HIDDEN]
         self._found[row] = found = np.concatenate([new, self._hidden(self._found[row], new, scan)])
         self._standing[row] = _outlines(found[~_moves(found)])
+        return self._chart.see(row, scan)
 
     def discs(self, row: int, time: float) -> Array:
         """Returns discs around what one robot has found beside the map.
@@ -131,15 +135,25 @@ class Sight:
 
     def outlines(self, row: int, time: float, margin: float = 0.0) -> Outlines:
         """Returns the map and the finds of one robot at a time in s; the finds are enlarged by a margin in m."""
-        found = _outlines(_placed(self._found[row], time)).discs + [0.0, 0.0, margin]
-        return self.map._replace(discs=np.concatenate([self.map.discs, found]))
+        found, known = _outlines(_placed(self._found[row], time)).discs + [0.0, 0.0, margin], self.map(row)
+        return known._replace(discs=np.concatenate([known.discs, found]))
+
+    def around(self, row: int, time: float, footprint: Array, pose: Array) -> Outlines:
+        """Returns what a new plan of one robot has to go around: the map and its finds, with a margin around these.
+
+        Args:
+            row: Index of the robot.
+            time: Time in s.
+            footprint: Corners of the robot in its frame in m, `(n, 2)`.
+            pose: x and y in m and θ in rad, from which it plans, `(3,)`.
+        """
+        left = clearance(footprint, pose, self.standing(row)) - LEFT
+        return self.outlines(row, time, min(ROUND, max(0.0, left)))
 
     def _unknown(self, scan: Scan) -> list[tuple[Array, bool]]:
         """Returns the points of each cluster beside the map in m, `(k, 2)`, and whether nothing hides a part of it."""
-        ranges, angles, place = scan.ranges, scan.angles, scan.place
-        met = np.flatnonzero(np.isfinite(ranges))
-        direction = place[2] + angles[met]
-        points = place[:2] + ranges[met, None] * np.column_stack([np.cos(direction), np.sin(direction)])
+        ranges = scan.ranges
+        met, points = np.flatnonzero(np.isfinite(ranges)), scan.points
         if self._field is not None:
             away = np.empty(len(points))
             from_map.compiled(self._field, points, away)
@@ -147,7 +161,7 @@ class Sight:
             met, points = met[beside], points[beside]
         if not len(met):
             return []
-        near = np.hypot(*(points - np.roll(points, 1, axis=0)).T) < GAP + 2 * _step(angles) * ranges[met]
+        near = np.hypot(*(points - np.roll(points, 1, axis=0)).T) < GAP + 2 * scan.step * ranges[met]
         joined = near & ((met - np.roll(met, 1)) % len(ranges) <= 2)  # with the point before; the first with the last
         first = np.flatnonzero(~joined)
         if len(first):
@@ -170,52 +184,11 @@ class Sight:
         return old[~gone]
 
 
-def through(points: Array, scan: Scan) -> NDArray[np.bool]:
-    """Tells for which points, `(k, 2)` in m, all beams pass that would meet a disc of `RADIUS` around them, `(k,)`."""
-    found = np.empty(len(points), bool)
-    beams = scan.ranges, float(scan.angles[0]), _step(scan.angles), scan.reach
-    pass_through.compiled(np.ascontiguousarray(points), *beams, scan.place, found)
-    return found
-
-
-@kernel
-def pass_through(
-    points: Array, ranges: Array, first: float, step: float, most: float, place: Array, found: NDArray[np.bool]
-) -> None:
-    """Writes what `through` returns into `found`.
-
-    Args:
-        points: The points in m, `(k, 2)`.
-        ranges: Ranges in m, `(n,)`; infinite where nothing returned.
-        first: Direction of the first beam from straight ahead in rad.
-        step: Angle from one beam to the next in rad.
-        most: Largest range in m, beyond which nothing is seen.
-        place: Pose of the lidar in m, m, rad, `(3,)`.
-        found: Out: whether the beams pass, `(k,)`.
-    """
-    n = len(ranges)
-    for k in range(len(points)):
-        dx, dy = points[k, 0] - place[0], points[k, 1] - place[1]
-        away = np.hypot(dx, dy)
-        half = np.arctan2(RADIUS, away)
-        beam = ((np.arctan2(dy, dx) - place[2] - first + step / 2) % (2 * np.pi)) / step
-        reach, wide = away + BESIDE[0] + BESIDE[1] * away, half / step
-        found[k] = reach <= most
-        for i in range(int(np.floor(beam - wide)), int(np.floor(beam + wide)) + 1):
-            around = i % max(n, int(np.round(2 * np.pi / step)))
-            found[k] &= around < n and ranges[min(around, n - 1)] > reach
-
-
 @kernel
 def from_map(field: Field, points: Array, found: Array) -> None:
     """Writes the distances of points, `(n, 2)` in m, from the obstacles of a map into `found`, `(n,)` in m."""
     for k in range(len(points)):
         found[k] = at(field, points[k, 0], points[k, 1])[0]
-
-
-def _step(angles: Array) -> float:
-    """Returns the angle from one beam to the next in rad."""
-    return float(angles[1] - angles[0]) if len(angles) > 1 else 2 * np.pi
 
 
 def _placed(found: Array, time: float) -> Array:

@@ -26,6 +26,18 @@ class Scan(NamedTuple):
     time: float
     """Time since the start of the run in s."""
 
+    @property
+    def step(self) -> float:
+        """Angle from one beam to the next in rad."""
+        return float(self.angles[1] - self.angles[0]) if len(self.angles) > 1 else 2 * np.pi
+
+    @property
+    def points(self) -> Array:
+        """Where the beams that met something did so, x and y in m, `(k, 2)`."""
+        met = np.isfinite(self.ranges)
+        direction = self.place[2] + self.angles[met]
+        return self.place[:2] + self.ranges[met, None] * np.column_stack([np.cos(direction), np.sin(direction)])
+
 
 @kernel
 def cast(pose: Array, first: float, step: float, reach: float, outlines: Outlines, ranges: Array) -> None:

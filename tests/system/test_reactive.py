@@ -109,7 +109,7 @@ def test_lag() -> None:
         found.append(costs[0])
     assert found[0] < 1e-5 and found[1] > 0.1 and found[2] > 0.01
     with pytest.raises(mrctl.InputError, match="^lag: "):
-        Mppi(mrctl.load_robot("car"), 1, None, Obstacles(), FOOTPRINT, None, lag=-0.1)  # pyright: ignore
+        Mppi(mrctl.load_robot("car"), 1, None, Obstacles(), FOOTPRINT, None, False, lag=-0.1)  # pyright: ignore
 
 
 @pytest.mark.parametrize("avoid", ["window", "mppi"])
@@ -155,6 +155,25 @@ def test_backs_off() -> None:
     assert driven.table["outcome"].tolist() == ["arrived"] and float(driven.result["v"].min()) < -0.1
 
 
+@pytest.mark.parametrize(("robot", "avoid"), [("turtlebot", "window"), ("turtlebot", "mppi"), ("car", "window")])
+def test_dead_end(robot: str, avoid: Avoid) -> None:
+    """A robot that can reverse leaves a dead end which its map lacks, and in which it cannot turn; the car cannot."""
+    wide = 0.7 if robot == "turtlebot" else 0.8
+    sides = [Box(x=2.2, y=side * (wide / 2 + 0.05), length=1.4, width=0.1) for side in (-1, 1)]
+    task = Task(
+        obstacles=Obstacles(shapes=(*sides, Box(x=2.95, length=0.1, width=wide + 0.2))),
+        map=Obstacles(),
+        start=(0, 0, 0),
+        goal=(5, 0, 0),
+    )
+    own = Scenario.from_dict({"prior": "model", "learner": "none", "robot": {"path": robot}})
+    driven = navigate(task, own, avoid=avoid)
+    run, found = driven.result.isel(run=0), driven.table.iloc[0]
+    assert float(run["x"][run["y"] < wide / 2].max()) > 1.9 and found["clearance"] > 0.03
+    back = -own.control_period * float(run["v"].where(run["v"] < 0, 0.0).sum())
+    assert (found["outcome"], back > 0.3) == (("arrived", True) if robot == "turtlebot" else ("stuck", False))
+
+
 def test_blocked_door() -> None:
     """A door of two is blocked, and the map shows it open: the robot sees it, plans again, and takes the other one."""
     walls = [Box(x=2.0, y=y, length=0.1, width=width) for y, width in ((-2.3, 1.4), (0.0, 1.4), (2.3, 1.4))]
@@ -168,6 +187,34 @@ def test_blocked_door() -> None:
     run = driven.result.isel(run=0)
     assert driven.table["outcome"].tolist() == ["arrived"]
     assert float(run["y"].values[np.argmax(run["x"].values > 2)]) > 0.7 and driven.plan.poses[:, 1].max() < 0.7
+
+
+@pytest.mark.parametrize(("robot", "avoid"), [("car", "barrier"), ("racecar", "window"), ("turtlebot", "mppi")])
+def test_open_door(robot: str, avoid: Avoid) -> None:
+    """Of two doors the map has the wrong one closed: the robot sees both, and takes the one that is open."""
+    walls = [Box(x=2.0, y=y, length=0.1, width=1.4) for y in (-2.3, 0.0, 2.3)]
+    outer = [Box(x=2.0, y=side * 3.0, length=6.0, width=0.1) for side in (-1, 1)]
+    shapes, (left, right) = (*walls, *outer), (Box(x=2.0, y=side * 1.15, length=0.2, width=0.7) for side in (1, -1))
+    task = Task(
+        obstacles=Obstacles(shapes=(*shapes, left)),
+        map=Obstacles(shapes=(*shapes, right)),
+        start=(0.0, 0.0, 0.0),
+        goal=(4.0, -0.4, 0.0),
+    )
+    own = Scenario.from_dict({"prior": "model", "learner": "none", "robot": {"path": robot}})
+    driven = navigate(task, own, speed=0.6, avoid=avoid)
+    run = driven.result.isel(run=0)
+    assert driven.table["outcome"].tolist() == ["arrived"] and driven.table["clearance"].iloc[0] > 0.01
+    assert float(run["y"].values[np.argmax(run["x"].values > 2)]) < -0.7 and driven.plan.poses[:, 1].max() > 0.7
+
+
+def test_shorter() -> None:
+    """Where the wall that its plan goes around has gone, a robot drives straight on."""
+    wall = Box(x=2.0, y=0.3, length=0.1, width=1.8)
+    task = Task(obstacles=Obstacles(), map=Obstacles(shapes=(wall,)), start=(0.0, 0.0, 0.0), goal=(4.0, 0.0, 0.0))
+    driven = navigate(task, PLANNED, avoid="window")
+    assert driven.table["outcome"].tolist() == ["arrived"]
+    assert float(np.abs(driven.result["y"]).max()) < 0.3 < 0.8 < np.abs(driven.plan.poses[:, 1]).max()
 
 
 def test_limits() -> None:

@@ -5,7 +5,8 @@ import pytest
 import shapely
 
 from mrctl import Box, Disc, Line, Obstacles
-from mrctl.navigation.sight import RADIUS, SPACING, Sight, through
+from mrctl.navigation.chart import RADIUS, through
+from mrctl.navigation.sight import SPACING, Sight
 from mrctl.sensing.lidar import Lidar
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.rays import Scan

@@ -1,0 +1,155 @@
+"""The map of a robot, without those obstacles on it that its scans have shown to be gone.
+
+An obstacle is gone when beams have passed through nearly all of it: through most of some places inside it, each in a
+few scans. One scan proves little, because the pose from which it seems to be taken is estimated. An obstacle is back
+when points of a scan lie on it again. What is gone is gone as a whole: a wall with a new door stays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrctl.kernel import Array, kernel
+from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings
+from mrctl.theory.rays import Scan
+
+RADIUS = 0.05  # m, of a disc around a place, through which beams pass or not
+BESIDE = 0.1, 0.02  # m, and share of the range: distance beyond which a point does not belong to a place; chosen
+FAR = 0.5  # m, beyond which it never does
+LEAST = 2  # points of a scan that show something
+AROUND, APART = (8, 32), 0.2  # places around the inside of an obstacle: how few and many, and m between them; chosen
+INSIDE = 0.8, 0.4  # how far out they lie, over the way from the middle to the outline
+SCANS, MOST = 5, 0.9  # scans that pass through a place, and share of the places, at which an obstacle is gone; chosen
+
+
+class Chart:
+    """The maps of B robots, which begin alike.
+
+    Attributes:
+        known: Outlines of all that was on the map at the start.
+    """
+
+    def __init__(self, known: Obstacles, size: int) -> None:
+        """Takes the obstacles on the map, and the number of robots."""
+        self.known, self._size = Surroundings(known).at(0.0), size
+        discs, _, _, rings = self.known
+        self._middles = np.concatenate([discs[:, :2], rings[:, :2]])
+        self._radii = np.concatenate([discs[:, 2], rings[:, 2]])
+        self._places: dict[int, tuple[Array, float]] = {}  # what `_inside` has returned
+        self.forget()
+
+    def forget(self) -> None:
+        """Forgets what scans have shown."""
+        self._gone = np.zeros((self._size, len(self._middles)), bool)
+        self._outlines = [self.known] * self._size
+        self._passed: list[dict[int, NDArray[np.int64]]] = [{} for _ in range(self._size)]
+
+    def outlines(self, row: int) -> Outlines:
+        """Returns what is on the map of one robot."""
+        return self._outlines[row]
+
+    def see(self, row: int, scan: Scan) -> bool:
+        """Takes a scan of one robot, whose index is `row`; returns whether its map has changed."""
+        passed, before = self._passed[row], self._gone[row].copy()
+        for shape in np.flatnonzero(through(self._middles, scan)).tolist():
+            places, depth = self._places[shape] = self._places.get(shape) or self._inside(shape)
+            away = np.hypot(*(places - scan.place[:2]).T)
+            seen = scan.step * away < depth  # beams do not pass on both sides of the obstacle there
+            passed[shape] = passed.get(shape, np.zeros(len(places), int)) + (seen & through(places, scan))
+        for shape, scans in list(passed.items()):
+            if self._shown(shape, scan):
+                del passed[shape]
+                self._gone[row, shape] = False
+            elif np.mean(scans >= SCANS) >= MOST:
+                self._gone[row, shape] = True
+        if changed := not np.array_equal(self._gone[row], before):
+            self._outlines[row] = _without(self.known, self._gone[row])
+        return changed
+
+    def _corners(self, shape: int) -> Array:
+        """Returns the corners of an obstacle, counter-clockwise, in m, `(n, 2)`; many of a disc."""
+        discs, edges, first, _ = self.known
+        if (ring := shape - len(discs)) >= 0:
+            return edges[first[ring] : first[ring + 1], :2]
+        turn = np.linspace(0.0, 2 * np.pi, AROUND[1], endpoint=False)
+        return discs[shape, :2] + discs[shape, 2] * np.column_stack([np.cos(turn), np.sin(turn)])
+
+    def _inside(self, shape: int) -> tuple[Array, float]:
+        """Returns places inside an obstacle in m, `(k, 2)`, and how deep its middle lies inside in m."""
+        middle, corners = self._middles[shape], self._corners(shape)
+        around = np.vstack([corners, corners[:1]])
+        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(around, axis=0).T)))
+        count = int(np.clip(np.ceil(along[-1] / APART), *AROUND))
+        outline = np.column_stack([np.interp(along[-1] / count * np.arange(count), along, side) for side in around.T])
+        places = np.concatenate([[middle], *(middle + share * (outline - middle) for share in INSIDE)])
+        return places, float(_depths(middle[None], corners)[0])
+
+    def _shown(self, shape: int, scan: Scan) -> bool:
+        """Tells whether points of a scan lie on an obstacle, or so near that they count as its own."""
+        points = scan.points
+        margin = np.minimum(BESIDE[0] + BESIDE[1] * np.hypot(*(points - scan.place[:2]).T), FAR)
+        depths = _depths(points, self._corners(shape))
+        near = depths > -margin
+        points, depths = points[near], depths[near]
+        reach = self._radii[shape] + self._radii + FAR
+        for other in np.flatnonzero(np.hypot(*(self._middles - self._middles[shape]).T) < reach).tolist():
+            if other != shape and not len(points):
+                break
+            if other != shape:  # which has its own points
+                own = depths >= _depths(points, self._corners(other))
+                points, depths = points[own], depths[own]
+        return len(points) >= LEAST
+
+
+def _depths(points: Array, corners: Array) -> Array:
+    """Returns how deep points, `(k, 2)`, lie inside a convex polygon, `(n, 2)`, in m; less than 0 beyond a side."""
+    sides = np.roll(corners, -1, axis=0) - corners
+    offsets = points[:, None] - corners
+    across = sides[:, 0] * offsets[..., 1] - sides[:, 1] * offsets[..., 0]
+    return (across / np.hypot(*sides.T)).min(axis=1)
+
+
+def _without(known: Outlines, gone: NDArray[np.bool]) -> Outlines:
+    """Returns outlines without the discs and polygons that are gone, in this order, `(C + P,)`."""
+    discs, edges, first, rings = known
+    left, sides = ~gone[len(discs) :], np.diff(first)
+    return Outlines(
+        discs[~gone[: len(discs)]], edges[np.repeat(left, sides)], np.cumsum([0, *sides[left]]), rings[left]
+    )
+
+
+def through(points: Array, scan: Scan) -> NDArray[np.bool]:
+    """Tells for which points, `(k, 2)` in m, all beams pass that would meet a disc of `RADIUS` around them, `(k,)`."""
+    found = np.empty(len(points), bool)
+    beams = scan.ranges, float(scan.angles[0]), scan.step, scan.reach
+    pass_through.compiled(np.ascontiguousarray(points), *beams, scan.place, found)
+    return found
+
+
+@kernel
+def pass_through(
+    points: Array, ranges: Array, first: float, step: float, most: float, place: Array, found: NDArray[np.bool]
+) -> None:
+    """Writes what `through` returns into `found`.
+
+    Args:
+        points: The points in m, `(k, 2)`.
+        ranges: Ranges in m, `(n,)`; infinite where nothing returned.
+        first: Direction of the first beam from straight ahead in rad.
+        step: Angle from one beam to the next in rad.
+        most: Largest range in m, beyond which nothing is seen.
+        place: Pose of the lidar in m, m, rad, `(3,)`.
+        found: Out: whether the beams pass, `(k,)`.
+    """
+    n = len(ranges)
+    for k in range(len(points)):
+        dx, dy = points[k, 0] - place[0], points[k, 1] - place[1]
+        away = np.hypot(dx, dy)
+        half = np.arctan2(RADIUS, away)
+        beam = ((np.arctan2(dy, dx) - place[2] - first + step / 2) % (2 * np.pi)) / step
+        reach, wide = away + BESIDE[0] + BESIDE[1] * away, half / step
+        found[k] = reach <= most
+        for i in range(int(np.floor(beam - wide)), int(np.floor(beam + wide)) + 1):
+            around = i % max(n, int(np.round(2 * np.pi / step)))
+            found[k] &= around < n and ranges[min(around, n - 1)] > reach

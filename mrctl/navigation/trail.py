@@ -1,0 +1,61 @@
+"""The way that a robot came, on which it goes back out of a place from which no plan leads on.
+
+It steers by pure pursuit: along the arc to a place on that way, whose curvature is 2 y / (x² + y²) with x and y of the
+place in the frame of the robot (Coulter, "Implementation of the pure pursuit path tracking algorithm", Carnegie Mellon
+University, 1992).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from mrctl.kernel import Array
+from mrctl.theory.clearance import clearance
+from mrctl.theory.obstacles import Outlines
+
+LENGTH, SPACING = 4.0, 0.02  # m: of the way that is remembered, and between its places; chosen, as what follows
+LOOK = 0.2  # m: how far back is the place to which the robot steers
+AHEAD = 0.1  # m: the robot looks so far ahead for obstacles
+
+
+class Trail:
+    """The way that one robot came."""
+
+    def __init__(self, footprint: Array, speed: float, curvature: float) -> None:
+        """Begins an empty trail.
+
+        Args:
+            footprint: Corners of the robot in its frame in m, `(n, 2)`.
+            speed: Speed in m/s with which it goes back.
+            curvature: Largest |θ̇| / |V| in 1/m.
+        """
+        self._footprint, self._speed, self._curvature = footprint, speed, curvature
+        self._places = deque[Array](maxlen=round(LENGTH / SPACING))
+
+    def add(self, pose: Array) -> None:
+        """Remembers where the robot is, x and y in m and θ in rad, `(3,)`."""
+        if not self._places or np.hypot(*(pose[:2] - self._places[-1])) > SPACING:
+            self._places.append(pose[:2].copy())
+
+    def back(self, pose: Array, outlines: Outlines) -> Array | None:
+        """Returns the twist with which the robot goes back, V in m/s and θ̇ in rad/s, `(2,)`.
+
+        Args:
+            pose: x and y in m and θ in rad, `(3,)`.
+            outlines: The obstacles.
+
+        Returns:
+            The twist, or None at the beginning of the trail, or where the robot would touch an obstacle.
+        """
+        while self._places and np.hypot(*(pose[:2] - self._places[-1])) < LOOK:
+            self._places.pop()
+        if not self._places:
+            return None
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        x, y = np.array([[c, s], [-s, c]]) @ (self._places[-1] - pose[:2])
+        curvature = np.clip(2 * y / (x * x + y * y), -self._curvature, self._curvature)
+        if clearance(self._footprint, pose - AHEAD * np.array([c, s, curvature]), outlines) <= 0:
+            return None
+        return -self._speed * np.array([1.0, curvature])
