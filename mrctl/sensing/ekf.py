@@ -49,6 +49,7 @@ SIDE = 0.94e-3
 FIX_GATE = 16.27  # 99.9 % of chi-square with 3 degrees of freedom
 LOST = 10  # the tenth fix in a row outside the gate is accepted
 LOOSE = 0.5  # m and rad, standard deviation that is added to the posture before
+SLIPPED = 6.0  # standard deviations of the innovation of an encoder, above which its wheel has slipped; chosen
 GRIP = 0.08  # m/s, difference of encoder and inertial speed of a wheel above which it slips
 TWIST = 2e-3  # m/s, difference of the slip of two wheels that grip
 INERTIAL = 5.0  # rad/s, bandwidth of the observer that compares encoders with the accelerometer
@@ -182,16 +183,23 @@ def absorb(residual: float, variance: float, s: Row) -> None:
 
 @kernel
 def measure(now: Row, s: Row) -> None:
-    """Updates by encoders and gyro; the encoder of a wheel that slips only resets the angle of that wheel."""
+    """Updates by encoders and gyro; the encoder of a wheel that slips only resets the angle of that wheel.
+
+    A wheel that is braked hard slips by a fraction of a millimetre in one tick, which `find_grip` does not see, and
+    which is many times what an encoder resolves. Where the innovation is above `SLIPPED`, the variance of the wheel's
+    angle is therefore raised until it is not: the angle takes the slip, and the other states learn the less from it,
+    the larger it is.
+    """
     P = s.P
     if now.encoder_new:
         for k in range(2):
             wheel = LEFT + k
             if now.grip[k] == 1:
+                residual = now.encoder[k] - s.mean[wheel]
+                P[wheel, wheel] += max(0.0, residual * residual / SLIPPED**2 - P[wheel, wheel] - s.encoder_variance)
                 for i in range(N):
                     s.g[i] = P[wheel, i]
                 variance = s.g[wheel] + s.encoder_variance
-                residual = now.encoder[k] - s.mean[wheel]
                 s.innovations[k] = residual / np.sqrt(variance)
                 absorb(residual, variance, s)
             else:

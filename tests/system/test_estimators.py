@@ -12,6 +12,7 @@ from mrctl.cli import main
 from mrctl.loop.simulation import Simulation, suited
 from mrctl.physics.tyres import measure
 from mrctl.results.dataset import SIGNALS
+from mrctl.scenario import replicates
 from mrctl.sensing import ekf
 from mrctl.sensing.prediction import wrapped
 from mrctl.sensing.tiers import Sensing
@@ -110,10 +111,10 @@ def test_start(tier):
 
 
 # What a robot meets: changes of the scenario, and the least share of time in which each of posture and twist is within
-# three standard deviations. A lifted wheel, whose encoder still counts, turns the heading by up to 3 mrad where the
+# three standard deviations. A lifted wheel, whose encoder still counts, turns the heading by up to 4 mrad where the
 # filter believes in 0.5 mrad. Over 48 runs each, x, y, θ, V and θ̇ are within three standard deviations in this share of
-# the time: with a lifted wheel 0.996, 0.993, 0.90, 0.99, 0.99 in `lab` and 0.98, 0.99, 0.81, 0.87, 0.99 in `field`;
-# with the left wheel on ice 0.97, 0.97, 0.89, 0.84, 0.96 in `lab` and 0.98, 0.98, 0.79, 0.74, 0.94 in `field`.
+# the time: with a lifted wheel 0.995, 0.993, 0.90, 0.99, 0.99 in `lab` and 0.995, 0.997, 0.97, 0.93, 0.99 in `field`;
+# with the left wheel on ice 0.99, 0.98, 0.88, 0.87, 0.96 in `lab` and 0.99, 0.99, 0.91, 0.83, 0.96 in `field`.
 MEETS = {
     "lost fixes": ({"fix_lost": 0.5}, {}, (0.98,) * 5),
     "outlying fixes": ({"fix_outliers": 0.2}, {}, (0.98,) * 5),
@@ -124,7 +125,7 @@ MEETS = {
         {}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.8)}, (0.93,) * 5
     ),
     "slipping wheel": (
-        {}, {"perturbation": Perturbation(left_tyre_friction_factor=0.1 / 0.9)}, (0.96, 0.96, 0.77, 0.73, 0.94)
+        {}, {"perturbation": Perturbation(left_tyre_friction_factor=0.1 / 0.9)}, (0.96, 0.96, 0.83, 0.78, 0.94)
     ),
 }  # fmt: skip
 
@@ -135,7 +136,7 @@ MET = [(t, n) for n in MEETS for t in TIERS]
 
 @pytest.mark.parametrize(
     ("tier", "name"),
-    [pytest.param(*m, marks=WANTED) if "as if" in m[1] or m == ("field", "lifted wheel") else m for m in MET],
+    [pytest.param(*m, marks=WANTED) if m == ("lab", "lifted wheel, as if on the ground") else m for m in MET],
 )
 def test_within_three_deviations(tier, name):
     """With lost or outlying fixes or a wheel off the ground, errors stay where the filter says; on ice, less often."""
@@ -155,6 +156,19 @@ def test_within_three_deviations(tier, name):
     if name == "lost fixes":
         expected = 0.5 * {"lab": 20, "field": 10}[tier]
         assert np.mean(~np.isnan(innovations)) == pytest.approx(expected / 100, rel=0.1)
+
+
+def test_jerked_wheels():
+    """Wheels that slip by a fraction of a millimetre where a racing car brakes hard do not mislead the filter.
+
+    Without `ekf.SLIPPED` three of these robots are wrong by up to 0.2 m and 0.4 m/s, until fixes that they refuse are
+    accepted; of 40 others eight track at least twice as badly.
+    """
+    base = suited(Scenario(robot=RobotFile(path="racecar"), prior="model", learner="none", laps=1))
+    runs = simulate(replicates(base, 24, 100))
+    assert (runs["failure"] == "").all()
+    assert float(np.hypot(runs.x - runs.x_measured, runs.y - runs.y_measured).max()) < 0.02
+    assert float(np.abs(runs.v - runs.v_measured).max()) < 0.06
 
 
 def test_lateral_slip():

@@ -91,12 +91,13 @@ def textbook(s, sample, before, theta_dot_dot, loading):
         if not grip[k]:  # the angle of a wheel that slips says nothing of the robot, and is known afresh
             P[wheel], P[:, wheel] = 0, 0
             x[wheel], P[wheel, wheel] = sample["encoder"][k], s["encoder_variance"]
-    rows = np.array([np.eye(N)[LEFT], np.eye(N)[RIGHT], np.eye(N)[OMEGA] + np.eye(N)[BIAS]])
-    z = np.array([*sample["encoder"], sample["gyro"]])
-    used = [*grip, True]
-    R = np.diag([s["encoder_variance"], s["encoder_variance"], s["gyro_variance"]])
-    H = rows[used]
-    return joseph(x, P, (z - rows @ x)[used], H, R[np.ix_(used, used)])
+    for k, wheel in enumerate((LEFT, RIGHT)):
+        if grip[k]:
+            e, R = sample["encoder"][k] - x[wheel], s["encoder_variance"]
+            P[wheel, wheel] = max(P[wheel, wheel], e**2 / laws.SLIPPED**2 - R)  # the slip is in the angle
+            x, P = joseph(x, P, np.array([e]), np.eye(N)[[wheel]], np.array([[R]]))
+    gyro = np.eye(N)[[OMEGA]] + np.eye(N)[[BIAS]]
+    return joseph(x, P, sample["gyro"] - gyro @ x, gyro, np.array([[s["gyro_variance"]]]))
 
 
 def random_filter(seed, spread=1.0):
