@@ -3,8 +3,8 @@
 Fox, Burgard and Thrun, "The dynamic window approach to collision avoidance", IEEE Robotics and Automation Magazine
 4(1), 1997. Their objective rewards heading, clearance and speed; here it is the cost of a roll-out along the plan. A
 twist is admissible if the robot can set out towards it and then brake without touching an obstacle; those come first
-that also keep off what the map lacks. If none is admissible, the robot does what it does first in the cheapest of these
-braking roll-outs.
+that also keep off what the map lacks. If none is admissible, the robot brakes as hard as it can, in the direction in
+which that costs least.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ class Window(Reactive):
             roll_out.compiled(falling, rest, pose, twist, last, 0.0, period, bounds, off, np.inf, stops, wide)
             costs[wide >= TOUCH] += TOUCH
         best = int(costs.argmin())
-        chosen = ahead[best] if np.isfinite(costs[best]) else stops[int(braking.argmin())]
+        hard = np.where(grid[:, 0, 0] == speeds[0], braking, np.inf)
+        chosen = ahead[best] if np.isfinite(costs[best]) else stops[int(hard.argmin())]
         self.considered[row] = Considered(pose.copy(), ahead, chosen)
         return chosen[0]
