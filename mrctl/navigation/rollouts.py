@@ -256,7 +256,9 @@ class Reactive(ABC):
         other = self._planned(row, pose)
         in_vain = not pieces and self._waited[row]  # what it got where it waits did not help it
         self._waited[row], self._pieces[row] = away <= OFF, 0
-        if self._reverses and (pieces or away <= OFF) and (in_vain or not other) and pieces < PIECES:
+        alone = not len(self._sight.moving(row, self._period * self._tick).discs)  # what moves may let it pass
+        stuck = alone and (pieces or away <= OFF) and (in_vain or not other)
+        if self._reverses and stuck and pieces < PIECES:
             self._pieces[row] = (pieces + 1) * self._back(row, pose)
         elif other:
             self._tables[row], self._place[row] = self._sampled(other), 0
@@ -277,8 +279,10 @@ class Reactive(ABC):
         return twist is not None
 
     def _planned(self, row: int, pose: Array) -> Waypoints | None:
-        around = self._sight.around(row, self._period * self._tick, self._footprint, pose)
-        return self._replan(pose, around, self._given[row])
+        """Makes a plan that keeps off what is not on the map, or else one that only does not touch it."""
+        now, given = self._period * self._tick, self._given[row]
+        far = self._replan(pose, self._sight.around(row, now, self._footprint, pose), given)
+        return far or self._replan(pose, self._sight.outlines(row, now), given)
 
     def begin(self, tick: int) -> None:  # noqa: B027 (most have nothing to do)
         """Is called once in a motion period, before `choose` for each robot."""
