@@ -187,6 +187,7 @@ class Pacing:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         plan, size = self._scenario.reference, len(pose)
         assert isinstance(plan, Waypoints)
+        self._sight.forget()
         self._period, self._tick, self.followed = period, 0, reference
         self._clock, self._pace = np.zeros(size), np.ones(size)  # s in motion periods, and λ
         self._plans, self._kept = [self._sampled(plan)] * size, [self._margin(plan, 0)] * size
@@ -194,7 +195,6 @@ class Pacing:
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
         self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
         self._looked = np.zeros(size, bool)  # which robots have a scan that is new
-        self._sight.forget()
 
     def _sampled(self, plan: Waypoints) -> Array:
         """Returns a plan as `output` gets it, for each motion period, `(n, 7)`."""

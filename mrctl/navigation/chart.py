@@ -1,8 +1,8 @@
 """The map of a robot, without those obstacles on it that its scans have shown to be gone.
 
-An obstacle is gone when beams have passed through nearly all of it: through most of some places inside it, each in a
-few scans. One scan proves little, because the pose from which it seems to be taken is estimated. An obstacle is back
-when points of a scan lie on it again. What is gone is gone as a whole: a wall with a new door stays.
+Some places inside each obstacle are looked at. It is gone when beams have passed through 90 % of them, through each in
+at least five scans. One scan proves little, because the pose from which it seems to be taken is estimated. An obstacle
+is back when points of a scan lie on it again. What is gone is gone as a whole: a wall with a new door stays.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings
 from mrctl.theory.rays import Scan
 
 RADIUS = 0.05  # m, of a disc around a place, through which beams pass or not
-BESIDE = 0.1, 0.02  # m, and share of the range: distance beyond which a point does not belong to a place; chosen
-FAR = 0.5  # m, beyond which it never does
-LEAST = 2  # points of a scan that show something
-AROUND, APART = (8, 32), 0.2  # places around the inside of an obstacle: how few and many, and m between them; chosen
-INSIDE = 0.8, 0.4  # how far out they lie, over the way from the middle to the outline
+BESIDE = 0.1, 0.02  # m, and share of the range: how far a point may lie beside the place to which it belongs; chosen
+FAR = 0.5  # m, at most
+LEAST = 2  # least number of points of a scan that show something
+AROUND, APART = (8, 32), 0.2  # least and greatest number of places on a ring inside an obstacle, and m between; chosen
+INSIDE = 0.8, 0.4  # sizes of the two rings over that of the outline
 SCANS, MOST = 5, 0.9  # scans that pass through a place, and share of the places, at which an obstacle is gone; chosen
 
 
@@ -51,14 +51,17 @@ class Chart:
 
     def see(self, row: int, scan: Scan) -> bool:
         """Takes a scan of one robot, whose index is `row`; returns whether its map has changed."""
-        passed, before = self._passed[row], self._gone[row].copy()
+        points, passed, before = scan.points, self._passed[row], self._gone[row].copy()
+        if not len(points):  # nothing says that the lidar sees at all
+            return False
+        away = np.hypot(*(points - scan.place[:2]).T)
+        margin = np.minimum(BESIDE[0] + BESIDE[1] * away, FAR)
         for shape in np.flatnonzero(through(self._middles, scan)).tolist():
             places, depth = self._places[shape] = self._places.get(shape) or self._inside(shape)
-            away = np.hypot(*(places - scan.place[:2]).T)
-            seen = scan.step * away < depth  # beams do not pass on both sides of the obstacle there
-            passed[shape] = passed.get(shape, np.zeros(len(places), int)) + (seen & through(places, scan))
+            dense = scan.step * np.hypot(*(places - scan.place[:2]).T) < depth  # a beam would have met the obstacle
+            passed[shape] = passed.get(shape, np.zeros(len(places), int)) + (dense & through(places, scan))
         for shape, scans in list(passed.items()):
-            if self._shown(shape, scan):
+            if self._shown(shape, points, margin):
                 del passed[shape]
                 self._gone[row, shape] = False
             elif np.mean(scans >= SCANS) >= MOST:
@@ -76,7 +79,7 @@ class Chart:
         return discs[shape, :2] + discs[shape, 2] * np.column_stack([np.cos(turn), np.sin(turn)])
 
     def _inside(self, shape: int) -> tuple[Array, float]:
-        """Returns places inside an obstacle in m, `(k, 2)`, and how deep its middle lies inside in m."""
+        """Returns places inside an obstacle, `(k, 2)`, and the distance of its middle from a side, at least; in m."""
         middle, corners = self._middles[shape], self._corners(shape)
         around = np.vstack([corners, corners[:1]])
         along = np.append(0.0, np.cumsum(np.hypot(*np.diff(around, axis=0).T)))
@@ -85,20 +88,25 @@ class Chart:
         places = np.concatenate([[middle], *(middle + share * (outline - middle) for share in INSIDE)])
         return places, float(_depths(middle[None], corners)[0])
 
-    def _shown(self, shape: int, scan: Scan) -> bool:
-        """Tells whether points of a scan lie on an obstacle, or so near that they count as its own."""
-        points = scan.points
-        margin = np.minimum(BESIDE[0] + BESIDE[1] * np.hypot(*(points - scan.place[:2]).T), FAR)
+    def _shown(self, shape: int, points: Array, margin: Array) -> bool:
+        """Tells whether points of a scan, `(k, 2)`, lie on an obstacle, or within margins in m, `(k,)`, of it.
+
+        A point that lies nearer to another obstacle, or deeper inside it, belongs to that one.
+        """
+        middle, radius = self._middles[shape], self._radii[shape]
+        near = np.hypot(*(points - middle).T) < radius + margin
+        if np.sum(near) < LEAST:
+            return False
+        points, margin = points[near], margin[near]
         depths = _depths(points, self._corners(shape))
-        near = depths > -margin
-        points, depths = points[near], depths[near]
-        reach = self._radii[shape] + self._radii + FAR
-        for other in np.flatnonzero(np.hypot(*(self._middles - self._middles[shape]).T) < reach).tolist():
-            if other != shape and not len(points):
-                break
-            if other != shape:  # which has its own points
-                own = depths >= _depths(points, self._corners(other))
-                points, depths = points[own], depths[own]
+        points, depths = points[depths > -margin], depths[depths > -margin]
+        others = np.hypot(*(self._middles - middle).T) < radius + self._radii + FAR
+        others[shape] = False
+        for other in np.flatnonzero(others).tolist():
+            if len(points) < LEAST:
+                return False
+            own = depths >= _depths(points, self._corners(other))
+            points, depths = points[own], depths[own]
         return len(points) >= LEAST
 
 

@@ -67,7 +67,7 @@ LARGEST = 64 * 2**20  # bytes of a `mission.json`, which holds the obstacles of 
 
 Avoid = Literal["none", "barrier", "window", "mppi"]
 REACTIVE = "window", "mppi"
-"""Motion stages that go along a plan at their own pace, forward only."""
+"""Motion stages that go along a plan at their own pace; their plans never reverse."""
 
 
 class Mission(NamedTuple):
@@ -190,7 +190,8 @@ def navigate(
 ) -> Mission:
     """Plans a way among the obstacles on the map, and drives it with the hierarchy.
 
-    A robot that can be driven backwards reverses where there is no way forward, but not with `window` and `mppi`.
+    The plan of a robot that can be driven backwards reverses where there is no way forward, but not with `window` and
+    `mppi`, which go back only from where they are stuck.
 
     Args:
         task: World, map, start and goal.

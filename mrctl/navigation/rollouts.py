@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mrctl.kernel import Array, kernel
+from mrctl.loop.goals import arrived
 from mrctl.navigation.chart import RADIUS
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.trail import Trail
@@ -40,11 +41,11 @@ FINE = 5  # samples of the plan in a motion period
 OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen, like the next two
 WAITED = 1.0, 0.05  # s and m: so does one that within this time gets no farther than this
 RETRY = 1.0  # s, least time between two plans
-# How a robot goes back from where there is no way forward: m of a piece, after which it looks for another plan, m/s,
-# and number of pieces; chosen, as all that follows
-BACK, PIECES = (0.4, 0.4), 5
-SHORTER = 0.9  # duration of a plan over the rest of that before, below which it takes its place
-FREE = 0.02  # m, clearance that it then keeps from what is not on the map
+# How a robot goes back from where there is no way forward; chosen, as all that follows.
+BACK = 0.4, 0.4  # m, length of a piece of the way back, after which it looks for another plan; m/s, its speed there
+PIECES = 5  # largest number of pieces
+FREE = 0.02  # m, clearance from what is not on the map while it goes back
+SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
 
 
 class Bounds(NamedTuple):
@@ -141,7 +142,7 @@ class Reactive(ABC):
     Attributes:
         bounds: What twists the robot can drive.
         last: The last twist of each robot, `(B, 2)`.
-        considered: What led to it, for each robot; None before the first one.
+        considered: What led to it, for each robot; None before the first one, and while the robot goes back.
     """
 
     def __init__(
@@ -169,11 +170,10 @@ class Reactive(ABC):
         self.bounds = Bounds.of(robot, plan.speed)
         self._size, self._plan, self._discs = size, plan, cover(footprint, DISCS)
         self._body = float((np.hypot(self._discs[:, 0], self._discs[:, 1]) + self._discs[:, 2]).max())
-        self._field = self._field_around(plan, 0)
+        self._field = self._field_around(plan.sample(np.linspace(0, plan.period, 200)).pose[:, :2], 0)
 
-    def _field_around(self, plan: Waypoints, row: int) -> Field:
-        """Returns the distance from the map of one robot around a plan."""
-        places = plan.sample(np.linspace(0, plan.period, 200)).pose[:, :2]
+    def _field_around(self, places: Array, row: int) -> Field:
+        """Returns the distance from the map of one robot around places on a plan, `(n, 2)` in m."""
         low, high = places.min(axis=0) - AROUND, places.max(axis=0) + AROUND
         return near_field(self._sight.map(row), low, high, CELL, self._body + KEPT + 2 * CELL)
 
@@ -183,13 +183,14 @@ class Reactive(ABC):
         self._tables, self._fields = [self._sampled(self._plan)] * self._size, [self._field] * self._size
         self._given: list[Waypoints | None] = [None] * self._size  # plans that came since the start
         self._anchor, self._since, self._tried = pose[:, :2].copy(), np.zeros(self._size), np.zeros(self._size)
-        self._waited = np.zeros(self._size, bool)  # which have made another plan where they are, in vain
+        self._waited = np.zeros(self._size, bool)  # which have made another plan where they are
+        self._approached = np.zeros(self._size, bool)  # which have gone back from a goal at which they did not arrive
         self._pieces = np.zeros(self._size, int)  # of the way back from `_anchor`, for robots that go back
         back = min(BACK[1], self.bounds.speed / 2), self.bounds.curvature
         self._trails = [Trail(self._footprint, *back) for _ in range(self._size)]
         self.last = np.zeros((self._size, 2))
         self._sight.forget()
-        self._freer = np.zeros(self._size, bool)  # for which a shorter way may be free since their maps changed
+        self._map_changed = np.zeros(self._size, bool)  # so that a shorter way may be free
         self._looked = np.zeros(self._size, bool)  # which robots have a scan that is new; those that failed have none
         self.considered: list[Considered | None] = [None] * self._size
 
@@ -202,15 +203,26 @@ class Reactive(ABC):
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
         self._given[row] = plan = opened(plan)
-        self._tables[row], self._place[row], self._fields[row] = self._sampled(plan), 0, self._field_around(plan, row)
+        self._take(row, plan)
         self._since[row] = self._period * self._tick  # it may have waited at its goal, and is not stuck
+        self._waited[row] = self._approached[row] = self._map_changed[row] = False
+        self._pieces[row] = 0
+
+    def _take(self, row: int, plan: Waypoints) -> None:
+        """Lets a robot go along a plan, with a field that reaches as far."""
+        self._tables[row], self._place[row] = table, _ = self._sampled(plan), 0
+        low, high = table[:, :2].min(axis=0), table[:, :2].max(axis=0)
+        distance, origin, resolution = self._fields[row]
+        end, room = origin + resolution * np.array(distance.shape[::-1]), self._body + KEPT
+        if (low - room < origin).any() or (high + room > end).any():
+            self._fields[row] = self._field_around(table[:, :2], row)
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.Motion`."""
         self._looked[row] = True
         if self._sight.see(row, scan):
-            self._fields[row] = self._field_around(self._given[row] or self._plan, row)
-            self._freer[row] = True
+            self._fields[row] = self._field_around(self._tables[row][:, :2], row)
+            self._map_changed[row] = True
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns twists that the robots can drive, `(B, 2)`; arguments are those of `mrctl.control.stages.Motion`."""
@@ -230,8 +242,13 @@ class Reactive(ABC):
         return self.last.copy()
 
     def _lost(self, row: int, pose: Array, away: float) -> bool:
-        """Tells whether a robot needs another plan: it is `away` m off its own, or has hardly moved for a while."""
-        now = self._period * self._tick
+        """Tells whether a robot needs another plan: it is `away` m off its own, or has hardly moved for a while.
+
+        One that has arrived at the end of its plan needs none.
+        """
+        now, (x, y, c, s) = self._period * self._tick, self._tables[row][-1]
+        if arrived(pose, 0.0, np.array([x, y, np.arctan2(s, c)])):
+            self._since[row] = now
         if np.hypot(*(pose[:2] - self._anchor[row])) > WAITED[1]:
             self._anchor[row], self._since[row], self._waited[row] = pose[:2], now, False
         lost = (away > OFF or now - self._since[row] > WAITED[0]) and now - self._tried[row] > RETRY
@@ -242,6 +259,8 @@ class Reactive(ABC):
 
     def _goes_back(self, row: int, pose: Array, away: float) -> bool:
         """Gives a robot another plan if it needs one; tells whether it goes back instead, with the twist `last`."""
+        if not np.isfinite(pose).all():
+            return False
         pieces = self._pieces[row]
         if pieces:
             gone = float(np.hypot(*(pose[:2] - self._anchor[row])))
@@ -258,18 +277,21 @@ class Reactive(ABC):
         self._waited[row], self._pieces[row] = away <= OFF, 0
         alone = not len(self._sight.moving(row, self._period * self._tick).discs)  # what moves may let it pass
         stuck = alone and (pieces or away <= OFF) and (in_vain or not other)
-        if self._reverses and stuck and pieces < PIECES:
+        at_end = self._place[row] > len(self._tables[row]) - 1 - FINE
+        if self._reverses and stuck and pieces < PIECES and not (at_end and self._approached[row]):
             self._pieces[row] = (pieces + 1) * self._back(row, pose)
+            self._approached[row] |= at_end
         elif other:
-            self._tables[row], self._place[row] = self._sampled(other), 0
+            self._take(row, other)
         return self._pieces[row] > 0
 
     def _shorten(self, row: int, pose: Array) -> None:
-        """Gives a robot whose map has changed another plan, if that is shorter than the rest of its own."""
-        left = self._period / FINE * (len(self._tables[row]) - 1 - self._place[row])
-        if self._freer[row] and (other := self._planned(row, pose)) and other.period < SHORTER * left:
-            self._tables[row], self._place[row] = self._sampled(other), 0
-        self._freer[row] = False
+        """Gives a robot whose map has changed another plan, if that takes less time than the rest of its own."""
+        now, left = self._period * self._tick, self._period / FINE * (len(self._tables[row]) - 1 - self._place[row])
+        if self._map_changed[row] and (now - self._tried[row] > RETRY or self._tried[row] == 0):
+            self._tried[row] = now
+            if (other := self._planned(row, pose)) and other.period < SHORTER * left:
+                self._take(row, other)
 
     def _back(self, row: int, pose: Array) -> bool:
         """Lets `last` be the twist with which a robot goes back; returns whether it can."""
@@ -281,6 +303,7 @@ class Reactive(ABC):
     def _planned(self, row: int, pose: Array) -> Waypoints | None:
         """Makes a plan that keeps off what is not on the map, or else one that only does not touch it."""
         now, given = self._period * self._tick, self._given[row]
+        self._map_changed[row] = False
         far = self._replan(pose, self._sight.around(row, now, self._footprint, pose), given)
         return far or self._replan(pose, self._sight.outlines(row, now), given)
 

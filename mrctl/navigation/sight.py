@@ -36,8 +36,8 @@ PAST, APART = 1.0, 0.1  # s, in which the place of a cluster must have been empt
 EMPTY = 0.3  # share of its points at which it must have been
 SLOW = 0.1  # m/s, below which a cluster stands
 HIDDEN = 1.0  # s, for which a cluster, and a disc that moves, is remembered
-# m, extra margin of a new plan around what is not on the map; and what a robot that is nearer than that already keeps
-# of its present clearance as the margin of the plan itself; chosen
+# m: extra margin of a new plan around what is not on the map. Where the robot is nearer already, the margin is its
+# clearance less LEFT. Chosen.
 ROUND, LEFT = 0.13, 0.03
 NOTHING = Surroundings(Obstacles()).at(0.0)
 

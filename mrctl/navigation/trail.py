@@ -15,9 +15,9 @@ from mrctl.kernel import Array
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines
 
-LENGTH, SPACING = 4.0, 0.02  # m: of the way that is remembered, and between its places; chosen, as what follows
+PLACES, SPACING = 200, 0.02  # that are remembered, and least m between two of them; chosen, as what follows
 LOOK = 0.2  # m: how far back is the place to which the robot steers
-AHEAD = 0.1  # m: the robot looks so far ahead for obstacles
+BEHIND = 0.1  # m: the robot looks so far behind it for obstacles
 
 
 class Trail:
@@ -32,7 +32,7 @@ class Trail:
             curvature: Largest |θ̇| / |V| in 1/m.
         """
         self._footprint, self._speed, self._curvature = footprint, speed, curvature
-        self._places = deque[Array](maxlen=round(LENGTH / SPACING))
+        self._places = deque[Array](maxlen=PLACES)
 
     def add(self, pose: Array) -> None:
         """Remembers where the robot is, x and y in m and θ in rad, `(3,)`."""
@@ -56,6 +56,6 @@ class Trail:
         c, s = np.cos(pose[2]), np.sin(pose[2])
         x, y = np.array([[c, s], [-s, c]]) @ (self._places[-1] - pose[:2])
         curvature = np.clip(2 * y / (x * x + y * y), -self._curvature, self._curvature)
-        if clearance(self._footprint, pose - AHEAD * np.array([c, s, curvature]), outlines) <= 0:
+        if clearance(self._footprint, pose - BEHIND * np.array([c, s, curvature]), outlines) <= 0:
             return None
         return -self._speed * np.array([1.0, curvature])

@@ -3,8 +3,8 @@
 Fox, Burgard and Thrun, "The dynamic window approach to collision avoidance", IEEE Robotics and Automation Magazine
 4(1), 1997. Their objective rewards heading, clearance and speed; here it is the cost of a roll-out along the plan. A
 twist is admissible if the robot can set out towards it and then brake without touching an obstacle; those come first
-that also keep off what the map lacks. If none is admissible, the robot brakes as hard as it can, in the direction in
-which that costs least.
+that also keep off what the map lacks. If none is admissible, the robot brakes as hard as it can, with the θ̇ of the
+cheapest of these roll-outs.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ EKF = np.dtype(
         ("offset", "f8"),  # offset o of the accelerometer as the observer of `find_grip` estimates it, m/s²
         ("refused", "i8"),  # number of fixes rejected in a row
         ("nis", "f8"),  # normalised innovation squared of the last fix, chi-square with 3 degrees of freedom
-        ("innovations", "f8", 3),  # normalised innovations of the last encoder samples and gyro sample
+        ("innovations", "f8", 3),  # normalised, of the last encoder samples, at most `SLIPPED`, and gyro sample
     ],
     align=True,
 )
@@ -187,8 +187,8 @@ def measure(now: Row, s: Row) -> None:
 
     A wheel that is braked hard slips by a fraction of a millimetre in one tick, which `find_grip` does not see, and
     which is many times what an encoder resolves. Where the innovation is above `SLIPPED`, the variance of the wheel's
-    angle is therefore raised until it is not: the angle takes the slip, and the other states learn the less from it,
-    the larger it is.
+    angle is therefore raised until it is not: the angle takes the slip, and the larger the slip is, the less it changes
+    the other states.
     """
     P = s.P
     if now.encoder_new:

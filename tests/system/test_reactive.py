@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import mrctl
-from mrctl import Box, Disc, Obstacles, Scenario
+from mrctl import Box, Disc, Obstacles, Scenario, simulate
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import Avoid, avoiding, navigate, planned, robot_of
+from mrctl.navigation.mission import Avoid, avoiding, navigate, planned, prepared, robot_of
 from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.rollouts import KNOTS, STEPS, Bounds, Scene, roll_out
 from mrctl.theory.clearance import clearance, cover
@@ -174,6 +174,33 @@ def test_dead_end(robot: str, avoid: Avoid) -> None:
     assert (found["outcome"], back > 0.3) == (("arrived", True) if robot == "turtlebot" else ("stuck", False))
 
 
+def test_waits() -> None:
+    """A robot at the end of its plan whose run goes on, as in the viewer, waits there, after a second try at most."""
+    task = Task(obstacles=Obstacles(shapes=(Box(x=1.0, y=3.0),)), start=(0, 0, 0), goal=(1.5, 0, 0))
+    turtlebot = Scenario.from_dict({"prior": "model", "learner": "none", "robot": {"path": "turtlebot"}})
+    own = prepared(task, turtlebot, avoid="window")[1].replace(laps=8)
+    run = simulate([own.replace(goal=None)], motion=avoiding("window", own)).isel(run=0)
+    after = run.isel(time=run["time"] > 0.7 * own.ticks * own.control_period)
+    assert len(after["time"]) > 200
+    assert float(np.hypot(after["x"] - 1.5, after["y"]).max()) < 0.12 and float(np.abs(after["v"]).max()) < 0.05
+
+
+@pytest.mark.parametrize("avoid", ["window", "mppi"])
+def test_far_door(avoid: Avoid) -> None:
+    """Where the plan leads past a blocked door, the robot takes another one, 8 m off, beyond the area of its plan."""
+    spans = (-3.0, -1.5), (-0.8, 6.65), (7.35, 12.0)
+    walls = [Box(x=2.0, y=(low + high) / 2, length=0.1, width=high - low) for low, high in spans]
+    known = Obstacles(shapes=(*walls, *(Box(x=2.0, y=y, length=6.0, width=0.1) for y in (-3.0, 12.0))))
+    plug = Box(x=2.0, y=-1.15, length=0.2, width=0.7)
+    world = Obstacles(shapes=(*known.shapes, plug))
+    task = Task(obstacles=world, map=known, start=(0.0, -0.4, 0.0), goal=(4.0, -0.4, 0.0))
+    turtlebot = Scenario.from_dict({"prior": "model", "learner": "none", "robot": {"path": "turtlebot"}})
+    own = prepared(task, turtlebot, avoid=avoid)[1].replace(laps=8)
+    run = simulate([own], motion=avoiding(avoid, own)).isel(run=0)
+    assert run["failure"].item() == "" and float(run["y"].max()) > 6.0
+    assert np.hypot(float(run["x"].dropna("time")[-1]) - 4.0, float(run["y"].dropna("time")[-1]) + 0.4) < 0.1
+
+
 def test_blocked_door() -> None:
     """A door of two is blocked, and the map shows it open: the robot sees it, plans again, and takes the other one."""
     walls = [Box(x=2.0, y=y, length=0.1, width=width) for y, width in ((-2.3, 1.4), (0.0, 1.4), (2.3, 1.4))]
@@ -210,8 +237,9 @@ def test_open_door(robot: str, avoid: Avoid) -> None:
 
 def test_shorter() -> None:
     """Where the wall that its plan goes around has gone, a robot drives straight on."""
-    wall = Box(x=2.0, y=0.3, length=0.1, width=1.8)
-    task = Task(obstacles=Obstacles(), map=Obstacles(shapes=(wall,)), start=(0.0, 0.0, 0.0), goal=(4.0, 0.0, 0.0))
+    wall, post = Box(x=2.0, y=0.3, length=0.1, width=1.8), Disc(x=2.0, y=4.0)
+    known = Obstacles(shapes=(wall, post))
+    task = Task(obstacles=Obstacles(shapes=(post,)), map=known, start=(0.0, 0.0, 0.0), goal=(4.0, 0.0, 0.0))
     driven = navigate(task, PLANNED, avoid="window")
     assert driven.table["outcome"].tolist() == ["arrived"]
     assert float(np.abs(driven.result["y"]).max()) < 0.3 < 0.8 < np.abs(driven.plan.poses[:, 1]).max()
