@@ -179,14 +179,14 @@ class Live(Page):
             self.add_download()
 
         self.add_key("space", "Play or pause", lambda: self._command("pause" if self.playing else "play"))
-        self.add_key("arrowright", "Step", lambda: self._command("step"))
+        self.add_key("N", "Step", lambda: self._command("step"))
         self.add_key("R", "Reset", lambda: self._command("reset"))
         self.add_key("F", "Camera follows", lambda: setattr(self._follow, "value", not self._follow.value))
         for key, (group, choices) in zip(KEYS, buttons(self.session.robot).items(), strict=True):
             self.add_key(key, next(iter(choices)).capitalize(), partial(self._press, group, next(iter(choices))))
 
         self.add_key("G", "Set a goal", self._hands.await_goal)
-        self.add_key("W", "Draw a way", self._hands.draw_way)
+        self.add_key("P", "Draw a way", self._hands.draw_way)
 
         self._controls = Controls(gui, partial(self.ask, self._note_input), self.session.robot, CHANGEABLE)
         self._controls.designed = self.session.designed()

@@ -183,7 +183,10 @@ class Page(ABC):
         self._scene.paint()
 
     def add_key(self, key: HotkeyKey, label: str, action: Callable[[], None]) -> None:
-        """Queues an action whenever a visitor presses a key; viser lists it under its label with Ctrl-K."""
+        """Queues an action whenever a visitor presses a key; viser lists it under its label with Ctrl-K.
+
+        The arrows and W, A, S, D, Q and E are viser's own: they move the camera.
+        """
 
         async def called(_: viser.CommandEvent) -> None:
             self.ask(action)

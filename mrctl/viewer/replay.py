@@ -74,7 +74,7 @@ class Replay(Page):
             self.on(gui.add_button("Only this run"), lambda _: self._only())
             self.add_download()
         self.add_key("space", "Play or pause", lambda: self._command("pause" if self.playing else "play"))
-        self.add_key("arrowright", "Forward by 0.1 s", lambda: self._scrub(self.time + 0.1))
+        self.add_key("N", "Forward by 0.1 s", lambda: self._scrub(self.time + 0.1))
         self.add_key("R", "Start", lambda: self._command("start"))
         self.add_key("F", "Camera follows", lambda: setattr(self._follow, "value", not self._follow.value))
         self._scatter: Scatter | None = None
