@@ -24,7 +24,9 @@ class _Interrupts:
         caught: Whether the program was interrupted.
     """
 
-    caught = False
+    def __init__(self) -> None:
+        """Begins before any interrupt."""
+        self.caught, self._report = False, sys.unraisablehook
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Ends the program at once if it is importing a module, and otherwise lets the command tidy up and end it."""
@@ -41,7 +43,7 @@ class _Interrupts:
     def lost(self, error: UnraisableHookArgs) -> None:
         """Interrupts again if compiled code that had called Python, as LLVM does, dropped the exception."""
         if not self.caught:
-            sys.__unraisablehook__(error)
+            self._report(error)
         elif isinstance(error.exc_value, KeyboardInterrupt):
             signal.setitimer(signal.ITIMER_REAL, 0.01)
 

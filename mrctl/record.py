@@ -204,5 +204,10 @@ def describe(error: ValidationError, source: str = "") -> str:
     first, *rest = error.errors()
     field = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "tuple_type":  # a file has no tuples
+        tables = (
+            f", in TOML of tables that begin with [[{first['loc'][-1]}]]" if isinstance(first["input"], dict) else ""
+        )
+        message = f"must be a list{tables}"
     more = f" (and {len(rest)} more)" if rest else ""
     return printable(": ".join(part for part in (source, field, message) if part) + more)

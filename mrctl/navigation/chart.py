@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
+from mrctl.theory.clearance import point_to_polygon
 from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings
 from mrctl.theory.rays import Scan
 
@@ -70,52 +71,58 @@ class Chart:
             self._outlines[row] = _without(self.known, self._gone[row])
         return changed
 
-    def _corners(self, shape: int) -> Array:
-        """Returns the corners of an obstacle, counter-clockwise, in m, `(n, 2)`; many of a disc."""
+    def _distances(self, shape: int, points: Array) -> Array:
+        """Returns the distances of points, `(k, 2)`, from an obstacle in m, negative inside, `(k,)`."""
         discs, edges, first, _ = self.known
-        if (ring := shape - len(discs)) >= 0:
-            return edges[first[ring] : first[ring + 1], :2]
-        turn = np.linspace(0.0, 2 * np.pi, AROUND[1], endpoint=False)
-        return discs[shape, :2] + discs[shape, 2] * np.column_stack([np.cos(turn), np.sin(turn)])
+        if (ring := shape - len(discs)) < 0:
+            return np.hypot(*(points - discs[shape, :2]).T) - discs[shape, 2]
+        found = np.empty(len(points))
+        from_polygon.compiled(np.ascontiguousarray(points), edges[first[ring] : first[ring + 1]], found)
+        return found
 
     def _inside(self, shape: int) -> tuple[Array, float]:
-        """Returns places inside an obstacle, `(k, 2)`, and the distance of its middle from a side, at least; in m."""
-        middle, corners = self._middles[shape], self._corners(shape)
+        """Returns places inside an obstacle, `(k, 2)`, and how deep its middle lies in it; all in m."""
+        discs, edges, first, _ = self.known
+        middle = self._middles[shape]
+        if (ring := shape - len(discs)) >= 0:
+            corners = edges[first[ring] : first[ring + 1], :2]
+        else:
+            turn = np.linspace(0.0, 2 * np.pi, AROUND[1], endpoint=False)
+            corners = middle + discs[shape, 2] * np.column_stack([np.cos(turn), np.sin(turn)])
         around = np.vstack([corners, corners[:1]])
         along = np.append(0.0, np.cumsum(np.hypot(*np.diff(around, axis=0).T)))
         count = int(np.clip(np.ceil(along[-1] / APART), *AROUND))
         outline = np.column_stack([np.interp(along[-1] / count * np.arange(count), along, side) for side in around.T])
         places = np.concatenate([[middle], *(middle + share * (outline - middle) for share in INSIDE)])
-        return places, float(_depths(middle[None], corners)[0])
+        return places, -float(self._distances(shape, middle[None])[0])
 
     def _shown(self, shape: int, points: Array, margin: Array) -> bool:
         """Tells whether points of a scan, `(k, 2)`, lie on an obstacle, or within margins in m, `(k,)`, of it.
 
-        A point that lies nearer to another obstacle, or deeper inside it, belongs to that one.
+        A point that lies nearer to another obstacle belongs to that one.
         """
         middle, radius = self._middles[shape], self._radii[shape]
         near = np.hypot(*(points - middle).T) < radius + margin
         if np.sum(near) < LEAST:
             return False
         points, margin = points[near], margin[near]
-        depths = _depths(points, self._corners(shape))
-        points, depths = points[depths > -margin], depths[depths > -margin]
+        away = self._distances(shape, points)
+        points, away = points[away < margin], away[away < margin]
         others = np.hypot(*(self._middles - middle).T) < radius + self._radii + FAR
         others[shape] = False
         for other in np.flatnonzero(others).tolist():
             if len(points) < LEAST:
                 return False
-            own = depths >= _depths(points, self._corners(other))
-            points, depths = points[own], depths[own]
+            own = away <= self._distances(other, points)
+            points, away = points[own], away[own]
         return len(points) >= LEAST
 
 
-def _depths(points: Array, corners: Array) -> Array:
-    """Returns how deep points, `(k, 2)`, lie inside a convex polygon, `(n, 2)`, in m; less than 0 beyond a side."""
-    sides = np.roll(corners, -1, axis=0) - corners
-    offsets = points[:, None] - corners
-    across = sides[:, 0] * offsets[..., 1] - sides[:, 1] * offsets[..., 0]
-    return (across / np.hypot(*sides.T)).min(axis=1)
+@kernel
+def from_polygon(points: Array, sides: Array, found: Array) -> None:
+    """Writes the distances of points, `(k, 2)`, from a polygon with sides `(n, 4)` in m, negative inside, `(k,)`."""
+    for k in range(len(points)):
+        found[k] = point_to_polygon(points[k, 0], points[k, 1], sides)
 
 
 def _without(known: Outlines, gone: NDArray[np.bool]) -> Outlines:

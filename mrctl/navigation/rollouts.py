@@ -182,7 +182,8 @@ class Reactive(ABC):
         self._period, self._tick, self._place = period, 0, np.zeros(self._size, int)
         self._tables, self._fields = [self._sampled(self._plan)] * self._size, [self._field] * self._size
         self._given: list[Waypoints | None] = [None] * self._size  # plans that came since the start
-        self._anchor, self._since, self._tried = pose[:, :2].copy(), np.zeros(self._size), np.zeros(self._size)
+        self._anchor, self._since = pose[:, :2].copy(), np.zeros(self._size)
+        self._tried = np.full(self._size, -np.inf)  # when they last looked for another plan
         self._waited = np.zeros(self._size, bool)  # which have made another plan where they are
         self._approached = np.zeros(self._size, bool)  # which have gone back from a goal at which they did not arrive
         self._pieces = np.zeros(self._size, int)  # of the way back from `_anchor`, for robots that go back
@@ -210,7 +211,8 @@ class Reactive(ABC):
 
     def _take(self, row: int, plan: Waypoints) -> None:
         """Lets a robot go along a plan, with a field that reaches as far."""
-        self._tables[row], self._place[row] = table, _ = self._sampled(plan), 0
+        self._tables[row] = table = self._sampled(plan)
+        self._place[row] = 0
         low, high = table[:, :2].min(axis=0), table[:, :2].max(axis=0)
         distance, origin, resolution = self._fields[row]
         end, room = origin + resolution * np.array(distance.shape[::-1]), self._body + KEPT
@@ -288,7 +290,7 @@ class Reactive(ABC):
     def _shorten(self, row: int, pose: Array) -> None:
         """Gives a robot whose map has changed another plan, if that takes less time than the rest of its own."""
         now, left = self._period * self._tick, self._period / FINE * (len(self._tables[row]) - 1 - self._place[row])
-        if self._map_changed[row] and (now - self._tried[row] > RETRY or self._tried[row] == 0):
+        if self._map_changed[row] and now - self._tried[row] > RETRY:
             self._tried[row] = now
             if (other := self._planned(row, pose)) and other.period < SHORTER * left:
                 self._take(row, other)

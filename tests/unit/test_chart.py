@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mrctl import Box, Disc, Obstacles, Polygon
-from mrctl.navigation.chart import SCANS, Chart, _depths
+from mrctl.navigation.chart import SCANS, Chart
 from mrctl.sensing.lidar import Lidar
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.rays import Scan
@@ -82,14 +82,3 @@ def test_what_is_hidden_stays() -> None:
     chart, near = Chart(Obstacles(shapes=(wall, behind, far)), 1), Lidar(range=6.0)
     for _ in range(3 * SCANS):
         assert not chart.see(0, scan(near, Obstacles(shapes=(wall,)), np.zeros(3), np.random.default_rng(0)))
-
-
-def test_depths() -> None:
-    """Inside a polygon the depth of a point is its distance from the outline, as shapely has it."""
-    corners, random = Polygon(points=((0, 0), (2, 0.3), (1.5, 1.8), (-0.2, 1.0))).vertices, np.random.default_rng(0)
-    points, shape = random.uniform([-0.5, -0.5], [2.5, 2.0], (300, 2)), shapely.Polygon(corners)
-    found, inside = _depths(points, corners), np.array([shape.contains(shapely.Point(p)) for p in points])
-    np.testing.assert_array_equal(found > 0, inside)
-    exact = [shape.exterior.distance(shapely.Point(p)) for p in points[inside]]
-    np.testing.assert_allclose(found[inside], exact, atol=1e-12)
-    assert 50 < inside.sum() < 250

@@ -82,6 +82,20 @@ def test_bad_toml(tmp_path, text):
     assert str(error.value).startswith(f"{path}: ") and len(str(error.value).splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"events": {"time": 1.0}}, "events: must be a list, in TOML of tables that begin with [[events]]"),
+        ({"initial_pose": 3.0}, "initial_pose: must be a list"),
+    ],
+)
+def test_lists(values, said):
+    """A table or a number in place of a list is called so in the words of the file."""
+    with pytest.raises(InputError) as caught:
+        Scenario.from_dict(values, "s.toml")
+    assert str(caught.value) == f"s.toml: {said}"
+
+
 def test_unreadable(tmp_path):
     """A missing file, a folder, an impossible path and bytes that are not UTF-8 are refused with one line."""
     (tmp_path / "bytes.toml").write_bytes(b"name = '\xff'")
