@@ -3,7 +3,8 @@
 A kernel is written as in a textbook, with arrays for vectors and a NumPy record for what is kept of a robot
 (`s.integral[k]`), and it may call other kernels. Numba compiles it when it is first called, not at import, for the
 types that it is called with; it releases Python's global lock, and the machine code is kept on disk. Kernels copy
-arrays element by element: with `a[:] = b` Numba also compiles its message about unequal shapes, which takes 3 s.
+arrays element by element: with `a[:] = b` Numba also compiles its message about unequal shapes, which takes 3 s. In a
+kernel a division by zero gives ±∞ or NaN, as in NumPy.
 
 The code on disk is valid for one state of all files that hold kernels: whoever edits a law gets the new law in every
 kernel that calls it, wherever that is written. Constants that a kernel uses must therefore stand in such a file.
@@ -62,7 +63,8 @@ class Kernel(Generic[P, T]):
         )
         update_wrapper(versioned, law)
         # Between kernels a call of a small one takes longer than its law, because each array is handed over in parts.
-        return njit(cache=True, nogil=True, forceinline=True)(versioned)
+        # A check of each division for zero would keep loops with a division from vector instructions.
+        return njit(cache=True, nogil=True, forceinline=True, error_model="numpy")(versioned)
 
     def repeated(self) -> Callable[..., T]:
         """Returns the compiled function for one caller, who promises that the types of its arguments never change.

@@ -34,7 +34,7 @@ REGULARISATION = 1e-3  # ε: keeps the normalised step finite at rest, where the
 
 @kernel
 def places(units: int) -> tuple[int, int, int, int]:
-    """Returns where b₁ `(units,)`, W₂ `(2, units)`, b₂ `(2,)` and W₃ `(2, 8)` begin, after W₁ `(units, 8)`.
+    """Returns where b₁ `(units,)`, W₂ `(2, units)`, b₂ `(2,)` and W₃ `(2, 8)` begin, after W₁ᵀ `(8, units)`.
 
     The laws index the flat weights: to make views of the five layers would take as long as the network itself.
     """
@@ -44,13 +44,64 @@ def places(units: int) -> tuple[int, int, int, int]:
     return b1, W2, b2, b2 + OUTPUTS
 
 
+def by_columns(weights: Array) -> Array:
+    """Returns flat weights of files and results, which begin with W₁, as those of the kernels, with W₁ᵀ, `(…, n)`."""
+    return _transposed(weights, rows=-1, columns=INPUTS)
+
+
+def by_rows(weights: Array) -> Array:
+    """Returns the inverse of `by_columns`."""
+    return _transposed(weights, rows=INPUTS, columns=-1)
+
+
+def _transposed(weights: Array, rows: int, columns: int) -> Array:
+    size = (weights.shape[-1] - OUTPUTS * (INPUTS + 1)) // (INPUTS + 1 + OUTPUTS) * INPUTS
+    first = weights[..., :size].reshape(*weights.shape[:-1], rows, columns)
+    return np.concatenate([np.swapaxes(first, -2, -1).reshape(*weights.shape[:-1], size), weights[..., size:]], axis=-1)
+
+
+@kernel
+def tanh(z: float) -> float:
+    """Returns tanh z = 1 − 2/(e²ᶻ + 1) to 2e-14, with e²ᶻ = (e^(2z/256))²⁵⁶ and a series for the root.
+
+    Unlike the exponential function of the library it has no branches, so that a loop takes four units at once.
+    """
+    u = z / 128
+    u = -1.0 if u < -1 else u  # there the result is −1, but the series would turn round
+    e = 1 + u * (1 + u * (1 / 2 + u * (1 / 6 + u * (1 / 24 + u * (1 / 120 + u / 720)))))
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    e = e * e
+    return 1 - 2 / (e + 1)
+
+
+@kernel
+def inner(a: Array, start: int, b: Array) -> float:
+    """Returns aᵀb, with a from an index on, from four sums side by side: in one each addition awaits the one before."""
+    p = q = r = s = 0.0
+    whole = b.shape[0] // 4 * 4
+    for n in range(0, whole, 4):
+        p += a[start + n] * b[n]
+        q += a[start + n + 1] * b[n + 1]
+        r += a[start + n + 2] * b[n + 2]
+        s += a[start + n + 3] * b[n + 3]
+    for n in range(whole, b.shape[0]):
+        p += a[start + n] * b[n]
+    return (p + q) + (r + s)
+
+
 @kernel
 def network(x: Array, w: Array, hidden: Array, scale: Array, output: Array) -> None:
     """The network: output = scale · (g_h W₂ tanh(W₁ x + b₁) + g_b b₂ + W₃ x).
 
     Args:
         x: Scaled features, `(8,)`.
-        w: Flat weights, W₁ and then the layers at their `places`.
+        w: Flat weights, W₁ᵀ and then the layers at their `places`.
         hidden: Out: tanh(W₁ x + b₁), `(units,)`.
         scale: Output for a network output of one, V (rad/s on a steering channel), `(2,)`.
         output: Out: feedforward of the two channels in the same units, `(2,)`.
@@ -60,29 +111,28 @@ def network(x: Array, w: Array, hidden: Array, scale: Array, output: Array) -> N
     for j in range(units):
         z = w[b1 + j]
         for i in range(INPUTS):
-            z += w[j * INPUTS + i] * x[i]
-        hidden[j] = z
-    for j in range(units):
-        hidden[j] = 1 - 2 / (np.exp(2 * hidden[j]) + 1)  # tanh, in half the time of the library's
+            z += w[i * units + j] * x[i]
+        hidden[j] = tanh(z)
     for k in range(OUTPUTS):
-        y = BIAS_GAIN * w[b2 + k]
-        for i in range(INPUTS):
-            y += w[W3 + k * INPUTS + i] * x[i]
-        for j in range(units):
-            y += w[W2 + k * units + j] * (HIDDEN_GAIN * hidden[j])
-        output[k] = scale[k] * y
+        direct = inner(w, W3 + k * INPUTS, x)
+        output[k] = scale[k] * (HIDDEN_GAIN * inner(w, W2 + k * units, hidden) + BIAS_GAIN * w[b2 + k] + direct)
 
 
 @kernel
-def backpropagate(x: Array, w: Array, hidden: Array, error: Array, gradient: Array) -> None:
+def backpropagate(x: Array, w: Array, hidden: Array, error: Array, gradient: Array) -> float:
     """Writes Jᵀe, with J = ∂(output/scale)/∂W of the network, in the order of the weights.
+
+        Jᵀe = (δ xᵀ, δ, g_h e hᵀ, g_b e, e xᵀ),    δ = g_h (1 − h²) ∘ W₂ᵀe,    h = tanh(W₁ x + b₁)
 
     Args:
         x: Scaled features, `(8,)`.
         w: Flat weights, `(n,)`.
-        hidden: Activations at x, as from `network`, `(units,)`.
+        hidden: Activations h at x, as from `network`, `(units,)`.
         error: e, `(2,)`.
         gradient: Out: Jᵀe, `(n,)`.
+
+    Returns:
+        ‖Jᵀe‖², where the squared norm of an outer product is the product of those of its factors.
     """
     units = hidden.shape[0]
     b1, W2, b2, W3 = places(units)
@@ -90,30 +140,18 @@ def backpropagate(x: Array, w: Array, hidden: Array, error: Array, gradient: Arr
         gradient[b2 + k] = BIAS_GAIN * error[k]
         for i in range(INPUTS):
             gradient[W3 + k * INPUTS + i] = error[k] * x[i]
-    for j in range(units):
-        back = 0.0
-        for k in range(OUTPUTS):
+        for j in range(units):
             gradient[W2 + k * units + j] = HIDDEN_GAIN * error[k] * hidden[j]
-            back += error[k] * w[W2 + k * units + j]
-        back *= HIDDEN_GAIN * (1 - hidden[j] * hidden[j])
-        gradient[b1 + j] = back
-        for i in range(INPUTS):
-            gradient[j * INPUTS + i] = back * x[i]
-
-
-@kernel
-def squared_norm(vector: Array) -> float:
-    """Returns ‖v‖², from four sums side by side, since in one sum each addition waits for the one before."""
-    a = b = c = d = 0.0
-    whole = vector.shape[0] // 4 * 4
-    for w in range(0, whole, 4):
-        a += vector[w] * vector[w]
-        b += vector[w + 1] * vector[w + 1]
-        c += vector[w + 2] * vector[w + 2]
-        d += vector[w + 3] * vector[w + 3]
-    for w in range(whole, vector.shape[0]):
-        a += vector[w] * vector[w]
-    return (a + b) + (c + d)
+    for j in range(units):
+        back = error[0] * w[W2 + j] + error[1] * w[W2 + units + j]
+        gradient[b1 + j] = HIDDEN_GAIN * (1 - hidden[j] * hidden[j]) * back
+    for i in range(INPUTS):
+        for j in range(units):
+            gradient[i * units + j] = gradient[b1 + j] * x[i]
+    delta = gradient[b1 : b1 + units]
+    inputs = inner(x, 0, x)
+    outer = BIAS_GAIN * BIAS_GAIN + inputs + HIDDEN_GAIN * HIDDEN_GAIN * inner(hidden, 0, hidden)
+    return inner(error, 0, error) * outer + inner(delta, 0, delta) * (1 + inputs)
 
 
 @kernel
@@ -142,13 +180,13 @@ def update(feedback: Array, s: Row, w: Array, initial: Array, hidden: Array, gra
     if power == 0:
         return
     network(s.past, w, hidden, s.scale, s.output)
-    backpropagate(s.past, w, hidden, s.error, gradient)
-    rate = s.step / (squared_norm(gradient) / power + REGULARISATION)
+    square = backpropagate(s.past, w, hidden, s.error, gradient)
+    rate, leak = s.step / (square / power + REGULARISATION), s.leak
     distance = gradient  # from here on W − W₀, in the same memory
     for n in range(w.shape[0]):
-        w[n] += rate * gradient[n] - s.leak * (w[n] - initial[n])
+        w[n] += rate * gradient[n] - leak * (w[n] - initial[n])
         distance[n] = w[n] - initial[n]
-    s.norm = np.sqrt(squared_norm(distance))
+    s.norm = np.sqrt(inner(distance, 0, distance))
     if s.norm > s.bound:
         for n in range(w.shape[0]):
             w[n] = initial[n] + (w[n] - initial[n]) * s.bound / s.norm
@@ -247,8 +285,8 @@ class FeedbackErrorLearning(Learner):
     """The learner `fel` for B robots.
 
     Attributes:
-        weights: Flat weights W, `(B, n)`.
-        initial: Initial weights W₀, to which leak and projection refer, `(B, n)`.
+        weights: Flat weights W in the order of the kernels, `(B, n)`.
+        initial: Initial weights W₀, to which leak and projection refer, in the same order, `(B, n)`.
         weight_norm: ‖W − W₀‖, `(B,)`.
     """
 
@@ -271,12 +309,11 @@ class FeedbackErrorLearning(Learner):
             InputError: A weights file is missing, broken or of another shape.
         """
         super().__init__(robot, len(settings), rigid, period)
-        self.initial = np.array(
-            [
-                load_weights(s.weights, s.hidden) if s.weights else initial_weights(s.hidden, seed)
-                for s, seed in zip(settings, seeds, strict=True)
-            ]
-        )
+        given = [
+            load_weights(s.weights, s.hidden) if s.weights else initial_weights(s.hidden, seed)
+            for s, seed in zip(settings, seeds, strict=True)
+        ]
+        self.initial = by_columns(np.array(given))
         self.weights = self.initial.copy()
         self.rows = fresh(settings, rigid)
         hidden, gradient = np.zeros((len(settings), settings[0].hidden)), np.zeros(self.initial.shape[1])
@@ -284,12 +321,12 @@ class FeedbackErrorLearning(Learner):
         self.arrays = self.rows, feature_scale(robot), self.weights, self.initial, hidden, gradient, queue
 
     def adapted(self) -> Array:
-        """The weights, `(B, n)`."""
-        return self.weights.copy()
+        """The weights, `(B, n)`, in the order of files."""
+        return by_rows(self.weights)
 
     def adopt(self, row: int, learned: Array) -> None:
         """Starts one robot from other weights, to which leak and projection then refer."""
-        self.weights[row] = self.initial[row] = learned
+        self.weights[row] = self.initial[row] = by_columns(learned)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to their initial weights."""

@@ -13,15 +13,19 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 import mrctl
-from mrctl.control.features import feature_matrix, feature_scale
+from mrctl.control.features import INPUTS, feature_matrix, feature_scale
 from mrctl.control.fel import (
     BIAS_GAIN,
     HIDDEN_GAIN,
     REGULARISATION,
     FeedbackErrorLearning,
     Fel,
+    by_columns,
+    by_rows,
     fresh,
+    inner,
     network,
+    tanh,
     update,
 )
 from mrctl.control.fel_torch import Network
@@ -49,18 +53,19 @@ def torch_network(weights):
 def answer(x, weights, scale):
     """Output of the network `(2,)`."""
     output = np.zeros(2)
-    network(x, weights, np.zeros(HIDDEN), np.array(scale, float), output)
+    network(x, by_columns(weights), np.zeros(HIDDEN), np.array(scale, float), output)
     return output
 
 
 def one_step(x, feedback, weights, rigid=False, prior=None, **settings):
     """Weights and norm after one step of one robot, without leak and far within the bound by default."""
     s = fresh([Fel(**{"step": 0.05, "leak": 0.0, "weight_bound": 1e4} | settings)], rigid)[0]
-    after, hidden = weights.copy(), np.zeros(HIDDEN)
+    after, hidden = by_columns(weights), np.zeros(HIDDEN)
+    initial = by_columns(weights if prior is None else prior)
     s["x"] = s["past"] = x
     network(s["x"], after, hidden, s["scale"], s["output"])
-    update(np.array(feedback, float), s, after, weights if prior is None else prior, hidden, np.zeros(len(weights)))
-    return after, float(s["norm"])
+    update(np.array(feedback, float), s, after, initial, hidden, np.zeros(len(weights)))
+    return by_rows(after), float(s["norm"])
 
 
 def teach(stage, feedback, frozen=0.0):
@@ -83,9 +88,28 @@ def taught(robot, settings=None, rigid=False, size=1):
 
 def power(stage):
     """Squared norm of the gradient of one channel at the first step, when only what is behind tanh can move."""
-    layers, x = unflatten(stage.weights[0]), stage.rows["x"][0]
+    layers, x = unflatten(stage.adapted()[0]), stage.rows["x"][0]
     hidden = np.tanh(layers["hidden.weight"] @ x + layers["hidden.bias"])
     return HIDDEN_GAIN**2 * hidden @ hidden + BIAS_GAIN**2 + x @ x
+
+
+@given(st.floats(-1e6, 1e6) | st.floats(-25, 25))
+def test_tanh(z):
+    """The tanh of the kernels, which compiles to vector instructions, is that of the library."""
+    assert tanh(z) == pytest.approx(np.tanh(z), rel=0, abs=3e-14)
+
+
+def test_tanh_of_nan():
+    """A motion that is not a number is not hidden by the limits of the series."""
+    assert np.isnan(tanh(np.nan)) and tanh(np.inf) == 1 == -tanh(-np.inf)
+
+
+@given(st.integers(0, 13), st.integers(0, 3), st.data())
+def test_inner(size, start, data):
+    """The inner product in four sums is NumPy's, whatever the length."""
+    a = data.draw(arrays(float, start + size, elements=st.floats(-10, 10)))
+    b = data.draw(arrays(float, size, elements=st.floats(-10, 10)))
+    assert inner(a, start, b) == pytest.approx(a[start:] @ b, abs=1e-11)
 
 
 def test_network():
@@ -177,7 +201,7 @@ def test_dead_zone(robot, rigid):
     np.testing.assert_array_equal(stage.weights, before)
     for channel in range(2):
         teach(stage, edge * (1 + 1e-6 * (np.arange(2) == channel)))
-        moved = unflatten(stage.weights[0])["direct.weight"].any(axis=1)
+        moved = unflatten(stage.adapted()[0])["direct.weight"].any(axis=1)
         assert moved.tolist() == [True, channel == 1]
 
 
@@ -252,6 +276,10 @@ def test_flat_weights(hidden):
     weights = trained(hidden)
     layers = unflatten(weights)
     np.testing.assert_array_equal(flatten(layers), weights)
+    for several in (weights, np.stack([weights, -weights])):  # of one robot and of two
+        np.testing.assert_array_equal(by_rows(by_columns(several)), several)
+    columns = by_columns(weights)[: hidden * INPUTS]
+    np.testing.assert_array_equal(columns, layers["hidden.weight"].T.ravel())
     theirs = {name: tuple(value.shape) for name, value in Network(hidden).state_dict().items()}
     assert {name: layer.shape for name, layer in layers.items()} == theirs == shapes(hidden)
 
@@ -277,7 +305,7 @@ def test_files(robot, tmp_path, suffix):
     stage, command, derivative = taught(robot, Fel(hidden=HIDDEN, weights=str(path)))
     x = feature_matrix(command, derivative, robot.half_track, feature_scale(robot))
     np.testing.assert_array_equal(stage.output(command, derivative)[0], answer(x[0], weights, [6, 6]))
-    np.testing.assert_array_equal(stage.initial, weights[None])
+    np.testing.assert_array_equal(stage.adapted(), weights[None])
 
 
 def test_single_precision(tmp_path):
