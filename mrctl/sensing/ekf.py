@@ -8,7 +8,8 @@
 
     encoder_l,r = λ_l,r + quantisation,    gyro = θ̇ + b + noise,    fix = (x, y, θ) + noise
 
-b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii. The accelerometer a, corrected for its
+b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii, of which that of a wheel which seems to
+slip alone becomes less certain. The accelerometer a, corrected for its
 place ahead of the axle, is an input; its offset o is the sum of its bias and a component of gravity. θ̈_c is the
 commanded acceleration that acts in the period. κ and ρ are `lag` and `load` of the tyres (`theory.robot.Tyres`), and
 the accelerometer measures a_y, too. The wheel angles λ are part of the state, so that the error of an encoder stays
@@ -40,6 +41,7 @@ JUMP = 3.0  # standard deviations; a jump is the part of a change of the acceler
 LOADING, LOAD = 0.1, 2.0  # s at the start in which the tyres take up their load, and the jolt that it counts as, m/s²
 RADIUS = 0.01  # standard deviation of the relative error of a wheel's radius at the start
 RADIUS_WALK = 5e-6  # random walk of that error, 1/√s
+RADIUS_DOUBT = 0.003  # the same for a wheel that seems to slip while the other one grips, 1/√s; chosen
 START_OFFSET = 0.2  # standard deviation of the component of gravity in the accelerometer at the start, m/s²
 START_TWIST = 0.02, 0.02  # standard deviations of V in m/s and θ̇ in rad/s at the start
 
@@ -158,8 +160,9 @@ def propagate(
     slip = JOLT**2 * jolt**2 + (T * (SLIDE / r) ** 2 if gripping == 1 else 0.0)
     P[LEFT, LEFT] += slip
     P[RIGHT, RIGHT] += slip
-    P[SCALE_LEFT, SCALE_LEFT] += T * RADIUS_WALK**2
-    P[SCALE_RIGHT, SCALE_RIGHT] += T * RADIUS_WALK**2
+    for k in range(2):  # what seems to be slip of one wheel may be another radius, as after a puncture
+        walk = RADIUS_DOUBT if grip[k] < grip[1 - k] else RADIUS_WALK
+        P[SCALE_LEFT + k, SCALE_LEFT + k] += T * walk**2
 
 
 @kernel

@@ -62,9 +62,10 @@ def process_noise(x, grip, s, force, theta_dot_dot, growth, jolt):
     Q += inputs @ np.diag([s["acceleration_variance"], laws.TURN**2 / T]) @ inputs.T
     Q[BIAS, BIAS] = T * s["bias_walk"] ** 2
     Q[OFFSET, OFFSET] = T * (s["offset_walk"] ** 2 + (s["offset"] - x[OFFSET]) ** 2 / laws.SETTLE)
-    for wheel, scale in ((LEFT, SCALE_LEFT), (RIGHT, SCALE_RIGHT)):
+    for k, (wheel, scale) in enumerate(((LEFT, SCALE_LEFT), (RIGHT, SCALE_RIGHT))):
         Q[wheel, wheel] += (laws.JOLT * jolt) ** 2 + (T * (laws.SLIDE / RADIUS) ** 2 if grip.sum() == 1 else 0)
-        Q[scale, scale] = T * laws.RADIUS_WALK**2
+        slips_alone = not grip[k] and grip[1 - k]
+        Q[scale, scale] = T * (laws.RADIUS_DOUBT if slips_alone else laws.RADIUS_WALK) ** 2
     return Q
 
 
