@@ -71,7 +71,7 @@ def test_too_fast(steering, name, delay, times):
     assert set(events["run"]) == {2}
     assert set(events["reason"]) - {""} <= {"sustained oscillation", "velocity far from the command"}
     assert laps["guard_actions"].values[2].sum() == (events["action"] != "resume").sum()
-    assert (laps["guard_actions"].values[:2] == 0).all()
+    assert np.nansum(laps["guard_actions"].values[:2]) == 0  # NaN from the lap on in which the robot without it is lost
 
 
 def test_silent():
