@@ -8,14 +8,14 @@
 
     encoder_l,r = λ_l,r + quantisation,    gyro = θ̇ + b + noise,    fix = (x, y, θ) + noise
 
-b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii, of which that of a wheel which seems to
-slip alone becomes less certain. The accelerometer a, corrected for its
-place ahead of the axle, is an input; its offset o is the sum of its bias and a component of gravity. θ̈_c is the
-commanded acceleration that acts in the period. κ and ρ are `lag` and `load` of the tyres (`theory.robot.Tyres`), and
-the accelerometer measures a_y, too. The wheel angles λ are part of the state, so that the error of an encoder stays
-bounded in angle; modelled as noise on V, it would become a random walk of the position. The noise of a and θ̈ moves the
-positions of the same period, so that an encoder sees it at once. A fix corrects the state at the time when it was
-taken: the filter stores that state, and repeats the periods since then.
+b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii, of which that of a wheel that seems to
+slip a little becomes less certain. The accelerometer a, corrected for its place ahead of the axle, is an input; its
+offset o is the sum of its bias and a component of gravity. θ̈_c is the commanded acceleration that acts in the period.
+κ and ρ are `lag` and `load` of the tyres (`theory.robot.Tyres`), and the accelerometer measures a_y, too. The wheel
+angles λ are part of the state, so that the error of an encoder stays bounded in angle; modelled as noise on V, it would
+become a random walk of the position. The noise of a and θ̈ moves the positions of the same period, so that an encoder
+sees it at once. A fix corrects the state at the time when it was taken: the filter stores that state, and repeats the
+periods since then.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ JUMP = 3.0  # standard deviations; a jump is the part of a change of the acceler
 LOADING, LOAD = 0.1, 2.0  # s at the start in which the tyres take up their load, and the jolt that it counts as, m/s²
 RADIUS = 0.01  # standard deviation of the relative error of a wheel's radius at the start
 RADIUS_WALK = 5e-6  # random walk of that error, 1/√s
-RADIUS_DOUBT = 0.003  # the same for a wheel that seems to slip while the other one grips, 1/√s; chosen
+RADIUS_DOUBT = 0.003  # the same for a wheel that slips a little, by the gyro alone, 1/√s; chosen
 START_OFFSET = 0.2  # standard deviation of the component of gravity in the accelerometer at the start, m/s²
 START_TWIST = 0.02, 0.02  # standard deviations of V in m/s and θ̇ in rad/s at the start
 
@@ -160,9 +160,8 @@ def propagate(
     slip = JOLT**2 * jolt**2 + (T * (SLIDE / r) ** 2 if gripping == 1 else 0.0)
     P[LEFT, LEFT] += slip
     P[RIGHT, RIGHT] += slip
-    for k in range(2):  # what seems to be slip of one wheel may be another radius, as after a puncture
-        walk = RADIUS_DOUBT if grip[k] < grip[1 - k] else RADIUS_WALK
-        P[SCALE_LEFT + k, SCALE_LEFT + k] += T * walk**2
+    P[SCALE_LEFT, SCALE_LEFT] += T * RADIUS_WALK**2
+    P[SCALE_RIGHT, SCALE_RIGHT] += T * RADIUS_WALK**2
 
 
 @kernel
@@ -259,10 +258,10 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
 
     It has the bandwidth ω₀ = `INERTIAL`, and its offset o is faster than that of the filter. A wheel slips if its own
     difference is larger than `GRIP` plus one count, or if it is the larger one and the two together contradict the
-    gyro.
+    gyro. In the latter case alone the wheel may have another radius instead, and is doubted.
 
     Args:
-        now: In and out: a record of `SAMPLE`, whose `grip` is the result.
+        now: In and out: a record of `SAMPLE`, whose `grip` and `doubted` are the result.
         geometry: As for the estimator `truth`.
         period: Control period in s.
         sensor: A record of `SENSOR`.
@@ -280,10 +279,9 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
     spread += 4 * D * D * (s.gyro_variance + P[BIAS, BIAS])
     spread += s.inertial**2 * (P[SCALE_LEFT, SCALE_LEFT] + P[SCALE_RIGHT, SCALE_RIGHT])
     if abs(left - right) > 4 * np.sqrt(spread) + TWIST:  # by the gyro, one of them slips
-        if abs(left) > abs(right):
-            now.grip[0] = 0
-        else:
-            now.grip[1] = 0
+        wheel = 0 if abs(left) > abs(right) else 1
+        now.doubted[wheel] = now.grip[0] + now.grip[1] == 2
+        now.grip[wheel] = 0
     count = now.grip[0] + now.grip[1]
     if count > 0:
         mean = (now.grip[0] * left + now.grip[1] * right) / count
@@ -308,6 +306,8 @@ def step(t: int, ring: Rows, i: int, geometry: Row, period: float, delay: int, s
         s.mean[OFFSET], s.P[OFFSET, OFFSET] = s.offset, START_OFFSET**2
     growth = geometry.load * now.acceleration[1]
     propagate(forward - s.mean[OFFSET], omega_dot, growth, jolt, now.grip, geometry, period, s)
+    for k in range(2):  # as after a puncture
+        s.P[SCALE_LEFT + k, SCALE_LEFT + k] += period * RADIUS_DOUBT**2 * now.doubted[k]
     measure(now, s)
 
 

@@ -62,10 +62,9 @@ def process_noise(x, grip, s, force, theta_dot_dot, growth, jolt):
     Q += inputs @ np.diag([s["acceleration_variance"], laws.TURN**2 / T]) @ inputs.T
     Q[BIAS, BIAS] = T * s["bias_walk"] ** 2
     Q[OFFSET, OFFSET] = T * (s["offset_walk"] ** 2 + (s["offset"] - x[OFFSET]) ** 2 / laws.SETTLE)
-    for k, (wheel, scale) in enumerate(((LEFT, SCALE_LEFT), (RIGHT, SCALE_RIGHT))):
+    for wheel, scale in ((LEFT, SCALE_LEFT), (RIGHT, SCALE_RIGHT)):
         Q[wheel, wheel] += (laws.JOLT * jolt) ** 2 + (T * (laws.SLIDE / RADIUS) ** 2 if grip.sum() == 1 else 0)
-        slips_alone = not grip[k] and grip[1 - k]
-        Q[scale, scale] = T * (laws.RADIUS_DOUBT if slips_alone else laws.RADIUS_WALK) ** 2
+        Q[scale, scale] = T * laws.RADIUS_WALK**2
     return Q
 
 
@@ -87,6 +86,7 @@ def textbook(s, sample, before, theta_dot_dot, loading):
     jump = abs(sample["acceleration"][0] - before["acceleration"][0])
     jolt = max(0, jump - laws.JUMP * np.sqrt(2 * s["acceleration_variance"]))
     Q = process_noise(x, grip, s, force, theta_dot_dot, growth, max(jolt, laws.LOAD) if loading else jolt)
+    Q[[SCALE_LEFT, SCALE_RIGHT], [SCALE_LEFT, SCALE_RIGHT]] += T * laws.RADIUS_DOUBT**2 * sample["doubted"]
     x, P = motion(x, force, theta_dot_dot, growth), F @ P @ F.T + Q
     for k, wheel in enumerate((LEFT, RIGHT)):
         if not grip[k]:  # the angle of a wheel that slips says nothing of the robot, and is known afresh
@@ -123,6 +123,7 @@ def sample_of(s, rng, grip=(1, 1)):
     sample["gyro"], sample["acceleration"] = s["mean"][OMEGA] + rng.normal() * 0.01, rng.normal(size=2)
     sample["encoder_new"] = sample["gyro_new"] = True
     sample["grip"] = grip
+    sample["doubted"] = rng.integers(2, size=2)
     return sample
 
 
