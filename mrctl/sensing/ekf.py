@@ -8,14 +8,14 @@
 
     encoder_l,r = λ_l,r + quantisation,    gyro = θ̇ + b + noise,    fix = (x, y, θ) + noise
 
-b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii, of which that of a wheel that seems to
-slip a little becomes less certain. The accelerometer a, corrected for its place ahead of the axle, is an input; its
-offset o is the sum of its bias and a component of gravity. θ̈_c is the commanded acceleration that acts in the period.
-κ and ρ are `lag` and `load` of the tyres (`theory.robot.Tyres`), and the accelerometer measures a_y, too. The wheel
-angles λ are part of the state, so that the error of an encoder stays bounded in angle; modelled as noise on V, it would
-become a random walk of the position. The noise of a and θ̈ moves the positions of the same period, so that an encoder
-sees it at once. A fix corrects the state at the time when it was taken: the filter stores that state, and repeats the
-periods since then.
+b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii. They hardly change; where encoders and
+gyro contradict each other although no wheel can slip, both become uncertain (`find_radius`). The accelerometer a,
+corrected for its place ahead of the axle, is an input; its offset o is the sum of its bias and a component of gravity.
+θ̈_c is the commanded acceleration that acts in the period. κ and ρ are `lag` and `load` of the tyres
+(`theory.robot.Tyres`), and the accelerometer measures a_y, too. The wheel angles λ are part of the state, so that the
+error of an encoder stays bounded in angle; modelled as noise on V, it would become a random walk of the position. The
+noise of a and θ̈ moves the positions of the same period, so that an encoder sees it at once. A fix corrects the state at
+the time when it was taken: the filter stores that state, and repeats the periods since then.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ JUMP = 3.0  # standard deviations; a jump is the part of a change of the acceler
 LOADING, LOAD = 0.1, 2.0  # s at the start in which the tyres take up their load, and the jolt that it counts as, m/s²
 RADIUS = 0.01  # standard deviation of the relative error of a wheel's radius at the start
 RADIUS_WALK = 5e-6  # random walk of that error, 1/√s
-RADIUS_DOUBT = 0.003  # the same for a wheel that slips a little, by the gyro alone, 1/√s; chosen
+DOUBT = 0.1  # largest standard deviation of that error where encoders and gyro contradict each other; chosen
+CALM = 0.5  # m/s², acceleration below which no force makes a wheel slip; chosen
 START_OFFSET = 0.2  # standard deviation of the component of gravity in the accelerometer at the start, m/s²
 START_TWIST = 0.02, 0.02  # standard deviations of V in m/s and θ̇ in rad/s at the start
 
@@ -54,6 +55,7 @@ LOOSE = 0.5  # m and rad, standard deviation that is added to the posture before
 SLIPPED = 6.0  # standard deviations of the innovation of an encoder, above which its wheel has slipped; chosen
 GRIP = 0.08  # m/s, difference of encoder and inertial speed of a wheel above which it slips
 TWIST = 2e-3  # m/s, difference of the slip of two wheels that grip
+AVERAGE = 1.0  # s, time constant of the mean of the wheels' difference, by which another radius is found; chosen
 INERTIAL = 5.0  # rad/s, bandwidth of the observer that compares encoders with the accelerometer
 
 EKF = np.dtype(
@@ -72,6 +74,7 @@ EKF = np.dtype(
         ("fix_variance", "f8", 3),  # m², m², rad²
         ("inertial", "f8"),  # V from accelerometer and the wheels that grip, m/s
         ("offset", "f8"),  # offset o of the accelerometer as the observer of `find_grip` estimates it, m/s²
+        ("difference", "f8"),  # mean of left less right wheel's speed by its encoder, less that by the gyro, m/s
         ("refused", "i8"),  # number of fixes rejected in a row
         ("nis", "f8"),  # normalised innovation squared of the last fix, chi-square with 3 degrees of freedom
         ("innovations", "f8", 3),  # normalised, of the last encoder samples, at most `SLIPPED`, and gyro sample
@@ -249,6 +252,38 @@ def absorb_fix(fix: Array, s: Row) -> None:
 
 
 @kernel
+def find_radius(difference: float, now: Row, geometry: Row, period: float, s: Row) -> None:
+    """Decides whether a wheel has another radius than before, as after a puncture, and writes it into the samples.
+
+    While both wheels grip and hardly any force acts, left and right speed v_l,r = r (1 + s_l,r) φ̇_l,r differ by what
+    the gyro measures, in the mean
+
+        d ← d + (T/τ) (v_l − v_r + 2 D (θ̇_gyro − b) − d),    τ = `AVERAGE`
+
+    but for the tyres' `TWIST` and four standard deviations of counts, gyro, b and s. Otherwise s_l and s_r are both as
+    uncertain as d/V: the gyro then tells their difference, and the fixes tell their sum.
+
+    Args:
+        difference: v_l − v_r + 2 D (θ̇_gyro − b) in m/s.
+        now: In and out: a record of `SAMPLE`, whose `doubt` is the result.
+        geometry: As for the estimator `truth`.
+        period: Control period in s.
+        s: In and out: a record of `EKF`.
+    """
+    if np.hypot(now.acceleration[0] - s.offset, now.acceleration[1]) > CALM:
+        return
+    s.difference += period / AVERAGE * (difference - s.difference)
+    P, u, D = s.P, s.inertial, geometry.half_track
+    variance = 2 * (geometry.wheel_radius / AVERAGE) ** 2 * s.encoder_variance
+    variance += 4 * D * D * (s.gyro_variance * period / (2 * AVERAGE) + P[BIAS, BIAS])
+    variance += u * u * (P[SCALE_LEFT, SCALE_LEFT] + P[SCALE_RIGHT, SCALE_RIGHT] - 2 * P[SCALE_LEFT, SCALE_RIGHT])
+    variance -= 4 * D * u * (P[BIAS, SCALE_LEFT] - P[BIAS, SCALE_RIGHT])
+    if abs(s.difference) > 4 * np.sqrt(variance) + TWIST:
+        now.doubt = min(abs(s.difference) / max(abs(u), TWIST), DOUBT)
+        s.difference = 0.0
+
+
+@kernel
 def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> None:
     """Decides which wheels grip, from encoders, gyro and accelerometer, and writes the result into the samples.
 
@@ -258,10 +293,10 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
 
     It has the bandwidth ω₀ = `INERTIAL`, and its offset o is faster than that of the filter. A wheel slips if its own
     difference is larger than `GRIP` plus one count, or if it is the larger one and the two together contradict the
-    gyro. In the latter case alone the wheel may have another radius instead, and is doubted.
+    gyro.
 
     Args:
-        now: In and out: a record of `SAMPLE`, whose `grip` and `doubted` are the result.
+        now: In and out: a record of `SAMPLE`, whose `grip` and `doubt` are the result.
         geometry: As for the estimator `truth`.
         period: Control period in s.
         sensor: A record of `SENSOR`.
@@ -274,13 +309,14 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
     left = r * (1 + s.mean[SCALE_LEFT]) * now.rate[0] - (ahead - D * omega)
     right = r * (1 + s.mean[SCALE_RIGHT]) * now.rate[1] - (ahead + D * omega)
     now.grip[0], now.grip[1] = abs(left) < bound, abs(right) < bound
+    if now.grip[0] + now.grip[1] == 2:
+        find_radius(left - right, now, geometry, period, s)
     P = s.P
     spread = 4 * (r / (period * sensor.encoder_every)) ** 2 * s.encoder_variance
     spread += 4 * D * D * (s.gyro_variance + P[BIAS, BIAS])
     spread += s.inertial**2 * (P[SCALE_LEFT, SCALE_LEFT] + P[SCALE_RIGHT, SCALE_RIGHT])
     if abs(left - right) > 4 * np.sqrt(spread) + TWIST:  # by the gyro, one of them slips
         wheel = 0 if abs(left) > abs(right) else 1
-        now.doubted[wheel] = now.grip[0] + now.grip[1] == 2
         now.grip[wheel] = 0
     count = now.grip[0] + now.grip[1]
     if count > 0:
@@ -306,8 +342,8 @@ def step(t: int, ring: Rows, i: int, geometry: Row, period: float, delay: int, s
         s.mean[OFFSET], s.P[OFFSET, OFFSET] = s.offset, START_OFFSET**2
     growth = geometry.load * now.acceleration[1]
     propagate(forward - s.mean[OFFSET], omega_dot, growth, jolt, now.grip, geometry, period, s)
-    for k in range(2):  # as after a puncture
-        s.P[SCALE_LEFT + k, SCALE_LEFT + k] += period * RADIUS_DOUBT**2 * now.doubted[k]
+    for k in range(SCALE_LEFT, N):
+        s.P[k, k] = max(s.P[k, k], now.doubt**2)
     measure(now, s)
 
 

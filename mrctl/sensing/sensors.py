@@ -60,7 +60,7 @@ SAMPLE = np.dtype(
         ("fix_taken", "?"),  # whether a fix was taken in this tick
         ("fix_arrives", "?"),  # whether it arrives
         ("grip", "u1", 2),  # whether the wheels grip, left and right; an estimator writes it
-        ("doubted", "u1", 2),  # whether what seems to be slip of each wheel may be another radius; likewise
+        ("doubt", "f8"),  # standard deviation that the wheel radii' relative errors have at least; likewise
         ("command", "f8", 2),  # derivative of the commanded twist that was computed in this tick, m/s² and rad/s²
     ],
     align=True,
@@ -114,7 +114,8 @@ def sample(tick: int, true: Row, noise: Row, period: float, s: Row, last: Row, n
         if wrong and k < 2:
             now.fix[k] += OUTLIER * (2 * noise.chance[2 + k] - 1)
     for k in range(2):
-        now.grip[k], now.doubted[k], now.command[k] = 1, 0, 0.0
+        now.grip[k], now.command[k] = 1, 0.0
+    now.doubt = 0.0
 
 
 @kernel

@@ -113,8 +113,8 @@ def test_start(tier):
 # What a robot meets: changes of the scenario, and the least share of time in which each of posture and twist is within
 # three standard deviations. A lifted wheel, whose encoder still counts, turns the heading by up to 4 mrad where the
 # filter believes in 0.5 mrad. Over 48 runs each, x, y, θ, V and θ̇ are within three standard deviations in this share of
-# the time: with a lifted wheel 0.995, 0.993, 0.90, 0.99, 0.99 in `lab` and 0.995, 0.997, 0.97, 0.93, 0.99 in `field`;
-# with the left wheel on ice 0.99, 0.98, 0.88, 0.87, 0.96 in `lab` and 0.99, 0.99, 0.91, 0.83, 0.96 in `field`.
+# the time: with a lifted wheel 0.995, 0.993, 0.90, 0.99, 0.99 in `lab` and 0.995, 0.997, 0.96, 0.93, 0.99 in `field`;
+# with the left wheel on ice 0.99, 0.99, 0.88, 0.87, 0.96 in `lab` and 0.996, 0.99, 0.93, 0.83, 0.97 in `field`.
 MEETS = {
     "lost fixes": ({"fix_lost": 0.5}, {}, (0.98,) * 5),
     "outlying fixes": ({"fix_outliers": 0.2}, {}, (0.98,) * 5),
@@ -131,23 +131,27 @@ MEETS = {
 
 
 WANTED = pytest.mark.xfail(strict=True, reason="the encoder of a lifted wheel is believed")
-MET = [pytest.param(t, n, marks=WANTED if n.endswith("on the ground") else ()) for n in MEETS for t in TIERS]
+MET = [(t, n) for n in MEETS for t in TIERS]
 
 
 @pytest.mark.parametrize("factor", [0.97, 1.02])
-def test_radius_changes(factor):
+@pytest.mark.parametrize(("tier", "position", "speed"), [("lab", 1e-3, 1e-3), ("field", 15e-3, 1.5e-3)])
+def test_radius_changes(tier, position, speed, factor):
     """A wheel that has another radius from one moment on is not taken for one that slips for the rest of the run."""
     event = Event(time=3.0, perturbation=Perturbation(left_radius_factor=factor))
-    scenario = Scenario(sensing=Sensing(estimator="ekf"), laps=2, events=(event,))
+    scenario = Scenario(sensing=Sensing(tier=tier, estimator="ekf"), laps=2, events=(event,))
     runs = simulate([scenario.replace(seed=seed) for seed in range(4)])
     assert not runs.failed.any()
     second = runs.isel(time=slice(runs.sizes["time"] // 2, None))
-    position = np.hypot(second.x_measured - second.x, second.y_measured - second.y)
-    assert np.sqrt((position**2).mean("time")).max() < 1e-3
-    assert abs((second.v_measured - second.v).mean("time")).max() < 1e-3
+    error = np.hypot(second.x_measured - second.x, second.y_measured - second.y)
+    assert np.sqrt((error**2).mean("time")).max() < position
+    assert abs((second.v_measured - second.v).mean("time")).max() < speed
 
 
-@pytest.mark.parametrize(("tier", "name"), MET)
+@pytest.mark.parametrize(
+    ("tier", "name"),
+    [pytest.param(*m, marks=WANTED) if m == ("lab", "lifted wheel, as if on the ground") else m for m in MET],
+)
 def test_within_three_deviations(tier, name):
     """With lost or outlying fixes or a wheel off the ground, errors stay where the filter says; on ice, less often."""
     sensing, changes, least = MEETS[name]

@@ -86,8 +86,9 @@ def textbook(s, sample, before, theta_dot_dot, loading):
     jump = abs(sample["acceleration"][0] - before["acceleration"][0])
     jolt = max(0, jump - laws.JUMP * np.sqrt(2 * s["acceleration_variance"]))
     Q = process_noise(x, grip, s, force, theta_dot_dot, growth, max(jolt, laws.LOAD) if loading else jolt)
-    Q[[SCALE_LEFT, SCALE_RIGHT], [SCALE_LEFT, SCALE_RIGHT]] += T * laws.RADIUS_DOUBT**2 * sample["doubted"]
     x, P = motion(x, force, theta_dot_dot, growth), F @ P @ F.T + Q
+    for scale in SCALE_LEFT, SCALE_RIGHT:
+        P[scale, scale] = max(P[scale, scale], sample["doubt"] ** 2)
     for k, wheel in enumerate((LEFT, RIGHT)):
         if not grip[k]:  # the angle of a wheel that slips says nothing of the robot, and is known afresh
             P[wheel], P[:, wheel] = 0, 0
@@ -123,7 +124,7 @@ def sample_of(s, rng, grip=(1, 1)):
     sample["gyro"], sample["acceleration"] = s["mean"][OMEGA] + rng.normal() * 0.01, rng.normal(size=2)
     sample["encoder_new"] = sample["gyro_new"] = True
     sample["grip"] = grip
-    sample["doubted"] = rng.integers(2, size=2)
+    sample["doubt"] = rng.choice([0.0, 0.03])
     return sample
 
 
@@ -236,6 +237,33 @@ class Drive:
             self.state = self.state + T / 10 * np.array([v * np.cos(direction), v * np.sin(direction), omega])
             self.angles = self.angles + T / 10 * np.array([v - HALF * omega, v + HALF * omega]) / RADIUS
         self.tick += 1
+
+
+@given(st.integers(0, 10**6), st.floats(-0.02, 0.02), st.floats(0.1, 1.0), st.booleans())
+@settings(max_examples=25, deadline=None)
+def test_another_radius(seed, difference, speed, calm):
+    """The radii are doubted when the mean difference, a decaying exponential, leaves its band, and only in calm."""
+    s, rng = random_filter(seed)
+    s["inertial"] = speed
+    sample = sample_of(s, rng)
+    sample["acceleration"], sample["doubt"] = (s["offset"] + (0.0 if calm else 1.01 * laws.CALM), 0), 0
+    counts = 2 * s["encoder_variance"] * (RADIUS / laws.AVERAGE) ** 2
+    turning = (2 * HALF) ** 2 * s["gyro_variance"] * T / (2 * laws.AVERAGE)
+    slope = np.zeros(N)  # of the difference by the state
+    slope[[BIAS, SCALE_LEFT, SCALE_RIGHT]] = -2 * HALF, speed, -speed
+    band = 4 * np.sqrt(counts + turning + slope @ s["P"] @ slope) + laws.TWIST
+    means = difference * (1 - (1 - T / laws.AVERAGE) ** np.arange(1, 501))
+    expected = np.flatnonzero(abs(means) > band)[:1]
+    found = None
+    for n in range(500):
+        laws.find_radius(difference, sample, CAR, T, s)
+        if sample["doubt"] > 0:
+            found = n
+            break
+    assert (found is not None) == (calm and len(expected) > 0)
+    if found is not None:
+        assert found == expected[0] and sample["doubt"] == pytest.approx(min(abs(means[found]) / speed, laws.DOUBT))
+        assert s["difference"] == 0
 
 
 def lab(**values):

@@ -19,7 +19,7 @@ PERIOD = 0.01
 NOISY = {"gyro_noise": 1e-3, "gyro_walk": 1e-3, "gyro_bias": 0.01, "accelerometer_noise": 1e-3,
          "accelerometer_walk": 1e-3, "accelerometer_bias": 0.1, "encoder_counts": 1000, "fix_position_noise": 0.01,
          "fix_heading_noise": 0.02, "fix_lost": 0.2, "fix_outliers": 0.1}  # fmt: skip
-STREAMS = [name for name in SAMPLE.names or () if name not in ("grip", "doubted", "command")]
+STREAMS = [name for name in SAMPLE.names or () if name not in ("grip", "doubt", "command")]
 
 
 def ideal(**values):
