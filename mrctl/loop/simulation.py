@@ -445,7 +445,12 @@ class Simulation:
         scanned = {}
         if self.estimator.scanner:
             scanned["scanned"] = "run", np.ones(size, bool), {"long_name": "whether its lidar scanned"}
-        return found.assign(self._parameters() | self._clearance(length) | scanned | faults | constants | gains)
+        parameters = {}
+        if (coefficients := self.parameters()) is not None:
+            axes, units = ("run", "feature", "channel"), {"units": "V"}
+            known, true = coefficients
+            parameters = {"parameters": (axes, known, units), "true_parameters": (axes, true, units)}
+        return found.assign(parameters | self._clearance(length) | scanned | faults | constants | gains)
 
     @property
     def faults(self) -> dict[str, list[str]]:
@@ -470,17 +475,21 @@ class Simulation:
         attributes = {"units": "m", "long_name": "distance of the footprint from the nearest obstacle"}
         return {"clearance": (("run", "time"), found, attributes)}
 
-    def _parameters(self) -> dict[str, Any]:
-        """Coefficients of the scaled features at the end, in V: the sum of prior and learner, and the true ones."""
+    def parameters(self) -> tuple[Array, Array] | None:
+        """Returns the coefficients of the scaled features now: the sum of prior and learner, and the true ones.
+
+        Returns:
+            Two arrays `(B, 8, 2)` in V, NaN where a robot has failed and where the second channel is steering; None
+            if the learner has no such coefficients.
+        """
         learner, hierarchy = self.hierarchy.learner, self.hierarchy
         learned = learner.parameters if isinstance(learner, Learner) else None
         if learned is None:
-            return {}
+            return None
         scale = feature_scale(self.plant.robot)[:, None]
         known = scale * hierarchy.prior.rows["c"] + learned
         true = scale * np.stack([inverse_coefficients(robot) for robot in self.plant.truth])
         known[self.plant.failed] = np.nan
         if self.scenarios[0].steering == "rigid":  # the second channel is steering
             known[:, :, 1] = true[:, :, 1] = np.nan
-        axes, units = ("run", "feature", "channel"), {"units": "V"}
-        return {"parameters": (axes, known, units), "true_parameters": (axes, true, units)}
+        return known, true

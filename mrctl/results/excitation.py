@@ -66,6 +66,22 @@ def strength(matrices: Array, rounding: float = ROUNDING) -> tuple[Array, Array]
     return np.where(finite[..., None], values, np.nan), np.where(finite[..., None], alone, np.nan)
 
 
+def alone(command: Array, period: float, half_track: Array, scale: Array) -> Array:
+    """Measures how well a whole motion determines the parameter of each feature alone.
+
+    Args:
+        command: Commanded twist in m/s, rad/s, `(…, n, 2)`; its derivative is taken by central differences.
+        period: Time between the samples in s.
+        half_track: Half track of the nominal robot in m, `(…,)`.
+        scale: Scales that the features are divided by, as from `feature_scale`, `(…, 8)`.
+
+    Returns:
+        1/(G⁻¹)_ii of the Gram matrix of all samples, `(…, 8)`; NaN where the motion is not finite.
+    """
+    x = feature_matrix(command, np.gradient(command, period, axis=-2), half_track[..., None], scale[..., None, :])
+    return strength(np.swapaxes(x, -1, -2) @ x / x.shape[-2])[1]
+
+
 def excitation(result: xr.Dataset, window: float = 4.0, motion: str = "commanded") -> xr.Dataset:
     """Measures how well the motion of the last seconds determines the parameters of the physical features.
 
@@ -93,7 +109,7 @@ def excitation(result: xr.Dataset, window: float = 4.0, motion: str = "commanded
         raise InputError(f"window: {window:g} s is shorter than two samples of {period:g} s")
     twist = np.stack([runs[name].transpose("run", "time").values for name in names], axis=-1)
     size, length = twist.shape[:2]
-    least, values, alone = (np.full((size, length, n), np.nan) for n in (1, 8, 8))
+    least, values, each = (np.full((size, length, n), np.nan) for n in (1, 8, 8))
     for row in range(size):  # one at a time, as its Gram matrices take 512 bytes a sample
         half_track, scale = runs["half_track"].values[row], runs["feature_scale"].values[row]
         alive = int(np.isfinite(twist[row]).all(axis=-1).sum())
@@ -102,14 +118,14 @@ def excitation(result: xr.Dataset, window: float = 4.0, motion: str = "commanded
         part = twist[row, :alive]
         x = feature_matrix(part, np.gradient(part, period, axis=0), half_track, scale)
         rounding = max(ROUNDING, np.finfo(float).eps * alive / samples)  # rounding of the sums grows with the run
-        values[row, :alive], alone[row, :alive] = strength(gram(x, samples), rounding)
+        values[row, :alive], each[row, :alive] = strength(gram(x, samples), rounding)
         least[row] = values[row, :, :1]
     spans = {"units": "1", "window": window}
     return xr.Dataset(
         {
             "least": (("run", "time"), least[..., 0], spans | {"long_name": "smallest eigenvalue of the Gram matrix"}),
             "eigenvalues": (("run", "time", "direction"), values, spans | {"long_name": "eigenvalues, ascending"}),
-            "alone": (("run", "time", "feature"), alone, spans | {"long_name": "excitation of each feature alone"}),
+            "alone": (("run", "time", "feature"), each, spans | {"long_name": "excitation of each feature alone"}),
         },
         {
             "time": runs["time"].values,

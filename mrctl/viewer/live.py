@@ -576,7 +576,8 @@ class Live(Page):
             if session.tick >= (len(self._laps) + 1) * ticks:
                 log = session.log(len(self._laps) * ticks)
                 self._laps += whole_laps(log, ticks, session.period, session.robot)
-            self._plots.score(now, self._laps[: self.tick // ticks])
+            laps, when = self._laps[: self.tick // ticks], f"at {session.time:.0f} s"
+            self._plots.score(now, laps, session.parameter_error(), when)
 
     def _show_past(self) -> None:
         """Draws the last seconds, or those around the moment that is shown: curves, and trails, which change less."""

@@ -16,7 +16,7 @@ from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.results.dataset import blank
 from mrctl.viewer.looks import Colour, Look, pale
 from mrctl.viewer.scene import EVENT_COLOUR
-from mrctl.viewer.score import table
+from mrctl.viewer.score import lessons, table
 
 Array = NDArray[np.float64]
 
@@ -48,6 +48,7 @@ if (!window.mrctlGoTo) {
         field.dispatchEvent(new Event('input', { bubbles: true }));
     }, true);
 }"></style>""".replace("GOTO", TIME := "Go to, s")
+LAST = 1e12  # place of what stands below the charts, which are added later; viser numbers elements from 1 on
 MAX_ROBOTS = 4  # number of robots whose curves are drawn
 
 
@@ -165,6 +166,7 @@ class Plots:
             self._score = gui.add_html("")
             self._cursor = gui.add_html("")
             gui.add_html(HOVER + GO_TO)
+            self._lessons = gui.add_html("", order=LAST)
             self.time = gui.add_number(TIME, 0.0, min=0.0, step=0.01, hint="A click on a curve sets it, too.")
 
     def set_robots(self, robots: Sequence[Look], period: float, obstacles: bool) -> None:
@@ -222,9 +224,10 @@ class Plots:
             values = [time, *(curve.values for curve in chart.curves)]
             _send(handle, (*(v[within][::step].astype(np.float32) for v in values), marks))
 
-    def score(self, now: Rows, laps: Sequence[dict[str, Array]]) -> None:
-        """Writes the score, as `score.table` does."""
+    def score(self, now: Rows, laps: Sequence[dict[str, Array]], error: Array | None, when: str) -> None:
+        """Writes the score above the charts, as `score.table` does, and below them what `score.lessons` says."""
         self._score.content = table(self._robots, now, laps)
+        self._lessons.content = lessons(self._robots, laps, error, when)
 
     def clear(self, span: float) -> None:
         """Draws empty charts of `span` s."""

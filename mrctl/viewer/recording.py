@@ -22,6 +22,7 @@ from mrctl.physics.stand import front_rates, stand, steer
 from mrctl.record import InputError
 from mrctl.results.controllers import title_of
 from mrctl.results.dataset import SIGNALS, blank, faults_of, scenarios_of
+from mrctl.results.excitation import parameter_error
 from mrctl.results.metrics import as_runs, summary
 from mrctl.scenario import Scenario
 from mrctl.sensing.scanner import Scanner
@@ -52,6 +53,8 @@ class Recording:
         failure: Reason of an early end, or "".
         faults: What `dataset.faults_of` returns.
         clearance: Distance from the nearest obstacle at each sample in m, `(T,)`; None where there are no obstacles.
+        parameter_error: Learned less true coefficients of the features at the end of the run in V, `(8, 2)`, as of
+            `results.excitation.parameter_error`; None where the result has none.
     """
 
     def __init__(self, run: xr.Dataset) -> None:
@@ -73,6 +76,8 @@ class Recording:
         near = bool(self.scenario.obstacles.shapes) and "clearance" in run
         self._scanned = "scanned" in run and run["scanned"].values.item() is True
         self.clearance: Array | None = run["clearance"].values[: len(self.log)] if near else None
+        known = "parameters" in run
+        self.parameter_error: Array | None = parameter_error(run).values[0] if known else None
 
     @property
     def _first(self) -> int:

@@ -111,6 +111,8 @@ class Replay(Page):
         self._times, self._events = times, event_times(recordings)
         self._lap = round(recordings[0].scenario.reference.period / recordings[0].period)
         self._laps = whole_laps(self._log, self._lap, recordings[0].period, read_robot(recordings[0].model))
+        learned = [np.full((8, 2), np.nan) if r.parameter_error is None else r.parameter_error for r in recordings]
+        self._parameter_error = None if np.isnan(learned).all() else np.stack(learned)
         self._labels, sensing = [robot.label for robot in robots], [r.scenario.sensing for r in recordings]
         self._latencies = [s.periods("fix_latency", r.period) for s, r in zip(sensing, recordings, strict=True)]
         off = np.nan_to_num(np.hypot(*np.moveaxis(error(self._log), -1, 0)))
@@ -211,7 +213,8 @@ class Replay(Page):
             self._plotted = self.time
             self.scrubber.value = self._plots.time.value = self.time  # a click there again changes it again
             tick = min(round(self.time / self.recordings[0].period), len(self._log) - 1)
-            self._plots.score(self._log[tick], self._laps[: (tick + 1) // self._lap])
+            laps = self._laps[: (tick + 1) // self._lap]
+            self._plots.score(self._log[tick], laps, self._parameter_error, "at the end")
             start, end = self._interval.value
             self._plots.point((self.time - start) / (end - start) if end > start else 0.0)
 

@@ -1,15 +1,16 @@
-"""The score of robots while they drive: the error now, and the metrics of their laps, which are those of the tables."""
+"""The score of robots while they drive, with the metrics of the tables, and what their last lap could teach."""
 
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mrctl.control.features import feature_scale
+from mrctl.control.features import NAMES, feature_scale
 from mrctl.kernel import Rows
+from mrctl.results.excitation import alone
 from mrctl.results.metrics import excitation, lap_metrics
 from mrctl.theory.robot import Robot
 from mrctl.viewer.looks import Look
@@ -28,7 +29,9 @@ SMALL = 1e-3  # below which a number is written with an exponent
 
 
 def whole_laps(log: Rows, ticks: int, period: float, robot: Robot) -> list[dict[str, Array]]:
-    """Returns the metrics `(B,)` of `results.metrics.METRICS` of each whole lap, by name.
+    """Returns the metrics `(B,)` of `results.metrics.METRICS` of each whole lap, by name, and `alone`, `(B, 8)`.
+
+    The last is the excitation of each feature alone, as of `results.excitation.alone`.
 
     Args:
         log: Record of `TICK` of each sample from the start of a lap and of each robot, `(T, B)`.
@@ -41,8 +44,8 @@ def whole_laps(log: Rows, ticks: int, period: float, robot: Robot) -> list[dict[
         data = {name: log[name][start : start + ticks].T for name in log.dtype.names or ()}
         command = np.stack([data["v_command"], data["omega_command"]], axis=-1)
         size, scale = len(command), feature_scale(robot)
-        excited = excitation(command, period, np.full(size, robot.half_track), np.tile(scale, (size, 1)))
-        laps.append(lap_metrics(data, data, period) | {"excitation": excited})
+        motion = command, period, np.full(size, robot.half_track), np.tile(scale, (size, 1))
+        laps.append(lap_metrics(data, data, period) | {"excitation": excitation(*motion), "alone": alone(*motion)})
     return laps
 
 
@@ -66,14 +69,40 @@ def table(robots: Sequence[Look], now: Rows, laps: Sequence[dict[str, Array]]) -
         last["energy"],
         last["excitation"],
     ]
+    return _table("mrctl-score", "", robots, HEADINGS, columns)
+
+
+def lessons(robots: Sequence[Look], laps: Sequence[dict[str, Array]], error: Array | None, when: str) -> str:
+    """Returns what the last lap could teach about each feature, and what has been learned, in HTML.
+
+    Args:
+        robots: Look of each robot.
+        laps: As from `whole_laps`, of the laps until now.
+        error: Learned less true coefficients of the features in V, `(B, 8, 2)`, NaN where there are none; None if no
+            robot has any.
+        when: When this error holds.
+    """
+    excited = laps[-1]["alone"].T if laps else np.full((len(NAMES), len(robots)), np.nan)
+    found = _table("mrctl-excitation", "excitation alone, last lap", robots, NAMES, excited)
+    if error is not None:
+        for k, channel in enumerate("ΣΔ"):
+            title = f"error of learned coefficient {channel}, V, {when}"
+            found += _table(f"mrctl-coefficients-{k}", title, robots, NAMES, error[:, :, k].T)
+    return found
+
+
+def _table(
+    name: str, title: str, robots: Sequence[Look], headings: Sequence[str], rows: Iterable[Sequence[float]]
+) -> str:
+    """Returns a table in HTML with a row for each heading and a column for each robot."""
     names = "".join(f'<th style="{NUMBER};color:rgb{r.colour}">{html.escape(r.label)}</th>' for r in robots)
-    rows = "".join(
+    lines = "".join(
         f'<tr><td style="{HEADING}">{heading}</td>{_cells(values)}</tr>'
-        for heading, values in zip(HEADINGS, columns, strict=True)
+        for heading, values in zip(headings, rows, strict=True)
     )
     return (
-        f'<div style="margin:0.3em 1em;overflow-x:auto"><table id="mrctl-score" style="font-size:0.75em">'
-        f'<tr><td style="{HEADING}"></td>{names}</tr>{rows}</table></div>'
+        f'<div style="margin:0.3em 1em;overflow-x:auto"><table id="{name}" style="font-size:0.75em">'
+        f'<tr><td style="{HEADING}">{title}</td>{names}</tr>{lines}</table></div>'
     )
 
 

@@ -283,6 +283,17 @@ class Session:
             parts[: len(done), rows] = done
         return parts
 
+    def parameter_error(self) -> Array | None:
+        """Returns the learned less the true coefficients of the scaled features now, `(B, 8, 2)` in V.
+
+        They are NaN for learners without such coefficients; None if no learner has any.
+        """
+        found = np.full((self.size, 8, 2), np.nan)
+        for rows, sim in self.simulations:
+            if (coefficients := sim.parameters()) is not None:
+                found[rows] = coefficients[0] - coefficients[1]
+        return None if np.isnan(found).all() else found
+
     def clearance(self, first: int = 0) -> Array | None:
         """Returns the distances from the nearest obstacle in m from a tick on, `(T, B)`; None without obstacles.
 

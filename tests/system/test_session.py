@@ -1,12 +1,19 @@
 """A session under way: what is done to it is kept, and the saved session runs again headless to the bit."""
 
+import io
+
 import numpy as np
+import pandas as pd
 import pytest
 
 from mrctl import FEEDFORWARDS, Circle, Event, InputError, Perturbation, RoundedSquare, Scenario
+from mrctl.control.features import NAMES
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
+from mrctl.results.excitation import alone, parameter_error
 from mrctl.sensing.tiers import Sensing
+from mrctl.viewer.looks import Look
+from mrctl.viewer.score import lessons, whole_laps
 from mrctl.viewer.session import Session, changed
 
 BASE = Scenario(reference=Circle(period=4, radius=0.5), seed=3)
@@ -51,11 +58,11 @@ def test_saved_session(reference, tmp_path):
     assert again[0].laps == np.ceil(5.02 / reference.period)
     results = simulate(again)  # the three of them; one alone goes through dm_control
     same(session, [results.isel(run=k) for k in range(3)])
-    alone = Session(scenarios[:1])
-    drive(alone, 20)
-    alone.apply(push=(20.0, 0.0, 0.0))
-    drive(alone, 60)
-    same(alone, [simulate(alone.saved()[0])])
+    single = Session(scenarios[:1])
+    drive(single, 20)
+    single.apply(push=(20.0, 0.0, 0.0))
+    drive(single, 60)
+    same(single, [simulate(single.saved()[0])])
 
 
 def test_refused_change():
@@ -152,3 +159,27 @@ def test_blocks(monkeypatch):
     parts = simulate(scenarios)
     for name in ("x_ref", "omega_ref", "x", "voltage_left"):
         assert parts[name].values.tobytes() == whole[name].values.tobytes()
+
+
+def test_what_is_learned():
+    """What a session says of coefficients and of a lap is what a result of the same run says; the network has none."""
+    scenarios = [
+        Scenario(laps=1, prior="model", learner="rls", perturbation=Perturbation(mass_factor=1.5)),
+        Scenario(laps=1, learner="fel"),
+    ]
+    session, single = Session(scenarios), simulate(scenarios[:1])
+    drive(session, single.sizes["time"])
+    error, expected = session.parameter_error(), parameter_error(single).values[0]
+    assert error is not None and np.array_equal(error[0], expected) and np.isnan(error[1]).all()
+    assert abs(expected).max() > 0.1 and Session(scenarios[1:]).parameter_error() is None
+    laps = whole_laps(session.log(), session.tick, session.period, session.robot)
+    robots = [Look("A & B", (1, 2, 3)), Look("fel", (4, 5, 6))]
+    excited, common, difference = pd.read_html(io.StringIO(lessons(robots, laps, error, "now")), header=0, index_col=0)
+    assert [*excited.index] == [*common.index] == [*NAMES] and [*excited.columns] == ["A & B", "fel"]
+    motion = single.isel(run=0)
+    twist = np.stack([motion.v_command.values, motion.omega_command.values], -1)
+    there = alone(twist, session.period, motion.half_track.values, motion.feature_scale.values)
+    assert excited["A & B"].values == pytest.approx(there, rel=0.06)
+    for table, k in ((common, 0), (difference, 1)):
+        assert table["A & B"].astype(float).values == pytest.approx(expected[:, k], rel=0.06)
+        assert (table["fel"] == "–").all()

@@ -13,7 +13,9 @@ from PIL import Image
 
 from mrctl import Circle, Event, Perturbation, Scenario, Sweep, save
 from mrctl.cli import main
+from mrctl.control.features import NAMES
 from mrctl.loop.simulation import simulate
+from mrctl.results.excitation import alone
 from mrctl.results.metrics import per_lap
 from mrctl.sensing.tiers import Sensing
 from mrctl.sweep import jobs
@@ -594,6 +596,12 @@ def test_replay(browser, tmp_path):
         score = [f"{1e3 * laps.position_rmse.values[0].min():.3g}", f"{100 * laps.feedback_share.values[0, 1]:.3g}"]
         score += [f"{value:.2g}" for value in laps.excitation.values[:1, 1]]
         until(lambda: {*score, "–"} <= set(page.inner_text("#mrctl-score").split()), "the score of the tables")
+        # Below the curves: what the last lap excites.
+        motion = (result[name].values[:1, 600:1200] for name in ("v_command", "omega_command"))
+        excited = alone(np.stack([*motion], -1), 0.01, result.half_track.values[:1], result.feature_scale.values[:1])[0]
+        lines = page.inner_text("#mrctl-excitation").splitlines()[1:]
+        assert [line.split("\t")[0] for line in lines] == [*NAMES]
+        assert [float(line.split("\t")[1]) for line in lines] == pytest.approx(excited, rel=0.05)
         stated = f"RMS distance to the reference: {1e3 * laps.position_rmse.values[0, 1]:.4g} mm"
         assert stated in page.inner_text("#mrctl-status") and "_" not in page.inner_text("#mrctl-status")
         pose = f"window.__viserMutable.nodePoseData[{GHOST!r}].wxyz"

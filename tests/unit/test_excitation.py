@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from mrctl.control.features import feature_scale
+from mrctl.control.features import feature_matrix, feature_scale
 from mrctl.record import InputError
 from mrctl.results import plots
-from mrctl.results.excitation import excitation, gram, parameter_error, strength
+from mrctl.results.excitation import alone, excitation, gram, parameter_error, strength
 
 PERIOD = 0.01
 RNG = np.random.default_rng(2)
@@ -62,6 +62,19 @@ def test_replaceable():
     assert values[0] == 0 and alone[0] == alone[2] == 0
     left = b - a * (a @ b) / (a @ a)
     assert alone[1] == pytest.approx(np.mean(left**2), rel=1e-6)
+
+
+def test_alone(robot):
+    """Over a whole motion, each feature has the mean square that regression on the seven others leaves of it."""
+    twist, scale = RNG.uniform(0.1, 1, (2, 300, 2)), np.tile(feature_scale(robot), (2, 1))
+    twist[1, 200:] = np.nan
+    found = alone(twist, PERIOD, np.full(2, robot.half_track), scale)
+    x = feature_matrix(twist[0], np.gradient(twist[0], PERIOD, axis=0), robot.half_track, scale[0])
+    for k in range(8):
+        others = np.delete(x, k, axis=1)
+        left = x[:, k] - others @ np.linalg.lstsq(others, x[:, k], rcond=None)[0]
+        assert found[0, k] == pytest.approx(np.mean(left**2), rel=1e-6)
+    assert np.isnan(found[1]).all()
 
 
 def test_sinusoids(robot):
