@@ -164,7 +164,11 @@ def _expanded(arguments: list[str]) -> list[str]:
     for argument in rest:
         flag, given, value = argument.partition("=")
         if flag == "--perturbation":
-            perturbation = Perturbation.from_dict(value if given else next(rest, ""), "perturbation")
+            if not (name := value if given else next(rest, "")) or name.startswith("--"):
+                raise InputError(
+                    "perturbation: needs a name, such as all, or a flag such as --perturbation.mass-factor"
+                )
+            perturbation = Perturbation.from_dict(name, "perturbation")
             for field, changed in perturbation.model_dump(exclude_defaults=True).items():
                 found += [f"--perturbation.{field.replace('_', '-')}", str(changed)]
         elif flag in SHORT:
@@ -232,13 +236,29 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
         raise InputError(describe(error)) from None
     except SystemExit as stop:
         if stop.code:
-            for flag in arguments:
-                if flag.startswith("--"):
-                    Scenario.refuse_moved(flag[2:].partition("=")[0].replace("-", "_"))
+            _refuse_known(arguments)
             raise InputError(_one_line(complaints.getvalue())) from None
         if _is_short_help(arguments):
             print(_further_flags(arguments[0]))
         raise
+
+
+def _refuse_known(arguments: Sequence[str]) -> None:
+    """Refuses flags of a scenario's fields that have none, or that had one in an earlier version.
+
+    Raises:
+        InputError: There is such a flag; the message says what to do in its place.
+    """
+    if arguments[0] not in ("run", "navigate", "identify", "view"):
+        return
+    for flag in arguments:
+        if flag.startswith("--"):
+            name = flag[2:].partition("=")[0].replace("-", "_")
+            Scenario.refuse_moved(name)
+            if name in FROM_FILES:
+                raise InputError(f"{name}: has no flag; set it in a scenario file, as for mrctl run scenario.toml")
+            if arguments[0] == "navigate" and name in NOT_OF_MISSIONS:
+                raise InputError(f"{name}: has no flag here, because the mission sets it")
 
 
 def _deferred(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
@@ -263,6 +283,10 @@ def _one_line(box: str) -> str:
     parts = re.split(r"(?:^|\n)[-─]{8,}(?:\n|$)", "\n".join(lines).strip())
     parts = [" ".join(part.split()) for part in parts if part.strip()]
     text = re.sub(r"\[/?bold\]", "", parts[min(titled, len(parts) - 1)]) if parts else "bad arguments"
+    if match := re.match(r"Error parsing -*([\w.-]+): no type matching (.*?) could be instantiated", text):
+        return f"{match[1]}: expected {re.sub('[{}]', '', match[2]).replace('|', ' or ')}"
+    if match := re.match(r"Error parsing -*([\w.-]+): invalid literal for int\(\) with base 10: (.*)", text):
+        return f"{match[1]}: {match[2]} is not a whole number"
     pattern = r"Error parsing (\S*): \d+ validation errors? for \w+ (?:([\w.]+) (?=[A-Z]))?(.*?) \[type="
     if not (match := re.match(pattern, text)):
         return text
@@ -656,7 +680,7 @@ def tune(
     With --search, finds settings of a feedforward instead, by driving; the same command resumes after an interrupt.
 
     Args:
-        robot: Robot to design for: `car`, `turtlebot`, `racecar`, or an MJCF file; by default the world's own.
+        robot: Robot to design for: `car`, `turtlebot`, `racecar`, or an MJCF file.
         wheels: Joints of the two driven wheels, left and right; by default the two with a <dcmotor>.
         steering: Joints of the steered wheels, at most two; by default the upright joints with an actuator.
         chassis: Body that carries the wheels; by default the one at their root.
@@ -666,7 +690,7 @@ def tune(
         time_constant: Time constant of the closed loop in s, for the IMC rule in place of the design.
         search: Feedforward whose settings to search, such as model+rls; none for the PID; or one of your own, such as
             my_file.py:MyController, whose class has an attribute such as search = {"gain": (0.01, 1.0)}.
-        tier: Sensing tiers to search in, each separately.
+        tier: With --search: sensing tiers to search in, each separately.
         out: Folder for the table, the measured responses and their figure; with --search for the table and the runs, by
             default a folder in search.
         json: Print JSON instead of a table.
@@ -681,6 +705,8 @@ def tune(
 
         print(find(search, tier, out, json))
         return
+    if tier != TIERS:
+        raise InputError("tier: is of --search; the design takes its delays from --delay")
     _check_world(world, RobotFile.from_dict({"path": robot}, "robot"))
     from mrctl.experiments import tuning
     from mrctl.physics.mjcf import load_robot
@@ -744,8 +770,10 @@ def check(
         chassis: Body that carries the wheels; by default the one at their root.
         json: Print JSON instead of a table.
     """
-    from mrctl.physics.files import SHIPPED
+    from mrctl.physics.files import SHIPPED, find
 
+    if not robot.endswith(".xml") and robot not in SHIPPED and not find(robot).is_file():
+        raise InputError(f"robot: {robot} is neither {', '.join(SHIPPED)} nor an MJCF file, which ends in .xml")
     if robot in SHIPPED or wheels or steering or chassis:
         _check_world("flat", RobotFile.from_dict({"path": robot}, "robot"))
     else:

@@ -80,6 +80,7 @@ def simulate(
     at_once = 1 if any(stages.values()) else threads
     with tqdm(total=total, unit="tick", unit_scale=True, disable=not progress) as bar:
         run([simulation for _, simulation in parts], bar.update if progress else None, threads=at_once)
+        bar.total = bar.n  # where runs ended early, at their goals or because they failed
     whole = dataset.combine([(rows, simulation.result()) for rows, simulation in parts], given)
     return whole.isel(run=0) if isinstance(scenarios, Scenario) else whole
 

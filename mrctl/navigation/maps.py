@@ -13,7 +13,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from pydantic import Field
 
 from mrctl.kernel import Array
@@ -86,14 +86,21 @@ def read_map(path: str | Path) -> Map:
     try:
         values = yaml.safe_load(read_file(path))
     except (yaml.YAMLError, RecursionError) as error:
-        raise InputError(f"{path}: {' '.join(str(error).split())}") from None
+        text = " ".join(str(error).replace('in "<byte string>", ', "").split())
+        raise InputError(f"{path}: no yaml: {text}") from None
     if not isinstance(values, dict):
         raise InputError(f"{path}: no map: not a yaml file of fields such as image and resolution")
-    values = {name: value for name, value in values.items() if name in MapFile.model_fields}  # tools add others
-    file = MapFile.from_dict(values, str(path))
+    others = [str(name) for name in values if name not in MapFile.model_fields]  # which tools add
+    try:
+        file = MapFile.from_dict({k: v for k, v in values.items() if k not in others}, str(path))
+    except InputError as error:
+        raise InputError(f"{error}; not known: {', '.join(others)}" if others else str(error)) from None
     if file.free_thresh >= file.occupied_thresh:
         raise InputError(f"{path}: free_thresh: must be below occupied_thresh")
-    pixels = _pixels(Path(path).parent / file.image)
+    image = Path(path).parent / file.image
+    if not image.is_file():
+        raise InputError(f"{path}: image: no file {image}")
+    pixels = _pixels(image)
     # As map_server: `trinary` averages transparency as one more channel, `scale` takes it for unknown.
     opaque = np.ones(pixels.shape[:2], bool)
     if file.mode == "scale" and pixels.shape[2] in (2, 4):
@@ -125,5 +132,7 @@ def _pixels(path: Path) -> Array:
                 return np.asarray(image, float).reshape(image.height, image.width, -1)
     except InputError:
         raise
+    except UnidentifiedImageError:
+        raise InputError(f"{path}: no image that can be read") from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: no image that can be read: {' '.join(str(error).split())}") from None

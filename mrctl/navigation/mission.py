@@ -113,6 +113,8 @@ def order_of(folder: str | Path) -> Order:
         InputError: There is no mission in the folder, or one of an older version, which was not saved whole.
     """
     path = Path(folder) / "mission.json"
+    if Path(folder).is_dir() and not path.exists():
+        raise InputError(f"{folder}: holds no mission, as there is no mission.json in it")
     try:
         values = json.loads(read_file(path, LARGEST))
     except ValueError:
@@ -150,7 +152,7 @@ def task_of(
     name, colon, seed = world.partition(":")
     if colon and name in GENERATORS:
         if not (seed.isdecimal() and len(seed) < 10):
-            raise InputError(f"world: {world}: the seed must be a number below 10⁹, as in {name}:3")
+            raise InputError(f"world: {world}: the seed must be a whole number from 0 to 999999999, as in {name}:3")
         length, width = np.ptp(robot_of(scenario)[0], axis=0).tolist()
         made = GENERATORS[name](length, width, int(seed))
         return made.replace(start=start or made.start, goal=goal or made.goal, map=chart)

@@ -32,7 +32,7 @@ def read_sdf(path: str | Path) -> Obstacles:
     try:
         world = ElementTree.fromstring(read_file(path)).find("world")
     except ElementTree.ParseError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(f"{path}: no SDF file, as it is not XML: {error}") from None
     if world is None:
         raise InputError(f"{path}: no SDF file with a <world>")
     shapes = []

@@ -15,9 +15,10 @@ from mrctl.kernel import Array
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines
 
-PLACES, SPACING = 200, 0.02  # that are remembered, and least m between two of them; chosen, as what follows
-LOOK = 0.2  # m: how far back is the place to which the robot steers
-BEHIND = 0.1  # m: the robot looks so far behind it for obstacles
+# All values are chosen.
+PLACES, SPACING = 200, 0.02  # number of places that are remembered, and the least distance of two of them in m
+LOOK = 0.2  # distance in m of the place behind the robot to which it steers
+BEHIND = 0.1  # distance in m behind the robot within which it looks for obstacles
 
 
 class Trail:

@@ -24,6 +24,11 @@ def find(name: str) -> Path:
     return Path(name) if name.endswith(".xml") else models_folder() / f"{name}.xml"
 
 
+def _not_there(name: str, path: Path) -> str:
+    """Returns what is wrong with a name that leads to no file."""
+    return f"{name} is not an MJCF file, which ends in .xml" if Path(name).exists() else f"no file {path}"
+
+
 def robot_path(robot: RobotFile) -> Path:
     """Returns the path of a robot's MJCF file.
 
@@ -32,7 +37,7 @@ def robot_path(robot: RobotFile) -> Path:
     """
     path = find(robot.path)
     if not path.is_file() or not (robot.path.endswith(".xml") or robot.path in SHIPPED):
-        raise InputError(f"robot.path: no file {path}; shipped robots: {', '.join(SHIPPED)}")
+        raise InputError(f"robot.path: {_not_there(robot.path, path)}; shipped robots: {', '.join(SHIPPED)}")
     check_bounds(path)
     return path
 
@@ -52,6 +57,6 @@ def world_path(world: str) -> Path:
     if not path.is_file():
         others = (*SHIPPED, "scenery")
         shipped = ", ".join(sorted(p.stem for p in models_folder().glob("*.xml") if p.stem not in others))
-        raise InputError(f"world: no file {path}; shipped worlds: {shipped}")
+        raise InputError(f"world: {_not_there(world, path)}; shipped worlds: {shipped}")
     check_bounds(path)
     return path

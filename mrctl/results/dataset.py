@@ -395,7 +395,7 @@ def open_result(path: str | Path) -> xr.Dataset:
             raise InputError(f"{folder}: {lost} chunks are missing")
     for name in result.variables:
         with reading_chunks(f"{path}/{name}"):
-            result[name].load()
+            result.variables[name].load()  # alone, without its coordinates
     for name in (WHOLE, WHOLE_BEFORE_0_10_2):
         result.attrs.pop(name, None)
     if missing := {"scenarios", "versions", "control_period"} - set(result.attrs):

@@ -23,12 +23,15 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Arc, Circle, FancyArrowPatch, FancyBboxPatch, Polygon
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import LogFormatterSciNotation
+from numpy.typing import NDArray
 
 from mrctl.record import InputError
 from mrctl.results import excitation as exciting
 from mrctl.results.controllers import colours_of
 from mrctl.results.dataset import scenarios_of
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap
+from mrctl.scenario import Scenario
+from mrctl.theory.obstacles import turned
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 
 COLUMN, PAGE = 88 / 25.4, 180 / 25.4  # inches
@@ -135,14 +138,16 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
 
 @styled
 def path(result: xr.Dataset, window: tuple[float, float] | None = None, lap: int | None = None) -> Figure:
-    """Draws the path of P over that of the reference; a dot marks the start. Obstacles that stand still are grey."""
+    """Draws the path of P over that of the reference; a dot marks the start, a star the goal.
+
+    Obstacles are grey; one that moves is drawn as an outline where it is at the end, with a dotted line from where it
+    was at the beginning.
+    """
     figure, (axes,) = _figure(COLUMN, COLUMN * 0.95)
-    for shape in scenarios_of(as_runs(result))[0].obstacles.shapes if "clearance" in result else ():
-        if shape.course is None:
-            disc = shape.kind == "disc"
-            patch = Circle((shape.x, shape.y), shape.radius) if disc else Polygon(shape.vertices)
-            axes.add_patch(patch).set(color="0.75", lw=0)
     curves = _curves(result, window, lap)
+    if "scenarios" in result.attrs:
+        times = max((data["time"].values[np.isfinite(data["x"].values)] for data, *_ in curves), key=len)
+        _surroundings(axes, scenarios_of(as_runs(result))[0], times)
     _references(axes, curves, "x_ref", "y_ref")
     for data, _, style in curves:
         x, y = data["x"].values, data["y"].values
@@ -463,6 +468,23 @@ def _figure(width: float, height: float, rows: int = 1, columns: int = 1, sharey
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots(rows, columns, sharex=rows > 1, sharey=sharey, squeeze=False)
     return figure, list(axes.flat)
+
+
+def _surroundings(axes: Axes, scenario: Scenario, times: NDArray[np.float64]) -> None:
+    """Draws the obstacles of a scenario, where they are at times in s, and its goal."""
+    for shape in scenario.obstacles.shapes:
+        disc = shape.kind == "disc"
+        corners = np.array([(shape.x, shape.y)] if disc else shape.vertices)
+        if shape.course is None:
+            patch = Circle(corners[0], shape.radius) if disc else Polygon(corners)
+            axes.add_patch(patch).set(color="0.75", lw=0)
+        elif len(times):
+            places = np.stack([turned(corners, pose) for pose in shape.course.sample(times).pose])
+            patch = Circle(places[-1, 0], shape.radius) if disc else Polygon(places[-1])
+            axes.add_patch(patch).set(facecolor="none", edgecolor="0.6", lw=0.8)
+            axes.plot(*places.mean(axis=1).T, ":", color="0.6", lw=0.8)
+    if scenario.goal is not None:
+        axes.plot(*scenario.goal[:2], "*", ms=7, color="0.25", zorder=4)
 
 
 def _curves(result: xr.Dataset, window: tuple[float, float] | None, lap: int | None) -> list[Curve]:

@@ -119,6 +119,7 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str]] = [
     ("out/result.zarr/voltage_left", shutil.rmtree, "result.zarr/voltage_left: missing"),
     ("out/result.zarr/x/zarr.json", recoded, "result.zarr/x: has the codec gzip, which mrctl does not write"),
     ("store/signals.zarr/signals/zarr.json", recoded, "signals.zarr/signals: has the codec gzip"),
+    ("out/result.zarr/seed/c/0", cut, "result.zarr/seed: damaged"),
     ("out/result.zarr/x/c", shutil.rmtree, "result.zarr/x: 1 chunks are missing"),
     ("out/result.zarr/x/c/0/0", flipped, "result.zarr/x"),
     ("out/result.zarr/x/zarr.json", cleared, "result.zarr"),

@@ -95,7 +95,7 @@ def test_changed_mission(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     file.write_text("{")
     assert "is not JSON" in refused(capsys, "navigate", str(out))
     file.unlink()
-    assert "mission.json" in refused(capsys, "navigate", str(out))
+    assert "holds no mission" in refused(capsys, "navigate", str(out))
 
 
 def test_outcomes() -> None:
@@ -160,7 +160,7 @@ def test_ends() -> None:
         (["doorway:3", "--robot"], "robot: needs a value"),
         (["doorway:3", "--localise", "stars"], "sensing.localisation"),
         (["doorway:3", "--localise", "--json"], "localise: needs a value"),
-        (["doorway:x"], "the seed must be a number"),
+        (["doorway:x"], "the seed must be a whole number"),
         (["maze:3"], "maze:3 is neither a file"),
         (["doorway:3", "--map", "none.toml"], "map: no file none.toml"),
         (["doorway:3", "--map", "plan.png"], "map: plan.png is not a file that ends in .toml, "),

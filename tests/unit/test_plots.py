@@ -14,8 +14,10 @@ from matplotlib.image import imread
 from mrctl.record import InputError
 from mrctl.results import metrics, plots
 from mrctl.results.controllers import CONTROLLERS, colours_of
-from mrctl.scenario import FEEDFORWARDS
+from mrctl.scenario import FEEDFORWARDS, Scenario
+from mrctl.theory.obstacles import Box, Disc, Obstacles
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
+from mrctl.theory.references import Waypoints
 from mrctl.viewer.looks import looks
 
 LAP = 2.0
@@ -193,6 +195,27 @@ def test_names_do_not_overlap():
     (axes,) = plots.learning_curve(result, ["lateral_rmse"]).axes
     heights = sorted(text.xyann[1] for text in axes.texts)
     assert len(heights) == 7 and min(np.diff(heights)) > 0.07
+
+
+def test_surroundings():
+    """A path shows what stands and what moves, at the end of the time that is drawn, and the goal."""
+    course = Waypoints(points=((0, 2), (6, 2)), speed=0.5, closed=False)
+    shapes = Disc(x=1, y=1, radius=0.3), Box(x=0, y=0.5, length=0.4, width=0.2, course=course)
+    scenario = Scenario(obstacles=Obstacles(shapes=shapes), goal=(3, 0, 0))
+    result = make()
+    result.attrs["scenarios"] = json.dumps([scenario.model_dump(mode="json")] * 2)
+    (axes,) = plots.path(result.isel(time=slice(0, 100))).axes
+    disc, box = axes.patches
+    assert tuple(disc.center) == (1, 1) and disc.radius == 0.3 and disc.get_facecolor() != box.get_facecolor()
+    end = course.sample(np.array([result.time.values[99]])).pose[0]
+    assert np.ptp(box.get_xy()[:, 0]) == pytest.approx(0.4) and end[2] == pytest.approx(0, abs=1e-9)
+    assert box.get_xy()[:4].mean(axis=0) == pytest.approx(end[:2] + [0, 0.5])
+    dots, star = (
+        next(line for line in axes.lines if wanted(line))
+        for wanted in (lambda line: line.get_linestyle() == ":", lambda line: line.get_marker() == "*")
+    )
+    assert dots.get_xydata()[[0, -1]] == pytest.approx(np.array([[0, 2.5], end[:2] + [0, 0.5]]))
+    assert star.get_xydata().tolist() == [[3, 0]]
 
 
 def test_failures_are_shown():
