@@ -24,10 +24,9 @@ from typing import Annotated, Any, Literal
 
 import pydantic
 import tyro
-from pydantic import ValidationError
 
 from mrctl import __version__
-from mrctl.record import InputError, Record, describe, printable, reading
+from mrctl.record import InputError, Record, printable, reading
 from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.sensing.tiers import LAB, TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -232,8 +231,6 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
                 "mrctl COMMAND --help explains a command, mrctl --version prints the version.",
                 args=["--help" if argument == "--help-all" else argument for argument in arguments],
             )
-    except ValidationError as error:  # raised by the scenario itself, and passed on by tyro
-        raise InputError(describe(error)) from None
     except SystemExit as stop:
         if stop.code:
             _refuse_known(arguments)
@@ -257,7 +254,7 @@ def _refuse_known(arguments: Sequence[str]) -> None:
             Scenario.refuse_moved(name)
             if name in FROM_FILES:
                 raise InputError(f"{name}: has no flag; set it in a scenario file, as for mrctl run scenario.toml")
-            if arguments[0] == "navigate" and name in NOT_OF_MISSIONS:
+            if arguments[0] == "navigate" and name in NOT_OF_MISSIONS and name != "goal":  # it has its own --goal
                 raise InputError(f"{name}: has no flag here, because the mission sets it")
 
 
@@ -276,7 +273,7 @@ def _deferred(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
 def _one_line(box: str) -> str:
     """Returns the message in one of tyro's boxes as one line.
 
-    The box is drawn in Unicode or ASCII. A message of pydantic becomes `field: reason`.
+    The box is drawn in Unicode or ASCII. The message of a record that is a part of a scenario gets the whole path.
     """
     titled = "╭" not in box  # without box characters the title is a part of its own
     lines = [line.strip("│| ") for line in box.splitlines() if not line.startswith(("╭", "╰", "+"))]
@@ -287,12 +284,12 @@ def _one_line(box: str) -> str:
         return f"{match[1]}: expected {re.sub('[{}]', '', match[2]).replace('|', ' or ')}"
     if match := re.match(r"Error parsing -*([\w.-]+): invalid literal for int\(\) with base 10: (.*)", text):
         return f"{match[1]}: {match[2]} is not a whole number"
-    pattern = r"Error parsing (\S*): \d+ validation errors? for \w+ (?:([\w.]+) (?=[A-Z]))?(.*?) \[type="
-    if not (match := re.match(pattern, text)):
+    if not (match := re.match(r"Error parsing (\S+): (.*)", text)):
         return text
-    path = [part for part in match[1].split(".") if part not in ("__tyro-dummy-inner__", "scenario", "")]
-    field = ".".join([*path, *([match[2]] if match[2] else [])])
-    return ": ".join(part for part in (field, match[3].removeprefix("Value error, ")) if part)
+    parts = match[1].removeprefix("--").split(".")
+    path = ".".join(part for part in parts if part not in ("__tyro-dummy-inner__", "scenario"))
+    joint = "." if re.match(r"[\w.]+: ", match[2]) else ": "  # that of a record begins with the field
+    return f"{path}{joint}{match[2]}" if path else match[2]
 
 
 def _is_short_help(arguments: Sequence[str]) -> bool:

@@ -10,12 +10,17 @@ import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from typing_extensions import override
 
 from mrctl import __version__
+
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
 
 LARGEST = 4 * 2**20  # bytes, largest text file of settings; one of this size takes some seconds to read
 WRITTEN_BY = "# written by mrctl "  # how a TOML file begins that `to_toml` made
@@ -73,7 +78,27 @@ def printable(text: str) -> str:
     return words if len(words) <= 2000 else f"{words[:1000]} … {words[-900:]}"
 
 
-class Record(BaseModel):
+class _Constructors(ModelMetaclass):
+    """Lets the constructors of records refuse bad fields as `Record.from_dict` does.
+
+    The error of pydantic has four lines and an address. Records that are parts of others are not made by constructors.
+    """
+
+    if not TYPE_CHECKING:  # which would take it for the signature of every constructor
+
+        def __call__(cls, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+            """Makes a record.
+
+            Raises:
+                InputError: A field is unknown, missing or out of range; the message names the first one.
+            """
+            try:
+                return super().__call__(*args, **kwargs)
+            except ValidationError as error:
+                raise InputError(describe(error)) from None
+
+
+class Record(BaseModel, metaclass=_Constructors):
     """A frozen record of settings, which refuses unknown keys and numbers that are not finite.
 
     The docstring under a field is its description in help texts, in the viewer and in the docstring of the class.

@@ -8,12 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from mrctl.control.kanayama import posture_error
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.loop.simulation import Simulation, group_of
-from mrctl.record import InputError, describe
+from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import Robot
@@ -183,8 +182,8 @@ class Episodes:
             if self._draw is not None:
                 try:
                     perturbation = self._draw(np.random.default_rng([seed, 5]))  # as `replicates` draws
-                except ValidationError as error:
-                    raise InputError(f"perturbation.{describe(error)}") from None
+                except InputError as error:
+                    raise InputError(f"perturbation.{error}") from None
         if perturbation == self.scenarios[row].perturbation:
             return self.scenarios[row].model_copy(update={"seed": seed})
         return self.scenarios[row].replace(seed=seed, perturbation=perturbation)

@@ -213,6 +213,7 @@ def test_bad_scenario_is_one_line(
         (["navigate", "--laps", "3"], "laps: has no flag here, because the mission sets it"),
         (["run", "--feedforward", "fel"], "feedforward: this field of an earlier version is gone"),
         (["suite", "--feedforward", "foo"], "invalid choice 'foo' for argument '--feedforward'"),
+        (["navigate", "doorway:3", "--goal", "1"], "goal: expected"),
         (["tune", "--tier", "lab"], "tier: is of --search"),
         (["check", "submarine"], "robot: submarine is neither car"),
         (["run", "--fel.step", "7"], "fel.step"),

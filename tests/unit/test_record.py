@@ -58,6 +58,10 @@ def test_bad_values(values, names):
         Outer.from_dict(values, "here")
     assert str(error.value).startswith("here: ") and names in str(error.value)
     assert len(str(error.value).splitlines()) == 1
+    if isinstance(values, dict):
+        with pytest.raises(InputError) as again:
+            Outer(**values)
+        assert f"here: {again.value}" == str(error.value)
 
 
 @pytest.mark.parametrize(

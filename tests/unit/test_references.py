@@ -91,7 +91,7 @@ def test_spline_anywhere(radii, speed, closed):
     points = tuple((r * np.cos(a), r * np.sin(a)) for r, a in zip(radii, angles, strict=True))
     try:
         reference = Waypoints(points=points, speed=speed, closed=closed)
-    except ValidationError:
+    except InputError:
         reject()
     t = np.linspace(0, reference.period, 20001)
     motion = reference.sample(t)
