@@ -379,8 +379,8 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
             out: Write the result, the figures and the learned weights to this folder.
             json: Print JSON instead of a table.
             controller: Use stages of your own: my_file.py:MyFeedforward or motion=my_file.py:MyMotion,feedback=...
-            number: Run the run of this number in the store again, and compare it with what is stored.
-            code: Whether a sweep may run the Python files of the controller that it names.
+            number: Drive the run of this number in a sweep's store again, and compare it with what is stored.
+            code: With --run: whether the Python files of the controller that the sweep names may be run.
         """
         if number is not None:
             return _repeat(file, number, out, json, code)
@@ -616,7 +616,7 @@ def suite(
 
     Args:
         feedforward: Feedforwards to compare, such as fel or model+composite; hindsight has fixed coefficients, which
-            are fitted to each run itself. By default those of the tables, with --full all.
+            are fitted to each run itself. By default those in the tables of RESULTS.md, with --full all.
         controller: Controllers of your own to compare, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion.
         seeds: Number of replicates of each case; by default 20, or 3 with --quick.
         random: Number of random scenarios; by default 30, with --quick 6, with --full 1,000 in each tier.

@@ -139,7 +139,7 @@ class Scenario(Record):
     """Settings of the guard, which limits or stops a learner that makes the loop worse."""
     perturbation: Perturbation = Perturbation()
     """Initial differences of the plant from its model, such as a mass factor or a payload; or the name of one of
-    `PERTURBATIONS`, such as `all`."""
+    `mrctl.PERTURBATIONS`, such as `all`."""
     events: tuple[Event, ...] = ()
     """Changes during the run."""
     initial_pose: tuple[float, float, float] | None = None

@@ -27,7 +27,7 @@ OBSERVATIONS: dict[str, int] = {
 }  # fmt: skip
 """Parts of an observation with their sizes: estimated posture error in the robot's frame (m, m, rad); estimated V and
 θ̇ (m/s, rad/s); V and θ̇ of the reference with their derivatives; rates of the rear wheels from the encoders (rad/s);
-commanded angle of the fork (rad); voltages sent last (V)."""
+commanded steering angle (rad); voltages sent last (V)."""
 EPISODE_METRICS = ("v_rmse", "omega_rmse", "position_rmse")
 """Metrics at the end of an episode, root mean squares as in `mrctl.results.metrics`, in m/s, rad/s and m."""
 RESIDUAL = 0.25  # largest residual, as a share of the supply
@@ -92,7 +92,7 @@ class Episodes:
     An episode has the same bits as its scenario under `simulate`, whatever its neighbours do and whenever it begins.
 
     - `twist`: the action is the requested twist, m/s and rad/s, in place of the motion controller.
-    - `voltage`: the voltages left and right in V, in place of both controllers; the fork follows the reference.
+    - `voltage`: the voltages left and right in V, in place of both controllers; the steering follows the reference.
     - `residual`: voltages left and right in V that are added to those of the controllers.
 
     Attributes:

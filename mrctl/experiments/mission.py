@@ -126,5 +126,5 @@ def _report(world: str, order: Order, driven: Mission, out: Path | None, as_json
         [robot["label"], robot["outcome"], *(number(scale * robot[name]) for name, (_, scale) in COLUMNS.items())]
         for robot in values["robots"]
     ]
-    title = f"plan of {driven.plan.length:.2f} m, for which {driven.plan.expanded:,} poses were expanded"
+    title = f"plan of {driven.plan.length:.2f} m; number of poses that the search expanded: {driven.plan.expanded:,}"
     return "\n".join([title, markdown(["robot", "outcome", *(title for title, _ in COLUMNS.values())], rows)]), outcome
