@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Unpack
 
@@ -65,10 +65,14 @@ def simulate(
         `failed`, `failure` and `failure_time` of each run; `weights`, flat, where something was learned.
 
     Raises:
-        InputError: A scenario asks for something that does not exist or that the robot cannot do, and the message names
-            the field; or the factory of a user's stage fails.
+        InputError: There is no scenario, or one asks for something that does not exist or that the robot cannot do, and
+            the message names the field; or the factory of a user's stage fails.
     """
-    given = [s.replace() for s in ([scenarios] if isinstance(scenarios, Scenario) else scenarios)]  # validated
+    single = isinstance(scenarios, Scenario) or not isinstance(scenarios, Iterable)
+    listed: list[Any] = [scenarios] if single else list(scenarios)
+    if not all(isinstance(s, Scenario) for s in listed):
+        raise InputError("scenarios: neither a Scenario nor a list of them")
+    given = [s.replace() for s in listed]  # validated
     several = [arranged(s) for s in given]
     if not several:
         raise InputError("scenarios: none given")

@@ -255,13 +255,14 @@ def absorb_fix(fix: Array, s: Row) -> None:
 def find_radius(difference: float, now: Row, geometry: Row, period: float, s: Row) -> None:
     """Decides whether a wheel has another radius than before, as after a puncture, and writes it into the samples.
 
-    While both wheels grip and hardly any force acts, left and right speed v_l,r = r (1 + s_l,r) φ̇_l,r differ by what
-    the gyro measures, in the mean
+    While both wheels grip and the acceleration is below `CALM`, no wheel can slip much, and encoders and gyro agree in
+    the mean: with v_l,r = r (1 + s_l,r) φ̇_l,r
 
         d ← d + (T/τ) (v_l − v_r + 2 D (θ̇_gyro − b) − d),    τ = `AVERAGE`
 
-    but for the tyres' `TWIST` and four standard deviations of counts, gyro, b and s. Otherwise s_l and s_r are both as
-    uncertain as d/V: the gyro then tells their difference, and the fixes tell their sum.
+    is within four standard deviations of counts, gyro, b and s, plus `TWIST`. Where it is not, a wheel has another
+    radius, and the standard deviations of s_l and s_r are raised to |d|/V, at most `DOUBT`. The gyro then tells their
+    difference, and the fixes tell their sum.
 
     Args:
         difference: v_l − v_r + 2 D (θ̇_gyro − b) in m/s.

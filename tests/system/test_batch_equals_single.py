@@ -260,3 +260,10 @@ def test_sweep(counts, tmp_path):
         assert str(row["failure"].values) == str(one["failure"].values)
         assert jobs.repeat(store, run) == ("bit-identical", True)
     print(f"{count} runs, {int(opened['failed'].sum())} of them failed, are the same alone, in the sweep and repeated")
+
+
+@pytest.mark.parametrize("wrong", ["scenario.toml", 3, [Scenario(), None], []])
+def test_no_scenarios(wrong):
+    """What is no scenario is refused with one line that names the argument."""
+    with pytest.raises(InputError, match="^scenarios: "):
+        simulate(wrong)
