@@ -300,6 +300,8 @@ def planned(
         raise InputError("goal: the robot starts there")
     if not 0 <= margin <= 10:
         raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
+    if speed is not None and not 0 < speed < np.inf:
+        raise InputError(f"speed: must be above 0 m/s, not {speed:g}")
     corners, robot = robot_of(scenario)
     known = task.known
     outlines = Surroundings(known).at(0.0) if outlines is None else outlines
