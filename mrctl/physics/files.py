@@ -26,7 +26,7 @@ def find(name: str) -> Path:
 
 def _not_there(name: str, path: Path) -> str:
     """Returns what is wrong with a name that leads to no file."""
-    return f"{name} is not an MJCF file, which ends in .xml" if Path(name).exists() else f"no file {path}"
+    return f"{name} is not an MJCF file, which ends in .xml" if name and Path(name).exists() else f"no file {path}"
 
 
 def robot_path(robot: RobotFile) -> Path:

@@ -76,7 +76,7 @@ class Recording:
         near = bool(self.scenario.obstacles.shapes) and "clearance" in run
         self._scanned = "scanned" in run and run["scanned"].values.item() is True
         self.clearance: Array | None = run["clearance"].values[: len(self.log)] if near else None
-        known = "parameters" in run
+        known = "parameters" in run and "time" not in run["parameters"].dims  # which `where` adds
         self.parameter_error: Array | None = parameter_error(run).values[0] if known else None
 
     @property
