@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mrctl import Box, Obstacles, cli
-from mrctl.experiments import bench
+from mrctl.experiments import bench, bench_navigation
 from mrctl.physics.obstacles import multi_ray
 
 sys.path.append(str(Path(__file__).parent))
@@ -89,7 +89,8 @@ def test_navigation(figures):
     """Everything was measured, the parts take less than the whole, and the worlds have the sizes that are said."""
     found = figures["navigation"]
     lidar, particles, mppi = found["pairs"]
-    assert lidar["judge"] == "mujoco.mj_multiRay" and particles["ratio"] > 0
+    assert lidar["judge"] == "mujoco.mj_multiRay"
+    assert bench_navigation._particles(41)["ratio"] < 1  # a median of two turns is that of a busy machine
     for row in (lidar, particles, mppi):
         assert row["us"] > 0 < row["judge_us"]
     discs, generated = found["plans"]
