@@ -276,7 +276,7 @@ class TrackingVectorEnv(VectorEnv):
 
 
 class NavigationVectorEnv(TrackingVectorEnv):
-    """Navigation of many robots in a batch, in one world."""
+    """Navigation of many robots in a batch, each of which may have a world of its own."""
 
     def __init__(
         self,
@@ -290,7 +290,8 @@ class NavigationVectorEnv(TrackingVectorEnv):
 
         Args:
             num_envs: Number of robots B.
-            scenario: As for `NavigationEnv`, or a sequence of B scenarios, which may differ in start, goal and length.
+            scenario: As for `NavigationEnv`, or a sequence of B scenarios, which may differ in start, goal, length and
+                obstacles. The numbers of moving obstacles and the corners of polygons must be the same.
             threads: Number of threads of the batch engine; 0 for all cores.
             draw: As for `TrackingEnv`.
             render_mode: As for `TrackingEnv`.

@@ -40,7 +40,7 @@ class Navigating(Episodes):
         """Stands the robots at their starts.
 
         Args:
-            scenarios: One for each robot, in one world and with one lidar.
+            scenarios: One for each robot, with the same lidar.
             draw: As for `Episodes`.
             threads: Number of threads of the batch engine; 0 for all cores.
 

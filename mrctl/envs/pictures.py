@@ -28,11 +28,18 @@ class Pictures:
     def __init__(self, episodes: Episodes) -> None:
         """Takes the episodes."""
         self._episodes = episodes
-        self._physics = CarPhysics.from_compiled(mjcf.clone(episodes.loop.model))
-        looks = self._physics.model.ptr.vis
-        looks.global_.offwidth, looks.global_.offheight = WIDTH, HEIGHT
-        # Larger values take most of the time without a GPU.
-        looks.quality.shadowsize, looks.quality.offsamples = SHADOW, 0
+        self._drawn: dict[int, CarPhysics] = {}  # by the identity of the model of a world
+
+    def _physics(self, robot: int) -> CarPhysics:
+        """Returns a physics of the world in which a robot drives."""
+        model = self._episodes.plant.models[robot]
+        if id(model) not in self._drawn:
+            physics = self._drawn[id(model)] = CarPhysics.from_compiled(mjcf.clone(model))
+            looks = physics.model.ptr.vis
+            looks.global_.offwidth, looks.global_.offheight = WIDTH, HEIGHT
+            # Larger values take most of the time without a GPU.
+            looks.quality.shadowsize, looks.quality.offsamples = SHADOW, 0
+        return self._drawn[id(model)]
 
     def draw(self, robot: int = 0) -> NDArray[np.uint8]:
         """Draws one robot as it is now, from a camera that follows it, with its reference on the floor.
@@ -43,15 +50,16 @@ class Pictures:
         Raises:
             InputError: MuJoCo cannot draw, because this machine has neither a display nor OpenGL without one.
         """
-        plant, data = self._episodes.plant, self._physics.data
+        plant, physics = self._episodes.plant, self._physics(robot)
+        data = physics.data
         now, size = plant.reading[robot], np.hypot(plant.robot.wheelbase, 2 * plant.robot.half_track)
         reference = self._episodes.scenarios[robot].reference
         course = reference.sample(np.linspace(0, reference.period, POINTS)).pose * [1, 1, 0] + [0, 0, 0.004]
         data.qpos[:] = plant.qpos[robot]
         data.mocap_pos[:], data.mocap_quat[:] = (part[robot] for part in plant.mocap)
-        self._physics.forward()
+        physics.forward()
         try:
-            _ = self._physics.contexts  # dm_control makes them when they are first read
+            _ = physics.contexts  # dm_control makes them when they are first read
         except Exception as error:  # noqa: BLE001 (each backend has errors of its own)
             reason = str(error).split("\n")[0] or type(error).__name__
             advice = "without a display it needs EGL (libegl1) and the variable MUJOCO_GL=egl"
@@ -60,6 +68,6 @@ class Pictures:
         def add_course(_: object, scene: mujoco.MjvScene) -> None:
             draw_line(scene, course, size / 40, REFERENCE_COLOUR)
 
-        camera = MovableCamera(self._physics, HEIGHT, WIDTH, scene_callback=add_course)
+        camera = MovableCamera(physics, HEIGHT, WIDTH, scene_callback=add_course)
         camera.set_pose(np.nan_to_num([*now["pose"][:2], now["z"]]), VIEW * size, AZIMUTH, ELEVATION)
         return camera.render()

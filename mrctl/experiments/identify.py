@@ -164,7 +164,7 @@ def identify(
     tau = min(nominal.velocity_time_constant, nominal.rotation_time_constant)
     substeps = max(5, int(np.ceil(FINE * TICK / tau)))
     model = mjcf.load(world, steering, TICK / substeps, robot)
-    plants = [build(one, nominal, REPEATS, substeps, threads=1) for one in (model, on_skid(model))]
+    plants = [build([one] * REPEATS, nominal, substeps, threads=1) for one in (model, on_skid(model))]
     for plant in plants:
         for row in range(REPEATS):
             delay = round(perturbation.control_delay / TICK)

@@ -65,11 +65,11 @@ class Courses:
             whole = range(first, self._block.stop + self._preview)
             self._samples = np.stack([course(s, whole) for s in self._courses], axis=1)
         row = tick - self._block.start
-        now = self._samples[row] if self._own else self._samples[row][self._place]
+        now = self._samples[row] if self._own else self._samples[row].take(self._place)  # ten times as fast as [place]
         if not self._preview:
             return now, now
         later = self._samples[row + self._preview]
-        return now, later if self._own else later[self._place]
+        return now, later if self._own else later.take(self._place)
 
 
 class RestartingCourses:

@@ -24,6 +24,7 @@ from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.log import DIVERGED, Log
 from mrctl.loop.user_stages import StageError, UserEstimator, UserHierarchy, UserStage
 from mrctl.physics import hull, mjcf, tyres
+from mrctl.physics import obstacles as walls
 from mrctl.physics.plant import Plant, build
 from mrctl.record import InputError
 from mrctl.results import dataset
@@ -50,8 +51,8 @@ def simulate(
     One scenario runs through dm_control, several run together on MuJoCo's batch engine, with the same bits.
 
     Args:
-        scenarios: One scenario, or several; those that differ in world, obstacles, robot, laws, estimator, steering,
-            delay, rates or, without a goal, length run in batches of their own.
+        scenarios: One scenario, or several; those that differ in world, robot, laws, estimator, steering, delay, rates,
+            much in the number of obstacles or, without a goal, in length run in batches of their own.
         progress: Whether to show a progress bar.
         threads: Number of threads for control and physics, which does not change the result; 0 for all cores.
         stages: The user's stages `motion`, `feedback`, `feedforward`, `steering` or `estimator` in place of the
@@ -101,10 +102,14 @@ def worthwhile(threads: int, size: int) -> int:
 
 
 def uniform(scenarios: Sequence[Scenario]) -> list[list[int]]:
-    """Returns the groups of scenarios that can run in one simulation, as lists of their indices."""
+    """Returns groups of scenarios that run best in one simulation, as lists of their indices.
+
+    Worlds whose numbers of obstacles differ by a factor of two or more are kept apart, because in one simulation all
+    worlds get as many geoms as the largest has, and each costs time.
+    """
     groups: dict[Hashable, list[int]] = defaultdict(list)
     for row, s in enumerate(scenarios):
-        groups[group_of(s)].append(row)
+        groups[group_of(s), len(s.obstacles.shapes).bit_length()].append(row)
     return list(groups.values())
 
 
@@ -200,7 +205,8 @@ def group_of(s: Scenario) -> Hashable:
     rates = s.ticks if s.goal is None else None, s.physics_step, s.control_period, s.motion_period
     sensing, period = s.sensing, s.control_period
     chain = sensing.source, sensing.periods("delay", period), sensing.loop_delay(period)
-    return s.world, s.obstacles, s.map, s.robot, s.steering, s.prior, s.learner, s.fel.hidden, *rates, *chain
+    laws = s.prior, s.learner, s.fel.hidden
+    return s.world, walls.layout(s.obstacles), s.robot, s.steering, *laws, *rates, *chain
 
 
 class Simulation:
@@ -208,7 +214,7 @@ class Simulation:
 
     Attributes:
         scenarios: Scenario of each run, with the events that were added.
-        model: The compiled world with the nominal robot.
+        model: The compiled world of the first run with the nominal robot.
         preview: Number of control periods that the reference is taken ahead, because a voltage acts that much later.
         courses: The references that the robots follow.
         sensors: The sensors of the robots.
@@ -244,7 +250,9 @@ class Simulation:
         first, size = scenarios[0], len(scenarios)
         self.scenarios = scenarios
         self.ticks, self.tick, self.period = max(s.ticks for s in scenarios), 0, first.control_period
-        self.model, robot = mjcf.build(first.world, first.steering, first.physics_step, first.robot, first.obstacles)
+        obstacles = [s.obstacles for s in scenarios]
+        models, robot = mjcf.build_each(obstacles, first.world, first.steering, first.physics_step, first.robot)
+        self.model = models[0]
         self._reverses = mjcf.reverses(self.model, first.steering)
         for scenario in scenarios:
             for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
@@ -257,9 +265,8 @@ class Simulation:
 
         self.preview = first.sensing.periods("delay", self.period)
         self.courses = (RestartingCourses if restarting else Courses)(scenarios, self.preview)
-        self.plant: Plant = build(
-            self.model, robot, size, round(self.period / first.physics_step), worthwhile(threads, size), first.obstacles
-        )
+        substeps = round(self.period / first.physics_step)
+        self.plant: Plant = build(models, robot, substeps, worthwhile(threads, size), obstacles)
         later = [event.perturbation for scenario in scenarios for event in scenario.events]
         for k, perturbation in enumerate(later):  # before anything is computed
             if perturbation is not None and perturbation not in later[:k]:
@@ -268,12 +275,13 @@ class Simulation:
         sensing, scanner = [s.sensing for s in scenarios], None
         self.hierarchy = UserHierarchy(scenarios, robot, users) if users else Hierarchy(scenarios, robot)
         if self.hierarchy.looks or any(s.localisation != "fixes" for s in sensing):
-            scanner = Scanner(sensing, self.period, first.obstacles)
+            scanner = Scanner(sensing, self.period, obstacles)
         self.hierarchy.scanner = scanner
         self.sensors = Sensors(sensing, [s.seed for s in scenarios], self.period)
         # The engine integrates positions with the velocities at the end of a step: velocities are half a step behind.
         skew = first.physics_step / 2
-        parts = sensing, robot, self.sensors, self.plant.imu, skew, self._tyres(first), scanner, first.known
+        known = [s.known for s in scenarios] if scanner else ()
+        parts = sensing, robot, self.sensors, self.plant.imu, skew, self._tyres(first), scanner, known
         self.estimator = UserEstimator(own, *parts) if own else Estimator(first.sensing.source, *parts)
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period, self.preview)
         self.log = Log(1 if restarting else self.ticks, size)
@@ -468,15 +476,15 @@ class Simulation:
 
     def _clearance(self, length: int) -> dict[str, Any]:
         """Distance of each robot's footprint from the nearest obstacle at each tick, where there are obstacles."""
-        obstacles = self.scenarios[0].obstacles
-        if not obstacles.shapes:
+        if not self.scenarios[0].obstacles.shapes:
             return {}
-        footprint, ticks, around = hull.footprint(self.model), self.log.ticks[:length], Surroundings(obstacles)
+        footprint, ticks = hull.footprint(self.model), self.log.ticks[:length]
+        around = [Surroundings(s.obstacles) for s in self.scenarios]
         poses, times = (
             np.stack([ticks[name].T for name in ("x", "y", "theta")], -1),
             self.period * np.arange(length, dtype=float),
         )
-        found = np.stack([clearances(footprint, poses[row], times, around) for row in range(len(poses))])
+        found = np.stack([clearances(footprint, poses[row], times, around[row]) for row in range(len(poses))])
         attributes = {"units": "m", "long_name": "distance of the footprint from the nearest obstacle"}
         return {"clearance": (("run", "time"), found, attributes)}
 

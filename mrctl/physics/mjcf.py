@@ -54,6 +54,7 @@ def build(
     timestep: float | None = None,
     robot: RobotFile = CAR,
     obstacles: Obstacles = NO_OBSTACLES,
+    idle: int = 0,
 ) -> tuple[mujoco.MjModel, Robot]:
     """Compiles a world with a robot in one of its steering arrangements.
 
@@ -65,6 +66,8 @@ def build(
         timestep: Time step of the physics in s; by default the file's own.
         robot: The robot that drives there; by default the world's own.
         obstacles: Obstacles in the world. With any, the robot gets a massless hull that collides with them.
+        idle: Number of further geoms that collide with nothing; robots in worlds with the same number of geoms can be
+            simulated in one batch.
 
     Returns:
         The compiled model, and the parameters of its robot.
@@ -82,7 +85,7 @@ def build(
         nominal = _arranged(model, steering, robot)
         if obstacles.shapes:
             spec = _assembled(path, robot)
-            walls.add(spec, obstacles, footprint(model))
+            walls.add(spec, obstacles, footprint(model), idle)
             model = spec.compile()
             nominal = _arranged(model, steering, robot)
     for warning in held:
@@ -90,6 +93,29 @@ def build(
     if timestep is not None:
         _set_timestep(model, timestep)
     return model, nominal
+
+
+def build_each(
+    obstacles: Sequence[Obstacles], world: str, steering: Steering | None, timestep: float, robot: RobotFile
+) -> tuple[list[mujoco.MjModel], Robot]:
+    """Compiles a world once with each of several sets of obstacles, so that all models have the same number of geoms.
+
+    Args:
+        obstacles: The sets of obstacles, with the same `mrctl.physics.obstacles.layout`.
+        world: As for `build`, like the other arguments.
+        steering: As for `build`.
+        timestep: As for `build`.
+        robot: As for `build`.
+
+    Returns:
+        A model for each set, the same object for equal ones, and the robot.
+
+    Raises:
+        InputError: As `build`.
+    """
+    most, same = max(len(own.shapes) for own in obstacles), (world, steering, timestep, robot)
+    made = {own: build(*same, own, most - len(own.shapes)) for own in dict.fromkeys(obstacles)}
+    return [made[own][0] for own in obstacles], made[obstacles[0]][1]
 
 
 def _assembled(world: Path, robot: RobotFile) -> mujoco.MjSpec:

@@ -10,7 +10,7 @@ and with no floor, wheel or other hull.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from pathlib import Path
 
 import mujoco
@@ -21,24 +21,42 @@ from mrctl.physics.bounds import check_bounds, compiling
 from mrctl.physics.elements import COLLISION
 from mrctl.physics.hull import convex
 from mrctl.record import InputError
-from mrctl.theory.obstacles import Box, Disc, Obstacles
+from mrctl.theory.obstacles import Box, Disc, Obstacles, Polygon
 
 HULL = "hull"  # name of the hull's geom
 BIT = 2  # of contype and conaffinity; MuJoCo's default, which floors have, is 1
+IDLE = 4  # of conaffinity; no geom has it in its contype, and one with no bit at all is left out of MuJoCo's trees
 GROUP = 2  # of walls: rays that look for the ground see only group 0
 HEIGHT = 0.5  # m, by which walls reach above and below the origin, because floors need not be level
 TALL = 0.1  # m, height of the hull above the axle
+DEEP = 10.0  # m below the origin, where idle geoms lie
 
 
-def add(spec: mujoco.MjSpec, obstacles: Obstacles, footprint: Array) -> None:
+def layout(obstacles: Obstacles) -> Hashable:
+    """Returns what worlds must share so that robots in them can be simulated in one batch.
+
+    The batch engine needs models whose data have the same layout. It depends on the number of geoms, which `add` fills
+    up, on the hull, on the number of moving bodies, and on the faces of the meshes.
+    """
+    corners = sorted(len(shape.points) for shape in obstacles.shapes if isinstance(shape, Polygon))
+    return bool(obstacles.shapes), len(obstacles.moving), tuple(corners)
+
+
+def add(spec: mujoco.MjSpec, obstacles: Obstacles, footprint: Array, idle: int = 0) -> None:
     """Puts obstacles into a world, and a massless hull on its robot.
 
     Args:
         spec: World with the body `chassis`; it is changed.
         obstacles: The obstacles.
         footprint: Corners of the hull in the frame of the chassis in m, `(n, 2)`.
+        idle: Number of geoms in addition that collide with nothing.
     """
     add_walls(spec, obstacles)
+    for _ in range(idle):
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.001, 0, 0], pos=[0, 0, -DEEP], contype=0, conaffinity=IDLE,
+            group=4,
+        )  # fmt: skip
     chassis = spec.body("chassis")
     _prism(spec, HULL, footprint, 0.0, TALL)
     chassis.add_geom(

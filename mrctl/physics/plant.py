@@ -11,12 +11,14 @@ a batch is a substep old.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
 from dm_control.rl.control import PhysicsError
 from mujoco import batch as mujoco_batch
+from numpy.typing import NDArray
 
 from mrctl.kernel import Array, Held, Row, held, kernel
 from mrctl.physics import mjcf
@@ -28,7 +30,7 @@ from mrctl.physics.perturb import fields, limit_current, perturb, write
 from mrctl.physics.readout import READING, addresses, current_limits, imu_motion, inputs, motor_parameters, read
 from mrctl.physics.stand import stand
 from mrctl.theory.drive import DRIVER, SERVO, Driver, SteeringServo, chop, drive, turn
-from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles, Surroundings
+from mrctl.theory.obstacles import Obstacles, Surroundings
 from mrctl.theory.perturbation import LONGEST_DELAY, Perturbation
 from mrctl.theory.robot import Robot
 
@@ -134,11 +136,27 @@ def look(first: int, last: int, period: float, place: int) -> bool:
     return upright
 
 
+class Tracks:
+    """The moving obstacles of one world."""
+
+    def __init__(self, obstacles: Obstacles, period: float) -> None:
+        """Takes the obstacles, and the control period in s."""
+        self._surroundings, self._period = Surroundings(obstacles), period
+        self._poses = self._surroundings.poses(np.zeros(0))
+
+    def at(self, ticks: NDArray[np.intp]) -> Array:
+        """Returns the poses of M obstacles at control ticks, `(n,)`, of a run: `(n, M, 3)` in m, m, rad."""
+        if ticks.max() >= len(self._poses):
+            self._poses = self._surroundings.poses(self._period * np.arange(2.0 * ticks.max() + 100))
+        return self._poses[ticks]
+
+
 class Plant(ABC):
     """B robots in physics. A robot that fails stops, and keeps its last state, while the others go on.
 
     Attributes:
         state: One record of `PLANT` for each robot; `reading`, `applied` and `failed` are views of it.
+        models: The world of each robot with the nominal robot; where the obstacles are the same, so is the object.
         robot: The nominal robot, which is all that a controller may know.
         truth: The perturbed robots, for the prior `true_model`.
         reading: One record of `READING` for each robot, current after `reset` and `step`.
@@ -159,9 +177,10 @@ class Plant(ABC):
     mocap: tuple[Array, Array]
 
     def __init__(
-        self, model: mujoco.MjModel, robot: Robot, size: int, substeps: int, obstacles: Obstacles = NO_OBSTACLES
+        self, models: Sequence[mujoco.MjModel], robot: Robot, substeps: int, obstacles: Sequence[Obstacles]
     ) -> None:
-        """Takes the nominal model, its robot, the number of robots, physics steps per control period, and obstacles."""
+        """Takes the arguments of `build`."""
+        model, size = models[0], len(models)
         self.size, self.substeps = size, substeps
         self.robot = robot
         self.truth = [robot] * size
@@ -169,7 +188,7 @@ class Plant(ABC):
         self.reading, self.applied, self.failed = state["reading"], state["applied"], state["failed"]
         self.failure = [""] * size
         self.running = size
-        self._nominal = model
+        self.models = list(models)
         self._scratch, self._scratch_data = mjcf.clone(model), mujoco.MjData(model)
         self._nominal_robots = np.ones(size, bool)
         self._address = addresses(model)
@@ -187,9 +206,12 @@ class Plant(ABC):
         self._pushes: dict[int, int] = {}
         self._chassis = model.body("chassis").id
         self._collision = model.sensor(COLLISION).adr[0] if has(model, "sensor", COLLISION) else -1
-        self._surroundings = Surroundings(obstacles)
         self._began = np.zeros(size, int)  # tick at which each robot was placed on the ground
-        self._poses = self._surroundings.poses(np.zeros(0))  # of the moving obstacles, by the ticks since then
+        worlds: dict[Obstacles, list[int]] = defaultdict(list)
+        for row, own in enumerate(obstacles):
+            if own.moving:
+                worlds[own].append(row)
+        self._moving = [(Tracks(own, self._period), np.array(rows)) for own, rows in worlds.items()]
 
     def _hold(self) -> None:
         """Lets the compiled calls of each tick find the arrays of the plant, which from then on stay where they are."""
@@ -231,20 +253,23 @@ class Plant(ABC):
         if self._nominal_robots[robot] and ideal and perturbation == Perturbation():
             return
         self._nominal_robots[robot] = False
-        perturb(self._nominal, self._scratch, perturbation, self.robot, self._scratch_data)
-        limit_current(self._nominal, self._scratch, driver.current_limit)
-        self._write(robot, self._scratch)
-        self.truth[robot] = read_robot(self._scratch, perturbation.supply_factor, self._scratch_data)
-        resistance, back_emf, _ = motor_parameters(self._scratch)
+        nominal, model = self.models[robot], self._scratch
+        if nominal is not self.models[0]:
+            model = mjcf.clone(nominal)
+        perturb(nominal, model, perturbation, self.robot, self._scratch_data)
+        limit_current(nominal, model, driver.current_limit)
+        self._write(robot, model)
+        self.truth[robot] = read_robot(model, perturbation.supply_factor, self._scratch_data)
+        resistance, back_emf, _ = motor_parameters(model)
         self.state["resistance"][robot], self.state["back_emf"][robot] = resistance[0], back_emf[0]
         self.state["delay"][robot] = delay
         rows = self.state["driver"]
         for name in ("dead_zone", "pwm_steps", "battery_resistance"):
             rows[name][robot] = getattr(driver, name)
         rows["gain"][robot] = rows["scale"][robot] = perturbation.supply_factor
-        rows["current_limit"][robot] = current_limits(self._scratch)
+        rows["current_limit"][robot] = current_limits(model)
         self.state["servo"]["offset"][robot], self.state["servo"]["backlash"][robot] = servo.offset, servo.backlash
-        self.state["gravity"][robot] = self._scratch.opt.gravity
+        self.state["gravity"][robot] = model.opt.gravity
 
     def check(self, perturbation: Perturbation) -> None:
         """Refuses a perturbation with which a robot could not stand.
@@ -252,7 +277,7 @@ class Plant(ABC):
         Raises:
             InputError: The robot could not stand; the message says why.
         """
-        perturb(self._nominal, self._scratch, perturbation, self.robot, self._scratch_data)
+        perturb(self.models[0], self._scratch, perturbation, self.robot, self._scratch_data)
 
     def reset(self, pose: Array, twist: Array) -> None:
         """Places every robot on the ground, rolling.
@@ -344,14 +369,11 @@ class Plant(ABC):
 
     def _move(self, ahead: int) -> None:
         """Moves the moving obstacles to their poses `ahead` ticks from now."""
-        if not self._surroundings.courses:
-            return
-        since = self._tick + ahead - self._began
-        if since.max() >= len(self._poses):
-            self._poses = self._surroundings.poses(self._period * np.arange(2.0 * since.max() + 100))
-        now, (position, turn) = self._poses[since], self.mocap
-        position[..., :2] = now[..., :2]
-        turn[..., 0], turn[..., 3] = np.cos(now[..., 2] / 2), np.sin(now[..., 2] / 2)
+        position, turn = self.mocap
+        for tracks, rows in self._moving:
+            now = tracks.at(self._tick + ahead - self._began[rows])
+            position[rows, :, :2] = now[..., :2]
+            turn[rows, :, 0], turn[rows, :, 3] = np.cos(now[..., 2] / 2), np.sin(now[..., 2] / 2)
 
     def look(self) -> None:
         """Updates the readouts after the physics; fails robots that have tilted or whose state is not finite."""
@@ -407,9 +429,12 @@ class PhysicsPlant(Plant):
         physics: The `CarPhysics`, for rendering and inspection.
     """
 
-    def __init__(self, model: mujoco.MjModel, robot: Robot, substeps: int, obstacles: Obstacles = NO_OBSTACLES) -> None:
-        """Takes a compiled world, its robot, physics steps in a control period, and obstacles."""
-        super().__init__(model, robot, 1, substeps, obstacles)
+    def __init__(
+        self, models: Sequence[mujoco.MjModel], robot: Robot, substeps: int, obstacles: Sequence[Obstacles] = ()
+    ) -> None:
+        """Takes the arguments of `build`, for one robot."""
+        super().__init__(models, robot, substeps, obstacles)
+        (model,) = models
         self.physics = CarPhysics.from_compiled(mjcf.clone(model))
         data = self.physics.data
         # Views of the engine's own memory, with the batch dimension in front.
@@ -438,23 +463,29 @@ class PhysicsPlant(Plant):
 
 
 class BatchPlant(Plant):
-    """Many robots on MuJoCo's batch engine, each with its own parameters through `expand` and `set_const`."""
+    """Many robots on MuJoCo's batch engine.
+
+    Robots in one world share its model, and each has its own parameters through `expand` and `set_const`. If the worlds
+    differ, each robot has a model of its own, through `set_models`, which excludes `expand`.
+    """
 
     def __init__(
         self,
-        model: mujoco.MjModel,
+        models: Sequence[mujoco.MjModel],
         robot: Robot,
-        size: int,
         substeps: int,
         threads: int = 0,
-        obstacles: Obstacles = NO_OBSTACLES,
+        obstacles: Sequence[Obstacles] = (),
     ) -> None:
         """Takes the arguments of `build`."""
-        super().__init__(model, robot, size, substeps, obstacles)
+        super().__init__(models, robot, substeps, obstacles)
+        model, size = models[0], len(models)
         quiet = mjcf.clone(model)
         if self._collision < 0:
             quiet.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR  # nothing reads them without obstacles
         self.batch = mujoco_batch.Batch(quiet, size, threads)
+        self._own: list[mujoco.MjModel] = [] if all(one is model for one in models) else list(models)
+        self._changed = bool(self._own)  # whether the batch has to be told of models
         self._model = mjcf.clone(quiet)  # overwritten by `_model_of`
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self.act, self.ctrl = self.batch.bind("act"), self.batch.bind("ctrl")
@@ -465,9 +496,12 @@ class BatchPlant(Plant):
         self._expanded: set[str] = set()
 
     def _model_of(self, robot: int) -> mujoco.MjModel:
-        return self.batch.get_model(robot, self._model)
+        return self._own[robot] if self._own else self.batch.get_model(robot, self._model)
 
     def _write(self, robot: int, model: mujoco.MjModel) -> None:
+        if self._own:
+            self._own[robot], self._changed = mjcf.clone(model), True
+            return
         for name, value in fields(model).items():
             if name in self._expanded or not np.array_equal(value, self._fields[name]):
                 self._expanded.add(name)
@@ -475,30 +509,42 @@ class BatchPlant(Plant):
         self.batch.set_const(np.array([robot]))
 
     def _clear(self, robot: int) -> None:
+        self._tell()
         self.batch.reset(np.array([robot]), stage=mujoco.mjtStage.mjSTAGE_NONE)
 
     def _advance(self) -> dict[int, str]:
         ids = None if self.running == self.size else np.flatnonzero(~self.failed)
+        self._tell()
         try:
             self.batch.step(ids, self.substeps)
         except mujoco_batch.SimulationError as error:
             return {int(i): self.batch.error(int(i)) for i in error.ids}
         return {}
 
+    def _tell(self) -> None:
+        """Tells the batch of the robots' own models, if they have changed."""
+        if self._changed:
+            self.batch.set_models(self._own)
+            self._changed = False
+
 
 def build(
-    model: mujoco.MjModel, robot: Robot, size: int, substeps: int, threads: int = 0, obstacles: Obstacles = NO_OBSTACLES
+    models: Sequence[mujoco.MjModel],
+    robot: Robot,
+    substeps: int,
+    threads: int = 0,
+    obstacles: Sequence[Obstacles] = (),
 ) -> Plant:
-    """Builds the plant for a number of robots: dm_control for one, the batch engine for more.
+    """Builds the plant for B robots: dm_control for one, the batch engine for more.
 
     Args:
-        model: Compiled world with the nominal robot.
+        models: The compiled world of each robot, with the nominal robot, one object for robots in the same world;
+            different worlds have the same layout (`obstacles.layout`) and number of geoms.
         robot: The nominal robot.
-        size: Number of robots.
         substeps: Physics steps in a control period.
         threads: Number of threads of the batch engine; 0 for all cores.
-        obstacles: The obstacles with which the model was compiled.
+        obstacles: The obstacles in the world of each robot; none by default.
     """
-    if size == 1:
-        return PhysicsPlant(model, robot, substeps, obstacles)
-    return BatchPlant(model, robot, size, substeps, threads, obstacles)
+    if len(models) == 1:
+        return PhysicsPlant(models, robot, substeps, obstacles)
+    return BatchPlant(models, robot, substeps, threads, obstacles)

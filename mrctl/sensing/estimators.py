@@ -19,7 +19,7 @@ from mrctl.sensing.scanner import Scanner
 from mrctl.sensing.sensors import Sensors, command_all, sample_all
 from mrctl.sensing.slip import slip_ratio
 from mrctl.sensing.tiers import Sensing
-from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles
+from mrctl.theory.obstacles import Obstacles
 from mrctl.theory.robot import Robot, Tyres
 
 GEOMETRY = np.dtype(
@@ -187,7 +187,7 @@ class Estimator:
         skew: float,
         tyres: Tyres,
         scanner: Scanner | None = None,
-        known: Obstacles = NO_OBSTACLES,
+        known: Sequence[Obstacles] = (),
     ) -> None:
         """Builds the estimator.
 
@@ -201,7 +201,7 @@ class Estimator:
                 positions with the velocities at the end of the step.
             tyres: The tyres of the nominal robot.
             scanner: The lidars, which localisation needs; None if there are none.
-            known: Obstacles on the map that localisation uses.
+            known: Obstacles on the map that the localisation of each robot uses.
 
         Raises:
             InputError: Localisation needs a map, and there is none, or it is too large.

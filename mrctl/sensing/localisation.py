@@ -21,31 +21,38 @@ AGREES = 0.5  # share of the points of a scan that must lie on the map for a fix
 
 
 class Localiser:
-    """Localisation of B robots by their lidars on the same map.
+    """Localisation of B robots by their lidars on their maps.
 
     Attributes:
         filters: Particle filter of each robot, or None.
     """
 
     def __init__(
-        self, sensing: Sequence[Sensing], sensors: Sensors, scanner: Scanner, wheel_radius: float, known: Obstacles
+        self,
+        sensing: Sequence[Sensing],
+        sensors: Sensors,
+        scanner: Scanner,
+        wheel_radius: float,
+        known: Sequence[Obstacles],
     ) -> None:
-        """Makes the map.
+        """Makes the maps.
 
         Args:
             sensing: Sensing of each robot.
             sensors: The sensors, whose encoders and gyros are read and whose fixes are replaced.
             scanner: The lidars.
             wheel_radius: Nominal radius of the driven wheels in m.
-            known: Obstacles on the map.
+            known: Obstacles on the map of each robot.
 
         Raises:
-            InputError: There are none, or the map is too large.
+            InputError: There are none on the map of a robot that localises, or the map is too large.
         """
         self._sensing, self._sensors, self._scanner, self._radius = list(sensing), sensors, scanner, wheel_radius
-        if not known.shapes:
+        needed = dict.fromkeys(own for own, s in zip(known, sensing, strict=True) if s.localisation != "fixes")
+        if not all(own.shapes for own in needed):
             raise InputError("sensing.localisation: the map has no obstacles to localise by")
-        self._map = field_of(Surroundings(known).at(0.0), *map_area(known))
+        fields = {own: field_of(Surroundings(own).at(0.0), *map_area(own)) for own in needed}
+        self._maps = [fields.get(own) for own in known]
         self.filters: list[Particles | None] = [None] * len(sensing)
         self._odometry = np.zeros((len(sensing), 2))  # distance in m and turn in rad since the last scan
 
@@ -58,8 +65,9 @@ class Localiser:
             seed: Seed of its particles.
         """
         self._odometry[row] = 0.0
-        if self._sensing[row].localisation == "particles":
-            self.filters[row] = Particles(self._map, seed, pose.copy())
+        chart = self._maps[row]
+        if chart and self._sensing[row].localisation == "particles":
+            self.filters[row] = Particles(chart, seed, pose.copy())
 
     def locate(self, tick: int, estimate: Array) -> None:
         """Adds up the odometry, and makes the fixes from the scans of this tick.
@@ -74,8 +82,8 @@ class Localiser:
         self._odometry[:, 0] += begun * self._radius * (now["encoder"] - last["encoder"]).mean(axis=1)
         self._odometry[:, 1] += begun * period * (now["gyro"] + last["gyro"]) / 2
         for row in np.flatnonzero(self._scanner.taken == tick):
-            sensing, scan = self._sensing[row], self._scanner.scans[row]
-            if sensing.localisation == "fixes" or scan is None:
+            sensing, scan, chart = self._sensing[row], self._scanner.scans[row], self._maps[row]
+            if sensing.localisation == "fixes" or scan is None or chart is None:
                 continue
             points = sensing.lidar.points(scan, BEAMS[sensing.localisation])
             if particles := self.filters[row]:
@@ -87,6 +95,6 @@ class Localiser:
                 guess = np.array(
                     [x + v * period * np.cos(theta), y + v * period * np.sin(theta), theta + omega * period]
                 )
-                found, share = match(points, guess, self._map)
+                found, share = match(points, guess, chart)
                 now["fix_arrives"][row] &= share >= AGREES
             now["fix"][row], self._odometry[row] = found, 0.0

@@ -22,18 +22,20 @@ class Scanner:
         taken: Control tick at which each of them was taken, `(B,)`; −1 before the first one.
     """
 
-    def __init__(self, sensing: Sequence[Sensing], period: float, obstacles: Obstacles) -> None:
+    def __init__(self, sensing: Sequence[Sensing], period: float, obstacles: Sequence[Obstacles]) -> None:
         """Takes what the lidars need.
 
         Args:
             sensing: Sensing of each robot.
             period: Control period in s.
-            obstacles: Obstacles that the beams meet.
+            obstacles: Obstacles that the beams of each robot meet.
 
         Raises:
             InputError: The time between two scans is not a whole number of control periods.
         """
-        self.lidars, self._period, self._surroundings = [s.lidar for s in sensing], period, Surroundings(obstacles)
+        self.lidars, self._period = [s.lidar for s in sensing], period
+        made = {world: Surroundings(world) for world in set(obstacles)}
+        self._surroundings = [made[world] for world in obstacles]
         try:
             self._every = [lidar.every(period) for lidar in self.lidars]
         except ValueError as error:
@@ -59,6 +61,6 @@ class Scanner:
         for row, lidar in enumerate(self.lidars):
             since = int(tick - self._start[row])
             if since % self._every[row] == 0 and self.taken[row] != tick and not failed[row]:
-                around = self._surroundings.at(since * self._period)
+                around = self._surroundings[row].at(since * self._period)
                 self.scans[row] = lidar.scan(poses[row], around, self._random[row])
                 self.taken[row] = tick

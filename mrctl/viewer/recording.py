@@ -111,7 +111,7 @@ class Recording:
     def _scans(self) -> list[Array]:
         """Places in the world that the beams of each scan met in m, `(n, 2)`."""
         s, first = self.scenario, self._first
-        scanner, found, failed = Scanner([s.sensing], self.period, s.obstacles), [], np.zeros(1)
+        scanner, found, failed = Scanner([s.sensing], self.period, [s.obstacles]), [], np.zeros(1)
         scanner.start(0, s.seed, 0)
         for tick in range(first + len(self.log)):
             now = self.log[max(0, tick - first)]  # before the interval only the noise is drawn

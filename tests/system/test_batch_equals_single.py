@@ -8,7 +8,9 @@ import pytest
 import mrctl
 from mrctl import (
     FEEDFORWARDS,
+    Box,
     Circle,
+    Disc,
     Event,
     Fel,
     InputError,
@@ -16,13 +18,17 @@ from mrctl import (
     LaneChange,
     Lemniscate,
     Line,
+    Obstacles,
     Perturbation,
     Pid,
+    Polygon,
+    RobotFile,
     Scenario,
     StopAndGo,
     Sweep,
 )
-from mrctl.loop.simulation import Simulation, simulate
+from mrctl.loop.simulation import Simulation, group_of, simulate, uniform
+from mrctl.physics.obstacles import layout
 from mrctl.physics.plant import BatchPlant, PhysicsPlant
 from mrctl.results.dataset import SIGNALS
 from mrctl.sensing.tiers import TIERS, Sensing
@@ -219,8 +225,8 @@ def test_equal(scenarios, alone, chunk):
 def test_threads(scenarios, alone, threads, monkeypatch):
     """The number of threads changes nothing; a batch of one is no special case either."""
 
-    def build(model, robot, size, substeps, _, obstacles):
-        return BatchPlant(model, robot, size, substeps, threads, obstacles)
+    def build(models, robot, substeps, _, obstacles):
+        return BatchPlant(models, robot, substeps, threads, obstacles)
 
     monkeypatch.setattr(import_module("mrctl.loop.simulation"), "build", build)
     rows = range(0, len(scenarios), 3)
@@ -228,6 +234,64 @@ def test_threads(scenarios, alone, threads, monkeypatch):
     for run, row in enumerate(rows):
         equal(alone[row], whole, run)
     equal(alone[1], simulate([scenarios[1]]), 0)
+
+
+def surroundings(seed: int) -> Obstacles:
+    """Four to seven obstacles around the way of a robot, one of which moves across it; one is a polygon."""
+    rng = np.random.default_rng(500 + seed)
+    shapes = []
+    for k in range(int(rng.integers(4, 8))):
+        away, angle = rng.uniform(0.9, 3.0), rng.uniform(-np.pi, np.pi)
+        x, y = away * np.cos(angle), 0.5 + away * np.sin(angle)
+        if k == 0:
+            shapes.append(Polygon(points=((x, y), (x + 0.3, y), (x, y + 0.4))))
+        elif k == 1:
+            course = Line(speed=float(rng.uniform(0.1, 0.4)), heading=angle)
+            shapes.append(Disc(x=-away, radius=0.15, course=course))  # relative to the start of its course
+        elif rng.random() < 0.5:
+            shapes.append(Box(x=x, y=y, angle=float(rng.uniform(0, 3)), length=0.4, width=0.2))
+        else:
+            shapes.append(Disc(x=x, y=y, radius=float(rng.uniform(0.05, 0.3))))
+    return Obstacles(shapes=tuple(shapes))
+
+
+@pytest.mark.parametrize("localisation", ["fixes", "particles", "scan"])
+def test_worlds(localisation):
+    """Robots in worlds that all differ go in one batch, with their own maps, scans, perturbations and collisions."""
+    runs = [
+        scenario(3 * seed).replace(
+            obstacles=surroundings(seed),
+            map=surroundings(seed // 2).still,  # of two robots one has a wrong map
+            robot=RobotFile(),
+            reference=Circle(period=4, radius=0.5),
+            sensing=Sensing(localisation=localisation),
+        )
+        for seed in range(8)
+    ]
+    alone = [simulate(run) for run in runs]
+    for rows in ([*range(8)], [7, 2, 5]):
+        assert len({group_of(runs[row]) for row in rows}) == 1
+        whole = simulate([runs[row] for row in rows])
+        for run, row in enumerate(rows):
+            equal(alone[row], whole, run)
+    ends = [str(run["failure"].values) for run in alone]
+    assert 1 <= ends.count("collision") <= 6
+
+
+def test_layouts():
+    """Worlds are kept apart where the engine cannot take them together, or one would pay for the other's geoms."""
+    disc, box = Disc(x=3), Box(x=3)
+    triangle, square = (Polygon(points=((2, 2), (3, 2), (2, 3), (1, 2.5))[:n]) for n in (3, 4))
+    moving = Disc(x=3, course=Line())
+    together = [(disc, box), (box, disc), (disc, disc, disc)], [(triangle, disc), (box, triangle, box)]
+    apart = [(), (disc, box), (triangle, disc), (square, disc), (moving, disc)]
+    assert len({layout(Obstacles(shapes=shapes)) for shapes in apart}) == len(apart)
+    for group in together:
+        assert len({layout(Obstacles(shapes=shapes)) for shapes in group}) == 1
+        Simulation([Scenario(obstacles=Obstacles(shapes=shapes)) for shapes in group])
+    counts = [1, 2, 3, 4, 7, 8]
+    rows = uniform([Scenario(obstacles=Obstacles(shapes=(disc,) * count)) for count in counts])
+    assert [[counts[row] for row in group] for group in rows] == [[1], [2, 3], [4, 7], [8]]
 
 
 def first_half(path: str, job: int) -> Outcome:

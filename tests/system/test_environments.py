@@ -221,7 +221,7 @@ def test_scale():
 RENDER = """
 import gymnasium, numpy as np
 from gymnasium.utils.env_checker import check_env
-from mrctl import Circle, InputError, Scenario
+from mrctl import Box, Circle, InputError, Obstacles, Scenario
 import mrctl.envs.gym
 
 make = lambda mode=None: gymnasium.make("mrctl/ResidualTracking-v0", scenario=Scenario(
@@ -243,6 +243,12 @@ for tick in range(51):
     many.step(np.zeros((2, 2)))
 drawn = many.render()
 assert len(drawn) == 2 and np.mean(drawn[0] != pictures[1]) < 1e-3 < np.mean(drawn[0] != drawn[1])
+near, far = (Scenario(reference=Circle(period=2.2, radius=0.3), laps=1, goal=(3, 3, 0),
+    obstacles=Obstacles(shapes=(Box(x=1, y=1, length=length, width=0.5),) * n)) for length, n in ((0.5, 1), (2, 2)))
+worlds = mrctl.envs.gym.NavigationVectorEnv(3, [near, far, near], render_mode="rgb_array")
+worlds.reset(seed=[3, 3, 3])
+one, other, same = worlds.render()
+assert (one == same).all() and np.mean(one != other) > 1e-2  # each in its own world
 """
 
 

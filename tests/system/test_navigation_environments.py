@@ -105,8 +105,13 @@ def test_bits():
 
 
 def test_vector_is_single():
-    """Robots with goals and lengths of their own: as Gymnasium's vector of single ones, autoreset and all."""
-    scenarios = [NOISY.replace(laps=1), NOISY.replace(goal=(0.5, 0.0, 0.0), laps=2), NOISY.replace(laps=3)]
+    """Robots with goals, lengths and worlds of their own: as Gymnasium's vector of single ones, autoreset and all."""
+    other = Obstacles(shapes=(Disc(x=2.6, radius=0.3), WALL.replace(y=-1.5), *NOISY.obstacles.moving, Box(y=-2)))
+    scenarios = [
+        NOISY.replace(laps=1),
+        NOISY.replace(goal=(0.5, 0.0, 0.0), laps=2),
+        NOISY.replace(laps=3, obstacles=other),
+    ]
     mine = NavigationVectorEnv(3, scenarios, threads=1)
     theirs = SyncVectorEnv([lambda s=s: NavigationEnv(s) for s in scenarios])
     assert mine.observation_space == theirs.observation_space and mine.action_space == theirs.action_space

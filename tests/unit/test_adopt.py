@@ -127,7 +127,7 @@ def test_the_same_robot(file, name):
 
 def drive(model, robot, volts, steering=0.0, seconds=3.0, twist=(0.0, 0.0)):
     """Returns the readings of a robot that starts at the origin, after some seconds of constant voltages in V."""
-    plant = build(model, robot, 1, 5)
+    plant = build([model], robot, 5)
     plant.reset(np.zeros((1, 3)), np.array([twist]))
     for _ in range(round(100 * seconds)):
         plant.step(np.array([[*volts, steering, 0.0]]))
@@ -141,7 +141,7 @@ def test_caster_behind(file):
     robot, model = read(file(document(body, MOTORS)))
     assert robot.wheelbase == pytest.approx(-0.3) and robot.com_offset == pytest.approx(-10 * 0.1 / 14)
     assert robot.front_load == pytest.approx(10 * 0.1 / 14 / 0.3)
-    plant = build(model, robot, 1, 5)
+    plant = build([model], robot, 5)
     plant.reset(np.zeros((1, 3)), np.zeros((1, 2)))
     for _ in range(100):
         plant.step(np.zeros((1, 4)))

@@ -14,7 +14,7 @@ MODEL, ROBOT = mjcf.build()
 
 def driven(size, volts, periods=150, model=MODEL, twist=(0.5, 0.0)):
     """Plant whose robots have driven with constant voltages in V, left and right."""
-    plant = build(model, ROBOT, size, 1)
+    plant = build([model] * size, ROBOT, 1)
     plant.reset(np.zeros((size, 3)), np.tile(twist, (size, 1)))
     for _ in range(periods):
         plant.step(np.tile([*volts, 0.0, 0.0], (size, 1)))
@@ -61,7 +61,7 @@ def test_wall():
     """A robot that drives into a wall is pushed back by it."""
     wall = Obstacles.from_dict({"shapes": [{"kind": "box", "x": 1.0, "length": 0.2, "width": 2.0}]})
     model, _ = mjcf.build(obstacles=wall)
-    plant = build(model, ROBOT, 1, 1, obstacles=wall)
+    plant = build([model], ROBOT, 1, obstacles=[wall])
     plant.reset(np.zeros((1, 3)), np.array([[0.5, 0.0]]))
     for _ in range(1000):
         if not plant.failed[0]:

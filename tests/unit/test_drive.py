@@ -26,7 +26,7 @@ def plants(
 ):
     """Yields a plant of each kind at the origin; the last robot has this driver, servo and perturbation."""
     model, robot = mjcf.build("flat", steering)
-    for plant in (PhysicsPlant(model, robot, SUBSTEPS), BatchPlant(model, robot, 3, SUBSTEPS)):
+    for plant in (PhysicsPlant([model], robot, SUBSTEPS), BatchPlant([model] * 3, robot, SUBSTEPS)):
         plant.perturb(plant.size - 1, perturbation, 0, driver, servo)
         plant.reset(np.zeros((plant.size, 3)), np.tile(twist, (plant.size, 1)))
         yield plant
@@ -155,7 +155,7 @@ def test_limit_within_the_period(tmp_path, inductance):
     text = (folder / "car.xml").read_text()
     (folder / "car.xml").write_text(text.replace('resistance="2.32"', f'resistance="2.32" inductance="{inductance}"'))
     model, robot = mjcf.build(str(folder / "flat.xml"))
-    plant = PhysicsPlant(model, robot, SUBSTEPS)
+    plant = PhysicsPlant([model], robot, SUBSTEPS)
     plant.perturb(0, Perturbation(motor_constant_factor=0.9), 0, Driver(current_limit=3.0))
     plant.reset(np.zeros((1, 3)), np.zeros((1, 2)))
     currents = []

@@ -23,7 +23,7 @@ SUBSTEPS = 5
 
 def plants(size=3, model=MODEL, robot=ROBOT):
     """Yields a plant of each kind, at rest at the origin."""
-    for plant in (PhysicsPlant(model, robot, SUBSTEPS), BatchPlant(model, robot, size, SUBSTEPS)):
+    for plant in (PhysicsPlant([model], robot, SUBSTEPS), BatchPlant([model] * size, robot, SUBSTEPS)):
         plant.reset(np.zeros((plant.size, 3)), np.zeros((plant.size, 2)))
         yield plant
 
@@ -35,8 +35,8 @@ def volts(plant, left, right=None, angle=0.0):
 
 def test_build():
     """One robot runs on dm_control, and several on the batch engine."""
-    assert isinstance(build(MODEL, ROBOT, 1, SUBSTEPS), PhysicsPlant)
-    assert isinstance(build(MODEL, ROBOT, 2, SUBSTEPS), BatchPlant)
+    assert isinstance(build([MODEL], ROBOT, SUBSTEPS), PhysicsPlant)
+    assert isinstance(build([MODEL] * 2, ROBOT, SUBSTEPS), BatchPlant)
 
 
 @pytest.mark.parametrize("world", ["flat", "slope", "rough"])

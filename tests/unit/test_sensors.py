@@ -157,7 +157,7 @@ def test_gravity(heading):
     """On a slope of 10° that climbs along the world's x, a resting accelerometer feels g sin 10° towards the summit."""
     model, robot = mjcf.build()
     slope = np.radians(10)
-    for plant in (PhysicsPlant(model, robot, 5), BatchPlant(model, robot, 2, 5)):
+    for plant in (PhysicsPlant([model], robot, 5), BatchPlant([model] * 2, robot, 5)):
         for row in range(plant.size):
             plant.perturb(row, Perturbation(slope=slope), 0)
         plant.reset(np.tile([0, 0, heading], (plant.size, 1)), np.zeros((plant.size, 2)))
@@ -180,7 +180,7 @@ def test_engine(name):
     """In a driven run encoders, gyro and accelerometer show what MuJoCo's own sensors at the wheels and `imu` show."""
     chosen = CAR if name == "car" else RobotFile(path=name)
     model, robot = mjcf.build("flat", mjcf.arrangement(chosen), 0.001, chosen)
-    plant, substeps = PhysicsPlant(model, robot, 10), 10
+    plant, substeps = PhysicsPlant([model], robot, 10), 10
     plant.reset(np.zeros((1, 3)), np.array([[0.2, 0.3]]))
     counts, data = 2000, mujoco.MjData(model)
     sensors = Sensors([ideal(encoder_counts=counts)], [0], PERIOD)
@@ -224,7 +224,7 @@ def test_models(name):
     model = mujoco.MjModel.from_xml_path(str(models_folder() / f"{name}.xml"))
     chosen = CAR if name == "car" else RobotFile(path=name)
     world, robot = mjcf.build("flat", mjcf.arrangement(chosen), 0.002, chosen)
-    plant = PhysicsPlant(world, robot, 5)
+    plant = PhysicsPlant([world], robot, 5)
     assert plant.imu[0] > 0 and np.array_equal(plant.imu, model.site("imu").pos)  # P is the origin of all three files
     data = mujoco.MjData(model)
     data.qpos[7:], data.qvel[3:6] = np.arange(1, model.nq - 6), (0, 0, 0.7)
