@@ -113,8 +113,9 @@ def build_each(
     Raises:
         InputError: As `build`.
     """
-    most, same = max(len(own.shapes) for own in obstacles), (world, steering, timestep, robot)
-    made = {own: build(*same, own, most - len(own.shapes)) for own in dict.fromkeys(obstacles)}
+    most = max(len(own.shapes) for own in obstacles)
+    idle = {own: most - len(own.shapes) for own in obstacles}
+    made = {own: build(world, steering, timestep, robot, own, count) for own, count in idle.items()}
     return [made[own][0] for own in obstacles], made[obstacles[0]][1]
 
 
