@@ -222,7 +222,7 @@ class Estimator:
         self._compiled = scanner is None and name != "user"  # else Python comes between the samples and the estimate
 
     def start(self, row: int, reading: Row, seed: int, tick: int) -> None:
-        """Starts the estimate of one robot from a first fix and an uncertain twist.
+        """Starts the estimate of one robot from a first posture and an uncertain twist.
 
         Args:
             row: Index of the robot.
@@ -237,7 +237,10 @@ class Estimator:
         seen["start"], seen["delay"] = tick, sensing.periods("delay", period)
         deviation = np.zeros(5)
         if self._name != "truth":
-            deviation[[0, 1, 2]] = sensor["fix_sigma"][[0, 0, 1]]
+            of_fix = sensor["fix_sigma"].tolist()
+            given = sensing.start_position_noise, sensing.start_heading_noise
+            position, heading = (own if noise is None else noise for own, noise in zip(of_fix, given, strict=True))
+            deviation[:3] = position, position, heading
             deviation[3] = START_TWIST[0] if sensor["quantum"] else 0.0
             deviation[4] = START_TWIST[1] if sensor["gyro_sigma"] else 0.0
         memory, size = self.memory[row], 5
@@ -246,7 +249,8 @@ class Estimator:
             self.scanner.start(row, seed, tick)
             self._located = -1  # the tick may have been located before a robot of an environment began again in it
         if self.localiser:
-            self.localiser.start(row, memory["mean"][:3], seed)
+            started = self.localiser.start(row, memory["mean"][:3], deviation[:3], seed)
+            memory["mean"][:3], deviation[:3] = started
         if self._name == "ekf":
             offset = sensing["accelerometer_bias"] ** 2 + START_OFFSET**2
             count = sensor["quantum"] ** 2 / 12

@@ -1,4 +1,8 @@
-"""Localisation on a map: posture fixes by scan matching or particles, from a lidar, replace the fixes of the tier."""
+"""Localisation on a map: posture fixes by scan matching or particles, from a lidar, replace the fixes of the tier.
+
+Where the first estimate may be far off, or there is none, scan matching starts from many poses, which odometry moves
+on, until a fix agrees with the estimate. The particle filter gets a share of its particles from such matches.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.record import InputError
-from mrctl.sensing.particles import Particles
+from mrctl.sensing.particles import MOST, SPREAD, TRIALS, Particles, anywhere, best_of, free
 from mrctl.sensing.scan_matching import match
 from mrctl.sensing.scanner import Scanner
 from mrctl.sensing.sensors import Sensors
@@ -17,6 +21,7 @@ from mrctl.theory.grid import field_of, map_area
 from mrctl.theory.obstacles import Obstacles, Surroundings
 
 BEAMS = {"scan": 120, "particles": 60}  # largest number of beams of a scan that are used
+SETTLED = 0.2  # m between fix and estimate in x and y, below which a search has ended
 AGREES = 0.5  # share of the points of a scan that must lie on the map for a fix
 
 
@@ -55,19 +60,37 @@ class Localiser:
         self._maps = [fields.get(own) for own in known]
         self.filters: list[Particles | None] = [None] * len(sensing)
         self._odometry = np.zeros((len(sensing), 2))  # distance in m and turn in rad since the last scan
+        self._sought: list[Array | None] = [None] * len(sensing)  # poses at which matching may find the robot, `(n, 3)`
 
-    def start(self, row: int, pose: Array, seed: int) -> None:
-        """Starts one robot at an estimate of its pose.
+    def start(self, row: int, pose: Array, deviation: Array, seed: int) -> tuple[Array, Array]:
+        """Starts one robot at an estimate of its pose, or anywhere on the map if its start is unknown.
 
         Args:
             row: Index of the robot.
-            pose: x and y in m and θ in rad, `(3,)`.
+            pose: Estimate of x and y in m and θ in rad, `(3,)`.
+            deviation: Standard deviations of its errors in m, m, rad, `(3,)`.
             seed: Seed of its particles.
+
+        Returns:
+            Estimate and standard deviations with which the estimator starts: those given or, if the start is unknown,
+            mean and standard deviations of the free places of the map, with any heading.
         """
-        self._odometry[row] = 0.0
-        chart = self._maps[row]
-        if chart and self._sensing[row].localisation == "particles":
-            self.filters[row] = Particles(chart, seed, pose.copy())
+        self._odometry[row], self._sought[row] = 0.0, None
+        chart, sensing, random = self._maps[row], self._sensing[row], np.random.default_rng([seed, 8])
+        if chart is None:
+            return pose, deviation
+        unknown = sensing.start_unknown
+        if sensing.localisation == "particles":
+            spread = np.maximum(deviation, SPREAD)
+            self.filters[row] = Particles(chart, seed, None if unknown else pose.copy(), spread)
+        elif unknown:
+            self._sought[row] = anywhere(free(chart), MOST, random)
+        elif sensing.start_position_noise or sensing.start_heading_noise:
+            self._sought[row] = pose + deviation * random.standard_normal((TRIALS, 3))
+        if not unknown:
+            return pose, deviation
+        places = free(chart)
+        return np.append(places.mean(axis=0), 0.0), np.append(places.std(axis=0), np.pi / np.sqrt(3))
 
     def locate(self, tick: int, estimate: Array) -> None:
         """Adds up the odometry, and makes the fixes from the scans of this tick.
@@ -88,6 +111,18 @@ class Localiser:
             points = sensing.lidar.points(scan, BEAMS[sensing.localisation])
             if particles := self.filters[row]:
                 found = particles.update(float(self._odometry[row, 0]), float(self._odometry[row, 1]), points)
+            elif (poses := self._sought[row]) is not None:
+                way, turn = self._odometry[row]
+                heading = poses[:, 2] + turn / 2
+                poses = poses + np.column_stack(
+                    [way * np.cos(heading), way * np.sin(heading), np.full(len(poses), turn)]
+                )
+                best, shares = best_of(poses, points, chart)
+                found, share = best[0], shares[0]
+                now["fix_arrives"][row] &= share >= AGREES
+                self._sought[row] = best if share >= AGREES else poses
+                if begun[row] and np.abs(found[:2] - estimate[row, :2]).max() < SETTLED:
+                    self._sought[row] = None
             elif not begun[row]:
                 continue  # there is no estimate yet
             else:

@@ -24,7 +24,8 @@ BIN = 0.1, 0.1, 0.2  # m, m and rad, bin sizes; the number of occupied bins sets
 ERROR, QUANTILE = 0.05, 2.326  # bound on the Kullback-Leibler distance, kept with probability 99 %
 CLUSTER = 0.5  # m and rad, distance from the best particle within which particles are averaged
 AGREE = 0.8  # share of a scan's points that lie on the map, below which the filter is taken for lost
-RESET = 0.2  # share of the particles that are then drawn from the scan
+RESET, CLOSE = 0.2, 0.02  # share of the particles that are then drawn from the scan; deviation about it in m and rad
+SPREAD = 0.1  # m and rad, least deviation of the particles at the start
 TRIALS, SEEDS, KEPT = 4000, 40, 5  # random poses, those matched with the scan, and the best, which seed particles
 
 
@@ -47,19 +48,16 @@ class Particles:
             spread: Standard deviations about it in m, m, rad, `(3,)`; by default 0.1 m and 0.1 rad.
         """
         self._field, self._random = field, np.random.default_rng([seed, 7])
-        rows, columns = np.nonzero(field.distance > 0.1)
-        self._free = field.origin + (np.column_stack([columns, rows]) + 0.5) * field.resolution
+        self._free = free(field)
+        self._sought: Array | None = None  # poses from which the first scan is matched, `(n, 3)`
         if start is None:
-            self.particles = self._anywhere(MOST)
+            self.particles = self._sought = anywhere(self._free, MOST, self._random)
         else:
-            deviation = np.array([0.1, 0.1, 0.1]) if spread is None else spread
+            deviation = np.full(3, SPREAD) if spread is None else spread
             self.particles = start + deviation * self._random.standard_normal((LEAST, 3))
+            if np.any(deviation > SPREAD):
+                self._sought = start + deviation * self._random.standard_normal((TRIALS, 3))
         self.pose, self.spread = self.particles.mean(axis=0), self.particles.std(axis=0)
-
-    def _anywhere(self, count: int) -> Array:
-        """Draws poses in free space, `(count, 3)`."""
-        places = self._free[self._random.integers(len(self._free), size=count)]
-        return np.column_stack([places, self._random.uniform(-np.pi, np.pi, count)])
 
     def update(self, way: float, turn: float, points: Array) -> Array:
         """Moves the particles as the robot moved by its odometry, weighs them by a scan, and resamples.
@@ -73,12 +71,19 @@ class Particles:
             `pose`, `(3,)`.
         """
         random, n = self._random, len(self.particles)
+        if self._sought is not None:
+            best, _ = best_of(self._sought, points, self._field)
+            count, self._sought = int(RESET * n), None
+            drawn = best[random.integers(len(best), size=count)]
+            self.particles[:count] = drawn + CLOSE * random.standard_normal((count, 3))
         move.compiled(self.particles, way, turn, random.standard_normal((n, 3)))
         weights = np.empty(n)
         weigh.compiled(self.particles, points, self._field, weights)
         average.compiled(self.particles, weights, self.pose, self.spread)
         lost = len(points) > 0 and agreement.compiled(points, self.pose, self._field) < AGREE
-        fresh = self._seeds(points) if lost else np.zeros((1, 3))
+        fresh = np.zeros((1, 3))
+        if lost:
+            fresh = best_of(anywhere(self._free, TRIALS, random), points, self._field)[0]
         found = np.empty((MOST, 3))
         count = resample.compiled(
             self.particles, weights, random.uniform(size=(MOST, 2)), random.standard_normal((MOST, 3)), fresh,
@@ -87,13 +92,38 @@ class Particles:
         self.particles = found[:count].copy()
         return self.pose
 
-    def _seeds(self, points: Array) -> Array:
-        """Returns the poses that agree best with a scan, of many random ones, `(KEPT, 3)`."""
-        poses, weights = self._anywhere(TRIALS), np.empty(TRIALS)
-        weigh.compiled(poses, points[:: max(1, len(points) // 20)], self._field, weights)
-        best = poses[np.argsort(-weights, kind="stable")[:SEEDS]]
-        shares = np.array([fit.compiled(points, pose, self._field) for pose in best])
-        return best[np.argsort(-shares, kind="stable")[:KEPT]]
+
+def free(field: Field) -> Array:
+    """Returns the places of a map that are more than 10 cm from what is on it, as x and y in m, `(n, 2)`."""
+    rows, columns = np.nonzero(field.distance > 0.1)
+    return field.origin + (np.column_stack([columns, rows]) + 0.5) * field.resolution
+
+
+def anywhere(places: Array, count: int, random: np.random.Generator) -> Array:
+    """Draws poses at some places, x and y in m, `(n, 2)`, with any heading: `(count, 3)` in m, m, rad."""
+    own = places[random.integers(len(places), size=count)]
+    return np.column_stack([own, random.uniform(-np.pi, np.pi, count)])
+
+
+def best_of(poses: Array, points: Array, field: Field) -> tuple[Array, Array]:
+    """Matches a scan from those of many poses that explain it best.
+
+    Args:
+        poses: Poses in m, m, rad, `(n, 3)`.
+        points: Points of the scan in the robot's frame in m, `(k, 2)`.
+        field: Distance field of the map.
+
+    Returns:
+        The `KEPT` likeliest of the matched poses, the likeliest first, `(KEPT, 3)`; and the shares of the points that
+        lie on the map from them, `(KEPT,)`.
+    """
+    weights = np.empty(len(poses))
+    weigh.compiled(poses, points[:: max(1, len(points) // 20)], field, weights)
+    best = poses[np.argsort(-weights, kind="stable")[:SEEDS]]
+    shares, weights = np.array([fit.compiled(points, pose, field) for pose in best]), np.empty(len(best))
+    weigh.compiled(best, points, field, weights)
+    order = np.argsort(-weights, kind="stable")[:KEPT]
+    return best[order], shares[order]
 
 
 @kernel
@@ -206,7 +236,7 @@ def resample(
         if chance[n, 1] < lost:
             own = fresh[int(chance[n, 0] * len(fresh))]
             for k in range(3):
-                found[n, k] = own[k] + 0.02 * noise[n, k]
+                found[n, k] = own[k] + CLOSE * noise[n, k]
         else:
             chosen = min(np.searchsorted(summed, chance[n, 0] * summed[-1]), len(particles) - 1)
             for k in range(3):

@@ -127,6 +127,13 @@ class Sensing(Record):
     """Share of the fixes that never arrive."""
     fix_outliers: Annotated[float, Field(ge=0, le=1)] | None = None
     """Share of the fixes that are wrong by up to 1 m in x and y; not with a lidar."""
+    start_position_noise: Annotated[float, Field(ge=0, le=10)] | None = None
+    """Standard deviation of x and y of the first estimate of the posture in m; by default that of a fix."""
+    start_heading_noise: Annotated[float, Field(ge=0, le=3)] | None = None
+    """Standard deviation of the heading of the first estimate in rad; by default that of a fix."""
+    start_unknown: bool = False
+    """Whether the robot starts without an estimate of its posture, and looks for its place on the whole map; only with
+    localisation by `scan` or `particles`."""
     delay: Latency | None = None
     """Delay from the measurement to the voltage in s, a multiple of the control period; the controller knows it."""
     dead_zone: DeadZone | None = None
@@ -212,8 +219,11 @@ class Sensing(Record):
 
         Raises:
             ValueError: A time is no whole number of control periods, more than four fixes are on their way at the same
-                time, fixes are older than the run, or `fix_rate` is set though fixes come from a lidar.
+                time, fixes are older than the run, `fix_rate` is set though fixes come from a lidar, or the start is
+                unknown and nothing looks for it.
         """
+        if self.start_unknown and (self.localisation == "fixes" or self.source == "odometry"):
+            raise ValueError("sensing.start_unknown: needs localisation by scan or particles, and not odometry alone")
         if self.localisation != "fixes":
             if self.fix_rate is not None:
                 raise ValueError("sensing.fix_rate: with a lidar the rate of fixes is that of its scans, lidar.rate")
