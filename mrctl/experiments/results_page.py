@@ -27,7 +27,7 @@ from mrctl.experiments import identify as identification
 from mrctl.experiments import paper, tuning
 from mrctl.experiments.cases import REPLICATES
 from mrctl.experiments.held_out import LOG
-from mrctl.experiments.suite_tables import COLUMNS, TITLES, interval
+from mrctl.experiments.suite_tables import COLUMNS, TITLES, column_title, interval
 from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.record import InputError
 
@@ -228,7 +228,8 @@ def suite_text(table: Table, everything: str) -> str:
         for row in table["rows"]
         if row["case"] == case
     ]
-    short = markdown(["case", "feedforward", "failed", *COLUMNS.values()], cells)
+    columns = [column_title(table["rows"], metric) for metric in COLUMNS]
+    short = markdown(["case", "feedforward", "failed", *columns], cells)
     by_title = {title: text.partition("\n\n") for title, text in sections(everything).items() if title}
     says = "\n".join(f"- {title}. {says}" for title, (says, _, _) in by_title.items())
     folded = [

@@ -143,7 +143,7 @@ def last_laps(rows: Sequence[Row]) -> pd.DataFrame:
 
     For random scenarios it also has the share of them in which the feedforward does no harm, compared with PID alone.
     """
-    header = ["case", "feedforward", "failed", *(f"{title}; worst 5 %" for title in COLUMNS.values())]
+    header = ["case", "feedforward", "failed", *(f"{column_title(rows, metric)}; worst 5 %" for metric in COLUMNS)]
     header += ["beats PID in V / θ̇ / position", "beats model", "guard acted"]
     unchanged, random = rows[0]["part"] in UNCHANGED, any("no_worse" in row["position_rmse"] for row in rows)
     harm = f"at most {NO_WORSE:g}× PID in V / θ̇ / position", f"position over PID, 99 %; runs above {MUCH_WORSE:g}"
@@ -244,14 +244,49 @@ def recovered(rows: Sequence[Row]) -> str:
 
 
 def interval(error: Row) -> str:
-    """Returns a mean in thousandths with its interval, with enough digits to tell the ends of the interval apart."""
+    """Returns a mean in thousandths with its interval, with the digits that the floor leaves, or three without a floor.
+
+    Where the ends of the interval would then be the same, they get more digits without a floor; with one, they are
+    rounded to the outside.
+    """
     if not error["samples"]:
         return "–"
     value, low, high = (1e3 * error[key] for key in ("value", "low", "high"))
+    step = _step(error)
     if not high > low:
-        return number(value)
-    digits = next((n for n in range(3, 9) if number(low, n) != number(high, n)), 9)
+        return _resolved(value, step)
+    if _resolved(low, step) != _resolved(high, step):
+        return f"{_resolved(value, step)} [{_resolved(low, step)}, {_resolved(high, step)}]"
+    if step:
+        outside = step * np.floor(low / step), step * np.ceil(high / step)
+        return f"{_resolved(value, step)} [{', '.join(_resolved(end, step) for end in outside)}]"
+    digits = next((n for n in range(4, 9) if number(low, n) != number(high, n)), 9)
     return f"{number(value, digits)} [{number(low, digits)}, {number(high, digits)}]"
+
+
+def _step(error: Row) -> float:
+    """Returns the unit of the last digit, in thousandths, that the floor of the means leaves; 0 without a floor.
+
+    The floor has two digits if they are below 36, else one, as the Particle Data Group rounds errors.
+    """
+    floor = 1e3 * error.get("floor", {}).get("mean", 0.0)
+    if not floor > 0:
+        return 0.0
+    decade = 10.0 ** np.floor(np.log10(floor))
+    return decade / 10 if floor < 3.55 * decade else decade
+
+
+def _resolved(value: float, step: float) -> str:
+    """Returns a number with three significant digits, but none beyond `step`; 0 stands for no such bound."""
+    if step and np.isfinite(value) and abs(value) < 100 * step:
+        return f"{value:.{max(0, -round(np.log10(step)))}f}"
+    return number(value)
+
+
+def column_title(rows: Sequence[Row], metric: str) -> str:
+    """Returns the title of the column of a metric, with the floor of the means in the last lap, if it is known."""
+    floor = 1e3 * max(row[metric].get("floor", {}).get("mean", 0.0) for row in rows)
+    return COLUMNS[metric] + (f" (floor {number(floor, 2)})" if floor else "")
 
 
 def _window(error: Row, window: str) -> Row:
@@ -269,7 +304,7 @@ def _signed(value: float) -> str:
 
 
 def _mean(error: Row) -> str:
-    return f"{interval(error)}; {number(1e3 * error['worst'])}" if error["samples"] else "–"
+    return f"{interval(error)}; {_resolved(1e3 * error['worst'], _step(error))}" if error["samples"] else "–"
 
 
 def _converged(row: Row) -> str:

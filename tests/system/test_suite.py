@@ -271,6 +271,24 @@ def test_interval(value: float, low: float, high: float, text: str) -> None:
     assert suite_tables.interval({"value": value, "low": low, "high": high, "samples": 2}) == text
 
 
+@pytest.mark.parametrize(
+    ("value", "low", "high", "floor", "text"),
+    [
+        (1.7236e-3, 1.68e-3, 1.76e-3, 0.54e-3, "1.7 [1.7, 1.8]"),  # one digit of the floor
+        (1.7236e-3, 1.71e-3, 1.74e-3, 0.54e-3, "1.7 [1.7, 1.8]"),  # ends that are rounded alike go outwards
+        (0.4927e-3, 0.462e-3, 0.552e-3, 0.0447e-3, "0.49 [0.46, 0.55]"),
+        (0.4740e-3, 0.452e-3, 0.496e-3, 0.111e-3, "0.47 [0.45, 0.50]"),  # two digits of a floor below 36
+        (12.714e-3, 12.6e-3, 12.9e-3, 0.54e-3, "12.7 [12.6, 12.9]"),
+        (1.4321, 1.4, 1.5, 0.54e-3, "1.43e+03 [1.40e+03, 1.50e+03]"),  # three significant digits suffice
+        (0.65e-3, 0.64e-3, 0.66e-3, 0.0, "0.650 [0.640, 0.660]"),
+    ],
+)
+def test_no_digit_below_the_floor(value: float, low: float, high: float, floor: float, text: str) -> None:
+    """The last printed digit is that of the floor, rounded as the Particle Data Group does."""
+    stated = {"value": value, "low": low, "high": high, "samples": 20, "floor": {"mean": floor}}
+    assert suite_tables.interval(stated) == text
+
+
 def test_no_worse() -> None:
     """A run that is lost where PID is not counts as infinitely worse; one that PID loses too does no harm."""
     pid, lost = np.full(200, 2.0), np.arange(200) < 3

@@ -8,12 +8,17 @@ import shapely
 from scipy.optimize import nnls
 from test_obstacles import judged, random_shapes
 
-from mrctl import Box, Obstacles, Scenario, Sensing, Waypoints
+from mrctl import Box, Obstacles, RobotFile, Scenario, Sensing, Waypoints
+from mrctl.control.features import feature_matrix
 from mrctl.control.kanayama import kanayama, posture_error
+from mrctl.experiments.feeding_up import PLANTS
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.navigation.avoidance import Avoiding, Barrier, Following, Pacing, approach, avoid, nearest, share
 from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
+from mrctl.physics.perturb import perturb
 from mrctl.theory.clearance import clearance, cover, rim
+from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.obstacles import Surroundings, turned
 from mrctl.theory.rays import Scan
 
@@ -236,3 +241,22 @@ def test_wrapped_stage_sees() -> None:
     stage.reset(np.zeros((1, 3)), np.zeros((1, 7)), 0.02)
     stage.see(0, Scan(np.full(8, np.inf), np.arange(8) * np.pi / 4, 5.0, np.zeros(3), 0.0))
     assert made[0].seen == 1 and stage.followed is Looks.followed
+
+
+@pytest.mark.parametrize("path", ["car", "racecar", "turtlebot"])
+def test_every_plant_brakes(path):
+    """On no plant of the suite is the supply too weak to brake as the filter counts on, by the true inverse dynamics."""
+    robot_file = RobotFile(path=path)
+    nominal, robot = mjcf.build(robot=robot_file)
+    for name, perturbation in PLANTS.items():
+        model = mjcf.clone(nominal)
+        perturb(nominal, model, perturbation, robot)
+        true = read_robot(model, perturbation.supply_factor)
+        speeds = np.linspace(0.05, 0.9, 18)[:, None] * [robot.max_speed, 0.0]
+        steady, braked = (
+            feature_matrix(speeds, np.full((18, 2), [a, 0.0]), robot.half_track, np.ones(8))
+            @ inverse_coefficients(true)
+            for a in (0.0, -1.0)
+        )
+        hardest = (0.9 * robot.supply + steady[:, 0]) / (steady - braked)[:, 0]  # m/s²
+        assert hardest.min() > 2.7 * robot.max_acceleration, name
