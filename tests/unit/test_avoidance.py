@@ -245,7 +245,7 @@ def test_wrapped_stage_sees() -> None:
 
 @pytest.mark.parametrize("path", ["car", "racecar", "turtlebot"])
 def test_every_plant_brakes(path):
-    """On no plant of the suite is the supply too weak to brake as the filter counts on, by the true inverse dynamics."""
+    """On no plant of the suite is the supply too weak to brake as the filter counts on."""
     robot_file = RobotFile(path=path)
     nominal, robot = mjcf.build(robot=robot_file)
     for name, perturbation in PLANTS.items():
