@@ -144,12 +144,23 @@ def written_by(result: xr.Dataset) -> str:
     return json.loads(result.attrs.get("versions", "{}")).get("mrctl", "")
 
 
+def check_kind(result: object) -> None:
+    """Refuses what is no dataset.
+
+    Raises:
+        InputError: It is something else.
+    """
+    if not isinstance(result, xr.Dataset):
+        raise InputError(f"result: must be an xarray.Dataset, as from simulate, not of type {type(result).__name__}")
+
+
 def require(result: xr.Dataset, names: Iterable[str]) -> None:
     """Checks that a result has the variables that are about to be read.
 
     Raises:
         InputError: One is missing, as may happen with a result of an older mrctl; the message names that version.
     """
+    check_kind(result)
     for name in names:
         if name not in result.variables:
             writer = f", which mrctl {version} wrote" if (version := written_by(result)) else ""
@@ -234,6 +245,7 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     Raises:
         InputError: The path exists or cannot be written.
     """
+    check_kind(result)
     from zarr.codecs import Crc32cCodec, ZstdCodec  # imported here because a run that saves nothing needs no zarr
 
     path = Path(path)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mrctl.control.features import feature_matrix
 from mrctl.control.guard import GUARD_ACTIONS, NONE, REASONS
 from mrctl.record import InputError
-from mrctl.results.dataset import require
+from mrctl.results.dataset import check_kind, require
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,12 @@ class Laps(NamedTuple):
 
 
 def as_runs(result: xr.Dataset) -> xr.Dataset:
-    """Returns the dataset with a `run` dimension and per-run coordinates, also for a single run that was squeezed."""
+    """Returns the dataset with a `run` dimension and per-run coordinates, also for a single run that was squeezed.
+
+    Raises:
+        InputError: It is no dataset.
+    """
+    check_kind(result)
     if "run" not in result.dims:
         single = result.expand_dims("run" if "run" in result.coords else {"run": [0]})
         result = single.assign_coords(
@@ -386,6 +391,7 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
     Raises:
         InputError: No run has that lap.
     """
+    check_kind(result)
     laps = result if "lap" in result.dims else per_lap(result)
     counts = laps["laps"].values
     index = np.where(lap > 0, lap - 1, counts + lap)

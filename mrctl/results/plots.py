@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from mrctl.record import InputError
 from mrctl.results import excitation as exciting
 from mrctl.results.controllers import colours_of
-from mrctl.results.dataset import scenarios_of
+from mrctl.results.dataset import check_kind, scenarios_of
 from mrctl.results.metrics import METRICS, as_runs, known, laps_of, per_lap
 from mrctl.scenario import Scenario
 from mrctl.theory.obstacles import turned
@@ -272,6 +272,7 @@ def learning_curve(result: xr.Dataset, metrics: Sequence[str] = ("v_rmse", "omeg
     if not metrics:
         raise InputError("metrics: at least one is needed")
     names = [known(name) for name in metrics]
+    check_kind(result)
     laps = as_runs(result if "lap" in result.dims else per_lap(result))
     columns = min(2, len(names))
     rows = -(-len(names) // columns)

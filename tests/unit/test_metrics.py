@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from mrctl.control.features import feature_scale
 from mrctl.record import InputError
-from mrctl.results import metrics
+from mrctl.results import metrics, plots
+from mrctl.results.dataset import save
 from mrctl.theory.references import Circle, Lemniscate
 
 DT, LAP = 0.01, 2.0
@@ -277,6 +278,11 @@ def test_recovery_laps():
         (lambda r: metrics.summary(r, lap=9), "lap"),
         (lambda r: metrics.laps_to_converge(metrics.per_lap(r), "speed"), "metric"),
         (lambda r: metrics.laps_to_converge(metrics.per_lap(r), "v_rmse", 0.5), "factor"),
+        (lambda _: metrics.summary(3), "result"),  # type: ignore[arg-type]
+        (lambda _: metrics.per_lap("runs.zarr"), "result"),  # type: ignore[arg-type]
+        (lambda _: plots.errors(None), "result"),  # type: ignore[arg-type]
+        (lambda _: plots.learning_curve([]), "result"),  # type: ignore[arg-type]
+        (lambda _: save(3, "a.zarr"), "result"),  # type: ignore[arg-type]
     ],
 )
 def test_bad_input(call, field):
