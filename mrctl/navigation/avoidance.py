@@ -23,9 +23,10 @@ from mrctl.control.design import motion as design
 from mrctl.control.kanayama import GAINS, kanayama, posture_error
 from mrctl.control.stages import Motion
 from mrctl.kernel import Array, kernel
+from mrctl.loop.goals import RESTING
 from mrctl.loop.simulation import arranged
 from mrctl.navigation.planning import room
-from mrctl.navigation.rollouts import Replan, opened
+from mrctl.navigation.rollouts import SHORTER, Replan, opened, plan_around
 from mrctl.navigation.sight import Sight
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance, outside, point_to_segment, rim
@@ -158,7 +159,8 @@ class Pacing:
     without obstacles. λ changes no faster than the robot can follow.
 
     Where something that stands and is not on the map blocks the plan, the robot stops `STANDOFF` before it, and drives
-    on along another plan.
+    on along another plan. Where the map has changed and another plan would take less than `SHORTER` of the time that is
+    left, it also stops, because a plan begins at rest, and drives on along that.
 
     Attributes:
         followed: What the robots follow, as in `mrctl.control.stages.Motion`, `(B, 7)`.
@@ -195,6 +197,8 @@ class Pacing:
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
         self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
         self._looked = np.zeros(size, bool)  # which robots have a scan that is new
+        self._map_changed = np.zeros(size, bool)  # so that a shorter way may be free
+        self._stops = np.zeros(size, bool)  # which stop for a shorter way
 
     def _sampled(self, plan: Waypoints) -> Array:
         """Returns a plan as `output` gets it, for each motion period, `(n, 7)`."""
@@ -218,10 +222,11 @@ class Pacing:
         """Lets a robot drive a plan from its beginning."""
         self._plans[row], self._kept[row] = self._sampled(plan), self._margin(plan, row)
         self._clock[row], self._anchor[row], self._blocked[row] = 0.0, 0.0, np.inf
+        self._map_changed[row] = self._stops[row] = False
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot, and looks whether its plan is free; for the arguments see `stages.Motion`."""
-        self._sight.see(row, scan)
+        self._map_changed[row] |= self._sight.see(row, scan)
         self._looked[row] = True
         standing = self._sight.standing(row)
         self._blocked[row] = np.inf
@@ -238,7 +243,7 @@ class Pacing:
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
         for row in np.flatnonzero(self._looked):  # robots that have failed do not look
-            self._get_on(int(row), pose[row])
+            self._get_on(int(row), pose[row], abs(float(twist[row, 0])))
         self._looked[:] = False
         now = np.empty((len(pose), 7))
         for row, plan in enumerate(self._plans):
@@ -256,7 +261,7 @@ class Pacing:
 
     def _share(self, row: int, request: Array, pose: Array) -> float:
         """Returns λ of one robot."""
-        sight, allowed = self._sight, 1.0
+        sight, allowed = self._sight, 0.0 if self._stops[row] else 1.0
         if np.isfinite(self._blocked[row]):
             part = self._plans[row][int(self._clock[row]) : int(self._blocked[row]), 3]
             left = self._period * float(np.abs(part).sum()) - STANDOFF
@@ -267,17 +272,38 @@ class Pacing:
             allowed, *(share(request, pose, *each) for each in around if len(each[0].discs) + len(each[0].rings))
         )
 
-    def _get_on(self, row: int, pose: Array) -> None:
-        """Gives a robot that has hardly got on along its plan another one, if what stands there is not on the map."""
+    def _get_on(self, row: int, pose: Array, speed: float) -> None:
+        """Gives a robot another plan, if what stands there has hardly let it get on, or if the map lets it.
+
+        Args:
+            row: Which robot.
+            pose: x and y in m and θ in rad, `(3,)`.
+            speed: |V| in m/s.
+        """
+        if self._stops[row]:
+            if speed < RESTING:
+                self._stops[row] = False
+                if plan := self._planned(row, pose):
+                    self._begin(row, plan)
+            return
+        if self._map_changed[row]:
+            self._map_changed[row] = False
+            left = self._period * (len(self._plans[row]) - self._clock[row])
+            plan = self._planned(row, pose)
+            self._stops[row] = plan is not None and plan.period + speed / self._brakes < SHORTER * left
         now, standing = self._period * self._tick, self._sight.standing(row)
         if self._clock[row] - self._anchor[row] > SLOW * WAITED / self._period or not len(standing.discs):
             self._anchor[row], self._since[row] = self._clock[row], now
         if now - self._since[row] < WAITED:
             return
         self._since[row] = now  # where there is no other plan, it tries again later
-        around = self._sight.around(row, now, self._footprint, pose)
-        if plan := self._replan(pose, around, self._given[row]):
+        if plan := self._planned(row, pose):
             self._begin(row, plan)
+
+    def _planned(self, row: int, pose: Array) -> Waypoints | None:
+        """Makes a plan from where a robot is, around what it knows."""
+        own = row, self._period * self._tick, self._footprint, pose
+        return plan_around(self._replan, self._sight, *own, self._given[row])
 
 
 def share(request: Array, pose: Array, outlines: Outlines, barrier: Barrier) -> float:

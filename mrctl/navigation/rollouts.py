@@ -133,6 +133,24 @@ def opened(reference: Reference) -> Waypoints:
     return reference
 
 
+def plan_around(
+    replan: Replan, sight: Sight, row: int, time: float, footprint: Array, pose: Array, given: Waypoints | None
+) -> Waypoints | None:
+    """Makes a plan that keeps off what is not on the map, or else one that only does not touch it.
+
+    Args:
+        replan: Makes a plan to the goal.
+        sight: What the robots know.
+        row: Which robot.
+        time: Time in s.
+        footprint: Its corners in its frame in m, `(n, 2)`.
+        pose: x and y in m and θ in rad, from which it plans, `(3,)`.
+        given: The plan that came since the start, or None.
+    """
+    far = replan(pose, sight.around(row, time, footprint, pose), given)
+    return far or replan(pose, sight.outlines(row, time), given)
+
+
 class Reactive(ABC):
     """A motion stage that asks for twists along a plan, and makes another plan when it is off this one or waits.
 
@@ -303,11 +321,10 @@ class Reactive(ABC):
         return twist is not None
 
     def _planned(self, row: int, pose: Array) -> Waypoints | None:
-        """Makes a plan that keeps off what is not on the map, or else one that only does not touch it."""
-        now, given = self._period * self._tick, self._given[row]
+        """Makes a plan from where a robot is, around what it knows."""
         self._map_changed[row] = False
-        far = self._replan(pose, self._sight.around(row, now, self._footprint, pose), given)
-        return far or self._replan(pose, self._sight.outlines(row, now), given)
+        own = row, self._period * self._tick, self._footprint, pose
+        return plan_around(self._replan, self._sight, *own, self._given[row])
 
     def begin(self, tick: int) -> None:  # noqa: B027 (most have nothing to do)
         """Is called once in a motion period, before `choose` for each robot."""

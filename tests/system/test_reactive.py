@@ -235,12 +235,13 @@ def test_open_door(robot: str, avoid: Avoid) -> None:
     assert float(run["y"].values[np.argmax(run["x"].values > 2)]) < -0.7 and driven.plan.poses[:, 1].max() > 0.7
 
 
-def test_shorter() -> None:
+@pytest.mark.parametrize("avoid", ["window", "barrier"])
+def test_shorter(avoid: Avoid) -> None:
     """Where the wall that its plan goes around has gone, a robot drives straight on."""
     wall, post = Box(x=2.0, y=0.3, length=0.1, width=1.8), Disc(x=2.0, y=4.0)
     known = Obstacles(shapes=(wall, post))
     task = Task(obstacles=Obstacles(shapes=(post,)), map=known, start=(0.0, 0.0, 0.0), goal=(4.0, 0.0, 0.0))
-    driven = navigate(task, PLANNED, avoid="window")
+    driven = navigate(task, PLANNED, avoid=avoid)
     assert driven.table["outcome"].tolist() == ["arrived"]
     assert float(np.abs(driven.result["y"]).max()) < 0.3 < 0.8 < np.abs(driven.plan.poses[:, 1]).max()
 
