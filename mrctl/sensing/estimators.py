@@ -237,9 +237,7 @@ class Estimator:
         seen["start"], seen["delay"] = tick, sensing.periods("delay", period)
         deviation = np.zeros(5)
         if self._name != "truth":
-            of_fix = sensor["fix_sigma"].tolist()
-            given = sensing.start_position_noise, sensing.start_heading_noise
-            position, heading = (own if noise is None else noise for own, noise in zip(of_fix, given, strict=True))
+            position, heading = sensing["start_position_noise"], sensing["start_heading_noise"]
             deviation[:3] = position, position, heading
             deviation[3] = START_TWIST[0] if sensor["quantum"] else 0.0
             deviation[4] = START_TWIST[1] if sensor["gyro_sigma"] else 0.0

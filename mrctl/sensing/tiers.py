@@ -64,6 +64,9 @@ VALUES: dict[str, tuple[float, float, float]] = {
 }
 """Values of the three tiers in the units of the fields of `Sensing`; a rate of 0 is that of the control loop."""
 
+START = {"start_position_noise": "fix_position_noise", "start_heading_noise": "fix_heading_noise"}
+"""Fields whose default is the value of another field."""
+
 LATENCIES = "encoder_latency", "gyro_latency", "accelerometer_latency"
 
 LOCALISED: dict[str, dict[str, float]] = {
@@ -152,6 +155,8 @@ class Sensing(Record):
     def __getitem__(self, name: str) -> float:
         """Returns the value of a field or, if it is None, that of the lidar or the tier, in the unit of the field."""
         own = getattr(self, name)
+        if name in START and own is None:
+            return self[START[name]]
         if self.localisation != "fixes" and own is None:
             if name == "fix_rate":
                 return self.lidar.rate
