@@ -12,7 +12,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic.fields import FieldInfo
 
 from mrctl.record import Record
-from mrctl.sensing.tiers import VALUES, Sensing
+from mrctl.sensing.tiers import START, VALUES, Sensing
 from mrctl.theory.robot import Robot
 from mrctl.viewer.slider_ranges import Interval, slider_range
 
@@ -20,7 +20,7 @@ OnChange = Callable[[tuple[str, ...], Any], None]
 WORLDS = ("flat", "slope", "rough", "patch")
 SENSORS = {"encoders": "encoder", "gyro": "gyro", "accelerometer": "accelerometer", "posture fixes": "fix"}
 DRIVER = ("dead_zone", "pwm_steps", "current_limit", "battery_resistance")
-MAPPED = ("localisation", "lidar")  # fields without an input, as they need obstacles, which a scenario file has
+MAPPED = ("localisation", "lidar", "start_unknown")  # fields without an input, as they need obstacles, which a scenario file has
 ANEW, ANEW_HINT = " ↻", "A change begins another run."  # behind the label of what cannot change during a run
 SEED = ("seed",)  # a number that no slider suits
 STEERING = ("steering_offset", "steering_backlash")
@@ -270,7 +270,8 @@ def _scale(path: tuple[str, ...], value: float) -> float:
     """Returns the number on which the step of an input depends: its present value, or the least one of any tier."""
     if path[0] != "sensing":
         return value
-    return min((v for v in VALUES[path[-1]] if v > 0), default=1.0)
+    name = START.get(path[-1], path[-1])
+    return min((v for v in VALUES[name] if v > 0), default=1.0)
 
 
 def _kinds(field: FieldInfo) -> dict[str, type[Record]]:
