@@ -51,8 +51,9 @@ def simulate(
     One scenario runs through dm_control, several run together on MuJoCo's batch engine, with the same bits.
 
     Args:
-        scenarios: One scenario, or several; those that differ in world, robot, laws, estimator, steering, delay, rates,
-            much in the number of obstacles or, without a goal, in length run in batches of their own.
+        scenarios: One scenario, or several. Those that differ in world, robot, laws, estimator, steering, delay or
+            rates, in the kinds or much in the number of their obstacles or, without a goal, in length run in batches of
+            their own.
         progress: Whether to show a progress bar.
         threads: Number of threads for control and physics, which does not change the result; 0 for all cores.
         stages: The user's stages `motion`, `feedback`, `feedforward`, `steering` or `estimator` in place of the
