@@ -480,7 +480,8 @@ class Simulation:
         if not self.scenarios[0].obstacles.shapes:
             return {}
         footprint, ticks = hull.footprint(self.model), self.log.ticks[:length]
-        around = [Surroundings(s.obstacles) for s in self.scenarios]
+        made = {obstacles: Surroundings(obstacles) for obstacles in dict.fromkeys(s.obstacles for s in self.scenarios)}
+        around = [made[s.obstacles] for s in self.scenarios]
         poses, times = (
             np.stack([ticks[name].T for name in ("x", "y", "theta")], -1),
             self.period * np.arange(length, dtype=float),
