@@ -332,7 +332,9 @@ def _partial_record(scenario: Scenario, names: Sequence[str]) -> Record:
     fields: dict[str, Any] = {
         name: (types[name], pydantic.Field(getattr(scenario, name), description=helps[name])) for name in names
     }
-    return pydantic.create_model("Part", __base__=Record, **fields)()
+    # The fields have their descriptions; pydantic would search the source of each calling frame for more.
+    described = {"use_attribute_docstrings": False}
+    return pydantic.create_model("Part", __base__=Record, __cls_kwargs__=described, **fields)()
 
 
 def _further_flags(command: str) -> str:
