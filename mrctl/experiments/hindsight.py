@@ -4,9 +4,13 @@
 
 The inverse dynamics of the nominal robot is the first guess. A run shows which voltage the feedback had to add; least
 squares finds the coefficients that would have given this voltage, and the run is repeated with them. Ticks in which
-learning is frozen do not count. After one repetition the coefficients hardly change any more. By analogy with on-line
-learning (Cesa-Bianchi and Lugosi, 2006), the regret of a learner is its RMS error over all laps less that of the last
-repetition. It can be negative, because the feedback voltage is minimised, not the error.
+learning is frozen do not count. After one repetition the coefficients hardly change any more.
+
+Least squares makes the feedback voltage small and not the error, which grows where the loop oscillates with the
+coefficients found. Of the drives of a run, the first guess included, the one with the least position error over all
+laps is therefore taken, so that the model never has less than it. By analogy with on-line learning (Cesa-Bianchi and
+Lugosi, 2006), the regret of a learner is its RMS position error over all laps less that of this drive. It can be
+negative, because a learner is not fixed, and because another fixed feedforward may have less.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from mrctl.control.features import feature_matrix
 from mrctl.kernel import Array
 from mrctl.loop.simulation import Simulation, uniform
 from mrctl.results import dataset
+from mrctl.results.metrics import over_laps, per_lap
 from mrctl.scenario import FEEDFORWARDS, Scenario
 
 REPETITIONS = 2
@@ -27,7 +32,7 @@ RIDGE = 1e-6  # share of a feature's sum of squares; keeps coefficients that wer
 
 
 def best_fixed(scenarios: Sequence[Scenario], *, threads: int = 0) -> xr.Dataset:
-    """Drives every scenario with the nominal model, then twice more; returns the last drives, as `simulate` does.
+    """Drives every scenario with the nominal model, then twice more; returns the best drives, as `simulate` does.
 
     Args:
         scenarios: Scenarios, whose priors and learners are replaced.
@@ -39,11 +44,15 @@ def best_fixed(scenarios: Sequence[Scenario], *, threads: int = 0) -> xr.Dataset
     scenarios = [s.model_copy(update=FEEDFORWARDS["model"] | {"name": s.name or "hindsight"}) for s in scenarios]
     parts = []
     for rows in uniform(scenarios):
-        group = [scenarios[row] for row in rows]
-        result, coefficients = drive(group, None, threads)
-        for _ in range(REPETITIONS):
+        group, coefficients, drives = [scenarios[row] for row in rows], None, []
+        for _ in range(1 + REPETITIONS):
             result, coefficients = drive(group, coefficients, threads)
-        parts.append((rows, result))
+            drives.append(result)
+        errors = np.array([over_laps(per_lap(result), "position_rmse") for result in drives])
+        best = np.argmin(np.where(np.isnan(errors), np.inf, errors), axis=0)  # NaN: a robot that was lost
+        for k in np.unique(best).tolist():
+            chosen = np.flatnonzero(best == k)
+            parts.append(([rows[row] for row in chosen], drives[k].isel(run=chosen)))
     return dataset.combine(parts, scenarios)
 
 
