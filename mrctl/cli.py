@@ -617,8 +617,9 @@ def suite(
     It prints how long it will take before it starts: by default less than half an hour on two cores.
 
     Args:
-        feedforward: Feedforwards to compare, such as fel or model+composite; hindsight has fixed coefficients, which
-            are fitted to each run itself. By default those in the tables of RESULTS.md, with --full all.
+        feedforward: Feedforwards to compare, such as fel or model+composite; hindsight is, for each run, the better one
+            of model and of coefficients fitted to that run. By default those in the tables of RESULTS.md, with --full
+            all.
         controller: Controllers of your own to compare, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion.
         seeds: Number of replicates of each case; by default 20, or 3 with --quick.
         random: Number of random scenarios; by default 30, with --quick 6, with --full 1,000 in each tier.
