@@ -5,6 +5,7 @@ The docstring of a field or argument is the help text of its flag.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import inspect
 import io
@@ -284,6 +285,9 @@ def _one_line(box: str) -> str:
         return f"{match[1]}: expected {re.sub('[{}]', '', match[2]).replace('|', ' or ')}"
     if match := re.match(r"Error parsing -*([\w.-]+): invalid literal for int\(\) with base 10: (.*)", text):
         return f"{match[1]}: {match[2]} is not a whole number"
+    if match := re.match(r"invalid choice (.+) for argument '-*([\w.-]+)'. Expected one of (\(.*\))", text):
+        choices = sorted(set(ast.literal_eval(match[3])) - {"None"})  # that of an optional flag which nobody gives
+        return f"{match[2]}: {match[1]} is none of {', '.join(choices)}"
     if not (match := re.match(r"Error parsing (\S+): (.*)", text)):
         return text
     parts = match[1].removeprefix("--").split(".")

@@ -172,9 +172,10 @@ def worst_trouble(g: Row, broken: bool, error: Array, command: Array, twist: Arr
 
 @kernel
 def fall_back(g: Row, trouble: int, nominal: Array, integral: Array, feedback: Array) -> None:
-    """Replaces the learner by the fallback; the integral of the PID takes over what the model lacked, up to D.
+    """Replaces the learner by the fallback; the integral of the feedback takes over what the model lacked, up to D.
 
-    What is left of the step in voltage fades; beyond D it would be one more disturbance that leaves the region.
+    What is left of the step in voltage fades; beyond D it would be one more disturbance that leaves the region. Where
+    the feedback has no integral, all of the step fades.
     """
     g.strikes += 1.0
     if g.strikes > 1 or trouble == OSCILLATION:  # the first error may be no more than a bad start
@@ -185,7 +186,7 @@ def fall_back(g: Row, trouble: int, nominal: Array, integral: Array, feedback: A
         fallback = nominal[k] if g.model else 0.0
         bound = g.harmless[k]
         lacked = max(-bound, min(bound, g.model_error[k]))
-        target = lacked + nominal[k] - fallback
+        target = lacked + nominal[k] - fallback if g.hands_over else integral[k]
         g.bump[k] = max(-bound, min(bound, g.output[k] + integral[k] - target - fallback))
         g.output[k] = fallback + g.bump[k]
         feedback[k] += target - integral[k]  # the feedback contains the old integral
@@ -232,6 +233,7 @@ GUARD = np.dtype(
         ("retries", "f8"),  # number of times that the learner may resume, 1
         ("fade", "f8"),  # time constant with which the step in voltage at the beginning of a fallback fades, s
         ("model", "?"),  # whether the fallback is the nominal model, not PID alone
+        ("hands_over", "?"),  # whether the feedback has an integral, which takes over what the fallback lacks
         ("range", "f8", 2),  # largest command of a channel: the supply in V, or the largest θ̇ in rad/s
         ("region", "f8", 2),  # ē: largest errors of V and θ̇ with which a learner may go on, m/s and rad/s
         ("harmless", "f8", 2),  # D: deviation of a channel that cannot leave that region, V (rad/s)
@@ -278,6 +280,7 @@ def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
         rows[name] = [getattr(s, name) for s in settings]
     supply, rotation = float(robot["supply"][0]), float(robot["max_twist"][0, 1])
     rows["model"] = [s.fallback == "model" for s in settings]
+    rows["hands_over"] = True
     rows["range"] = supply, rotation if robot["rigid"][0] else supply
     rows["region"] = np.maximum(np.array([[s.velocity] for s in settings]) * robot["max_twist"], LEAST)
     rows["harmless"] = harmless(rows["region"], gains)

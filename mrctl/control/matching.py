@@ -1,14 +1,13 @@
 """Matching of voltage and motion: a law that compares the two must know which voltage made which motion.
 
-A voltage acts d control periods after it was computed, d being the delay of the sensing tier, and it is held for one
-period. The controllers receive the motion predicted to the moment when the coming voltage acts (`mrctl.sensing`):
+A voltage acts d control periods after it was computed, d being `Sensing.loop_delay`, and it is held for one period. The
+controllers receive the motion predicted to the moment when the coming voltage acts (`mrctl.sensing`):
 
     x̂_n = x_n + h Σ ẋ_c,p,   p = n − d … n − 1,      h = control period, ẋ_c,p = acceleration that was commanded then
 
 `match` takes the commanded accelerations out again. The rest, x_n, was measured at tick n, and its mean acceleration in
 the period before, (x_n − x_(n−1))/h, is exactly what the voltage u_(n−1−d) made, together with all other forces. The
-latencies of the sensors, which an estimator bridges in the same way, are not matched, nor is the `control_delay` of a
-perturbation, which nobody knows.
+`control_delay` of a perturbation is not matched, because nobody knows it.
 
 A law that is taught by the feedback voltage must know which output that voltage answers: `recall` returns the delayed
 features, those of τ = (d + 2) h ago. With the loop L of PID and plant, ∂U_fb/∂U_ff = −T_a, T_a = ½ (1 + T) and T =

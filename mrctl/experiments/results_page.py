@@ -254,16 +254,16 @@ def random_text(everything: str) -> str:
 
 
 def held_out_text(table: str, log: str) -> str:
-    """Returns the table of `mrctl suite --held-out`, and a list of all times that the cells were driven.
+    """Returns the tables of `mrctl suite --held-out`, and a list of all times that the cells were driven.
 
     Args:
         table: The content of `table.md`.
         log: The content of `held_out.jsonl`.
     """
-    (text,) = (text for title, text in sections(table).items() if title)
+    tables = [text for title, text in sections(table).items() if title]
     lines = [json.loads(line) for line in log.splitlines()]
     driven = [f"- {one['time']}, {one['entry']}, mrctl {one['mrctl']}: {one.get('says') or 'begun'}" for one in lines]
-    return "\n\n".join([text, "Every time that the cells were driven:", "\n".join(driven)])
+    return "\n\n".join([*tables, "Every time that the cells were driven:", "\n".join(driven)])
 
 
 def tune_text(table: Table) -> str:

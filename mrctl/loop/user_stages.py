@@ -268,6 +268,7 @@ class UserHierarchy(Hierarchy):
         integral = getattr(stage.stage, "integral", None)
         known = 0.0 if integral is None else stage.checked(integral, self.feedback.shape, "`integral`")
         state["pid"]["integral"] = known
+        state["guard"]["hands_over"] = integral is not None
 
     def feedforward(self, command: Array, derivative: Array) -> Array:
         """Returns the feedforward of the prior and of the learner, the user's or a built-in one."""

@@ -144,6 +144,44 @@ def test_own_stage():
     assert (events[events["run"] == 1]["reason"] == "output not finite").any()
 
 
+class Proportional:
+    """A user's feedback without an integral."""
+
+    def __init__(self, robot, size):
+        pass
+
+    def reset(self, steady, period):
+        pass
+
+    def output(self, command, twist, excess):
+        return np.array([20.0, 4.0]) * (command - twist)
+
+
+class Breaks:
+    """A user's feedforward in proportion to the command, which suits a weak supply, until it breaks after 3 s."""
+
+    def __init__(self, robot, size):
+        self.ticks = 0
+
+    def output(self, command, derivative):
+        self.ticks += 1
+        return np.array([17.0, 3.0]) * command if self.ticks <= 300 else np.full(command.shape, np.nan)
+
+    def learn(self, feedback, saturated, twist, voltage):
+        pass
+
+
+def test_feedback_without_integral():
+    """The fallback begins without a step in voltage, too, where no integral can take over what the model lacks."""
+    weak = of(DELAYED, "none", Guard(), laps=1, perturbation=Perturbation(supply_factor=0.6))
+    run = simulate([weak], feedforward=Breaks, feedback=Proportional).isel(run=0)
+    assert run["guard"].values[298:300].tolist() == [0, 1]
+    sent = np.stack([run["voltage_left"].values, run["voltage_right"].values])
+    steps = np.abs(np.diff(sent)).max(axis=0)
+    assert np.ptp(sent[:, 298:340], axis=1).max() > 3.0  # what the model gives less
+    assert steps[298:340].max() < 0.6  # of which 9 % go in a tick; all at once would be 7 V
+
+
 def test_told():
     """A run says how often and why."""
     fast = of(LATE, "fel", Guard(), steering="rigid", laps=1, **FAST)

@@ -2,12 +2,16 @@
 
 import hashlib
 import json
-from itertools import combinations
+from itertools import combinations, product
+from typing import Any
 
+import numpy as np
 import pytest
 
 from mrctl import PERTURBATIONS, Scenario
 from mrctl.experiments import cases, held_out
+from mrctl.experiments.suite import Floor
+from mrctl.experiments.suite_tables import COLUMNS, WINDOWS
 from mrctl.loop.simulation import Simulation
 
 
@@ -41,3 +45,25 @@ def test_can_be_driven(course: str) -> None:
     simulation = Simulation(plants)
     simulation.step()
     assert simulation.running
+
+
+def test_cells_above_a_rival_are_named() -> None:
+    """A cell that is above a rival beyond the floor is listed with both; where there is none, there is no list."""
+
+    error, floor = 1e-3 * np.array([1.0, 1.1, 1.2, 1.0]), Floor(difference=1e-4, mean=1e-4)
+    level, worse = held_out._standing(error, error, floor), held_out._standing(error + 5e-4, error, floor)
+    names = ("course", "plant", "metric", "window", "rival")
+    everywhere = list(product(held_out.courses(), held_out.PLANTS, COLUMNS, WINDOWS, held_out.RIVALS))
+
+    def rows(*above: tuple[str, ...]) -> list[dict[str, Any]]:
+        return [dict(zip(names, at, strict=True)) | (worse if at in above else level) for at in everywhere]
+
+    (only,) = held_out.summarised("fel", rows(), 4)
+    assert (only.cells.iloc[:, 2:] == "40/40, 40 of them ties").all(axis=None)
+    behind = ("square", "slope 4°, mass +20 %", "omega_rmse", "first", "true_model")
+    counts, listed = held_out.summarised("fel", rows(behind), 4)
+    assert counts.says.endswith("in V at least 40, in θ̇ at least 39, in position at least 40.")
+    (line,) = listed.cells.to_dict("records")
+    assert line["error"] == "θ̇, mrad/s" and line["rival"] == "true_model" and line["window"] == "lap 1"
+    assert line["cell"] == "square; slope 4°, mass +20 %" and line["above it by"].startswith("0.5")
+    assert line["floor"] == "0.100"
