@@ -4,7 +4,8 @@ This is the simplex architecture (Seto, Krogh, Sha and Chutinan 1998): a control
 as long as the state is one from which a trusted one, here PID and nominal model, recovers. Let d be the deviation of a
 channel, d = authority · (learner − model), e the error of its velocity, and ρ the posture error. The region of recovery
 is |e| ≤ ē, ρ ≤ ρ̄ = 0.15 m. A learner is to blame for an error if the peak of its |d|, which decays with a time constant
-of 1 s, exceeds D, and for an oscillation if it exceeds a quarter of D:
+of 1 s, exceeds D, and for an oscillation if it exceeds a quarter of D. What learning has taken from the PID's integral
+counts like a d; its sum decays with the same time constant.
 
     D = min(ē/‖G_e‖₁, ρ̄/‖G_ρ‖₁)        ‖G‖₁: peak-to-peak gains of the designed loops from a voltage (`rejection`)
 
@@ -114,7 +115,8 @@ def guard(
         if g.authority < 1.0:
             g.bump[k] *= g.fade / (g.fade + period)
             g.output[k] = fallback + deviation + g.bump[k]
-        g.deviation[k] = max(abs(deviation), RECENT / (RECENT + period) * g.deviation[k])
+        g.handed[k] *= RECENT / (RECENT + period)
+        g.deviation[k] = max(abs(deviation), abs(g.handed[k]), RECENT / (RECENT + period) * g.deviation[k])
         g.model_error[k] += period / (MEAN + period) * (voltage[k] - nominal[k] - g.model_error[k])
     trouble = worst_trouble(g, broken, error, command, twist)
 
@@ -246,6 +248,7 @@ GUARD = np.dtype(
         ("waves", "f8", 2),  # consecutive half-waves above the threshold
         # What is compared with a bound
         ("deviation", "f8", 2),  # peak of the deviation from the fallback, which decays, V (rad/s)
+        ("handed", "f8", 2),  # sum of what learning took from the PID's integral, which decays, V (rad/s)
         ("nearest", "f8"),  # smallest posture error so far, m
         ("model_error", "f8", 2),  # mean of the voltage sent less that of the nominal model, V
         # Decisions

@@ -120,7 +120,9 @@ def apply_voltages(seen: Row, model: Row, robot: Row, period: float, s: Row) -> 
 def hand_over(s: Row) -> None:
     """The PID's integral gives up a share of what learning added: ∫ ← ∫ − `TAKE_OVER` · authority · added."""
     for k in range(2):
-        s.pid.integral[k] -= TAKE_OVER * s.guard.authority * s.added[k]
+        taken = TAKE_OVER * s.guard.authority * s.added[k]
+        s.pid.integral[k] -= taken
+        s.guard.handed[k] += taken
 
 
 @kernel

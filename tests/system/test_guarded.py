@@ -144,6 +144,30 @@ def test_own_stage():
     assert (events[events["run"] == 1]["reason"] == "output not finite").any()
 
 
+class Takes:
+    """A user's feedforward whose `learn` returns its whole output in row 0, and far too much in row 1."""
+
+    def __init__(self, robot, size):
+        self.out = np.zeros((size, 2))
+
+    def output(self, command, derivative):
+        self.out = np.array([21.0, 5.0]) * command
+        return self.out
+
+    def learn(self, feedback, saturated, twist, voltage):
+        return np.concatenate([self.out[:1], 1e6 * feedback[1:]])
+
+
+def test_what_learning_takes_from_the_integral():
+    """A learner that hands over what it did not learn takes the robot off its path, and the guard stops it."""
+    quiet = of(DELAYED, "none", Guard(), laps=2, perturbation=Perturbation())
+    bare = simulate([quiet.model_copy(update={"guard": OFF})] * 2, feedforward=Takes)
+    watched = simulate([quiet] * 2, feedforward=Takes)
+    off = np.hypot(watched.x - watched.x_ref, watched.y - watched.y_ref)
+    assert bare.failed.all() and not watched.failed.any() and off.max() < 0.25
+    assert set(guard_events(watched)["reason"]) - {""} == {"velocity far from the command"}
+
+
 class Proportional:
     """A user's feedback without an integral."""
 
