@@ -19,8 +19,8 @@ from mrctl.control.kanayama import Kanayama
 from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.experiments import kanayama
-from mrctl.experiments.hindsight import best_fixed
 from mrctl.experiments.tables import machine, markdown, number, output_folder, write_json
+from mrctl.loop.hindsight import best_fixed
 from mrctl.loop.simulation import simulate
 from mrctl.results import metrics, plots
 from mrctl.results.dataset import versions

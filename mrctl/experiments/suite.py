@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -32,10 +31,10 @@ from mrctl.experiments.cases import (
     Outcome,
     cases,
 )
-from mrctl.experiments.hindsight import REPETITIONS, best_fixed
 from mrctl.experiments.suite_tables import COLUMNS, TITLES, YARDSTICKS
 from mrctl.experiments.tables import machine, output_folder, write_json
 from mrctl.loop import user_files
+from mrctl.loop.hindsight import REPETITIONS
 from mrctl.loop.simulation import cores, simulate
 from mrctl.record import InputError
 from mrctl.results import metrics
@@ -126,12 +125,12 @@ def run(chosen: Sequence[Case], choices: Choices, workers: int | None, out: Path
     laps, aside = {}, []
     for place, (name, choice) in enumerate(choices.items(), 1):
         fields = FEEDFORWARDS[choice["feedforward"] if choice.get("feedforward") in FEEDFORWARDS else "none"]
-        work = partial(jobs.compute, drive=best_fixed) if name == HINDSIGHT else None
         scenarios = [s.model_copy(update=fields) for case in chosen for s in case.scenarios]
         chunk = min(CHUNK, -(-len(scenarios) // 4))
-        sweep = Sweep.of(scenarios, record="laps", chunk=chunk, controller=choice.get("controller"))
+        own = {"controller": choice.get("controller"), "hindsight": name == HINDSIGHT}
+        sweep = Sweep.of(scenarios, record="laps", chunk=chunk, **own)
         print(f"{name} ({place} of {len(choices)})", file=sys.stderr)
-        ended = jobs.run(sweep, out / name, workers, progress=True, work=work)
+        ended = jobs.run(sweep, out / name, workers, progress=True)
         laps[name] = store.open(out / name)
         if ended.aside:
             lost, why = sum(map(len, ended.aside)), next(iter(ended.aside.values()))

@@ -189,7 +189,7 @@ def dataset(
 
     Returns:
         Variables (run, time) by signal, `failed`, `failure`, `failure_time` and `weights`; coordinates label,
-        feedforward, steering, seed and lap_time.
+        feedforward, steering, seed, lap_time and samples.
     """
     period = scenarios[0].control_period
     variables: dict[str, tuple] = {
@@ -207,6 +207,7 @@ def dataset(
         "steering": ("run", np.array([s.steering for s in scenarios], object)),
         "seed": ("run", np.array([s.seed for s in scenarios])),
         "lap_time": ("run", np.array([s.reference.period for s in scenarios]), {"units": "s"}),
+        "samples": ("run", np.array([s.ticks for s in scenarios]), {"long_name": "samples of the run if it lasts"}),
     }
     if weights is not None:
         variables["weights"] = (("run", "weight"), weights, {"long_name": "what was learned, flat"})

@@ -73,7 +73,7 @@ def as_runs(result: xr.Dataset) -> xr.Dataset:
     if "run" not in result.dims:
         single = result.expand_dims("run" if "run" in result.coords else {"run": [0]})
         result = single.assign_coords(
-            {name: ("run", [result[name].item()]) for name in PER_RUN if name in result.coords}
+            {name: ("run", [result[name].item()]) for name in (*PER_RUN, "samples") if name in result.coords}
         )
     if "label" not in result.coords:
         result = result.assign_coords(label=("run", [f"run {run}" for run in result["run"].values]))
@@ -126,8 +126,13 @@ def _failed(run: xr.Dataset) -> bool:
 
 def _end(run: xr.Dataset) -> int:
     """Returns the number of samples of one run: NaN that pad a shorter run do not count, NaN after a failure do."""
-    alive = np.flatnonzero(np.isfinite(run["x"].values))
-    return len(run["time"]) if _failed(run) or not len(alive) else int(alive[-1]) + 1
+    alive, size = np.flatnonzero(np.isfinite(run["x"].values)), len(run["time"])
+    if not _failed(run) and len(alive):
+        return int(alive[-1]) + 1
+    if "samples" not in run.coords or not size:  # an older version wrote the result
+        return size
+    begun = round(float(run["time"][0]) / control_period(run))  # where it is an interval of a run
+    return min(size, max(int(run["samples"]) - begun, 0))
 
 
 def per_lap(result: xr.Dataset) -> xr.Dataset:

@@ -9,7 +9,7 @@ import re
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from tqdm import tqdm
 from mrctl import __version__
 from mrctl.control.stages import METHODS, Stages
 from mrctl.loop import user_files
+from mrctl.loop.hindsight import best_fixed
 from mrctl.loop.simulation import Simulation, arranged, cores, simulate
 from mrctl.physics import mjcf
 from mrctl.record import InputError, printable
@@ -208,18 +209,17 @@ def _models(sweep: Sweep) -> dict[str, str]:
     return worlds | ({sweep.controller: user_files.digest(sweep.controller)} if sweep.controller else {})
 
 
-def compute(path: str, job: int, drive: Callable[..., xr.Dataset] = simulate) -> Outcome:
+def compute(path: str, job: int) -> Outcome:
     """Computes the runs of a job in a worker and writes them to the store.
 
     Args:
         path: Folder of the store.
         job: Number of the job.
-        drive: Function that drives scenarios, with the arguments and the result of `simulate`.
     """
     try:
         store = Store(path)
         sweep = _agreed(json.dumps(store.manifest))
-        rows, signals = _compute(sweep, store.runs(job), store.samples, drive)
+        rows, signals = _compute(sweep, store.runs(job), store.samples)
         store.write(job, _table(sweep, rows), signals)
         return Outcome(job, failed=sum(row["failed"] for row in rows))
     except InputError as error:
@@ -250,9 +250,12 @@ def _agreed(manifest: str) -> Sweep:
     return sweep
 
 
-def _compute(
-    sweep: Sweep, runs: Sequence[int], samples: int, drive: Callable[..., xr.Dataset] = simulate
-) -> tuple[list[dict[str, Any]], NDArray | None]:
+def driver(sweep: Sweep, stages: Stages) -> Callable[..., xr.Dataset]:
+    """Returns what drives the scenarios of a sweep, with the user's stages: `simulate`, or `best_fixed`."""
+    return best_fixed if sweep.hindsight else partial(simulate, **stages)
+
+
+def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict[str, Any]], NDArray | None]:
     """Drives runs; returns their rows of the table, and signals `(runs, samples, signals)` if the store keeps them."""
     rows: dict[int, dict[str, Any]] = {}
     signals = np.full((len(runs), samples, len(SIGNALS)), np.nan) if samples else None
@@ -263,18 +266,19 @@ def _compute(
             batches.setdefault(scenario.control_period, {})[run] = scenario
         except InputError as error:  # a drawn value is out of range
             rows[run] = _row(sweep, run, str(error).removeprefix(f"run {run}: "))
-    stages: Stages = user_files.load(sweep.controller) if sweep.controller else {}
+    drive = driver(sweep, user_files.load(sweep.controller) if sweep.controller else {})
     queue = list(batches.values())
     for batch in queue:
         try:
-            result = drive(list(batch.values()), threads=1, **stages)
+            result = drive(list(batch.values()), threads=1)
         except InputError as error:
             if len(batch) == 1:
                 rows |= {run: _row(sweep, run, str(error)) for run in batch}
             else:  # a run that is impossible must not prevent the others
                 queue.extend({run: scenario} for run, scenario in batch.items())
             continue
-        if stages and len(batch) > 1 and any(str(why).startswith((*METHODS,)) for why in result["failure"].values):
+        raised = any(str(why).startswith((*METHODS,)) for why in result["failure"].values)
+        if sweep.controller and len(batch) > 1 and raised:
             # A stage that raises ends its whole batch; computed alone, a run does not depend on the others.
             queue.extend({run: scenario} for run, scenario in batch.items())
             continue
@@ -328,7 +332,7 @@ def scenario_of(out: str | Path, run: int) -> Scenario:
         InputError: There is no store or no such run, a value that was drawn for it is out of range, or another version
             of mrctl, which the message names, wrote a field that this one does not know.
     """
-    return _sweep(Store(out)).scenario(run)
+    return sweep_of(Store(out)).scenario(run)
 
 
 def stages_of(out: str | Path, code: bool = True) -> Stages:
@@ -352,7 +356,7 @@ def stages_of(out: str | Path, code: bool = True) -> Stages:
     return user_files.load(controller)
 
 
-def _sweep(store: Store) -> Sweep:
+def sweep_of(store: Store) -> Sweep:
     """Returns the sweep of a store that any version of mrctl may have written."""
     return Sweep.from_dict(store.manifest["sweep"], f"{store.path} (written by mrctl {store.writer})")
 
@@ -364,7 +368,7 @@ def repeat(out: str | Path, run: int) -> Repeat:
         InputError: As `scenario_of`, or the run is not done yet or was set aside.
     """
     store = Store(out)
-    sweep = _sweep(store)
+    sweep = sweep_of(store)
     sweep.values(run)  # raises an error if there is no such run
     if (stored := store.row(run)) is None:
         raise InputError(f"run: {run} is not done yet")
@@ -387,6 +391,9 @@ def repeat(out: str | Path, run: int) -> Repeat:
     if all(new.tobytes() == old.tobytes() for new, old in pairs.values()):
         return Repeat("bit-identical", True)
     scale = {name: TOLERANCE * np.abs(old).max(initial=0, where=np.isfinite(old)) for name, (_, old) in pairs.items()}
+    for name, (new, old) in pairs.items():
+        if new.shape != old.shape:
+            return Repeat(f"departs: {name} has {new.size} values, in the store {old.size}{writers}", False)
     off = {name: ~np.isclose(*pair, rtol=0, atol=scale[name], equal_nan=True) for name, pair in pairs.items()}
     if not any(one.any() for one in off.values()):
         return Repeat(f"within tolerance ({TOLERANCE:g} of each signal's and metric's size)", True)

@@ -138,6 +138,9 @@ class Sweep(Record):
     controller: str | None = None
     """Feedforward of the user instead of the named one, as `my_file.py:MyController`, or other stages, as
     `motion=my_file.py:PurePursuit`; see `mrctl.loop.user_files`."""
+    hindsight: bool = False
+    """Whether each run is driven with the best fixed feedforward in hindsight instead of its own; see
+    `mrctl.loop.hindsight`."""
 
     @classmethod
     def of(cls, scenarios: Sequence[Scenario], **settings: Any) -> Self:  # noqa: ANN401
@@ -153,6 +156,8 @@ class Sweep(Record):
         for name in fields:
             if fields.count(name) > 1:
                 raise ValueError(f"axes: {name} is there twice")
+        if self.hindsight and self.controller:
+            raise ValueError("hindsight: drives with a feedforward of its own; give no controller")
         if self.every and self.record != "decimated":
             raise ValueError('every: only where record = "decimated"')
         for group in self._dimensions:

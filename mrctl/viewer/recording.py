@@ -15,7 +15,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from mrctl.kernel import Rows
-from mrctl.loop.simulation import simulate
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.stand import front_rates, stand, steer
@@ -228,7 +227,7 @@ class Library:
         self._path, self._result = path, None
         if (path / "sweep.json").is_file():
             self.table = Store(path).frame().set_index("run", drop=False)
-            self._stages = jobs.stages_of(path, code)
+            self._drive = jobs.driver(jobs.sweep_of(Store(path)), jobs.stages_of(path, code))
         else:
             self._result = as_runs(store.open(path))
             self.table = summary(self._result).set_index(np.arange(self._result.sizes["run"]))
@@ -249,4 +248,4 @@ class Library:
         self.check(run)
         if self._result is not None:
             return Recording(self._result.isel(run=run))
-        return Recording(simulate([jobs.scenario_of(self._path, run)], **self._stages).isel(run=0))
+        return Recording(self._drive([jobs.scenario_of(self._path, run)]).isel(run=0))

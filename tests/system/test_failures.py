@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from mrctl import Circle, Event, Guard, Line, Perturbation, Scenario
+from mrctl import Circle, Event, Guard, Line, Perturbation, Scenario, Sweep, per_lap
 from mrctl.control.feedforward import NoLearner
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
+from mrctl.sweep import jobs
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 PERIOD = 0.01
@@ -89,6 +90,18 @@ def test_alone(kind):
     check_record(alone, reason)
     assert len(alone.time) == scenario.ticks
     same(alone, simulate([scenario, HEALTHY[0]]).isel(run=0, time=slice(0, scenario.ticks)))
+
+
+def test_laps_beside_a_longer_run(tmp_path):
+    """A run that fails counts the laps that it was to drive, whatever the length of the runs beside it."""
+    short, long = (pushed((4000.0, 4000.0, 0.0), laps=laps) for laps in (2, 5))
+    alone, both = (per_lap(simulate(runs)) for runs in (short, [short, long]))
+    assert alone["laps"].item() == 2 and both["laps"].values.tolist() == [2, 5]
+    later = simulate([short, long]).isel(run=0, time=slice(400, None))
+    assert per_lap(later)["laps"].item() == 1
+    axes = [{"field": "laps", "values": [2, 5]}]
+    jobs.run(Sweep.from_dict({"base": short.model_dump(), "axes": axes, "record": "laps"}), tmp_path, 1)
+    assert all(jobs.repeat(tmp_path, run).same for run in (0, 1))
 
 
 def test_non_finite_stage():

@@ -17,7 +17,7 @@ from mrctl import (
     simulate,
 )
 from mrctl.control.features import feature_matrix
-from mrctl.experiments.hindsight import best_fixed, drive
+from mrctl.loop.hindsight import best_fixed, drive
 from mrctl.loop.simulation import Simulation
 from mrctl.results.metrics import over_laps
 

@@ -25,11 +25,12 @@ import mrctl
 from mrctl import cli
 from mrctl.experiments import held_out, report, suite, suite_tables, tuning
 from mrctl.experiments.cases import Case
-from mrctl.experiments.hindsight import best_fixed
+from mrctl.loop.hindsight import best_fixed
 from mrctl.results import metrics, plots
 from mrctl.sweep import jobs
 from mrctl.sweep.pool import Outcome
 from mrctl.sweep.store import Store
+from mrctl.viewer.recording import Library
 
 pytestmark = pytest.mark.xdist_group("suite")  # what its tests share is made once
 
@@ -190,7 +191,7 @@ def test_leaders() -> None:
     assert suite_tables.leaders(rows) == [["a", *["model, rls"] * 5]]
 
 
-def test_hindsight(tmp_path: Path) -> None:
+def test_hindsight(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """The best fixed feedforward is that of `best_fixed`, and the regret of the model is what it does worse."""
     words = ["suite", "--feedforward", "model", "hindsight", "--seeds", "1", "--random", "0", "--workers", "1"]
     assert cli.main([*words, "--out", str(tmp_path)]) == 0
@@ -203,6 +204,12 @@ def test_hindsight(tmp_path: Path) -> None:
         one for one in (tmp_path / "table.md").read_text().partition("Position error in mm")[2].splitlines()
         if re.match(r"\| all +\| model ", one) and one.count("|") == 9
     )  # fmt: skip
+    folder = tmp_path / "runs" / "hindsight"
+    assert cli.main(["run", str(folder), "--run", "0"]) == 0 and "bit-identical" in capsys.readouterr().out
+    library = Library(folder)
+    shown = np.stack([library.recording(1).log[name] for name in ("x", "y")])
+    again = best_fixed([jobs.scenario_of(folder, 1)]).isel(run=0)
+    assert np.array_equal(shown, np.stack([again.x, again.y]))
     regret = 1e3 * (all_laps["model"] - all_laps["hindsight"])
     assert float(line.split("|")[7]) == pytest.approx(regret, rel=0.06)  # two digits
 
