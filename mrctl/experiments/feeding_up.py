@@ -127,27 +127,28 @@ def drive(base: Scenario, count: int, journal: Journal) -> dict[str, dict[str, l
     return found
 
 
-def _fed(ill: Scenario, draws: Sequence[Draw], robot: Robot, speed: float) -> dict[str, list[Run]]:
+def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float) -> dict[str, list[Run]]:
     """Drives all draws, then plans with what was learned and drives both plans of each; returns the runs by limits.
 
     Args:
-        ill: The robot with its velocity controller.
+        perturbed: The robot as it is, with its velocity controller.
         draws: The draws.
         robot: The nominal robot.
         speed: Largest speed of the plans in m/s.
     """
-    first = simulate([_replicate(ill, one, one.reference) for one in draws])
+    first = simulate([_replicate(perturbed, one, one.reference) for one in draws])
     with TemporaryDirectory() as folder:
         files, references = [], []
         for k, one in enumerate(draws):
             run, path, limits = first.isel(run=k), str(Path(folder) / f"{k}.safetensors"), Limits.of(robot)
-            with suppress(InputError):  # a run that failed teaches nothing
+            if learns := not run["failed"]:  # a run that failed teaches nothing
                 save_learned(path, run)
-                limits = limits_of(run, robot)
-            files.append(path if Path(path).exists() else None)
+                with suppress(InputError):  # no robot has such coefficients, and it plans with the nominal ones
+                    limits = limits_of(run, robot)
+            files.append(path if learns else None)
             references.append(one.plan.reference(speed, limits))
         ways = {"nominal": [one.reference for one in draws], "learned": references}
-        return {name: _driven(ill, draws, way, files) for name, way in ways.items()}
+        return {name: _driven(perturbed, draws, way, files) for name, way in ways.items()}
 
 
 def limits_of(run: xr.Dataset, robot: Robot) -> Limits:
@@ -175,11 +176,11 @@ def _replicate(scenario: Scenario, one: Draw, reference: Waypoints, learned: str
 
 
 def _driven(
-    ill: Scenario, draws: Sequence[Draw], references: Sequence[Waypoints], files: Sequence[str | None]
+    perturbed: Scenario, draws: Sequence[Draw], references: Sequence[Waypoints], files: Sequence[str | None]
 ) -> list[Run]:
     """Drives plans with what was learned."""
     cases = zip(draws, references, files, strict=True)
-    result, found = simulate([_replicate(ill, *case) for case in cases]), []
+    result, found = simulate([_replicate(perturbed, *case) for case in cases]), []
     for k, (one, reference) in enumerate(zip(draws, references, strict=True)):
         run = result.isel(run=k).dropna("time", subset=["x"])
         end = run.isel(time=-1)

@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from mrctl.record import InputError
+from mrctl.sweep.jobs import code_digest
+
+SHOWING = ("checks", "envs", "viewer", "cli.py", "__main__.py")  # rooms on which no experiment depends
 
 
 class Journal:
@@ -21,12 +24,12 @@ class Journal:
 
         Args:
             file: The file; an unfinished last line is dropped.
-            head: Everything that the results depend on.
+            head: Everything that the results depend on, but the code of mrctl, whose digest is added.
 
         Raises:
             InputError: The results in the file depend on something else, or it cannot be read or written.
         """
-        self._file, head = file, json.loads(json.dumps(head))
+        self._file, head = file, json.loads(json.dumps(head | {"code": code_digest(SHOWING)}))
         try:
             begun = file.read_text() if file.exists() else ""
             first, *rest = [json.loads(line) for line in begun[: begun.rfind("\n") + 1].splitlines()] or [head]

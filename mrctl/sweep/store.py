@@ -387,14 +387,17 @@ class Store:
         Raises:
             InputError: No run is done.
         """
+        old = []
         if self.table.exists():
             self._check_size([self.table])
             with reading(self.table):
-                return pq.read_table(self.table, page_checksum_verification=True).to_pandas()
-        if not (jobs := sorted(self.done())):
+                old = [pq.read_table(self.table, page_checksum_verification=True).to_pandas()]
+        jobs = [] if self.complete else sorted(self.done())
+        if not (jobs or old):
             raise InputError(f"{self.path}: no job is done yet")
         self._check_size(map(self._part, jobs))
-        return pa.concat_tables(self.rows(job) for job in jobs).to_pandas()
+        found = pd.concat([self.rows(job).to_pandas() for job in jobs] + old, ignore_index=True)
+        return found.drop_duplicates("run").sort_values("run", ignore_index=True)  # of a job done since, the new rows
 
     def dataset(self) -> xr.Dataset:
         """Opens the runs that are done as one dataset, labelled as by `mrctl.simulate`; signals are read when used.

@@ -204,7 +204,7 @@ def test_refused_before_anything_is_driven(whole: Path, tmp_path: Path, capsys: 
     """A run that is not there, a file that is, a store whose code may not run: one line, and nothing is simulated."""
     (tmp_path / "x.html").write_text("mine")
     store = str(whole / "store")
-    with mock.patch("mrctl.viewer.recording.simulate", side_effect=AssertionError("drives")):
+    with mock.patch("mrctl.sweep.jobs.simulate", side_effect=AssertionError("drives")):
         for words, says in (
             (["view", store, "--run", "99"], "has no run 99"),
             (["view", str(whole / "out"), "--run", "-1"], "has no run -1"),

@@ -129,7 +129,9 @@ def test_learned_limits() -> None:
 def test_worlds() -> None:
     """The discs cross the middle line where and about when a robot is there, and the plan does not know them."""
     base = Scenario()
-    for one in filter(None, (three.world(base, seed) for seed in (0, 1))):
+    worlds = [three.world(base, seed) for seed in (0, 1)]
+    assert all(worlds)
+    for one in worlds:
         own, goal = one.scenario.obstacles, one.scenario.goal
         still = tuple(shape for shape in own.shapes if shape.course is None)
         assert goal is not None and goal[0] == pytest.approx(6.0)

@@ -384,7 +384,7 @@ def shaky(path, job):
     return compute(path, job)
 
 
-def test_poison(file, sweep, tmp_path, whole, capsys):
+def test_poison(file, sweep, tmp_path, finished, whole, capsys):
     """A job that kills its worker is set aside and reported; its runs count as failed; the others are as ever."""
     store = tmp_path / "store"
     report = jobs.run(sweep, store, 2, work=poisoned)
@@ -398,6 +398,8 @@ def test_poison(file, sweep, tmp_path, whole, capsys):
     opened = mrctl.open(store)
     assert opened.sizes["run"] == 24 and np.isnan(opened["x"][5:10]).all()
     assert "set aside" in refused(capsys, "run", store, "--run", 7)
+    assert not compute(str(store), 1).error  # as if the same command were stopped after that job
+    pd.testing.assert_frame_equal(Store(store).frame(), Store(finished).frame())
     assert not jobs.run(sweep, store, 2).aside, "the cause is gone: the same command does what is left"
     assert content(store) == whole
 
