@@ -55,8 +55,8 @@ TQDM_WITHOUT_TERMINAL = {"MININTERVAL": "60", "MAXINTERVAL": "60", "BAR_FORMAT":
 
 SHORT = {"--robot": "--robot.path", "--localise": "--sensing.localisation"}
 """Flags that stand for longer ones."""
-POSES = "--goal", "--start"
-"""Flags of `navigate` whose values may be written as x,y,θ."""
+POSES = "--goal", "--start", "--initial-pose"
+"""Flags whose values may be written as x,y,θ."""
 
 DELAYS = 0.0, 0.01, 0.02  # s
 
@@ -316,7 +316,8 @@ def _explained(arguments: Sequence[str]) -> Sequence[str]:
 
 def _fields_set(arguments: Sequence[str]) -> set[str]:
     """Returns the fields that a command line sets; of nested ones the outermost, such as `robot` for --robot.path."""
-    return {re.split("[.:=]", argument.removeprefix("--"))[0] for argument in arguments[1:]}
+    flags = [argument for argument in arguments[1:] if argument.startswith(("--", "reference:"))]
+    return {re.split("[.:=]", flag.removeprefix("--"))[0].replace("_", "-") for flag in flags}
 
 
 def _suited(scenario: Scenario, arguments: Sequence[str], scenario_file: str | None) -> Scenario:
@@ -469,6 +470,8 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             quick: With --suite, drive fewer draws; some confidence intervals then have no upper end.
         """
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
+        if port != 8080 and not view:
+            raise InputError("port: belongs to --view")
         if suite:
             taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _fields_set(arguments)
             if taken or world or goal or start or known or compare or speed or avoid != "none" or json or view:
@@ -480,11 +483,9 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             return
         if quick or not world:
             raise InputError("quick: belongs to --suite" if quick else "world: none given; see mrctl navigate --help")
-        if port != 8080 and not view:
-            raise InputError("port: belongs to --view")
         if Path(world).is_dir():
             new = sorted({a.partition("=")[0] for a in arguments if a.startswith("--")} - {"--out", "--json"})
-            if new:
+            if new and (Path(world) / "mission.json").exists():
                 raise InputError(f"{new[0].removeprefix('--')}: {world} holds a mission, which is driven as it was")
             from mrctl.experiments import mission
 
@@ -778,6 +779,8 @@ def check(
 
     if not robot.endswith(".xml") and robot not in SHIPPED and not find(robot).is_file():
         raise InputError(f"robot: {robot} is neither {', '.join(SHIPPED)} nor an MJCF file, which ends in .xml")
+    if robot.endswith(".xml") and not find(robot).is_file():
+        raise InputError(f"robot: no file {robot}; there are {', '.join(SHIPPED)}")
     if robot in SHIPPED or wheels or steering or chassis:
         _check_world("flat", RobotFile.from_dict({"path": robot}, "robot"))
     else:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import inspect
 import json
 import stat
 import textwrap
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -95,7 +96,7 @@ class _Constructors(ModelMetaclass):
             try:
                 return super().__call__(*args, **kwargs)
             except ValidationError as error:
-                raise InputError(describe(error)) from None
+                raise InputError(describe(error, fields=cls.model_fields)) from None
 
 
 class Record(BaseModel, metaclass=_Constructors):
@@ -107,6 +108,8 @@ class Record(BaseModel, metaclass=_Constructors):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
     moved: ClassVar[dict[str, str]] = {}
     """Fields of earlier versions, each with the advice what to set in its place."""
+    named_by: ClassVar[str] = ""
+    """Field that a string sets which stands in the place of a record; by default none does."""
 
     @classmethod
     @override
@@ -121,6 +124,11 @@ class Record(BaseModel, metaclass=_Constructors):
                 lines.append(textwrap.fill(text, 112, initial_indent=4 * " ", subsequent_indent=8 * " "))
         if lines and cls.__doc__:
             cls.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__), "", "Attributes:", *lines])
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_a_name(cls, values: Any) -> Any:  # noqa: ANN401
+        return {cls.named_by: values} if cls.named_by and isinstance(values, str) else values
 
     @model_validator(mode="before")
     @classmethod
@@ -178,7 +186,7 @@ class Record(BaseModel, metaclass=_Constructors):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise InputError(describe(error, source)) from None
+            raise InputError(describe(error, source, cls.model_fields)) from None
         except OSError as error:  # raised by a field that names a file
             raise InputError(printable(f"{source}: {error.filename}: {error.strerror}".removeprefix(": "))) from None
 
@@ -192,8 +200,8 @@ class Record(BaseModel, metaclass=_Constructors):
         """
         try:
             text = read_file(path).decode()
-        except UnicodeDecodeError as error:
-            raise InputError(f"{path}: {error}") from None
+        except UnicodeDecodeError:
+            raise InputError(f"{path}: not TOML: no text in UTF-8") from None
         try:
             values = tomllib.loads(text)
         except (ValueError, RecursionError) as error:
@@ -224,11 +232,26 @@ def _toml(value: Any, nested: bool = True) -> str:  # noqa: ANN401
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def describe(error: ValidationError, source: str = "") -> str:
-    """Returns a pydantic error as one line: `source: field.subfield: reason`."""
-    first, *rest = error.errors()
+def describe(error: ValidationError, source: str = "", fields: Iterable[str] = ()) -> str:
+    """Returns a pydantic error as one line: `source: field.subfield: reason`.
+
+    A field that does not exist comes first: it may be why another one is missing.
+
+    Args:
+        error: The error.
+        source: Name of the file or of the record.
+        fields: Names of the fields of the outermost record, for which a misspelt one may stand.
+    """
+    first, *rest = sorted(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     field = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        *parent, name = first["loc"]
+        missing = [str(one["loc"][-1]) for one in rest if one["type"] == "missing" and [*one["loc"][:-1]] == parent]
+        nearest = difflib.get_close_matches(str(name), missing if parent else [*missing, *fields], 1)
+        message = f"there is no such field; did you mean {nearest[0]}?" if nearest else "there is no such field"
+    if first["type"] in ("model_type", "model_attributes_type"):
+        message = "must be a record, or a table of its fields"
     if first["type"] == "tuple_type":  # a file has no tuples
         tables = (
             f", in TOML of tables that begin with [[{first['loc'][-1]}]]" if isinstance(first["input"], dict) else ""

@@ -97,6 +97,19 @@ def write_arrays(path: str | Path, arrays: Mapping[str, Array], metadata: dict[s
         raise InputError(f"{path}: cannot write weights: {error.strerror}") from None
 
 
+def notes_on(path: str | Path) -> dict[str, str]:
+    """Returns what `write_arrays` noted in a file beside its arrays; nothing where it notes nothing, or is broken."""
+    if Path(path).suffix != ".safetensors" or not Path(path).is_file():
+        return {}
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "numpy") as file:
+            return file.metadata() or {}
+    except SafetensorError:
+        return {}
+
+
 def read_arrays(path: str | Path, field: str, expected: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
     """Reads arrays of these names and shapes, as float64.
 

@@ -142,7 +142,12 @@ class Episodes:
         if action == "voltage":  # a learner must not learn from feedback that does not act
             scenarios = [s.model_copy(update={"prior": "none", "learner": "none"}) for s in scenarios]
         self._agent: AgentMotion | None = None
-        motion = self._make_agent if action == "twist" else None
+
+        def agent(robot: Robot, size: int) -> AgentMotion:  # whose name begins the reason of a failure
+            self._agent = self.agent(robot, size)
+            return self._agent
+
+        motion = agent if action == "twist" else None
         self.loop = Simulation(scenarios, threads=threads, restarting=True, motion=motion)
         self.plant, self.log, self.period = self.loop.plant, self.loop.log, self.loop.period
         self._kind = action
@@ -163,10 +168,6 @@ class Episodes:
         self.limits = np.full(sum(OBSERVATIONS.values()), -np.inf), np.full(sum(OBSERVATIONS.values()), np.inf)
         self._lengths = np.array([s.ticks for s in scenarios])
         self.goals = np.array([(np.nan,) * 3 if s.goal is None else s.goal for s in scenarios])
-
-    def _make_agent(self, robot: Robot, size: int) -> AgentMotion:
-        self._agent = self.agent(robot, size)
-        return self._agent
 
     @property
     def tick(self) -> int:

@@ -11,6 +11,7 @@ import xarray as xr
 from mrctl.control.stages import Stages
 from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.loop import user_files
+from mrctl.loop.goals import arrived
 from mrctl.loop.learned import save_learned
 from mrctl.loop.simulation import simulate
 from mrctl.results import metrics
@@ -92,11 +93,24 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         f"steering {steering}"
     ]
     lines += [f"failed {failure}"] if failure else []
-    lines += faults
+    lines += faults + _unreached(scenario, result.isel(run=0))
     if rows:
         lines.append(markdown(header, rows))
     acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]
     return "\n".join([*lines, *(text.removesuffix(", ") for text in acted)]), failure
+
+
+def _unreached(scenario: Scenario, run: xr.Dataset) -> list[str]:
+    """Says which events of a scenario come after its end, and whether the robot stands at the goal, if it has one."""
+    end = scenario.ticks * scenario.control_period
+    late = [one.time for one in scenario.events if one.time >= end]
+    said = [f"event at {time:g} s: after the end of the run at {end:g} s" for time in late]
+    last = run.dropna("time", subset=["x"]).isel(time=slice(-1, None))
+    if scenario.goal is None or not last.sizes["time"]:
+        return said
+    pose = np.stack([last[name].values for name in ("x", "y", "theta")], axis=-1)
+    there = arrived(pose, last["v"].values, np.array(scenario.goal))[0]
+    return [*said, f"goal: {'reached' if there else 'not reached'}, {float(last['time'][0]):.2f} s"]
 
 
 def _written() -> list[str]:

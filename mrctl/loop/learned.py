@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from mrctl.control.l1 import PREDICTOR, L1Adaptive
 from mrctl.control.mrac import MRAC, ModelReferenceAdaptive
 from mrctl.control.observer import OBSERVER, DisturbanceObserver
 from mrctl.control.rls import RLS, RecursiveLeastSquares
-from mrctl.control.weights import read_arrays, shapes, write_arrays
+from mrctl.control.weights import notes_on, read_arrays, shapes, write_arrays
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results.dataset import scenarios_of
@@ -67,11 +68,16 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
 
 
 def load_learned(scenario: Scenario) -> Array:
-    """Reads what the learner of a scenario starts from, flat, `(n,)`.
+    """Reads what the learner of a scenario starts from, flat, `(n,)`; warns if another robot has learned it.
 
     Raises:
         InputError: The file is missing, broken, or of another learner.
     """
-    expected = kept(scenario)
+    expected, notes = kept(scenario), notes_on(str(scenario.learned))
+    if (learner := notes.get("learner", scenario.learner)) != scenario.learner:
+        raise InputError(f"learned: {scenario.learned} was learned by {learner}, not by {scenario.learner}")
+    own = scenario.robot.path
+    if Path(robot := notes.get("robot", own)).name != Path(own).name:
+        warnings.warn(f"learned: {scenario.learned} was learned on the robot {robot}, not on {own}", stacklevel=2)
     arrays = read_arrays(str(scenario.learned), "learned", expected)
     return np.concatenate([arrays[name].ravel() for name in expected])

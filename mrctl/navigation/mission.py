@@ -300,9 +300,9 @@ def planned(
         raise InputError("goal: the robot starts there")
     if not 0 <= margin <= 10:
         raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
-    if speed is not None and not 0 < speed < np.inf:
-        raise InputError(f"speed: must be above 0 m/s, not {speed:g}")
     corners, robot = robot_of(scenario)
+    if speed is not None and not 0 < speed <= robot.max_speed:
+        raise InputError(f"speed: must be above 0 and at most {robot.max_speed:g} m/s, not {speed:g}")
     known = task.known
     outlines = Surroundings(known).at(0.0) if outlines is None else outlines
     radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (

@@ -80,7 +80,12 @@ Latency = Annotated[float, Field(ge=0, le=LONGEST_DELAY)]
 
 
 class Sensing(Record):
-    """Sensors, estimator, motor driver, battery, steering servo and delay: a tier, and values that replace its own."""
+    """Sensors, estimator, motor driver, battery, steering servo and delay: a tier, and values that replace its own.
+
+    Where a scenario has a string in its place, that is the `tier`.
+    """
+
+    named_by = "tier"
 
     tier: Tier = "lab"
     """Quality of sensors, motor driver, battery and steering: exact (`ideal`), good (`lab`) or cheap (`field`)."""

@@ -183,7 +183,12 @@ class Tyres(NamedTuple):
 
 
 class RobotFile(Record):
-    """The MJCF file of a robot, and the names of its parts where they are ambiguous in the file."""
+    """The MJCF file of a robot, and the names of its parts where they are ambiguous in the file.
+
+    Where a scenario has a string in its place, that is the `path`.
+    """
+
+    named_by = "path"
 
     path: str = "car"
     """Robot that drives: `car`, `turtlebot`, `racecar`, or the path of an MJCF file."""

@@ -75,8 +75,11 @@ def test_refused(files, tmp_path):
     """A learner that keeps nothing, another learner's file, several runs, a user's stage: one line that says which."""
     with pytest.raises(InputError, match="^learned: the learner indi keeps nothing that a run could start from$"):
         Scenario.from_dict({"prior": "model", "learner": "indi", "learned": "x.safetensors"})
-    with pytest.raises(InputError, match=r"^learned: .*fel\.safetensors: theta is missing, it must have"):
+    with pytest.raises(InputError, match=r"^learned: .*fel\.safetensors was learned by fel, not by rls$"):
         Simulation([BASE.model_copy(update={"learner": "rls", "learned": files["fel"][0]})])
+    other = BASE.replace(robot="racecar", reference=Circle(radius=1.5, period=8.0), learned=files["fel"][0])
+    with pytest.warns(UserWarning, match=r"fel\.safetensors was learned on the robot car, not on racecar$"):
+        Simulation([other])
     with pytest.raises(InputError, match="^run: 2 runs; choose one"):
         mrctl.save_learned(tmp_path / "x", mrctl.simulate([BASE.model_copy(update={"laps": 1})] * 2))
     with pytest.raises(InputError, match="^learned: the run has no learner of mrctl"):
@@ -96,5 +99,5 @@ def test_renewed(files):
     own = Simulation([start], motion=Still).hierarchy  # with a stage of the user beside it
     own.restore(np.arange(1))
     assert np.array_equal(own.learner.adapted()[0], load_learned(start))
-    with pytest.raises(InputError, match="theta is missing"):
+    with pytest.raises(InputError, match="was learned by fel, not by rls"):
         hierarchy.renew(0, start.model_copy(update={"learned": second}))

@@ -304,7 +304,7 @@ def test_store_that_cannot_be_read(store, capsys):
     base = {"base": {"former": 1}, "axes": [], "record": "decimated"}
     aged(store, "0.0.9", **OLD, sweep=base)
     line = refused(capsys, "run", store, "--run", 0)
-    assert "(written by mrctl 0.0.9): base.former: Extra inputs" in line
+    assert "(written by mrctl 0.0.9): base.former: there is no such field" in line
 
 
 def test_signals_keep_their_names(store):

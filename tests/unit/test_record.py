@@ -46,10 +46,10 @@ def write(tmp_path, text):
         ({"inner": {"rate": float("inf")}}, "inner.rate"),
         ({"inner": {"rate": 10**400}}, "inner.rate"),
         ({"inner": {}}, "inner.rate"),
-        ({"inner": {"rate": 1, "x": 1}, "name": 3}, "name"),
+        ({"inner": {"rate": 1, "x": 1}, "name": 3}, "inner.x: there is no such field"),
         ({"two\nlines": 1}, "lines"),
-        ([1, 2], "dictionary"),
-        (None, "dictionary"),
+        ([1, 2], "a table of its fields"),
+        (None, "a table of its fields"),
     ],
 )
 def test_bad_values(values, names):
@@ -200,3 +200,29 @@ def test_toml(tmp_path_factory, name, x, time, delay, points):
     path = tmp_path_factory.mktemp("toml") / "scenario.toml"
     path.write_bytes(scenario.to_toml().encode())
     assert Scenario.from_toml(path) == scenario
+
+
+def test_names_in_the_place_of_records():
+    """A robot, a tier and a perturbation may be given by name, in Python and in a file."""
+    fields = {"robot": "turtlebot", "sensing": "field", "perturbation": "all"}
+    named = Scenario(**fields)
+    assert named == Scenario.from_dict(fields)
+    assert (named.robot.path, named.sensing.tier) == ("turtlebot", "field")
+    with pytest.raises(InputError, match=r"^sensing.tier: Input should be 'ideal'"):
+        Scenario.from_dict({"sensing": "fild"})
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"lap": 3}, "lap: there is no such field; did you mean laps?"),
+        ({"events": [{"tim": 1}]}, "events.0.tim: there is no such field; did you mean time? (and 1 more)"),
+        ({"colour": 1, "laps": 0}, "colour: there is no such field (and 1 more)"),
+        ({"reference": "circle"}, "reference: must be a record, or a table of its fields"),
+    ],
+)
+def test_misspelt(values, says):
+    """The message names the field that does not exist, even if another one is then missing, and the nearest one."""
+    with pytest.raises(InputError) as refused:
+        Scenario.from_dict(values)
+    assert str(refused.value) == says

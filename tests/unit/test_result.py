@@ -154,7 +154,7 @@ def test_result_of_an_older_version(result, tmp_path):
     assert opened.identical(old)
     refused("guard: not a variable of this result, which mrctl 0.0.9 wrote", mrctl.summary, opened)
     refused("guard: not a variable of this result, which mrctl 0.0.9 wrote", mrctl.guard_events, opened)
-    refused("scenario of a result of mrctl 0.0.9: former: Extra inputs", scenarios_of, opened)
+    refused("scenario of a result of mrctl 0.0.9: former: there is no such field", scenarios_of, opened)
     assert scenarios_of(opened.isel(run=[1])) == [SCENARIOS[1]]
 
 

@@ -158,7 +158,7 @@ def grid(start, stop, count):
         ("laps is there twice", [axis("laps", values=[1]), axis("laps", values=[2])], {}),
         ("learner, laps are zipped, but differ", [{**LAWS, "zip": "a"}, axis("laps", values=[1], zip="a")], {}),
         ("axes.0.values: .* at least 1", [axis("laps", values=[])], {}),
-        ("axes.0.stdev: Extra inputs", [{**MASS, "stdev": 1}], {}),
+        ("axes.0.stdev: there is no such field", [{**MASS, "stdev": 1}], {}),
         ("every: only where record", [], {"every": 5}),
         ("runs: .* at most 100,000,000", [axis("laps", grid=grid(1, 10000, 10000))], {"runs": 99999999}),
         (
