@@ -476,9 +476,9 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _fields_set(arguments)
             if taken or world or goal or start or known or compare or speed or avoid != "none" or json or view:
                 raise InputError("suite: has its own worlds, controllers and speeds; give only flags of the robot")
-            from mrctl.experiments import feeding_up, mission_suite, three_mppis
+            from mrctl.experiments import learned_limits, mission_suite, three_mppis
 
-            for part in (mission_suite.suite, three_mppis.suite, feeding_up.suite):
+            for part in (mission_suite.suite, three_mppis.suite, learned_limits.suite):
                 print(part(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
             return
         if quick or not world:

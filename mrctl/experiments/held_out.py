@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from mrctl.experiments import suite
 from mrctl.experiments.cases import HALF, HELD_OUT_SEEDS, NO_SPREAD, Case, Laps
-from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, Table, interval
-from mrctl.experiments.tables import machine, number, output_folder, write_json
+from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, interval
+from mrctl.experiments.tables import Table, machine, number, output_folder, write_json
 from mrctl.record import InputError
 from mrctl.results.comparison import bootstrap_interval
 from mrctl.results.dataset import versions

@@ -26,15 +26,15 @@ from tqdm import tqdm
 
 from mrctl.experiments.cases import HARD
 from mrctl.experiments.journal import Journal
-from mrctl.experiments.suite_tables import TITLES, Table
-from mrctl.experiments.tables import machine, number, output_folder, write_json
+from mrctl.experiments.suite_tables import TITLES
+from mrctl.experiments.tables import Table, machine, number, output_folder, share_cell, wins_cell, write_json
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import cores, simulate
 from mrctl.navigation.generators import corridor, corridor_width
 from mrctl.navigation.mission import PATIENCE, planned, robot_of
 from mrctl.record import InputError
-from mrctl.results.comparison import quantile_interval, superiority, wilson
+from mrctl.results.comparison import quantile_interval, superiority
 from mrctl.results.dataset import versions
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.theory.obstacles import Pose
@@ -234,12 +234,11 @@ def critical_widths(found: Found, shown: str) -> Table:
     for plant, own in zip(PLANTS, needed.swapaxes(0, 1), strict=True):
         for name, one in zip(CONTROLLERS, own, strict=True):
             there = int(np.isfinite(one).sum())
-            low, high = wilson(there / len(one), len(one))
-            share = f"{there}/{len(one)} [{100 * low:.0f}, {100 * high:.0f}] %"
+            share = share_cell(there, len(one))
             rows.append([plant, TITLES.get(name, name), share, _quantile(one, 1e3), _quantile(one - found.plans, 1e3)])
             for rival in ("none", "model"):
                 wins = superiority(one, own[CONTROLLERS.index(rival)], floor=TIE)
-                rows[-1].append("" if rival == name else f"{wins.value:.2f} [{wins.low:.2f}, {wins.high:.2f}]")
+                rows[-1].append("" if rival == name else wins_cell(wins))
     header = [
         "plant",
         "controller",

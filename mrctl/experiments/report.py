@@ -19,8 +19,8 @@ from mrctl.control.pid import Pid
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
 from mrctl.experiments.cases import BAND, REFERENCES, SLOW, Choices, Outcome
-from mrctl.experiments.suite_tables import NO_CLAIM, TITLES, Table, verdict
-from mrctl.experiments.tables import number
+from mrctl.experiments.suite_tables import NO_CLAIM, TITLES, verdict
+from mrctl.experiments.tables import Table, number
 from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation
 from mrctl.results import metrics, plots

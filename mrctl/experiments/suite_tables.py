@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from mrctl.experiments.cases import BAND, FLOOR, HALF, HINDSIGHT, MUCH_WORSE, NO_WORSE, PARTS, REFERENCES, UNCHANGED
-from mrctl.experiments.tables import markdown, number
+from mrctl.experiments.tables import Table, number
 
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
 TITLES = {"none": "PID"}  # names of feedforwards in the tables, where these differ
@@ -27,21 +27,6 @@ NO_CLAIM = "So few draws tell nothing apart: this table supports no claim."
 LEAST = 6  # pairs that a feedforward which always wins needs for 95 % confidence: the exact sign test gives p = 0.03
 
 Row = dict[str, Any]
-
-
-class Table(NamedTuple):
-    """A table of text, with a title and a statement."""
-
-    title: str
-    """Content of the table, and the size of the suite that made it."""
-    says: str
-    """Statement that the table supports, from paired tests."""
-    cells: pd.DataFrame
-
-    @property
-    def markdown(self) -> str:
-        """Title, sentence and table."""
-        return f"## {self.title}\n\n{self.says}\n\n{markdown(list(self.cells), self.cells.to_numpy().tolist())}\n"
 
 
 def tables(rows: Sequence[Row], mode: str) -> list[Table]:

@@ -9,9 +9,14 @@ import platform
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+import pandas as pd
+
+from mrctl.kernel import Array
 from mrctl.record import InputError
+from mrctl.results.comparison import Superiority, bootstrap_interval, wilson
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -25,6 +30,43 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def number(value: float, digits: int = 3) -> str:
     """Returns a number as text with a number of significant digits."""
     return f"{value:#.{digits}g}".rstrip(".")
+
+
+class Table(NamedTuple):
+    """A table of text, with a title and a statement."""
+
+    title: str
+    """Content of the table, and the size of the suite that made it."""
+    says: str
+    """Statement that the table supports, from paired tests."""
+    cells: pd.DataFrame
+
+    @property
+    def markdown(self) -> str:
+        """Title, sentence and table."""
+        return f"## {self.title}\n\n{self.says}\n\n{markdown(list(self.cells), self.cells.to_numpy().tolist())}\n"
+
+
+def share_cell(count: int, total: int) -> str:
+    """Returns a number of runs out of all, with Wilson's 95 % interval of the share."""
+    low, high = wilson(count / total, total)
+    return f"{count}/{total} [{100 * low:.0f}, {100 * high:.0f}] %"
+
+
+def wins_cell(wins: Superiority) -> str:
+    """Returns the share of paired runs that one wins, with its interval."""
+    return f"{wins.value:.2f} [{wins.low:.2f}, {wins.high:.2f}]"
+
+
+def word_of(wins: Superiority, better: str, worse: str) -> str:
+    """Returns the word for one that wins more than half of the pairs with confidence, for one that loses, or level."""
+    return better if wins.low > 0.5 else worse if wins.high < 0.5 else "level"
+
+
+def centre_cell(samples: Array, digits: int, median: bool = False) -> str:
+    """Returns the mean or the median of the finite samples with its 95 % bootstrap interval, or – if there is none."""
+    value, low, high, *_ = bootstrap_interval(samples, median=median)
+    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]" if np.isfinite(value) else "–"
 
 
 @contextlib.contextmanager

@@ -24,15 +24,22 @@ from tqdm import tqdm
 
 from mrctl.experiments.journal import Journal
 from mrctl.experiments.mission_suite import PLANTS, Mode, titled
-from mrctl.experiments.suite_tables import Table
-from mrctl.experiments.tables import machine, output_folder, write_json
-from mrctl.kernel import Array
+from mrctl.experiments.tables import (
+    Table,
+    centre_cell,
+    machine,
+    output_folder,
+    share_cell,
+    wins_cell,
+    word_of,
+    write_json,
+)
 from mrctl.loop.simulation import cores, simulate
 from mrctl.navigation.generators import Task, slalom
 from mrctl.navigation.mission import PERIOD, avoiding, outcomes, prepared, robot_of
 from mrctl.navigation.planning import Plan
 from mrctl.record import InputError
-from mrctl.results.comparison import bootstrap_interval, superiority, wilson
+from mrctl.results.comparison import superiority
 from mrctl.results.dataset import versions
 from mrctl.results.metrics import control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
@@ -223,17 +230,17 @@ def table(lag: float, runs: dict[str, dict[str, list[Run]]], shown: str) -> Tabl
         for name, of in runs.items():
             own = of[plant]
             counts = [sum(run.outcome == outcome for run in own) for outcome in ("arrived", "collided")]
-            cells = [f"{count}/{len(own)} {_percent(wilson(count / len(own), len(own)))}" for count in counts]
+            cells = [share_cell(count, len(own)) for count in counts]
             near = np.array([run.clearance for run in own])
-            rows.append([plant, name, *cells, _mean(late[name], 2), _mean(1e3 * near, 0)])
+            rows.append([plant, name, *cells, centre_cell(late[name], 2), centre_cell(1e3 * near, 0)])
             for rival in (FIRST, SECOND):
                 wins = superiority(late[name], late[rival], floor=TIE)
-                rows[-1].append("" if rival == name else f"{wins.value:.2f} [{wins.low:.2f}, {wins.high:.2f}]")
+                rows[-1].append("" if rival == name else wins_cell(wins))
         for rival, parts in verdicts.items():
             both = np.isfinite(late[THIRD]) & np.isfinite(late[rival])
             wins = superiority(late[THIRD], late[rival], floor=TIE)
-            word = "faster" if wins.low > 0.5 else "slower" if wins.high < 0.5 else "level"
-            parts.append(f"{word} ({plant}, {_mean(late[THIRD][both] - late[rival][both], 2)} s later)")
+            later = centre_cell(late[THIRD][both] - late[rival][both], 2)
+            parts.append(f"{word_of(wins, 'faster', 'slower')} ({plant}, {later} s later)")
     header = ["plant", "MPPI", "arrived", "collided", "later than the plan, s", "least clearance, mm"]
     header += ["arrives before the first", "before the second"]
     says = (
@@ -243,13 +250,3 @@ def table(lag: float, runs: dict[str, dict[str, list[Run]]], shown: str) -> Tabl
         "time are means over the draws in which both arrive."
     )
     return Table(f"Three MPPIs ({shown})", says, pd.DataFrame(rows, columns=header))  # pyright: ignore[reportArgumentType]
-
-
-def _percent(interval: tuple[float, float]) -> str:
-    return f"[{100 * interval[0]:.0f}, {100 * interval[1]:.0f}] %"
-
-
-def _mean(samples: Array, digits: int) -> str:
-    """The mean of the finite samples with its interval."""
-    value, low, high, *_ = bootstrap_interval(samples)
-    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]" if np.isfinite(value) else "–"

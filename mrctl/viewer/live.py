@@ -37,11 +37,11 @@ from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
 from mrctl.viewer.scene import HARD, MAX_MARKED, Scene
-from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import CHANGEABLE, HOUR, Session, changed, ends, followed, pushed, state
+from mrctl.viewer.stories import STORIES
 
 WINDOW = 12.0  # s, time span of the plots
 SAMPLES = 200  # about the largest number of samples in a curve; a chart is some 300 pixels wide

@@ -10,7 +10,7 @@ import xarray as xr
 from scipy.signal import lsim
 from test_commands import refused
 
-import mrctl.experiments.feeding_up as feeding
+import mrctl.experiments.learned_limits as feeding
 import mrctl.experiments.mission_suite as suite
 import mrctl.experiments.three_mppis as three
 import mrctl.navigation.mppi as mppi
@@ -87,7 +87,10 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
         assert re.search(rf"{re.escape(name)} +\| 1/1 \[21, 100\] % \| 0/1 .* {run['lateness']:.2f} \[", printed)
     first, second, _ = (of["nominal"][0] for of in values["runs"].values())
     assert first != second  # they differ in the lag alone
-    assert "\n3 runs that feed up, about 1 min" in printed and (tmp_path / "limits.md").read_text() in printed
+    assert (
+        "\n3 runs with nominal and with learned limits, about 1 min" in printed
+        and (tmp_path / "limits.md").read_text() in printed
+    )
     (before,), (after,) = json.loads((tmp_path / "limits.json").read_text())["limits"]["all"].values()
     assert before["arrived"] and after["arrived"] and before["plan"] < after["plan"] < 1.1 * before["plan"]
     assert after["error"] < before["error"]

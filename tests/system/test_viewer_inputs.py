@@ -18,9 +18,9 @@ from mrctl.theory.robot import RobotFile
 from mrctl.viewer import live as module
 from mrctl.viewer.controls import ANEW, ANEW_HINT
 from mrctl.viewer.live import Live
-from mrctl.viewer.scenes import STORIES
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import CHANGEABLE
+from mrctl.viewer.stories import STORIES
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from test_obstacles import judged, random_shapes
 from mrctl import Box, Obstacles, RobotFile, Scenario, Sensing, Waypoints
 from mrctl.control.features import feature_matrix
 from mrctl.control.kanayama import kanayama, posture_error
-from mrctl.experiments.feeding_up import PLANTS
+from mrctl.experiments.learned_limits import PLANTS
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.navigation.avoidance import Avoiding, Barrier, Following, Pacing, approach, avoid, nearest, share
 from mrctl.physics import mjcf

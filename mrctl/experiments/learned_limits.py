@@ -25,9 +25,16 @@ from mrctl.control.features import INPUTS, feature_scale
 from mrctl.experiments.journal import Journal
 from mrctl.experiments.mission_suite import PATIENCE, ROOMY, SHAPE, TIE, Mode, titled
 from mrctl.experiments.mission_suite import PLANTS as SHARED
-from mrctl.experiments.suite_tables import Table
-from mrctl.experiments.tables import machine, output_folder, write_json
-from mrctl.kernel import Array
+from mrctl.experiments.tables import (
+    Table,
+    centre_cell,
+    machine,
+    output_folder,
+    share_cell,
+    wins_cell,
+    word_of,
+    write_json,
+)
 from mrctl.loop.goals import arrived
 from mrctl.loop.learned import kept, save_learned
 from mrctl.loop.simulation import arranged, cores, simulate
@@ -35,7 +42,7 @@ from mrctl.navigation.generators import corridor
 from mrctl.navigation.mission import SLIM, planned, robot_of
 from mrctl.navigation.planning import Plan
 from mrctl.record import InputError
-from mrctl.results.comparison import bootstrap_interval, superiority, wilson
+from mrctl.results.comparison import superiority
 from mrctl.results.dataset import scenarios_of, versions
 from mrctl.scenario import FEEDFORWARDS, Scenario, replicates
 from mrctl.theory.dynamics import inverse_coefficients
@@ -118,7 +125,7 @@ def drive(base: Scenario, count: int, journal: Journal) -> dict[str, dict[str, l
         raise InputError(f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m")
     left = sum(plant not in journal for plant in PLANTS) * (1 + len(LIMITS))
     minutes = max(1, round(left * sum(one.reference.period for one in draws) / PACE / cores() / 60))
-    print(f"{left * count} runs that feed up, about {minutes} min", flush=True)
+    print(f"{left * count} runs with nominal and with learned limits, about {minutes} min", flush=True)
     own = base.replace(**FEEDFORWARDS["model+composite"], laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
     found = {}
     for plant, perturbation in tqdm(PLANTS.items(), unit="plant"):
@@ -198,13 +205,11 @@ def table(runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
         errors = {name: np.array([run.error for run in own]) for name, own in of.items()}
         for name, own in of.items():
             there = sum(run.arrived for run in own)
-            low, high = wilson(there / len(own), len(own))
-            share = f"{there}/{len(own)} [{100 * low:.0f}, {100 * high:.0f}] %"
             times = np.array([run.plan for run in own])
-            rows.append([plant, name, share, _median(times, 2), _median(1e3 * errors[name], 1)])
+            cells = [centre_cell(times, 2, median=True), centre_cell(1e3 * errors[name], 1, median=True)]
+            rows.append([plant, name, share_cell(there, len(own)), *cells])
         wins = superiority(errors["learned"], errors["nominal"], floor=TIE)
-        word = "smaller" if wins.low > 0.5 else "larger" if wins.high < 0.5 else "level"
-        verdicts.append(f"{word} on {plant} ({wins.value:.2f} [{wins.low:.2f}, {wins.high:.2f}])")
+        verdicts.append(f"{word_of(wins, 'smaller', 'larger')} on {plant} ({wins_cell(wins)})")
     says = (
         f"In paired draws, with 95 % confidence and differences up to {1e3 * TIE:.0f} mm as ties, the largest error "
         f"with learned limits is, against nominal ones: {', '.join(verdicts)}. Times and errors are medians; errors "
@@ -212,9 +217,3 @@ def table(runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
     )
     header = ["plant", "limits of the plan", "arrived", "time of the plan, s", "largest error, mm"]
     return Table(f"Feeding up ({shown})", says, pd.DataFrame(rows, columns=header))  # pyright: ignore[reportArgumentType]
-
-
-def _median(samples: Array, digits: int) -> str:
-    """The median of the finite samples with its interval."""
-    value, low, high, *_ = bootstrap_interval(samples, median=True)
-    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]" if np.isfinite(value) else "–"
