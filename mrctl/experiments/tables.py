@@ -64,9 +64,13 @@ def word_of(wins: Superiority, better: str, worse: str) -> str:
 
 
 def centre_cell(samples: Array, digits: int, median: bool = False) -> str:
-    """Returns the mean or the median of the finite samples with its 95 % bootstrap interval, or – if there is none."""
+    """Returns the mean or the median of the finite samples with its 95 % bootstrap interval.
+
+    One sample has no interval, and – stands for none.
+    """
     value, low, high, *_ = bootstrap_interval(samples, median=median)
-    return f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]" if np.isfinite(value) else "–"
+    interval = f" [{low:.{digits}f}, {high:.{digits}f}]" if np.isfinite(low) else ""
+    return f"{value:.{digits}f}{interval}" if np.isfinite(value) else "–"
 
 
 @contextlib.contextmanager

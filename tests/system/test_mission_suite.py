@@ -101,7 +101,8 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
         (tmp_path / name).write_text("".join(kept[:lines]) + kept[lines][:30])
     assert cli.main(["navigate", "--suite", "--quick", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
-    assert printed.startswith("24 runs, about") and "\n2 runs with MPPI" in printed and "\n3 runs that feed" in printed
+    assert printed.startswith("24 runs, about") and "\n2 runs with MPPI" in printed
+    assert "\n3 runs with nominal" in printed
     assert {name: (tmp_path / name).read_bytes() for name in first} == first
     for part in (suite, three, feeding):
         monkeypatch.setattr(part, "simulate", None)
