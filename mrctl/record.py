@@ -9,9 +9,9 @@ import json
 import stat
 import textwrap
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from typing_extensions import override
@@ -96,7 +96,7 @@ class _Constructors(ModelMetaclass):
             try:
                 return super().__call__(*args, **kwargs)
             except ValidationError as error:
-                raise InputError(describe(error, fields=cls.model_fields)) from None
+                raise InputError(describe(error, record=cls)) from None
 
 
 class Record(BaseModel, metaclass=_Constructors):
@@ -186,7 +186,7 @@ class Record(BaseModel, metaclass=_Constructors):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise InputError(describe(error, source, cls.model_fields)) from None
+            raise InputError(describe(error, source, cls)) from None
         except OSError as error:  # raised by a field that names a file
             raise InputError(printable(f"{source}: {error.filename}: {error.strerror}".removeprefix(": "))) from None
 
@@ -232,7 +232,7 @@ def _toml(value: Any, nested: bool = True) -> str:  # noqa: ANN401
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def describe(error: ValidationError, source: str = "", fields: Iterable[str] = ()) -> str:
+def describe(error: ValidationError, source: str = "", record: type[Record] | None = None) -> str:
     """Returns a pydantic error as one line: `source: field.subfield: reason`.
 
     A field that does not exist comes first: it may be why another one is missing.
@@ -240,18 +240,19 @@ def describe(error: ValidationError, source: str = "", fields: Iterable[str] = (
     Args:
         error: The error.
         source: Name of the file or of the record.
-        fields: Names of the fields of the outermost record, for which a misspelt one may stand.
+        record: The record that is refused, among whose fields is the one for which a misspelt one may stand.
     """
     first, *rest = sorted(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     field = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
-        *parent, name = first["loc"]
-        missing = [str(one["loc"][-1]) for one in rest if one["type"] == "missing" and [*one["loc"][:-1]] == parent]
-        nearest = difflib.get_close_matches(str(name), missing if parent else [*missing, *fields], 1)
+        *parents, name = first["loc"]
+        known = [field for one in _records_at(record, parents) for field in one.model_fields]
+        nearest = difflib.get_close_matches(str(name), known, 1)
         message = f"there is no such field; did you mean {nearest[0]}?" if nearest else "there is no such field"
     if first["type"] in ("model_type", "model_attributes_type"):
-        message = "must be a record, or a table of its fields"
+        names = {one.named_by for one in _records_at(record, first["loc"])} - {""}
+        message = ", or its ".join(["must be a record, or a table of its fields", *sorted(names)])
     if first["type"] == "tuple_type":  # a file has no tuples
         tables = (
             f", in TOML of tables that begin with [[{first['loc'][-1]}]]" if isinstance(first["input"], dict) else ""
@@ -259,3 +260,20 @@ def describe(error: ValidationError, source: str = "", fields: Iterable[str] = (
         message = f"must be a list{tables}"
     more = f" (and {len(rest)} more)" if rest else ""
     return printable(": ".join(part for part in (source, field, message) if part) + more)
+
+
+def _records_at(record: type[Record] | None, path: Sequence[int | str]) -> list[type[Record]]:
+    """Returns the records that may stand at a path of fields, indices and kinds within one; none if that is unknown."""
+    found = [record] if record else []
+    for part in path:
+        fields = [one.model_fields[str(part)].annotation for one in found if part in one.model_fields]
+        kinds = [one for one in found if "kind" in one.model_fields and one.model_fields["kind"].default == part]
+        found = kinds or [one for annotation in fields for one in _records_in(annotation)] or found
+    return found
+
+
+def _records_in(annotation: object) -> list[type[Record]]:
+    """Returns the records in an annotation, such as those of a union or of a tuple."""
+    if isinstance(annotation, type) and issubclass(annotation, Record):
+        return [annotation]
+    return [one for part in get_args(annotation) for one in _records_in(part)]

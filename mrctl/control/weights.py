@@ -106,7 +106,7 @@ def notes_on(path: str | Path) -> dict[str, str]:
     try:
         with safe_open(path, "numpy") as file:
             return file.metadata() or {}
-    except SafetensorError:
+    except (SafetensorError, OSError):
         return {}
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from mrctl.record import InputError
 from mrctl.sweep.jobs import code_digest
 
-SHOWING = ("checks", "envs", "viewer", "cli.py", "__main__.py")  # rooms on which no experiment depends
+SHOWING = ("envs", "viewer", "cli.py", "__main__.py")  # rooms on which no experiment depends
 
 
 class Journal:
@@ -24,7 +24,7 @@ class Journal:
 
         Args:
             file: The file; an unfinished last line is dropped.
-            head: Everything that the results depend on, but the code of mrctl, whose digest is added.
+            head: Everything that the results depend on, but the Python code of mrctl, whose digest is added.
 
         Raises:
             InputError: The results in the file depend on something else, or it cannot be read or written.

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from mrctl.experiments.cases import BAND, FLOOR, HALF, HINDSIGHT, MUCH_WORSE, NO_WORSE, PARTS, REFERENCES, UNCHANGED
-from mrctl.experiments.tables import Table, number
+from mrctl.experiments.tables import LEAST, Table, number
 
 COLUMNS = {"v_rmse": "V, mm/s", "omega_rmse": "θ̇, mrad/s", "position_rmse": "position, mm"}
 TITLES = {"none": "PID"}  # names of feedforwards in the tables, where these differ
@@ -24,7 +24,6 @@ LEADING = {
     "position in all laps": ("position_rmse", "all"),
 }
 NO_CLAIM = "So few draws tell nothing apart: this table supports no claim."
-LEAST = 6  # pairs that a feedforward which always wins needs for 95 % confidence: the exact sign test gives p = 0.03
 
 Row = dict[str, Any]
 

@@ -240,13 +240,14 @@ def table(lag: float, runs: dict[str, dict[str, list[Run]]], shown: str) -> Tabl
             both = np.isfinite(late[THIRD]) & np.isfinite(late[rival])
             wins = superiority(late[THIRD], late[rival], floor=TIE)
             later = centre_cell(late[THIRD][both] - late[rival][both], 2)
-            parts.append(f"{word_of(wins, 'faster', 'slower')} ({plant}, {later} s later)")
+            word = word_of(wins, "faster", "slower")
+            parts.append(f"{word} ({plant}: before it in {wins_cell(wins)} of the pairs, on average {later} s later)")
     header = ["plant", "MPPI", "arrived", "collided", "later than the plan, s", "least clearance, mm"]
     header += ["arrives before the first", "before the second"]
     says = (
         f"The lag that fits PID on the nominal plant is {1e3 * lag:.0f} ms. In paired draws, with 95 % confidence, "
         f"differences up to {1e3 * TIE:.0f} ms as ties and who does not arrive as last, the third is, against the "
-        f"second: {', '.join(verdicts[SECOND])}; against the first: {', '.join(verdicts[FIRST])}. The differences in "
-        "time are means over the draws in which both arrive."
+        f"second: {', '.join(verdicts[SECOND])}; against the first: {', '.join(verdicts[FIRST])}. The words follow "
+        "from the share of the pairs, and the averages are over those in which both arrive."
     )
     return Table(f"Three MPPIs ({shown})", says, pd.DataFrame(rows, columns=header))  # pyright: ignore[reportArgumentType]

@@ -122,7 +122,8 @@ def hand_over(s: Row) -> None:
     for k in range(2):
         taken = TAKE_OVER * s.guard.authority * s.added[k]
         s.pid.integral[k] -= taken
-        s.guard.handed[k] += taken
+        if s.guard.hands_over:
+            s.guard.handed[k] += taken
 
 
 @kernel

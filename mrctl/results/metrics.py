@@ -131,8 +131,8 @@ def _end(run: xr.Dataset) -> int:
         return int(alive[-1]) + 1
     if "samples" not in run.coords or not size:  # an older version wrote the result
         return size
-    begun = round(float(run["time"][0]) / control_period(run))  # where it is an interval of a run
-    return min(size, max(int(run["samples"]) - begun, 0))
+    left = int(run["samples"]) - round(float(run["time"][0]) / control_period(run))  # in an interval of a run
+    return min(size, left) if left > 0 else size
 
 
 def per_lap(result: xr.Dataset) -> xr.Dataset:

@@ -99,6 +99,8 @@ def test_laps_beside_a_longer_run(tmp_path):
     assert alone["laps"].item() == 2 and both["laps"].values.tolist() == [2, 5]
     later = simulate([short, long]).isel(run=0, time=slice(400, None))
     assert per_lap(later)["laps"].item() == 1
+    after = per_lap(simulate([short, HEALTHY[0], long]).isel(time=slice(900, None)))  # the first two have ended
+    assert after["position_rmse"].isnull().all() and after["failed"].values.tolist() == [True, False, True]
     axes = [{"field": "laps", "values": [2, 5]}]
     jobs.run(Sweep.from_dict({"base": short.model_dump(), "axes": axes, "record": "laps"}), tmp_path, 1)
     assert all(jobs.repeat(tmp_path, run).same for run in (0, 1))

@@ -22,6 +22,7 @@ from mrctl import (
 )
 from mrctl.experiments import single
 from mrctl.experiments.paper import IDEAL
+from mrctl.loop.simulation import Simulation
 from mrctl.results.dataset import SIGNALS
 from mrctl.sensing.tiers import Sensing
 
@@ -204,6 +205,15 @@ def test_feedback_without_integral():
     steps = np.abs(np.diff(sent)).max(axis=0)
     assert np.ptp(sent[:, 298:340], axis=1).max() > 3.0  # what the model gives less
     assert steps[298:340].max() < 0.6  # of which 9 % go in a tick; all at once would be 7 V
+
+
+@pytest.mark.parametrize("stages", [{}, {"feedback": Proportional}])
+def test_nothing_is_taken_where_there_is_no_integral(stages):
+    """A learner takes nothing from a feedback without an integral, so the guard counts nothing."""
+    simulation = Simulation([of(DELAYED, "none", Guard())] * 2, feedforward=Takes, **stages)
+    for _ in range(10):
+        simulation.step()
+    assert simulation.hierarchy.state["guard"]["handed"].any() == (not stages)
 
 
 def test_told():

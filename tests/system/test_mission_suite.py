@@ -84,7 +84,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     for name, of in values["runs"].items():
         (run,) = of["nominal"]
         assert run["outcome"] == "arrived" and 0 < run["clearance"] and abs(run["lateness"]) < 3
-        assert re.search(rf"{re.escape(name)} +\| 1/1 \[21, 100\] % \| 0/1 .* {run['lateness']:.2f} \[", printed)
+        assert re.search(rf"{re.escape(name)} +\| 1/1 \[21, 100\] % \| 0/1 .* {run['lateness']:.2f} +\|", printed)
     first, second, _ = (of["nominal"][0] for of in values["runs"].values())
     assert first != second  # they differ in the lag alone
     assert (

@@ -218,7 +218,13 @@ def test_names_in_the_place_of_records():
         ({"lap": 3}, "lap: there is no such field; did you mean laps?"),
         ({"events": [{"tim": 1}]}, "events.0.tim: there is no such field; did you mean time? (and 1 more)"),
         ({"colour": 1, "laps": 0}, "colour: there is no such field (and 1 more)"),
+        ({"sensing": {"teir": "lab"}}, "sensing.teir: there is no such field; did you mean tier?"),
+        (
+            {"reference": {"kind": "circle", "perod": 3}},
+            "reference.circle.perod: there is no such field; did you mean period?",
+        ),
         ({"reference": "circle"}, "reference: must be a record, or a table of its fields"),
+        ({"robot": 3}, "robot: must be a record, or a table of its fields, or its path"),
     ],
 )
 def test_misspelt(values, says):
