@@ -30,7 +30,7 @@ from mrctl.theory.timing import RESERVE
 
 STEPS = 56  # of a roll-out, each a motion period
 KNOTS = 8  # of a roll-out, between which what is added to its twists changes linearly
-PLACE, HEADING, NEAR, TOUCH = 10.0, 4.0, 5.0, 1000.0  # costs in 1/(m² s), 1/s, 1/s and for a collision; chosen
+PLACE, HEADING, NEAR, TOUCH = 10.0, 1.0, 5.0, 1000.0  # costs in 1/(m² s), 1/s, 1/s and for a collision; chosen
 KEPT = 0.1  # m from obstacles, below which it costs
 DEEPER = 0.005  # m, by which discs that touch an obstacle already may come nearer
 CELL = 0.04  # m, of the distance field

@@ -79,12 +79,20 @@ def test_tight_spline(world: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_other_refusals_are_final(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wider arcs are no remedy for a speed beyond the robot's, which is what the message names."""
+    """Wider arcs are no remedy for what does not turn the wheel; a speed beyond the robot's needs no plan at all."""
     scenario, searches = Scenario(), []
-    search = mission.plan
+    task, search = task_of("doorway:3", scenario), mission.plan
     monkeypatch.setattr(mission, "plan", lambda *arguments: searches.append(arguments) or search(*arguments))
-    with pytest.raises(InputError, match="exceeds the robot's max_"):
-        prepared(task_of("doorway:3", scenario), scenario, speed=9)
+    with pytest.raises(InputError, match=r"^speed: must be above 0 and at most 1.5 m/s, not 9$"):
+        prepared(task, scenario, speed=9)
+    assert not searches
+
+    def refuses(*_: object) -> None:
+        raise InputError("reference: rotation 4 rad/s exceeds the robot's max_rotation")
+
+    monkeypatch.setattr(mission, "check", refuses)
+    with pytest.raises(InputError, match="exceeds the robot's max_rotation"):
+        prepared(task, scenario)
     assert len(searches) == 1
 
 

@@ -167,7 +167,7 @@ def test_settings_of_a_user(file, tmp_path):
         (["mine.py:Other"], "controller: mine.py has no Other"),
         (["mine.py:Scaled(gian=1)"], "gian"),
         (["fel", "--delay", "0.01"], "flags of the design"),
-        (["fel", "--tier", "moon"], "--tier"),
+        (["fel", "--tier", "moon"], "tier: 'moon' is none of field, ideal, lab"),
         (["fel", "--out", "mine.py"], "mine.py"),
     ],
 )
