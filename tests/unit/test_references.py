@@ -290,7 +290,7 @@ NARROW = [
         ({"kind": "spiral"}, "'kind'"),
         ({"kind": "circle", "radius": -1}, "circle.radius: .*greater than 0"),
         ({"kind": "line", "speed": float("inf")}, "line.speed: "),
-        ({"kind": "circle", "size": 1}, "circle.size: .*not permitted"),
+        ({"kind": "circle", "size": 1}, "circle.size: there is no such field"),
         ({"kind": "rounded_square", "side": 1, "radius": 0.4}, "radius: corners do not fit .*at most 0.2885 m"),
         ({"kind": "waypoints", "points": [[0, 0], [1, 0]]}, "points: a closed curve needs at least 3"),
         ({"kind": "waypoints", "points": [[0, 0]], "closed": False}, "points: an open curve needs at least 2"),
