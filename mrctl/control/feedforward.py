@@ -6,7 +6,7 @@
 | ------------ | ------------------------------------------------------------------ |
 | `none`       | 0: the learner starts from nothing, as in the paper                |
 | `model`      | those of the nominal robot                                         |
-| `true_model` | those of the robot as it is, one motor standing for both; nobody knows them: for reference only |
+| `true_model` | the true ones, as means of left and right; for reference only      |
 """
 
 from __future__ import annotations
