@@ -42,6 +42,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from mrctl.control.oscillation import HALF_WAVES, SWING, count_half_waves, swing
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 
@@ -50,12 +51,8 @@ NONE, FALLBACK = range(2)
 REASONS = ("", "sustained oscillation", "far from the reference", "velocity far from the command", "output not finite")
 _, OSCILLATION, FAR, FAST, BROKEN = range(5)
 
-# The loops are designed with damping ratios of at least 0.5: after a push a half-wave has at most a sixth of the
-# amplitude of the one before it. Many in a row are fed by something, and what a lap asks for is slower.
-SMOOTH, DRIFT = 0.01, 0.3  # s, time constants of the filters that remove noise and slow motion from the PID's output
-SLOWEST = 1.0  # s, longest half-wave
-SUSTAINED = 16  # half-waves in a row
-
+SLOWEST = 1.0  # s, longest half-wave of an oscillation; what a lap asks for is slower
+SUSTAINED = 16  # half-waves in a row that make an oscillation
 RECENT = 1.0  # s, time constant with which the peak of a deviation decays
 MEAN = 0.5  # s over which voltages are averaged before the integral takes them over; a few periods of an oscillation
 RETURN = 5.0  # s in which a learner that resumes at full gain gets its authority back
@@ -110,7 +107,8 @@ def guard(
     for k in range(2):
         fallback = nominal[k] if g.model else 0.0
         deviation = g.authority * (g.limited[k] - fallback)
-        count_half_waves(g, k, feedback[k], period)
+        wave = swing(feedback[k], k, period, g.feedback)
+        count_half_waves(wave, k, g.oscillation * g.harmless[k], SLOWEST, period, g.half_waves)
         g.output[k] = g.limited[k]
         if g.authority < 1.0:
             g.bump[k] *= g.fade / (g.fade + period)
@@ -136,21 +134,6 @@ def guard(
 
 
 @kernel
-def count_half_waves(g: Row, k: int, value: float, period: float) -> None:
-    """Counts the half-waves of a signal of channel k in a row that are large enough, and shorter than `SLOWEST`."""
-    g.low_pass[k] += period / (SMOOTH + period) * (value - g.low_pass[k])
-    g.slow_mean[k] += period / (DRIFT + period) * (g.low_pass[k] - g.slow_mean[k])
-    wave = g.low_pass[k] - g.slow_mean[k]
-    sign = 1.0 if wave >= 0 else -1.0
-    if sign != g.sign[k] or g.half_wave_time[k] > SLOWEST:
-        counts = g.half_wave_time[k] <= SLOWEST and g.peak[k] > g.oscillation * g.harmless[k]
-        g.waves[k] = g.waves[k] + 1.0 if counts else 0.0
-        g.sign[k], g.peak[k], g.half_wave_time[k] = sign, 0.0, 0.0
-    g.peak[k] = max(g.peak[k], abs(wave))
-    g.half_wave_time[k] += period
-
-
-@kernel
 def worst_trouble(g: Row, broken: bool, error: Array, command: Array, twist: Array) -> int:
     """Returns the reason of the worst trouble now, an index into `REASONS`; 0 if nothing is wrong.
 
@@ -167,7 +150,7 @@ def worst_trouble(g: Row, broken: bool, error: Array, command: Array, twist: Arr
                 return FAR
             if abs(command[k] - twist[k]) > g.region[k]:
                 return FAST
-        if deviation > g.oscillation * g.harmless[k] and g.waves[k] >= SUSTAINED:
+        if deviation > g.oscillation * g.harmless[k] and g.half_waves.count[k] >= SUSTAINED:
             return OSCILLATION
     return 0
 
@@ -240,12 +223,8 @@ GUARD = np.dtype(
         ("region", "f8", 2),  # ē: largest errors of V and θ̇ with which a learner may go on, m/s and rad/s
         ("harmless", "f8", 2),  # D: deviation of a channel that cannot leave that region, V (rad/s)
         # Oscillation of the PID's output in the two channels
-        ("low_pass", "f8", 2),  # the signal without noise, V (rad/s)
-        ("slow_mean", "f8", 2),  # its slow mean, V (rad/s)
-        ("sign", "f8", 2),  # of the present half-wave
-        ("peak", "f8", 2),  # its amplitude, V (rad/s)
-        ("half_wave_time", "f8", 2),  # its duration so far, s
-        ("waves", "f8", 2),  # consecutive half-waves above the threshold
+        ("feedback", SWING),
+        ("half_waves", HALF_WAVES),
         # What is compared with a bound
         ("deviation", "f8", 2),  # peak of the deviation from the fallback, which decays, V (rad/s)
         ("handed", "f8", 2),  # sum of what learning took from the PID's integral, which decays, V (rad/s)

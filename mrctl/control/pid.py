@@ -68,6 +68,8 @@ class Pid(Record):
     for the plant K/(τ s + 1); by default the gains are the largest that the delay allows."""
     delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] | None = None
     """Delay from measurement to voltage in s that the design of the gains assumes; by default that of `sensing`."""
+    retune: bool = True
+    """Whether a sustained oscillation makes the designed gains be designed anew, for 10 ms more delay each time."""
     lag: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Time constant in s by which, as the design assumes, the measured velocities lag behind the true ones."""
     derivative_time: Annotated[float, Field(ge=0, le=0.5)] = 0.0

@@ -97,7 +97,16 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     if rows:
         lines.append(markdown(header, rows))
     acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]
-    return "\n".join([*lines, *(text.removesuffix(", ") for text in acted)]), failure
+    return "\n".join([*lines, *(text.removesuffix(", ") for text in acted), *_retuned(result.isel(run=0))]), failure
+
+
+def _retuned(run: xr.Dataset) -> list[str]:
+    """Says when the PID was designed for a longer delay, because it oscillated."""
+    added, time = np.nan_to_num(run["added_delay"].values), run["time"].values
+    return [
+        f"PID at {time[k]:.2f} s: oscillates, and is designed for {1e3 * added[k]:.3g} ms more delay from now on"
+        for k in np.flatnonzero(np.diff(added, prepend=0.0) > 0)
+    ]
 
 
 def _unreached(scenario: Scenario, run: xr.Dataset) -> list[str]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mrctl.control import guard as guarding
 from mrctl.control.composite import CompositeAdaptation
+from mrctl.control.delay import DELAY, LONGEST, STEP, watch_delay
 from mrctl.control.design import Motion, motion
 from mrctl.control.feedforward import (
     Feedforward,
@@ -25,7 +26,7 @@ from mrctl.control.feedforward import (
     nothing,
 )
 from mrctl.control.fel import FeedbackErrorLearning
-from mrctl.control.guard import GUARD, UNSURE, guard
+from mrctl.control.guard import BACK_OFF, GUARD, UNSURE, guard
 from mrctl.control.indi import IncrementalInversion
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.control.l1 import L1Adaptive
@@ -63,6 +64,7 @@ CONTROL = np.dtype(
         ("prior", "f8", 2),  # feedforward of the prior, V
         ("feedforward", "f8", 2),  # that of prior and learner, V (rad/s on a steering channel)
         ("nominal", "f8", 2),  # output of the nominal inverse dynamics, if the guard is on, V (rad/s)
+        ("delay", DELAY),
         ("guard", GUARD),
         ("allocation", ALLOCATION),
         ("voltage", "f8", 2),  # voltage of the two channels after the limits, V (rad/s)
@@ -99,6 +101,7 @@ def command_motion(goal: Row, robot: Row, period: float, s: Row) -> None:
 def apply_voltages(seen: Row, model: Row, robot: Row, period: float, s: Row) -> bool:
     """Guard and allocation: from feedback and feedforward to voltages and steering; returns whether they are finite."""
     command, derivative, a = s.limiter.command, s.limiter.derivative, s.allocation
+    watch_delay(s.feedback, s.guard.output, s.guard.range, period, s.delay)
     if s.guard.on:
         inverse_dynamics(command, derivative, model, s.nominal)
     guard(
@@ -140,10 +143,10 @@ def update(moves: bool, seen: Rows, goal: Rows, period: float, place: int) -> tu
             what the learner keeps.
 
     Returns:
-        Whether all voltages are finite, and whether a guard demands that a learner is reset.
+        Whether all voltages are finite, and whether a robot asks for what `answer` does.
     """
     robot, model, prior, control, arrays = held(place)
-    finite, forget = True, False
+    finite, asks = True, False
     for i in range(len(control)):
         s, measured, wanted = control[i], seen[i], goal[i]
         if moves:
@@ -161,8 +164,8 @@ def update(moves: bool, seen: Rows, goal: Rows, period: float, place: int) -> tu
             s.added,
         )  # fmt: skip
         hand_over(s)
-        forget |= s.guard.forget
-    return finite, forget
+        asks |= s.guard.forget | s.delay.due
+    return finite, asks
 
 
 def learner_of(scenarios: Sequence[Scenario], robot: Robot) -> Learner:
@@ -246,7 +249,8 @@ class Hierarchy:
         self.model = Prior([robot] * size, self.rigid)
         self.state = state = np.zeros(size, CONTROL)
         self._delays = [s.sensing.loop_delay(self.period) * self.period for s in scenarios]
-        self._pids = [s.pid for s in scenarios]
+        self._pids, self._kanayamas = [s.pid for s in scenarios], [s.kanayama for s in scenarios]
+        self._prefilters = [s.prefilter for s in scenarios]
         self._motions: list[Motion] = []
         for row, scenario in enumerate(scenarios):
             gains = scenario.pid.channels(robot, self.rigid, self._delays[row], self.period)
@@ -283,7 +287,8 @@ class Hierarchy:
         return False
 
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
-        """Changes the motion controller of one robot; gains that are not set are designed for its PID at the start."""
+        """Changes the motion controller of one robot; gains that are not set are those of its last design."""
+        self._kanayamas[row] = gains
         designed = self._motions[row].kanayama.model_dump()
         chosen = designed | gains.model_dump(exclude_none=True)
         if gains.k_y is not None and gains.k_theta is None:
@@ -292,11 +297,43 @@ class Hierarchy:
         self._tolerate(row)
 
     def set_pid(self, row: int, design: Pid) -> None:
-        """Changes the PID of one robot."""
+        """Changes the PID of one robot, which is designed for the delay of the sensing again."""
         self._pids[row] = design
-        for name, value in design.gains(self.robot, self.rigid, self._delays[row], self.period).items():
-            self.state["pid"][name][row] = value
+        watch = self.state["delay"]
+        watch["on"][row] = design.retune and design.time_constant is None
+        watch["added"][row], watch["ahead"][row] = 0.0, False
+        self._set_gains(row)
         self._tolerate(row)
+
+    def _set_gains(self, row: int) -> None:
+        """Computes the gains of the PID of one robot."""
+        pid, delay = self._designed_for(row)
+        for name, value in pid.gains(self.robot, self.rigid, delay, self.period).items():
+            self.state["pid"][name][row] = value
+
+    def _designed_for(self, row: int, ahead: float = 0.0) -> tuple[Pid, float]:
+        """Returns the PID of one robot and the delay of its loop in s, both with what has been added, and `ahead`."""
+        pid, added = self._pids[row], float(self.state["delay"]["added"][row]) + ahead
+        if pid.delay is not None:
+            pid = pid.model_copy(update={"delay": round(pid.delay + added, 6)})
+        return pid, round(self._delays[row] + added, 6)
+
+    def _lengthen(self, row: int) -> None:
+        """Makes the next move of `mrctl.control.delay` for one robot."""
+        watch, limiter = self.state["delay"], self.state["limiter"]
+        watch["ahead"][row] = not watch["ahead"][row]
+        if watch["ahead"][row]:
+            self.state["guard"]["gain"][row] /= BACK_OFF
+            pid, delay = self._designed_for(row, STEP)
+        else:
+            watch["added"][row] += STEP
+            watch["on"][row] = watch["added"][row] < LONGEST - STEP / 2
+            self._set_gains(row)
+            pid, delay = self._designed_for(row)
+        gains = pid.channels(self.robot, self.rigid, delay, self.period)
+        self._motions[row] = motion(self.robot, self.rigid, gains, delay, self.period, self._prefilters[row])
+        limiter["time_constant"][row] = self._motions[row].prefilter
+        self.set_kanayama(row, self._kanayamas[row])
 
     def _tolerate(self, row: int) -> None:
         """Computes anew the deviation D that the guard of one robot tolerates, which depends on both controllers."""
@@ -305,11 +342,11 @@ class Hierarchy:
 
     def _rejection(self, row: int) -> tuple[Peaks, Peaks]:
         """Peak-to-peak gains from a voltage to the errors of one robot under its controllers."""
-        delay, k = self._delays[row], self.state["kanayama"][row]
+        k, (pid, delay) = self.state["kanayama"][row], self._designed_for(row)
         kanayama = Kanayama(k_x=k["k_x"], k_y=k["k_y"], k_theta=k["k_theta"])
         prefilter = float(self.state["limiter"]["time_constant"][row])
         around = Motion(kanayama, prefilter, self._motions[row].lag)
-        gains = self._pids[row].channels(self.robot, self.rigid, delay, self.period)
+        gains = pid.channels(self.robot, self.rigid, delay, self.period)
         return rejection(self.robot, self.rigid, gains, around, delay, self.period)
 
     def set_reference(self, row: int, reference: Reference) -> None:
@@ -334,7 +371,9 @@ class Hierarchy:
         renewed = Hierarchy([scenario], self.robot)
         self.state[row] = renewed.state[0]
         self.prior.rows[row] = renewed.prior.rows[0]
-        self._pids[row], self._motions[row], self._delays[row] = scenario.pid, renewed._motions[0], renewed._delays[0]
+        self._pids[row], self._kanayamas[row] = scenario.pid, scenario.kanayama
+        self._prefilters[row] = scenario.prefilter
+        self._motions[row], self._delays[row] = renewed._motions[0], renewed._delays[0]
         for name, values in self.gains.items():
             values[row] = renewed.gains[name][0]
         self._learned.pop(row, None)
@@ -389,9 +428,9 @@ class Hierarchy:
         Returns:
             `output`, `(B, 4)`.
         """
-        finite, forget = self._update(self.moves, seen, goal, self.period, self._held.place)
-        if forget:
-            self.forget()
+        finite, asks = self._update(self.moves, seen, goal, self.period, self._held.place)
+        if asks:
+            self.answer()
         self.faults = {} if finite else self.non_finite()  # the voltage limit would turn NaN into the full voltage
         self.tick += 1
         return self.output
@@ -402,10 +441,15 @@ class Hierarchy:
         finite = np.isfinite(a["feedback"]).all(axis=1) & np.isfinite(a["feedforward"]).all(axis=1)
         return dict.fromkeys(np.flatnonzero(~finite).tolist(), "non-finite voltage")
 
-    def forget(self) -> None:
-        """Resets the learners that their guards stopped; one that cannot be reset learns more slowly instead."""
+    def answer(self) -> None:
+        """Does what the tick asked for: designs controllers for more delay, and resets the learners of some guards.
+
+        A learner that cannot be reset learns more slowly instead.
+        """
+        for row in np.flatnonzero(self.state["delay"]["due"]):
+            self._lengthen(int(row))
         rows = np.flatnonzero(self.state["guard"]["forget"])
-        if not self.restore(rows):
+        if rows.size and not self.restore(rows):
             self.state["guard"]["gain"][rows] *= UNSURE
 
     def restore(self, rows: NDArray[np.intp]) -> bool:

@@ -131,12 +131,12 @@ def command_all(seen: Rows, goal: Rows, robot: Rows, period: float, control: Row
 
 @kernel
 def apply_all(seen: Rows, model: Rows, robot: Rows, period: float, control: Rows) -> tuple[bool, bool]:
-    """Calls `apply_voltages` for all robots; returns whether all are finite, and whether a learner is to be reset."""
-    finite, forget = True, False
+    """Calls `apply_voltages` for all robots; returns whether all are finite, and whether one asks for `answer`."""
+    finite, asks = True, False
     for i in range(len(control)):
         finite &= apply_voltages(seen[i], model[0], robot[0], period, control[i])
-        forget |= control[i].guard.forget
-    return finite, forget
+        asks |= control[i].guard.forget | control[i].delay.due
+    return finite, asks
 
 
 @kernel
@@ -164,6 +164,8 @@ class UserHierarchy(Hierarchy):
         super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
         for name in (name for stage in stages for name in REPLACED.get(stage, ())):
             self.gains[name][:] = np.nan
+        if "feedback" in stages:
+            self.state["delay"]["on"] = False
         self.feedforward_faults = [""] * len(scenarios)
 
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
@@ -202,7 +204,7 @@ class UserHierarchy(Hierarchy):
             self._feed_back(feedback, seen["twist"])
         state["feedforward"] = self.feedforward(self.command, self.derivative)
         self._read_weight_norm()
-        finite, forget = apply_all(seen, self.model.rows, *constants, state)
+        finite, asks = apply_all(seen, self.model.rows, *constants, state)
         if stage := self._stages.get("steering"):
             self._steer(stage, seen["lost"].any(axis=1))
         if (added := self._learn(seen["twist"])) is not None:
@@ -210,8 +212,8 @@ class UserHierarchy(Hierarchy):
             hand_over_all(state)
         if feedback and (integral := getattr(feedback.stage, "integral", None)) is not None:
             integral[:] = state["pid"]["integral"]
-        if forget:
-            self.forget()
+        if asks:
+            self.answer()
         self._read_weight_norm()
         if not finite:
             self.faults = self.non_finite() | self.faults

@@ -256,7 +256,10 @@ class Session:
 
     def gains(self) -> tuple[Gains, Gains]:
         """Returns the present gains of both channels of the first robot, in the units of `Pid.channels`."""
-        return self.state()["pid"].channels(*self._design)
+        sim, k = self._place[0]
+        pid = sim.hierarchy.state["pid"][k]
+        common, second = (Gains(float(k_p), float(k_i)) for k_p, k_i in zip(pid["k_p"], pid["k_i"], strict=True))
+        return common, second
 
     @property
     def _design(self) -> tuple[Robot, bool, float, float]:

@@ -12,6 +12,7 @@ from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.fel_torch import ModuleLearning
 from mrctl.control.guard import GUARD_ACTIONS, REASONS, Guard, fresh, guard
 from mrctl.control.nominal import NOMINAL
+from mrctl.control.oscillation import DRIFT, SMOOTH
 from mrctl.control.rls import RecursiveLeastSquares, Rls
 
 PERIOD = 0.01
@@ -70,7 +71,7 @@ def sine(amplitude, frequency, duration=20.0):
 def passed(frequency):
     """Gain of the guard's band-pass, as designed in continuous time."""
     s = 2j * np.pi * frequency
-    return abs(s * module.DRIFT / (1 + s * module.DRIFT) / (1 + s * module.SMOOTH))
+    return abs(s * DRIFT / (1 + s * DRIFT) / (1 + s * SMOOTH))
 
 
 small = st.floats(-5, 5)
