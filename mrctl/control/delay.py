@@ -1,22 +1,21 @@
 """The delay that the velocity loop shows: when the PID's output oscillates, the controllers are designed anew.
 
 The PID is as fast as the delay of its loop allows (`design`). Where the motors act later than the controller knows, or
-the plant has several times the nominal gain, the loop oscillates. The delay for which the controllers are designed
-then grows by `STEP`, in two moves that take turns:
+the plant has several times the nominal gain, the loop oscillates. Each oscillation is answered by one move; odd and
+even moves differ:
 
-1. The motion controller is designed for the longer delay, and the learner is taught with a third of the feedback: both
-   are feedbacks around the PID, through the same delay, and may be what takes the margin of a PID that is stable alone.
-2. The PID is designed for it too.
+1. The motion controller is designed for `STEP` more delay, and the learner is taught with a third of the feedback, at
+   most `SLOWED` times. Both close further loops through the same delay, and a PID that is stable alone may oscillate
+   because of them. So they give way first.
+2. The PID is designed for `STEP` more delay too.
 
-The controllers are never made faster again. To lower a gain on an oscillation is the idea of adaptive augmenting
-control (Orr and VanZwieten 2012, Robust, practical adaptive control for launch vehicles); here the design of the gains
-replaces its factor.
+The moves are not taken back during a run. To lower a gain on an oscillation is the idea of adaptive augmenting control
+(Orr and VanZwieten 2012, Robust, practical adaptive control for launch vehicles); here the design of the gains replaces
+its factor.
 
-An oscillation is a number of half-waves of the PID's output in a row that are
-
-- shorter than `FASTEST_COMMAND`, because a slower wave may be what the reference asks for, and
-- larger than `LEAST` of the supply and the swing of the feedforward together: if the feedforward swings more than the
-  PID, it makes the oscillation itself, which is a matter for the guard.
+An oscillation is `SUSTAINED` half-waves of the PID's output in a row that are shorter than `SLOWEST`, and larger than
+the sum of `LEAST` of the supply and the recent peak of what explains them without an oscillating loop: the swing of the
+feedforward, or `MISMATCH` times the swing of the voltage that the nominal robot needs for the command.
 """
 
 from __future__ import annotations
@@ -27,30 +26,35 @@ from mrctl.control.oscillation import HALF_WAVES, SWING, count_half_waves, swing
 from mrctl.kernel import Array, Row, kernel
 
 STEP = 0.01
-"""Delay in s that is added at a time, *chosen*."""
-LONGEST = 0.1
-"""Largest delay in s that is added in all, *chosen*."""
+"""Delay in s that two moves add, rounded to whole control periods, *chosen*."""
+MOST = 20
+"""Largest number of moves, *chosen*."""
+SLOWED = 2
+"""Number of moves that slow the learner, *chosen*; after that it would hardly learn."""
 LEAST = 0.02
 """Least amplitude of a half-wave as a share of the supply (of the largest θ̇ on a steering channel), *chosen*. In 222
-random worlds without delay in `lab`, 8 half-waves in a row reach 0.013 at most, or 0.1 in the two that oscillate."""
+random worlds in `lab` without unknown delay, the largest level that 8 half-waves in a row exceed is 0.013 of the
+supply; in the two of them in which the loop oscillates it is 0.1."""
 SUSTAINED = 8
 """Half-waves in a row that make an oscillation, *chosen*."""
-FASTEST_COMMAND = 0.3
-"""Longest half-wave in s, *chosen*: an oscillation of at least 10 rad/s, which no reference asks for."""
+SLOWEST = 0.3
+"""Longest half-wave in s, *chosen*."""
+MISMATCH = 2.0
+"""Factor by which the robot may need more voltage than the nominal one, *chosen*."""
 REST = 2.0
 """Least time in s between two moves, in which an oscillation may fade, *chosen*."""
 RECENT = 1.0
-"""Time constant in s with which the peak of the feedforward's swing decays."""
+"""Time constant in s with which the peak of an explained swing decays."""
 
 
 @kernel
-def watch_delay(feedback: Array, feedforward: Array, scale: Array, period: float, s: Row) -> None:
+def watch_delay(feedback: Array, feedforward: Array, nominal: Array, period: float, s: Row) -> None:
     """One tick of the watch on the velocity loop, which sets `due` when an oscillation asks for the next move.
 
     Args:
         feedback: Output of the PID in V (rad/s on a steering channel), `(2,)`.
-        feedforward: Output of prior and learner in the same units, `(2,)`.
-        scale: Largest command of a channel: the supply in V, or the largest θ̇ in rad/s, `(2,)`.
+        feedforward: Output of prior and learner of the last tick in the same units, `(2,)`.
+        nominal: Output of the nominal inverse dynamics at the command, `(2,)`.
         period: Control period in s.
         s: In and out: a record of `DELAY`.
     """
@@ -59,10 +63,11 @@ def watch_delay(feedback: Array, feedforward: Array, scale: Array, period: float
         return
     s.rest -= period
     for k in range(2):
-        other = abs(swing(feedforward[k], k, period, s.feedforward))
-        s.other[k] = max(other, RECENT / (RECENT + period) * s.other[k])
+        known = MISMATCH * abs(swing(nominal[k], k, period, s.nominal))
+        known = max(known, abs(swing(feedforward[k], k, period, s.feedforward)))
+        s.explained[k] = max(known, RECENT / (RECENT + period) * s.explained[k])
         wave = swing(feedback[k], k, period, s.feedback)
-        count_half_waves(wave, k, LEAST * scale[k] + s.other[k], FASTEST_COMMAND, period, s.half_waves)
+        count_half_waves(wave, k, s.least[k] + s.explained[k], SLOWEST, period, s.half_waves)
         s.due |= s.half_waves.count[k] >= SUSTAINED
     s.due &= s.rest <= 0.0
     if s.due:
@@ -71,12 +76,13 @@ def watch_delay(feedback: Array, feedforward: Array, scale: Array, period: float
 
 DELAY = np.dtype(
     [
-        ("on", "?"),  # whether the PID is designed for a delay, which may still grow
-        ("added", "f8"),  # delay for which the PID is designed beyond that of the sensing, s
-        ("ahead", "?"),  # whether the motion controller is designed for one `STEP` more
+        ("on", "?"),  # whether the watch acts
+        ("moves", "f8"),  # number of moves so far
+        ("least", "f8", 2),  # least amplitude of a half-wave, V (rad/s); infinite on a channel that is not watched
         ("feedback", SWING),  # swing of the PID's output
         ("feedforward", SWING),  # swing of the feedforward
-        ("other", "f8", 2),  # its peak, which decays, V (rad/s)
+        ("nominal", SWING),  # swing of the nominal voltage
+        ("explained", "f8", 2),  # peak of what explains a swing of the PID's output, which decays, V (rad/s)
         ("half_waves", HALF_WAVES),  # of the PID's output
         ("rest", "f8"),  # time until the next move may be due, s
         ("due", "?"),  # whether the next move is due

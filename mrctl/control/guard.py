@@ -261,15 +261,24 @@ def fresh(settings: list[Guard], robot: Rows, gains: Array) -> Rows:
     rows = np.zeros(len(settings), GUARD)
     for name in ("on", "oscillation", "growth", "hold", "retries", "fade"):
         rows[name] = [getattr(s, name) for s in settings]
-    supply, rotation = float(robot["supply"][0]), float(robot["max_twist"][0, 1])
     rows["model"] = [s.fallback == "model" for s in settings]
     rows["hands_over"] = True
-    rows["range"] = supply, rotation if robot["rigid"][0] else supply
+    rows["range"] = ranges(robot)
     rows["region"] = np.maximum(np.array([[s.velocity] for s in settings]) * robot["max_twist"], LEAST)
     rows["harmless"] = harmless(rows["region"], gains)
     rows["nearest"] = np.inf
     rows["gain"] = rows["authority"] = 1.0
     return rows
+
+
+def ranges(robot: Rows) -> tuple[float, float]:
+    """Returns the largest command of each channel: the supply in V, or the largest θ̇ of a steering channel in rad/s.
+
+    Args:
+        robot: The nominal robot, as from `nominal`.
+    """
+    supply, rotation = float(robot["supply"][0]), float(robot["max_twist"][0, 1])
+    return supply, rotation if robot["rigid"][0] else supply
 
 
 def harmless(region: Array, gains: Array) -> Array:

@@ -141,6 +141,8 @@ class Episodes:
             raise InputError("motion_period: robots that begin at different times need that of control_period")
         if action == "voltage":  # a learner must not learn from feedback that does not act
             scenarios = [s.model_copy(update={"prior": "none", "learner": "none"}) for s in scenarios]
+        if action != "twist":  # what the agent does to the voltages is no oscillation of the PID's loop
+            scenarios = [s.model_copy(update={"pid": s.pid.model_copy(update={"retune": False})}) for s in scenarios]
         self._agent: AgentMotion | None = None
 
         def agent(robot: Robot, size: int) -> AgentMotion:  # whose name begins the reason of a failure

@@ -115,7 +115,7 @@ def measure(scenarios: Sequence[Scenario], channel: int, speed: float = Line().s
     line = Line(length=speed * duration, speed=speed)
     steady = {"reference": line, "laps": 1, "events": (), "initial_spread": (0.0, 0.0, 0.0), "guard": Guard(on=False)}
     steady |= FEEDFORWARDS["none"]
-    runs = [s.model_copy(update=steady) for s in scenarios]
+    runs = [s.model_copy(update=steady | {"pid": s.pid.model_copy(update={"retune": False})}) for s in scenarios]
     shaker = Shaker(signal, 2 * SAMPLES, len(runs))
     simulation = Simulation(runs, feedforward=lambda robot, size: shaker)
     while simulation.running:

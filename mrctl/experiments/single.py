@@ -79,6 +79,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
             "laps": [{name: _number(row[name].values[k]) for name in metrics.METRICS} for k in range(row.sizes["lap"])],
             "faults": faults,
             "guard": events.to_dict("records"),
+            "retuned": _retuned(result.isel(run=0)),
         }
         return json.dumps(values, indent=1), failure
     header = ["lap", *(title for title, _ in COLUMNS.values())]
@@ -101,11 +102,11 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
 
 
 def _retuned(run: xr.Dataset) -> list[str]:
-    """Says when the PID was designed for a longer delay, because it oscillated."""
-    added, time = np.nan_to_num(run["added_delay"].values), run["time"].values
+    """Says when the controllers were slowed down, because the PID oscillated."""
+    moves, time = np.nan_to_num(run["retunes"].values), run["time"].values
     return [
-        f"PID at {time[k]:.2f} s: oscillates, and is designed for {1e3 * added[k]:.3g} ms more delay from now on"
-        for k in np.flatnonzero(np.diff(added, prepend=0.0) > 0)
+        f"oscillation at {time[k]:.2f} s: slower {'motion controller' if moves[k] % 2 else 'PID'} from now on"
+        for k in np.flatnonzero(np.diff(moves, prepend=0.0) > 0)
     ]
 
 

@@ -12,9 +12,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.control import delay as late
 from mrctl.control import guard as guarding
 from mrctl.control.composite import CompositeAdaptation
-from mrctl.control.delay import DELAY, LONGEST, STEP, watch_delay
+from mrctl.control.delay import DELAY, watch_delay
 from mrctl.control.design import Motion, motion
 from mrctl.control.feedforward import (
     Feedforward,
@@ -77,6 +78,7 @@ CONTROL = np.dtype(
     align=True,
 )
 
+NO_MOTION = Motion(Kanayama(k_x=0.0, k_y=0.0, k_theta=0.0), 0.0, (0.0, 0.0))
 respond, learn_one = nothing, learn_nothing  # the learner of `update`, which `Kernel.calling` replaces
 
 
@@ -101,9 +103,9 @@ def command_motion(goal: Row, robot: Row, period: float, s: Row) -> None:
 def apply_voltages(seen: Row, model: Row, robot: Row, period: float, s: Row) -> bool:
     """Guard and allocation: from feedback and feedforward to voltages and steering; returns whether they are finite."""
     command, derivative, a = s.limiter.command, s.limiter.derivative, s.allocation
-    watch_delay(s.feedback, s.guard.output, s.guard.range, period, s.delay)
-    if s.guard.on:
+    if s.guard.on or s.delay.on:
         inverse_dynamics(command, derivative, model, s.nominal)
+    watch_delay(s.feedback, s.guard.output, s.nominal, period, s.delay)
     guard(
         s.guard, s.feedforward, s.nominal, s.error, command, seen.twist, s.voltage, period, robot.rigid, s.pid.integral,
         s.feedback,
@@ -215,6 +217,7 @@ class Hierarchy:
         rigid: Whether its steering is `rigid`, so that the second channel is steering.
         nominal: Its parameters for the kernels, one record of `NOMINAL`, `(1,)`.
         model: Its inverse dynamics for each robot.
+        motions: Designs of the motion controller, one for each robot.
         period: Control period in s.
         gains: Gains of each robot before any event, by the names and in the units of `dataset.GAINS`: `(B, 2)` for
             `k_p` and `k_i`, `(B,)` for the others.
@@ -251,12 +254,10 @@ class Hierarchy:
         self._delays = [s.sensing.loop_delay(self.period) * self.period for s in scenarios]
         self._pids, self._kanayamas = [s.pid for s in scenarios], [s.kanayama for s in scenarios]
         self._prefilters = [s.prefilter for s in scenarios]
-        self._motions: list[Motion] = []
+        self.motions = [NO_MOTION] * size
+        self._range = guarding.ranges(self.nominal)
         for row, scenario in enumerate(scenarios):
-            gains = scenario.pid.channels(robot, self.rigid, self._delays[row], self.period)
-            designed = motion(robot, self.rigid, gains, self._delays[row], self.period, scenario.prefilter)
-            self._motions.append(designed)
-            state["limiter"]["time_constant"][row] = designed.prefilter
+            self._design_motion(row)
             self.set_kanayama(row, scenario.kanayama)
             self.set_pid(row, scenario.pid)
         self.gains: dict[str, Array] = {name: state["pid"][name].copy() for name in ("k_p", "k_i")}
@@ -289,7 +290,7 @@ class Hierarchy:
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
         """Changes the motion controller of one robot; gains that are not set are those of its last design."""
         self._kanayamas[row] = gains
-        designed = self._motions[row].kanayama.model_dump()
+        designed = self.motions[row].kanayama.model_dump()
         chosen = designed | gains.model_dump(exclude_none=True)
         if gains.k_y is not None and gains.k_theta is None:
             chosen["k_theta"] = 2 * np.sqrt(gains.k_y)
@@ -297,43 +298,69 @@ class Hierarchy:
         self._tolerate(row)
 
     def set_pid(self, row: int, design: Pid) -> None:
-        """Changes the PID of one robot, which is designed for the delay of the sensing again."""
+        """Changes the PID of one robot; what an oscillation has shown of its loop stays, unless it is not watched."""
         self._pids[row] = design
         watch = self.state["delay"]
-        watch["on"][row] = design.retune and design.time_constant is None
-        watch["added"][row], watch["ahead"][row] = 0.0, False
+        watched = design.retune and design.time_constant is None and self.watches
+        if not watched:
+            watch["moves"][row] = 0.0
+        watch["on"][row] = watched and watch["moves"][row] < late.MOST
+        own = self.rigid and (design.steering_kp is not None or design.steering_ki is not None)
+        watch["least"][row] = late.LEAST * self._range[0], np.inf if own else late.LEAST * self._range[1]
         self._set_gains(row)
         self._tolerate(row)
 
+    @property
+    def watches(self) -> bool:
+        """Whether the feedback is the PID, whose loop can be watched."""
+        return True
+
     def _set_gains(self, row: int) -> None:
         """Computes the gains of the PID of one robot."""
-        pid, delay = self._designed_for(row)
+        pid, delay = self.lengthened(row, self._pids[row])
         for name, value in pid.gains(self.robot, self.rigid, delay, self.period).items():
             self.state["pid"][name][row] = value
 
-    def _designed_for(self, row: int, ahead: float = 0.0) -> tuple[Pid, float]:
-        """Returns the PID of one robot and the delay of its loop in s, both with what has been added, and `ahead`."""
-        pid, added = self._pids[row], float(self.state["delay"]["added"][row]) + ahead
-        if pid.delay is not None:
-            pid = pid.model_copy(update={"delay": round(pid.delay + added, 6)})
-        return pid, round(self._delays[row] + added, 6)
+    def lengthened(self, row: int, pid: Pid, ahead: int = 0) -> tuple[Pid, float]:
+        """Returns a PID for one robot and the delay of its loop in s, both with the delay that the moves have added.
 
-    def _lengthen(self, row: int) -> None:
+        Args:
+            row: Index of the robot.
+            pid: The settings.
+            ahead: Number of further moves to count.
+        """
+        steps = (int(self.state["delay"]["moves"][row]) + ahead) // 2
+        added = steps * max(1, round(late.STEP / self.period)) * self.period
+        if pid.delay is not None:
+            pid = pid.model_copy(update={"delay": pid.delay + added})
+        return pid, self._delays[row] + added
+
+    def _move(self, row: int) -> None:
         """Makes the next move of `mrctl.control.delay` for one robot."""
-        watch, limiter = self.state["delay"], self.state["limiter"]
-        watch["ahead"][row] = not watch["ahead"][row]
-        if watch["ahead"][row]:
+        watch = self.state["delay"]
+        watch["moves"][row] += 1 if self._moves_motion else 2
+        moves = watch["moves"][row]
+        watch["on"][row] = moves < late.MOST
+        if moves <= 2 * late.SLOWED and (moves % 2 or not self._moves_motion):
             self.state["guard"]["gain"][row] /= BACK_OFF
-            pid, delay = self._designed_for(row, STEP)
+        self._set_gains(row)
+        if self._moves_motion:
+            self._design_motion(row)
+            self.set_kanayama(row, self._kanayamas[row])
         else:
-            watch["added"][row] += STEP
-            watch["on"][row] = watch["added"][row] < LONGEST - STEP / 2
-            self._set_gains(row)
-            pid, delay = self._designed_for(row)
+            self._tolerate(row)
+
+    @property
+    def _moves_motion(self) -> bool:
+        """Whether the motion controller is that of Kanayama, which the moves slow down."""
+        return True
+
+    def _design_motion(self, row: int) -> None:
+        """Designs the motion controller of one robot, after odd moves for one step of delay more than its PID."""
+        pid, delay = self.lengthened(row, self._pids[row], ahead=1)
         gains = pid.channels(self.robot, self.rigid, delay, self.period)
-        self._motions[row] = motion(self.robot, self.rigid, gains, delay, self.period, self._prefilters[row])
-        limiter["time_constant"][row] = self._motions[row].prefilter
-        self.set_kanayama(row, self._kanayamas[row])
+        self.motions[row] = motion(self.robot, self.rigid, gains, delay, self.period, self._prefilters[row])
+        self.state["limiter"]["time_constant"][row] = self.motions[row].prefilter
 
     def _tolerate(self, row: int) -> None:
         """Computes anew the deviation D that the guard of one robot tolerates, which depends on both controllers."""
@@ -342,10 +369,10 @@ class Hierarchy:
 
     def _rejection(self, row: int) -> tuple[Peaks, Peaks]:
         """Peak-to-peak gains from a voltage to the errors of one robot under its controllers."""
-        k, (pid, delay) = self.state["kanayama"][row], self._designed_for(row)
+        k, (pid, delay) = self.state["kanayama"][row], self.lengthened(row, self._pids[row])
         kanayama = Kanayama(k_x=k["k_x"], k_y=k["k_y"], k_theta=k["k_theta"])
         prefilter = float(self.state["limiter"]["time_constant"][row])
-        around = Motion(kanayama, prefilter, self._motions[row].lag)
+        around = Motion(kanayama, prefilter, self.motions[row].lag)
         gains = pid.channels(self.robot, self.rigid, delay, self.period)
         return rejection(self.robot, self.rigid, gains, around, delay, self.period)
 
@@ -373,7 +400,7 @@ class Hierarchy:
         self.prior.rows[row] = renewed.prior.rows[0]
         self._pids[row], self._kanayamas[row] = scenario.pid, scenario.kanayama
         self._prefilters[row] = scenario.prefilter
-        self._motions[row], self._delays[row] = renewed._motions[0], renewed._delays[0]
+        self.motions[row], self._delays[row] = renewed.motions[0], renewed._delays[0]
         for name, values in self.gains.items():
             values[row] = renewed.gains[name][0]
         self._learned.pop(row, None)
@@ -447,7 +474,7 @@ class Hierarchy:
         A learner that cannot be reset learns more slowly instead.
         """
         for row in np.flatnonzero(self.state["delay"]["due"]):
-            self._lengthen(int(row))
+            self._move(int(row))
         rows = np.flatnonzero(self.state["guard"]["forget"])
         if rows.size and not self.restore(rows):
             self.state["guard"]["gain"][rows] *= UNSURE

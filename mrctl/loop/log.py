@@ -56,7 +56,7 @@ def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, error: Array, tic
         t.saturated, t.weight_norm = 1.0 if a.saturated else 0.0, c.weight_norm
         t.current_left, t.current_right = p.current[0], p.current[1]
         t.power = p.applied[0] * p.current[0] + p.applied[1] * p.current[1]
-        t.guard, t.guard_reason, t.added_delay = c.guard.action, c.guard.reason, c.delay.added
+        t.guard, t.guard_reason, t.retunes = c.guard.action, c.guard.reason, c.delay.moves
         t.z, t.roll_angle, t.pitch_angle = state.z, state.roll, state.pitch
         near &= not abs(t.lateral_error) > DIVERGED or p.failed
     return near

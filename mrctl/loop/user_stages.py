@@ -164,8 +164,6 @@ class UserHierarchy(Hierarchy):
         super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
         for name in (name for stage in stages for name in REPLACED.get(stage, ())):
             self.gains[name][:] = np.nan
-        if "feedback" in stages:
-            self.state["delay"]["on"] = False
         self.feedforward_faults = [""] * len(scenarios)
 
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
@@ -224,6 +222,16 @@ class UserHierarchy(Hierarchy):
         """Tells the user's motion controller, if it asks for that, that one robot has another reference."""
         if self.roams:
             self._new[row] = reference
+
+    @property
+    def watches(self) -> bool:
+        """Whether the feedback is the built-in PID."""
+        return "feedback" not in self._stages
+
+    @property
+    def _moves_motion(self) -> bool:
+        """Whether the motion controller is the built-in one; the gains of another one are its own."""
+        return "motion" not in self._stages
 
     @property
     def looks(self) -> bool:

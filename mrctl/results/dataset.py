@@ -82,7 +82,7 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "power": ("W", "electrical power"),
     "guard": ("1", "what the guard does: 0 nothing, 1 fallback"),
     "guard_reason": ("1", "why, as an index into `mrctl.control.guard.REASONS`"),
-    "added_delay": ("s", "delay for which the PID is designed beyond that of the sensing, as it oscillated"),
+    "retunes": ("1", "moves that slowed the controllers as the PID oscillated; see `mrctl.control.delay`"),
     "z": ("m", "height of the middle between the driven wheels"),
     "roll_angle": ("rad", "roll, positive to the right; after heading and pitch, about the robot's own axis"),
     "pitch_angle": ("rad", "pitch, positive nose down; after the heading"),
@@ -112,7 +112,7 @@ WHOLE = (
 WHOLE_BEFORE_0_10_2 = "all_chunks"  # the same without their names
 CHECKSUMS = "checksums"  # attribute of a saved result: what `_checksums` returns; older results lack it
 CODECS = {"bytes", "vlen-utf8", "zstd", "blosc", "crc32c", "sharding_indexed"}  # all that mrctl ever wrote
-ADDED = ("z", "roll_angle", "pitch_angle", "added_delay")  # signals that results of older versions lack
+ADDED = ("z", "roll_angle", "pitch_angle", "retunes")  # signals that results of older versions lack
 
 TICK = np.dtype([(name, "f8") for name in SIGNALS])  # the signals of one robot at one control tick
 

@@ -10,7 +10,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from mrctl.control.design import motion
 from mrctl.control.margins import Gains
 from mrctl.control.stages import Motion, Stages
 from mrctl.kernel import Array, Rows
@@ -233,9 +232,9 @@ class Session:
         The values are in the units of the fields, to three digits. `pid.time_constant` is 0, as the designed gains are
         not those of any; the gains on the steering are None unless it is rigid.
         """
-        robot, rigid, delay, period = self._design
-        first = self.start[0]
-        over = motion(robot, rigid, first.pid.channels(*self._design), delay, period, first.prefilter)
+        sim, k = self._place[0]
+        rigid, over = self.start[0].steering == "rigid", sim.hierarchy.motions[k]
+        _, delay = sim.hierarchy.lengthened(k, self.state()["pid"])
         own = self.state()["kanayama"].k_y
         k_y = over.kanayama.k_y if own is None else own
         assert k_y is not None
@@ -257,16 +256,14 @@ class Session:
     def gains(self) -> tuple[Gains, Gains]:
         """Returns the present gains of both channels of the first robot, in the units of `Pid.channels`."""
         sim, k = self._place[0]
-        pid = sim.hierarchy.state["pid"][k]
-        common, second = (Gains(float(k_p), float(k_i)) for k_p, k_i in zip(pid["k_p"], pid["k_i"], strict=True))
-        return common, second
+        pid, delay = sim.hierarchy.lengthened(k, self.state()["pid"])
+        return pid.channels(self.robot, self.start[0].steering == "rigid", delay, self.period)
 
     @property
-    def _design(self) -> tuple[Robot, bool, float, float]:
-        """For what the controllers are designed: robot, whether its steering is rigid, delay and period in s."""
-        start = self.start[0]
-        delay = start.sensing.loop_delay(self.period) * self.period
-        return self.robot, start.steering == "rigid", delay, self.period
+    def retunes(self) -> int:
+        """Number of moves that have slowed the controllers of the first robot; see `mrctl.control.delay`."""
+        sim, k = self._place[0]
+        return int(sim.hierarchy.state["delay"]["moves"][k])
 
     def saved(self) -> list[Scenario]:
         """Returns scenarios that repeat the session, to the end of the present lap of each robot."""

@@ -10,6 +10,7 @@ from mrctl import (
     Circle,
     Lemniscate,
     Perturbation,
+    Pid,
     Scenario,
     Sensing,
     per_lap,
@@ -67,7 +68,7 @@ def test_best_of_its_drives():
 
     With 20 ms more delay than the controller knows the loop oscillates with the fitted coefficients.
     """
-    plain = Scenario(sensing=Sensing(tier="lab"), reference=BASE.reference, laps=2)
+    plain = Scenario(sensing=Sensing(tier="lab"), reference=BASE.reference, laps=2, pid=Pid(retune=False))
     plants = Perturbation(control_delay=0.02), Perturbation(control_delay=0.02), BASE.perturbation
     runs = [
         s.replace(**FEEDFORWARDS["model"], perturbation=p) for s, p in zip(replicates(plain, 3), plants, strict=True)

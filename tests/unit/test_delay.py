@@ -7,25 +7,26 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from mrctl import Guard, Kanayama, Scenario
-from mrctl.control.delay import DELAY, FASTEST_COMMAND, LEAST, LONGEST, REST, STEP, SUSTAINED, watch_delay
+from mrctl.control.delay import DELAY, LEAST, MISMATCH, MOST, REST, SLOWED, SLOWEST, STEP, SUSTAINED, watch_delay
 from mrctl.control.design import motion
 from mrctl.control.oscillation import DRIFT, SMOOTH, SWING, swing
 from mrctl.control.pid import Pid
 from mrctl.loop.hierarchy import Hierarchy
+from mrctl.loop.user_stages import UserHierarchy, UserStage
 from mrctl.sensing.tiers import Sensing
 
 PERIOD = 0.01
-SCALE = np.array([24.0, 24.0])
+SUPPLY = 24.0
 
 
-def due(feedback, feedforward=None, scale=SCALE, on=True):
-    """Times at which a move is due, for a PID output and a feedforward of two channels, `(T, 2)`."""
+def due(feedback, feedforward=None, nominal=None, on=True):
+    """Times at which a move is due, for a PID output, a feedforward and a nominal voltage, `(T, 2)`."""
     s = np.zeros(1, DELAY)
-    s["on"] = on
-    times = []
-    for k, value in enumerate(feedback):
-        other = np.zeros(2) if feedforward is None else feedforward[k]
-        watch_delay(value, other, scale, PERIOD, s[0])
+    s["on"], s["least"] = on, LEAST * SUPPLY
+    times, nothing = [], np.zeros_like(feedback)
+    others = (nothing if signal is None else signal for signal in (feedforward, nominal))
+    for k, values in enumerate(zip(feedback, *others, strict=True)):
+        watch_delay(*values, PERIOD, s[0])
         if s["due"][0]:
             times.append(k * PERIOD)
     return times
@@ -60,11 +61,11 @@ def test_swing_is_two_filters():
 @given(frequency=st.floats(3, 100), ratio=st.floats(0.2, 5), channel=st.integers(0, 1))
 def test_an_oscillation_is_fast_and_large(frequency, ratio, channel):
     """A sine counts where its half-wave is short enough and its amplitude, after the filters, above the threshold."""
-    found = due(wave(frequency, ratio * LEAST * SCALE[0] / gain(frequency), channel))
+    found = due(wave(frequency, ratio * LEAST * SUPPLY / gain(frequency), channel))
     half = np.pi / frequency
-    if half > FASTEST_COMMAND + PERIOD or ratio < 0.95:
+    if half > SLOWEST + PERIOD or ratio < 0.95:
         assert not found
-    elif half < FASTEST_COMMAND - 2 * PERIOD and ratio > 1.3:  # the peak between two samples may be missed
+    elif half < SLOWEST - 2 * PERIOD and ratio > 1.3:  # the peak between two samples may be missed
         assert SUSTAINED * half - 0.1 <= found[0] <= (SUSTAINED + 4) * half + 0.1
 
 
@@ -85,57 +86,113 @@ def test_what_is_no_oscillation():
     assert due(own)
     assert not due(own, -1.0 * own)
     assert due(own, 0.5 * own)
+    assert not due(own, None, own / (0.9 * MISMATCH))
+    assert due(own, None, own / (3 * MISMATCH))
     assert not due(own, on=False)
 
 
+def move(hierarchy, row=0):
+    """Lets one robot make its next move."""
+    hierarchy.state["delay"]["due"][row] = True
+    hierarchy.answer()
+    hierarchy.state["delay"]["due"][row] = False
+
+
 @pytest.mark.parametrize("tier", ["ideal", "lab", "field"])
-@pytest.mark.parametrize("own", [None, 0.03])
-def test_moves(robot, tier, own):
+@pytest.mark.parametrize("own", [None, 1 / 30])
+@pytest.mark.parametrize("period", [0.01, 0.02])
+def test_moves(robot, tier, own, period):
     """Motion controller and PID take turns; each has the gains of a robot that is designed for that delay."""
-    scenario = Scenario(sensing=Sensing(tier=tier), pid=Pid(delay=own), learner="fel", kanayama=Kanayama(k_x=1.5))
+    scenario = Scenario(
+        sensing=Sensing(tier=tier, delay=period), pid=Pid(delay=own), learner="fel", kanayama=Kanayama(k_x=1.5),
+        control_period=period, motion_period=period,
+    )  # fmt: skip
     h = Hierarchy([scenario], robot)
-    known = scenario.sensing.loop_delay(PERIOD) * PERIOD
+    known, step = scenario.sensing.loop_delay(period) * period, max(STEP, period)
     start = known if own is None else own
-
-    def gains(delay):
-        return Pid(delay=delay).gains(robot, False)
-
-    for move in range(1, 5):
-        h.state["delay"]["due"] = True
-        h.answer()
-        h.state["delay"]["due"] = False
-        added, ahead = move // 2 * STEP, (move + 1) // 2 * STEP
-        np.testing.assert_allclose(h.state["pid"]["k_p"][0], gains(start + added)["k_p"], rtol=1e-9)
-        np.testing.assert_allclose(h.state["pid"]["k_i"][0], gains(start + added)["k_i"], rtol=1e-9)
-        channels = Pid().channels(robot, False, start + ahead)
-        designed = motion(robot, False, channels, known + ahead, PERIOD)
+    for done in range(6):
+        pid, ahead = done // 2 * step, (done + 1) // 2 * step
+        expected = Pid(delay=start + pid).gains(robot, False, known, period)
+        np.testing.assert_allclose(h.state["pid"]["k_p"][0], expected["k_p"], rtol=1e-9)
+        np.testing.assert_allclose(h.state["pid"]["k_i"][0], expected["k_i"], rtol=1e-9)
+        channels = Pid(delay=start + ahead).channels(robot, False, known, period)
+        designed = motion(robot, False, channels, known + ahead, period)
         k = h.state["kanayama"][0]
         assert k["k_x"] == 1.5  # which the scenario gives
         assert (k["k_y"], k["k_theta"]) == pytest.approx((designed.kanayama.k_y, designed.kanayama.k_theta))
         assert h.state["limiter"]["time_constant"][0] == pytest.approx(designed.prefilter)
-        assert h.state["guard"]["gain"][0] == pytest.approx(3.0 ** -((move + 1) // 2))
-        assert h.state["delay"]["added"][0] == pytest.approx(added)
+        assert h.state["guard"]["gain"][0] == pytest.approx(3.0 ** -min(SLOWED, (done + 1) // 2))
+        assert h.state["delay"]["moves"][0] == done
+        move(h)
+
+
+def test_settings_during_a_run(robot):
+    """After some moves new settings keep what the loop has shown, unless it is no longer watched; a new run forgets."""
+    h = Hierarchy([Scenario()] * 2, robot)
+    first = h.state.copy()
+    for _ in range(3):
+        move(h)
+    assert np.all(h.state["pid"]["k_p"][0] < first["pid"]["k_p"][0])
+    np.testing.assert_array_equal(h.state[1]["pid"], first[1]["pid"])
+    slow, motions = h.state["pid"]["k_p"][0].copy(), h.state["kanayama"][0].copy()
+    h.set_pid(0, Pid(derivative_time=0.01))
+    np.testing.assert_array_equal(h.state["pid"]["k_p"][0], slow)
+    h.set_kanayama(0, Kanayama())
+    assert h.state["kanayama"][0] == motions
+    move(h)
+    assert np.all(h.state["pid"]["k_p"][0] < slow) and h.state["kanayama"]["k_y"][0] == motions["k_y"]
+    h.set_pid(0, Pid(retune=False))
+    np.testing.assert_array_equal(h.state[0]["pid"], first[0]["pid"])
+    assert not h.state["delay"]["on"][0]
+    h.renew(0, Scenario())
+    assert h.state[0]["kanayama"] == first[0]["kanayama"] and h.state[0]["delay"] == first[0]["delay"]
 
 
 def test_end_of_the_moves(robot):
-    """After `LONGEST` nothing is added; new settings of the PID, and a new run, begin at the delay of the sensing."""
-    h = Hierarchy([Scenario()] * 2, robot)
-    first = h.state.copy()
-    for _ in range(2 * round(LONGEST / STEP)):
+    """After the last move the watch is off."""
+    h = Hierarchy([Scenario()], robot)
+    for _ in range(MOST):
         assert h.state["delay"]["on"][0]
-        h.state["delay"]["due"][0] = True
-        h.answer()
-    assert not h.state["delay"]["on"][0] and h.state["delay"]["on"][1]
-    assert h.state["delay"]["added"][0] == pytest.approx(LONGEST)
-    assert np.all(h.state["pid"]["k_p"][0] < 0.5 * first["pid"]["k_p"][0])
-    np.testing.assert_array_equal(h.state[1]["pid"], first[1]["pid"])
-    h.set_pid(0, Pid())
-    np.testing.assert_array_equal(h.state[0]["pid"], first[0]["pid"])
-    h.renew(0, Scenario())
-    assert h.state[0]["kanayama"] == first[0]["kanayama"] and h.state[0]["delay"] == first[0]["delay"]
+        move(h)
+    assert not h.state["delay"]["on"][0]
 
 
 @pytest.mark.parametrize("pid", [Pid(retune=False), Pid(time_constant=0.15)])
 def test_gains_that_are_left_alone(robot, pid):
     """Switched off, or with gains that follow from λ and not from a delay, nothing watches."""
     assert not Hierarchy([Scenario(pid=pid, guard=Guard(on=False))], robot).state["delay"]["on"].any()
+
+
+def test_steering_gains_of_ones_own(robot):
+    """A steering channel whose gains are given is not watched, since they would not change."""
+    rigid = Hierarchy([Scenario(steering="rigid", pid=Pid(steering_kp=p)) for p in (None, 0.3)], robot)
+    least = rigid.state["delay"]["least"]
+    assert least[0] == pytest.approx((LEAST * robot.supply, LEAST * robot.max_rotation))
+    assert np.isinf(least[1, 1]) and least[1, 0] == least[0, 0]
+
+
+def test_stages_of_ones_own(robot):
+    """A feedback of the user's is never watched; beside a motion controller of the user's the PID alone gets slower."""
+
+    class Still:
+        def __init__(self, robot, size):
+            self.size = size
+
+        def reset(self, *_):
+            pass
+
+        def output(self, *_):
+            return np.zeros((self.size, 2))
+
+    def build(name):
+        return UserHierarchy([Scenario()], robot, {name: UserStage(name, Still, robot, 1)})
+
+    feedback, moved = build("feedback"), build("motion")
+    assert not feedback.state["delay"]["on"][0]
+    feedback.set_pid(0, Pid())
+    assert not feedback.state["delay"]["on"][0]
+    start = moved.state.copy()
+    move(moved)
+    assert moved.state["delay"]["moves"][0] == 2
+    assert np.all(moved.state["pid"]["k_p"][0] < start["pid"]["k_p"][0])
+    assert moved.state["limiter"]["time_constant"][0] == start["limiter"]["time_constant"][0]
