@@ -95,6 +95,8 @@ class Episodes:
     - `voltage`: the voltages left and right in V, in place of both controllers; the steering follows the reference.
     - `residual`: voltages left and right in V that are added to those of the controllers.
 
+    With voltages `pid.retune` of the scenarios is False, because what an agent does to them is no oscillation of a loop.
+
     Attributes:
         loop: The simulation, of which this class takes a tick apart: `sense`, `send`, the physics, `settle`.
         plant: Its physics.
@@ -141,7 +143,7 @@ class Episodes:
             raise InputError("motion_period: robots that begin at different times need that of control_period")
         if action == "voltage":  # a learner must not learn from feedback that does not act
             scenarios = [s.model_copy(update={"prior": "none", "learner": "none"}) for s in scenarios]
-        if action != "twist":  # what the agent does to the voltages is no oscillation of the PID's loop
+        if action != "twist":
             scenarios = [s.model_copy(update={"pid": s.pid.model_copy(update={"retune": False})}) for s in scenarios]
         self._agent: AgentMotion | None = None
 
