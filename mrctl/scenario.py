@@ -72,7 +72,8 @@ class Event(Record):
     kanayama: Kanayama | None = None
     """Gains of the motion controller from then on."""
     pid: Pid | None = None
-    """Settings of the velocity PID from then on; the gains of the motion controller, and what oscillations have slowed, stay."""
+    """Settings of the velocity PID from then on; the gains of the motion controller stay, and so does the delay that
+    oscillations have added."""
     learning: bool | None = None
     """Whether the feedforward learns from then on."""
 

@@ -95,7 +95,7 @@ class Episodes:
     - `voltage`: the voltages left and right in V, in place of both controllers; the steering follows the reference.
     - `residual`: voltages left and right in V that are added to those of the controllers.
 
-    With voltages `pid.retune` of the scenarios is False, because what an agent does to them is no oscillation of a loop.
+    With voltages `pid.retune` of the scenarios is False: what an agent does to them is no oscillation of a loop.
 
     Attributes:
         loop: The simulation, of which this class takes a tick apart: `sense`, `send`, the physics, `settle`.
