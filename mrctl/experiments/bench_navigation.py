@@ -17,10 +17,11 @@ import numpy as np
 from mrctl.experiments.tables import markdown, number
 from mrctl.loop.simulation import simulate
 from mrctl.navigation import mission
-from mrctl.navigation.mission import Avoid, avoiding, prepared, robot_of, task_of
+from mrctl.navigation.mission import Avoid, avoiding, prepared, task_of
 from mrctl.navigation.mppi import SAMPLES, SPREAD, WORTH, Mppi
 from mrctl.navigation.planning import around, plan, space
 from mrctl.navigation.rollouts import KNOTS, STEPS, roll_out
+from mrctl.navigation.vehicle import robot_of
 from mrctl.physics.obstacles import multi_ray
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
@@ -149,19 +150,21 @@ def _particles(turns: int) -> dict[str, Any]:
 def _mppi(turns: int) -> dict[str, Any]:
     """Measures the choice of a twist by MPPI, and its roll-outs alone."""
     own = prepared(task_of(MISSION, SCENARIO), SCENARIO, avoid="mppi")[1]
-    make, robot = avoiding("mppi", own), robot_of(own)[1]
+    make = avoiding("mppi")
     assert make is not None
-    stage: Mppi = make(robot, 1)
+    stage: Mppi = make(robot_of(own)[1], 1)
+    stage.assign([own])
     pose, twist = np.array([own.initial_pose], float), np.array([[0.5, 0.0]])
     stage.reset(pose, np.zeros((1, 7)), own.motion_period)
     with mock.patch.object(stage, "choose", wraps=stage.choose) as watched:
         stage.output(pose, twist, np.zeros((1, 7)))
     arguments = watched.call_args.args
-    spread = np.array(SPREAD) * (stage.bounds.speed, stage.bounds.rotation)
+    (bounds,) = stage.bounds
+    spread = np.array(SPREAD) * (bounds.speed, bounds.rotation)
     knots = np.random.default_rng(0).standard_normal((SAMPLES, KNOTS, 2)) * spread
     nominal, period, scene = np.zeros((STEPS, 2)), own.motion_period, arguments[-1]
     twists, costs = np.empty((SAMPLES, STEPS, 2)), np.empty(SAMPLES)
-    state = pose[0], twist[0], twist[0], 0.0, period, stage.bounds, scene
+    state = pose[0], twist[0], twist[0], 0.0, period, bounds, scene
     bare = partial(roll_out.compiled, knots, nominal, *state, WORTH, twists, costs)
     name = f"MPPI, {SAMPLES:,} samples of {STEPS} steps"
     return _pair(name, partial(stage.choose, *arguments), "its roll-outs alone", bare, turns)
@@ -229,7 +232,7 @@ def _missions(turns: int) -> dict[str, float]:
     for turn in range(turns + 1):
         for avoid, own in drives.items():
             start = time.perf_counter()
-            result = simulate([own], motion=avoiding(avoid, own))
+            result = simulate([own], motion=avoiding(avoid))
             spent = time.perf_counter() - start
             if turn:
                 driven = int(np.isfinite(result["x"].values).sum()) * own.control_period

@@ -39,8 +39,9 @@ from mrctl.loop.goals import arrived
 from mrctl.loop.learned import kept, save_learned
 from mrctl.loop.simulation import arranged, cores, simulate
 from mrctl.navigation.generators import corridor
-from mrctl.navigation.mission import SLIM, planned, robot_of
+from mrctl.navigation.mission import SLIM, planned
 from mrctl.navigation.planning import Plan
+from mrctl.navigation.vehicle import robot_of
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority
 from mrctl.results.dataset import scenarios_of, versions

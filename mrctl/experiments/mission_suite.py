@@ -32,7 +32,8 @@ from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import cores, simulate
 from mrctl.navigation.generators import corridor, corridor_width
-from mrctl.navigation.mission import PATIENCE, planned, robot_of
+from mrctl.navigation.mission import PATIENCE, planned
+from mrctl.navigation.vehicle import robot_of
 from mrctl.record import InputError
 from mrctl.results.comparison import quantile_interval, superiority
 from mrctl.results.dataset import versions

@@ -36,8 +36,9 @@ from mrctl.experiments.tables import (
 )
 from mrctl.loop.simulation import cores, simulate
 from mrctl.navigation.generators import Task, slalom
-from mrctl.navigation.mission import PERIOD, avoiding, outcomes, prepared, robot_of
+from mrctl.navigation.mission import PERIOD, avoiding, outcomes, prepared
 from mrctl.navigation.planning import Plan
+from mrctl.navigation.vehicle import robot_of
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority
 from mrctl.results.dataset import versions
@@ -162,7 +163,7 @@ def _driven(worlds: Sequence[World], changes: dict[str, Any], lag: float, bar: t
 
     def driven(one: World) -> xr.Dataset:
         (scenario,) = replicates(one.scenario.replace(**changes), 1, one.seed)
-        result = simulate([scenario], threads=1, motion=avoiding("mppi", one.scenario, lag))
+        result = simulate([scenario], threads=1, motion=avoiding("mppi", lag))
         bar.update()
         return result
 

@@ -14,7 +14,7 @@ What the robot avoids is what it knows: its map, and what its lidar sees beside 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,9 +28,10 @@ from mrctl.loop.simulation import arranged
 from mrctl.navigation.planning import room
 from mrctl.navigation.rollouts import SHORTER, Replan, opened, plan_around
 from mrctl.navigation.sight import Sight
+from mrctl.navigation.vehicle import robot_of
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance, outside, point_to_segment, rim
-from mrctl.theory.obstacles import Obstacles, Outlines, moved
+from mrctl.theory.obstacles import Outlines, moved
 from mrctl.theory.rays import Scan
 from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
@@ -75,36 +76,38 @@ def avoid(request: Array, pose: Array, outlines: Outlines, barrier: Barrier) -> 
 
 
 class Avoiding:
-    """A motion stage whose request passes the filter: `simulate(…, motion=lambda *robots: Avoiding(*robots, …))`."""
+    """A motion stage whose request passes the filter: `simulate(…, motion=lambda *robots: Avoiding(*robots, …))`.
 
-    def __init__(
-        self,
-        robot: Robot,
-        size: int,
-        motion: Callable[[Robot, int], Motion],
-        known: Obstacles,
-        barrier: Barrier,
-    ) -> None:
+    Obstacles on the map are known; the others are seen by the lidar, and taken where they are, as if they stood.
+    """
+
+    def __init__(self, robot: Robot, size: int, motion: Callable[[Robot, int], Motion], barrier: Barrier) -> None:
         """Makes the stage.
 
         Args:
             robot: Nominal robot.
             size: Number of robots.
             motion: Factory of the motion stage that makes the requests.
-            known: Obstacles on the map; the others are seen by the lidar, and taken where they are, as if they stood.
-            barrier: Discs, margin and braking of the robot.
+            barrier: Discs, margin and braking of the robots.
         """
-        self._motion, self._sight, self._barrier = motion(robot, size), Sight(known, size), barrier
+        self._motion, self._barrier = motion(robot, size), barrier
+
+    def assign(self, scenarios: Sequence[Scenario]) -> None:
+        """Takes the scenarios of the robots, with their maps, and hands them on to the motion stage."""
+        self._sights = [Sight(scenario.known) for scenario in scenarios]
+        if take := getattr(self._motion, "assign", None):
+            take(scenarios)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         self._motion.reset(pose, reference, period)
         self._time, self._period = 0.0, period
-        self._sight.forget()
+        for sight in self._sights:
+            sight.forget()
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot, for the filter and for the motion stage, if that takes scans."""
-        self._sight.see(row, scan)
+        self._sights[row].see(scan)
         if look := getattr(self._motion, "see", None):
             look(row, scan)
 
@@ -116,24 +119,25 @@ class Avoiding:
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
         requests = np.asarray(self._motion.output(pose, twist, reference))
-        around = [self._sight.outlines(row, self._time) for row in range(len(pose))]
+        around = [sight.outlines(self._time) for sight in self._sights]
         self._time += self._period
         return np.stack([avoid(*own, self._barrier) for own in zip(requests, pose, around, strict=True)])
 
 
 class Following:
-    """Kanayama's motion controller as a stage, with the gains that a scenario has or that are designed for it."""
+    """Kanayama's motion controller as a stage, with the gains that scenarios have or that are designed for them."""
 
-    def __init__(self, robot: Robot, size: int, scenario: Scenario) -> None:
-        """Takes the nominal robot, the number of robots, and the scenario of all, which differ in what they learn."""
-        rigid = arranged(scenario).steering == "rigid"
-        latency = scenario.sensing.loop_delay(scenario.control_period) * scenario.control_period
-        gains = scenario.pid.channels(robot, rigid, latency, scenario.control_period)
-        designed = design(robot, rigid, gains, latency, scenario.control_period, scenario.prefilter).kanayama
-        self._gains = np.zeros((), GAINS)
-        for name in self._gains.dtype.names or ():
-            own = getattr(scenario.kanayama, name)
-            self._gains[name] = getattr(designed, name) if own is None else own
+    def __init__(self, robot: Robot, scenarios: Sequence[Scenario]) -> None:
+        """Takes the nominal robot, and the scenario of each robot."""
+        self._gains = np.zeros(len(scenarios), GAINS)
+        for row, scenario in enumerate(scenarios):
+            rigid = arranged(scenario).steering == "rigid"
+            latency = scenario.sensing.loop_delay(scenario.control_period) * scenario.control_period
+            gains = scenario.pid.channels(robot, rigid, latency, scenario.control_period)
+            designed = design(robot, rigid, gains, latency, scenario.control_period, scenario.prefilter).kanayama
+            for name in self._gains.dtype.names or ():
+                own = getattr(scenario.kanayama, name)
+                self._gains[name][row] = getattr(designed, name) if own is None else own
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Has nothing to start."""
@@ -143,7 +147,7 @@ class Following:
         error, requests = np.empty(3), np.empty((len(pose), 2))
         for row in range(len(pose)):
             posture_error.compiled(pose[row], reference[row, :3], error)
-            kanayama.compiled(error, reference[row, 3:5], self._gains[()], requests[row])
+            kanayama.compiled(error, reference[row, 3:5], self._gains[row], requests[row])
         return requests
 
 
@@ -166,33 +170,37 @@ class Pacing:
         followed: What the robots follow, as in `mrctl.control.stages.Motion`, `(B, 7)`.
     """
 
-    def __init__(self, robot: Robot, size: int, scenario: Scenario, footprint: Array, replan: Replan) -> None:
+    def __init__(self, robot: Robot, size: int, replan: Replan) -> None:
         """Makes the stage.
 
         Args:
             robot: Nominal robot.
             size: Number of robots.
-            scenario: The scenario of all, with its map and the plan as its reference.
-            footprint: Corners of the robot in its frame in m, `(n, 2)`.
             replan: Makes a plan to the goal.
         """
-        self._follow, self._robot, self._scenario = Following(robot, size, scenario), robot, scenario
-        self._sight, self._footprint, self._replan = Sight(scenario.known, size), footprint, replan
+        self._robot, self._size, self._replan = robot, size, replan
         self._brakes = BRAKING * robot.max_acceleration
+
+    def assign(self, scenarios: Sequence[Scenario]) -> None:
+        """Takes the missions of the robots, with their maps and with their plans as references."""
+        self._follow, self._scenarios = Following(self._robot, scenarios), scenarios
+        self._sights = [Sight(scenario.known) for scenario in scenarios]
+        self._footprint = robot_of(scenarios[0])[0]
         self._near, self._away = self._barrier(-RIM), self._barrier(AWAY)
 
     def _barrier(self, margin: float) -> Barrier:
         """Returns the filter that keeps this clearance in m."""
-        return Barrier(rim(self._footprint, RIM), margin, self._brakes, self._scenario.motion_period)
+        return Barrier(rim(self._footprint, RIM), margin, self._brakes, self._scenarios[0].motion_period)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
-        plan, size = self._scenario.reference, len(pose)
-        assert isinstance(plan, Waypoints)
-        self._sight.forget()
+        plans, size = [opened(scenario.reference) for scenario in self._scenarios], self._size
+        for sight in self._sights:
+            sight.forget()
         self._period, self._tick, self.followed = period, 0, reference
         self._clock, self._pace = np.zeros(size), np.ones(size)  # s in motion periods, and λ
-        self._plans, self._kept = [self._sampled(plan)] * size, [self._margin(plan, 0)] * size
+        self._plans = [self._sampled(plan) for plan in plans]
+        self._kept = [self._margin(plan, row) for row, plan in enumerate(plans)]
         self._given: list[Waypoints | None] = [None] * size  # plans that came since the start
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
         self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
@@ -202,7 +210,7 @@ class Pacing:
 
     def _sampled(self, plan: Waypoints) -> Array:
         """Returns a plan as `output` gets it, for each motion period, `(n, 7)`."""
-        step, sensing, period = self._scenario.control_period, self._scenario.sensing, self._period
+        step, sensing, period = self._scenarios[0].control_period, self._scenarios[0].sensing, self._period
         ticks = round(period / step) * np.arange(int(plan.period / period) + 2) + sensing.periods("delay", step)
         return np.hstack(plan.sample(np.asarray(step * ticks, float)))
 
@@ -211,7 +219,7 @@ class Pacing:
 
         The clearance is negative where the discs would overlap the map on the plan.
         """
-        return self._barrier(min(KEPT, room(self._footprint, plan, self._sight.map(row)) - RIM - TRACKED))
+        return self._barrier(min(KEPT, room(self._footprint, plan, self._sights[row].map) - RIM - TRACKED))
 
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
@@ -226,9 +234,9 @@ class Pacing:
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot, and looks whether its plan is free; for the arguments see `stages.Motion`."""
-        self._map_changed[row] |= self._sight.see(row, scan)
+        self._map_changed[row] |= self._sights[row].see(scan)
         self._looked[row] = True
-        standing = self._sight.standing(row)
+        standing = self._sights[row].standing
         self._blocked[row] = np.inf
         if not len(standing.discs):
             return
@@ -261,13 +269,13 @@ class Pacing:
 
     def _share(self, row: int, request: Array, pose: Array) -> float:
         """Returns λ of one robot."""
-        sight, allowed = self._sight, 0.0 if self._stops[row] else 1.0
+        sight, allowed = self._sights[row], 0.0 if self._stops[row] else 1.0
         if np.isfinite(self._blocked[row]):
             part = self._plans[row][int(self._clock[row]) : int(self._blocked[row]), 3]
             left = self._period * float(np.abs(part).sum()) - STANDOFF
             allowed = approach.compiled(left, self._brakes, self._period) / max(abs(float(request[0])), 1e-9)
-        moving = sight.moving(row, self._period * self._tick)
-        around = (sight.map(row), self._kept[row]), (sight.standing(row), self._near), (moving, self._away)
+        moving = sight.moving(self._period * self._tick)
+        around = (sight.map, self._kept[row]), (sight.standing, self._near), (moving, self._away)
         return min(
             allowed, *(share(request, pose, *each) for each in around if len(each[0].discs) + len(each[0].rings))
         )
@@ -291,7 +299,7 @@ class Pacing:
             left = self._period * (len(self._plans[row]) - self._clock[row])
             plan = self._planned(row, pose)
             self._stops[row] = plan is not None and plan.period + speed / self._brakes < SHORTER * left
-        now, standing = self._period * self._tick, self._sight.standing(row)
+        now, standing = self._period * self._tick, self._sights[row].standing
         if self._clock[row] - self._anchor[row] > SLOW * WAITED / self._period or not len(standing.discs):
             self._anchor[row], self._since[row] = self._clock[row], now
         if now - self._since[row] < WAITED:
@@ -302,8 +310,11 @@ class Pacing:
 
     def _planned(self, row: int, pose: Array) -> Waypoints | None:
         """Makes a plan from where a robot is, around what it knows."""
-        own = row, self._period * self._tick, self._footprint, pose
-        return plan_around(self._replan, self._sight, *own, self._given[row])
+
+        def replan(pose: Array, outlines: Outlines) -> Waypoints | None:
+            return self._replan(self._scenarios[row], pose, outlines, self._given[row])
+
+        return plan_around(replan, self._sights[row], self._period * self._tick, self._footprint, pose)
 
 
 def share(request: Array, pose: Array, outlines: Outlines, barrier: Barrier) -> float:

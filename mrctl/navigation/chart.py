@@ -25,15 +25,16 @@ SCANS, MOST = 5, 0.9  # scans that pass through a place, and share of the places
 
 
 class Chart:
-    """The maps of B robots, which begin alike.
+    """The map of a robot.
 
     Attributes:
         known: Outlines of all that was on the map at the start.
+        outlines: Outlines of what is on it now.
     """
 
-    def __init__(self, known: Obstacles, size: int) -> None:
-        """Takes the obstacles on the map, and the number of robots."""
-        self.known, self._size = Surroundings(known).at(0.0), size
+    def __init__(self, known: Obstacles) -> None:
+        """Takes the obstacles on the map."""
+        self.known = Surroundings(known).at(0.0)
         discs, _, _, rings = self.known
         self._middles = np.concatenate([discs[:, :2], rings[:, :2]])
         self._radii = np.concatenate([discs[:, 2], rings[:, 2]])
@@ -42,17 +43,13 @@ class Chart:
 
     def forget(self) -> None:
         """Forgets what scans have shown."""
-        self._gone = np.zeros((self._size, len(self._middles)), bool)
-        self._outlines = [self.known] * self._size
-        self._passed: list[dict[int, NDArray[np.int64]]] = [{} for _ in range(self._size)]
+        self._gone = np.zeros(len(self._middles), bool)
+        self.outlines = self.known
+        self._passed: dict[int, NDArray[np.int64]] = {}  # scans that have passed through the places of an obstacle
 
-    def outlines(self, row: int) -> Outlines:
-        """Returns what is on the map of one robot."""
-        return self._outlines[row]
-
-    def see(self, row: int, scan: Scan) -> bool:
-        """Takes a scan of one robot, whose index is `row`; returns whether its map has changed."""
-        points, passed, before = scan.points, self._passed[row], self._gone[row].copy()
+    def see(self, scan: Scan) -> bool:
+        """Takes a scan; returns whether the map has changed."""
+        points, passed, before = scan.points, self._passed, self._gone.copy()
         if not len(points):  # nothing says that the lidar sees at all
             return False
         away = np.hypot(*(points - scan.place[:2]).T)
@@ -64,11 +61,11 @@ class Chart:
         for shape, scans in list(passed.items()):
             if self._shown(shape, points, margin):
                 del passed[shape]
-                self._gone[row, shape] = False
+                self._gone[shape] = False
             elif np.mean(scans >= SCANS) >= MOST:
-                self._gone[row, shape] = True
-        if changed := not np.array_equal(self._gone[row], before):
-            self._outlines[row] = _without(self.known, self._gone[row])
+                self._gone[shape] = True
+        if changed := not np.array_equal(self._gone, before):
+            self.outlines = _without(self.known, self._gone)
         return changed
 
     def _distances(self, shape: int, points: Array) -> Array:

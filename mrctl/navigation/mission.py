@@ -23,10 +23,10 @@ from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
 from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.planning import Plan, plan, room, shortcut, space
+from mrctl.navigation.rollouts import opened
 from mrctl.navigation.sdf import read_sdf
+from mrctl.navigation.vehicle import reverses, robot_of
 from mrctl.navigation.window import Window
-from mrctl.physics import mjcf
-from mrctl.physics.hull import footprint
 from mrctl.record import InputError, Record, read_file
 from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
@@ -214,9 +214,8 @@ def navigate(
     began = perf_counter()
     found, own = prepared(task, scenario, speed, margin, avoid)
     planning_time = perf_counter() - began
-    stage = avoiding(avoid, own)
     others = [own.replace(name="", **FEEDFORWARDS[name]) for name in compare]
-    result = simulate([own, *others], progress=progress, motion=stage)
+    result = simulate([own, *others], progress=progress, motion=avoiding(avoid))
     driven = np.flatnonzero(np.isfinite(result["x"].values).any(axis=0))
     result = result.isel(time=slice(int(driven[-1]) + 1))
     return Mission(found, result, outcomes(result, task.goal, found), planning_time)
@@ -236,31 +235,29 @@ def prepared(
     return found, scenario.replace(**own, initial_pose=task.start, goal=task.goal)
 
 
-def avoiding(avoid: Avoid, scenario: Scenario, lag: float = 0.0) -> Callable[[Robot, int], Any] | None:
-    """Returns the factory of the motion stage of a mission, which bears the name in tables; None for that of mrctl.
+def avoiding(avoid: Avoid, lag: float = 0.0) -> Callable[[Robot, int], Any] | None:
+    """Returns the factory of the motion stage of missions, which bears the name in tables; None for that of mrctl.
+
+    The scenarios that it drives are those that `prepared` returns for the same `avoid`; their missions may differ.
 
     Args:
-        avoid: What keeps the robot from obstacles.
-        scenario: The scenario that `prepared` returns, with the motion period of the mission.
+        avoid: What keeps the robots from obstacles.
         lag: Time constant of the roll-outs of `mppi` in s; see `Mppi`.
     """
     if avoid == "none":
         return None
-    corners, robot = robot_of(scenario)
-    plan, known = scenario.reference, scenario.known
-    assert isinstance(plan, Waypoints)
 
-    def replan(pose: Array, outlines: Outlines, given: Waypoints | None) -> Waypoints | None:
+    def replan(scenario: Scenario, pose: Array, outlines: Outlines, given: Waypoints | None) -> Waypoints | None:
+        plan = opened(scenario.reference)
         goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
-        start = Task.from_dict({"obstacles": known, "start": pose.tolist(), "goal": goal})
+        start = Task.from_dict({"obstacles": scenario.known, "start": pose.tolist(), "goal": goal})
         with contextlib.suppress(InputError):  # it waits, and tries again
             return either_way(start, scenario, plan.speed, SLIM, avoid, outlines)[1]
 
     def made(robot: Robot, size: int) -> Pacing | Window | Mppi:
         if avoid == "barrier":
-            return Pacing(robot, size, scenario, corners, replan)
-        parts = robot, size, plan, known, corners, replan, reverses(scenario)
-        return Window(*parts) if avoid == "window" else Mppi(*parts, lag)
+            return Pacing(robot, size, replan)
+        return Window(robot, size, replan) if avoid == "window" else Mppi(robot, size, replan, lag)
 
     made.__name__ = avoid
     return made
@@ -332,18 +329,6 @@ def planned(
     if room(corners, reference, outlines) <= 0:
         raise InputError(f"plan: its smooth path touches an obstacle in spite of the margin of {margin:g} m; set more")
     return found, reference
-
-
-def robot_of(scenario: Scenario) -> tuple[Array, Robot]:
-    """Returns the footprint of a scenario's robot, corners in m, `(n, 2)`, and its parameters."""
-    model, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
-    return footprint(model), robot
-
-
-def reverses(scenario: Scenario) -> bool:
-    """Tells whether a scenario's robot can be driven backwards."""
-    model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
-    return mjcf.reverses(model, scenario.steering)
 
 
 def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:

@@ -12,8 +12,6 @@ import numpy as np
 from mrctl.kernel import Array
 from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Reactive, Replan, Scene, roll_out
 from mrctl.record import InputError
-from mrctl.theory.obstacles import Obstacles
-from mrctl.theory.references import Waypoints
 from mrctl.theory.robot import Robot
 
 SAMPLES = 2000
@@ -27,27 +25,13 @@ MOST_LAG = 10.0  # s
 class Mppi(Reactive):
     """A motion stage that samples twists around those of the period before; the same noise for every robot."""
 
-    def __init__(
-        self,
-        robot: Robot,
-        size: int,
-        plan: Waypoints,
-        known: Obstacles,
-        footprint: Array,
-        replan: Replan,
-        reverses: bool,
-        lag: float = 0.0,
-    ) -> None:
+    def __init__(self, robot: Robot, size: int, replan: Replan, lag: float = 0.0) -> None:
         """Takes the arguments of `Reactive`, and the lag that the roll-outs assume.
 
         Args:
             robot: The nominal robot.
             size: Number of robots.
-            plan: The way, which each robot goes along at its own pace.
-            known: As in `Reactive`.
-            footprint: As in `Reactive`.
-            replan: As in `Reactive`.
-            reverses: As in `Reactive`.
+            replan: Makes a plan to the goal.
             lag: Time constant in s with which V and θ̇ follow what is requested; 0: at once.
 
         Raises:
@@ -55,7 +39,7 @@ class Mppi(Reactive):
         """
         if not 0 <= lag <= MOST_LAG:
             raise InputError(f"lag: must be between 0 and {MOST_LAG:g} s, not {lag:g}")
-        super().__init__(robot, size, plan, known, footprint, replan, reverses)
+        super().__init__(robot, size, replan)
         self._lag = lag
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
@@ -65,23 +49,23 @@ class Mppi(Reactive):
         self._twists, self._costs = np.empty((SAMPLES, STEPS, 2)), np.empty(SAMPLES)
 
     def begin(self, tick: int) -> None:
-        """Draws the noise of a period, whose number is the only seed; one roll-out is nominal, and another brakes."""
-        spread = np.array(SPREAD) * (self.bounds.speed, self.bounds.rotation)
-        self._knots = np.random.default_rng(tick).standard_normal((SAMPLES, KNOTS, 2)) * spread
-        self._knots[0] = 0.0
-        self._knots[1] = -self.bounds.speed, 0.0
+        """Draws the noise of a period, whose number is the only seed."""
+        self._noise = np.random.default_rng(tick).standard_normal((SAMPLES, KNOTS, 2))
 
     def choose(self, row: int, pose: Array, twist: Array, last: Array, period: float, scene: Scene) -> Array:
         """Returns the first of the mean twists, or of the cheapest sample where only the mean touches an obstacle."""
-        nominal, twists, costs = self._nominal[row], self._twists, self._costs
+        nominal, twists, costs, bounds = self._nominal[row], self._twists, self._costs, self.bounds[row]
+        knots = self._noise * (np.array(SPREAD) * (bounds.speed, bounds.rotation))
+        knots[0] = 0.0  # one roll-out is nominal, and another brakes
+        knots[1] = -bounds.speed, 0.0
         nominal[:-1] = nominal[1:].copy()  # a period has passed
-        state = pose, twist, last, self._lag, period, self.bounds, scene
-        roll_out.compiled(self._knots, nominal, *state, WORTH, twists, costs)
+        state = pose, twist, last, self._lag, period, bounds, scene
+        roll_out.compiled(knots, nominal, *state, WORTH, twists, costs)
         weights = np.exp((costs.min() - costs) / TEMPERATURE)
         mean = (weights[:, None, None] / weights.sum() * twists).sum(axis=0)  # BLAS adds in an order of its own
         cheapest, some = twists[costs.argmin()].copy(), twists[:: SAMPLES // KEPT].copy()
         touches = costs.min() >= TOUCH
-        roll_out.compiled(self._knots[:1], mean, *state, WORTH, twists[:1], costs[:1])
+        roll_out.compiled(knots[:1], mean, *state, WORTH, twists[:1], costs[:1])
         nominal[:] = mean if touches or costs[0] < TOUCH else cheapest
         self.considered[row] = Considered(pose.copy(), some, nominal.copy())
         return nominal[0]

@@ -9,7 +9,7 @@ a first-order lag, τ dV/dt = V_requested − V, and the same for θ̇.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,10 +19,12 @@ from mrctl.loop.goals import arrived
 from mrctl.navigation.chart import RADIUS
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.trail import Trail
+from mrctl.navigation.vehicle import reverses, robot_of
 from mrctl.record import InputError
+from mrctl.scenario import Scenario
 from mrctl.theory.clearance import cover
 from mrctl.theory.grid import Field, near_field, value
-from mrctl.theory.obstacles import Obstacles, Outlines
+from mrctl.theory.obstacles import Outlines
 from mrctl.theory.rays import Scan
 from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
@@ -117,9 +119,9 @@ def _path(pose: Array, twists: Array, step: float) -> Array:
     return pose[:2] + np.pad(np.cumsum(moves, axis=-2), [(0, 0), (1, 0), (0, 0)])
 
 
-Replan = Callable[[Array, Outlines, Waypoints | None], Waypoints | None]
-"""Plans from a pose in m, m, rad, `(3,)`, among obstacles as they are now, to the end of a plan that an event brought,
-or else to the goal of the mission; None where there is no way."""
+Replan = Callable[[Scenario, Array, Outlines, Waypoints | None], Waypoints | None]
+"""Plans for the mission of a scenario, from a pose in m, m, rad, `(3,)`, among obstacles as they are now, to the end of
+a plan that an event brought, or else to the goal of the mission; None where there is no way."""
 
 
 def opened(reference: Reference) -> Waypoints:
@@ -134,21 +136,18 @@ def opened(reference: Reference) -> Waypoints:
 
 
 def plan_around(
-    replan: Replan, sight: Sight, row: int, time: float, footprint: Array, pose: Array, given: Waypoints | None
+    replan: Callable[[Array, Outlines], Waypoints | None], sight: Sight, time: float, footprint: Array, pose: Array
 ) -> Waypoints | None:
     """Makes a plan that keeps off what is not on the map, or else one that only does not touch it.
 
     Args:
-        replan: Makes a plan to the goal.
-        sight: What the robots know.
-        row: Which robot.
+        replan: Makes a plan from a pose, among outlines, to the goal.
+        sight: What the robot knows.
         time: Time in s.
         footprint: Its corners in its frame in m, `(n, 2)`.
         pose: x and y in m and θ in rad, from which it plans, `(3,)`.
-        given: The plan that came since the start, or None.
     """
-    far = replan(pose, sight.around(row, time, footprint, pose), given)
-    return far or replan(pose, sight.outlines(row, time), given)
+    return replan(pose, sight.around(time, footprint, pose)) or replan(pose, sight.outlines(time))
 
 
 class Reactive(ABC):
@@ -158,57 +157,55 @@ class Reactive(ABC):
     `Trail`, and plans again.
 
     Attributes:
-        bounds: What twists the robot can drive.
+        bounds: What twists each robot can drive.
         last: The last twist of each robot, `(B, 2)`.
         considered: What led to it, for each robot; None before the first one, and while the robot goes back.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        size: int,
-        plan: Waypoints,
-        known: Obstacles,
-        footprint: Array,
-        replan: Replan,
-        reverses: bool,
-    ) -> None:
+    def __init__(self, robot: Robot, size: int, replan: Replan) -> None:
         """Makes the stage.
 
         Args:
             robot: Nominal robot.
             size: Number of robots B.
-            plan: The plan with its time law.
-            known: Obstacles on the map; the others are seen by the lidar.
-            footprint: Corners of the robot in its frame in m, `(n, 2)`.
             replan: Makes a plan to the goal.
-            reverses: Whether the robot can be driven backwards.
         """
-        self._replan, self._sight, self._footprint, self._reverses = replan, Sight(known, size), footprint, reverses
-        self.bounds = Bounds.of(robot, plan.speed)
-        self._size, self._plan, self._discs = size, plan, cover(footprint, DISCS)
+        self._robot, self._size, self._replan = robot, size, replan
+
+    def assign(self, scenarios: Sequence[Scenario]) -> None:
+        """Takes the missions of the robots, with their maps and with their plans as references."""
+        self._scenarios, self._own = scenarios, [opened(scenario.reference) for scenario in scenarios]
+        self._sights = [Sight(scenario.known) for scenario in scenarios]
+        self._footprint, self._reverses = robot_of(scenarios[0])[0], reverses(scenarios[0])
+        self.bounds = [Bounds.of(self._robot, plan.speed) for plan in self._own]
+        self._discs = cover(self._footprint, DISCS)
         self._body = float((np.hypot(self._discs[:, 0], self._discs[:, 1]) + self._discs[:, 2]).max())
-        self._field = self._field_around(plan.sample(np.linspace(0, plan.period, 200)).pose[:, :2], 0)
 
     def _field_around(self, places: Array, row: int) -> Field:
         """Returns the distance from the map of one robot around places on a plan, `(n, 2)` in m."""
         low, high = places.min(axis=0) - AROUND, places.max(axis=0) + AROUND
-        return near_field(self._sight.map(row), low, high, CELL, self._body + KEPT + 2 * CELL)
+        return near_field(self._sights[row].map, low, high, CELL, self._body + KEPT + 2 * CELL)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         self._period, self._tick, self._place = period, 0, np.zeros(self._size, int)
-        self._tables, self._fields = [self._sampled(self._plan)] * self._size, [self._field] * self._size
+        for sight in self._sights:
+            sight.forget()
+        self._tables, self._fields = [self._sampled(plan) for plan in self._own], []
+        fields: dict[Hashable, Field] = {}
+        for row, own in enumerate(zip(self._own, (scenario.known for scenario in self._scenarios), strict=True)):
+            if own not in fields:
+                places = own[0].sample(np.linspace(0, own[0].period, 200)).pose[:, :2]
+                fields[own] = self._field_around(places, row)
+            self._fields.append(fields[own])
         self._given: list[Waypoints | None] = [None] * self._size  # plans that came since the start
         self._anchor, self._since = pose[:, :2].copy(), np.zeros(self._size)
         self._tried = np.full(self._size, -np.inf)  # when they last looked for another plan
         self._waited = np.zeros(self._size, bool)  # which have made another plan where they are
         self._approached = np.zeros(self._size, bool)  # which have gone back from a goal at which they did not arrive
         self._pieces = np.zeros(self._size, int)  # of the way back from `_anchor`, for robots that go back
-        back = min(BACK[1], self.bounds.speed / 2), self.bounds.curvature
-        self._trails = [Trail(self._footprint, *back) for _ in range(self._size)]
+        self._trails = [Trail(self._footprint, min(BACK[1], own.speed / 2), own.curvature) for own in self.bounds]
         self.last = np.zeros((self._size, 2))
-        self._sight.forget()
         self._map_changed = np.zeros(self._size, bool)  # so that a shorter way may be free
         self._looked = np.zeros(self._size, bool)  # which robots have a scan that is new; those that failed have none
         self.considered: list[Considered | None] = [None] * self._size
@@ -240,7 +237,7 @@ class Reactive(ABC):
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.Motion`."""
         self._looked[row] = True
-        if self._sight.see(row, scan):
+        if self._sights[row].see(scan):
             self._fields[row] = self._field_around(self._tables[row][:, :2], row)
             self._map_changed[row] = True
 
@@ -295,7 +292,7 @@ class Reactive(ABC):
         other = self._planned(row, pose)
         in_vain = not pieces and self._waited[row]  # what it got where it waits did not help it
         self._waited[row], self._pieces[row] = away <= OFF, 0
-        alone = not len(self._sight.moving(row, self._period * self._tick).discs)  # what moves may let it pass
+        alone = not len(self._sights[row].moving(self._period * self._tick).discs)  # what moves may let it pass
         stuck = alone and (pieces or away <= OFF) and (in_vain or not other)
         at_end = self._place[row] > len(self._tables[row]) - 1 - FINE
         if self._reverses and stuck and pieces < PIECES and not (at_end and self._approached[row]):
@@ -315,7 +312,7 @@ class Reactive(ABC):
 
     def _back(self, row: int, pose: Array) -> bool:
         """Lets `last` be the twist with which a robot goes back; returns whether it can."""
-        twist = self._trails[row].back(pose, self._sight.outlines(row, self._period * self._tick, FREE - RADIUS))
+        twist = self._trails[row].back(pose, self._sights[row].outlines(self._period * self._tick, FREE - RADIUS))
         if twist is not None:
             self.last[row] = twist
         return twist is not None
@@ -323,8 +320,11 @@ class Reactive(ABC):
     def _planned(self, row: int, pose: Array) -> Waypoints | None:
         """Makes a plan from where a robot is, around what it knows."""
         self._map_changed[row] = False
-        own = row, self._period * self._tick, self._footprint, pose
-        return plan_around(self._replan, self._sight, *own, self._given[row])
+
+        def replan(pose: Array, outlines: Outlines) -> Waypoints | None:
+            return self._replan(self._scenarios[row], pose, outlines, self._given[row])
+
+        return plan_around(replan, self._sights[row], self._period * self._tick, self._footprint, pose)
 
     def begin(self, tick: int) -> None:  # noqa: B027 (most have nothing to do)
         """Is called once in a motion period, before `choose` for each robot."""
@@ -344,8 +344,8 @@ class Reactive(ABC):
 
     def _near(self, row: int, pose: Array) -> Array:
         """Returns the discs that a robot has found and could meet within a roll-out, as in `Scene.movers`."""
-        found, horizon = self._sight.discs(row, self._period * self._tick), self._period * STEPS
-        reach = (self._body + KEPT) + horizon * (self.bounds.speed + np.hypot(found[:, 2], found[:, 3]))
+        found, horizon = self._sights[row].discs(self._period * self._tick), self._period * STEPS
+        reach = (self._body + KEPT) + horizon * (self.bounds[row].speed + np.hypot(found[:, 2], found[:, 3]))
         return found[np.hypot(*(found[:, :2] - pose[:2]).T) < reach + found[:, 4]]
 
 

@@ -16,6 +16,7 @@ scan does not show are remembered as long as something may hide them, those that
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -58,35 +59,38 @@ class Cluster(NamedTuple):
 
 
 class Sight:
-    """Map and finds of B robots; a motion stage hands its scans to `see`."""
+    """Map and finds of one robot; a motion stage hands its scans to `see`.
 
-    def __init__(self, known: Obstacles, size: int) -> None:
-        """Takes the obstacles on the map, and the number of robots."""
-        self._chart, self._field, self._size = Chart(known, size), None, size
-        if known.shapes:
-            low, high, cell = map_area(known)
-            self._field: Field | None = near_field(self._chart.known, low, high, cell, FAR + 2 * cell)
+    Attributes:
+        standing: Outlines of those finds that stand.
+    """
+
+    def __init__(self, known: Obstacles) -> None:
+        """Takes the obstacles on the map."""
+        self._chart = Chart(known)
+        self._field = _from_map(known) if known.shapes else None  # pyright: ignore[reportArgumentType] (it is frozen)
         self.forget()
 
     def forget(self) -> None:
         """Forgets all that scans have shown."""
-        self._found = [np.zeros((0, 5))] * self._size  # discs: x, y, their velocities, and when they were seen
-        self._clusters: list[list[Cluster]] = [[] for _ in range(self._size)]
-        self._scans: list[list[Scan]] = [[] for _ in range(self._size)]
-        self._standing = [NOTHING] * self._size
+        self._found = np.zeros((0, 5))  # discs: x, y, their velocities, and when they were seen
+        self._clusters: list[Cluster] = []
+        self._scans: list[Scan] = []
+        self.standing = NOTHING
         self._chart.forget()
 
-    def map(self, row: int) -> Outlines:
-        """Returns what is on the map of one robot, without what has turned out to be gone."""
-        return self._chart.outlines(row)
+    @property
+    def map(self) -> Outlines:
+        """What is on the map, without what has turned out to be gone."""
+        return self._chart.outlines
 
-    def see(self, row: int, scan: Scan) -> bool:
-        """Takes a scan of one robot, whose index is `row`; returns whether its map has changed."""
-        time, past = scan.time, [other for other in self._scans[row] if scan.time - other.time < PAST + 1e-9]
+    def see(self, scan: Scan) -> bool:
+        """Takes a scan; returns whether the map has changed."""
+        time, past = scan.time, [other for other in self._scans if scan.time - other.time < PAST + 1e-9]
         if not past or time - past[-1].time > APART - 1e-9:
             past.append(scan)
-        self._scans[row] = past
-        before, now, discs = list(self._clusters[row]), [], [np.zeros((0, 5))]
+        self._scans = past
+        before, now, discs = list(self._clusters), [], [np.zeros((0, 5))]
         for points, whole in self._unknown(scan):
             centre, velocity = points.mean(axis=0), np.zeros(2)
             was_empty = np.any([through(points, other) for other in past], axis=0)
@@ -105,50 +109,43 @@ class Sight:
             own = velocity if moves else np.zeros(2)
             discs.append(np.array([(*point, *own, time) for point in _thinned(points)]))
         new = np.concatenate(discs)
-        self._clusters[row] = now + [cluster for cluster in before if time - cluster.time < HIDDEN]
-        self._found[row] = found = np.concatenate([new, self._hidden(self._found[row], new, scan)])
-        self._standing[row] = _outlines(found[~_moves(found)])
-        return self._chart.see(row, scan)
+        self._clusters = now + [cluster for cluster in before if time - cluster.time < HIDDEN]
+        self._found = found = np.concatenate([new, self._hidden(self._found, new, scan)])
+        self.standing = _outlines(found[~_moves(found)])
+        return self._chart.see(scan)
 
-    def discs(self, row: int, time: float) -> Array:
-        """Returns discs around what one robot has found beside the map.
+    def discs(self, time: float) -> Array:
+        """Returns discs around what the robot has found beside the map.
 
         Args:
-            row: Index of the robot.
             time: Time in s at which they are where they would be by their velocities.
 
         Returns:
             x and y in m, velocities along x and y in m/s and radius in m, `(M, 5)`.
         """
-        found = self._found[row]
+        found = self._found
         return np.column_stack([_placed(found, time), found[:, 2:4], np.full(len(found), RADIUS)])
 
-    def standing(self, row: int) -> Outlines:
-        """Returns those finds of one robot that stand."""
-        return self._standing[row]
-
-    def moving(self, row: int, time: float) -> Outlines:
-        """Returns those finds of one robot that move, where they would be at a time in s."""
-        found = self._found[row]
-        moving = found[_moves(found)]
+    def moving(self, time: float) -> Outlines:
+        """Returns those finds that move, where they would be at a time in s."""
+        moving = self._found[_moves(self._found)]
         return _outlines(_placed(moving, time)) if len(moving) else NOTHING
 
-    def outlines(self, row: int, time: float, margin: float = 0.0) -> Outlines:
-        """Returns the map and the finds of one robot at a time in s; the finds are enlarged by a margin in m."""
-        found, known = _outlines(_placed(self._found[row], time)).discs + [0.0, 0.0, margin], self.map(row)
+    def outlines(self, time: float, margin: float = 0.0) -> Outlines:
+        """Returns the map and the finds at a time in s; the finds are enlarged by a margin in m."""
+        found, known = _outlines(_placed(self._found, time)).discs + [0.0, 0.0, margin], self.map
         return known._replace(discs=np.concatenate([known.discs, found]))
 
-    def around(self, row: int, time: float, footprint: Array, pose: Array) -> Outlines:
-        """Returns what a new plan of one robot has to go around: the map and its finds, with a margin around these.
+    def around(self, time: float, footprint: Array, pose: Array) -> Outlines:
+        """Returns what a new plan has to go around: the map and the finds, with a margin around these.
 
         Args:
-            row: Index of the robot.
             time: Time in s.
             footprint: Corners of the robot in its frame in m, `(n, 2)`.
             pose: x and y in m and θ in rad, from which it plans, `(3,)`.
         """
-        left = clearance(footprint, pose, self.standing(row)) - LEFT
-        return self.outlines(row, time, min(ROUND, max(0.0, left)))
+        left = clearance(footprint, pose, self.standing) - LEFT
+        return self.outlines(time, min(ROUND, max(0.0, left)))
 
     def _unknown(self, scan: Scan) -> list[tuple[Array, bool]]:
         """Returns the points of each cluster beside the map in m, `(k, 2)`, and whether nothing hides a part of it."""
@@ -182,6 +179,13 @@ class Sight:
         if len(new):
             gone |= np.hypot(*(places[:, None] - new[None, :, :2]).transpose(2, 0, 1)).min(axis=1) < 2 * SPACING
         return old[~gone]
+
+
+@lru_cache(64)
+def _from_map(known: Obstacles) -> Field:
+    """Returns the distance from the obstacles on a map near them, which robots with the same map share."""
+    low, high, cell = map_area(known)
+    return near_field(Surroundings(known).at(0.0), low, high, cell, FAR + 2 * cell)
 
 
 @kernel

@@ -27,7 +27,7 @@ class Window(Reactive):
 
     def choose(self, row: int, pose: Array, twist: Array, last: Array, period: float, scene: Scene) -> Array:
         """Returns the first twist towards the best one of the window."""
-        bounds = self.bounds
+        bounds = self.bounds[row]
         reach, turn = MOMENT * bounds.acceleration, MOMENT * bounds.rotation_acceleration
         speeds = np.linspace(max(0.0, last[0] - reach), min(bounds.speed, last[0] + reach), SPEEDS)
         rotations = np.linspace(max(-bounds.rotation, last[1] - turn), min(bounds.rotation, last[1] + turn), ROTATIONS)

@@ -54,12 +54,9 @@ FAN_HINT = "Draws some of the ways that `window` or `mppi` considers, and the on
 # What *Save session* writes beside the scenarios of a mission with an avoider.
 AVOIDER = '''"""The motion stage of a session: `mrctl run {scenario} --controller motion={avoid}.py:{avoid}`."""
 
-from pathlib import Path
-
 from mrctl.navigation.mission import avoiding
-from mrctl.scenario import Scenario
 
-{avoid} = avoiding("{avoid}", Scenario.from_toml(str(Path(__file__).with_name("{scenario}"))))
+{avoid} = avoiding("{avoid}")
 '''
 KEYS: tuple[HotkeyKey, ...] = ("1", "2", "3", "4")  # of the first button of each group
 RIGID_UNITS = "rad/s per rad/s", "1/s"  # of K_p and K_i of the second channel under rigid steering

@@ -68,7 +68,7 @@ class Session:
         self.period = scenarios[0].control_period
         long = [s.model_copy(update={"laps": max(1, floor(HOUR / s.reference.period))}) for s in scenarios]
         self.avoid: Avoid = avoid
-        motion, self._stages = avoiding(avoid, scenarios[0]), []
+        motion, self._stages = avoiding(avoid), []
 
         def kept(robot: Robot, size: int) -> Motion:
             assert motion is not None

@@ -7,7 +7,8 @@ import pytest
 
 from mrctl import Disc, InputError, Line, Obstacles, Scenario, simulate
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import Avoid, avoiding, outcomes, prepared, robot_of, task_of
+from mrctl.navigation.mission import Avoid, avoiding, outcomes, prepared, task_of
+from mrctl.navigation.vehicle import robot_of
 from mrctl.theory.timing import RESERVE
 
 FIRST = 200_000  # seed
@@ -65,7 +66,7 @@ def driven(world: str, robot: str, avoid: Avoid, count: int) -> tuple[Counter[st
             plan, drive = prepared(task, scenario, avoid=avoid)
         except InputError:
             continue
-        row = outcomes(simulate([drive], motion=avoiding(avoid, drive)), task.goal, plan).iloc[0]
+        row = outcomes(simulate([drive], motion=avoiding(avoid)), task.goal, plan).iloc[0]
         found[row["outcome"]] += 1
         if row["outcome"] == "arrived":
             times.append(row["time"] / drive.reference.period)

@@ -16,7 +16,7 @@ import mrctl.experiments.three_mppis as three
 import mrctl.navigation.mppi as mppi
 from mrctl import Lemniscate, Perturbation, Scenario, cli, simulate
 from mrctl.navigation.generators import bent_line, corridor, corridor_width
-from mrctl.navigation.mission import robot_of
+from mrctl.navigation.vehicle import robot_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.theory.clearance import clearance, clearances

@@ -279,7 +279,7 @@ def test_filter_in_the_loop() -> None:
     scenario = PID.replace(obstacles=obstacles, reference=mrctl.Line(length=2.6), laps=1, initial_spread=(0, 0, 0))
     hit = mrctl.simulate(scenario, motion=Blind)
     assert hit["failure"] == "collision"
-    result = mrctl.simulate(scenario, motion=lambda robot, size: Avoiding(robot, size, Blind, obstacles, barrier))
+    result = mrctl.simulate(scenario, motion=lambda robot, size: Avoiding(robot, size, Blind, barrier))
     assert result["failure"] == "" and 0.02 < float(result["clearance"].min()) < 0.3
     early = result["clearance"] > 1.0
     assert np.array_equal(result["v_command"].where(early, drop=True), hit["v_command"][: int(early.sum())])

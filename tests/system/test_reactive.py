@@ -2,13 +2,16 @@
 
 import numpy as np
 import pytest
+from test_batch_equals_single import equal
 
 import mrctl
 from mrctl import Box, Disc, Obstacles, Scenario, simulate
+from mrctl.loop.simulation import arranged, uniform
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import Avoid, avoiding, navigate, planned, prepared, robot_of
+from mrctl.navigation.mission import Avoid, avoiding, navigate, planned, prepared
 from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.rollouts import KNOTS, STEPS, Bounds, Scene, roll_out
+from mrctl.navigation.vehicle import robot_of
 from mrctl.theory.clearance import clearance, cover
 from mrctl.theory.grid import field_of
 from mrctl.theory.obstacles import Surroundings
@@ -109,7 +112,7 @@ def test_lag() -> None:
         found.append(costs[0])
     assert found[0] < 1e-5 and found[1] > 0.1 and found[2] > 0.01
     with pytest.raises(mrctl.InputError, match="^lag: "):
-        Mppi(mrctl.load_robot("car"), 1, None, Obstacles(), FOOTPRINT, None, False, lag=-0.1)  # pyright: ignore
+        Mppi(mrctl.load_robot("car"), 1, lambda *_: None, lag=-0.1)
 
 
 @pytest.mark.parametrize("avoid", ["window", "mppi"])
@@ -179,7 +182,7 @@ def test_waits() -> None:
     task = Task(obstacles=Obstacles(shapes=(Box(x=1.0, y=3.0),)), start=(0, 0, 0), goal=(1.5, 0, 0))
     turtlebot = Scenario.from_dict({"prior": "model", "learner": "none", "robot": {"path": "turtlebot"}})
     own = prepared(task, turtlebot, avoid="window")[1].replace(laps=8)
-    run = simulate([own.replace(goal=None)], motion=avoiding("window", own)).isel(run=0)
+    run = simulate([own.replace(goal=None)], motion=avoiding("window")).isel(run=0)
     after = run.isel(time=run["time"] > 0.7 * own.ticks * own.control_period)
     assert len(after["time"]) > 200
     assert float(np.hypot(after["x"] - 1.5, after["y"]).max()) < 0.12 and float(np.abs(after["v"]).max()) < 0.05
@@ -196,7 +199,7 @@ def test_far_door(avoid: Avoid) -> None:
     task = Task(obstacles=world, map=known, start=(0.0, -0.4, 0.0), goal=(4.0, -0.4, 0.0))
     turtlebot = Scenario.from_dict({"prior": "model", "learner": "none", "robot": {"path": "turtlebot"}})
     own = prepared(task, turtlebot, avoid=avoid)[1].replace(laps=8)
-    run = simulate([own], motion=avoiding(avoid, own)).isel(run=0)
+    run = simulate([own], motion=avoiding(avoid)).isel(run=0)
     assert run["failure"].item() == "" and float(run["y"].max()) > 6.0
     assert np.hypot(float(run["x"].dropna("time")[-1]) - 4.0, float(run["y"].dropna("time")[-1]) + 0.4) < 0.1
 
@@ -246,6 +249,23 @@ def test_shorter(avoid: Avoid) -> None:
     assert float(np.abs(driven.result["y"]).max()) < 0.3 < 0.8 < np.abs(driven.plan.poses[:, 1]).max()
 
 
+@pytest.mark.parametrize("avoid", ["barrier", "window", "mppi"])
+def test_several_missions(avoid: Avoid) -> None:
+    """Robots in different worlds, with different goals, maps and speeds, drive in one batch as each drives alone."""
+    drives = []
+    for side, end, speed in ((1, 3.0, 0.8), (-1, 2.6, 0.5)):
+        known = Obstacles(shapes=(Box(x=1.4, y=0.7 * side, length=0.3, width=0.6), Disc(x=1.0, y=-1.2 * side)))
+        unknown = Disc(x=2.0, y=-0.1 * side, radius=0.12)
+        world = Obstacles(shapes=(*known.shapes, unknown))
+        task = Task(obstacles=world, map=known, start=(0.0, 0.0, 0.0), goal=(end + 1, 0.3 * side, 0.0))
+        drives.append(prepared(task, PLANNED, speed, avoid=avoid)[1])
+    assert len(uniform([arranged(own) for own in drives])) == 1
+    together = simulate(drives, motion=avoiding(avoid))
+    assert together["clearance"].min() > 0.0 and not together["failed"].any()
+    for row, own in enumerate(drives):
+        equal(simulate(own, motion=avoiding(avoid)), together, row)
+
+
 def test_limits() -> None:
     """What the stages ask for is within the bounds at every tick, also where the robot is thrown about."""
     task = Task(obstacles=Obstacles(shapes=(crossing(0.4),)), start=(0.0, 0.0, 0.0), goal=(4.0, 0.0, 0.0))
@@ -253,9 +273,10 @@ def test_limits() -> None:
     own = PLANNED.replace(obstacles=task.obstacles, reference=plan, goal=task.goal)
     robot, random = robot_of(own)[1], np.random.default_rng(1)
     for avoid in ("window", "mppi"):
-        make = avoiding(avoid, own)
+        make = avoiding(avoid)
         assert make is not None
         stage, pose = make(robot, 1), np.zeros((1, 3))
+        stage.assign([own])
         stage.reset(pose, np.zeros((1, 7)), 0.05)
         for _ in range(40):
             ((v, omega),) = stage.output(pose, np.zeros((1, 2)), np.zeros((1, 7)))

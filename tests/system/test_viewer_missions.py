@@ -324,12 +324,12 @@ def test_another_goal(avoid, tmp_path):
     assert session.running and session.clearance().min() > 0
     (saved,) = session.saved()
     laps = int(np.ceil(session.time / saved.reference.period))
-    again = simulate(saved.replace(laps=laps), motion=avoiding(avoid, saved))
+    again = simulate(saved.replace(laps=laps), motion=avoiding(avoid))
     for name in ("x", "theta", "voltage_left"):
         driven = session.log()[name][:, 0]
         assert again[name].values[: len(driven)].tobytes() == np.ascontiguousarray(driven).tobytes(), name
     closed = saved.with_event(Event(time=0.5, reference=Circle())).replace(laps=1)
-    failure = simulate(closed, motion=avoiding(avoid, saved)).failure.item()
+    failure = simulate(closed, motion=avoiding(avoid)).failure.item()
     assert failure.startswith(f"motion {avoid}: InputError: reference: robots with an avoider follow open waypoints")
     if avoid == "mppi":
         with pytest.raises(InputError, match="^way: with --avoid mppi"):

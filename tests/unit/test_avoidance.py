@@ -14,6 +14,7 @@ from mrctl.control.kanayama import kanayama, posture_error
 from mrctl.experiments.learned_limits import PLANTS
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.navigation.avoidance import Avoiding, Barrier, Following, Pacing, approach, avoid, nearest, share
+from mrctl.navigation.vehicle import robot_of
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
@@ -161,7 +162,7 @@ def test_following_has_the_gains_of_the_hierarchy(prefilter: float | None) -> No
     posture_error.compiled(pose[0], reference[0, :3], error)
     gains = Hierarchy([scenario], robot).state["kanayama"][0]
     kanayama.compiled(error, reference[0, 3:5], gains, request)
-    assert np.array_equal(Following(robot, 1, scenario).output(pose, np.zeros((1, 2)), reference)[0], request)
+    assert np.array_equal(Following(robot, [scenario]).output(pose, np.zeros((1, 2)), reference)[0], request)
 
 
 def test_share() -> None:
@@ -191,16 +192,17 @@ def test_share() -> None:
 
 def test_paced_plan_is_driven_whole() -> None:
     """Robots that obey at once drive the plan itself, more slowly, pass what it passes narrowly, and end at its end."""
-    wall = [Box(x=2.0, y=side * 1.0, length=0.3, width=1.5) for side in (-1, 1)]  # about 2 cm beside the plan
+    wall = [Box(x=2.0, y=side * 0.985, length=0.3, width=1.5) for side in (-1, 1)]  # about 2 cm beside the plan
     plan = Waypoints(
         points=(*((x / 2, 0) for x in range(7)), (4, 0.5), (5, 1)), closed=False, timing="limits", speed=1.2
     )
     robot = mjcf.build()[1]
     scenario = Scenario(reference=plan, obstacles=Obstacles(shapes=(*wall,)), prior="model")
-    footprint = np.array([[-0.1, -0.225], [0.44, -0.225], [0.44, 0.225], [-0.1, 0.225]])
+    footprint = robot_of(scenario)[0]
     outlines, pose, period = Surroundings(scenario.obstacles).at(0.0), np.zeros((2, 3)), 0.01
     pose[:] = plan.sample(np.zeros(1)).pose
-    stage = Pacing(robot, 2, scenario, footprint, lambda pose, outlines: None)
+    stage = Pacing(robot, 2, lambda *_: None)
+    stage.assign([scenario] * 2)
     stage.reset(pose, np.zeros((2, 7)), period)
     way, ticks = plan.sample(np.linspace(0, plan.period, 4000)).pose, 0
     least = min(clearance(footprint, place, outlines) for place in way)
@@ -237,7 +239,8 @@ def test_wrapped_stage_sees() -> None:
             return np.zeros((1, 2))
 
     made = []
-    stage = Avoiding(mjcf.build()[1], 1, lambda *robots: made.append(Looks(*robots)) or made[0], Obstacles(), BARRIER)
+    stage = Avoiding(mjcf.build()[1], 1, lambda *robots: made.append(Looks(*robots)) or made[0], BARRIER)
+    stage.assign([Scenario()])
     stage.reset(np.zeros((1, 3)), np.zeros((1, 7)), 0.02)
     stage.see(0, Scan(np.full(8, np.inf), np.arange(8) * np.pi / 4, 5.0, np.zeros(3), 0.0))
     assert made[0].seen == 1 and stage.followed is Looks.followed

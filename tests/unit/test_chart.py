@@ -34,20 +34,19 @@ def scan(
 def test_gone_and_back(thing: str) -> None:
     """It goes after so many scans that pass through it, alone, and is back with the first scan that shows it."""
     full, rest = Obstacles(shapes=(*ROOM, THINGS[thing])), Obstacles(shapes=ROOM)
-    chart, random, pose = Chart(full, 2), np.random.default_rng(0), np.array([-0.5, 0.0, 0.0])
-    changes = [chart.see(0, scan(LIDAR, rest, pose, random)) for _ in range(SCANS + 2)]
+    chart, random, pose = Chart(full), np.random.default_rng(0), np.array([-0.5, 0.0, 0.0])
+    changes = [chart.see(scan(LIDAR, rest, pose, random)) for _ in range(SCANS + 2)]
     assert changes == [k == SCANS - 1 for k in range(SCANS + 2)]
-    for left, right in zip(chart.outlines(0), Surroundings(rest).at(0.0), strict=True):
+    for left, right in zip(chart.outlines, Surroundings(rest).at(0.0), strict=True):
         np.testing.assert_array_equal(left, right)
-    assert chart.outlines(1) is chart.known  # another robot has not seen it
-    assert chart.see(0, scan(LIDAR, full, pose, random))
-    for left, right in zip(chart.outlines(0), chart.known, strict=True):
+    assert chart.see(scan(LIDAR, full, pose, random))
+    for left, right in zip(chart.outlines, chart.known, strict=True):
         np.testing.assert_array_equal(left, right)
     for _ in range(SCANS):
-        chart.see(0, scan(LIDAR, rest, pose, random))
-    assert chart.outlines(0) is not chart.known
+        chart.see(scan(LIDAR, rest, pose, random))
+    assert chart.outlines is not chart.known
     chart.forget()
-    assert chart.outlines(0) is chart.known
+    assert chart.outlines is chart.known
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -67,18 +66,18 @@ def test_what_stands_stays(seed: int) -> None:
         shapely.Point(s.x, s.y).buffer(s.radius) if isinstance(s, Disc) else shapely.Polygon(s.vertices)
         for s in world.shapes
     ])  # fmt: skip
-    chart = Chart(world, 1)
+    chart = Chart(world)
     for _ in range(15):
         pose = random.uniform([-3.8, -3.8, -3], [3.8, 3.8, 3])
         error = *(0.04 / np.sqrt(2) * random.choice([-1, 1], 2)), np.deg2rad(random.choice([-1.5, 1.5]))
         if solid.distance(shapely.Point(pose[:2])) > 0.2:
             for _ in range(2 * SCANS):  # it stands a moment, and errs the same way
-                assert not chart.see(0, scan(lidar, world, pose, random, error))
+                assert not chart.see(scan(lidar, world, pose, random, error))
 
 
 def test_what_is_hidden_stays() -> None:
     """What no beam reaches, behind a wall or beyond the range, stays on the map."""
     wall, behind, far = Box(x=1.0, length=0.1, width=2.0), Disc(x=2.0, radius=0.3), Disc(x=-9.0, radius=0.3)
-    chart, near = Chart(Obstacles(shapes=(wall, behind, far)), 1), Lidar(range=6.0)
+    chart, near = Chart(Obstacles(shapes=(wall, behind, far))), Lidar(range=6.0)
     for _ in range(3 * SCANS):
-        assert not chart.see(0, scan(near, Obstacles(shapes=(wall,)), np.zeros(3), np.random.default_rng(0)))
+        assert not chart.see(scan(near, Obstacles(shapes=(wall,)), np.zeros(3), np.random.default_rng(0)))

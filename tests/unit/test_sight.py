@@ -19,17 +19,17 @@ PILLAR = Disc(x=-1.5, y=1.5, radius=0.2)
 def scanned(sight: Sight, world: Obstacles, pose: np.ndarray, time: float, seed: int = 0, error: float = 0.0) -> None:
     """Hands a scan from a pose to one robot, which believes to be `error` metres ahead of where it is along x."""
     ranges = LIDAR.scan(pose, Surroundings(world).at(time), np.random.default_rng([seed, round(10 * time)]))
-    sight.see(0, Scan(ranges, LIDAR.angles, LIDAR.range, LIDAR.place(pose + [error, 0.0, 0.0]), time))
+    sight.see(Scan(ranges, LIDAR.angles, LIDAR.range, LIDAR.place(pose + [error, 0.0, 0.0]), time))
 
 
 def discs(sight: Sight, time: float) -> np.ndarray:
-    return sight.discs(0, time)
+    return sight.discs(time)
 
 
 def test_a_map_that_is_right_hides_nothing_and_shows_nothing() -> None:
     """From 40 poses, with the noise of the lidar and 2 cm of error in the estimate, nothing is found beside the map."""
     known, random = Obstacles(shapes=(*WALLS, PILLAR)), np.random.default_rng(1)
-    sight = Sight(known, 1)
+    sight = Sight(known)
     for k in range(40):
         pose = np.append(random.uniform(-2.2, 2.2, 2), random.uniform(-3, 3))
         scanned(sight, known, pose, 0.1 * k, error=0.02)
@@ -46,7 +46,7 @@ def test_a_map_that_is_right_hides_nothing_and_shows_nothing() -> None:
 def test_what_the_map_lacks_is_found(shape: Disc | Box, outline: shapely.Polygon | None) -> None:
     """Discs lie along the side of it that beams meet, without gaps, and nowhere else."""
     outline = outline or shapely.Polygon(shape.vertices)
-    sight = Sight(Obstacles(shapes=WALLS), 1)
+    sight = Sight(Obstacles(shapes=WALLS))
     scanned(sight, Obstacles(shapes=(*WALLS, shape)), np.array([0.0, 0.0, 0.3]), 0.0)
     found = discs(sight, 0.0)
     edge = [shapely.Point(x, y).distance(outline.exterior) for x, y in found[:, :2]]
@@ -56,7 +56,7 @@ def test_what_the_map_lacks_is_found(shape: Disc | Box, outline: shapely.Polygon
     met = exact.points(ranges)
     gaps = np.hypot(*(met[:, None] - found[None, :, :2]).transpose(2, 0, 1)).min(axis=1)
     assert gaps.max() < SPACING + 3 * LIDAR.noise
-    assert len(sight.outlines(0, 0.0).discs) == len(found) and not len(sight.moving(0, 0.0).discs)
+    assert len(sight.outlines(0.0).discs) == len(found) and not len(sight.moving(0.0).discs)
 
 
 @pytest.mark.parametrize(("speed", "rate"), [(0.3, 10), (0.5, 10), (0.8, 10), (0.5, 5), (0.5, 50), (0.8, 200)])
@@ -67,7 +67,7 @@ def test_velocity(speed: float, rate: int) -> None:
     """
     course = Line(heading=np.pi / 2, speed=speed, length=20.0)
     world = Obstacles(shapes=(*WALLS[:1], Disc(x=-1.5, y=-2.0, radius=0.15, course=course)))
-    sight, errors = Sight(Obstacles(shapes=WALLS[:1]), 1), []
+    sight, errors = Sight(Obstacles(shapes=WALLS[:1])), []
     for k in range(int(2.5 / speed * rate)):
         scanned(sight, world, np.zeros(3), k / rate, seed=k)
         if k >= rate:
@@ -81,7 +81,7 @@ def test_velocity(speed: float, rate: int) -> None:
 def test_what_stands_stands() -> None:
     """A robot that drives past a pillar and along a wall at 1 m/s takes neither for something that moves."""
     world = Obstacles(shapes=(PILLAR, Box(x=0.0, y=-1.0, length=4.0, width=0.1)))
-    sight = Sight(Obstacles(), 1)
+    sight = Sight(Obstacles())
     for k in range(30):
         scanned(sight, world, np.array([-3.0 + 0.1 * k, 1.0, 0.0]), 0.1 * k)
         assert np.all(discs(sight, 0.1 * k)[:, 2:4] == 0)
@@ -90,7 +90,7 @@ def test_what_stands_stands() -> None:
 def test_memory() -> None:
     """What something hides is remembered, what has gone is forgotten when it is seen to have gone."""
     pillar, screen = Disc(x=2.0, radius=0.15), Box(x=1.0, length=0.1, width=2.0)
-    sight, pose = Sight(Obstacles(), 1), np.zeros(3)
+    sight, pose = Sight(Obstacles()), np.zeros(3)
 
     def near(place: float) -> bool:
         return bool((np.abs(discs(sight, 0.0)[:, 0] - place) < 0.3).any())
@@ -107,7 +107,7 @@ def test_memory() -> None:
 
 def test_end_of_range() -> None:
     """What is out of range is remembered, and what comes into range is not taken for something that moves."""
-    short, sight = Lidar(range=3.0), Sight(Obstacles(), 1)
+    short, sight = Lidar(range=3.0), Sight(Obstacles())
     for world, places in (
         (Disc(x=2.0, radius=0.2), [0.0, -3.0]),
         (Box(x=5.0, angle=0.6, length=1.0, width=1.0), 0.1 * np.arange(40.0)),
@@ -116,7 +116,7 @@ def test_end_of_range() -> None:
         around, random = Surroundings(Obstacles(shapes=(world,))).at(0.0), np.random.default_rng(0)
         for k, x in enumerate(places):
             pose = np.array([x, 0.0, 0.0])
-            sight.see(0, Scan(short.scan(pose, around, random), short.angles, short.range, pose, 0.1 * k))
+            sight.see(Scan(short.scan(pose, around, random), short.angles, short.range, pose, 0.1 * k))
             assert np.all(discs(sight, 0.1 * k)[:, 2:4] == 0)
         assert len(discs(sight, 0.1 * len(places))) >= 4
 
@@ -146,9 +146,10 @@ def test_seen_through() -> None:
 
 
 def test_robots_do_not_mix() -> None:
-    """A scan of one robot of two changes nothing for the other, and a robot that begins again knows its map alone."""
-    sight = Sight(Obstacles(), 2)
-    scanned(sight, Obstacles(shapes=(PILLAR,)), np.zeros(3), 0.0)
-    assert len(sight.discs(0, 0.0)) and not len(sight.discs(1, 0.0))
+    """A scan of one robot changes nothing for another with the same map; one that begins again knows its map alone."""
+    known = Obstacles(shapes=WALLS)
+    sight, other = Sight(known), Sight(known)
+    scanned(sight, Obstacles(shapes=(*WALLS, PILLAR)), np.zeros(3), 0.0)
+    assert len(sight.discs(0.0)) and not len(other.discs(0.0))
     sight.forget()
-    assert not len(sight.discs(0, 0.0))
+    assert not len(sight.discs(0.0))
