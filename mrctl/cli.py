@@ -288,6 +288,9 @@ def _one_line(box: str) -> str:
     if match := re.match(r"invalid choice (.+) for argument '-*([\w.-]+)'. Expected one of (\(.*\))", text):
         choices = sorted(set(ast.literal_eval(match[3])) - {"None"})  # that of an optional flag which nobody gives
         return f"{match[2]}: {match[1]} is none of {', '.join(choices)}"
+    if match := re.match(r"Unrecognized options: (-[^\s,]+)", text):
+        nearest = re.search(r"Perhaps you meant:[\s│|]*(--[\w.-]+)", box)
+        return f"no flag is called {match[1]}" + (f"; did you mean {nearest[1]}?" if nearest else "")
     if not (match := re.match(r"Error parsing (\S+): (.*)", text)):
         return text
     parts = match[1].removeprefix("--").split(".")
@@ -436,6 +439,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         port: int = 8080,
         suite: bool = False,
         quick: bool = False,
+        scheduler: str | None = None,
     ) -> None:
         """Plans a way among obstacles, drives it, and prints how the drive ended.
 
@@ -468,6 +472,8 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
                 Each part prints first how long it takes. The tables are written to --out, by default navigate_suite,
                 where the same command goes on if it was stopped.
             quick: With --suite, drive fewer draws; some confidence intervals then have no upper end.
+            scheduler: With --suite, use the workers of the Dask scheduler at this address, such as
+                tcp://127.0.0.1:8786, instead of this machine's cores.
         """
         chosen = Scenario().replace(**{name: getattr(scenario, name) for name in type(scenario).model_fields})
         if port != 8080 and not view:
@@ -476,13 +482,16 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _fields_set(arguments)
             if taken or world or goal or start or known or compare or speed or avoid != "none" or json or view:
                 raise InputError("suite: has its own worlds, controllers and speeds; give only flags of the robot")
-            from mrctl.experiments import learned_limits, mission_suite, three_mppis
+            from mrctl.experiments import navigation_suite
 
-            for part in (mission_suite.suite, three_mppis.suite, learned_limits.suite):
-                print(part(chosen, "quick" if quick else "core", out or Path("navigate_suite")))
+            mode = "quick" if quick else "core"
+            for tables in navigation_suite.suite(chosen, mode, out or Path("navigate_suite"), scheduler):
+                print(tables)
             return
-        if quick or not world:
-            raise InputError("quick: belongs to --suite" if quick else "world: none given; see mrctl navigate --help")
+        if quick or scheduler:
+            raise InputError(f"{'quick' if quick else 'scheduler'}: belongs to --suite")
+        if not world:
+            raise InputError("world: none given; see mrctl navigate --help")
         if Path(world).is_dir():
             new = sorted({a.partition("=")[0] for a in arguments if a.startswith("--")} - {"--out", "--json"})
             if new and (Path(world) / "mission.json").exists():

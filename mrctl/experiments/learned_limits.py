@@ -14,37 +14,27 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
-from tqdm import tqdm
 
 from mrctl.control.features import INPUTS, feature_scale
-from mrctl.experiments.journal import Journal
-from mrctl.experiments.mission_suite import PATIENCE, ROOMY, SHAPE, TIE, Mode, titled
+from mrctl.experiments.journal import Computation, Journal
+from mrctl.experiments.mission_suite import PATIENCE, ROOMY, SHAPE, TIE, Mode
 from mrctl.experiments.mission_suite import PLANTS as SHARED
-from mrctl.experiments.tables import (
-    Table,
-    centre_cell,
-    machine,
-    output_folder,
-    share_cell,
-    wins_cell,
-    word_of,
-    write_json,
-)
+from mrctl.experiments.tables import Table, centre_cell, share_cell, wins_cell, word_of
 from mrctl.loop.goals import arrived
 from mrctl.loop.learned import kept, save_learned
-from mrctl.loop.simulation import arranged, cores, simulate
+from mrctl.loop.simulation import arranged, simulate
 from mrctl.navigation.generators import corridor
 from mrctl.navigation.mission import SLIM, planned
 from mrctl.navigation.planning import Plan
 from mrctl.navigation.vehicle import robot_of
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority
-from mrctl.results.dataset import scenarios_of, versions
+from mrctl.results.dataset import scenarios_of
 from mrctl.scenario import FEEDFORWARDS, Scenario, replicates
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.obstacles import Pose
@@ -79,41 +69,22 @@ class Run(NamedTuple):
     """Largest distance from the reference in m; infinite where it did not arrive."""
 
 
-def suite(base: Scenario, mode: Mode, out: Path) -> str:
-    """Drives all draws; writes `limits.md` and `limits.json`.
+Found = dict[str, dict[str, list[Run]]]
+"""Runs by plant and limits."""
+
+
+def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
+    """Drives all draws on all plants; says first how long that takes.
 
     Args:
         base: Robot, steering, sensing and all else that is the same for all.
         mode: Which suite.
-        out: Folder.
-
-    Returns:
-        The table in Markdown.
-
-    Raises:
-        InputError: The folder cannot be written, or the robot does not fit most corridors.
-    """
-    source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
-    with output_folder(out):
-        runs = drive(base, DRAWS[mode], Journal(out / "limits.jsonl", source))
-    text = table(runs, titled(base, mode)).markdown
-    (out / "limits.md").write_text(text)
-    rows = {plant: {name: [run._asdict() for run in own] for name, own in of.items()} for plant, of in runs.items()}
-    write_json(out / "limits.json", source | {"machine": machine(), "limits": rows})
-    return text
-
-
-def drive(base: Scenario, count: int, journal: Journal) -> dict[str, dict[str, list[Run]]]:
-    """Drives so many draws on all plants; says first how long that takes.
-
-    Args:
-        base: Robot, steering, sensing and all else that is the same for all.
-        count: Number of draws.
         journal: What was driven already, by plant, which is kept there.
 
-    Returns:
-        The runs by plant and limits.
+    Raises:
+        InputError: The robot does not fit most corridors.
     """
+    count = DRAWS[mode]
     corners, robot = robot_of(base)
     width, speed, draws = ROOMY * float(np.ptp(corners[:, 1])), RESERVE * robot.max_speed, []
     for seed in range(MOST * count):
@@ -125,17 +96,21 @@ def drive(base: Scenario, count: int, journal: Journal) -> dict[str, dict[str, l
     else:
         raise InputError(f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m")
     left = sum(plant not in journal for plant in PLANTS) * (1 + len(LIMITS))
-    minutes = max(1, round(left * sum(one.reference.period for one in draws) / PACE / cores() / 60))
-    print(f"{left * count} runs with nominal and with learned limits, about {minutes} min", flush=True)
+    minutes = max(1, round(left * sum(one.reference.period for one in draws) / PACE / journal.cores / 60))
+    runs = f"{left * count} runs with nominal and with learned limits"
+    print(f"{runs}, about {minutes} min on {journal.cores} cores", flush=True)
     own = base.replace(**FEEDFORWARDS["model+composite"], laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
-    found = {}
-    for plant, perturbation in tqdm(PLANTS.items(), unit="plant"):
-        driven = journal.once(plant, partial(_fed, own.replace(perturbation=perturbation), draws, robot, speed))
-        found[plant] = {name: [Run(*run) for run in runs] for name, runs in driven.items()}
-    return found
+    parts = [
+        Computation(plant, partial(_fed, own.replace(perturbation=perturbation), draws, robot, speed))
+        for plant, perturbation in PLANTS.items()
+    ]
+    return {
+        plant: {name: [Run(*run) for run in driven] for name, driven in found.items()}
+        for plant, found in zip(PLANTS, journal.results(parts), strict=True)
+    }
 
 
-def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float) -> dict[str, list[Run]]:
+def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float, threads: int) -> dict[str, list[Run]]:
     """Drives all draws, then plans with what was learned and drives both plans of each; returns the runs by limits.
 
     Args:
@@ -143,8 +118,9 @@ def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float)
         draws: The draws.
         robot: The nominal robot.
         speed: Largest speed of the plans in m/s.
+        threads: Number of threads.
     """
-    first = simulate([_replicate(perturbed, one, one.reference) for one in draws])
+    first = simulate([_replicate(perturbed, one, one.reference) for one in draws], threads=threads)
     with TemporaryDirectory() as folder:
         files, references = [], []
         for k, one in enumerate(draws):
@@ -156,7 +132,7 @@ def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float)
             files.append(path if learns else None)
             references.append(one.plan.reference(speed, limits))
         ways = {"nominal": [one.reference for one in draws], "learned": references}
-        return {name: _driven(perturbed, draws, way, files) for name, way in ways.items()}
+        return {name: _driven(perturbed, draws, way, files, threads) for name, way in ways.items()}
 
 
 def limits_of(run: xr.Dataset, robot: Robot) -> Limits:
@@ -184,11 +160,15 @@ def _replicate(scenario: Scenario, one: Draw, reference: Waypoints, learned: str
 
 
 def _driven(
-    perturbed: Scenario, draws: Sequence[Draw], references: Sequence[Waypoints], files: Sequence[str | None]
+    perturbed: Scenario,
+    draws: Sequence[Draw],
+    references: Sequence[Waypoints],
+    files: Sequence[str | None],
+    threads: int,
 ) -> list[Run]:
     """Drives plans with what was learned."""
     cases = zip(draws, references, files, strict=True)
-    result, found = simulate([_replicate(perturbed, *case) for case in cases]), []
+    result, found = simulate([_replicate(perturbed, *case) for case in cases], threads=threads), []
     for k, (one, reference) in enumerate(zip(draws, references, strict=True)):
         run = result.isel(run=k).dropna("time", subset=["x"])
         end = run.isel(time=-1)
@@ -199,7 +179,13 @@ def _driven(
     return found
 
 
-def table(runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
+def values(runs: Found) -> dict[str, Any]:
+    """Returns what was found for JSON."""
+    rows = {plant: {name: [run._asdict() for run in own] for name, own in of.items()} for plant, of in runs.items()}
+    return {"limits": rows}
+
+
+def tables(runs: Found, shown: str) -> list[Table]:
     """Returns the table of the tracking of the plans on each plant, with a sentence that sums it up."""
     rows, verdicts = [], []
     for plant, of in runs.items():
@@ -217,4 +203,5 @@ def table(runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
         "are of the robots that arrive."
     )
     header = ["plant", "limits of the plan", "arrived", "time of the plan, s", "largest error, mm"]
-    return Table(f"Feeding up ({shown})", says, pd.DataFrame(rows, columns=header))  # pyright: ignore[reportArgumentType]
+    frame = pd.DataFrame(rows, columns=header)  # pyright: ignore[reportArgumentType]
+    return [Table(f"Feeding up ({shown})", says, frame)]

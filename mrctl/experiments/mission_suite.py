@@ -16,27 +16,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from itertools import islice
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
-from tqdm import tqdm
 
 from mrctl.experiments.cases import HARD
-from mrctl.experiments.journal import Journal
+from mrctl.experiments.journal import Computation, Journal
 from mrctl.experiments.suite_tables import TITLES
-from mrctl.experiments.tables import Table, machine, number, output_folder, share_cell, wins_cell, write_json
+from mrctl.experiments.tables import Table, number, share_cell, wins_cell
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
-from mrctl.loop.simulation import cores, simulate
+from mrctl.loop.simulation import simulate
 from mrctl.navigation.generators import corridor, corridor_width
 from mrctl.navigation.mission import PATIENCE, planned
 from mrctl.navigation.vehicle import robot_of
 from mrctl.record import InputError
 from mrctl.results.comparison import quantile_interval, superiority
-from mrctl.results.dataset import versions
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.theory.obstacles import Pose
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -94,46 +91,18 @@ class Found(NamedTuple):
     """Number of corridors that were left out, for no plan goes through them."""
 
 
-def suite(base: Scenario, mode: Mode, out: Path) -> str:
-    """Drives all draws; writes `table.md` and `table.json`.
+def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
+    """Drives all draws at all speeds with all controllers on all plants; says first how long that takes.
 
     Args:
         base: Robot, steering, sensing and all else that is the same for all.
         mode: Which suite.
-        out: Folder.
-
-    Returns:
-        The tables in Markdown.
+        journal: What was driven already, by controller and speed, which is kept there.
 
     Raises:
-        InputError: The folder cannot be written, or the robot does not fit most corridors.
+        InputError: The robot does not fit most corridors.
     """
-    source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
-    with output_folder(out):
-        found = drive(base, DRAWS[mode], Journal(out / "table.jsonl", source))
-    shown = titled(base, mode)
-    tables = [critical_widths(found, shown), critical_speeds(found, shown), budget(found, shown)]
-    text = "\n".join(table.markdown for table in tables)
-    (out / "table.md").write_text(text)
-    values = {name: np.asarray(part).tolist() for name, part in found._asdict().items()}
-    source |= {"machine": machine(), "controllers": CONTROLLERS, "plants": list(PLANTS)}
-    write_json(out / "table.json", source | values)
-    return text
-
-
-def titled(base: Scenario, mode: Mode) -> str:
-    """Returns what the titles of the tables say of robot, sensing tier and mode."""
-    return f"{base.robot.path}, {base.sensing.tier}, {mode}"
-
-
-def drive(base: Scenario, count: int, journal: Journal) -> Found:
-    """Drives so many draws at all speeds with all controllers on all plants; says first how long that takes.
-
-    Args:
-        base: Robot, steering, sensing and all else that is the same for all.
-        count: Number of draws.
-        journal: What was driven already, by controller and speed, which is kept there.
-    """
+    count = DRAWS[mode]
     corners, robot = robot_of(base)
     width = ROOMY * float(np.ptp(corners[:, 1]))
     speeds = [share * robot.max_speed for share in SPEEDS]
@@ -145,17 +114,19 @@ def drive(base: Scenario, count: int, journal: Journal) -> Found:
     times = [sum(one.references[k].period for one in draws) for k in (*range(len(SPEEDS)), -1)]
     cases = [(c, k) for c in range(len(CONTROLLERS)) for k in range(len(shares))]
     left = [(c, k) for c, k in cases if [CONTROLLERS[c], shares[k]] not in journal]
-    minutes = sum(times[k] for _, k in left) * len(PLANTS) / PACE / cores() / 60
+    minutes = sum(times[k] for _, k in left) * len(PLANTS) / PACE / journal.cores / 60
     runs = count * len(PLANTS) * len(left)
-    print(f"{runs:,} runs, about {max(1, round(minutes))} min on {cores()} cores", flush=True)
+    print(f"{runs:,} runs, about {max(1, round(minutes))} min on {journal.cores} cores", flush=True)
     needed, known, on_reference, off = np.empty((len(SPEEDS), *size)), *(np.empty(size) for _ in range(3))
-    for c, k in tqdm(cases, unit="batch"):
-        own = base.replace(**FEEDFORWARDS[CONTROLLERS[c]])
+    tasks = []
+    for c, k in cases:
+        own, speed = base.replace(**FEEDFORWARDS[CONTROLLERS[c]]), k
         if k == len(SPEEDS):
-            own, k = own.replace(sensing=own.sensing.replace(estimator="truth")), -1
-        driven = partial(_driven, own, draws, k, corners)
-        widths = np.array(journal.once([CONTROLLERS[c], shares[k]], driven), float)
-        if k < 0:
+            own, speed = own.replace(sensing=own.sensing.replace(estimator="truth")), -1
+        tasks.append(Computation([CONTROLLERS[c], shares[k]], partial(_driven, own, draws, speed, corners)))
+    for (c, k), driven in zip(cases, journal.results(tasks), strict=True):
+        widths = np.array(driven, float)
+        if k == len(SPEEDS):
             known[c] = widths[0]
         else:
             needed[k, c], on_reference[c], off[c] = widths
@@ -190,12 +161,12 @@ def draw(base: Scenario, seed: int, width: float, speeds: Sequence[float]) -> Dr
     return None
 
 
-def _driven(own: Scenario, draws: Sequence[Draw], speed: int, corners: Array) -> list[Any]:
+def _driven(own: Scenario, draws: Sequence[Draw], speed: int, corners: Array, threads: int) -> list[Any]:
     """Drives all draws on all plants at one speed; returns the widths that they need in m, as `_widths` does."""
-    return _widths(_simulated(own, draws, speed), draws, corners).tolist()
+    return _widths(_simulated(own, draws, speed, threads), draws, corners).tolist()
 
 
-def _simulated(own: Scenario, draws: Sequence[Draw], speed: int) -> xr.Dataset:
+def _simulated(own: Scenario, draws: Sequence[Draw], speed: int, threads: int) -> xr.Dataset:
     """Drives all draws on all plants at one speed; run p · D + d is draw d of D on plant p."""
     own = own.replace(laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
     scenarios = [
@@ -203,7 +174,7 @@ def _simulated(own: Scenario, draws: Sequence[Draw], speed: int) -> xr.Dataset:
         for plant in PLANTS.values()
         for one in draws
     ]
-    return simulate([replicates(s, 1, draws[k % len(draws)].seed)[0] for k, s in enumerate(scenarios)])
+    return simulate([replicates(s, 1, draws[k % len(draws)].seed)[0] for k, s in enumerate(scenarios)], threads=threads)
 
 
 def _widths(result: xr.Dataset, draws: Sequence[Draw], corners: Array) -> Array:
@@ -227,6 +198,17 @@ def _widths(result: xr.Dataset, draws: Sequence[Draw], corners: Array) -> Array:
                 for poses, off in ((own, 0.0), (on_reference, 0.0), (own, aside))
             ]
     return found.reshape(3, len(PLANTS), -1)
+
+
+def tables(found: Found, shown: str) -> list[Table]:
+    """Returns the tables; their titles say what is `shown`."""
+    return [critical_widths(found, shown), critical_speeds(found, shown), budget(found, shown)]
+
+
+def values(found: Found) -> dict[str, Any]:
+    """Returns what was found for JSON."""
+    found_values = {name: np.asarray(part).tolist() for name, part in found._asdict().items()}
+    return {"controllers": CONTROLLERS, "plants": list(PLANTS)} | found_values
 
 
 def critical_widths(found: Found, shown: str) -> Table:

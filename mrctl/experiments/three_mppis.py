@@ -13,35 +13,23 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import islice
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 from scipy.optimize import fminbound
-from tqdm import tqdm
 
-from mrctl.experiments.journal import Journal
-from mrctl.experiments.mission_suite import PLANTS, Mode, titled
-from mrctl.experiments.tables import (
-    Table,
-    centre_cell,
-    machine,
-    output_folder,
-    share_cell,
-    wins_cell,
-    word_of,
-    write_json,
-)
-from mrctl.loop.simulation import cores, simulate
+from mrctl.experiments.journal import Computation, Journal
+from mrctl.experiments.mission_suite import PLANTS, Mode
+from mrctl.experiments.tables import Table, centre_cell, share_cell, wins_cell, word_of
+from mrctl.loop.simulation import simulate
 from mrctl.navigation.generators import Task, slalom
 from mrctl.navigation.mission import PERIOD, avoiding, outcomes, prepared
 from mrctl.navigation.planning import Plan
 from mrctl.navigation.vehicle import robot_of
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority
-from mrctl.results.dataset import versions
 from mrctl.results.metrics import control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.theory.obstacles import Disc, Obstacles
@@ -93,69 +81,53 @@ class Run(NamedTuple):
     """Smallest clearance in m."""
 
 
-def suite(base: Scenario, mode: Mode, out: Path) -> str:
-    """Drives all worlds; writes `mppi.md` and `mppi.json`.
+class Found(NamedTuple):
+    """What was found."""
+
+    lag: float
+    """Lag of the roll-outs in s."""
+    runs: dict[str, dict[str, list[Run]]]
+    """Runs by entry and plant, in the order of the worlds."""
+
+
+def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
+    """Drives all worlds with all three on all plants; says first how long that takes.
 
     Args:
         base: Robot, steering, sensing and all else that is the same for all.
         mode: Which suite.
-        out: Folder.
-
-    Returns:
-        The table in Markdown.
-
-    Raises:
-        InputError: The folder cannot be written, or the robot finds no way through most worlds.
-    """
-    source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
-    with output_folder(out):
-        lag, runs = drive(base, WORLDS[mode], Journal(out / "mppi.jsonl", source))
-    text = table(lag, runs, titled(base, mode)).markdown
-    (out / "mppi.md").write_text(text)
-    rows = {entry: {plant: [run._asdict() for run in own] for plant, own in of.items()} for entry, of in runs.items()}
-    write_json(out / "mppi.json", source | {"machine": machine(), "lag": lag, "runs": rows})
-    return text
-
-
-def drive(base: Scenario, count: int, journal: Journal) -> tuple[float, dict[str, dict[str, list[Run]]]]:
-    """Drives so many worlds with all three on all plants; says first how long that takes.
-
-    Args:
-        base: Robot, steering, sensing and all else that is the same for all.
-        count: Number of worlds.
         journal: What was driven already, by entry and plant, which is kept there.
 
-    Returns:
-        The lag in s, and the runs by entry and plant, in the order of the worlds.
+    Raises:
+        InputError: The robot finds no way through most worlds.
     """
+    count = WORLDS[mode]
     worlds = list(islice(filter(None, (world(base, seed) for seed in range(MOST * count))), count))
     if len(worlds) < count:
         raise InputError(f"suite: {base.robot.path} finds no way through most slaloms")
     left = sum([name, plant] not in journal for name in ENTRIES for plant in PLANTS)
     seconds = left * sum(one.scenario.reference.period for one in worlds)
-    minutes = max(1, round(seconds / PACE / cores() / 60))
-    print(f"{left * count} runs with MPPI, about {minutes} min on {cores()} cores", flush=True)
-    lag, found = 0.0, {name: {} for name in ENTRIES}
-    with tqdm(total=len(ENTRIES) * len(PLANTS) * count, unit="run") as bar:
-        for name, (feedforward, lagging) in ENTRIES.items():
-            for plant, perturbation in PLANTS.items():
-                case = {**FEEDFORWARDS[feedforward], "perturbation": perturbation}
-                driven = journal.once([name, plant], partial(_driven, worlds, case, lag * lagging, bar))
-                found[name][plant] = [Run(*run) for run in driven["runs"]]
-                if (name, plant) == (FIRST, "nominal"):
-                    lag = driven["lag"]
-                bar.update(sum(map(len, (own for of in found.values() for own in of.values()))) - bar.n)
-    return lag, found
+    minutes = max(1, round(seconds / PACE / journal.cores / 60))
+    print(f"{left * count} runs with MPPI, about {minutes} min on {journal.cores} cores", flush=True)
+    lag, found = 0.0, {}
+    for name, (feedforward, lagging) in ENTRIES.items():
+        changes = [{**FEEDFORWARDS[feedforward], "perturbation": perturbation} for perturbation in PLANTS.values()]
+        parts = [partial(_driven, worlds, one, lag * lagging) for one in changes]
+        driven = journal.results([Computation([name, plant], part) for plant, part in zip(PLANTS, parts, strict=True)])
+        found[name] = {p: [Run(*run) for run in own["runs"]] for p, own in zip(PLANTS, driven, strict=True)}
+        if name == FIRST:
+            lag = driven[list(PLANTS).index("nominal")]["lag"]
+    return Found(lag, found)
 
 
-def _driven(worlds: Sequence[World], changes: dict[str, Any], lag: float, bar: tqdm) -> dict[str, Any]:
+def _driven(worlds: Sequence[World], changes: dict[str, Any], lag: float, threads: int) -> dict[str, Any]:
     """Drives all worlds.
 
     Args:
         worlds: The worlds.
         changes: What replaces the velocity controller and the robot of their scenarios.
         lag: Lag of the roll-outs in s.
-        bar: Progress bar.
+        threads: Number of threads.
 
     Returns:
         `runs`, and the `lag` in s that fits them, `fitted`.
@@ -163,11 +135,9 @@ def _driven(worlds: Sequence[World], changes: dict[str, Any], lag: float, bar: t
 
     def driven(one: World) -> xr.Dataset:
         (scenario,) = replicates(one.scenario.replace(**changes), 1, one.seed)
-        result = simulate([scenario], threads=1, motion=avoiding("mppi", lag))
-        bar.update()
-        return result
+        return simulate([scenario], threads=1, motion=avoiding("mppi", lag))
 
-    with ThreadPoolExecutor(cores()) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         results = list(pool.map(driven, worlds))
     return {"runs": [ended(*case) for case in zip(results, worlds, strict=True)], "lag": fitted(results)}
 
@@ -223,9 +193,17 @@ def ended(result: xr.Dataset, one: World) -> Run:
     return Run(row["outcome"], row["time"] - plan.period if there else np.inf, row["clearance"])
 
 
-def table(lag: float, runs: dict[str, dict[str, list[Run]]], shown: str) -> Table:
-    """Returns the table of the results of the three MPPIs on each plant, with a sentence that sums it up."""
-    rows, verdicts = [], {SECOND: [], FIRST: []}
+def values(found: Found) -> dict[str, Any]:
+    """Returns what was found for JSON."""
+    rows = {
+        entry: {plant: [run._asdict() for run in own] for plant, own in of.items()} for entry, of in found.runs.items()
+    }
+    return {"lag": found.lag, "runs": rows}
+
+
+def tables(found: Found, shown: str) -> list[Table]:
+    """Returns the table of the three MPPIs on each plant, with a sentence that sums it up; its title says the rest."""
+    (lag, runs), rows, verdicts = found, [], {SECOND: [], FIRST: []}
     for plant in PLANTS:
         late = {name: np.array([run.lateness for run in of[plant]]) for name, of in runs.items()}
         for name, of in runs.items():
@@ -251,4 +229,5 @@ def table(lag: float, runs: dict[str, dict[str, list[Run]]], shown: str) -> Tabl
         f"second: {', '.join(verdicts[SECOND])}; against the first: {', '.join(verdicts[FIRST])}. The words follow "
         "from the share of the pairs, and the averages are over those in which both arrive."
     )
-    return Table(f"Three MPPIs ({shown})", says, pd.DataFrame(rows, columns=header))  # pyright: ignore[reportArgumentType]
+    frame = pd.DataFrame(rows, columns=header)  # pyright: ignore[reportArgumentType]
+    return [Table(f"Three MPPIs ({shown})", says, frame)]

@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import sys
-from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -31,7 +29,7 @@ from mrctl.results import metrics
 from mrctl.results.dataset import FAULTS, SIGNALS, versions
 from mrctl.scenario import Scenario
 from mrctl.sweep.plan import TRIED, Sweep
-from mrctl.sweep.pool import Cluster, Outcome, Pool, Processes, Work
+from mrctl.sweep.pool import Cluster, Outcome, Pool, Processes, Work, carry_out, check_address
 from mrctl.sweep.store import Store
 from mrctl.theory.robot import CAR
 
@@ -77,8 +75,8 @@ def run(
     """
     if workers is not None and (scheduler or workers < 1):
         raise InputError("workers: not together with a scheduler" if scheduler else f"workers: {workers} is below 1")
-    if scheduler is not None and not re.fullmatch(r"\w+://.+:\d+", scheduler):
-        raise InputError(f"scheduler: {scheduler!r} is no address such as tcp://127.0.0.1:8786")
+    if scheduler is not None:
+        check_address(scheduler)
     if sweep.controller:  # absolute, so that the user's files are found from every folder
         sweep = sweep.model_copy(update={"controller": user_files.absolute(sweep.controller)})
     work, path = work or compute, Path(out).absolute()
@@ -107,41 +105,25 @@ def run(
 
 
 def _drive(store: Store, pending: Sequence[int], pool: Pool, progress: bool) -> dict[int, str]:
-    """Lets the pool compute jobs; returns why some were set aside, by job.
-
-    A job that kills its worker or raises an error is tried again after the others, alone, before it is set aside.
-    """
-    fresh, again = deque(pending), deque[int]()
-    tries, aside, flying = Counter[int](), dict[int, str](), 0
+    """Lets the pool compute jobs, with a progress bar; returns why some were set aside, by job."""
     kept = store.size - sum(len(store.runs(job)) for job in pending)
     failed = _failed(store.path.glob("parts/[0-9]*.parquet")) if kept and progress else 0
     with tqdm(total=store.size, initial=kept, unit="run", disable=not progress) as bar:
         bar.set_postfix(failed=failed)
+
+        def ended(outcome: Outcome) -> None:
+            nonlocal failed
+            size = len(store.runs(outcome.job))
+            failed += size if outcome.error else outcome.failed
+            bar.set_postfix(failed=failed, refresh=False)
+            bar.update(size)
+
         try:
-            while fresh or again or flying:
-                room = pool.room()
-                while (fresh and flying < room) or (again and not fresh and not flying):
-                    pool.submit((fresh or again).popleft())
-                    flying += 1
-                for outcome in pool.wait():
-                    flying -= 1
-                    tries[outcome.job] += 1
-                    if outcome.fatal:
-                        raise InputError(f"{outcome.error}; what was done is kept")
-                    if outcome.error and tries[outcome.job] < pool.tries:
-                        again.append(outcome.job)
-                        continue
-                    size = len(store.runs(outcome.job))
-                    if outcome.error:
-                        aside[outcome.job] = outcome.error
-                    failed += size if outcome.error else outcome.failed
-                    bar.set_postfix(failed=failed, refresh=False)
-                    bar.update(size)
+            return carry_out(pool, pending, ended)
         except KeyboardInterrupt:
             pool.close()  # otherwise a worker would finish another job while the jobs are counted
             done = sum(len(store.runs(job)) for job in store.done())
             raise KeyboardInterrupt(f"{done} of {store.size} runs are done; the same command goes on") from None
-    return aside
 
 
 def _failed(tables: Iterable[Path]) -> int:

@@ -7,10 +7,12 @@ import gc
 import logging
 import multiprocessing
 import os
+import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
@@ -35,6 +37,8 @@ class Outcome(NamedTuple):
     """Why the job has no result, or ""."""
     fatal: bool = False
     """Whether every other job would end the same way, because the disk is full or the versions differ."""
+    value: Any = None
+    """What the job returns, where it does not write it to a store."""
 
 
 Work = Callable[[str, int], Outcome]
@@ -65,6 +69,40 @@ class Pool(Protocol):
     def close(self) -> None:
         """Stops at once; jobs under way are lost."""
         ...
+
+
+def carry_out(pool: Pool, jobs: Iterable[int], ended: Callable[[Outcome], None]) -> dict[int, str]:
+    """Lets a pool compute jobs; returns why some were set aside, by job.
+
+    A job that kills its worker or raises an error is tried again after the others, alone, before it is set aside.
+
+    Args:
+        pool: The pool.
+        jobs: Numbers of the jobs.
+        ended: Is called with the last outcome of each job as it comes.
+
+    Raises:
+        InputError: An outcome is fatal.
+    """
+    fresh, again = deque(jobs), deque[int]()
+    tries, aside, flying = Counter[int](), dict[int, str](), 0
+    while fresh or again or flying:
+        room = pool.room()
+        while (fresh and flying < room) or (again and not fresh and not flying):
+            pool.submit((fresh or again).popleft())
+            flying += 1
+        for outcome in pool.wait():
+            flying -= 1
+            tries[outcome.job] += 1
+            if outcome.fatal:
+                raise InputError(f"{outcome.error}; what was done is kept")
+            if outcome.error and tries[outcome.job] < pool.tries:
+                again.append(outcome.job)
+                continue
+            if outcome.error:
+                aside[outcome.job] = outcome.error
+            ended(outcome)
+    return aside
 
 
 class Processes:
@@ -174,8 +212,18 @@ def _follow(sentinel: int) -> None:
     os._exit(1)
 
 
+def check_address(scheduler: str) -> None:
+    """Checks that a text could be the address of a Dask scheduler.
+
+    Raises:
+        InputError: It could not.
+    """
+    if not re.fullmatch(r"\w+://.+:\d+", scheduler):
+        raise InputError(f"scheduler: {scheduler!r} is no address such as tcp://127.0.0.1:8786")
+
+
 class Cluster:
-    """A Dask cluster that is running already; every machine must see the store at the same path."""
+    """A Dask cluster that is running already; where jobs use a store, every machine must see it at the same path."""
 
     tries = 2  # in each of which the scheduler lets a job kill four workers
 

@@ -210,6 +210,8 @@ def test_bad_scenario_is_one_line(
         (["run", "--goal", "1"], "goal: expected None or FLOAT FLOAT FLOAT"),
         (["run", "--laps", "1.5"], "laps: '1.5' is not a whole number"),
         (["run", "--map", "hall.yaml"], "map: has no flag; set it in a scenario file"),
+        (["run", "--sensing.teir", "field"], "no flag is called --sensing.teir; did you mean --sensing.tier?"),
+        (["sweep", "x.toml", "--out", "y", "--wxyz", "3"], "no flag is called --wxyz"),
         (["navigate", "--laps", "3"], "laps: has no flag here, because the mission sets it"),
         (["run", "--feedforward", "fel"], "feedforward: this field of an earlier version is gone"),
         (["suite", "--feedforward", "foo"], "feedforward: 'foo' is none of composite, fel, hindsight, model, model+c"),

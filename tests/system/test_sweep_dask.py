@@ -13,7 +13,8 @@ import pytest
 import victim
 from test_sweeps import FILE, children, content, failures, poisoned, refused, until
 
-from mrctl import Sweep, cli
+from mrctl import InputError, Scenario, Sweep, cli
+from mrctl.experiments import journal, learned_limits, navigation_suite
 from mrctl.sweep import jobs
 from mrctl.sweep.store import Store
 
@@ -130,6 +131,25 @@ def test_lost_scheduler(tmp_path_factory, tmp_path):
     assert jobs.run(Sweep.from_toml(file), store, 2).runs == 24 and Store(store).complete
 
 
+def test_suite_of_missions(cluster, tmp_path, monkeypatch):
+    """`mrctl navigate --suite` computes the same on a cluster as here, and refuses workers with other code."""
+    monkeypatch.setattr(learned_limits, "DRAWS", {"quick": 1})
+    monkeypatch.setattr(learned_limits, "PLANTS", {name: learned_limits.PLANTS[name] for name in ("nominal", "all")})
+    monkeypatch.setattr(navigation_suite, "PARTS", navigation_suite.PARTS[-1:])
+    there, here = tmp_path / "there", tmp_path / "here"
+    with monkeypatch.context() as other:
+        other.setattr(journal, "code_digest", lambda but: "another")
+        with pytest.raises(InputError, match="^scheduler: its workers have other"):
+            list(navigation_suite.suite(Scenario(), "quick", tmp_path / "other", cluster[0]))
+    assert list(navigation_suite.suite(Scenario(), "quick", there, cluster[0])) == list(
+        navigation_suite.suite(Scenario(), "quick", here)
+    )
+    for file in ("limits.md", "limits.json"):
+        assert (there / file).read_bytes() == (here / file).read_bytes()
+    kept = [sorted((folder / "limits.jsonl").read_text().splitlines()) for folder in (there, here)]
+    assert len(kept[0]) == 3 and kept[0] == kept[1]
+
+
 def test_no_scheduler(tmp_path, capsys, monkeypatch):
     """One line that names the address."""
     monkeypatch.setattr("mrctl.sweep.pool.PATIENCE", 1.0)
@@ -137,4 +157,6 @@ def test_no_scheduler(tmp_path, capsys, monkeypatch):
     file.write_text(FILE)
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):
         assert address in refused(capsys, "sweep", file, "--out", tmp_path / "store", "--scheduler", address)
+        suite = "navigate", "--suite", "--quick", "--out", tmp_path / "suite"
+        assert address in refused(capsys, *suite, "--scheduler", address) and not (tmp_path / "suite").exists()
     assert cli.main(["sweep", str(file), "--out", str(tmp_path / "store"), "--workers", "1"]) == 0

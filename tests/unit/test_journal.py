@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import mrctl
-from mrctl.experiments.journal import Journal
+from mrctl.experiments.journal import Computation, Journal
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.floats(allow_nan=False) | st.integers() | st.text(),
@@ -25,13 +25,14 @@ def test_kept(results, cut, tmp_path_factory):
         expected[json.dumps(key)] = value
     again = Journal(file, {"seed": 1})
     assert all(again[json.loads(key)] == value for key, value in expected.items())
-    assert all(again.once(key, pytest.fail) == again[key] for key, _ in results)
+    assert again.results([Computation(key, pytest.fail) for key, _ in results]) == [again[key] for key, _ in results]
     whole = file.read_bytes()
     journal["last"] = "x" * 60
     file.write_bytes(file.read_bytes()[:-cut])
     torn = Journal(file, {"seed": 1})
     assert "last" not in torn and file.read_bytes() == whole
-    assert torn.once("last", lambda: 2) == 2 and Journal(file, {"seed": 1})["last"] == 2
+    assert torn.results([Computation("last", lambda threads: [threads])]) == [[torn.cores]]
+    assert Journal(file, {"seed": 1})["last"] == [torn.cores]
 
 
 def test_refused(tmp_path):

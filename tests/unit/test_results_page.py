@@ -222,7 +222,7 @@ def test_sources(source: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
 
     for job in ("paper.reproduce", "suite.suite", "held_out.judge", "tuning.tune", "search.search"):
         monkeypatch.setattr(f"mrctl.experiments.{job}", reached)
-    for job in ("mission_suite.suite", "identify.run", "bench.run"):
+    for job in ("navigation_suite.suite", "identify.run", "bench.run"):
         monkeypatch.setattr(f"mrctl.experiments.{job}", reached)
     for command in results_page.SOURCES.get(source, ()):
         assert cli.main(command.partition(" >")[0].split()) == 2

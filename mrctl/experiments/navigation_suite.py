@@ -1,0 +1,61 @@
+"""`mrctl navigate --suite`: its experiments one after another, on this machine or on a cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mrctl.experiments import learned_limits, mission_suite, three_mppis
+from mrctl.experiments.journal import Journal
+from mrctl.experiments.mission_suite import Mode
+from mrctl.experiments.tables import Table, machine, output_folder, write_json
+from mrctl.results.dataset import versions
+from mrctl.scenario import Scenario
+
+
+class Part(NamedTuple):
+    """One experiment."""
+
+    files: str
+    """Name of its files, without their endings."""
+    drive: Callable[[Scenario, Mode, Journal], Any]
+    """Drives its runs; says first how long that takes."""
+    tables: Callable[[Any, str], list[Table]]
+    """Makes its tables of what was found, with titles that name robot, sensing tier and mode."""
+    values: Callable[[Any], dict[str, Any]]
+    """Makes what stands in its JSON file of what was found."""
+
+
+PARTS = [
+    Part("table", mission_suite.drive, mission_suite.tables, mission_suite.values),
+    Part("mppi", three_mppis.drive, three_mppis.tables, three_mppis.values),
+    Part("limits", learned_limits.drive, learned_limits.tables, learned_limits.values),
+]
+
+
+def suite(base: Scenario, mode: Mode, out: Path, scheduler: str | None = None) -> Iterator[str]:
+    """Drives all parts; writes the tables of each in Markdown and JSON, and goes on where it was stopped.
+
+    Args:
+        base: Robot, steering, sensing and all else that is the same for all.
+        mode: Which suite.
+        out: Folder.
+        scheduler: Address of a Dask scheduler to use; by default all cores of this machine are used.
+
+    Yields:
+        The tables of each part in Markdown, when it has ended.
+
+    Raises:
+        InputError: The folder cannot be written or holds other results, the robot finds no way through most worlds, or
+            no scheduler answers.
+    """
+    source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
+    shown = f"{base.robot.path}, {base.sensing.tier}, {mode}"
+    for part in PARTS:
+        with output_folder(out):
+            found = part.drive(base, mode, Journal(out / f"{part.files}.jsonl", source, scheduler))
+        text = "\n".join(table.markdown for table in part.tables(found, shown))
+        (out / f"{part.files}.md").write_text(text)
+        write_json(out / f"{part.files}.json", source | {"machine": machine()} | part.values(found))
+        yield text
