@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import difflib
 import inspect
 import io
 import json as jsonlib
@@ -235,7 +236,7 @@ def _parse(arguments: list[str]) -> Callable[[], Any]:
     except SystemExit as stop:
         if stop.code:
             _refuse_known(arguments)
-            raise InputError(_one_line(complaints.getvalue())) from None
+            raise InputError(_one_line(complaints.getvalue(), arguments[0])) from None
         if _is_short_help(arguments):
             print(_further_flags(arguments[0]))
         raise
@@ -271,8 +272,8 @@ def _deferred(function: Callable[..., Any]) -> Callable[..., Callable[[], Any]]:
     return inner
 
 
-def _one_line(box: str) -> str:
-    """Returns the message in one of tyro's boxes as one line.
+def _one_line(box: str, command: str) -> str:
+    """Returns the message in one of tyro's boxes, about a command, as one line.
 
     The box is drawn in Unicode or ASCII. The message of a record that is a part of a scenario gets the whole path.
     """
@@ -288,9 +289,14 @@ def _one_line(box: str) -> str:
     if match := re.match(r"invalid choice (.+) for argument '-*([\w.-]+)'. Expected one of (\(.*\))", text):
         choices = sorted(set(ast.literal_eval(match[3])) - {"None"})  # that of an optional flag which nobody gives
         return f"{match[2]}: {match[1]} is none of {', '.join(choices)}"
-    if match := re.match(r"Unrecognized options: (-[^\s,]+)", text):
-        nearest = re.search(r"Perhaps you meant:[\s│|]*(--[\w.-]+)", box)
-        return f"no flag is called {match[1]}" + (f"; did you mean {nearest[1]}?" if nearest else "")
+    if match := re.match(r"Unrecognized options: (-[^\s,=]+)", text):
+        flag, similar = "", []
+        for line in lines:
+            flag = line.split()[0] if line.startswith("--") else flag
+            if line.startswith(f"in mrctl {command} "):
+                similar.append(flag)
+        nearest = difflib.get_close_matches(match[1], similar, 1)
+        return f"no flag is called {match[1]}" + (f"; did you mean {nearest[0]}?" if nearest else "")
     if not (match := re.match(r"Error parsing (\S+): (.*)", text)):
         return text
     parts = match[1].removeprefix("--").split(".")
@@ -488,7 +494,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             for tables in navigation_suite.suite(chosen, mode, out or Path("navigate_suite"), scheduler):
                 print(tables)
             return
-        if quick or scheduler:
+        if quick or scheduler is not None:
             raise InputError(f"{'quick' if quick else 'scheduler'}: belongs to --suite")
         if not world:
             raise InputError("world: none given; see mrctl navigate --help")

@@ -30,8 +30,9 @@ from mrctl.theory.robot import Robot
 class Motion(Protocol):
     """The motion controller: it requests the twist that brings the robot to its reference, once in a motion period.
 
-    It may have a method `assign(scenarios)`, which gets the `mrctl.Scenario` of each robot, with its map and its goal,
-    before all other methods.
+    It may have a method `assign(scenarios)`, which gets the `mrctl.Scenario` of each robot before all other methods, as
+    it is at the start. A scenario also has what a robot cannot know, such as its perturbation; what is on its map is
+    `scenario.known`.
 
     It may have a method `see(row, scan)`, which gets the index of a robot and a `mrctl.theory.rays.Scan` in each tick
     in which the lidar of that robot has scanned, before `output` if that is called in the same tick. The robots have

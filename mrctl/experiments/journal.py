@@ -1,8 +1,10 @@
-"""A file that keeps results as they come, so that a command that was stopped goes on where it was, or on a cluster."""
+"""A file that keeps results as they come, so that a command goes on where it stopped; a cluster may compute them."""
 
 from __future__ import annotations
 
 import json
+import os
+import pickle
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,8 +26,8 @@ class Computation(NamedTuple):
     key: object
     """Key of its result, of numbers, strings and lists."""
     compute: Callable[[int], object]
-    """Returns the result, of numbers, strings, lists and dictionaries, with that many threads. Workers of a cluster get
-    it pickled."""
+    """Returns the result, of numbers, strings, lists and dictionaries; its argument is the number of threads to use.
+    Workers of a cluster get it pickled."""
 
 
 class Journal:
@@ -37,20 +39,30 @@ class Journal:
         cores: Number of cores that compute results.
     """
 
-    def __init__(self, file: Path, head: dict[str, Any], scheduler: str | None = None) -> None:
+    def __init__(
+        self,
+        file: Path,
+        head: dict[str, Any],
+        scheduler: str | None = None,
+        origin: Callable[[], dict[str, str]] = lambda: {},
+    ) -> None:
         """Opens the file or begins it.
 
         Args:
             file: The file; an unfinished last line is dropped.
-            head: Everything that the results depend on, but the Python code of mrctl, whose digest is added.
+            head: Everything that the results depend on, but what `origin` returns and the Python code of mrctl, whose
+                digest is added.
             scheduler: Address of a Dask scheduler whose workers compute results; by default this process does.
+            origin: Returns what must be the same in this process and in the workers of a cluster, which get it pickled,
+                such as digests of files.
 
         Raises:
             InputError: The results in the file depend on something else, it cannot be read or written, or no scheduler
                 answers.
         """
-        self._scheduler, self.cores = scheduler, threads_of(scheduler) if scheduler else cores()
-        self._file, head = file, json.loads(json.dumps(head | {"code": code_digest(SHOWING)}))
+        self._scheduler, self._origin = scheduler, origin
+        self.cores = cores() if scheduler is None else threads_of(scheduler)
+        self._file, head = file, json.loads(json.dumps(head | origin() | {"code": code_digest(SHOWING)}))
         try:
             begun = file.read_text() if file.exists() else ""
             first, *rest = [json.loads(line) for line in begun[: begun.rfind("\n") + 1].splitlines()] or [head]
@@ -83,37 +95,45 @@ class Journal:
             file.write(line + "\n")
         self._known[json.dumps(key)] = json.loads(line)["value"]
 
-    def results(self, tasks: Sequence[Computation]) -> list[Any]:
-        """Returns the results of tasks, of which it computes and keeps those that are missing, with a progress bar.
+    def expected(self, seconds: float, parts: int) -> str:
+        """Says how long computations take: seconds of one core in so many equal parts that can be done at a time."""
+        at_once = self.cores if self._scheduler is None else max(1, min(self.cores, parts))
+        return f"about {max(1, round(seconds / at_once / 60))} min on {at_once} core{'s' * (at_once > 1)}"
+
+    def results(self, parts: Sequence[Computation]) -> list[Any]:
+        """Returns the results of computations; those that are missing are computed and kept, with a progress bar.
 
         Raises:
-            InputError: The workers of the cluster have other code, or a task fails there.
+            InputError: The workers of the cluster have other code, the scheduler is gone, or a computation fails there.
         """
-        missing = [k for k, task in enumerate(tasks) if task.key not in self]
-        with tqdm(total=len(tasks), initial=len(tasks) - len(missing), unit="part") as bar:
-            if self._scheduler and missing:
-                self._on_cluster(tasks, missing, self._scheduler, bar)
+        missing = [k for k, part in enumerate(parts) if part.key not in self]
+        with tqdm(total=len(parts), initial=len(parts) - len(missing), unit="part") as bar:
+            if self._scheduler is not None and missing:
+                self._on_cluster(parts, missing, self._scheduler, bar)
                 missing = []
             for k in missing:
-                self[tasks[k].key] = tasks[k].compute(self.cores)
+                self[parts[k].key] = parts[k].compute(self.cores)
                 bar.update()
-        return [self[task.key] for task in tasks]
+        return [self[part.key] for part in parts]
 
-    def _on_cluster(self, tasks: Sequence[Computation], missing: Sequence[int], scheduler: str, bar: tqdm) -> None:
-        """Computes tasks on a cluster and keeps their results."""
+    def _on_cluster(self, parts: Sequence[Computation], missing: Sequence[int], scheduler: str, bar: tqdm) -> None:
+        """Has a cluster do computations, and keeps their results."""
 
         def ended(outcome: Outcome) -> None:
             if not outcome.error:
-                self[tasks[outcome.job].key] = outcome.value
-            bar.update()
+                self[parts[outcome.job].key] = outcome.value
+                bar.update()
 
-        pool = Cluster(Remote(tasks, versions(), code_digest(SHOWING)), "", scheduler)
+        computed = {k: pickle.dumps(parts[k].compute) for k in missing}
+        here = versions() | self._origin() | {"code": code_digest(SHOWING)}
+        pool = Cluster(Remote(computed, self._origin, here), "", scheduler)
         try:
             aside = carry_out(pool, missing, ended)
         finally:
             pool.close()
-        for k, why in sorted(aside.items()):
-            raise InputError(f"{tasks[k].key}: {why}; what was done is kept")
+        if aside:
+            k, why = min(aside.items())
+            raise InputError(f"scheduler: {json.dumps(parts[k].key)} failed there: {why}; what was done is kept")
 
 
 def threads_of(scheduler: str) -> int:
@@ -123,7 +143,7 @@ def threads_of(scheduler: str) -> int:
         InputError: No scheduler or no worker answers.
     """
     check_address(scheduler)
-    pool = Cluster(Remote((), {}, ""), "", scheduler)
+    pool = Cluster(Remote({}, dict, {}), "", scheduler)
     try:
         return pool.room()
     finally:
@@ -131,16 +151,19 @@ def threads_of(scheduler: str) -> int:
 
 
 class Remote(NamedTuple):
-    """Computes tasks in the workers of a cluster, which have to have the same code."""
+    """What a worker of a cluster does; it has to have the versions, the code and the files of the process that asks."""
 
-    tasks: Sequence[Computation]
-    versions: dict[str, str]
-    """Versions of the packages of the process that asks."""
-    code: str
-    """Digest of its code."""
+    computed: dict[int, bytes]
+    """Pickled `Computation.compute`, by number of the job; unpickled after the check below alone."""
+    origin: Callable[[], dict[str, str]]
+    """As for `Journal`."""
+    there: dict[str, str]
+    """Versions of the packages of the process that asks, what `origin` returned there, and the digest of its code."""
 
     def __call__(self, _: str, job: int) -> Outcome:
-        """Computes a task, with one thread; Dask tries again, or reports, what it raises."""
-        if (versions(), code_digest(SHOWING)) != (self.versions, self.code):
-            return Outcome(job, error="scheduler: its workers have other versions or other code", fatal=True)
-        return Outcome(job, value=self.tasks[job].compute(1))
+        """Does a computation with one thread."""
+        here = versions() | self.origin() | {"code": code_digest(SHOWING)}
+        if other := next((name for name, value in self.there.items() if here.get(name) != value), ""):
+            who = f"worker {os.getpid()} on {os.uname().nodename}"
+            return Outcome(job, error=f"scheduler: {who} has another {other} than this process", fatal=True)
+        return Outcome(job, value=pickle.loads(self.computed[job])(1))  # noqa: S301 (from the process that asks)

@@ -96,9 +96,8 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     else:
         raise InputError(f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m")
     left = sum(plant not in journal for plant in PLANTS) * (1 + len(LIMITS))
-    minutes = max(1, round(left * sum(one.reference.period for one in draws) / PACE / journal.cores / 60))
-    runs = f"{left * count} runs with nominal and with learned limits"
-    print(f"{runs}, about {minutes} min on {journal.cores} cores", flush=True)
+    expected = journal.expected(left * sum(one.reference.period for one in draws) / PACE, left // (1 + len(LIMITS)))
+    print(f"{left * count} runs with nominal and with learned limits, {expected}", flush=True)
     own = base.replace(**FEEDFORWARDS["model+composite"], laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
     parts = [
         Computation(plant, partial(_fed, own.replace(perturbation=perturbation), draws, robot, speed))

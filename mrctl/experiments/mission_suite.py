@@ -114,9 +114,8 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     times = [sum(one.references[k].period for one in draws) for k in (*range(len(SPEEDS)), -1)]
     cases = [(c, k) for c in range(len(CONTROLLERS)) for k in range(len(shares))]
     left = [(c, k) for c, k in cases if [CONTROLLERS[c], shares[k]] not in journal]
-    minutes = sum(times[k] for _, k in left) * len(PLANTS) / PACE / journal.cores / 60
-    runs = count * len(PLANTS) * len(left)
-    print(f"{runs:,} runs, about {max(1, round(minutes))} min on {journal.cores} cores", flush=True)
+    seconds = sum(times[k] for _, k in left) * len(PLANTS) / PACE
+    print(f"{count * len(PLANTS) * len(left):,} runs, {journal.expected(seconds, len(left))}", flush=True)
     needed, known, on_reference, off = np.empty((len(SPEEDS), *size)), *(np.empty(size) for _ in range(3))
     tasks = []
     for c, k in cases:

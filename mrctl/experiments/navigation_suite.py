@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +11,8 @@ from mrctl.experiments import learned_limits, mission_suite, three_mppis
 from mrctl.experiments.journal import Journal
 from mrctl.experiments.mission_suite import Mode
 from mrctl.experiments.tables import Table, machine, output_folder, write_json
+from mrctl.loop.simulation import arranged
+from mrctl.physics import mjcf
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
 
@@ -47,15 +50,23 @@ def suite(base: Scenario, mode: Mode, out: Path, scheduler: str | None = None) -
         The tables of each part in Markdown, when it has ended.
 
     Raises:
-        InputError: The folder cannot be written or holds other results, the robot finds no way through most worlds, or
-            no scheduler answers.
+        InputError: The folder cannot be written or holds other results, the robot finds no way through most worlds, no
+            scheduler answers, its workers have other code or another robot, or a part fails there.
     """
     source = {"versions": versions(), "mode": mode, "scenario": base.model_dump(mode="json")}
     shown = f"{base.robot.path}, {base.sensing.tier}, {mode}"
     for part in PARTS:
         with output_folder(out):
-            found = part.drive(base, mode, Journal(out / f"{part.files}.jsonl", source, scheduler))
+            journal = Journal(out / f"{part.files}.jsonl", source, scheduler, partial(model_of, base))
+            found = part.drive(base, mode, journal)
         text = "\n".join(table.markdown for table in part.tables(found, shown))
         (out / f"{part.files}.md").write_text(text)
-        write_json(out / f"{part.files}.json", source | {"machine": machine()} | part.values(found))
+        where = machine() if scheduler is None else {"processor": "a Dask cluster", "cores": journal.cores}
+        write_json(out / f"{part.files}.json", source | {"machine": where} | part.values(found))
         yield text
+
+
+def model_of(base: Scenario) -> dict[str, str]:
+    """Returns the digest of the compiled model of a robot in its world."""
+    own = arranged(base)
+    return {"robot": mjcf.digest(mjcf.load(own.world, own.steering, robot=own.robot))}

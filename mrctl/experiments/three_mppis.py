@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import islice
+from itertools import islice, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -106,18 +106,19 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     if len(worlds) < count:
         raise InputError(f"suite: {base.robot.path} finds no way through most slaloms")
     left = sum([name, plant] not in journal for name in ENTRIES for plant in PLANTS)
-    seconds = left * sum(one.scenario.reference.period for one in worlds)
-    minutes = max(1, round(seconds / PACE / journal.cores / 60))
-    print(f"{left * count} runs with MPPI, about {minutes} min on {journal.cores} cores", flush=True)
-    lag, found = 0.0, {}
-    for name, (feedforward, lagging) in ENTRIES.items():
-        changes = [{**FEEDFORWARDS[feedforward], "perturbation": perturbation} for perturbation in PLANTS.values()]
-        parts = [partial(_driven, worlds, one, lag * lagging) for one in changes]
-        driven = journal.results([Computation([name, plant], part) for plant, part in zip(PLANTS, parts, strict=True)])
-        found[name] = {p: [Run(*run) for run in own["runs"]] for p, own in zip(PLANTS, driven, strict=True)}
-        if name == FIRST:
-            lag = driven[list(PLANTS).index("nominal")]["lag"]
-    return Found(lag, found)
+    seconds = left * sum(one.scenario.reference.period for one in worlds) / PACE
+    print(f"{left * count} runs with MPPI, {journal.expected(seconds, 2 * len(PLANTS))}", flush=True)
+    lag, driven = 0.0, {}
+    for entries in (FIRST, THIRD), (SECOND,):  # the second needs the lag that fits the first
+        parts = []
+        for name, plant in product(entries, PLANTS):
+            changes = {**FEEDFORWARDS[ENTRIES[name].feedforward], "perturbation": PLANTS[plant]}
+            own = partial(_driven, worlds, changes, lag * ENTRIES[name].lagging)
+            parts.append(Computation([name, plant], own))
+        driven |= dict(zip(product(entries, PLANTS), journal.results(parts), strict=True))
+        lag = driven[FIRST, "nominal"]["lag"]
+    runs = {name: {plant: [Run(*run) for run in driven[name, plant]["runs"]] for plant in PLANTS} for name in ENTRIES}
+    return Found(lag, runs)
 
 
 def _driven(worlds: Sequence[World], changes: dict[str, Any], lag: float, threads: int) -> dict[str, Any]:
@@ -135,7 +136,7 @@ def _driven(worlds: Sequence[World], changes: dict[str, Any], lag: float, thread
 
     def driven(one: World) -> xr.Dataset:
         (scenario,) = replicates(one.scenario.replace(**changes), 1, one.seed)
-        return simulate([scenario], threads=1, motion=avoiding("mppi", lag))
+        return simulate([scenario], threads=1, motion=avoiding("mppi", lag=lag))
 
     with ThreadPoolExecutor(threads) as pool:
         results = list(pool.map(driven, worlds))
@@ -202,7 +203,7 @@ def values(found: Found) -> dict[str, Any]:
 
 
 def tables(found: Found, shown: str) -> list[Table]:
-    """Returns the table of the three MPPIs on each plant, with a sentence that sums it up; its title says the rest."""
+    """Returns the table of the three MPPIs on each plant, with a sentence that sums it up and `shown` in its title."""
     (lag, runs), rows, verdicts = found, [], {SECOND: [], FIRST: []}
     for plant in PLANTS:
         late = {name: np.array([run.lateness for run in of[plant]]) for name, of in runs.items()}

@@ -68,7 +68,7 @@ def simulate(
 
     Raises:
         InputError: There is no scenario, or one asks for something that does not exist or that the robot cannot do, and
-            the message names the field; or the factory of a user's stage fails.
+            the message names the field; or the factory of a user's stage, or its method `assign`, fails.
     """
     single = isinstance(scenarios, Scenario) or not isinstance(scenarios, Iterable)
     listed: list[Any] = [scenarios] if single else list(scenarios)

@@ -163,7 +163,7 @@ class UserHierarchy(Hierarchy):
         self._new: dict[int, Reference] = {}  # references that it has not been told yet, by robot
         super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
         if self._has("assign"):
-            stages["motion"].ask("assign", scenarios)
+            stages["motion"].ask("assign", tuple(scenarios))
         for name in (name for stage in stages for name in REPLACED.get(stage, ())):
             self.gains[name][:] = np.nan
         self.feedforward_faults = [""] * len(scenarios)

@@ -94,7 +94,7 @@ class Avoiding:
 
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Takes the scenarios of the robots, with their maps, and hands them on to the motion stage."""
-        self._sights = [Sight(scenario.known) for scenario in scenarios]
+        self._sights = Sight.each(scenarios)
         if take := getattr(self._motion, "assign", None):
             take(scenarios)
 
@@ -184,7 +184,8 @@ class Pacing:
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Takes the missions of the robots, with their maps and with their plans as references."""
         self._follow, self._scenarios = Following(self._robot, scenarios), scenarios
-        self._sights = [Sight(scenario.known) for scenario in scenarios]
+        self._own = [opened(scenario.reference) for scenario in scenarios]
+        self._sights = Sight.each(scenarios)
         self._footprint = robot_of(scenarios[0])[0]
         self._near, self._away = self._barrier(-RIM), self._barrier(AWAY)
 
@@ -194,13 +195,13 @@ class Pacing:
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
-        plans, size = [opened(scenario.reference) for scenario in self._scenarios], self._size
+        size = self._size
         for sight in self._sights:
             sight.forget()
         self._period, self._tick, self.followed = period, 0, reference
         self._clock, self._pace = np.zeros(size), np.ones(size)  # s in motion periods, and λ
-        self._plans = [self._sampled(plan) for plan in plans]
-        self._kept = [self._margin(plan, row) for row, plan in enumerate(plans)]
+        self._plans = [self._sampled(plan) for plan in self._own]
+        self._kept = [self._margin(plan, row) for row, plan in enumerate(self._own)]
         self._given: list[Waypoints | None] = [None] * size  # plans that came since the start
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
         self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on

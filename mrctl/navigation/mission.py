@@ -235,7 +235,7 @@ def prepared(
     return found, scenario.replace(**own, initial_pose=task.start, goal=task.goal)
 
 
-def avoiding(avoid: Avoid, lag: float = 0.0) -> Callable[[Robot, int], Any] | None:
+def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] | None:
     """Returns the factory of the motion stage of missions, which bears the name in tables; None for that of mrctl.
 
     The scenarios that it drives are those that `prepared` returns for the same `avoid`; their missions may differ.

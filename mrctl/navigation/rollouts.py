@@ -175,7 +175,7 @@ class Reactive(ABC):
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Takes the missions of the robots, with their maps and with their plans as references."""
         self._scenarios, self._own = scenarios, [opened(scenario.reference) for scenario in scenarios]
-        self._sights = [Sight(scenario.known) for scenario in scenarios]
+        self._sights = Sight.each(scenarios)
         self._footprint, self._reverses = robot_of(scenarios[0])[0], reverses(scenarios[0])
         self.bounds = [Bounds.of(self._robot, plan.speed) for plan in self._own]
         self._discs = cover(self._footprint, DISCS)

@@ -16,7 +16,7 @@ scan does not show are remembered as long as something may hide them, those that
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
 from mrctl.navigation.chart import BESIDE, FAR, LEAST, RADIUS, Chart, through
+from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance
 from mrctl.theory.grid import Field, at, map_area, near_field
 from mrctl.theory.obstacles import Obstacles, Outlines, Surroundings
@@ -65,11 +66,22 @@ class Sight:
         standing: Outlines of those finds that stand.
     """
 
-    def __init__(self, known: Obstacles) -> None:
-        """Takes the obstacles on the map."""
-        self._chart = Chart(known)
-        self._field = _from_map(known) if known.shapes else None  # pyright: ignore[reportArgumentType] (it is frozen)
+    def __init__(self, known: Obstacles, field: Field | None = None) -> None:
+        """Takes the obstacles on the map, and the distance field around them, if that is known."""
+        self._chart, self._field = Chart(known), field
+        if field is None and known.shapes:
+            low, high, cell = map_area(known)
+            self._field = near_field(self._chart.known, low, high, cell, FAR + 2 * cell)
         self.forget()
+
+    @classmethod
+    def each(cls, scenarios: Sequence[Scenario]) -> list[Sight]:
+        """Makes the sight of each robot; robots with the same map share its distance field."""
+        found: dict[Obstacles, Sight] = {}
+        for known in (scenario.known for scenario in scenarios):
+            if known not in found:
+                found[known] = cls(known)
+        return [cls(scenario.known, found[scenario.known]._field) for scenario in scenarios]
 
     def forget(self) -> None:
         """Forgets all that scans have shown."""
@@ -179,13 +191,6 @@ class Sight:
         if len(new):
             gone |= np.hypot(*(places[:, None] - new[None, :, :2]).transpose(2, 0, 1)).min(axis=1) < 2 * SPACING
         return old[~gone]
-
-
-@lru_cache(64)
-def _from_map(known: Obstacles) -> Field:
-    """Returns the distance from the obstacles on a map near them, which robots with the same map share."""
-    low, high, cell = map_area(known)
-    return near_field(Surroundings(known).at(0.0), low, high, cell, FAR + 2 * cell)
 
 
 @kernel

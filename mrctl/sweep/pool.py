@@ -289,6 +289,9 @@ class Cluster:
         error = future.exception()
         if error is None:
             return future.result()
+        if "deserializ" in str(error):
+            why = f"scheduler: {self._address}: it or its workers have another version of mrctl"
+            return Outcome(job, error=why, fatal=True)
         if isinstance(error, self._distributed.KilledWorker):
             return Outcome(job, error="its worker died repeatedly")
         return Outcome(job, error=" ".join(f"{type(error).__name__}: {error}".split()))

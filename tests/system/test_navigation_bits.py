@@ -1,6 +1,6 @@
 """A mission is the same alone, in a batch, in a sweep that was killed and resumed, and replayed from its store.
 
-Runs come in pairs that differ in seed and plant: so two at least share a batch.
+Runs come in pairs of missions that may share a batch.
 """
 
 import os
@@ -18,12 +18,14 @@ from test_batch_equals_single import equal
 import mrctl
 from mrctl import Disc, InputError, Line, Obstacles, Scenario, Sweep, simulate
 from mrctl.loop import user_files
+from mrctl.loop.simulation import arranged, uniform
 from mrctl.navigation.mission import prepared, task_of
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
 from mrctl.sweep.pool import Outcome
 from mrctl.sweep.store import Store
 
+ALIKE = 90  # difference of the numbers of missions that have the same kind of world, robot and localisation
 TOGETHER = 6  # runs in a batch
 AVOIDERS = "barrier", "window", "mppi"
 KINDS = "doorway", "slalom", "corridor", "cellular", "warehouse"
@@ -62,7 +64,14 @@ def killing(path: str, job: int) -> Outcome:
 
 
 def pair(number: int, avoid: str) -> list[Scenario]:
-    """Two runs of a mission with obstacles, one of which moves; the world, robot and localisation go by the number."""
+    """Two missions in different worlds of the same kind, which differ in seed and plant, and may share a batch."""
+    plants = {}, {"mass_factor": 1.2, "payload": 1.0}
+    drives = [mission(other, avoid) for other in (number, number + ALIKE)]
+    return [own.replace(seed=2 * number + k, perturbation=plants[k]) for k, own in enumerate(drives)]
+
+
+def mission(number: int, avoid: str) -> Scenario:
+    """A mission with obstacles, one of which moves; the kind of world, robot and localisation go by the number."""
     kind, localised = KINDS[number % 5], LOCALISED[number % 3]
     path = "car" if avoid != "none" else ("car", "turtlebot", "racecar")[number // 15 % 3]
     own = Scenario.from_dict({"robot": {"path": path}, "prior": "model", "learner": ("none", "composite")[number % 2]})
@@ -75,12 +84,9 @@ def pair(number: int, avoid: str) -> list[Scenario]:
             course = Line(heading=1.5, speed=0.3)
             mover = Disc(x=-2.5, y=-x - 1.6, radius=0.1, course=course)  # crosses ahead of the start along +y
             task = task.replace(obstacles=Obstacles(shapes=(*task.obstacles.shapes, mover.replace(x=y - 1.5))))
-            drive = prepared(task, own, avoid=avoid)[1]  # pyright: ignore[reportArgumentType]
-            break
+            return prepared(task, own, avoid=avoid)[1]  # pyright: ignore[reportArgumentType]
         except InputError:
-            number += 15
-    plants = {}, {"mass_factor": 1.2, "payload": 1.0}
-    return [drive.replace(seed=2 * number + k, perturbation=plant) for k, plant in enumerate(plants)]
+            number += 2 * ALIKE
 
 
 @pytest.mark.parametrize(
@@ -99,7 +105,7 @@ def test_same_bits(plain: Sequence[int], avoiders: Sequence[str], avoided: int, 
         (tmp_path / f"{name}.json").write_text(sweep.model_dump_json())
     command = [sys.executable, "-c", KILLED, str(Path(__file__).parent), *(str(tmp_path / name) for name in sweeps)]
     subprocess.run(command, check=True)
-    count, outcomes = 0, []
+    count, shared, outcomes = 0, set(), []
     for name, sweep in sweeps.items():
         store = tmp_path / name
         assert len(Store(store).done()) == Store(store).jobs // 2 > 0
@@ -109,6 +115,8 @@ def test_same_bits(plain: Sequence[int], avoiders: Sequence[str], avoided: int, 
         for first in range(0, sweep.size, TOGETHER):
             some = [sweep.scenario(run) for run in range(first, min(first + TOGETHER, sweep.size))]
             together = simulate(some, **stages)
+            if any(len(rows) > 1 for rows in uniform([arranged(own) for own in some])):
+                shared.add(name)
             for row, own in enumerate(some):
                 alone, stored = simulate(own, **stages), opened.isel(run=first + row)
                 equal(alone, together, row)
@@ -122,3 +130,4 @@ def test_same_bits(plain: Sequence[int], avoiders: Sequence[str], avoided: int, 
                 count += 1
     print(f"{count} runs have the same bits; failures: { {why: outcomes.count(why) for why in set(outcomes)} }")
     assert count == 2 * (len(plain) + len(avoiders) * avoided)
+    assert shared == {"none", *avoiders}  # missions in different worlds did share a batch

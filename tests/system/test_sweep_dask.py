@@ -14,7 +14,7 @@ import victim
 from test_sweeps import FILE, children, content, failures, poisoned, refused, until
 
 from mrctl import InputError, Scenario, Sweep, cli
-from mrctl.experiments import journal, learned_limits, navigation_suite
+from mrctl.experiments import journal, learned_limits, mission_suite, navigation_suite, three_mppis
 from mrctl.sweep import jobs
 from mrctl.sweep.store import Store
 
@@ -132,22 +132,37 @@ def test_lost_scheduler(tmp_path_factory, tmp_path):
 
 
 def test_suite_of_missions(cluster, tmp_path, monkeypatch):
-    """`mrctl navigate --suite` computes the same on a cluster as here, and refuses workers with other code."""
-    monkeypatch.setattr(learned_limits, "DRAWS", {"quick": 1})
+    """`mrctl navigate --suite` computes the same on a cluster as here, but says where it was computed."""
+    for part in (mission_suite, learned_limits):
+        monkeypatch.setattr(part, "DRAWS", {"quick": 1})
+    monkeypatch.setattr(mission_suite, "SPEEDS", (0.3, 0.9))
     monkeypatch.setattr(learned_limits, "PLANTS", {name: learned_limits.PLANTS[name] for name in ("nominal", "all")})
-    monkeypatch.setattr(navigation_suite, "PARTS", navigation_suite.PARTS[-1:])
-    there, here = tmp_path / "there", tmp_path / "here"
-    with monkeypatch.context() as other:
-        other.setattr(journal, "code_digest", lambda but: "another")
-        with pytest.raises(InputError, match="^scheduler: its workers have other"):
-            list(navigation_suite.suite(Scenario(), "quick", tmp_path / "other", cluster[0]))
-    assert list(navigation_suite.suite(Scenario(), "quick", there, cluster[0])) == list(
-        navigation_suite.suite(Scenario(), "quick", here)
+    monkeypatch.setattr(three_mppis, "WORLDS", {"quick": 1})
+    monkeypatch.setattr(three_mppis, "PLANTS", {"nominal": three_mppis.PLANTS["nominal"]})
+    folders = tmp_path / "there", tmp_path / "here"
+    assert list(navigation_suite.suite(Scenario(), "quick", folders[0], cluster[0])) == list(
+        navigation_suite.suite(Scenario(), "quick", folders[1])
     )
-    for file in ("limits.md", "limits.json"):
-        assert (there / file).read_bytes() == (here / file).read_bytes()
-    kept = [sorted((folder / "limits.jsonl").read_text().splitlines()) for folder in (there, here)]
-    assert len(kept[0]) == 3 and kept[0] == kept[1]
+    for part in ("table", "mppi", "limits"):
+        kept = [sorted((folder / f"{part}.jsonl").read_text().splitlines()) for folder in folders]
+        assert len(kept[0]) > 2 and kept[0] == kept[1]
+        there, here = (json.loads((folder / f"{part}.json").read_text()) for folder in folders)
+        assert there.pop("machine")["processor"] == "a Dask cluster" != here.pop("machine")["processor"]
+        assert there == here
+
+
+@pytest.mark.parametrize("what", ["code", "robot"])
+def test_other_workers(what, cluster, tmp_path, monkeypatch):
+    """Workers with other code, or with another robot in the same file, are refused, and nothing is kept of them."""
+    monkeypatch.setattr(learned_limits, "DRAWS", {"quick": 1})
+    monkeypatch.setattr(navigation_suite, "PARTS", navigation_suite.PARTS[-1:])
+    if what == "code":
+        monkeypatch.setattr(journal, "code_digest", lambda but: "another")
+    else:
+        monkeypatch.setattr(navigation_suite.mjcf, "digest", lambda model: "another")
+    with pytest.raises(InputError, match=f"^scheduler: worker .* has another {what} than this process"):
+        list(navigation_suite.suite(Scenario(), "quick", tmp_path / "out", cluster[0]))
+    assert len((tmp_path / "out" / "limits.jsonl").read_text().splitlines()) == 1
 
 
 def test_no_scheduler(tmp_path, capsys, monkeypatch):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from mrctl import Box, Disc, Line, Obstacles
+from mrctl import Box, Disc, Line, Obstacles, Scenario
 from mrctl.navigation.chart import RADIUS, through
 from mrctl.navigation.sight import SPACING, Sight
 from mrctl.sensing.lidar import Lidar
@@ -147,8 +147,7 @@ def test_seen_through() -> None:
 
 def test_robots_do_not_mix() -> None:
     """A scan of one robot changes nothing for another with the same map; one that begins again knows its map alone."""
-    known = Obstacles(shapes=WALLS)
-    sight, other = Sight(known), Sight(known)
+    sight, other = Sight.each([Scenario(obstacles=Obstacles(shapes=WALLS))] * 2)
     scanned(sight, Obstacles(shapes=(*WALLS, PILLAR)), np.zeros(3), 0.0)
     assert len(sight.discs(0.0)) and not len(other.discs(0.0))
     sight.forget()
