@@ -43,6 +43,7 @@ FINE = 5  # samples of the plan in a motion period
 OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen, like the next two
 WAITED = 1.0, 0.05  # s and m: so does one that within this time gets no farther than this
 RETRY = 1.0  # s, least time between two plans
+STAYS = 1.0  # s at the end of its plan, after which a robot stays there; its run may end before
 # How a robot goes back from where there is no way forward; chosen, as all that follows.
 BACK = 0.4, 0.4  # m, length of a piece of the way back, after which it looks for another plan; m/s, its speed there
 PIECES = 5  # largest number of pieces
@@ -201,6 +202,7 @@ class Reactive(ABC):
         self._given: list[Waypoints | None] = [None] * self._size  # plans that came since the start
         self._anchor, self._since = pose[:, :2].copy(), np.zeros(self._size)
         self._tried = np.full(self._size, -np.inf)  # when they last looked for another plan
+        self._arrived = np.full(self._size, np.inf)  # when they arrived at the ends of their plans
         self._waited = np.zeros(self._size, bool)  # which have made another plan where they are
         self._approached = np.zeros(self._size, bool)  # which have gone back from a goal at which they did not arrive
         self._pieces = np.zeros(self._size, int)  # of the way back from `_anchor`, for robots that go back
@@ -248,6 +250,10 @@ class Reactive(ABC):
             table, first = self._tables[row], self._place[row]
             away = np.hypot(*(table[first : first + AHEAD, :2] - pose[row, :2]).T)
             self._place[row] = first + int(away.argmin())
+            if self._stands(row, pose[row], float(twist[row, 0])):
+                self.last[row] = 0.0
+                self.considered[row] = None
+                continue
             if self._goes_back(row, pose[row], float(away.min())):
                 self.considered[row] = None
                 continue
@@ -258,13 +264,30 @@ class Reactive(ABC):
         self._tick += 1
         return self.last.copy()
 
+    def _at_end(self, row: int, pose: Array, speed: float = 0.0) -> bool:
+        """Tells whether a robot is at the end of its plan, at a speed in m/s at which it has arrived."""
+        x, y, c, s = self._tables[row][-1]
+        return bool(arrived(pose, speed, np.array([x, y, np.arctan2(s, c)])))
+
+    def _stands(self, row: int, pose: Array, speed: float) -> bool:
+        """Tells whether a robot has arrived at the end of its plan a while ago, and stays until something moves it.
+
+        Roll-outs never go back, so that their mean would let it creep on and come round again.
+        """
+        now = self._period * self._tick
+        if not self._at_end(row, pose):
+            self._arrived[row] = np.inf
+        elif self._at_end(row, pose, speed):
+            self._arrived[row] = min(self._arrived[row], now)
+        return now - self._arrived[row] > STAYS
+
     def _lost(self, row: int, pose: Array, away: float) -> bool:
         """Tells whether a robot needs another plan: it is `away` m off its own, or has hardly moved for a while.
 
-        One that has arrived at the end of its plan needs none.
+        One that is at the end of its plan needs none.
         """
-        now, (x, y, c, s) = self._period * self._tick, self._tables[row][-1]
-        if arrived(pose, 0.0, np.array([x, y, np.arctan2(s, c)])):
+        now = self._period * self._tick
+        if self._at_end(row, pose):
             self._since[row] = now
         if np.hypot(*(pose[:2] - self._anchor[row])) > WAITED[1]:
             self._anchor[row], self._since[row], self._waited[row] = pose[:2], now, False

@@ -177,15 +177,17 @@ def test_dead_end(robot: str, avoid: Avoid) -> None:
     assert (found["outcome"], back > 0.3) == (("arrived", True) if robot == "turtlebot" else ("stuck", False))
 
 
-def test_waits() -> None:
+@pytest.mark.parametrize("avoid", ["window", "mppi"])
+def test_waits(avoid: Avoid) -> None:
     """A robot at the end of its plan whose run goes on, as in the viewer, waits there, after a second try at most."""
     task = Task(obstacles=Obstacles(shapes=(Box(x=1.0, y=3.0),)), start=(0, 0, 0), goal=(1.5, 0, 0))
     turtlebot = Scenario.from_dict({"prior": "model", "learner": "none", "robot": {"path": "turtlebot"}})
-    own = prepared(task, turtlebot, avoid="window")[1].replace(laps=8)
-    run = simulate([own.replace(goal=None)], motion=avoiding("window")).isel(run=0)
+    own = prepared(task, turtlebot, avoid=avoid)[1].replace(laps=8)
+    run = simulate([own.replace(goal=None)], motion=avoiding(avoid)).isel(run=0)
     after = run.isel(time=run["time"] > 0.7 * own.ticks * own.control_period)
     assert len(after["time"]) > 200
     assert float(np.hypot(after["x"] - 1.5, after["y"]).max()) < 0.12 and float(np.abs(after["v"]).max()) < 0.05
+    assert float(np.hypot(np.ptp(after["x"].values), np.ptp(after["y"].values))) < 0.005  # it does not creep
 
 
 @pytest.mark.parametrize("avoid", ["window", "mppi"])
