@@ -311,11 +311,8 @@ class Pacing:
 
     def _planned(self, row: int, pose: Array) -> Waypoints | None:
         """Makes a plan from where a robot is, around what it knows."""
-
-        def replan(pose: Array, outlines: Outlines) -> Waypoints | None:
-            return self._replan(self._scenarios[row], pose, outlines, self._given[row])
-
-        return plan_around(replan, self._sights[row], self._period * self._tick, self._footprint, pose)
+        own, now = (self._scenarios[row], self._sights[row]), self._period * self._tick
+        return plan_around(self._replan, *own, now, self._footprint, pose, self._given[row])
 
 
 def share(request: Array, pose: Array, outlines: Outlines, barrier: Barrier) -> float:

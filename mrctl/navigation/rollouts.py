@@ -137,18 +137,27 @@ def opened(reference: Reference) -> Waypoints:
 
 
 def plan_around(
-    replan: Callable[[Array, Outlines], Waypoints | None], sight: Sight, time: float, footprint: Array, pose: Array
+    replan: Replan,
+    scenario: Scenario,
+    sight: Sight,
+    time: float,
+    footprint: Array,
+    pose: Array,
+    given: Waypoints | None,
 ) -> Waypoints | None:
     """Makes a plan that keeps off what is not on the map, or else one that only does not touch it.
 
     Args:
-        replan: Makes a plan from a pose, among outlines, to the goal.
+        replan: Makes a plan to the goal.
+        scenario: The mission.
         sight: What the robot knows.
         time: Time in s.
         footprint: Its corners in its frame in m, `(n, 2)`.
         pose: x and y in m and θ in rad, from which it plans, `(3,)`.
+        given: The plan that came since the start, or None.
     """
-    return replan(pose, sight.around(time, footprint, pose)) or replan(pose, sight.outlines(time))
+    far = replan(scenario, pose, sight.around(time, footprint, pose), given)
+    return far or replan(scenario, pose, sight.outlines(time), given)
 
 
 class Reactive(ABC):
@@ -343,11 +352,8 @@ class Reactive(ABC):
     def _planned(self, row: int, pose: Array) -> Waypoints | None:
         """Makes a plan from where a robot is, around what it knows."""
         self._map_changed[row] = False
-
-        def replan(pose: Array, outlines: Outlines) -> Waypoints | None:
-            return self._replan(self._scenarios[row], pose, outlines, self._given[row])
-
-        return plan_around(replan, self._sights[row], self._period * self._tick, self._footprint, pose)
+        own, now = (self._scenarios[row], self._sights[row]), self._period * self._tick
+        return plan_around(self._replan, *own, now, self._footprint, pose, self._given[row])
 
     def begin(self, tick: int) -> None:  # noqa: B027 (most have nothing to do)
         """Is called once in a motion period, before `choose` for each robot."""
