@@ -44,7 +44,7 @@ class Journal:
         file: Path,
         head: dict[str, Any],
         scheduler: str | None = None,
-        origin: Callable[[], dict[str, str]] = lambda: {},
+        origin: Callable[[], dict[str, str]] = dict,
     ) -> None:
         """Opens the file or begins it.
 

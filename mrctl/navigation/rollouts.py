@@ -43,7 +43,7 @@ FINE = 5  # samples of the plan in a motion period
 OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen, like the next two
 WAITED = 1.0, 0.05  # s and m: so does one that within this time gets no farther than this
 RETRY = 1.0  # s, least time between two plans
-STAYS = 1.0  # s at the end of its plan, after which a robot stays there; its run may end before
+STAYS = 1.0  # s at the end of its plan, after which a robot without a goal at which its run ends stays there; chosen
 # How a robot goes back from where there is no way forward; chosen, as all that follows.
 BACK = 0.4, 0.4  # m, length of a piece of the way back, after which it looks for another plan; m/s, its speed there
 PIECES = 5  # largest number of pieces
@@ -281,10 +281,11 @@ class Reactive(ABC):
     def _stands(self, row: int, pose: Array, speed: float) -> bool:
         """Tells whether a robot has arrived at the end of its plan a while ago, and stays until something moves it.
 
-        Roll-outs never go back, so that their mean would let it creep on and come round again.
+        Roll-outs never go back, so that their mean would let it creep on and come round again. Where the run ends at a
+        goal, a robot that drives on is not there yet, whatever it believes, and does not stay.
         """
         now = self._period * self._tick
-        if not self._at_end(row, pose):
+        if self._scenarios[row].goal is not None or not self._at_end(row, pose):
             self._arrived[row] = np.inf
         elif self._at_end(row, pose, speed):
             self._arrived[row] = min(self._arrived[row], now)
