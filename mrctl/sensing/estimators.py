@@ -257,7 +257,8 @@ class Estimator:
             memory["offset_walk"] = np.hypot(sensing["accelerometer_walk"], INCLINE)
             memory["P"][:] = np.diag(np.maximum(variances, 1e-12))
             memory["encoder_variance"], memory["gyro_variance"] = count, sensor["gyro_sigma"] ** 2
-            memory["bias_walk"], memory["kept_tick"] = sensing["gyro_walk"], -1
+            memory["bias_variance"], memory["bias_walk"] = sensing["gyro_bias"] ** 2, sensing["gyro_walk"]
+            memory["kept_tick"] = -1
             memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
             memory["inertial"] = memory["mean"][3]
 

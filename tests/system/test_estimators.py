@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mrctl import Event, InputError, LaneChange, Perturbation, RobotFile, Scenario, Sweep, simulate
+from mrctl import Circle, Event, InputError, LaneChange, Lemniscate, Perturbation, RobotFile, Scenario, Sweep, simulate
 from mrctl.cli import main
 from mrctl.loop.simulation import Simulation, suited
 from mrctl.physics.tyres import measure
@@ -146,6 +146,32 @@ def test_radius_changes(tier, position, speed, factor):
     error = np.hypot(second.x_measured - second.x, second.y_measured - second.y)
     assert np.sqrt((error**2).mean("time")).max() < position
     assert abs((second.v_measured - second.v).mean("time")).max() < speed
+
+
+@pytest.mark.parametrize(
+    ("tier", "factors", "reference", "position"),
+    [
+        ("lab", (0.97, 0.97), Lemniscate(), 1e-3),
+        ("field", (0.97, 0.97), Lemniscate(), 8e-3),
+        ("lab", (0.97, 0.98), Circle(radius=0.8, period=5.0), 2e-3),
+        ("field", (1.02, 1.0), Circle(radius=0.8, period=5.0), 10e-3),
+    ],
+)
+def test_radius_changes_unseen_by_the_gyro(tier, factors, reference, position):
+    """Where both wheels change alike, or forces always act, the fixes tell that a radius has changed."""
+    worn = Perturbation(left_radius_factor=factors[0], right_radius_factor=factors[1])
+    scenario = Scenario(
+        sensing=Sensing(tier=tier, estimator="ekf"),
+        reference=reference,
+        learner="none",
+        events=(Event(time=3.0, perturbation=worn),),
+    )
+    laps = 3 if reference.kind == "lemniscate" else 6
+    runs = simulate([scenario.replace(seed=seed, laps=laps) for seed in range(6)])
+    assert not runs.failed.any()
+    last = runs.isel(time=slice(-round(reference.period / 0.01), None))
+    error = np.hypot(last.x_measured - last.x, last.y_measured - last.y)
+    assert np.sqrt((error**2).mean("time")).max() < position
 
 
 @pytest.mark.parametrize(

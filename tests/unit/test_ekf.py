@@ -266,6 +266,52 @@ def test_another_radius(seed, difference, speed, calm):
         assert s["difference"] == 0
 
 
+@given(st.integers(0, 10**6), st.floats(-3, 3), st.floats(-3, 3))
+@settings(max_examples=25, deadline=None)
+def test_drift(seed, along, turned):
+    """Radii, bias and posture are doubted when a mean innovation, a decaying exponential, leaves its band."""
+    s, _ = random_filter(seed)
+    s["bias_variance"] = 2 * s["P"][BIAS, BIAS]
+    means = np.outer((along, turned), 1 - (1 - 1 / laws.FIXES) ** np.arange(1, 201))
+    expected = np.flatnonzero(abs(means).max(0) > laws.DRIFTING / np.sqrt(2 * laws.FIXES - 1))[:1]
+    before, found = s.copy(), None
+    for n in range(200):
+        laws.find_drift(along, turned, s)
+        if not np.array_equal(s["P"], before["P"]):
+            found = n
+            break
+    assert [found] == (list(expected) or [None])
+    assert np.array_equal(s["mean"], before["mean"])
+    if found is None:
+        np.testing.assert_allclose(s["drift"], means[:, -1], rtol=1e-9, atol=1e-12)
+        return
+    assert np.all(s["drift"] == 0)
+    raised = np.diag(s["P"] - before["P"]).copy()
+    np.testing.assert_allclose(raised[:3], s["fix_variance"], rtol=1e-9)
+    assert np.diag(s["P"])[[BIAS, SCALE_LEFT, SCALE_RIGHT]] == pytest.approx(
+        [2 * before["P"][BIAS, BIAS], *np.maximum(laws.DOUBT**2, np.diag(before["P"])[-2:])]
+    )
+    raised[[0, 1, 2, BIAS, SCALE_LEFT, SCALE_RIGHT]] = 0
+    assert not raised.any() and np.array_equal(np.triu(s["P"], 1), np.triu(before["P"], 1))
+
+
+def test_drift_of_innovations():
+    """The running mean of innovations that the filter's own covariance expects has the variance 1/(2n − 1)."""
+    s, rng = random_filter(5)
+    s["bias_variance"] = s["P"][BIAS, BIAS]
+    S = s["P"][:3, :3] + np.diag(s["fix_variance"])
+    root, drift, kept = np.linalg.cholesky(S), np.zeros(2), []
+    for e in (root @ rng.normal(size=(3, 20_000))).T:
+        other = s.copy()
+        other["drift"] = drift
+        laws.absorb_fix(s["mean"][:3] + e, other)
+        if other["nis"] <= FIX_GATE:
+            drift = other["drift"].copy()
+            kept.append(drift)
+    variance = np.var(kept, axis=0) * (2 * laws.FIXES - 1)
+    assert variance == pytest.approx([1, 1], abs=0.2)
+
+
 def lab(**values):
     return Sensing(tier="lab", delay=0.0, **values)
 
