@@ -376,7 +376,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
     default = Scenario.from_toml(scenario_file) if scenario_file else Scenario()
 
     def run(
-        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO.toml|STORE]")] = None,
+        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO.toml|FOLDER]")] = None,
         /,
         scenario: Annotated[Scenario, tyro.conf.arg(name="")] = default,
         out: Path | None = None,
@@ -390,7 +390,8 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         The exit status is 1 if the run fails.
 
         Args:
-            file: Run this scenario file, whose values flags override; or with --run a sweep's store.
+            file: Run this scenario file, whose values flags override; or the folder --out of a run, which is then run
+                again and compared with what it holds, bit for bit; or with --run a sweep's store.
             scenario: The scenario.
             out: Write the result, the figures and the learned weights to this folder.
             json: Print JSON instead of a table.
@@ -401,8 +402,13 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         if number is not None:
             return _repeat(file, number, out, json, code)
         if file is not None and file.is_dir():
-            raise InputError(f"run: {file} is a folder; for a run of a sweep's store give its number with --run")
+            return _repeat_saved(file, arguments, out, json, controller)
         if file is not None and str(file) != scenario_file:
+            before = arguments[arguments.index(str(file)) - 1] if str(file) in arguments else ""
+            if (switch := _switch(before)) is not None:
+                raise InputError(
+                    f"{switch}: takes no value, such as {file}; --{switch} switches it on, {_off(switch)} off"
+                )
             raise InputError(f"run: {file} is not a scenario file, whose name ends in .toml; see mrctl run --help")
         _check_world(scenario.world, scenario.robot)
         from mrctl.kernel import announced_early
@@ -533,13 +539,23 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
 
 def _scenario_file(arguments: Sequence[str]) -> str | None:
     """Returns the argument of `run` or `view` that is a scenario file: it ends in .toml and is no value of a flag."""
-    valueless = {"json", "code", *_switches(Scenario)}
     for previous, argument in zip(arguments, arguments[1:], strict=False):
-        flag = re.sub(r"(^--|\.)no-", r"\1", previous.replace("_", "-")).removeprefix("--")
-        is_value = previous.startswith("--") and "=" not in previous and flag not in valueless
+        is_value = previous.startswith("--") and "=" not in previous and _switch(previous) is None
         if argument.endswith(".toml") and not argument.startswith("-") and not is_value:
             return str(Path(argument))
     return None
+
+
+def _switch(flag: str) -> str | None:
+    """Returns the name of a flag of `run` or `view` that takes no value, such as `guard.on` for --guard.no-on."""
+    name = re.sub(r"(^--|\.)no-", r"\1", flag.replace("_", "-")).removeprefix("--")
+    return name if flag.startswith("--") and name in {"json", "code", *_switches(Scenario)} else None
+
+
+def _off(switch: str) -> str:
+    """Returns the flag that switches off what the name of a switch says, such as --guard.no-on."""
+    *path, name = switch.split(".")
+    return "--" + ".".join([*path, f"no-{name}"])
 
 
 def _switches(record: type[Record], prefix: str = "") -> list[str]:
@@ -559,6 +575,21 @@ def _report(text: str, out: Path | None, json: bool) -> None:
     print(text)
     if out is not None:
         print(f"The files are in {out}.", file=sys.stderr if json else sys.stdout)
+
+
+def _repeat_saved(folder: Path, arguments: Sequence[str], out: Path | None, json: bool, controller: str | None) -> None:
+    """Runs a saved run again and compares it with what was saved: `mrctl run FOLDER`."""
+    if not (folder / "result.zarr").is_dir():
+        raise InputError(f"run: {folder} holds no result; for a run of a sweep's store give its number with --run")
+    if new := sorted(_fields_set(arguments) - {"out", "json", "controller"}):
+        raise InputError(f"{new[0]}: {folder} holds a run, which is driven as it was")
+    from mrctl.experiments import single
+
+    text, departs = single.repeat(folder, out, json, controller)
+    _report(text, out, json)
+    if departs:
+        raise _Incomplete(f"{folder}: departs in {departs}, from what was saved there")
+    print(f"{folder}: bit-identical", file=sys.stderr if json else sys.stdout)
 
 
 def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code: bool) -> None:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import xarray as xr
-
 from mrctl.experiments.tables import json_text, markdown, number, output_folder, write_json
 from mrctl.navigation.mission import Avoid, Mission, Order, again, navigate, order_of, task_of
 from mrctl.results import plots
-from mrctl.results.dataset import open_result, save, versions
+from mrctl.results.dataset import departure, open_result, save, versions
 from mrctl.scenario import FeedforwardName, Scenario
 from mrctl.theory.obstacles import Pose
 
@@ -90,16 +88,7 @@ def repeat(folder: Path, out: Path | None, as_json: bool) -> tuple[str, str, str
         order, saved = order_of(folder), open_result(folder / "result.zarr")
         driven = again(folder, progress=True)
     text, outcome = _report(str(folder), order, driven, out, as_json)
-    departs = [str(name) for name in saved.data_vars if not _same(driven.result.get(name), saved[name])]
-    return text, outcome, departs[0] if departs else ""
-
-
-def _same(one: xr.DataArray | None, other: xr.DataArray) -> bool:
-    """Tells whether numbers have the same bits, or texts are the same."""
-    if one is None or one.shape != other.shape:
-        return False
-    texts = one.dtype.kind not in "fiub"
-    return one.values.tolist() == other.values.tolist() if texts else one.values.tobytes() == other.values.tobytes()
+    return text, outcome, departure(driven.result, saved)
 
 
 def _report(world: str, order: Order, driven: Mission, out: Path | None, as_json: bool) -> tuple[str, str]:

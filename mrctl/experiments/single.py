@@ -14,8 +14,9 @@ from mrctl.loop import user_files
 from mrctl.loop.goals import arrived
 from mrctl.loop.learned import save_learned
 from mrctl.loop.simulation import simulate
+from mrctl.record import InputError
 from mrctl.results import metrics
-from mrctl.results.dataset import faults_of, save, versions
+from mrctl.results.dataset import departure, faults_of, open_result, save, scenarios_of, versions
 from mrctl.scenario import Scenario
 
 COLUMNS = {
@@ -57,8 +58,47 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
         InputError: The scenario or a stage is invalid, or the folder cannot be written or holds a result already.
     """
     with output_folder(out, () if out is None else _written()):
-        stages: Stages = user_files.load(own) if own else {}
-        result = simulate([scenario], progress=True, **stages)
+        result = _driven(scenario, own)
+    return _report(scenario, result, out, as_json, own)
+
+
+def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None) -> tuple[str, str]:
+    """Runs a saved run again, and compares it with what was saved.
+
+    Args:
+        folder: What `run` wrote as `out`.
+        out: As for `run`.
+        as_json: As for `run`.
+        own: The stages of the user that drove it; a result holds only their names.
+
+    Returns:
+        The report of `run`; and in which signal the run departs from the saved one, or "".
+
+    Raises:
+        InputError: The folder has no result of one run, the stages are others, or `run` refuses something.
+    """
+    with output_folder(out, () if out is None else _written()):
+        saved = open_result(folder / "result.zarr")
+        scenarios = scenarios_of(saved)
+        if len(scenarios) != 1:
+            raise InputError(f"{folder}: holds {len(scenarios)} runs; mrctl run repeats a single one")
+        result = _driven(scenarios[0], own)
+        drove, drives = (str(one["label"].values[0]) for one in (saved, result))
+        if drove != drives:
+            raise InputError(f"{folder}: {drove} drove it, and not {drives}; name your own stages with --controller")
+    text, _ = _report(scenarios[0], result, out, as_json, own)
+    return text, departure(result, saved)
+
+
+def _driven(scenario: Scenario, own: str | None) -> xr.Dataset:
+    stages: Stages = user_files.load(own) if own else {}
+    return simulate([scenario], progress=True, **stages)
+
+
+def _report(
+    scenario: Scenario, result: xr.Dataset, out: Path | None, as_json: bool, own: str | None
+) -> tuple[str, str]:
+    """Returns what `run` returns, and saves the result."""
     laps = metrics.per_lap(result)
     if out is not None:
         save(result, out / "result.zarr")

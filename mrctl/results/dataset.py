@@ -377,6 +377,26 @@ def check_codecs(path: Path) -> None:
         raise InputError(f"{path}: has the codec {printable(min(foreign))}, which mrctl does not write")
 
 
+def departure(result: xr.Dataset, saved: xr.Dataset) -> str:
+    """Returns the first variable of a saved result that has other bits in a result of the same runs, or "".
+
+    Where another version of mrctl has saved it, both versions are named too.
+    """
+    for name, old in saved.data_vars.items():
+        new = result.get(name)
+        if new is None or not _same(new, old):
+            writer = written_by(saved)
+            return f"{name}" + (f" (of mrctl {writer}; this is mrctl {__version__})" if writer != __version__ else "")
+    return ""
+
+
+def _same(new: xr.DataArray, old: xr.DataArray) -> bool:
+    if new.shape != old.shape:
+        return False
+    texts = new.dtype.kind not in "fiub"
+    return new.values.tolist() == old.values.tolist() if texts else new.values.tobytes() == old.values.tobytes()
+
+
 def open_result(path: str | Path) -> xr.Dataset:
     """Opens a saved result, whichever version of mrctl wrote it: a result names its variables, with their units.
 

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import typing
@@ -16,6 +17,7 @@ import mrctl
 from mrctl import cli
 from mrctl.control.fel import initial_weights
 from mrctl.record import Record
+from mrctl.results.dataset import save
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import Robot
 
@@ -27,6 +29,18 @@ laps = 1
 kind = "circle"
 radius = 0.5
 period = 5
+"""
+
+OWN = """
+class Own:
+    def __init__(self, robot, size):
+        pass
+
+    def output(self, command, derivative):
+        return 10 * command
+
+    def learn(self, *_):
+        pass
 """
 
 
@@ -127,6 +141,36 @@ def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.Cap
     assert float(mrctl.per_lap(mrctl.simulate([carried]))["v_rmse"].values[0, 0]) < first
 
 
+def test_saved_run_again(tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A saved run is driven again, bit for bit; the first signal that departs is named, with the version that saved."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text(OWN)
+    assert cli.main(["run", "--learner", "rls", "--seed", "3", "--out", "first", *SHORT]) == 0
+    assert cli.main(["run", "first", "--out", "second"]) == 0
+    assert "first: bit-identical" in capsys.readouterr().out
+    first, second = (mrctl.open(tmp_path / name / "result.zarr") for name in ("first", "second"))
+    assert first.equals(second) and first.attrs["scenarios"] == second.attrs["scenarios"]
+    assert cli.main(["run", "second", "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["scenario"]["seed"] == 3 and "second: bit-identical" in captured.err
+
+    second["v"][0, 100] += 1e-12
+    second.attrs["versions"] = json.dumps({"mrctl": "0.1.0"})
+    shutil.rmtree(tmp_path / "second" / "result.zarr")
+    save(second, tmp_path / "second" / "result.zarr")
+    assert cli.main(["run", "second"]) == 1
+    assert f"second: departs in v (of mrctl 0.1.0; this is mrctl {mrctl.__version__})" in capsys.readouterr().err
+
+    assert cli.main(["run", "--controller", "own.py:Own", "--out", "own", *SHORT]) == 0
+    assert cli.main(["run", "own", "--controller", "own.py:Own"]) == 0
+    assert "own: bit-identical" in capsys.readouterr().out
+    assert cli.main(["run", "own"]) == 2
+    assert "own: Own drove it, and not fel; name your own stages with --controller" in capsys.readouterr().err
+    assert "seed: first holds a run, which is driven as it was" in refused(capsys, "run", "first", "--seed", "4")
+    (tmp_path / "empty").mkdir()
+    assert "empty holds no result" in refused(capsys, "run", "empty")
+
+
 def test_tune_states_the_learning_condition(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """By the IMC rule the ratio of the learning condition is 1 + τ/λ, with the robot's own time constant."""
     by_rule = ["tune", "--time-constant", "0.15", "--delay", "0", "0.03", "--out", str(tmp_path), "--json"]
@@ -205,6 +249,8 @@ def test_bad_scenario_is_one_line(
         (["run", "missing.toml"], "missing.toml"),
         (["run", "turtlebot"], "turtlebot is not a scenario file"),
         (["run", "scenario.tml", "--laps", "1"], "scenario.tml is not a scenario file"),
+        (["run", "--pid.retune", "maybe"], "pid.retune: takes no value, such as maybe; --pid.retune switches it"),
+        (["run", "--json", "turtlebot"], "json: takes no value, such as turtlebot"),
         (["run", "--perturbation", "al"], "perturbation: no perturbation is called 'al'; there are nominal, mass"),
         (["identify", "--perturbation"], "perturbation: needs a name"),
         (["run", "--goal", "1"], "goal: expected None or FLOAT FLOAT FLOAT"),
