@@ -42,7 +42,7 @@ JUMP = 3.0  # standard deviations; a jump is the part of a change of the acceler
 LOADING, LOAD = 0.1, 2.0  # s at the start in which the tyres take up their load, and the jolt that it counts as, m/s²
 RADIUS = 0.01  # standard deviation of the relative error of a wheel's radius at the start
 RADIUS_WALK = 5e-6  # random walk of that error, 1/√s
-DOUBT = 0.1  # largest standard deviation of that error where a radius has changed; chosen
+DOUBT = 0.1  # standard deviation of that error where a radius has changed, at most; chosen
 CALM = 0.5  # m/s², acceleration below which no force makes a wheel slip; chosen
 START_OFFSET = 0.2  # standard deviation of the component of gravity in the accelerometer at the start, m/s²
 START_TWIST = 0.02, 0.02  # standard deviations of V in m/s and θ̇ in rad/s at the start
@@ -53,8 +53,8 @@ SIDE = 0.94e-3
 FIX_GATE = 16.27  # 99.9 % of chi-square with 3 degrees of freedom
 LOST = 10  # the tenth fix in a row outside the gate is accepted
 LOOSE = 0.5  # m and rad, standard deviation that is added to the posture before
-FIXES = 30  # fixes over which their innovations are averaged; chosen
-DRIFTING = 4.5  # standard deviations of that average above which dead reckoning drifts; chosen
+FIXES = 30  # fixes, time constant of the running mean of their innovations; chosen
+DRIFTING = 4.5  # standard deviations of that mean above which dead reckoning drifts; chosen
 SLIPPED = 6.0  # standard deviations of the innovation of an encoder, above which its wheel has slipped; chosen
 GRIP = 0.08  # m/s, difference of encoder and inertial speed of a wheel above which it slips
 TWIST = 2e-3  # m/s, difference of the slip of two wheels that grip
@@ -79,7 +79,7 @@ EKF = np.dtype(
         ("inertial", "f8"),  # V from accelerometer and the wheels that grip, m/s
         ("offset", "f8"),  # offset o of the accelerometer as the observer of `find_grip` estimates it, m/s²
         ("difference", "f8"),  # mean of left less right wheel's speed by its encoder, less that by the gyro, m/s
-        ("drift", "f8", 2),  # mean innovations of the fixes along the heading and in it, in standard deviations
+        ("drift", "f8", 2),  # running means for `find_drift`: of the position along the heading, and of the heading
         ("refused", "i8"),  # number of fixes rejected in a row
         ("nis", "f8"),  # normalised innovation squared of the last fix, chi-square with 3 degrees of freedom
         ("innovations", "f8", 3),  # normalised, of the last encoder samples, at most `SLIPPED`, and gyro sample
@@ -227,21 +227,21 @@ def measure(now: Row, s: Row) -> None:
 
 @kernel
 def find_drift(along: float, turned: float, s: Row) -> None:
-    """Decides by the innovations of a fix whether dead reckoning drifts, as after a puncture.
+    """Decides by a test of bias of the innovations whether dead reckoning drifts, as after a puncture.
 
-    The innovations of a filter whose model is right are white. Their mean over the last fixes,
+    The innovations of a filter whose model is right are white, with mean 0. Their running mean,
 
         m ← m + (z − m)/n,    n = `FIXES`,
 
     where z is an innovation in its own standard deviations, then has the variance 1/(2n − 1). Where m leaves `DRIFTING`
-    standard deviations, along the heading or in it, a wheel has another radius than the filter believes. Until it was
+    standard deviations, dead reckoning is wrong; the filter takes that for another radius of a wheel. Until it was
     found out, the error has gone into the bias of the gyro and into the posture, too: the standard deviations of the
     radii are raised to `DOUBT`, that of the bias to that of the start, and the variances of the posture by those of a
-    fix.
+    fix. Then the mean begins again at 0, so that another error that lasts is found again and again.
 
     Args:
-        along: Innovation of the position along the heading, in standard deviations.
-        turned: Innovation of the heading, in standard deviations.
+        along: Innovation of the position along the heading, in its standard deviation.
+        turned: Innovation of the heading, in its standard deviation.
         s: In and out: a record of `EKF`.
     """
     s.drift[0] += (along - s.drift[0]) / FIXES
@@ -258,7 +258,11 @@ def find_drift(along: float, turned: float, s: Row) -> None:
 
 @kernel
 def absorb_fix(fix: Array, s: Row) -> None:
-    """Updates by a posture fix, unless it lies outside the gate; the tenth such fix in a row is accepted."""
+    """Updates by a posture fix, unless it lies outside the gate; the tenth such fix in a row is accepted.
+
+    A fix within the gate also counts for `find_drift`. A robot that is found again after ten fixes may have been moved,
+    which says nothing about its wheels.
+    """
     P, m = s.P, s.mean
     e0, e1 = fix[0] - m[X], fix[1] - m[Y]
     e2 = wrapped(fix[2] - m[THETA])
@@ -277,9 +281,11 @@ def absorb_fix(fix: Array, s: Row) -> None:
             return
         for k in range(3):
             P[k, k] += LOOSE**2
+        s.drift[0] = s.drift[1] = 0.0
+    else:
+        u, w = np.cos(m[THETA]), np.sin(m[THETA])
+        find_drift((u * e0 + w * e1) / np.sqrt(u * u * a + 2 * u * w * b + w * w * d), e2 / np.sqrt(f), s)
     s.refused = 0
-    u, w = np.cos(m[THETA]), np.sin(m[THETA])
-    find_drift((u * e0 + w * e1) / np.sqrt(u * u * a + 2 * u * w * b + w * w * d), e2 / np.sqrt(f), s)
     for k in range(3):
         for i in range(N):
             s.g[i] = P[k, i]

@@ -7,7 +7,20 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from mrctl import Circle, Event, InputError, LaneChange, Lemniscate, Perturbation, RobotFile, Scenario, Sweep, simulate
+from mrctl import (
+    Box,
+    Circle,
+    Event,
+    InputError,
+    LaneChange,
+    Lemniscate,
+    Obstacles,
+    Perturbation,
+    RobotFile,
+    Scenario,
+    Sweep,
+    simulate,
+)
 from mrctl.cli import main
 from mrctl.loop.simulation import Simulation, suited
 from mrctl.physics.tyres import measure
@@ -108,6 +121,24 @@ def test_start(tier):
     errors, covariances, _, _ = nominal(tier, 24)
     early = normalised(errors[:100], covariances[:100], [3])
     assert early.mean(1).max() < 5 and np.mean(early < 9) > 0.94
+
+
+@pytest.mark.parametrize(
+    ("tier", "localisation"), [("lab", "fixes"), ("field", "fixes"), ("lab", "scan"), ("field", "particles")]
+)
+def test_radii_of_nominal_robots_are_not_doubted(tier, localisation):
+    """While nothing changes, the filter hardly ever takes its innovations for those of wheels of other radii."""
+    walls = (Box(x=0, y=2.5, length=6, width=0.2), Box(x=0, y=-2.5, length=6, width=0.2))
+    sensing = Sensing(tier=tier, localisation=localisation)
+    scenario = Scenario(sensing=sensing, laps=2, prior="model", learner="none", obstacles=Obstacles(shapes=walls))
+    simulation = Simulation([scenario.replace(seed=2000 + k) for k in range(12)])
+    before, doubts = np.full((12, 2), np.inf), 0
+    while simulation.running:
+        simulation.step()
+        variance = np.diagonal(simulation.estimator.memory["P"], axis1=1, axis2=2)[:, -2:].copy()
+        doubts += np.sum((variance > before + 1e-4).any(axis=1))
+        before = variance
+    assert not simulation.plant.failed.any() and doubts <= 1
 
 
 # What a robot meets: changes of the scenario, and the least share of time in which each of posture and twist is within

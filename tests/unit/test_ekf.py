@@ -295,10 +295,26 @@ def test_drift(seed, along, turned):
     assert not raised.any() and np.array_equal(np.triu(s["P"], 1), np.triu(before["P"], 1))
 
 
+@given(st.integers(0, 10**6), st.floats(-np.pi, np.pi), st.floats(-0.9, 0.9))
+def test_drift_along_the_heading(seed, heading, correlation):
+    """A fix adds to the running means hᵀe/√(hᵀSh)/n for the directions h along the heading and of the heading."""
+    s, rng = random_filter(seed)
+    s["mean"][THETA] = heading
+    deviation = np.array([0.05, 0.01])
+    P = np.diag(np.diag(s["P"]))
+    P[:2, :2] = np.outer(deviation, deviation) * [[1, correlation], [correlation, 1]]
+    s["P"][:] = P
+    S = P[:3, :3] + np.diag(s["fix_variance"])
+    e = 0.3 * np.linalg.cholesky(S) @ rng.normal(size=3)
+    directions = np.array([[np.cos(heading), np.sin(heading), 0], [0, 0, 1]])
+    expected = [h @ e / np.sqrt(h @ S @ h) / laws.FIXES for h in directions]
+    laws.absorb_fix(s["mean"][:3] + e, s)
+    np.testing.assert_allclose(s["drift"], expected, rtol=1e-6, atol=1e-12)
+
+
 def test_drift_of_innovations():
     """The running mean of innovations that the filter's own covariance expects has the variance 1/(2n − 1)."""
     s, rng = random_filter(5)
-    s["bias_variance"] = s["P"][BIAS, BIAS]
     S = s["P"][:3, :3] + np.diag(s["fix_variance"])
     root, drift, kept = np.linalg.cholesky(S), np.zeros(2), []
     for e in (root @ rng.normal(size=(3, 20_000))).T:
@@ -380,6 +396,10 @@ def test_outlier():
     assert s["refused"] == 0
     np.testing.assert_allclose(s["mean"][:3], fix, atol=1e-3)
     np.testing.assert_allclose(np.diag(s["P"])[:3], s["fix_variance"], rtol=0.01)
+    assert np.all(s["drift"] == 0)
+    assert np.all(
+        np.diag(s["P"])[[BIAS, SCALE_LEFT, SCALE_RIGHT]] <= np.diag(before["P"])[[BIAS, SCALE_LEFT, SCALE_RIGHT]]
+    )
 
 
 def test_one_good_fix_between_outliers():
