@@ -391,7 +391,8 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
 
         Args:
             file: Run this scenario file, whose values flags override; or the folder --out of a run, which is then run
-                again and compared with what it holds, bit for bit; or with --run a sweep's store.
+                again and compared with what it holds, and the exit status is 1 if a bit differs; or with --run a
+                sweep's store.
             scenario: The scenario.
             out: Write the result, the figures and the learned weights to this folder.
             json: Print JSON instead of a table.
@@ -404,11 +405,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         if file is not None and file.is_dir():
             return _repeat_saved(file, arguments, out, json, controller)
         if file is not None and str(file) != scenario_file:
-            before = arguments[arguments.index(str(file)) - 1] if str(file) in arguments else ""
-            if (switch := _switch(before)) is not None:
-                raise InputError(
-                    f"{switch}: takes no value, such as {file}; --{switch} switches it on, {_off(switch)} off"
-                )
+            _check_switches(arguments)
             raise InputError(f"run: {file} is not a scenario file, whose name ends in .toml; see mrctl run --help")
         _check_world(scenario.world, scenario.robot)
         from mrctl.kernel import announced_early
@@ -552,10 +549,13 @@ def _switch(flag: str) -> str | None:
     return name if flag.startswith("--") and name in {"json", "code", *_switches(Scenario)} else None
 
 
-def _off(switch: str) -> str:
-    """Returns the flag that switches off what the name of a switch says, such as --guard.no-on."""
-    *path, name = switch.split(".")
-    return "--" + ".".join([*path, f"no-{name}"])
+def _check_switches(arguments: Sequence[str]) -> None:
+    """Refuses a word such as true behind a flag that takes no value."""
+    for flag, word in zip(arguments[1:], arguments[2:], strict=False):
+        if word.lower() in ("true", "false", "on", "off", "yes", "no", "0", "1") and (name := _switch(flag)):
+            *path, last = name.split(".")
+            off = ".".join([*path, f"no-{last}"])
+            raise InputError(f"{name}: a switch without a value, but {word} follows it; --{name} is on, --{off} off")
 
 
 def _switches(record: type[Record], prefix: str = "") -> list[str]:
@@ -579,10 +579,15 @@ def _report(text: str, out: Path | None, json: bool) -> None:
 
 def _repeat_saved(folder: Path, arguments: Sequence[str], out: Path | None, json: bool, controller: str | None) -> None:
     """Runs a saved run again and compares it with what was saved: `mrctl run FOLDER`."""
-    if not (folder / "result.zarr").is_dir():
-        raise InputError(f"run: {folder} holds no result; for a run of a sweep's store give its number with --run")
+    if (folder / "mission.json").exists():
+        raise InputError(f"run: {folder} holds a mission, which mrctl navigate {folder} repeats")
+    if (folder / "sweep.json").exists():
+        raise InputError(f"run: {folder} is the store of a sweep; give the number of a run with --run")
     if new := sorted(_fields_set(arguments) - {"out", "json", "controller"}):
-        raise InputError(f"{new[0]}: {folder} holds a run, which is driven as it was")
+        raise InputError(f"{new[0]}: {folder} holds a run, which is driven as it was; leave --{new[0]} out")
+    from mrctl.kernel import announced_early
+
+    announced_early()
     from mrctl.experiments import single
 
     text, departs = single.repeat(folder, out, json, controller)
@@ -892,6 +897,8 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
             code: Whether a sweep may run the Python files of the controller that it names.
         """
         if file is not None and str(file) != scenario_file:
+            if not file.exists():
+                _check_switches(arguments)
             if scenario != default:
                 raise InputError(f"view: {file} has its own scenarios; flags of a scenario need a live session")
             _check_exists(file)

@@ -13,7 +13,7 @@ from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.loop import user_files
 from mrctl.loop.goals import arrived
 from mrctl.loop.learned import save_learned
-from mrctl.loop.simulation import simulate
+from mrctl.loop.simulation import named_stages, simulate
 from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.dataset import departure, faults_of, open_result, save, scenarios_of, versions
@@ -66,7 +66,7 @@ def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None
     """Runs a saved run again, and compares it with what was saved.
 
     Args:
-        folder: What `run` wrote as `out`.
+        folder: What `run` wrote as `out`, or a saved result of one run.
         out: As for `run`.
         as_json: As for `run`.
         own: The stages of the user that drove it; a result holds only their names.
@@ -75,17 +75,20 @@ def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None
         The report of `run`; and in which signal the run departs from the saved one, or "".
 
     Raises:
-        InputError: The folder has no result of one run, the stages are others, or `run` refuses something.
+        InputError: There is no result of one run, other stages drove it, or `run` refuses something.
     """
     with output_folder(out, () if out is None else _written()):
-        saved = open_result(folder / "result.zarr")
+        saved = metrics.as_runs(open_result(folder / "result.zarr" if (folder / "result.zarr").exists() else folder))
         scenarios = scenarios_of(saved)
         if len(scenarios) != 1:
             raise InputError(f"{folder}: holds {len(scenarios)} runs; mrctl run repeats a single one")
+        drove = json.loads(saved.attrs.get("stages", "{}"))
+        given = named_stages(user_files.load(own)) if own else {}
+        if drove != given:
+            names = ", ".join(f"{stage}={name}" for stage, name in drove.items())
+            with_them = f"--controller with {names}" if names else "no --controller"
+            raise InputError(f"controller: the run in {folder} needs {with_them}, as when it was saved")
         result = _driven(scenarios[0], own)
-        drove, drives = (str(one["label"].values[0]) for one in (saved, result))
-        if drove != drives:
-            raise InputError(f"{folder}: {drove} drove it, and not {drives}; name your own stages with --controller")
     text, _ = _report(scenarios[0], result, out, as_json, own)
     return text, departure(result, saved)
 

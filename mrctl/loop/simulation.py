@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 from collections import defaultdict
@@ -88,7 +89,14 @@ def simulate(
         run([simulation for _, simulation in parts], bar.update if progress else None, threads=at_once)
         bar.total = bar.n  # where runs ended early, at their goals or because they failed
     whole = dataset.combine([(rows, simulation.result()) for rows, simulation in parts], given)
+    if names := named_stages(stages):
+        whole.attrs["stages"] = json.dumps(names)
     return whole.isel(run=0) if isinstance(scenarios, Scenario) else whole
+
+
+def named_stages(stages: Stages) -> dict[str, str]:
+    """Returns the names of the user's factories by stage."""
+    return {stage: getattr(factory, "__name__", "custom") for stage, factory in stages.items() if factory}
 
 
 def cores() -> int:
@@ -260,7 +268,7 @@ class Simulation:
                 check(reference, robot, self._reverses)
         factories: dict[str, Any] = {name: factory for name, factory in stages.items() if factory}
         users = {name: UserStage(name, factory, robot, size) for name, factory in factories.items()}
-        names = {name: getattr(factory, "__name__", "custom") for name, factory in factories.items()}
+        names = named_stages(stages)
         self._feedforward = named(first.prior, names.pop("feedforward", first.learner))
         self._label = " + ".join([self._feedforward, *names.values()])
 

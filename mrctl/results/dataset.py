@@ -378,23 +378,41 @@ def check_codecs(path: Path) -> None:
 
 
 def departure(result: xr.Dataset, saved: xr.Dataset) -> str:
-    """Returns the first variable of a saved result that has other bits in a result of the same runs, or "".
+    """Returns which variable of a saved result has other bits in a result of the same runs, and from when on; or "".
 
-    Where another version of mrctl has saved it, both versions are named too.
+    Of several variables it is the one that departs first. Where other versions of the packages have made the saved
+    result, they are named too.
     """
+    found: list[tuple[float, str]] = []
     for name, old in saved.data_vars.items():
         new = result.get(name)
-        if new is None or not _same(new, old):
-            writer = written_by(saved)
-            return f"{name}" + (f" (of mrctl {writer}; this is mrctl {__version__})" if writer != __version__ else "")
-    return ""
+        if new is None or new.dims != old.dims or new.shape != old.shape:
+            found.append((-np.inf, str(name)))
+            continue
+        off = np.asarray(_bits(new) != _bits(old))
+        if off.any():
+            axes = tuple(axis for axis, dim in enumerate(old.dims) if dim != "time")
+            timed = "time" in old.dims
+            found.append((float(saved["time"].values[off.any(axes).argmax()]) if timed else np.inf, str(name)))
+    if not found:
+        return ""
+    time, name = min(found)
+    return f"{name}{f' from t = {time:g} s on' if np.isfinite(time) else ''}{_other_versions(saved)}"
 
 
-def _same(new: xr.DataArray, old: xr.DataArray) -> bool:
-    if new.shape != old.shape:
-        return False
-    texts = new.dtype.kind not in "fiub"
-    return new.values.tolist() == old.values.tolist() if texts else new.values.tobytes() == old.values.tobytes()
+def _bits(values: xr.DataArray) -> NDArray:
+    """Returns the bits of numbers as whole numbers; texts as they are."""
+    plain = values.values
+    if plain.dtype.kind not in "fiub":
+        return plain.astype(object)
+    return np.frombuffer(plain.tobytes(), f"u{plain.itemsize}").reshape(plain.shape)
+
+
+def _other_versions(saved: xr.Dataset) -> str:
+    """Says which packages had other versions when a result was saved, in parentheses, or nothing."""
+    now, then = versions(), json.loads(saved.attrs.get("versions", "{}"))
+    others = [f"{name} {old}, not {now.get(name)}" for name, old in then.items() if now.get(name) != old]
+    return f" (saved with {'; '.join(others)})" if others else ""
 
 
 def open_result(path: str | Path) -> xr.Dataset:

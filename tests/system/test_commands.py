@@ -154,21 +154,51 @@ def test_saved_run_again(tmp_path: Path, capsys: pytest.CaptureFixture, monkeypa
     captured = capsys.readouterr()
     assert json.loads(captured.out)["scenario"]["seed"] == 3 and "second: bit-identical" in captured.err
 
-    second["v"][0, 100] += 1e-12
-    second.attrs["versions"] = json.dumps({"mrctl": "0.1.0"})
+    second["v"][0, 100] = -second["v"][0, 100]
+    second["omega"][0, 50] = np.nextafter(second["omega"][0, 50], 1)
+    second.attrs["versions"] = json.dumps(json.loads(second.attrs["versions"]) | {"mujoco": "3.0.0"})
     shutil.rmtree(tmp_path / "second" / "result.zarr")
     save(second, tmp_path / "second" / "result.zarr")
     assert cli.main(["run", "second"]) == 1
-    assert f"second: departs in v (of mrctl 0.1.0; this is mrctl {mrctl.__version__})" in capsys.readouterr().err
+    departs = "second: departs in omega from t = 0.5 s on (saved with mujoco 3.0.0, not 3.17.0), from what was saved"
+    assert departs in capsys.readouterr().err
 
     assert cli.main(["run", "--controller", "own.py:Own", "--out", "own", *SHORT]) == 0
     assert cli.main(["run", "own", "--controller", "own.py:Own"]) == 0
     assert "own: bit-identical" in capsys.readouterr().out
-    assert cli.main(["run", "own"]) == 2
-    assert "own: Own drove it, and not fel; name your own stages with --controller" in capsys.readouterr().err
-    assert "seed: first holds a run, which is driven as it was" in refused(capsys, "run", "first", "--seed", "4")
-    (tmp_path / "empty").mkdir()
-    assert "empty holds no result" in refused(capsys, "run", "empty")
+    refusals = {
+        ("own",): "controller: the run in own needs --controller with feedforward=Own, as when it was saved",
+        ("own", "--controller", "motion=own.py:Own"): "the run in own needs --controller with feedforward=Own",
+        ("first", "--controller", "own.py:Own"): "controller: the run in first needs no --controller",
+        ("first", "--seed", "4"): "seed: first holds a run, which is driven as it was; leave --seed out",
+        ("first", "--out", "first"): "first",
+        ("empty",): "empty: not a saved result",
+        ("mission",): "mission holds a mission, which mrctl navigate mission repeats",
+        ("both",): "both: holds 2 runs; mrctl run repeats a single one",
+    }
+    for folder in ("empty", "mission"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "mission" / "mission.json").write_text("{}")
+    scenario = mrctl.Scenario(laps=1, reference=mrctl.Circle(radius=0.5, period=5.0), learner="none")
+    mrctl.save(mrctl.simulate([scenario, scenario.replace(seed=1)]), "both")
+    for arguments, says in refusals.items():
+        assert says in refused(capsys, "run", *arguments)
+
+
+def test_saved_results_again(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """So is a result that Python saved, of one run, a named one, one that fails, or one with events."""
+    course = mrctl.Circle(radius=0.5, period=5.0)
+    tall = mrctl.Perturbation(payload=20.0, payload_z=0.5)
+    runs = [
+        mrctl.Scenario(name="mine", laps=1, reference=course, learner="rls"),
+        mrctl.Scenario(laps=1, reference=course, events=(mrctl.Event(time=1.0, push=(3.0, 0.0, 0.0)),)),
+        mrctl.Scenario(laps=1, perturbation=tall, learner="none"),
+    ]
+    for k, scenario in enumerate(runs):
+        folder = tmp_path / f"{k}"
+        mrctl.save(mrctl.simulate(scenario), folder)
+        assert cli.main(["run", str(folder)]) == 0
+        assert f"{folder}: bit-identical" in capsys.readouterr().out
 
 
 def test_tune_states_the_learning_condition(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -249,8 +279,12 @@ def test_bad_scenario_is_one_line(
         (["run", "missing.toml"], "missing.toml"),
         (["run", "turtlebot"], "turtlebot is not a scenario file"),
         (["run", "scenario.tml", "--laps", "1"], "scenario.tml is not a scenario file"),
-        (["run", "--pid.retune", "maybe"], "pid.retune: takes no value, such as maybe; --pid.retune switches it"),
-        (["run", "--json", "turtlebot"], "json: takes no value, such as turtlebot"),
+        (
+            ["run", "--pid.retune", "false"],
+            "pid.retune: a switch without a value, but false follows it; --pid.retune is",
+        ),
+        (["view", "--guard.no-on", "1"], "guard.on: a switch without a value, but 1 follows it"),
+        (["run", "--json", "turtlebot"], "turtlebot is not a scenario file"),
         (["run", "--perturbation", "al"], "perturbation: no perturbation is called 'al'; there are nominal, mass"),
         (["identify", "--perturbation"], "perturbation: needs a name"),
         (["run", "--goal", "1"], "goal: expected None or FLOAT FLOAT FLOAT"),
