@@ -26,7 +26,7 @@ from mrctl.kernel import Array, kernel
 from mrctl.loop.goals import RESTING
 from mrctl.loop.simulation import arranged
 from mrctl.navigation.planning import room
-from mrctl.navigation.rollouts import SHORTER, Replan, opened, plan_around
+from mrctl.navigation.reactive import SHORTER, Replan, open_waypoints, plan_around
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.vehicle import robot_of
 from mrctl.scenario import Scenario
@@ -184,7 +184,7 @@ class Pacing:
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Takes the missions of the robots, with their maps and with their plans as references."""
         self._follow, self._scenarios = Following(self._robot, scenarios), scenarios
-        self._own = [opened(scenario.reference) for scenario in scenarios]
+        self._own = [open_waypoints(scenario.reference) for scenario in scenarios]
         self._sights = Sight.each(scenarios)
         self._footprint = robot_of(scenarios[0])[0]
         self._near, self._away = self._barrier(-RIM), self._barrier(AWAY)
@@ -224,7 +224,7 @@ class Pacing:
 
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
-        self._given[row] = plan = opened(plan)
+        self._given[row] = plan = open_waypoints(plan)
         self._begin(row, plan)
 
     def _begin(self, row: int, plan: Waypoints) -> None:

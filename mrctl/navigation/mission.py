@@ -23,7 +23,7 @@ from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
 from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.planning import Plan, plan, room, shortcut, space
-from mrctl.navigation.rollouts import opened
+from mrctl.navigation.reactive import open_waypoints
 from mrctl.navigation.sdf import read_sdf
 from mrctl.navigation.vehicle import reverses, robot_of
 from mrctl.navigation.window import Window
@@ -248,7 +248,7 @@ def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] |
         return None
 
     def replan(scenario: Scenario, pose: Array, outlines: Outlines, given: Waypoints | None) -> Waypoints | None:
-        plan = opened(scenario.reference)
+        plan = open_waypoints(scenario.reference)
         goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
         start = Task.from_dict({"obstacles": scenario.known, "start": pose.tolist(), "goal": goal})
         with contextlib.suppress(InputError):  # it waits, and tries again

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Reactive, Replan, Scene, roll_out
+from mrctl.navigation.reactive import Reactive, Replan
+from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Scene, roll_out
 from mrctl.record import InputError
 from mrctl.theory.robot import Robot
 

@@ -12,7 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Reactive, Scene, roll_out
+from mrctl.navigation.reactive import Reactive
+from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Scene, roll_out
 
 SPEEDS, ROTATIONS = 9, 15  # of the window
 MOMENT = 0.25  # s, in which the twists of the window can be reached

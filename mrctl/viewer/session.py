@@ -17,7 +17,7 @@ from mrctl.loop.simulation import Simulation, arranged, run, uniform
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import MARGIN, SLIM, Avoid, avoiding, prepared
 from mrctl.navigation.planning import Plan
-from mrctl.navigation.rollouts import Reactive
+from mrctl.navigation.reactive import Reactive
 from mrctl.physics.contacts import NOTHING, Contacts
 from mrctl.physics.hull import footprint
 from mrctl.record import InputError, Record
