@@ -37,7 +37,7 @@ from pydantic import Field
 
 from mrctl.control.features import INPUTS, SLOW, feature_scale, features, symmetric_product
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, explained
-from mrctl.control.matching import SETTLED, histories, recall
+from mrctl.control.matching import SETTLED, histories, note_sent, recall
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
@@ -205,9 +205,7 @@ def filter_motion(command: Array, twist: Array, voltage: Array, period: float, r
         s.variance[k] += s.lasting * (difference * difference / 6 - s.variance[k])
         s.last[1, k], s.last[0, k] = s.last[0, k], twist[k]
         s.rate[k] = (once.twist[k] - twice.twist[k]) * s.filter / (1 - s.filter) / period
-        now.voltage[k] = voltage[k]  # it acts in the coming period
-    if robot.rigid:
-        now.voltage[1] += command[1]  # a steering channel adds a correction to the commanded rotation
+    note_sent(voltage, command, robot.rigid, now.voltage)
     s.age += s.filter
 
 

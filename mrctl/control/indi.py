@@ -46,7 +46,7 @@ from pydantic import Field
 
 from mrctl.control.features import INPUTS
 from mrctl.control.feedforward import PRIOR, Learner, Prior, explained, inverse_dynamics
-from mrctl.control.matching import MATCHED, low_pass, match, queues
+from mrctl.control.matching import MATCHED, low_pass, match, note_sent, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot
@@ -97,9 +97,7 @@ def learn(
     s = rows[i]
     for j in range(INPUTS):
         s.prior.c[j, 0], s.prior.c[j, 1] = prior.c[j, 0], prior.c[j, 1]
-    s.sent[0], s.sent[1] = voltage[0], voltage[1]
-    if robot.rigid:
-        s.sent[1] += command[1]  # a steering channel adds a correction to the commanded rotation
+    note_sent(voltage, command, robot.rigid, s.sent)
     measure(twist, robot.rigid, period, queue[i], s)
     added[0] = added[1] = 0.0
     return 0.0

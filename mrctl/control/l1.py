@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.feedforward import Learner, explained
-from mrctl.control.matching import MATCHED, match, queues
+from mrctl.control.matching import MATCHED, match, note_sent, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.linear import steering
@@ -97,9 +97,7 @@ def learn(
     """One step, which goes on while the robot must not learn: the voltage is the one after the limits."""
     rows, queue = arrays
     s = rows[i]
-    s.sent[0], s.sent[1] = voltage[0], voltage[1]
-    if robot.rigid:
-        s.sent[1] += command[1]  # a steering channel adds a correction to the commanded rotation
+    note_sent(voltage, command, robot.rigid, s.sent)
     step(twist, robot.rigid, prior, period, queue[i], s)
     added[0] = added[1] = 0.0
     return 0.0

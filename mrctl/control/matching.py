@@ -48,6 +48,21 @@ SENT = np.dtype(
 )
 
 
+@kernel
+def note_sent(voltage: Array, command: Array, rigid: bool, sent: Array) -> None:
+    """Notes the voltage that acts in the coming period.
+
+    Args:
+        voltage: Voltage of the two channels after the limits, in V (rad/s on a steering channel), `(2,)`.
+        command: Commanded V in m/s and θ̇ in rad/s, `(2,)`.
+        rigid: Whether the second channel is steering, which adds a correction to the commanded rotation.
+        sent: Out: the voltage (with the whole rotation on a steering channel), `(2,)`.
+    """
+    sent[0], sent[1] = voltage[0], voltage[1]
+    if rigid:
+        sent[1] += command[1]
+
+
 def queues(size: int, delay: int) -> Rows:
     """Returns empty queues for `match`, records of `SENT`, `(B, delay + 1)`; the delay is in control periods."""
     return np.zeros((size, delay + 1), SENT)

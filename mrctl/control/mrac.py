@@ -62,7 +62,7 @@ from pydantic import Field
 
 from mrctl.control.features import INPUTS, SLOW, feature_scale, features, linear, symmetric_product
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner
-from mrctl.control.matching import MATCHED, SETTLED, low_pass, match, queues
+from mrctl.control.matching import MATCHED, SETTLED, low_pass, match, note_sent, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
@@ -203,9 +203,7 @@ def learn(
     """One step of the law, unless the robot must not learn; the feedback teaches through x_c − x, not as a voltage."""
     rows, scale, queue = arrays
     s = rows[i]
-    s.sent[0], s.sent[1] = voltage[0], voltage[1]
-    if robot.rigid:
-        s.sent[1] += command[1]  # a steering channel adds a correction to the commanded rotation
+    note_sent(voltage, command, robot.rigid, s.sent)
     settled = filter_motion(command, twist, period, queue[i], scale, robot, s)
     now = s.matched.twist
     moves = abs(now[0]) + robot.half_track * abs(now[1]) > SLOW

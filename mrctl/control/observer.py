@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.feedforward import Learner, explained
+from mrctl.control.matching import note_sent
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.robot import Robot
@@ -77,9 +78,7 @@ def learn(
 ) -> float:  # fmt: skip
     """One step of the observer, which also runs while the robot must not learn; it hands nothing over to the PID."""
     rows, sent = arrays
-    sent[0], sent[1] = voltage[0], voltage[1]
-    if robot.rigid:
-        sent[1] += command[1]  # a steering channel adds a correction to the commanded rotation
+    note_sent(voltage, command, robot.rigid, sent)
     observe(twist, sent, robot.rigid, prior, period, rows[i])
     added[0] = added[1] = 0.0
     return 0.0
