@@ -42,6 +42,8 @@ FROM_FILES = ("events", "obstacles", "map")
 NOT_OF_MISSIONS = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
 """Fields of `Scenario` without flags in `mrctl navigate`: they come from files, or the mission sets them."""
 
+WITH_RECORDS = "run", "navigate", "identify", "view"
+"""Commands whose short help leaves out most of the flags of a record."""
 IDENTIFIED = ("perturbation", "robot", "sensing")
 """Arguments of `mrctl identify` that are records; its short help lists them, as that of `run` does with its fields."""
 
@@ -248,7 +250,7 @@ def _refuse_known(arguments: Sequence[str]) -> None:
     Raises:
         InputError: There is such a flag; the message says what to do in its place.
     """
-    if arguments[0] not in ("run", "navigate", "identify", "view"):
+    if arguments[0] not in WITH_RECORDS:
         return
     for flag in arguments:
         if flag.startswith("--"):
@@ -309,14 +311,12 @@ def _is_short_help(arguments: Sequence[str]) -> bool:
     """Tells whether a command line asks for the short help of a command; the help of a reference is always short."""
     asked = bool({"-h", "--help"} & set(arguments))
     return (
-        arguments[0] in ("run", "navigate", "identify", "view")
-        and asked
-        and not any(argument.startswith("reference:") for argument in arguments)
+        arguments[0] in WITH_RECORDS and asked and not any(argument.startswith("reference:") for argument in arguments)
     )
 
 
 def _explained(arguments: Sequence[str]) -> Sequence[str]:
-    """Returns the fields of a scenario that the help which a command line asks for explains; none if it does not."""
+    """Returns the fields of a scenario to explain: some for --help, all with flags for --help-all, else none."""
     if _is_short_help(arguments):
         return FIRST
     asked = {"--help", "--help-all", "-h"} & set(arguments)
@@ -349,6 +349,15 @@ def _partial_record(scenario: Scenario, names: Sequence[str]) -> Record:
     # The fields have their descriptions; pydantic would search the source of each calling frame for more.
     described = {"use_attribute_docstrings": False}
     return pydantic.create_model("Part", __base__=Record, __cls_kwargs__=described, **fields)()
+
+
+def _with_fields(command: Callable[..., None], default: Scenario, names: Sequence[str]) -> Callable[..., None]:
+    """Returns `run` or `view` with the flags of these fields of the scenario alone, or of all where there are none."""
+    if names:
+        part = _partial_record(default, names)
+        command.__annotations__["scenario"] = Annotated[type(part), tyro.conf.arg(name="")]
+        command.__defaults__ = (None, part, *(command.__defaults__ or ())[2:])
+    return command
 
 
 def _further_flags(command: str) -> str:
@@ -418,11 +427,7 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         if failure:
             raise _Incomplete(f"the run failed {failure}")
 
-    if explained := _explained(arguments):
-        part = _partial_record(default, explained)
-        run.__annotations__["scenario"] = Annotated[type(part), tyro.conf.arg(name="")]
-        run.__defaults__ = (None, part, *(run.__defaults__ or ())[2:])
-    return run
+    return _with_fields(run, default, _explained(arguments))
 
 
 def _navigate_with(arguments: list[str]) -> Callable[..., None]:
@@ -491,27 +496,13 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             taken = {"prior", "learner", "perturbation", "margin", "seed", "initial-spread"} & _fields_set(arguments)
             if taken or world or goal or start or known or compare or speed or avoid != "none" or json or view:
                 raise InputError("suite: has its own worlds, controllers and speeds; give only flags of the robot")
-            from mrctl.experiments import navigation_suite
-
-            mode = "quick" if quick else "core"
-            for tables in navigation_suite.suite(chosen, mode, out or Path("navigate_suite"), scheduler):
-                print(tables)
-            return
+            return _navigate_suite(chosen, quick, out or Path("navigate_suite"), scheduler)
         if quick or scheduler is not None:
             raise InputError(f"{'quick' if quick else 'scheduler'}: belongs to --suite")
         if not world:
             raise InputError("world: none given; see mrctl navigate --help")
         if Path(world).is_dir():
-            new = sorted({a.partition("=")[0] for a in arguments if a.startswith("--")} - {"--out", "--json"})
-            if new and (Path(world) / "mission.json").exists():
-                raise InputError(f"{new[0].removeprefix('--')}: {world} holds a mission, which is driven as it was")
-            from mrctl.experiments import mission
-
-            text, _, departs = mission.repeat(Path(world), out, json)
-            _report(text, out, json)
-            if departs:
-                raise _Incomplete(f"{world}: departs in {departs}, from what was saved there")
-            return print(f"{world}: bit-identical", file=sys.stderr if json else sys.stdout)
+            return _repeat_mission(Path(world), arguments, out, json)
         if view and (out is not None or json):
             raise InputError("view: a live session has no --out and --json")
         if ":" not in world and not Path(world).is_file():
@@ -532,6 +523,14 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
 
     navigate.__annotations__["scenario"] = Annotated[type(part), tyro.conf.arg(name="")]
     return navigate
+
+
+def _navigate_suite(scenario: Scenario, quick: bool, out: Path, scheduler: str | None) -> None:
+    """Drives the suite of navigation: `mrctl navigate --suite`."""
+    from mrctl.experiments import navigation_suite
+
+    for tables in navigation_suite.suite(scenario, "quick" if quick else "core", out, scheduler):
+        print(tables)
 
 
 def _scenario_file(arguments: Sequence[str]) -> str | None:
@@ -592,6 +591,23 @@ def _repeat_saved(folder: Path, arguments: Sequence[str], out: Path | None, json
 
     text, departs = single.repeat(folder, out, json, controller)
     _report(text, out, json)
+    _judge(folder, departs, json)
+
+
+def _repeat_mission(folder: Path, arguments: Sequence[str], out: Path | None, json: bool) -> None:
+    """Drives a saved mission again and compares it with what was saved: `mrctl navigate FOLDER`."""
+    new = sorted({a.partition("=")[0] for a in arguments if a.startswith("--")} - {"--out", "--json"})
+    if new and (folder / "mission.json").exists():
+        raise InputError(f"{new[0].removeprefix('--')}: {folder} holds a mission, which is driven as it was")
+    from mrctl.experiments import mission
+
+    text, _, departs = mission.repeat(folder, out, json)
+    _report(text, out, json)
+    _judge(folder, departs, json)
+
+
+def _judge(folder: Path, departs: str, json: bool) -> None:
+    """Says that a repeated run has the bits of the saved one, or fails the command."""
     if departs:
         raise _Incomplete(f"{folder}: departs in {departs}, from what was saved there")
     print(f"{folder}: bit-identical", file=sys.stderr if json else sys.stdout)
@@ -913,11 +929,7 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
         scenario = _suited(scenario, arguments, scenario_file)
         viewing.live(scenario, compare if chosen else ("none",), export, host, port)
 
-    if explained := _explained(arguments) if asked else FIRST:
-        part = _partial_record(default, explained)
-        view.__annotations__["scenario"] = Annotated[type(part), tyro.conf.arg(name="")]
-        view.__defaults__ = (None, part, *(view.__defaults__ or ())[2:])
-    return view
+    return _with_fields(view, default, _explained(arguments) if asked else FIRST)
 
 
 def record(

@@ -103,9 +103,10 @@ class Kernel(Generic[P, T]):
         return self.compiled(*arguments, **options)
 
     def calling(self, **laws: Any) -> Kernel[P, T]:  # noqa: ANN401
-        """The same function with other kernels or readers of `Held` in place of the global names of these keywords.
+        """Returns the kernel with some of the functions that it calls replaced.
 
-        For the same ones it is the same kernel, because compiled code is never freed.
+        `update.calling(respond=law)` compiles `update` with `law` wherever its source says `respond`. For the same
+        functions it is the same kernel, because compiled code is never freed.
         """
         return _calling(self.law, *laws.items())
 
@@ -142,7 +143,7 @@ def flat(arrays: tuple[Any, ...]) -> list[NDArray[Any]]:
 
 
 def held(place: int) -> tuple[Any, ...]:
-    """Returns, in a kernel, the arrays at the address of a `Held`, whose reader must replace this function."""
+    """Stands in a kernel for its arrays; the reader of a `Held` replaces it (`Kernel.calling`)."""
     raise NotImplementedError
 
 

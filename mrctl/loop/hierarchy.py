@@ -356,7 +356,7 @@ class Hierarchy:
         return True
 
     def _design_motion(self, row: int) -> None:
-        """Designs the motion controller of one robot, after odd moves for one step of delay more than its PID."""
+        """Designs the motion controller of one robot; after odd moves it has one step of delay more than the PID."""
         pid, delay = self.lengthened(row, self._pids[row], ahead=1)
         gains = pid.channels(self.robot, self.rigid, delay, self.period)
         self.motions[row] = motion(self.robot, self.rigid, gains, delay, self.period, self._prefilters[row])
@@ -377,7 +377,7 @@ class Hierarchy:
         return rejection(self.robot, self.rigid, gains, around, delay, self.period)
 
     def set_reference(self, row: int, reference: Reference) -> None:
-        """Says that one robot is given another reference from this tick on, which is all that mrctl's stages need."""
+        """Does nothing, because the built-in motion controller reads the reference in each tick; subclasses may not."""
 
     def set_learning(self, row: int, on: bool) -> None:
         """Switches learning of one robot on or off."""

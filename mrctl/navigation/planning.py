@@ -2,11 +2,11 @@
 
 Dolgov, Thrun, Montemerlo and Diebel, "Path planning for autonomous vehicles in unknown semi-structured environments",
 IJRR 29(5), 2010. Each cell holds the best pose that was found in it, and six arcs (three without reversing) lead on
-from there. A shortest path without obstacles is also tried to the goal; it counts as one more arc. Where it hits an
-obstacle, another one is tried only after half of the way to there, or when no pose is left. The heuristic is the larger
-of that path's length and of the way around the obstacles on the plane, times `WEIGHT` (Pohl, "Heuristic search viewed
-as path finding in a graph", Artificial Intelligence 1, 1970). The budget is a number of poses; ties go to the earlier
-pose.
+from there. From a pose the search also tries the shortest path to the goal that ignores obstacles, as one more arc (the
+analytic expansion). If an obstacle blocks it after d metres, the poses that follow try again once they are d/2 further;
+those that were skipped are tried when no pose is left. The heuristic is the larger of that path's length and of the way
+around the obstacles on the plane, times `WEIGHT` (Pohl, "Heuristic search viewed as path finding in a graph",
+Artificial Intelligence 1, 1970). The budget is a number of poses; ties go to the earlier pose.
 """
 
 from __future__ import annotations

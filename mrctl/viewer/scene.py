@@ -39,7 +39,7 @@ from mrctl.viewer.shapes import bar, disc, ribbons, sides
 
 Array = NDArray[np.float64]
 EVENT_COLOUR: Colour = (217, 119, 6)
-# Of the cells and sections of the floor, and of the floor.
+# Colours of the floor: its thin lines, its thick lines, its surface.
 LIGHT_FLOOR = (214, 217, 221), (190, 194, 200), (238, 240, 242)
 DARK_FLOOR = (52, 55, 60), (70, 74, 80), (36, 38, 42)
 HORIZON = 2.0, 9.0  # distances at which things begin to fade and are gone, in widths of the view
