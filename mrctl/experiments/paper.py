@@ -22,7 +22,7 @@ from mrctl.experiments import kanayama
 from mrctl.experiments.tables import machine, markdown, number, output_folder, write_json
 from mrctl.loop.hindsight import best_fixed
 from mrctl.loop.simulation import simulate
-from mrctl.results import metrics, plots
+from mrctl.results import drawings, metrics, plots
 from mrctl.results.dataset import versions
 from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario, replicates
 from mrctl.sensing.tiers import TIERS, Sensing, Tier
@@ -138,8 +138,8 @@ def figures(result: xr.Dataset, scenarios: Sequence[Scenario], out: Path) -> Non
     pid, network = both.isel(run=0), both.isel(run=1)
     last, lap = scenarios[0].laps, FAST
     drawn = {
-        "figure2_posture": plots.posture_definition(),
-        "figure3_structure": plots.control_structure(),
+        "figure2_posture": drawings.posture_definition(),
+        "figure3_structure": drawings.control_structure(),
         "figure4a_linear_velocity": plots.velocities(network, ("v",), lap=last),
         "figure4b_rotation_velocity": plots.velocities(network, ("omega",), lap=last),
         "figure4c_tracking_errors": plots.errors(network, window=(0.0, last * lap)),

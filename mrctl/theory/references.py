@@ -13,22 +13,20 @@ from __future__ import annotations
 
 import cmath
 import contextlib
-from collections.abc import Callable
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import pairwise, product
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
+from mrctl.kernel import Array
 from mrctl.record import InputError, Record
 from mrctl.theory.robot import GRAVITY, Robot
+from mrctl.theory.spline import Plane, Spline, plane, spline
 from mrctl.theory.timing import RESERVE, Limits, SmoothLaw, sample_path, smooth
-
-Array = NDArray[np.float64]
-Plane = NDArray[np.complexfloating]
 
 Length = Annotated[float, Field(gt=0, le=1000)]
 Speed = Annotated[float, Field(ge=0.01, le=20)]
@@ -38,9 +36,8 @@ Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 # Polynomials that rise from 0 to 1 on (0, 1); the first 2 (quintic) or 3 (septic) derivatives vanish at both ends.
 _QUINTIC = Polynomial([0, 0, 0, 10, -15, 6])
 _SEPTIC = Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
-# Gauss-Legendre quadrature on (0, 1), exact to rounding: for a corner of the square, and for a piece of a spline.
+# Gauss-Legendre quadrature on (0, 1) for a corner of the square, exact to rounding.
 _CORNER_NODES, _CORNER_WEIGHTS = (np.polynomial.legendre.leggauss(24) + np.array([[1], [0]])) / 2
-_PIECE_NODES, _PIECE_WEIGHTS = (np.polynomial.legendre.leggauss(6) + np.array([[1], [0]])) / 2
 
 
 class Motion(NamedTuple):
@@ -306,11 +303,11 @@ class Waypoints(Record):
         least = 3 if self.closed else 2
         if len(self.points) < least:
             raise ValueError(f"points: {'a closed' if self.closed else 'an open'} curve needs at least {least} points")
-        gaps = np.abs(np.diff(_plane(self.points, self.closed)))
+        gaps = np.abs(np.diff(plane(self.points, self.closed)))
         if gaps.min() < 1e-3:
             first = int(gaps.argmin())
             raise ValueError(f"points: {first} and {(first + 1) % len(self.points)} coincide")
-        path = _spline(self.points, self.closed)
+        path = self._path
         # The parameter is chord length, so a regular curve has |dp/du| near one.
         slow, where = path.slowest
         if slow < 0.02:
@@ -329,7 +326,7 @@ class Waypoints(Record):
             raise ValueError(f"cusps: must increase, and be before the last point, {len(self.points) - 1}")
         heading = None
         for part, back in self._parts:
-            ends = _spline(part.points, False).heading[[0, -1]] + np.pi * back
+            ends = part._path.heading[[0, -1]] + np.pi * back
             if heading is not None and abs(cmath.phase(cmath.exp(1j * (ends[0] - heading)))) > KINK:
                 raise ValueError(f"cusps: the curve turns by more than {KINK:g} rad at a cusp")
             heading = ends[1]
@@ -349,21 +346,25 @@ class Waypoints(Record):
         """Samples a curve with cusps at the times t in s, shape (T,); V is negative in reverse."""
         samples, since, heading = np.empty((len(t), 7)), 0.0, 0.0
         for part, back in self._parts:
-            spline = _spline(part.points, False)
+            path = part._path
             s, v, a = part._law.at(np.maximum(t - since, 0.0))
-            p, theta, k, dk = spline.at(s)
+            p, theta, k, dk = path.at(s)
             sign = -1.0 if back else 1.0
-            start = spline.heading[0] + np.pi * back
+            start = path.heading[0] + np.pi * back
             turn = 2 * np.pi * round((heading - start) / (2 * np.pi))
             moved = along_path(p, theta + np.pi * back + turn, sign * k, dk, sign * v, sign * a)
             now = (t >= since) | (since == 0)
             samples[now] = np.hstack(moved)[now]
-            since, heading = since + part._law.duration, spline.heading[-1] + np.pi * back + turn
+            since, heading = since + part._law.duration, path.heading[-1] + np.pi * back + turn
         return Motion(samples[:, :3], samples[:, 3:5], samples[:, 5:])
 
     @property
+    def _path(self) -> Spline:
+        return spline(self.points, self.closed)
+
+    @property
     def _law(self) -> SmoothLaw:
-        return _law(self.points, self.closed, self.speed, self.limits)  # type: ignore[arg-type]
+        return _time_law(self.points, self.closed, self.speed, self.limits)  # type: ignore[arg-type]
 
     @property
     def period(self) -> float:
@@ -372,7 +373,7 @@ class Waypoints(Record):
             return sum(part.period for part, _ in self._parts)
         if self.timing == "limits":
             return self._law.duration
-        return _spline(self.points, self.closed).length / self.speed + (0 if self.closed else self.stop_time / 2)
+        return self._path.length / self.speed + (0 if self.closed else self.stop_time / 2)
 
     def sample(self, t: Array) -> Motion:
         """Samples the spline at the times t in s, shape (T,).
@@ -383,101 +384,21 @@ class Waypoints(Record):
             return self._sample_parts(t)
         if self.timing == "limits":
             s, v, a = self._law.at(t)
-            return along_path(*_spline(self.points, self.closed).at(s), v, a)
+            return along_path(*self._path.at(s), v, a)
         s, v, a = self.speed * t, np.full(t.shape, self.speed), np.zeros(t.shape)
         if not self.closed:
             brake = self.period - self.stop_time
             u = np.clip((t - brake) / self.stop_time, 0, 1)
             s = self.speed * (np.minimum(t, brake) + self.stop_time * (u - _QUINTIC.integ()(u)))
             v, a = self.speed * (1 - _QUINTIC(u)), -self.speed * _QUINTIC.deriv()(u) / self.stop_time
-        return along_path(*_spline(self.points, self.closed).at(s), v, a)
-
-
-def _plane(points: tuple[tuple[float, float], ...], closed: bool) -> Plane:
-    """Returns the points as complex numbers in m, with the first one again at the end of a closed curve."""
-    return np.array([complex(*point) for point in (*points, *points[: int(closed)])])
-
-
-class _Spline:
-    """A planar quintic spline by arc length s; its own parameter u is the accumulated chord length, both in m."""
-
-    def __init__(self, points: tuple[tuple[float, float], ...], closed: bool) -> None:
-        from scipy.interpolate import make_interp_spline  # imported here, so that settings are read without scipy
-
-        p = _plane(points, closed)
-        knots = np.append(0, np.cumsum(np.abs(np.diff(p))))
-        straight = [(2, np.zeros(2)), (3, np.zeros(2))]
-        ends = "periodic" if closed else (straight, straight)
-        curve = make_interp_spline(knots, np.stack([p.real, p.imag], -1), k=5, bc_type=ends)  # type: ignore[arg-type]
-        self.curves = [curve, *(curve.derivative(n) for n in (1, 2, 3))]
-        self.u = np.append(np.linspace(knots[:-1], knots[1:], 64, endpoint=False).T, knots[-1])
-        self.s = np.append(0, np.cumsum(self.arc(self.u[:-1], self.u[1:])))
-        self.length = float(self.s[-1])
-        self.heading = np.unwrap(np.angle(self.derivative(self.u, 1)))
-        self.closed = closed
-
-    @cached_property
-    def parameter(self) -> Callable[[Array], Array]:
-        """Approximation of u(s), whose error falls with the fourth power of the length of a piece."""
-        from scipy.interpolate import CubicHermiteSpline
-
-        return CubicHermiteSpline(self.s, self.u, 1 / np.abs(self.derivative(self.u, 1)))
-
-    def derivative(self, u: Array, n: int) -> Plane:
-        """Returns the n-th derivative of x + i y with respect to u, for n = 0 to 3."""
-        x, y = np.moveaxis(self.curves[n](u), -1, 0)
-        return x + 1j * y
-
-    @cached_property
-    def slowest(self) -> tuple[float, complex]:
-        """The least |dp/du| of the curve, also between the samples, and x + i y in m of the place."""
-
-        def falls(u: Array) -> NDArray[np.bool]:  # the sign of d|dp/du|²/du
-            return (np.conj(self.derivative(u, 1)) * self.derivative(u, 2)).real < 0
-
-        falling = falls(self.u)
-        (valley,) = np.nonzero(falling[:-1] & ~falling[1:])
-        low, high = self.u[valley], self.u[valley + 1]
-        for _ in range(12):  # bisections
-            middle = (low + high) / 2
-            before = falls(middle)
-            low, high = np.where(before, middle, low), np.where(before, high, middle)
-        u = np.append(self.u, low)
-        slow = np.abs(self.derivative(u, 1))
-        return float(slow.min()), complex(self.derivative(u, 0)[slow.argmin()])
-
-    def arc(self, start: Array, end: Array) -> Array:
-        """Returns the arc length in m from u = start to u = end, shape (T,); both lie within one piece."""
-        u = start[:, None] + (end - start)[:, None] * _PIECE_NODES
-        return (end - start) * (np.abs(self.derivative(u, 1)) @ _PIECE_WEIGHTS)
-
-    def at(self, s: Array) -> tuple[Plane, Array, Array, Array]:
-        """Returns position in m, heading in rad, curvature in 1/m and sharpness in 1/m² at the arc lengths s in m.
-
-        All have the shape (T,).
-        """
-        lap, s = np.divmod(s, self.length) if self.closed else (np.zeros(s.shape), np.minimum(s, self.length))
-        piece = np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
-        u = self.parameter(s)
-        # One step of Newton's method reduces the error of `parameter` to rounding.
-        u = u - (self.s[piece] + self.arc(self.u[piece], u) - s) / np.abs(self.derivative(u, 1))
-        p, d1, d2, d3 = (self.derivative(u, n) for n in range(4))
-        log, step = d2 / d1, np.abs(d1)
-        sharpness = ((d3 / d1 - log**2).imag - log.imag * log.real) / step**2
-        # The tabulated heading selects the branch of the exact one.
-        near, exact = np.interp(u, self.u, self.heading), np.angle(d1)
-        heading = exact + 2 * np.pi * np.round((near - exact) / (2 * np.pi))
-        return p, heading + lap * (self.heading[-1] - self.heading[0]), log.imag / step, sharpness
-
-
-_spline = lru_cache(maxsize=512)(_Spline)
+        return along_path(*self._path.at(s), v, a)
 
 
 @lru_cache(maxsize=512)  # a comparison has hundreds of plans, whose scenarios ask for their durations repeatedly
-def _law(points: tuple[tuple[float, float], ...], closed: bool, speed: float, limits: Limits) -> SmoothLaw:
+def _time_law(points: tuple[tuple[float, float], ...], closed: bool, speed: float, limits: Limits) -> SmoothLaw:
     """The time law along the spline through the points."""
-    spline = _spline(points, closed)
-    path = sample_path(lambda s: spline.at(s)[2:], spline.s, closed, limits, speed)
+    curve = spline(points, closed)
+    path = sample_path(lambda s: curve.at(s)[2:], curve.s, closed, limits, speed)
     return smooth(path, limits, speed)
 
 
@@ -505,8 +426,8 @@ def random_spline(
             loop = Waypoints(points=tuple((float(z.real), float(z.imag)) for z in p), speed=top)
         except ValueError:  # the spline turns on the spot
             continue
-        spline = _spline(loop.points, loop.closed)
-        tightest = float(np.abs(spline.at(spline.s)[2]).max())
+        curve = spline(loop.points, loop.closed)
+        tightest = float(np.abs(curve.at(curve.s)[2]).max())
         if np.arctan(abs(robot.wheelbase) * tightest) > reserve * robot.steering_limit:
             continue
         grip = {"lateral_acceleration": min(limits.lateral_acceleration, slow**2 * tightest)}

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.image import imread
 
 from mrctl.record import InputError
-from mrctl.results import metrics, plots
+from mrctl.results import drawings, metrics, plots
 from mrctl.results.controllers import CONTROLLERS, colours_of
 from mrctl.scenario import FEEDFORWARDS, Scenario
 from mrctl.theory.obstacles import Box, Disc, Obstacles
@@ -254,8 +254,11 @@ def test_units_on_axes(name):
 @pytest.mark.parametrize(
     ("draw", "words"),
     [
-        (plots.posture_definition, ["x_0", "O_0", "y_0", "x_r", "P", "y_r", "theta", "phi", "L", "2D", "V_{AV}"]),
-        (plots.control_structure, ["Kanayama", "PID", "Neural network", "Robot", "eta_c", "U_{ff}", "U_{fb}", "U_l"]),
+        (drawings.posture_definition, ["x_0", "O_0", "y_0", "x_r", "P", "y_r", "theta", "phi", "L", "2D", "V_{AV}"]),
+        (
+            drawings.control_structure,
+            ["Kanayama", "PID", "Neural network", "Robot", "eta_c", "U_{ff}", "U_{fb}", "U_l"],
+        ),
     ],
 )
 def test_drawings(draw, words):
@@ -311,7 +314,7 @@ def test_inverse_dynamics():
 
 def test_save(tmp_path):
     """PNG and PDF are written into a new folder; the PNG is not blank, and 180 mm at 200 dpi."""
-    png, pdf = plots.save(plots.control_structure(), tmp_path / "new" / "folder", "figure3")
+    png, pdf = plots.save(drawings.control_structure(), tmp_path / "new" / "folder", "figure3")
     assert (png.name, pdf.name) == ("figure3.png", "figure3.pdf") and pdf.read_bytes().startswith(b"%PDF")
     image = imread(png)
     assert image.shape[1] == pytest.approx(180 / 25.4 * 200, abs=1) and image[..., :3].std() > 0.05
@@ -323,7 +326,7 @@ def test_save_unwritable(tmp_path):
     blocker.write_text("")
     for folder in (blocker, blocker / "below"):
         with pytest.raises(InputError, match=rf"^{re.escape(str(folder))}: cannot write") as caught:
-            plots.save(plots.posture_definition(), folder, "figure2")
+            plots.save(drawings.posture_definition(), folder, "figure2")
         assert "\n" not in str(caught.value)
 
 
