@@ -19,7 +19,7 @@ from mrctl.loop.simulation import simulate
 from mrctl.navigation import mission
 from mrctl.navigation.mission import Avoid, avoiding, prepared, task_of
 from mrctl.navigation.mppi import SAMPLES, SPREAD, WORTH, Mppi
-from mrctl.navigation.planning import around, plan, space
+from mrctl.navigation.planning import cost_to_go, plan, space
 from mrctl.navigation.rollouts import KNOTS, STEPS, roll_out
 from mrctl.navigation.vehicle import robot_of
 from mrctl.physics.obstacles import multi_ray
@@ -34,7 +34,7 @@ from mrctl.theory.obstacles import Box, Disc, Obstacles, Surroundings
 from mrctl.theory.rays import cast
 
 WORLDS = 40  # of either kind, in which plans are made
-SIDES = (6.0, 0.0), (-6.0, 0.0), (0.0, 6.0), (0.0, -6.0)  # m, middles of the walls around the particle filter
+SIDES = (6.0, 0.0), (-6.0, 0.0), (0.0, 6.0), (0.0, -6.0)  # m, middles of the walls cost_to_go the particle filter
 CYLINDERS = 300  # that the lidar sees
 SIDE, CELL, DISCS = 38.4, 0.1, 100  # m, m; side of the worlds of random discs and of their 147,456 cells, and discs
 RADIUS = 0.5  # m, turning radius of plans there
@@ -111,7 +111,7 @@ def _seconds(function: Callable[[], Any]) -> float:
 
 
 def _discs(random: np.random.Generator, count: int, side: float, least: float, most: float) -> Obstacles:
-    """Returns discs at random places of a square around the origin with that side, and random radii; all in m."""
+    """Returns discs at random places of a square cost_to_go the origin with that side, and random radii; all in m."""
     places, radii = random.uniform(-side / 2, side / 2, (count, 2)), random.uniform(least, most, count)
     return Obstacles(shapes=tuple(Disc(x=x, y=y, radius=r) for (x, y), r in zip(places.tolist(), radii, strict=True)))
 
@@ -207,7 +207,7 @@ def _planned(name: str, tried: list[tuple[Any, ...]]) -> dict[str, Any]:
         except InputError:
             continue
         seconds.append(time.perf_counter() - start)
-        alone.append(_seconds(partial(around, arguments[0], arguments[2])))
+        alone.append(_seconds(partial(cost_to_go, arguments[0], arguments[2])))
         expanded.append(found.expanded)
         cells.append(arguments[0].field.distance.size)
     return {

@@ -25,7 +25,7 @@ from mrctl.control.stages import Motion
 from mrctl.kernel import Array, kernel
 from mrctl.loop.goals import RESTING
 from mrctl.loop.simulation import arranged
-from mrctl.navigation.planning import room
+from mrctl.navigation.planning import least_clearance
 from mrctl.navigation.reactive import SHORTER, Replan, open_waypoints, plan_around
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.vehicle import robot_of
@@ -220,7 +220,7 @@ class Pacing:
 
         The clearance is negative where the discs would overlap the map on the plan.
         """
-        return self._barrier(min(KEPT, room(self._footprint, plan, self._sights[row].map) - RIM - TRACKED))
+        return self._barrier(min(KEPT, least_clearance(self._footprint, plan, self._sights[row].map) - RIM - TRACKED))
 
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""

@@ -22,7 +22,7 @@ from mrctl.navigation.avoidance import Pacing
 from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
 from mrctl.navigation.mppi import Mppi
-from mrctl.navigation.planning import Plan, plan, room, shortcut, space
+from mrctl.navigation.planning import Plan, least_clearance, plan, shortcut, space
 from mrctl.navigation.reactive import open_waypoints
 from mrctl.navigation.sdf import read_sdf
 from mrctl.navigation.vehicle import reverses, robot_of
@@ -326,7 +326,7 @@ def planned(
             check(reference, robot, reverse)
         except InputError:
             raise fault from None
-    if room(corners, reference, outlines) <= 0:
+    if least_clearance(corners, reference, outlines) <= 0:
         raise InputError(f"plan: its smooth path touches an obstacle in spite of the margin of {margin:g} m; set more")
     return found, reference
 

@@ -33,7 +33,7 @@ SWITCH = 0.5  # cost of a change of direction, m
 CHECK = 0.05  # m, distance of the poses of an arc that are held against the obstacles
 STRIDE = 5  # of these poses, between those to which shortcuts are looked for
 DISCS = 4  # that cover the footprint; where one of them touches, the footprint itself is looked at
-SHOT = 2.0  # in place of the turn of an arc, a shortest path to the goal
+EXPANSION = 2.0  # in place of the turn of an arc, a shortest path to the goal
 WEIGHT = 1.04  # of the heuristic, and so about the most by which a plan costs more than the cheapest; chosen
 AGAIN = 0.5  # share of the free part of a shortest path that hits something, after which another one is tried; chosen
 SLACK = 2.0  # cells, by which the way around the obstacles may be too long
@@ -67,8 +67,8 @@ class Tree(NamedTuple):
     parents: NDArray[np.int64]
     """Pose before each, −1 for the start, `(N,)`."""
     turns: Array
-    """Turn of the arc that leads to each, as in `Curve`, or `SHOT` for a shortest path to the goal, `(N,)`."""
-    ways: Array
+    """Turn of the arc that leads to each, as in `Curve`, or `EXPANSION` for a shortest path to the goal, `(N,)`."""
+    lengths: Array
     """Signed length of that arc in m; of a shortest path the direction of its end, `(N,)`."""
     costs: Array
     """Cost of the way to each in m, `(N,)`."""
@@ -83,7 +83,7 @@ class Plan(NamedTuple):
 
     poses: Array
     """x and y in m and θ in rad, `(n, 3)`, at most 5 cm apart."""
-    ways: Array
+    directions: Array
     """1 where the robot comes to the pose forward, −1 in reverse and 0 at the start, `(n,)`."""
     cost: float
     """Length in m, in reverse times 1.5, plus 0.5 m for each change of direction."""
@@ -110,13 +110,13 @@ class Plan(NamedTuple):
         Raises:
             InputError: The speed is not positive, or a spline turns too far from the plan at a change of direction.
         """
-        turns = np.flatnonzero(self.ways[2:] * self.ways[1:-1] < 0) + 1
+        turns = np.flatnonzero(self.directions[2:] * self.directions[1:-1] < 0) + 1
         ends = [0, *turns.tolist(), len(self.poses) - 1]
         legs = [_points(self.poses[a : b + 1], spacing) for a, b in pairwise(ends)]
         points = np.concatenate([legs[0][:1], *(leg[1:] for leg in legs)])
         cusps = np.cumsum([len(leg) - 1 for leg in legs[:-1]], dtype=int).tolist()
         values = {"points": points.tolist(), "closed": False, "timing": "limits", "speed": speed, "limits": limits}
-        return Waypoints.from_dict(values | {"cusps": [*([0] if self.ways[1] < 0 else []), *cusps]}, "plan")
+        return Waypoints.from_dict(values | {"cusps": [*([0] if self.directions[1] < 0 else []), *cusps]}, "plan")
 
 
 def _points(poses: Array, spacing: float) -> Array:
@@ -179,7 +179,7 @@ def plan(where: Space, start: Array, goal: Array, radius: float, reverse: bool, 
         if (free := clearance(where.footprint, pose, where.outlines)) <= where.margin:
             found = "is in an obstacle" if free <= 0 else f"is {free:.3f} m from an obstacle, within the margin"
             raise InputError(f"{name}: the robot {found} at {place}")
-    ahead = around(where, goal)
+    ahead = cost_to_go(where, goal)
     step = max(1.5 * where.field.resolution, radius * 2 * np.pi / HEADINGS)
     tree = Tree(np.empty((most, 3)), np.empty(most, np.int64), *np.empty((5, most)))
     best = np.zeros((*ahead.shape, HEADINGS, 3 if reverse else 1), np.int32)  # here memory is taken when it is written
@@ -209,8 +209,8 @@ def shortcut(where: Space, whole: Plan, radius: float, reverse: bool) -> Plan:
 
 def _shortcut(where: Space, whole: Plan, radius: float, reverse: bool) -> Plan:
     """Does what `shortcut` describes, once."""
-    steps = np.hypot(*np.diff(whole.poses[:, :2], axis=0, prepend=whole.poses[:1, :2]).T) * whole.ways
-    poses, ways, total, now, last = [whole.poses[:1]], [np.zeros(1)], 0.0, 0, 0.0
+    steps = np.hypot(*np.diff(whole.poses[:, :2], axis=0, prepend=whole.poses[:1, :2]).T) * whole.directions
+    poses, directions, total, now, last = [whole.poses[:1]], [np.zeros(1)], 0.0, 0, 0.0
     cost = np.empty(len(steps))
     while now < len(steps) - 1:
         other, found = farthest.compiled(whole.poses, steps, now, radius, reverse, last, where, cost)
@@ -219,11 +219,11 @@ def _shortcut(where: Space, whole: Plan, radius: float, reverse: bool) -> Plan:
             piece, direction = (column[1:] for column in sample(whole.poses[now], curve, radius, CHECK))
         else:
             other, found = now + 1, cost[now + 1]
-            piece, direction = whole.poses[other : other + 1], whole.ways[other : other + 1]
+            piece, direction = whole.poses[other : other + 1], whole.directions[other : other + 1]
         poses.append(piece)
-        ways.append(direction)
+        directions.append(direction)
         now, last, total = other, float(direction[-1]) if len(direction) else last, total + found
-    return Plan(np.concatenate(poses), np.concatenate(ways), float(total), whole.expanded, whole.searched)
+    return Plan(np.concatenate(poses), np.concatenate(directions), float(total), whole.expanded, whole.searched)
 
 
 @kernel
@@ -238,7 +238,7 @@ def farthest(
         now: Index of the pose where the path begins.
         radius: Least turning radius in m.
         reverse: Whether the robot may reverse.
-        last: Direction in which the robot came to that pose, as in `shot`.
+        last: Direction in which the robot came to that pose, as in `analytic_expansion`.
         where: Obstacles and footprint.
         cost: Out: cost of the plan from that pose to each later one in m, `(n,)`.
 
@@ -250,19 +250,21 @@ def farthest(
     for k in range(now + 1, n):
         cost[k] = cost[k - 1]
         if steps[k] != 0:
-            cost[k] += price(steps[k], direction)
+            cost[k] += cost_of(steps[k], direction)
             direction = np.sign(steps[k])
     sides, end = np.empty((len(where.footprint), 4)), np.empty(3)
     for k in range(n - 1, now, -STRIDE):
         after = steps[k + 1] if k + 1 < n else 0.0  # the plan goes on with its first step after the path
-        most = cost[k + 1] - price(after, 0.0) if k + 1 < n else cost[k]
-        found, direction, _ = shot(poses[now], poses[k], radius, reverse, last, most - 1e-6, where, sides, end)
-        if found + price(after, direction) - price(after, 0.0) < most - 1e-6:
+        most = cost[k + 1] - cost_of(after, 0.0) if k + 1 < n else cost[k]
+        found, direction, _ = analytic_expansion(
+            poses[now], poses[k], radius, reverse, last, most - 1e-6, where, sides, end
+        )
+        if found + cost_of(after, direction) - cost_of(after, 0.0) < most - 1e-6:
             return k, found
     return now, 0.0
 
 
-def around(where: Space, goal: Array) -> Array:
+def cost_to_go(where: Space, goal: Array) -> Array:
     """Returns the length of the shortest way from each cell to the goal's around the obstacles in m, `(rows, columns)`.
 
     A cell is free where P keeps its distance from the nearest side of the footprint. The length solves the eikonal
@@ -283,7 +285,7 @@ def around(where: Space, goal: Array) -> Array:
 
 @kernel
 def spread(free: NDArray[np.bool], row: int, column: int, cell: float, found: Array) -> None:
-    """Writes what `around` returns, from a row and a column; `found` is infinite at first.
+    """Writes what `cost_to_go` returns, from a row and a column; `found` is infinite at first.
 
     The front advances in bands that are a cell wide (Kim, "An O(N) level set method for eikonal equations", SIAM J.
     Scientific Computing 22(6), 2001); the cells of a band are looked at again until none changes.
@@ -355,7 +357,7 @@ def cell_of(pose: Array, where: Space) -> tuple[int, int, int]:
 
 
 @kernel
-def drives(pose: Array, turn: float, radius: float, way: float, where: Space, sides: Array, end: Array) -> float:
+def free_length(pose: Array, turn: float, radius: float, way: float, where: Space, sides: Array, end: Array) -> float:
     """Drives along an arc, as `advance` does, and returns how far it is free in m, |way| where it is to its end.
 
     Poses are looked at every `CHECK`, but for those that are so near one before that P has not left a circle about it
@@ -390,14 +392,14 @@ def drives(pose: Array, turn: float, radius: float, way: float, where: Space, si
 
 
 @kernel
-def price(way: float, last: float) -> float:
+def cost_of(way: float, last: float) -> float:
     """Returns the cost of a way in m, negative in reverse, after one in the direction `last`, 0 at the start."""
     switch = SWITCH if way * last < 0 else 0.0
     return switch + (way if way >= 0 else -REVERSE * way)
 
 
 @kernel
-def shot(
+def analytic_expansion(
     start: Array, goal: Array, radius: float, reverse: bool, last: float, most: float, where: Space, sides: Array,
     end: Array,
 ) -> tuple[float, float, float]:  # fmt: skip
@@ -423,7 +425,7 @@ def shot(
     cost, direction, free = 0.0, last, 0.0
     for length in lengths:
         if length != 0.0:
-            cost += price(length, direction)
+            cost += cost_of(length, direction)
             direction = np.sign(length)
     if cost >= most:
         return np.inf, direction, free
@@ -431,7 +433,7 @@ def shot(
     for k in range(PIECES):
         if lengths[k] == 0.0:
             continue
-        driven = drives(now, turns[k], radius, lengths[k], where, sides, end)
+        driven = free_length(now, turns[k], radius, lengths[k], where, sides, end)
         free += driven
         if driven < abs(lengths[k]):
             return np.inf, direction, free
@@ -466,15 +468,15 @@ def search(
     weight, gears = WEIGHT if ahead.any() else 0.0, best.shape[3]
     sides, end = np.empty((len(where.footprint), 4)), np.empty(3)
     turns, lengths = np.zeros(PIECES), np.zeros(PIECES)
-    tree.poses[0], tree.parents[0], tree.turns[0], tree.ways[0], tree.costs[0] = start, -1, 0.0, 0.0, 0.0
+    tree.poses[0], tree.parents[0], tree.turns[0], tree.lengths[0], tree.costs[0] = start, -1, 0.0, 0.0, 0.0
     tree.direct[0], tree.again[0] = shortest(start, goal, radius, reverse, turns, lengths), 0.0
     queue, late, expanded = [(0.0, 0)], [0 for _ in range(0)], 0
     while len(queue) + len(late) > 0:
         delayed = len(queue) == 0  # there is no way but by a shortest path that was not tried
         now = late.pop() if delayed else heapq.heappop(queue)[1]
-        if tree.turns[now] == SHOT:
+        if tree.turns[now] == EXPANSION:
             return now, n, expanded
-        pose, last = tree.poses[now], np.sign(tree.ways[now])
+        pose, last = tree.poses[now], np.sign(tree.lengths[now])
         row, column, heading = cell_of(pose, where)
         if now > 0 and best[row, column, heading, int(last + 1) % gears] != now + 1:
             continue  # a cheaper pose has taken the cell
@@ -486,10 +488,10 @@ def search(
             if not delayed and tree.costs[now] < tree.again[now]:
                 late.append(now)
             else:
-                cost, direction, free = shot(pose, goal, radius, reverse, last, np.inf, where, sides, end)
+                cost, direction, free = analytic_expansion(pose, goal, radius, reverse, last, np.inf, where, sides, end)
                 tree.again[now] = tree.costs[now] + AGAIN * free
                 if cost < np.inf:
-                    tree.poses[n], tree.parents[n], tree.turns[n], tree.ways[n] = goal, now, SHOT, direction
+                    tree.poses[n], tree.parents[n], tree.turns[n], tree.lengths[n] = goal, now, EXPANSION, direction
                     tree.costs[n] = tree.costs[now] + cost
                     heapq.heappush(queue, (tree.costs[n], n))
                     n += 1
@@ -497,17 +499,17 @@ def search(
             continue
         for choice in range(6 if reverse else 3):
             turn, way = float(choice % 3 - 1), step if choice < 3 else -step
-            if drives(pose, turn, radius, way, where, sides, end) < step:
+            if free_length(pose, turn, radius, way, where, sides, end) < step:
                 continue
             row, column, heading = cell_of(end, where)
             gear = int(np.sign(way) + 1) % gears
-            cost = tree.costs[now] + price(way, last)
+            cost = tree.costs[now] + cost_of(way, last)
             rival = best[row, column, heading, gear]
             if ahead[row, column] == np.inf or (rival and tree.costs[rival - 1] <= cost):
                 continue
             tree.direct[n] = shortest(end, goal, radius, reverse, turns, lengths)
             estimate = weight * max(ahead[row, column] - SLACK * cell, tree.direct[n])
-            tree.poses[n], tree.parents[n], tree.turns[n], tree.ways[n], tree.costs[n] = end, now, turn, way, cost
+            tree.poses[n], tree.parents[n], tree.turns[n], tree.lengths[n], tree.costs[n] = end, now, turn, way, cost
             tree.again[n], best[row, column, heading, gear] = tree.again[now], n + 1
             heapq.heappush(queue, (cost + estimate, n))
             n += 1
@@ -521,14 +523,14 @@ def _traced(tree: Tree, count: int, last: int, radius: float, reverse: bool, exp
         chain.append(int(tree.parents[chain[-1]]))
     arcs = np.array(chain[-2:0:-1], int)
     final = steer(tree.poses[tree.parents[last]], tree.poses[last], radius, reverse)
-    curve = Curve(np.append(tree.turns[arcs], final.turns), np.append(tree.ways[arcs], final.lengths))
-    poses, ways = sample(tree.poses[0], curve, radius, CHECK)
-    made = np.flatnonzero((tree.parents[:count] >= 0) & (tree.turns[:count] != SHOT))
+    curve = Curve(np.append(tree.turns[arcs], final.turns), np.append(tree.lengths[arcs], final.lengths))
+    poses, directions = sample(tree.poses[0], curve, radius, CHECK)
+    made = np.flatnonzero((tree.parents[:count] >= 0) & (tree.turns[:count] != EXPANSION))
     searched = np.stack([tree.poses[tree.parents[made], :2], tree.poses[made, :2]], axis=1)
-    return Plan(poses, ways, float(tree.costs[last]), expanded, searched)
+    return Plan(poses, directions, float(tree.costs[last]), expanded, searched)
 
 
-def room(footprint: Array, plan: Waypoints, outlines: Outlines) -> float:
+def least_clearance(footprint: Array, plan: Waypoints, outlines: Outlines) -> float:
     """Returns the smallest clearance along a plan in m; `footprint` has the corners of the robot in m, `(n, 2)`."""
     times = np.linspace(0, plan.period, max(2, round(plan.speed * plan.period / 0.01)))
     return min(clearance(footprint, pose, outlines) for pose in plan.sample(times).pose)

@@ -104,4 +104,4 @@ def test_parks(robot: str, seed: int) -> None:
     task = task_of(f"parking_bay:{seed}", scenario)
     plan, drive = prepared(task, scenario)
     assert outcomes(simulate([drive]), task.goal, plan)["outcome"].tolist() == ["arrived"]
-    assert (plan.ways.min() < 0) == bool(robot)
+    assert (plan.directions.min() < 0) == bool(robot)

@@ -22,7 +22,7 @@ def test_parks():
     run = parked.result.isel(run=0)
     assert float(run["v"].min()) < -0.3 and float(run["v"].max()) > 0.3
     assert np.abs(run["v"].values[np.isclose(run["v_ref"], 0, atol=1e-3)]).max() < 0.05
-    assert parked.plan.ways.min() < 0 and float(run["clearance"].min()) > 0.02
+    assert parked.plan.directions.min() < 0 and float(run["clearance"].min()) > 0.02
 
 
 def test_through_a_door():

@@ -10,7 +10,7 @@ from test_obstacles import judged, random_shapes
 from mrctl import Box, Disc, InputError, Limits, Obstacles
 from mrctl.navigation import planning
 from mrctl.navigation.generators import cellular, corridor, parking_bay
-from mrctl.navigation.planning import around, plan, shortcut, space
+from mrctl.navigation.planning import cost_to_go, plan, shortcut, space
 from mrctl.navigation.steer import sample, steer
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Surroundings, turned
@@ -28,7 +28,7 @@ def drivable(where, found, start, goal, reverse):
     assert np.allclose(found.poses[0], start)
     assert np.allclose(found.poses[-1][:2], goal[:2], atol=1e-6) and np.cos(found.poses[-1][2] - goal[2]) > 1 - 1e-9
     assert min(clearance(FOOTPRINT, pose, where.outlines) for pose in found.poses) > where.margin - 1e-9
-    assert reverse or found.ways.min() >= 0
+    assert reverse or found.directions.min() >= 0
     steps, turns = np.diff(found.poses[:, :2], axis=0), np.diff(found.poses[:, 2])
     turns -= 2 * np.pi * np.round(turns / (2 * np.pi))
     length = np.hypot(*steps.T)
@@ -36,9 +36,9 @@ def drivable(where, found, start, goal, reverse):
     assert np.all(np.abs(turns) <= length / RADIUS * 1.01 + 1e-9)
     middle = found.poses[:-1, 2] + turns / 2
     ahead = np.sum(steps * np.column_stack([np.cos(middle), np.sin(middle)]), axis=1)
-    assert np.allclose(ahead, length * found.ways[1:], atol=1e-6)
-    switches = np.sum(np.diff(found.ways[1:]) != 0)
-    cost = np.sum(length * np.where(found.ways[1:] < 0, planning.REVERSE, 1)) + planning.SWITCH * switches
+    assert np.allclose(ahead, length * found.directions[1:], atol=1e-6)
+    switches = np.sum(np.diff(found.directions[1:]) != 0)
+    cost = np.sum(length * np.where(found.directions[1:] < 0, planning.REVERSE, 1)) + planning.SWITCH * switches
     assert cost == pytest.approx(found.cost, rel=0.01)
 
 
@@ -74,7 +74,7 @@ def test_parking():
     where = space(Surroundings(task.obstacles).at(0.0), FOOTPRINT, low, high)
     found = plan(where, task.start, task.goal, RADIUS, True)
     drivable(where, found, task.start, task.goal, True)
-    assert found.ways.min() == -1
+    assert found.directions.min() == -1
     with pytest.raises(InputError, match="no way"):
         plan(where, task.start, task.goal, RADIUS, False)
 
@@ -196,7 +196,7 @@ def costs(where, poses, reverse):
             return None
         for way in curve.lengths:
             if way != 0:
-                cost += planning.price.compiled(way, last)
+                cost += planning.cost_of.compiled(way, last)
                 length, last = length + abs(way), np.sign(way)
     return cost, length
 
@@ -229,7 +229,7 @@ def test_rrt_star(count):
 def test_around():
     """The way around a wall is at least the straight one, and at most 8 % longer than the shortest."""
     where = prepared(Obstacles(shapes=(Box(length=0.2, width=4.0),)), 3.0, margin=0.0)
-    found = around(where, np.array([2.0, 0.0, 0.0]))
+    found = cost_to_go(where, np.array([2.0, 0.0, 0.0]))
     row, column = (np.array([0.0, -2.0]) + 3.0) / 0.1
     corner = np.array([0.1, 2.0])  # of the wall; P keeps 0.1 m from it
     shortest = 2 * np.hypot(2.0, 2.0)
