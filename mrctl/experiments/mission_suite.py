@@ -24,7 +24,7 @@ import xarray as xr
 
 from mrctl.experiments.cases import HARD
 from mrctl.experiments.journal import Computation, Journal
-from mrctl.experiments.suite_tables import TITLES
+from mrctl.experiments.suite_tables import titled
 from mrctl.experiments.tables import Table, number, share_cell, wins_cell
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
@@ -217,7 +217,7 @@ def critical_widths(found: Found, shown: str) -> Table:
         for name, one in zip(CONTROLLERS, own, strict=True):
             there = int(np.isfinite(one).sum())
             share = share_cell(there, len(one))
-            rows.append([plant, TITLES.get(name, name), share, _quantile(one, 1e3), _quantile(one - found.plans, 1e3)])
+            rows.append([plant, titled(name), share, _quantile(one, 1e3), _quantile(one - found.plans, 1e3)])
             for rival in ("none", "model"):
                 wins = superiority(one, own[CONTROLLERS.index(rival)], floor=TIE)
                 rows[-1].append("" if rival == name else wins_cell(wins))
@@ -246,7 +246,7 @@ def critical_speeds(found: Found, shown: str) -> Table:
     for plant, own in zip(PLANTS, critical.swapaxes(0, 1), strict=True):
         for name, one in zip(CONTROLLERS, own, strict=True):
             counts = " / ".join(f"{np.mean(one >= speed):.2f}" for speed in found.speeds)
-            rows.append([plant, TITLES.get(name, name), _quantile(-one, -1), counts])
+            rows.append([plant, titled(name), _quantile(-one, -1), counts])
     header = ["plant", "controller", "critical speed, m/s", "success up to each speed"]
     says = (
         f"Speeds of {', '.join(f'{speed:.2f}' for speed in found.speeds)} m/s; 0 where even the slowest is too fast. "
@@ -262,13 +262,11 @@ def budget(found: Found, shown: str) -> Table:
         for c, name in enumerate(CONTROLLERS):
             every = found.map_off[c, p], found.needed[-1, c, p], found.posture_known[c, p], found.on_reference[c, p]
             parts = [needed - found.plans for needed in every]
-            rows.append([plant, TITLES.get(name, name), *(_quantile(part, 1e3) for part in parts)])
+            rows.append([plant, titled(name), *(_quantile(part, 1e3) for part in parts)])
             value = [quantile_interval(part, SHARE).value for part in parts]
             if plant == "nominal" and np.isfinite(value).all():
                 off, right, *others = (1e3 * v for v in value)
-                gains[TITLES.get(name, name)] = ", ".join(
-                    f"{v:.1f}" for v in (off - right, *(right - v for v in others))
-                )
+                gains[titled(name)] = ", ".join(f"{v:.1f}" for v in (off - right, *(right - v for v in others)))
     listed = "; ".join(f"`{name}` {gain}" for name, gain in gains.items())
     says = (
         f"On the nominal plant with a map that is {1e3 * MAP_ERROR:.0f} mm off, a right map lowers the allowance by "
@@ -308,8 +306,6 @@ def _against(rival: FeedforwardName, samples: Array) -> str:
         for p, plant in enumerate(PLANTS):
             wins = superiority(samples[c, p], samples[CONTROLLERS.index(rival), p], floor=TIE)
             if name != rival and (wins.low > 0.5 or wins.high < 0.5):
-                verdicts["better" if wins.low > 0.5 else "worse"].append(f"`{TITLES.get(name, name)}` ({plant})")
-    parts = [
-        f"{word} than `{TITLES.get(rival, rival)}` are {', '.join(names)}" for word, names in verdicts.items() if names
-    ]
-    return "; ".join(parts) or f"none differs from `{TITLES.get(rival, rival)}`"
+                verdicts["better" if wins.low > 0.5 else "worse"].append(f"`{titled(name)}` ({plant})")
+    parts = [f"{word} than `{titled(rival)}` are {', '.join(names)}" for word, names in verdicts.items() if names]
+    return "; ".join(parts) or f"none differs from `{titled(rival)}`"

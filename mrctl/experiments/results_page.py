@@ -27,7 +27,7 @@ from mrctl.experiments import identify as identification
 from mrctl.experiments import paper, tuning
 from mrctl.experiments.cases import REPLICATES
 from mrctl.experiments.held_out import LOG
-from mrctl.experiments.suite_tables import COLUMNS, TITLES, column_title, interval
+from mrctl.experiments.suite_tables import COLUMNS, column_title, interval, titled
 from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.record import InputError
 
@@ -192,7 +192,7 @@ def suite_text(table: Table, everything: str) -> str:
         everything: The content of `table.md`.
     """
     cells = [
-        [row["case"], TITLES.get(row["feedforward"], row["feedforward"]), f"{row['failed']}/{row['runs']}"]
+        [row["case"], titled(row["feedforward"]), f"{row['failed']}/{row['runs']}"]
         + [interval(row[metric]) for metric in COLUMNS]
         for case in BENCHMARK
         for row in table["rows"]
@@ -269,7 +269,7 @@ def search_text(tables: Sequence[Table]) -> str:
             unseen = ", ".join(number(fresh[which]["to_model"]) for which in ("shipped", tier))
             gain = f"{number(ratio['value'])} [{number(ratio['low'])}, {number(ratio['high'])}]"
             gain = "the same" if before == found["found"] else gain
-            cells.append([f"`{TITLES.get(table['entry'], table['entry'])}`", tier, settings, seen, unseen, gain])
+            cells.append([f"`{titled(table['entry'])}`", tier, settings, seen, unseen, gain])
     budget = tables[0]["budget"]
     tried = 1 + budget["generations"] * budget["population"]
     says = (
