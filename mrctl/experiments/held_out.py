@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mrctl.experiments import suite
 from mrctl.experiments.cases import HALF, HELD_OUT_SEEDS, NO_SPREAD, Case, Laps
 from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, interval
-from mrctl.experiments.tables import Table, machine, number, output_folder, write_json
+from mrctl.experiments.tables import Table, frame, machine, number, output_folder, write_json
 from mrctl.record import InputError
 from mrctl.results.comparison import bootstrap_interval
 from mrctl.results.dataset import versions
@@ -221,7 +221,7 @@ def summarised(name: str, rows: Sequence[dict[str, Any]], count: int) -> list[Ta
         f"`model+observer` in so many, in the worst of lap 1, all laps and the last lap: {counted}."
     )
     header = ["error", "window", *(f"at or below {rival}" for rival in RIVALS)]
-    found = [Table("Held-out cells (held-out)", says, pd.DataFrame(cells, columns=header))]  # pyright: ignore[reportArgumentType]
+    found = [Table("Held-out cells (held-out)", says, frame(cells, header))]
     if not all(row["at_or_below"] for row in rows):
         found.append(_above(name, rows))
     return found

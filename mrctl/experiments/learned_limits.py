@@ -17,19 +17,17 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from mrctl.control.features import INPUTS, feature_scale
 from mrctl.experiments.journal import Computation, Journal
-from mrctl.experiments.mission_suite import PATIENCE, ROOMY, SHAPE, TIE, Mode
+from mrctl.experiments.mission_suite import PATIENCE, ROOMY, SHAPE, TIE, Mode, drawn
 from mrctl.experiments.mission_suite import PLANTS as SHARED
-from mrctl.experiments.tables import Table, centre_cell, share_cell, wins_cell, word_of
-from mrctl.loop.goals import arrived
+from mrctl.experiments.tables import Table, centre_cell, frame, share_cell, wins_cell, word_of
 from mrctl.loop.learned import kept, save_learned
 from mrctl.loop.simulation import arranged, simulate
 from mrctl.navigation.generators import corridor
-from mrctl.navigation.mission import SLIM, planned
+from mrctl.navigation.mission import SLIM, planned, reached
 from mrctl.navigation.planning import Plan
 from mrctl.navigation.vehicle import robot_of
 from mrctl.record import InputError
@@ -45,7 +43,6 @@ from mrctl.theory.timing import RESERVE, Limits
 
 PLANTS: dict[str, Perturbation] = {**SHARED, "mass +50 %": PERTURBATIONS["mass +50 %"]}
 DRAWS = {"quick": 6, "core": 40}
-MOST = 10  # corridors that are made, over the number of draws
 PACE = 50  # simulated s in a s of one core, planning included
 LIMITS = ("nominal", "learned")
 
@@ -86,15 +83,9 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     """
     count = DRAWS[mode]
     corners, robot = robot_of(base)
-    width, speed, draws = ROOMY * float(np.ptp(corners[:, 1])), RESERVE * robot.max_speed, []
-    for seed in range(MOST * count):
-        task = corridor(width, seed, **SHAPE)
-        with suppress(InputError):
-            draws.append(Draw(seed, *planned(task, base, speed, SLIM), task.goal))
-        if len(draws) == count:
-            break
-    else:
-        raise InputError(f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m")
+    width, speed = ROOMY * float(np.ptp(corners[:, 1])), RESERVE * robot.max_speed
+    complaint = f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m"
+    draws = drawn(partial(draw, base, width, speed), count, complaint)
     left = sum(plant not in journal for plant in PLANTS) * (1 + len(LIMITS))
     expected = journal.expected(left * sum(one.reference.period for one in draws) / PACE, left // (1 + len(LIMITS)))
     print(f"{left * count} runs with nominal and with learned limits, {expected}", flush=True)
@@ -107,6 +98,13 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
         plant: {name: [Run(*run) for run in driven] for name, driven in found.items()}
         for plant, found in zip(PLANTS, journal.results(parts), strict=True)
     }
+
+
+def draw(base: Scenario, width: float, speed: float, seed: int) -> Draw | None:
+    """Makes a corridor and plans a way through it; None where there is no way."""
+    task = corridor(width, seed, **SHAPE)
+    with suppress(InputError):
+        return Draw(seed, *planned(task, base, speed, SLIM), task.goal)
 
 
 def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float, threads: int) -> dict[str, list[Run]]:
@@ -170,9 +168,7 @@ def _driven(
     result, found = simulate([_replicate(perturbed, *case) for case in cases], threads=threads), []
     for k, (one, reference) in enumerate(zip(draws, references, strict=True)):
         run = result.isel(run=k).dropna("time", subset=["x"])
-        end = run.isel(time=-1)
-        pose = np.array([float(end[name]) for name in ("x", "y", "theta")])
-        there = run["failure"].item() == "" and bool(arrived(pose, float(end["v"]), np.array(one.goal)))
+        there = reached(run, one.goal)
         error = float(np.hypot(run["longitudinal_error"], run["lateral_error"]).max())
         found.append(Run(there, reference.period, error if there else np.inf))
     return found
@@ -202,5 +198,4 @@ def tables(runs: Found, shown: str) -> list[Table]:
         "are of the robots that arrive."
     )
     header = ["plant", "limits of the plan", "arrived", "time of the plan, s", "largest error, mm"]
-    frame = pd.DataFrame(rows, columns=header)  # pyright: ignore[reportArgumentType]
-    return [Table(f"Feeding up ({shown})", says, frame)]
+    return [Table(f"Feeding up ({shown})", says, frame(rows, header))]

@@ -13,19 +13,18 @@ place (one standard deviation), and then that of the estimate or that of trackin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import islice
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from mrctl.experiments.cases import HARD
 from mrctl.experiments.journal import Computation, Journal
-from mrctl.experiments.suite_tables import TITLES
-from mrctl.experiments.tables import Table, number, share_cell, wins_cell
+from mrctl.experiments.suite_tables import titled
+from mrctl.experiments.tables import Table, frame, number, share_cell, wins_cell
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import simulate
@@ -52,7 +51,7 @@ ROOMY = 1.5  # width of the corridor of a plan over that of the robot
 MARGINS = (0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)  # of the plan, over half of the rest; the largest that it can keep
 MAP_ERROR = 0.01  # m, standard deviation of the offset of a corridor from its place on the map; chosen
 SLACK = 0.005  # m, the allowance for the critical speed; chosen
-MOST = 10  # corridors that are made, over the number of draws
+MOST = 10  # worlds that are made, over the number of draws
 SHARE = 0.95
 DRAWS = {"quick": 20, "core": 80}  # with fewer than 72 the interval of a critical width has no upper end
 EVERY = 2  # control periods between the poses whose widths are looked at
@@ -61,6 +60,7 @@ PACE = 100  # simulated s in a s of one core, planning included
 
 
 Mode = Literal["quick", "core"]
+T = TypeVar("T")
 POSE = ("x", "y", "theta")
 
 
@@ -106,10 +106,8 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     corners, robot = robot_of(base)
     width = ROOMY * float(np.ptp(corners[:, 1]))
     speeds = [share * robot.max_speed for share in SPEEDS]
-    every = (draw(base, seed, width, speeds) for seed in range(MOST * count))
-    draws = list(islice(filter(None, every), count))
-    if len(draws) < count:
-        raise InputError(f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m")
+    complaint = f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m"
+    draws = drawn(lambda seed: draw(base, seed, width, speeds), count, complaint)
     size, shares = (len(CONTROLLERS), len(PLANTS), count), [*SPEEDS, "true posture"]
     times = [sum(one.references[k].period for one in draws) for k in (*range(len(SPEEDS)), -1)]
     cases = [(c, k) for c in range(len(CONTROLLERS)) for k in range(len(shares))]
@@ -135,6 +133,23 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
         poses = fastest.sample(np.arange(0, fastest.period, 0.02)).pose
         plans.append(corridor_width(corners, poses, one.seed, **SHAPE))
     return Found(needed, off, known, on_reference, np.array(plans), speeds, draws[-1].seed + 1 - count)
+
+
+def drawn(make: Callable[[int], T | None], count: int, complaint: str) -> list[T]:
+    """Makes draws from the seeds 0, 1, … until there are enough.
+
+    Args:
+        make: Makes the draw of a seed, or returns None where there is none.
+        count: Number of draws.
+        complaint: Message of the error.
+
+    Raises:
+        InputError: `MOST` times as many seeds give too few draws.
+    """
+    found = list(islice(filter(None, map(make, range(MOST * count))), count))
+    if len(found) < count:
+        raise InputError(complaint)
+    return found
 
 
 def draw(base: Scenario, seed: int, width: float, speeds: Sequence[float]) -> Draw | None:
@@ -217,7 +232,7 @@ def critical_widths(found: Found, shown: str) -> Table:
         for name, one in zip(CONTROLLERS, own, strict=True):
             there = int(np.isfinite(one).sum())
             share = share_cell(there, len(one))
-            rows.append([plant, TITLES.get(name, name), share, _quantile(one, 1e3), _quantile(one - found.plans, 1e3)])
+            rows.append([plant, titled(name), share, _quantile(one, 1e3), _quantile(one - found.plans, 1e3)])
             for rival in ("none", "model"):
                 wins = superiority(one, own[CONTROLLERS.index(rival)], floor=TIE)
                 rows[-1].append("" if rival == name else wins_cell(wins))
@@ -236,7 +251,7 @@ def critical_widths(found: Found, shown: str) -> Table:
         f"confidence and differences up to {1e3 * TIE:.0f} mm as ties: {_against('none', needed)}; "
         f"{_against('model', needed)}."
     )
-    return Table(f"Critical width of a corridor at {found.speeds[-1]:.2f} m/s ({shown})", says, _frame(rows, header))
+    return Table(f"Critical width of a corridor at {found.speeds[-1]:.2f} m/s ({shown})", says, frame(rows, header))
 
 
 def critical_speeds(found: Found, shown: str) -> Table:
@@ -246,13 +261,13 @@ def critical_speeds(found: Found, shown: str) -> Table:
     for plant, own in zip(PLANTS, critical.swapaxes(0, 1), strict=True):
         for name, one in zip(CONTROLLERS, own, strict=True):
             counts = " / ".join(f"{np.mean(one >= speed):.2f}" for speed in found.speeds)
-            rows.append([plant, TITLES.get(name, name), _quantile(-one, -1), counts])
+            rows.append([plant, titled(name), _quantile(-one, -1), counts])
     header = ["plant", "controller", "critical speed, m/s", "success up to each speed"]
     says = (
         f"Speeds of {', '.join(f'{speed:.2f}' for speed in found.speeds)} m/s; 0 where even the slowest is too fast. "
         f"In paired draws, with 95 % confidence: {_against('none', -critical)}; {_against('model', -critical)}."
     )
-    return Table(f"Critical speed with an allowance of {1e3 * SLACK:.0f} mm ({shown})", says, _frame(rows, header))
+    return Table(f"Critical speed with an allowance of {1e3 * SLACK:.0f} mm ({shown})", says, frame(rows, header))
 
 
 def budget(found: Found, shown: str) -> Table:
@@ -262,13 +277,11 @@ def budget(found: Found, shown: str) -> Table:
         for c, name in enumerate(CONTROLLERS):
             every = found.map_off[c, p], found.needed[-1, c, p], found.posture_known[c, p], found.on_reference[c, p]
             parts = [needed - found.plans for needed in every]
-            rows.append([plant, TITLES.get(name, name), *(_quantile(part, 1e3) for part in parts)])
+            rows.append([plant, titled(name), *(_quantile(part, 1e3) for part in parts)])
             value = [quantile_interval(part, SHARE).value for part in parts]
             if plant == "nominal" and np.isfinite(value).all():
                 off, right, *others = (1e3 * v for v in value)
-                gains[TITLES.get(name, name)] = ", ".join(
-                    f"{v:.1f}" for v in (off - right, *(right - v for v in others))
-                )
+                gains[titled(name)] = ", ".join(f"{v:.1f}" for v in (off - right, *(right - v for v in others)))
     listed = "; ".join(f"`{name}` {gain}" for name, gain in gains.items())
     says = (
         f"On the nominal plant with a map that is {1e3 * MAP_ERROR:.0f} mm off, a right map lowers the allowance by "
@@ -283,11 +296,7 @@ def budget(found: Found, shown: str) -> Table:
         "and a known posture",
         "or the estimate on the reference",
     ]
-    return Table(f"Error budget of the allowance ({shown})", says, _frame(rows, header))
-
-
-def _frame(rows: list[list[str]], header: list[str]) -> pd.DataFrame:
-    return pd.DataFrame(rows, columns=header)  # pyright: ignore[reportArgumentType] (a list of names)
+    return Table(f"Error budget of the allowance ({shown})", says, frame(rows, header))
 
 
 def _quantile(samples: Array, scale: float) -> str:
@@ -308,8 +317,6 @@ def _against(rival: FeedforwardName, samples: Array) -> str:
         for p, plant in enumerate(PLANTS):
             wins = superiority(samples[c, p], samples[CONTROLLERS.index(rival), p], floor=TIE)
             if name != rival and (wins.low > 0.5 or wins.high < 0.5):
-                verdicts["better" if wins.low > 0.5 else "worse"].append(f"`{TITLES.get(name, name)}` ({plant})")
-    parts = [
-        f"{word} than `{TITLES.get(rival, rival)}` are {', '.join(names)}" for word, names in verdicts.items() if names
-    ]
-    return "; ".join(parts) or f"none differs from `{TITLES.get(rival, rival)}`"
+                verdicts["better" if wins.low > 0.5 else "worse"].append(f"`{titled(name)}` ({plant})")
+    parts = [f"{word} than `{titled(rival)}` are {', '.join(names)}" for word, names in verdicts.items() if names]
+    return "; ".join(parts) or f"none differs from `{titled(rival)}`"

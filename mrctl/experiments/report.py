@@ -19,7 +19,7 @@ from mrctl.control.pid import Pid
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
 from mrctl.experiments.cases import BAND, REFERENCES, SLOW, Choices, Outcome
-from mrctl.experiments.suite_tables import NO_CLAIM, TITLES, verdict
+from mrctl.experiments.suite_tables import NO_CLAIM, titled, verdict
 from mrctl.experiments.tables import Table, number
 from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation
@@ -222,7 +222,7 @@ def duels(outcome: Outcome) -> str:
             if other == name:
                 cells[name][other] = Cell("–")
                 continue
-            won = row["position_rmse"][f"beats_{TITLES.get(other, other)}"]
+            won = row["position_rmse"][f"beats_{titled(other)}"]
             text = f"{won['value']:.2f} [{won['low']:.2f}, {won['high']:.2f}]"
             cells[name][other] = Cell(text, np.exp(3 * (1 - 2 * won["value"])))
         cells[name]["failed"] = Cell(f"{row['failed']}/{row['runs']}")

@@ -27,7 +27,7 @@ from mrctl.experiments import identify as identification
 from mrctl.experiments import paper, tuning
 from mrctl.experiments.cases import REPLICATES
 from mrctl.experiments.held_out import LOG
-from mrctl.experiments.suite_tables import COLUMNS, TITLES, column_title, interval
+from mrctl.experiments.suite_tables import COLUMNS, column_title, interval, titled
 from mrctl.experiments.tables import markdown, number, output_folder
 from mrctl.record import InputError
 
@@ -114,50 +114,20 @@ def main(
         tune, search, identify = found["tune"], found["search"], found["identify"]
         navigate = found["navigate"]
         mppi = limits = navigate[: len(ROBOTS)]
-    written: dict[str, str] = {}
-    if reproduce is not None:
-        table = _read(reproduce / "table.json", "last_lap", "endurance", "tiers", "kanayama")
-        written["The paper"] = _section("mrctl reproduce", table, paper_text(table))
-    if suite is not None:
-        table = _read(suite / "table.json", "rows", "mode")
-        flag = "" if table["mode"] == "core" else f" --{table['mode']}"
-        if (count := min(row["runs"] for row in table["rows"])) != REPLICATES[table["mode"]]:
-            flag += f" --seeds {count}"
-        text = suite_text(table, _text(suite / "table.md"))
-        written["The uncertainty suite"] = _section(f"mrctl suite{flag}", table, text)
-    if random is not None:
-        table = _read(random / "table.json", "rows", "mode")
-        names, count = (list(dict.fromkeys(row[k] for row in _random(table))) for k in ("feedforward", "runs"))
-        flags = f"--{table['mode']} --feedforward {' '.join(names)} --random {max(count)}"
-        written["Random worlds"] = _section(f"mrctl suite {flags}", table, random_text(_text(random / "table.md")))
-    if held_out is not None:
-        table = _read(held_out / "table.json", "cells", "entry")
-        text = held_out_text(_text(held_out / "table.md"), _text(held_out / LOG))
-        written["The held-out cells"] = _section(f"mrctl suite --held-out {table['entry']}", table, text)
-    tables = [_read(folder / "table.json", "loops", "motion", "robot", "time_constant") for folder in tune]
-    if designed := [t | {"time_constant": None} for t in tables if np.isnan(t["time_constant"])]:
-        parts = [_section(_tuned(t), t, tuning.default_text(t)) for t in designed]
-        written["The designed PID"] = "\n\n".join([*parts, tuning.GAINS_UNITS])
-    for table in tables:
-        if not np.isnan(table["time_constant"]):
-            written["Where learning is safe"] = _section(_tuned(table), table, tune_text(table))
-    if search:
-        tables = [_read(folder / "table.json", "entry", "shipped", "tiers") for folder in search]
-        written["The search of settings"] = _section("mrctl tune --search NAME", tables[0], search_text(tables))
-    if navigate:
-        written["How narrow and how fast"] = _navigated(navigate, "table", "needed")
-    if mppi:
-        written["Three MPPIs"] = _navigated(mppi, "mppi", "runs")
-    if limits:
-        written["Feeding up"] = _navigated(limits, "limits", "limits")
-    if identify:
-        tables = [_read(file, "constants", "robot") for file in identify]
-        parts = [_section(f"mrctl identify --robot.path {t['robot']['path']}", t, identify_text(t)) for t in tables]
-        written["Identification"] = "\n\n".join(parts)
-    if bench is not None:
-        table = _read(bench, "robots", "threads", "parts", "today")
-        source = {"versions": {k: v for k, v in table["machine"].items() if k not in ("processor", "cores")}}
-        written["Speed"] = _section("mrctl bench", {**table, **source}, benchmark.text(dict(table)))
+    made = {
+        "The paper": reproduce and _paper_section(reproduce),
+        "The uncertainty suite": suite and _suite_section(suite),
+        "Random worlds": random and _random_section(random),
+        "The held-out cells": held_out and _held_out_section(held_out),
+        **_tune_sections(tune),
+        "The search of settings": search and _search_section(search),
+        "How narrow and how fast": navigate and _navigated(navigate, "table", "needed"),
+        "Three MPPIs": mppi and _navigated(mppi, "mppi", "runs"),
+        "Feeding up": limits and _navigated(limits, "limits", "limits"),
+        "Identification": identify and _identify_section(identify),
+        "Speed": bench and _bench_section(bench),
+    }
+    written = {title: text for title, text in made.items() if isinstance(text, str)}  # others have no input
     if not written:
         raise InputError("results_page: name at least one input, such as --bench bench.json")
     page = (sections(_text(out)) if out.exists() else {"": BEGINNING}) | written
@@ -222,7 +192,7 @@ def suite_text(table: Table, everything: str) -> str:
         everything: The content of `table.md`.
     """
     cells = [
-        [row["case"], TITLES.get(row["feedforward"], row["feedforward"]), f"{row['failed']}/{row['runs']}"]
+        [row["case"], titled(row["feedforward"]), f"{row['failed']}/{row['runs']}"]
         + [interval(row[metric]) for metric in COLUMNS]
         for case in BENCHMARK
         for row in table["rows"]
@@ -299,7 +269,7 @@ def search_text(tables: Sequence[Table]) -> str:
             unseen = ", ".join(number(fresh[which]["to_model"]) for which in ("shipped", tier))
             gain = f"{number(ratio['value'])} [{number(ratio['low'])}, {number(ratio['high'])}]"
             gain = "the same" if before == found["found"] else gain
-            cells.append([f"`{TITLES.get(table['entry'], table['entry'])}`", tier, settings, seen, unseen, gain])
+            cells.append([f"`{titled(table['entry'])}`", tier, settings, seen, unseen, gain])
     budget = tables[0]["budget"]
     tried = 1 + budget["generations"] * budget["population"]
     says = (
@@ -321,6 +291,62 @@ def _section(command: str, table: Table, text: str) -> str:
     machine = table["machine"]
     source = f"`{command}` made this with {versions}, on {machine['processor']} with {machine['cores']} cores."
     return f"{source}\n\n{text}"
+
+
+def _paper_section(folder: Path) -> str:
+    table = _read(folder / "table.json", "last_lap", "endurance", "tiers", "kanayama")
+    return _section("mrctl reproduce", table, paper_text(table))
+
+
+def _suite_section(folder: Path) -> str:
+    table = _read(folder / "table.json", "rows", "mode")
+    flag = "" if table["mode"] == "core" else f" --{table['mode']}"
+    if (count := min(row["runs"] for row in table["rows"])) != REPLICATES[table["mode"]]:
+        flag += f" --seeds {count}"
+    return _section(f"mrctl suite{flag}", table, suite_text(table, _text(folder / "table.md")))
+
+
+def _random_section(folder: Path) -> str:
+    table = _read(folder / "table.json", "rows", "mode")
+    names, count = (list(dict.fromkeys(row[k] for row in _random(table))) for k in ("feedforward", "runs"))
+    flags = f"--{table['mode']} --feedforward {' '.join(names)} --random {max(count)}"
+    return _section(f"mrctl suite {flags}", table, random_text(_text(folder / "table.md")))
+
+
+def _held_out_section(folder: Path) -> str:
+    table = _read(folder / "table.json", "cells", "entry")
+    text = held_out_text(_text(folder / "table.md"), _text(folder / LOG))
+    return _section(f"mrctl suite --held-out {table['entry']}", table, text)
+
+
+def _tune_sections(folders: Sequence[Path]) -> dict[str, str]:
+    """Returns the sections of `mrctl tune` by title: of the designed PIDs, and of the last with a time constant."""
+    tables = [_read(folder / "table.json", "loops", "motion", "robot", "time_constant") for folder in folders]
+    made = {}
+    if designed := [t | {"time_constant": None} for t in tables if np.isnan(t["time_constant"])]:
+        parts = [_section(_tuned(t), t, tuning.default_text(t)) for t in designed]
+        made["The designed PID"] = "\n\n".join([*parts, tuning.GAINS_UNITS])
+    for table in tables:
+        if not np.isnan(table["time_constant"]):
+            made["Where learning is safe"] = _section(_tuned(table), table, tune_text(table))
+    return made
+
+
+def _search_section(folders: Sequence[Path]) -> str:
+    tables = [_read(folder / "table.json", "entry", "shipped", "tiers") for folder in folders]
+    return _section("mrctl tune --search NAME", tables[0], search_text(tables))
+
+
+def _identify_section(files: Sequence[Path]) -> str:
+    tables = [_read(file, "constants", "robot") for file in files]
+    parts = [_section(f"mrctl identify --robot.path {t['robot']['path']}", t, identify_text(t)) for t in tables]
+    return "\n\n".join(parts)
+
+
+def _bench_section(file: Path) -> str:
+    table = _read(file, "robots", "threads", "parts", "today")
+    source = {"versions": {k: v for k, v in table["machine"].items() if k not in ("processor", "cores")}}
+    return _section("mrctl bench", {**table, **source}, benchmark.text(dict(table)))
 
 
 def _navigated(folders: Sequence[Path], name: str, key: str) -> str:

@@ -40,7 +40,7 @@ from tqdm import tqdm
 from mrctl.control.stages import Stages
 from mrctl.experiments.cases import GRIP, MARGIN, TUNING_SEEDS, slowed
 from mrctl.experiments.journal import Journal
-from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder
+from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder, write_json
 from mrctl.kernel import Array
 from mrctl.loop import user_files
 from mrctl.loop.simulation import Simulation, run
@@ -325,7 +325,7 @@ def search(
     for tier, one in found.items():
         fresh = compare(searched, candidates, memories[tier], drawn[tier].fresh)
         table["tiers"][tier] = one | {"fresh": fresh, "flags": searched.flags(one["found"])}
-    (out / "table.json").write_text(json_text(table) + "\n")
+    write_json(out / "table.json", table)
     return json_text(table) if json else f"{text(table)}\n\nThe files are in {out}."
 
 

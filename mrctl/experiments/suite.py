@@ -12,7 +12,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-import mrctl.experiments.suite_tables as presented
 from mrctl.experiments import report
 from mrctl.experiments.cases import (
     BAND,
@@ -31,7 +30,7 @@ from mrctl.experiments.cases import (
     Outcome,
     cases,
 )
-from mrctl.experiments.suite_tables import COLUMNS, TITLES, YARDSTICKS
+from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, YARDSTICKS, tables, titled
 from mrctl.experiments.tables import machine, output_folder, write_json
 from mrctl.loop import user_files
 from mrctl.loop.hindsight import REPETITIONS
@@ -47,6 +46,7 @@ from mrctl.sweep.store import Store
 from mrctl.theory.references import Circle
 
 Entry = FeedforwardName | Literal["hindsight"]
+Errors = Mapping[str, Mapping[str, NDArray[np.float64]]]
 CHUNK = 40  # runs in a job: enough for a fast batch, and few enough that no worker idles for long at the end
 STARTING, STATISTICS = 3.0, 0.15  # s for the start of a feedforward's workers, and for a row of the tables; measured
 
@@ -89,7 +89,7 @@ def suite(
     runs = runs_of(chosen, laps)
     rows = compare(chosen, runs)
     outcome = Outcome(mode, chosen, laps, runs, rows, aside)
-    shown = presented.tables(rows, mode)
+    shown = tables(rows, mode)
     (out / "table.md").write_text("\n".join(one.markdown for one in shown))
     found = {"versions": versions(), "machine": machine(), "mode": mode, "rows": rows, "runs": each_run(runs)}
     write_json(out / "table.json", found)
@@ -202,39 +202,60 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
     for case in sorted(chosen, key=lambda case: [*PARTS].index(case.part)):
         ends = found[case.name]
         errors = {metric: {name: windows(own, metric) for name, own in ends.items()} for metric in COLUMNS}
-        lost = {name: own["failed"].values.astype(bool) for name, own in ends.items()}
-        for name, own in ends.items():
-            row: dict[str, Any] = {"part": case.part, "case": case.name, "feedforward": name}
-            row |= {"runs": len(lost[name]), "failed": int(lost[name].sum())}
-            row["guard_events"] = float(own["guard_actions"].sum("lap").mean())
-            if "none" in ends:
-                row["failed_where_pid_did_not"] = int((lost[name] & ~lost["none"]).sum())
-            for metric in COLUMNS:
-                row[metric] = {
-                    window: standing(
-                        name, {one: e[window] for one, e in errors[metric].items()}, floor, case.part == "random"
-                    )
-                    for window, floor in limits[metric].items()
-                }
-                row[metric] |= row[metric].pop("last")
-                last = {one: e["last"] for one, e in errors[metric].items()}
-                if case.part == "random" and "none" in ends and name != "none":
-                    row[metric]["no_worse"] = no_worse(last[name], last["none"])
-                row[metric]["worst"] = cvar(last[name])
-                for rival in YARDSTICKS:
-                    if rival in ends and rival != name:
-                        row[metric][f"to_{titled(rival)}"] = paired_ratio(last[name], last[rival])._asdict()
-                if not any(event.reference for event in case.scenarios[0].events):
-                    until = case.back - 1 if case.back else case.scenarios[0].laps
-                    integral = metrics.excess(own, metric, case.change or 1, until).values
-                    row[metric]["excess"] = bootstrap_interval(integral)._asdict()
-                if case.part in UNCHANGED:
-                    laps = metrics.laps_to_converge(own, metric, BAND).values
-                    row[metric]["laps_to_converge"] = bootstrap_interval(laps)._asdict()
-                if case.back:
-                    row[metric] |= _step(own, metric, case)
-            rows.append(row)
+        rows += [_row(case, name, ends, errors, limits) for name in ends]
     return rows
+
+
+def _row(
+    case: Case, name: str, ends: Laps, errors: Mapping[str, Errors], limits: Mapping[str, Mapping[str, Floor]]
+) -> dict[str, Any]:
+    """Computes the row of a feedforward in a case; `errors` and `limits` are those of `_statistics` by metric."""
+    own, lost = ends[name], ends[name]["failed"].values.astype(bool)
+    row: dict[str, Any] = {"part": case.part, "case": case.name, "feedforward": name}
+    row |= {"runs": len(lost), "failed": int(lost.sum())}
+    row["guard_events"] = float(own["guard_actions"].sum("lap").mean())
+    if "none" in ends:
+        row["failed_where_pid_did_not"] = int((lost & ~ends["none"]["failed"].values.astype(bool)).sum())
+    for metric in COLUMNS:
+        row[metric] = _statistics(case, name, own, metric, errors[metric], limits[metric])
+    return row
+
+
+def _statistics(
+    case: Case, name: str, own: xr.Dataset, metric: str, errors: Errors, limits: Mapping[str, Floor]
+) -> dict[str, Any]:
+    """Computes the statistics of one metric of a row.
+
+    Args:
+        case: The case.
+        name: Name of the feedforward.
+        own: The runs of this feedforward, lap by lap.
+        metric: Name of the metric.
+        errors: What `windows` returns, by feedforward.
+        limits: The floors of the metric by window.
+    """
+    found: dict[str, Any] = {
+        window: standing(name, {one: e[window] for one, e in errors.items()}, floor, case.part == "random")
+        for window, floor in limits.items()
+    }
+    found |= found.pop("last")
+    last = {one: e["last"] for one, e in errors.items()}
+    if case.part == "random" and "none" in last and name != "none":
+        found["no_worse"] = no_worse(last[name], last["none"])
+    found["worst"] = cvar(last[name])
+    for rival in YARDSTICKS:
+        if rival in last and rival != name:
+            found[f"to_{titled(rival)}"] = paired_ratio(last[name], last[rival])._asdict()
+    if not any(event.reference for event in case.scenarios[0].events):
+        until = case.back - 1 if case.back else case.scenarios[0].laps
+        integral = metrics.excess(own, metric, case.change or 1, until).values
+        found["excess"] = bootstrap_interval(integral)._asdict()
+    if case.part in UNCHANGED:
+        laps = metrics.laps_to_converge(own, metric, BAND).values
+        found["laps_to_converge"] = bootstrap_interval(laps)._asdict()
+    if case.back:
+        found |= _step(own, metric, case)
+    return found
 
 
 def windows(laps: xr.Dataset, metric: str) -> dict[str, NDArray[np.float64]]:
@@ -270,11 +291,6 @@ def no_worse(error: NDArray[np.float64], pid: NDArray[np.float64]) -> dict[str, 
     return {"value": share, "low": low, "high": high, "quantile_99": quantile, "much": int((ratio > MUCH_WORSE).sum())}
 
 
-def titled(name: str) -> str:
-    """Returns the name of a feedforward in tables."""
-    return TITLES.get(name, name)
-
-
 class Floor(NamedTuple):
     """Differences that the integrator does not resolve."""
 
@@ -295,7 +311,7 @@ def floors(pairs: Sequence[tuple[Laps, Laps]], metric: str) -> dict[str, Floor]:
     Returns:
         The largest over the pairs; 0 without any.
     """
-    found = {window: Floor(0.0, 0.0) for window in presented.WINDOWS}
+    found = {window: Floor(0.0, 0.0) for window in WINDOWS}
     for whole, half in pairs:
         fine = [name for name in whole if not (whole[name]["failed"].any() or half[name]["failed"].any())]
         before, after = ({name: windows(one[name], metric) for name in fine} for one in (whole, half))

@@ -54,13 +54,18 @@ def tables(rows: Sequence[Row], mode: str) -> list[Table]:
     return found
 
 
+def titled(name: str) -> str:
+    """Returns the name of a feedforward in tables."""
+    return TITLES.get(name, name)
+
+
 def verdict(row: Row, rival: str, metric: str = "position_rmse", window: str = "last") -> int:
     """Compares two feedforwards in one case: −1 is below the rival with 95 % confidence, 1 is above it, 0 is level.
 
     The test pairs the runs (sign test with Wilson's interval); differences that the integrator cannot resolve are ties.
     """
     stated = row[metric] if window == "last" else row[metric][window]
-    beats = stated[f"beats_{TITLES.get(rival, rival)}"]
+    beats = stated[f"beats_{titled(rival)}"]
     return int(beats["high"] < 0.5) - int(beats["low"] > 0.5)
 
 
@@ -80,7 +85,7 @@ def against(rows: Sequence[Row], window: str) -> str:
     ]
     rest = "the others are level with it" if parts else "all are level with it"
     return (
-        f"Position in {WINDOWS[window]} against `{TITLES.get(rival, rival)}` in {cases} case{'s' * (cases > 1)} "
+        f"Position in {WINDOWS[window]} against `{titled(rival)}` in {cases} case{'s' * (cases > 1)} "
         f"({' or '.join(map(str, runs))} runs each, paired, 95 %, differences up to {tie} mm are ties): "
         f"{'; '.join([*parts, rest])}."
     )
@@ -89,7 +94,7 @@ def against(rows: Sequence[Row], window: str) -> str:
 def _counted(counts: dict[str, int]) -> str:
     """Lists names with their counts as text, the largest first, without zeros."""
     ordered = sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
-    return ", ".join(f"`{TITLES.get(name, name)}` in {counts[name]}" for name in ordered)
+    return ", ".join(f"`{titled(name)}` in {counts[name]}" for name in ordered)
 
 
 def resolution(rows: Sequence[Row]) -> str:
@@ -136,7 +141,7 @@ def last_laps(rows: Sequence[Row]) -> pd.DataFrame:
     cells = [
         [
             row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", *(_mean(row[m]) for m in COLUMNS),
-            *(_wins(row, TITLES.get(one, one)) for one in YARDSTICKS), number(row["guard_events"]),
+            *(_wins(row, titled(one)) for one in YARDSTICKS), number(row["guard_events"]),
             *(_harm(row) if random else ()), *([_converged(row)] if unchanged else []),
         ]
         for row in rows
@@ -179,7 +184,7 @@ def leaders(rows: Sequence[Row]) -> list[list[str]]:
         for metric, window in LEADING.values():
             best, *others = sorted(fine, key=lambda name: float(_window(own[name][metric], window)["value"]))
             level = [one for one in others if verdict(own[best], one, metric, window) >= 0]
-            names = (TITLES.get(name, name) for name in (best, *level))
+            names = (titled(name) for name in (best, *level))
             cells.append("tie" if others and len(level) == len(others) else ", ".join(names))
         lines.append([case, *cells])
     return lines

@@ -49,6 +49,11 @@ class Table(NamedTuple):
         return f"## {self.title}\n\n{self.says}\n\n{markdown(list(self.cells), self.cells.to_numpy().tolist())}\n"
 
 
+def frame(rows: Sequence[Sequence[str]], header: Sequence[str]) -> pd.DataFrame:
+    """Returns rows of text as the cells of a table."""
+    return pd.DataFrame(rows, columns=header)  # pyright: ignore[reportArgumentType] (a list of names)
+
+
 def share_cell(count: int, total: int) -> str:
     """Returns a number of runs out of all, with Wilson's 95 % interval of the share."""
     low, high = wilson(count / total, total)

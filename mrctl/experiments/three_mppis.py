@@ -12,17 +12,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from itertools import islice, product
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 from scipy.optimize import fminbound
 
 from mrctl.experiments.journal import Computation, Journal
-from mrctl.experiments.mission_suite import PLANTS, Mode
-from mrctl.experiments.tables import Table, centre_cell, share_cell, wins_cell, word_of
+from mrctl.experiments.mission_suite import PLANTS, Mode, drawn
+from mrctl.experiments.tables import Table, centre_cell, frame, share_cell, wins_cell, word_of
 from mrctl.loop.simulation import simulate
 from mrctl.navigation.generators import Task, slalom
 from mrctl.navigation.mission import PERIOD, avoiding, outcomes, prepared
@@ -56,7 +55,6 @@ GATES, SPACING = 2, 2.0  # of the slalom; m
 CROSSINGS = (3.0, 5.0)  # m, where the discs cross the way, on average
 RADIUS = 0.2  # m, of the discs
 PATIENCE = 2  # time of a run over that of its plan, after which it is out of time
-MOST = 10  # worlds that are made, over the number that is driven
 MOST_LAG = 1.0  # s
 PACE = 8  # simulated s in a s of one core
 TIE = PERIOD
@@ -102,9 +100,8 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
         InputError: The robot finds no way through most worlds.
     """
     count = WORLDS[mode]
-    worlds = list(islice(filter(None, (world(base, seed) for seed in range(MOST * count))), count))
-    if len(worlds) < count:
-        raise InputError(f"suite: {base.robot.path} finds no way through most slaloms")
+    complaint = f"suite: {base.robot.path} finds no way through most slaloms"
+    worlds = drawn(partial(world, base), count, complaint)
     left = sum([name, plant] not in journal for name in ENTRIES for plant in PLANTS)
     seconds = left * sum(one.scenario.reference.period for one in worlds) / PACE
     print(f"{left * count} runs with MPPI, {journal.expected(seconds, 2 * len(PLANTS))}", flush=True)
@@ -230,5 +227,4 @@ def tables(found: Found, shown: str) -> list[Table]:
         f"second: {', '.join(verdicts[SECOND])}; against the first: {', '.join(verdicts[FIRST])}. The words follow "
         "from the share of the pairs, and the averages are over those in which both arrive."
     )
-    frame = pd.DataFrame(rows, columns=header)  # pyright: ignore[reportArgumentType]
-    return [Table(f"Three MPPIs ({shown})", says, frame)]
+    return [Table(f"Three MPPIs ({shown})", says, frame(rows, header))]

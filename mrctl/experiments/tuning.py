@@ -17,7 +17,7 @@ from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import learning_ratio, margins, sampled_loop
 from mrctl.control.pid import Pid
 from mrctl.experiments.response import Array, Response, measure, refine, safety
-from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder
+from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder, write_json
 from mrctl.physics import mjcf
 from mrctl.record import InputError
 from mrctl.results import plots
@@ -87,7 +87,7 @@ def tune(
     with output_folder(out, ["table.json", *plots.files("sensitivity")]):
         table = design(world, Pid.from_dict({"time_constant": time_constant, "lag": lag}), delays, robot)
     if out is not None:
-        (out / "table.json").write_text(json_text(table) + "\n")
+        write_json(out / "table.json", table)
         plots.save(figure(table), out, "sensitivity")
     return json_text(table) if json else text(table)
 

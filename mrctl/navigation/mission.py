@@ -351,13 +351,11 @@ def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
     runs, period, rows = as_runs(result), control_period(result), []
     for row in range(runs.sizes["run"]):
         driven = runs.isel(run=row).dropna("time", subset=["x"])
-        end, failure = driven.isel(time=-1), str(driven["failure"].values)
-        pose = np.array([float(end[name]) for name in ("x", "y", "theta")])
-        there = not failure and bool(arrived(pose, float(end["v"]), np.array(goal)))
+        there, failure = reached(driven, goal), driven["failure"].item()
         length = float(np.hypot(np.diff(driven["x"]), np.diff(driven["y"])).sum())
         rows.append({
             "outcome": "arrived" if there else {"": "out of time", "collision": "collided"}.get(failure, failure),
-            "time": float(end["time"]),
+            "time": float(driven["time"][-1]),
             "length": length,
             "spl": there * found.length / max(found.length, length),
             "clearance": float(driven["clearance"].min()) if "clearance" in driven else np.inf,
@@ -367,6 +365,13 @@ def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
             "expanded": found.expanded,
         })  # fmt: skip
     return pd.DataFrame(rows, index=pd.Index(runs["label"].values, name="label"))
+
+
+def reached(run: xr.Dataset, goal: Pose) -> bool:
+    """Returns whether a robot that did not fail has arrived at its goal when its run ends; `run` ends without NaN."""
+    end = run.isel(time=-1)
+    pose = np.array([float(end[name]) for name in ("x", "y", "theta")])
+    return run["failure"].item() == "" and bool(arrived(pose, float(end["v"]), np.array(goal)))
 
 
 def jerk_of(places: Array, period: float) -> float:
