@@ -34,7 +34,7 @@ from mrctl.theory.obstacles import Box, Disc, Obstacles, Surroundings
 from mrctl.theory.rays import cast
 
 WORLDS = 40  # of either kind, in which plans are made
-SIDES = (6.0, 0.0), (-6.0, 0.0), (0.0, 6.0), (0.0, -6.0)  # m, middles of the walls cost_to_go the particle filter
+SIDES = (6.0, 0.0), (-6.0, 0.0), (0.0, 6.0), (0.0, -6.0)  # m, middles of the walls around the particle filter
 CYLINDERS = 300  # that the lidar sees
 SIDE, CELL, DISCS = 38.4, 0.1, 100  # m, m; side of the worlds of random discs and of their 147,456 cells, and discs
 RADIUS = 0.5  # m, turning radius of plans there
@@ -111,7 +111,7 @@ def _seconds(function: Callable[[], Any]) -> float:
 
 
 def _discs(random: np.random.Generator, count: int, side: float, least: float, most: float) -> Obstacles:
-    """Returns discs at random places of a square cost_to_go the origin with that side, and random radii; all in m."""
+    """Returns discs at random places of a square around the origin with that side, and random radii; all in m."""
     places, radii = random.uniform(-side / 2, side / 2, (count, 2)), random.uniform(least, most, count)
     return Obstacles(shapes=tuple(Disc(x=x, y=y, radius=r) for (x, y), r in zip(places.tolist(), radii, strict=True)))
 
