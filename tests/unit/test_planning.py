@@ -120,7 +120,7 @@ def test_exhaustive(reverse, size, shapes, count, monkeypatch):
     for where, start, goal in worlds(random, size, shapes, cell=0.15):
         found = tried(where, start, goal, RADIUS, reverse)
         with monkeypatch.context() as patch:
-            patch.setattr(planning, "around", lambda where, _: np.zeros(where.field.distance.shape))
+            patch.setattr(planning, "cost_to_go", lambda where, _: np.zeros(where.field.distance.shape))
             every = tried(where, start, goal, RADIUS, reverse, 4_000_000)
         if found is None:
             assert every is None  # it finds a way where there is one
@@ -226,7 +226,7 @@ def test_rrt_star(count):
         assert max(ratios) <= 1.05
 
 
-def test_around():
+def test_cost_to_go():
     """The way around a wall is at least the straight one, and at most 8 % longer than the shortest."""
     where = prepared(Obstacles(shapes=(Box(length=0.2, width=4.0),)), 3.0, margin=0.0)
     found = cost_to_go(where, np.array([2.0, 0.0, 0.0]))
