@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from matplotlib.rcsetup import cycler
-from matplotlib.ticker import LogFormatterSciNotation
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator
 from numpy.typing import NDArray
 
 from mrctl.record import InputError
@@ -367,6 +367,10 @@ def distributions(samples: Mapping[str, np.ndarray], label: str) -> Figure:
         axes.step(finite, np.arange(1, len(finite) + 1) / max(1, len(values)), where="post", **_line(order))
     axes.axvline(1, color="0.4", lw=0.8, ls=":")
     axes.set(xlabel=label, ylabel="share of runs", xscale="log", ylim=(0, 1.02))
+    low, high = axes.get_xlim()
+    axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5) if high < 40 * low else ()))  # more numbers would overlap
+    for formatted in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        formatted("{x:g}")
     handles = [Line2D([], [], **_line(k)) for k in range(len(samples))]
     figure.legend(handles, list(samples), loc="outside upper center", ncols=2)
     return figure

@@ -3,6 +3,7 @@
 import colorsys
 import json
 import re
+from itertools import pairwise
 
 import matplotlib as mpl
 import numpy as np
@@ -296,6 +297,19 @@ def test_distributions():
     (axes,) = figure.axes
     np.testing.assert_array_equal(axes.lines[0].get_xydata(), [[1, 0.25], [2, 0.5], [3, 0.75]])
     assert legend(figure) == ["fel"]
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.13, 2.0), (0.9, 1.2), (0.01, 40.0)])
+def test_numbers_of_distributions(low, high):
+    """The numbers of the axis are plain, lie apart, and there are at least two, whatever its range."""
+    figure = plots.distributions({"fel": np.geomspace(low, high, 20)}, "ratio")
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    texts = [text for text in axes.get_xticklabels() + axes.get_xticklabels(minor=True) if text.get_text()]
+    texts = [text for text in texts if axes.get_xlim()[0] <= text.get_position()[0] <= axes.get_xlim()[1]]
+    boxes = sorted((text.get_window_extent() for text in texts), key=lambda box: box.x0)
+    assert len(boxes) >= 2 and all(one.x1 < other.x0 for one, other in pairwise(boxes))
+    assert all(float(text.get_text()) == pytest.approx(text.get_position()[0], rel=1e-3) for text in texts)
 
 
 def test_inverse_dynamics():
