@@ -581,7 +581,7 @@ def _repeat_saved(folder: Path, arguments: Sequence[str], out: Path | None, json
     if (folder / "mission.json").exists():
         raise InputError(f"run: {folder} holds a mission, which mrctl navigate {folder} repeats")
     if (folder / "sweep.json").exists():
-        raise InputError(f"run: {folder} is the store of a sweep; give the number of a run with --run")
+        raise InputError(f"run: {folder} is the store of a sweep; for one of its runs give its number with --run")
     if new := sorted(_fields_set(arguments) - {"out", "json", "controller"}):
         raise InputError(f"{new[0]}: {folder} holds a run, which is driven as it was; leave --{new[0]} out")
     from mrctl.kernel import announced_early
