@@ -256,11 +256,12 @@ def test_live(browser, tmp_path):
         page.keyboard.press("n")  # the arrows move the camera
         until(lambda: live.session.tick == tick + 2, "a step by the key N")
         page.keyboard.press("f")
-        until(lambda: live._follow.value and abs(node(page, "/world")[0]) > 0.1, "the camera to follow by the key F")
+        away = lambda: np.allclose(node(page, "/world")[:2], -node(page, ROBOT)[:2], atol=1e-3)  # noqa: E731
+        until(lambda: live._follow.value and away(), "the camera to follow by the key F")
         page.keyboard.press("f")
         until(lambda: np.allclose(node(page, "/world"), 0), "the camera to let go")
         page.get_by_label("Camera follows").click()  # the robot stays, and the world moves
-        until(lambda: np.allclose(node(page, "/world")[:2], -node(page, ROBOT)[:2], atol=1e-3), "the world to move")
+        until(away, "the world to move")
         page.keyboard.press("f")  # a checkbox that was clicked on does not keep the key
         until(lambda: np.allclose(node(page, "/world"), 0), "the world to be back")
         assert live.session.tick == tick + 2
