@@ -44,6 +44,7 @@ NOT_OF_MISSIONS = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
 
 WITH_RECORDS = "run", "navigate", "identify", "view"
 """Commands whose short help leaves out most of the flags of a record."""
+
 IDENTIFIED = ("perturbation", "robot", "sensing")
 """Arguments of `mrctl identify` that are records; its short help lists them, as that of `run` does with its fields."""
 

@@ -16,8 +16,9 @@ from mrctl.loop.learned import save_learned
 from mrctl.loop.simulation import named_stages, simulate
 from mrctl.record import InputError
 from mrctl.results import metrics
-from mrctl.results.dataset import departure, faults_of, open_result, save, scenarios_of, versions
+from mrctl.results.dataset import departure, faults_of, save, scenarios_of, versions
 from mrctl.scenario import Scenario
+from mrctl.sweep import store
 
 COLUMNS = {
     "longitudinal_rmse": ("x error, mm", 1e3),
@@ -78,7 +79,7 @@ def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None
         InputError: There is no result of one run, other stages drove it, or `run` refuses something.
     """
     with output_folder(out, () if out is None else _written()):
-        saved = metrics.as_runs(open_result(folder / "result.zarr" if (folder / "result.zarr").exists() else folder))
+        saved = metrics.as_runs(store.open(folder))
         scenarios = scenarios_of(saved)
         if len(scenarios) != 1:
             raise InputError(f"{folder}: holds {len(scenarios)} runs; mrctl run repeats a single one")

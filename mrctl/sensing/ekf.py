@@ -10,9 +10,9 @@
 
 b is the bias of the gyro, and s_l,r are the relative errors of the wheel radii. They hardly change. The radii become
 uncertain where encoders and gyro contradict each other although no wheel can slip (`find_radius`), and radii, bias and
-posture where the fixes contradict dead reckoning (`find_drift`). The accelerometer a,
-corrected for its place ahead of the axle, is an input; its offset o is the sum of its bias and a component of gravity.
-θ̈_c is the commanded acceleration that acts in the period. κ and ρ are `lag` and `load` of the tyres
+posture where the fixes contradict dead reckoning (`find_drift`). The accelerometer a, corrected for its place ahead of
+the axle, is an input; its offset o is the sum of its bias and a component of gravity. θ̈_c is the commanded
+acceleration that acts in the period. κ and ρ are `lag` and `load` of the tyres
 (`theory.robot.Tyres`), and the accelerometer measures a_y, too. The wheel angles λ are part of the state, so that the
 error of an encoder stays bounded in angle; modelled as noise on V, it would become a random walk of the position. The
 noise of a and θ̈ moves the positions of the same period, so that an encoder sees it at once. A fix corrects the state at
@@ -80,6 +80,7 @@ EKF = np.dtype(
         ("offset", "f8"),  # offset o of the accelerometer as the observer of `find_grip` estimates it, m/s²
         ("difference", "f8"),  # mean of left less right wheel's speed by its encoder, less that by the gyro, m/s
         ("drift", "f8", 2),  # running means for `find_drift`: of the position along the heading, and of the heading
+        ("drift_bound", "f8"),  # on these means; infinite where the fixes are not independent of encoders and gyro
         ("refused", "i8"),  # number of fixes rejected in a row
         ("nis", "f8"),  # normalised innovation squared of the last fix, chi-square with 3 degrees of freedom
         ("innovations", "f8", 3),  # normalised, of the last encoder samples, at most `SLIPPED`, and gyro sample
@@ -237,7 +238,8 @@ def find_drift(along: float, turned: float, s: Row) -> None:
     standard deviations, dead reckoning is wrong; the filter takes that for another radius of a wheel. Until it was
     found out, the error has gone into the bias of the gyro and into the posture, too: the standard deviations of the
     radii are raised to `DOUBT`, that of the bias to that of the start, and the variances of the posture by those of a
-    fix. Then the mean begins again at 0, so that another error that lasts is found again and again.
+    fix. Then the mean begins again at 0, so that another error that lasts is found again and again. Fixes by particles,
+    which encoders and gyro move, have no white innovations; there the bound is infinite.
 
     Args:
         along: Innovation of the position along the heading, in its standard deviation.
@@ -246,7 +248,7 @@ def find_drift(along: float, turned: float, s: Row) -> None:
     """
     s.drift[0] += (along - s.drift[0]) / FIXES
     s.drift[1] += (turned - s.drift[1]) / FIXES
-    if max(abs(s.drift[0]), abs(s.drift[1])) > DRIFTING / np.sqrt(2 * FIXES - 1):
+    if max(abs(s.drift[0]), abs(s.drift[1])) > s.drift_bound:
         P = s.P
         for k in range(SCALE_LEFT, N):
             P[k, k] = max(P[k, k], DOUBT**2)

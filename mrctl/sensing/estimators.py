@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mrctl.kernel import Array, Held, Kernel, Row, Rows, held, kernel
-from mrctl.sensing.ekf import EKF, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
+from mrctl.sensing.ekf import DRIFTING, EKF, FIXES, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
 from mrctl.sensing.localisation import Localiser
 from mrctl.sensing.prediction import SEEN, front, predict, wrapped
 from mrctl.sensing.scanner import Scanner
@@ -259,6 +259,8 @@ class Estimator:
             memory["encoder_variance"], memory["gyro_variance"] = count, sensor["gyro_sigma"] ** 2
             memory["bias_variance"], memory["bias_walk"] = sensing["gyro_bias"] ** 2, sensing["gyro_walk"]
             memory["kept_tick"] = -1
+            own = sensing.localisation == "particles"  # moved by encoders and gyro, so that errors of fixes last
+            memory["drift_bound"] = np.inf if own else DRIFTING / np.sqrt(2 * FIXES - 1)
             memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
             memory["inertial"] = memory["mean"][3]
 

@@ -114,6 +114,7 @@ def random_filter(seed, spread=1.0):
     s["encoder_variance"], s["gyro_variance"] = (2 * np.pi / 88_064) ** 2 / 12, 3e-3**2
     s["bias_walk"], s["acceleration_variance"], s["offset_walk"] = 2e-5, 0.016**2, 0.02
     s["fix_variance"], s["offset"] = (9e-6, 9e-6, 9e-6), 0.05
+    s["drift_bound"] = laws.DRIFTING / np.sqrt(2 * laws.FIXES - 1)
     s["kept_tick"] = -1
     return s, rng
 
