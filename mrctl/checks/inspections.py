@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mrctl.checks.open_loop import Car, is_steered, rolling_wheels
+from mrctl.kernel import Array
 from mrctl.physics.elements import MOTORS, REAR, fronts
 from mrctl.physics.mjcf import steerings
 from mrctl.physics.parameters import read_robot
@@ -107,7 +108,7 @@ def _centres(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     return _suspect("off-centre wheel", odd, advice, lambda m, wheel: [(m.geom(wheel).pos, m.joint(wheel).pos)])
 
 
-def _axis(model: mujoco.MjModel, joint: Part) -> NDArray[np.float64]:
+def _axis(model: mujoco.MjModel, joint: Part) -> Array:
     """Returns the axis of a joint in the frame of its body's parent, a unit vector `(3,)`."""
     rotated = np.zeros(3)
     mujoco.mju_rotVecQuat(rotated, model.joint(joint).axis, model.body(model.jnt_bodyid[model.joint(joint).id]).quat)
@@ -290,7 +291,7 @@ def _losses(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 def _creep(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
-    def impedance(m: mujoco.MjModel, wheel: Part) -> NDArray[np.float64]:
+    def impedance(m: mujoco.MjModel, wheel: Part) -> Array:
         return m.dof_solimp[m.joint(wheel).dofadr[0], :2]
 
     lowest = {wheel: impedance(model, wheel).min() for wheel in rolling_wheels(model)}
@@ -415,7 +416,7 @@ def _grip(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
     )
 
 
-def _slip_times(model: mujoco.MjModel) -> NDArray[np.float64]:
+def _slip_times(model: mujoco.MjModel) -> Array:
     """Returns the time constants with which the tyres' contacts damp slip, in s; a solreffriction of 0 means solref."""
     pairs = list(_tyres(model))
     own = model.pair_solreffriction[pairs, 0]

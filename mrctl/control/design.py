@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains, sampled_loop
+from mrctl.kernel import Array
 from mrctl.theory import linear
 from mrctl.theory.linear import Linear
 from mrctl.theory.robot import Robot
@@ -129,7 +130,7 @@ def _largest_gain(loop: NDArray[np.complex128]) -> float:
     return float(min(gains))
 
 
-def _least_root(a: NDArray[np.float64], b: NDArray[np.float64], c: float) -> float:
+def _least_root(a: Array, b: Array, c: float) -> float:
     """Returns the least positive root of any of the equations a k² + b k + c = 0 with a and c positive."""
     square = b**2 - 4 * a * c
     touching = (square >= 0) & (b < 0)
@@ -228,7 +229,7 @@ def _motion(
     return Motion(Kanayama(k_x=k_x, k_y=lateral**2, k_theta=2 * lateral), prefilter, (v_lag, omega_lag))
 
 
-def _kept(shares: NDArray[np.float64], peaks: NDArray[np.float64]) -> float:
+def _kept(shares: Array, peaks: Array) -> float:
     """Returns the largest share up to which the peaks keep the bound; the first peak is that of the PID alone."""
     bound = WHOLE * max(M_S, peaks[0])
     beyond = np.flatnonzero(peaks > bound)
@@ -239,9 +240,9 @@ def _kept(shares: NDArray[np.float64], peaks: NDArray[np.float64]) -> float:
 
 
 def sensitivity(
-    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], kanayama: NDArray[np.float64], prefilter: float,
+    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], kanayama: Array, prefilter: float,
     delay: float = 0.0, period: float = 0.01,
-) -> NDArray[np.float64]:  # fmt: skip
+) -> Array:  # fmt: skip
     """Returns max |S| of both channels under the motion controller, with and without the nominal model as feedforward.
 
     Each is the largest over the speeds of `points`, dimensionless. The prior `none` is without the model until the
@@ -270,8 +271,8 @@ def sensitivity(
 
 
 def whole_loop(
-    frequency: NDArray[np.float64], robot: Robot, rigid: bool, channel: int, gains: Gains,
-    kanayama: NDArray[np.float64], prefilter: float, delay: float, period: float,
+    frequency: Array, robot: Robot, rigid: bool, channel: int, gains: Gains,
+    kanayama: Array, prefilter: float, delay: float, period: float,
 ) -> NDArray[np.complex128]:  # fmt: skip
     """Frequency responses of the loop of one channel under the motion controller, without and with the nominal model.
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.kernel import Array
 from mrctl.theory.linear import Linear
 
 
@@ -18,7 +19,7 @@ class Gains(NamedTuple):
 
 
 def sampled_loop(
-    frequency: NDArray[np.float64], plant: Linear, gains: Gains, period: float, delay: float, lag: float = 0.0
+    frequency: Array, plant: Linear, gains: Gains, period: float, delay: float, lag: float = 0.0
 ) -> NDArray[np.complex128]:
     """Frequency response of the open velocity loop: PI control, zero-order hold, plant P, delay and lag.
 
@@ -63,7 +64,7 @@ class Margins(NamedTuple):
     sensitivity: float
 
 
-def margins(frequency: NDArray[np.float64], loop: NDArray[np.complex128]) -> Margins:
+def margins(frequency: Array, loop: NDArray[np.complex128]) -> Margins:
     """Margins of an open loop on a fine grid of frequencies.
 
     Args:

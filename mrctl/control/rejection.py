@@ -15,11 +15,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrctl.control.design import Motion, points
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains
+from mrctl.kernel import Array
 from mrctl.theory.linear import Linear
 from mrctl.theory.robot import Robot
 
@@ -109,7 +109,7 @@ class Loop:
                 return position - step, 0.0
             return position + period * speed * (2 * heading - step) / 2, heading - step
 
-        def after(s: NDArray[np.float64], disturbance: float) -> NDArray[np.float64]:
+        def after(s: Array, disturbance: float) -> Array:
             new, v, position, heading = s.copy(), s[0], s[p], s[h]
             for rate in s[r:]:  # predicted over the delay
                 position, heading = moved(v, v + period * rate, position, heading)
@@ -133,7 +133,7 @@ class Loop:
         self.state = {"velocity": 0, "integral": i, "position": p, "heading": h}
         self._doublings = int(np.ceil(np.log2(HORIZON / period)))
 
-    def response(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
+    def response(self, state: Array) -> Array:
         """Velocity error and position error that follow from a state, tick by tick, `(2, n)`."""
         states, power = state[:, None], self.step
         for _ in range(self._doublings):  # x(n … 2n) = Aⁿ x(0 … n)

@@ -21,8 +21,9 @@ from dm_control.rl import control
 from dm_control.utils import containers
 from dm_env import specs
 
-from mrctl.envs.episodes import ACTION_KINDS, Action, Array, Draw, Episodes, read
+from mrctl.envs.episodes import ACTION_KINDS, Action, Draw, Episodes, read
 from mrctl.envs.navigation import Navigating, read_mission
+from mrctl.kernel import Array
 from mrctl.physics.plant import PhysicsPlant
 from mrctl.scenario import Scenario
 

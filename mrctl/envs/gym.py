@@ -24,9 +24,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from mrctl.envs.episodes import ACTION_KINDS, Action, Array, Draw, Episodes, read
+from mrctl.envs.episodes import ACTION_KINDS, Action, Draw, Episodes, read
 from mrctl.envs.navigation import Navigating, read_mission
 from mrctl.envs.pictures import Pictures
+from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from mrctl.experiments import suite
 from mrctl.experiments.cases import HALF, HELD_OUT_SEEDS, NO_SPREAD, Case, Laps
 from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, interval
 from mrctl.experiments.tables import Table, frame, machine, number, output_folder, write_json
+from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results.comparison import bootstrap_interval
 from mrctl.results.dataset import versions
@@ -184,7 +184,7 @@ def compare(name: str, found: Mapping[str, Laps]) -> list[dict[str, Any]]:
     return rows
 
 
-def _standing(mine: NDArray[np.float64], theirs: NDArray[np.float64], floor: suite.Floor) -> dict[str, Any]:
+def _standing(mine: Array, theirs: Array, floor: suite.Floor) -> dict[str, Any]:
     lost, lost_by_rival = (int((~np.isfinite(one)).sum()) for one in (mine, theirs))
     both = np.isfinite(mine) & np.isfinite(theirs)
     difference = bootstrap_interval((mine - theirs)[both])._asdict()

@@ -35,6 +35,7 @@ from tqdm import trange
 
 from mrctl.checks.open_loop import on_skid
 from mrctl.experiments.tables import json_text, machine, markdown
+from mrctl.kernel import Array
 from mrctl.physics import mjcf
 from mrctl.physics.elements import is_level
 from mrctl.physics.plant import Plant, build
@@ -45,7 +46,6 @@ from mrctl.sensing.tiers import LAB, Sensing
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.robot import CAR, Robot, RobotFile
 
-Array = NDArray[np.float64]
 Lines = NDArray[np.complex128]
 
 PERIOD = 10.0  # s of the excitation

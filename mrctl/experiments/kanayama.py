@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrctl.control.kanayama import GAINS, kanayama, posture_error
 from mrctl.control.limiter import LIMITER, limit
@@ -88,7 +87,7 @@ def control(
         limit(s.request, zero, zero, max_twist, max_acceleration, period, s.limiter)
 
 
-def paths(cases: list[Case], period: float = STEP) -> NDArray[np.float64]:
+def paths(cases: list[Case], period: float = STEP) -> Array:
     """Simulates every case; returns the postures over time.
 
     Args:
@@ -119,7 +118,7 @@ def paths(cases: list[Case], period: float = STEP) -> NDArray[np.float64]:
     return record
 
 
-def measure(case: Case, path: NDArray[np.float64]) -> float:
+def measure(case: Case, path: Array) -> float:
     """Returns the value of one case in its unit, from its postures `(steps, 3)` in m, m, rad."""
     x, y = path[:, 0], path[:, 1]
     if case.measure == "residual":

@@ -19,13 +19,13 @@ from scipy.interpolate import CubicSpline
 from mrctl.control.feedforward import STEERING_SCALE
 from mrctl.control.guard import Guard
 from mrctl.control.matching import LAG
+from mrctl.kernel import Array
 from mrctl.loop.hierarchy import TAKE_OVER
 from mrctl.loop.simulation import Simulation, arranged
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, Scenario
 from mrctl.theory.references import Line
 
-Array = NDArray[np.float64]
 Response = NDArray[np.complex128]
 
 SAMPLES = 1000  # control periods in a period of the excitation

@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from mrctl.experiments import report
 from mrctl.experiments.cases import (
@@ -32,6 +31,7 @@ from mrctl.experiments.cases import (
 )
 from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, YARDSTICKS, tables, titled
 from mrctl.experiments.tables import machine, output_folder, write_json
+from mrctl.kernel import Array
 from mrctl.loop import user_files
 from mrctl.loop.hindsight import REPETITIONS
 from mrctl.loop.simulation import cores, simulate
@@ -46,7 +46,7 @@ from mrctl.sweep.store import Store
 from mrctl.theory.references import Circle
 
 Entry = FeedforwardName | Literal["hindsight"]
-Errors = Mapping[str, Mapping[str, NDArray[np.float64]]]
+Errors = Mapping[str, Mapping[str, Array]]
 CHUNK = 40  # runs in a job: enough for a fast batch, and few enough that no worker idles for long at the end
 STARTING, STATISTICS = 3.0, 0.15  # s for the start of a feedforward's workers, and for a row of the tables; measured
 
@@ -258,13 +258,13 @@ def _statistics(
     return found
 
 
-def windows(laps: xr.Dataset, metric: str) -> dict[str, NDArray[np.float64]]:
+def windows(laps: xr.Dataset, metric: str) -> dict[str, Array]:
     """Returns the errors of each run in lap 1, over all laps (RMS), and in the last lap; NaN if the run failed."""
     error = laps[metric].transpose("run", "lap").values
     return {"first": error[:, 0], "all": np.sqrt(np.mean(error**2, axis=1)), "last": error[:, -1]}
 
 
-def standing(name: str, errors: Mapping[str, NDArray[np.float64]], floor: Floor, median: bool) -> dict[str, Any]:
+def standing(name: str, errors: Mapping[str, Array], floor: Floor, median: bool) -> dict[str, Any]:
     """Returns the mean or median of one feedforward in a case, and compares it with the others in the same runs."""
     found: dict[str, Any] = bootstrap_interval(errors[name], median=median)._asdict() | {"floor": floor._asdict()}
     for rival, theirs in errors.items():
@@ -278,7 +278,7 @@ def standing(name: str, errors: Mapping[str, NDArray[np.float64]], floor: Floor,
     return found
 
 
-def no_worse(error: NDArray[np.float64], pid: NDArray[np.float64]) -> dict[str, float | int]:
+def no_worse(error: Array, pid: Array) -> dict[str, float | int]:
     """Share of runs whose error is at most `NO_WORSE` times that of PID alone, with Wilson's 95 % interval.
 
     With it come the 99 % quantile of that ratio, and the number of runs in which it is above `MUCH_WORSE`. The ratio of

@@ -16,8 +16,9 @@ from mrctl.control.design import motion as motion_design
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import learning_ratio, margins, sampled_loop
 from mrctl.control.pid import Pid
-from mrctl.experiments.response import Array, Response, measure, refine, safety
+from mrctl.experiments.response import Response, measure, refine, safety
 from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder, write_json
+from mrctl.kernel import Array
 from mrctl.physics import mjcf
 from mrctl.record import InputError
 from mrctl.results import plots

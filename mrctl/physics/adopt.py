@@ -17,16 +17,14 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from mrctl.kernel import Array
 from mrctl.physics.bounds import compiling
 from mrctl.physics.elements import FRONTS, MOTORS, NUMERICS, REAR, RIGID, has
 from mrctl.physics.files import robot_path
 from mrctl.record import InputError
 from mrctl.theory.kinematics import UP
 from mrctl.theory.robot import RobotFile
-
-Array = NDArray[np.float64]
 
 PREFIX = "robot/"  # put before each name of the robot's file that is not replaced
 LEVEL = 0.1  # share of the wheel radius: a caster this near to the floor touches it, and two this close are one

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+
+from mrctl.kernel import Array
 
 REAR = ("wheel_left", "wheel_right")
 """Names of the driven wheels: of body, joint and geom alike."""
@@ -57,7 +58,7 @@ def bodies_of(model: mujoco.MjModel) -> list[int]:
     return [body for body in range(model.nbody) if model.body_rootid[body] == chassis]
 
 
-def centres(model: mujoco.MjModel, data: mujoco.MjData, wheels: Sequence[str]) -> NDArray[np.float64]:
+def centres(model: mujoco.MjModel, data: mujoco.MjData, wheels: Sequence[str]) -> Array:
     """Returns the positions of wheel centres relative to P in the chassis' frame, rounded to the picometre.
 
     Args:
@@ -72,7 +73,7 @@ def centres(model: mujoco.MjModel, data: mujoco.MjData, wheels: Sequence[str]) -
     return np.array([rounded(chassis.xmat.reshape(3, 3).T @ (data.geom(w).xpos - chassis.xpos)) for w in wheels])
 
 
-def rounded(length: NDArray[np.float64]) -> NDArray[np.float64]:
+def rounded(length: Array) -> Array:
     """Rounds lengths in m, of any shape, to the picometre, so that an MJCF's 0.40 − 0.37 gives 0.03."""
     return np.round(length, 12)
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
+from mrctl.kernel import Array
 from mrctl.physics.elements import (
     MOTORS,
     REAR,
@@ -107,7 +107,7 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
     return robot
 
 
-def at_rest(model: mujoco.MjModel, scratch: mujoco.MjData | None = None) -> tuple[mujoco.MjData, NDArray[np.float64]]:
+def at_rest(model: mujoco.MjModel, scratch: mujoco.MjData | None = None) -> tuple[mujoco.MjData, Array]:
     """Computes the kinematics of the robot as its file places it.
 
     Args:

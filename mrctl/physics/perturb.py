@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.kernel import Array
 from mrctl.physics.elements import MOTORS, REAR, bodies_of, left_tyre_pairs, rolling_fronts
 from mrctl.physics.parameters import at_rest, load_torques, read_robot
 from mrctl.physics.readout import current_limits
@@ -142,7 +143,7 @@ def _upright_axis(model: mujoco.MjModel, body: int) -> int:
     return int(np.argmax(np.abs(frame[6:])))
 
 
-def _add_point_mass(model: mujoco.MjModel, body: int, mass: float, position: NDArray[np.float64]) -> None:
+def _add_point_mass(model: mujoco.MjModel, body: int, mass: float, position: Array) -> None:
     """Adds a point mass in kg to a body, at a position `(3,)` in m in the body's frame.
 
     The parallel-axis theorem gives the tensor about the new centre of mass, whose principal axes MuJoCo stores.

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.kernel import Array
 from mrctl.physics.elements import COLLISION, centres, fronts, has, knuckles
 from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError
@@ -24,8 +25,8 @@ from mrctl.theory.robot import Robot
 class State(NamedTuple):
     """Generalised positions `(nq,)` and velocities `(nv,)` of one model, as MuJoCo orders them."""
 
-    qpos: NDArray[np.float64]
-    qvel: NDArray[np.float64]
+    qpos: Array
+    qvel: Array
 
 
 def stand(model: mujoco.MjModel, pose: NDArray, twist: NDArray, robot: Robot | None = None) -> State:

@@ -12,11 +12,10 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from mrctl.kernel import Array
 from mrctl.record import InputError
-
-Array = NDArray[np.float64]
 
 
 class Interval(NamedTuple):

@@ -19,6 +19,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from mrctl import __version__
+from mrctl.kernel import Array
 from mrctl.record import InputError, printable, read_file, reading
 from mrctl.scenario import Scenario
 
@@ -174,8 +175,8 @@ def dataset(
     feedforwards: Sequence[str],
     log: NDArray[np.void],
     failure: Sequence[str],
-    failure_time: NDArray[np.float64],
-    weights: NDArray[np.float64] | None,
+    failure_time: Array,
+    weights: Array | None,
 ) -> xr.Dataset:
     """Labels the record of a batch of runs.
 

@@ -14,14 +14,12 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from mrctl.control.features import NAMES, feature_matrix
+from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results.dataset import require
 from mrctl.results.metrics import as_runs, control_period
-
-Array = NDArray[np.float64]
 
 ROUNDING = 1e-14  # eigenvalues below this share of the largest are due to rounding; long runs have a larger share
 MOTIONS = {"commanded": ("v_command", "omega_command"), "true": ("v", "omega")}

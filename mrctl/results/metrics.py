@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from mrctl.control.features import feature_matrix
 from mrctl.control.guard import GUARD_ACTIONS, NONE, REASONS
+from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results.dataset import check_kind, require
-
-Array = NDArray[np.float64]
 
 METRICS: dict[str, tuple[str, str]] = {
     "longitudinal_rmse": ("m", "RMS longitudinal error"),

@@ -23,8 +23,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator
-from numpy.typing import NDArray
 
+from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results import excitation as exciting
 from mrctl.results.controllers import colours_of
@@ -474,7 +474,7 @@ def _figure(width: float, height: float, rows: int = 1, columns: int = 1, sharey
     return figure, list(axes.flat)
 
 
-def _surroundings(axes: Axes, scenario: Scenario, times: NDArray[np.float64]) -> None:
+def _surroundings(axes: Axes, scenario: Scenario, times: Array) -> None:
     """Draws the obstacles of a scenario, where they are at times in s, and its goal."""
     for shape in scenario.obstacles.shapes:
         disc = shape.kind == "disc"

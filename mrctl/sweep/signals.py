@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 import zarr
-from numpy.typing import NDArray
 from xarray.backends import BackendArray, BackendEntrypoint
 from xarray.core import indexing
 
+from mrctl.kernel import Array
 from mrctl.results.dataset import reading_chunks
 
 DIMENSIONS = ("run", "time", "signal")
@@ -25,10 +25,10 @@ class _Signals(BackendArray):
         self.shape, self.dtype = array.shape, array.dtype
         self._array, self._shard = array, shard
 
-    def __getitem__(self, key: indexing.ExplicitIndexer) -> NDArray[np.float64]:
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Array:
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.OUTER, self._read)
 
-    def _read(self, key: tuple[Any, ...]) -> NDArray[np.float64]:
+    def _read(self, key: tuple[Any, ...]) -> Array:
         """Returns the elements with these indices, one integer, slice or array for each dimension."""
         rows, *others = key
         runs = np.arange(self.shape[0])[rows]

@@ -43,6 +43,7 @@ from zarr.core.buffer import default_buffer_prototype
 from zarr.storage import MemoryStore
 
 from mrctl import __version__
+from mrctl.kernel import Array
 from mrctl.record import InputError, Record, read_file, reading
 from mrctl.results.dataset import (
     FAULTS,
@@ -217,7 +218,7 @@ class Store:
         return self.manifest.get("signals", list(SIGNALS))
 
     @property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> Array:
         """Times of the samples in s."""
         return self.manifest["control_period"] * (self.manifest["stride"] * np.arange(self.samples))
 
@@ -257,7 +258,7 @@ class Store:
     def _part(self, job: int) -> Path:
         return self.path / "parts" / f"{job:06d}.parquet"
 
-    def write(self, job: int, rows: pa.Table, signals: NDArray[np.float64] | None) -> None:
+    def write(self, job: int, rows: pa.Table, signals: Array | None) -> None:
         """Writes the results of a job: signals `(runs, samples, signals)`, then rows, which show that it is done."""
         if signals is not None:
             runs = self.runs(job)
@@ -300,7 +301,7 @@ class Store:
             found = pq.read_table(source, filters=[("run", "=", run)], page_checksum_verification=True).to_pylist()
         return found[0] if found else None
 
-    def signals(self, run: int) -> NDArray[np.float64]:
+    def signals(self, run: int) -> Array:
         """Returns the signals of one run `(samples, signals)`, if the store keeps them.
 
         Raises:

@@ -24,27 +24,28 @@ A controller near rest needs the signs smoothed to tanh(V_i/`sign_speed`).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from mrctl.kernel import Array
 from mrctl.theory.kinematics import split, stack, wheel_rates
 from mrctl.theory.robot import Robot
 
 RPM = 2 * np.pi / 60  # rad/s
 
 
-def common_differential(voltage: ArrayLike) -> NDArray[np.float64]:
+def common_differential(voltage: ArrayLike) -> Array:
     """Common and differential voltage (U_Σ, U_Δ) from (left, right), by U_r,l = U_Σ ± U_Δ; both in V, shape (…, 2)."""
     left, right = split(voltage)
     return stack((right + left) / 2, (right - left) / 2)
 
 
-def left_right(mixed: ArrayLike) -> NDArray[np.float64]:
+def left_right(mixed: ArrayLike) -> Array:
     """Voltages (left, right) from (U_Σ, U_Δ), the inverse of `common_differential`; both in V, shape (…, 2)."""
     common, differential = split(mixed)
     return stack(common - differential, common + differential)
 
 
-def wheel_signs(twist: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> NDArray[np.float64]:
+def wheel_signs(twist: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> Array:
     """Signs s_i of the rear wheels' speeds V_i.
 
     Args:
@@ -59,7 +60,7 @@ def wheel_signs(twist: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> NDAr
     return np.tanh(speeds / sign_speed) if sign_speed > 0 else np.sign(speeds)
 
 
-def wheel_torques(voltage: ArrayLike, twist: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> NDArray[np.float64]:
+def wheel_torques(voltage: ArrayLike, twist: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> Array:
     """Torques P of the two drives at their wheels, less the losses of motor and gearbox.
 
     Args:
@@ -76,7 +77,7 @@ def wheel_torques(voltage: ArrayLike, twist: ArrayLike, robot: Robot, sign_speed
     return electric - robot.drive_loss * wheel_signs(twist, robot, sign_speed)
 
 
-def rolling_losses(twist: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> NDArray[np.float64]:
+def rolling_losses(twist: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> Array:
     """Rolling resistance against the motion.
 
     Args:
@@ -91,7 +92,7 @@ def rolling_losses(twist: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> N
     return robot.rolling_force * stack(mean, robot.half_track * (1 - robot.front_load) * difference)
 
 
-def accelerations(twist: ArrayLike, voltage: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> NDArray[np.float64]:
+def accelerations(twist: ArrayLike, voltage: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> Array:
     """Equation (3), corrected: the forward model.
 
     Args:
@@ -112,9 +113,7 @@ def accelerations(twist: ArrayLike, voltage: ArrayLike, robot: Robot, sign_speed
     return stack(force / robot.effective_mass, torque / robot.effective_inertia)
 
 
-def inverse_dynamics(
-    twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_speed: float = 0.0
-) -> NDArray[np.float64]:
+def inverse_dynamics(twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> Array:
     """Commanded voltages that give an acceleration: `accelerations` solved for the voltages, without the supply limit.
 
     Args:
@@ -137,7 +136,7 @@ def inverse_dynamics(
     return (wheels / robot.motor_gain + robot.back_emf * wheel_rates(twist, robot)) / robot.drive_gain
 
 
-def regressor(twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> NDArray[np.float64]:
+def regressor(twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_speed: float = 0.0) -> Array:
     """The 8 features in which the inverse dynamics is linear: V, θ̇, V̇, θ̈, V θ̇, θ̇², s_l, s_r.
 
     Args:
@@ -155,7 +154,7 @@ def regressor(twist: ArrayLike, acceleration: ArrayLike, robot: Robot, sign_spee
     return stack(v, omega, v_dot, omega_dot, v * omega, omega**2, left, right)
 
 
-def inverse_coefficients(robot: Robot) -> NDArray[np.float64]:
+def inverse_coefficients(robot: Robot) -> Array:
     """Coefficients, shape (8, 2), with `regressor` @ coefficients = (U_Σ, U_Δ) of `inverse_dynamics` in V."""
     r, d = robot.wheel_radius, robot.half_track
     volts = r / (2 * robot.motor_gain)  # U_Σ per newton along x
@@ -171,7 +170,7 @@ def inverse_coefficients(robot: Robot) -> NDArray[np.float64]:
 
 def wheel_torques_as_printed(
     voltage: ArrayLike, wheel_speed: ArrayLike, robot: Robot, back_emf_constant: float
-) -> NDArray[np.float64]:
+) -> Array:
     """The third line of equation (3) as printed: P = N (k_M U/R_a − k_M k_E/R_a · 60 N V/(2 π r) − k_M I₀).
 
     60 N V/(2πr) is the motor's speed in rpm, so the term is right only with k_E in V/rpm. The no-load current has no
@@ -192,7 +191,7 @@ def wheel_torques_as_printed(
     return n * (k_m / r_a * np.asarray(voltage, float) - emf - k_m * robot.no_load_current)
 
 
-def accelerations_as_printed(twist: ArrayLike, voltage: ArrayLike, robot: Robot) -> NDArray[np.float64]:
+def accelerations_as_printed(twist: ArrayLike, voltage: ArrayLike, robot: Robot) -> Array:
     """Equation (3) as printed, solved for its two derivatives and kept for comparison. It has seven errors.
 
     1. The first derivative is printed V̈, but (P_d + P_s)/(2r) has the dimension of M V̇; the value is an acceleration.

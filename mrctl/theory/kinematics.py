@@ -7,25 +7,26 @@ A twist is (V_AV, θ̇) of P, the midpoint of the rear axle, in (m/s, rad/s). An
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from mrctl.kernel import Array
 from mrctl.theory.robot import Robot
 
 UP = np.array([0.0, 0.0, 1.0])
 """Unit vector against gravity."""
 
 
-def split(array: ArrayLike) -> NDArray[np.float64]:
+def split(array: ArrayLike) -> Array:
     """Moves the last axis to the front, so that the components along it can be unpacked."""
     return np.moveaxis(np.asarray(array, float), -1, 0)
 
 
-def stack(*components: ArrayLike) -> NDArray[np.float64]:
+def stack(*components: ArrayLike) -> Array:
     """Broadcasts components against each other and stacks them along a new last axis: the inverse of `split`."""
     return np.stack(np.broadcast_arrays(*components), axis=-1)
 
 
-def state_rates(state: ArrayLike, u: ArrayLike, robot: Robot) -> NDArray[np.float64]:
+def state_rates(state: ArrayLike, u: ArrayLike, robot: Robot) -> Array:
     """Equation (1), corrected: the rate of the kinematic state.
 
     The printed equation is corrected in two respects: ẏ and the two rear wheels take counter-clockwise angles, and the
@@ -49,7 +50,7 @@ def state_rates(state: ArrayLike, u: ArrayLike, robot: Robot) -> NDArray[np.floa
     return stack(x, y, heading, u2, u1 / robot.front_wheel_radius, left, right)
 
 
-def state_rates_as_printed(state: ArrayLike, u: ArrayLike, robot: Robot) -> NDArray[np.float64]:
+def state_rates_as_printed(state: ArrayLike, u: ArrayLike, robot: Robot) -> Array:
     """Equation (1) as printed: `state_rates` with θ and φ counted clockwise, and one radius r for all wheels.
 
     It is kept for comparison. It contradicts (2) and (3), which are counter-clockwise: in a positive turn y decreases
@@ -63,7 +64,7 @@ def state_rates_as_printed(state: ArrayLike, u: ArrayLike, robot: Robot) -> NDAr
     return stack(np.cos(theta) * forward, -np.sin(theta) * forward, turn, u2, front, left, right)
 
 
-def pose_rates(pose: ArrayLike, twist: ArrayLike) -> NDArray[np.float64]:
+def pose_rates(pose: ArrayLike, twist: ArrayLike) -> Array:
     """Equation (2), S(θ) η: the rate of the pose.
 
     Args:
@@ -78,7 +79,7 @@ def pose_rates(pose: ArrayLike, twist: ArrayLike) -> NDArray[np.float64]:
     return stack(v * np.cos(theta), v * np.sin(theta), omega)
 
 
-def twist_from_front_wheel(u1: ArrayLike, phi: ArrayLike, robot: Robot) -> NDArray[np.float64]:
+def twist_from_front_wheel(u1: ArrayLike, phi: ArrayLike, robot: Robot) -> Array:
     """The twist that a rolling front wheel without trail enforces: V = u₁ cos φ, θ̇ = u₁ sin φ / L.
 
     Args:
@@ -93,7 +94,7 @@ def twist_from_front_wheel(u1: ArrayLike, phi: ArrayLike, robot: Robot) -> NDArr
     return stack(u1 * np.cos(phi), u1 * np.sin(phi) / robot.wheelbase)
 
 
-def wheel_rates(twist: ArrayLike, robot: Robot) -> NDArray[np.float64]:
+def wheel_rates(twist: ArrayLike, robot: Robot) -> Array:
     """Rates (left, right) of the rolling rear wheels, (V ∓ D θ̇) / r, in rad/s.
 
     Args:
@@ -108,7 +109,7 @@ def wheel_rates(twist: ArrayLike, robot: Robot) -> NDArray[np.float64]:
     return stack(v - across, v + across) / robot.wheel_radius
 
 
-def steering_angle(twist: ArrayLike, robot: Robot) -> NDArray[np.float64]:
+def steering_angle(twist: ArrayLike, robot: Robot) -> Array:
     """The textbook steering angle atan(L θ̇ / V), for either sign of V, without trail.
 
     The angle is 0 at rest, where the control law in `mrctl.control.steering` holds the last angle, and ±π/2 for a turn
@@ -125,7 +126,7 @@ def steering_angle(twist: ArrayLike, robot: Robot) -> NDArray[np.float64]:
     return np.arctan2(robot.wheelbase * np.where(v < 0, -omega, omega), np.abs(v))
 
 
-def scrub_free_angle(twist: ArrayLike, robot: Robot) -> NDArray[np.float64]:
+def scrub_free_angle(twist: ArrayLike, robot: Robot) -> Array:
     """The steering angle at which a contact point with trail t behind the steering axis is not dragged sideways.
 
     At constant φ the lateral velocity of the contact point, L θ̇ cos φ − V sin φ − t θ̇, vanishes at

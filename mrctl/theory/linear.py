@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.kernel import Array
 from mrctl.theory.robot import Robot
 
 TYRE_LAG = 0.0019
@@ -37,8 +38,8 @@ class Linear(NamedTuple):
         b: b, `(n,)`.
     """
 
-    a: NDArray[np.float64]
-    b: NDArray[np.float64]
+    a: Array
+    b: Array
 
     @property
     def gain(self) -> float:
@@ -65,7 +66,7 @@ class Linear(NamedTuple):
         both = np.asarray(expm(both * period), float)
         return Linear(both[:n, :n], both[:n, n])
 
-    def response(self, frequency: NDArray[np.float64], period: float) -> NDArray[np.complex128]:
+    def response(self, frequency: Array, period: float) -> NDArray[np.complex128]:
         """Frequency response behind a zero-order hold, from sample to sample; exact.
 
         Args:

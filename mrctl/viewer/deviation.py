@@ -6,12 +6,9 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
-from mrctl.kernel import Row, Rows
+from mrctl.kernel import Array, Row, Rows
 from mrctl.viewer.shapes import ball, bar
-
-Array = NDArray[np.float64]
 
 CHOICES = ("automatic", "1×", "10×", "100×")
 PIN_COLOUR = (75, 85, 99)

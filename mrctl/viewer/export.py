@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
@@ -119,5 +119,5 @@ def _curves(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
     return json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
 
 
-def _rounded(values: NDArray[np.float64]) -> list[float | None]:
+def _rounded(values: Array) -> list[float | None]:
     return [float(f"{v:.5g}") if np.isfinite(v) else None for v in values]

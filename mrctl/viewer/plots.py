@@ -8,17 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 from viser import uplot
 
-from mrctl.kernel import Rows
+from mrctl.kernel import Array, Rows
 from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.results.dataset import blank
 from mrctl.viewer.looks import Colour, Look, pale
 from mrctl.viewer.scene import EVENT_COLOUR
 from mrctl.viewer.score import lessons, table
-
-Array = NDArray[np.float64]
 
 SHARE_WINDOW = 1.0  # s over which the share of the feedback is averaged
 CURSOR_COLOUR: Colour = (107, 114, 128)

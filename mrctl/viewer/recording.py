@@ -12,9 +12,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from mrctl.kernel import Rows
+from mrctl.kernel import Array, Rows
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.stand import front_rates, stand, steer
@@ -33,7 +32,6 @@ from mrctl.viewer.deviation import drawn
 from mrctl.viewer.looks import Look, looks
 from mrctl.viewer.session import state
 
-Array = NDArray[np.float64]
 MAX_SHOWN = 4  # largest number of runs in a result that are all shown at the beginning
 ABOVE = 0.01  # m, height of a path above the ground
 WHEELS = {"wheel_left": "wheel_rate_left", "wheel_right": "wheel_rate_right"}

@@ -15,9 +15,8 @@ import numpy as np
 import trimesh
 import viser
 from mjviser.conversions import merge_geoms
-from numpy.typing import NDArray
 
-from mrctl.kernel import Rows
+from mrctl.kernel import Array, Rows
 from mrctl.physics import mjcf
 from mrctl.physics.contacts import NOTHING, Contacts
 from mrctl.physics.obstacles import HEIGHT, quaternion
@@ -37,7 +36,6 @@ from mrctl.viewer.sensors import Marks, outline
 from mrctl.viewer.server import Server
 from mrctl.viewer.shapes import bar, disc, ribbons, sides
 
-Array = NDArray[np.float64]
 EVENT_COLOUR: Colour = (217, 119, 6)
 # Colours of the floor: its thin lines, its thick lines, its surface.
 LIGHT_FLOOR = (214, 217, 221), (190, 194, 200), (238, 240, 242)

@@ -6,16 +6,13 @@ import html
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrctl.control.features import NAMES, feature_scale
-from mrctl.kernel import Rows
+from mrctl.kernel import Array, Rows
 from mrctl.results.excitation import alone
 from mrctl.results.metrics import excitation, lap_metrics
 from mrctl.theory.robot import Robot
 from mrctl.viewer.looks import Look
-
-Array = NDArray[np.float64]
 
 HEADINGS = (
     "error now, mm", "RMS of last lap, mm", "best lap, mm", "feedback in last lap, %", "energy of last lap, J",

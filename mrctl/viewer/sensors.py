@@ -6,13 +6,10 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
-from mrctl.kernel import Row, Rows
+from mrctl.kernel import Array, Row, Rows
 from mrctl.theory.kinematics import UP
 from mrctl.viewer.shapes import disc, ribbons
-
-Array = NDArray[np.float64]
 
 SIGMAS = 3.0  # size of the ellipse in standard deviations: it holds 98.9 % of a plane normal distribution
 FIX_AGE = 2.0  # s, after which a fix has faded

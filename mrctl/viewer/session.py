@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from mrctl.control.margins import Gains
 from mrctl.control.stages import Motion, Stages
@@ -362,7 +361,7 @@ class Session:
         sim, k = self._place[0]
         return sim.log.ticks[: sim.tick, k]
 
-    def qpos(self, row: int) -> NDArray[np.float64]:
+    def qpos(self, row: int) -> Array:
         """Returns the generalised position of a robot, `(nq,)`."""
         sim, k = self._place[row]
         return sim.plant.qpos[k]

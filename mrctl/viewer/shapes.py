@@ -6,10 +6,10 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from mrctl.kernel import Array
 from mrctl.theory.obstacles import Outlines
 
 ROUND = 24  # sides of a circle that is drawn with segments
-Array = NDArray[np.float64]
 Mesh = tuple[NDArray[np.float32], NDArray[np.uint32]]
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from tqdm import tqdm
 
+from mrctl.kernel import Array
 from mrctl.physics import mjcf
 from mrctl.physics.obstacles import quaternion
 from mrctl.physics.parameters import read_robot
@@ -30,7 +31,6 @@ from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, loo
 from mrctl.viewer.scene import CAMERA_POSITION, CAMERA_TARGET, LEAST_VIEW
 from mrctl.viewer.sensors import magnification
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 SIZES = {".mp4": (1280, 720), ".gif": (640, 360)}  # pixels
