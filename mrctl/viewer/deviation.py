@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import viser
 
 from mrctl.kernel import Array, Row, Rows
-from mrctl.viewer.shapes import ball, bar
+from mrctl.viewer.shapes import Mesh, add_mesh, ball, bar
 
 CHOICES = ("automatic", "1×", "10×", "100×")
 PIN_COLOUR = (75, 85, 99)
@@ -55,15 +53,15 @@ class Target:
             colour: Colour of the robot.
         """
         name, self._height = f"/world/target/{row}", height
-        plain: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
         self._root = scene.add_frame(name, show_axes=False, visible=False)
-        pin = bar(np.array([0, 0, -self._height]), np.zeros(3), thick / 2)
-        scene.add_mesh_simple(f"{name}/pin", *pin, color=PIN_COLOUR, flat_shading=True, **plain)
-        scene.add_mesh_simple(f"{name}/head", *ball(2 * thick), color=PIN_COLOUR, flat_shading=True, **plain)
-        self._line = scene.add_mesh_simple(
-            f"{name}/line", *bar(np.zeros(3), np.array([1.0, 0, 0]), thick), color=colour, flat_shading=True, **plain
-        )
-        self._ball = scene.add_mesh_simple(f"{name}/ball", *ball(3 * thick), color=colour, flat_shading=True, **plain)
+
+        def add(part: str, mesh: Mesh, colour: tuple[int, int, int]) -> viser.MeshHandle:
+            return add_mesh(scene, f"{name}/{part}", *mesh, color=colour, flat_shading=True)
+
+        add("pin", bar(np.array([0, 0, -self._height]), np.zeros(3), thick / 2), PIN_COLOUR)
+        add("head", ball(2 * thick), PIN_COLOUR)
+        self._line = add("line", bar(np.zeros(3), np.array([1.0, 0, 0]), thick), colour)
+        self._ball = add("ball", ball(3 * thick), colour)
 
     def show(self, now: Row, ground: float, magnified: int) -> None:
         """Moves the target; of a robot that has stopped it is invisible.

@@ -34,7 +34,7 @@ from mrctl.viewer.looks import Colour, Look, pale
 from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, path
 from mrctl.viewer.sensors import Marks, outline
 from mrctl.viewer.server import Server
-from mrctl.viewer.shapes import bar, disc, ribbons, sides
+from mrctl.viewer.shapes import add_mesh, bar, disc, ribbons, sides
 
 EVENT_COLOUR: Colour = (217, 119, 6)
 # Colours of the floor: its thin lines, its thick lines, its surface.
@@ -156,9 +156,9 @@ class Scene:
             for row, robot in enumerate(robots[:MAX_MARKED])
         ]
         self._ends = [
-            self._scene.add_mesh_simple(
-                f"/world/{name}", *ribbons(outline(self._footprint), OUTLINE), color=colour, side="double",
-                cast_shadow=False, receive_shadow=False, visible=False,
+            add_mesh(
+                self._scene, f"/world/{name}", *ribbons(outline(self._footprint), OUTLINE),
+                color=colour, side="double", visible=False,
             )
             for name, colour in (("start", REFERENCE_COLOUR), ("goal", GOAL_COLOUR))
         ]  # fmt: skip
@@ -213,9 +213,9 @@ class Scene:
             else:
                 mesh = merge_geoms(model, [geom])
                 colour = 255 * model.mat_rgba[model.geom_matid[geom], :3] if model.geom_matid[geom] >= 0 else 200
-                drawn = self._scene.add_mesh_simple(
-                    name, mesh.vertices, mesh.faces, color=np.broadcast_to(0.92 * colour, 3).astype(np.uint8),
-                    flat_shading=True, cast_shadow=False, receive_shadow=False,
+                drawn = add_mesh(
+                    self._scene, name, mesh.vertices, mesh.faces, flat_shading=True,
+                    color=np.broadcast_to(0.92 * colour, 3).astype(np.uint8),
                     wxyz=data.xquat[body], position=data.xpos[body],
                 )  # fmt: skip
                 self._walls.append(drawn)
@@ -234,7 +234,10 @@ class Scene:
             if geoms:
                 mesh, name = merge_geoms(model, geoms), self._node(0, body)
                 solid = self._draw_solid(f"{name}/mesh", geoms)
-                glass = self._draw_glass(f"{name}/glass", parts[-1], GLASS, GLASS_OPACITY, visible=False)
+                glass = add_mesh(
+                    self._scene, f"{name}/glass", parts[-1].vertices, parts[-1].faces,
+                    color=GLASS, opacity=GLASS_OPACITY, flat_shading=True, visible=False,
+                )  # fmt: skip
                 self._looks.append((solid, glass))
                 self._held.append(glass)
                 corners = mesh.vertices @ self._data.xmat[body].reshape(3, 3).T
@@ -260,20 +263,9 @@ class Scene:
             if colour is None:
                 drawn = self._scene.add_mesh_trimesh(f"{name}/{k}", mesh, cast_shadow=False, receive_shadow=False)
             else:
-                drawn = self._scene.add_mesh_simple(
-                    f"{name}/{k}", mesh.vertices, mesh.faces, color=colour, flat_shading=True,
-                    cast_shadow=False, receive_shadow=False,
-                )  # fmt: skip
+                drawn = add_mesh(self._scene, f"{name}/{k}", mesh.vertices, mesh.faces, color=colour, flat_shading=True)
             self._held.append(drawn)
         return root
-
-    def _draw_glass(
-        self, name: str, part: trimesh.Trimesh, colour: Colour, opacity: float, visible: bool = True
-    ) -> viser.MeshHandle:
-        return self._scene.add_mesh_simple(
-            name, part.vertices, part.faces, color=colour, opacity=opacity,
-            flat_shading=True, cast_shadow=False, receive_shadow=False, visible=visible,
-        )  # fmt: skip
 
     def _draw_robot(self, row: int) -> list[viser.FrameHandle]:
         """Draws a robot, with a frame for each body.
@@ -286,10 +278,9 @@ class Scene:
             frames.append(self._scene.add_frame(name, show_axes=False))
             if row and part is not None:
                 middle = part.bounds.mean(axis=0)
-                self._scene.add_mesh_simple(
-                    f"{name}/mesh", middle + HALO * (part.vertices - middle), part.faces, side="back",
+                add_mesh(
+                    self._scene, f"{name}/mesh", middle + HALO * (part.vertices - middle), part.faces, side="back",
                     color=self._robots[row].colour, opacity=GHOST_OPACITY, flat_shading=True,
-                    cast_shadow=False, receive_shadow=False,
                 )  # fmt: skip
         return frames
 
@@ -392,10 +383,9 @@ class Scene:
         if posts:
             vertices, faces = zip(*posts, strict=True)
             moved = [face + 8 * k for k, face in enumerate(faces)]
-            self._posts = self._scene.add_mesh_simple(
-                "/world/events", np.concatenate(vertices), np.concatenate(moved), color=EVENT_COLOUR,
-                cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
+            self._posts = add_mesh(
+                self._scene, "/world/events", np.concatenate(vertices), np.concatenate(moved), color=EVENT_COLOUR
+            )
 
     def above_floor(self, position: Array) -> Array:
         """Returns the nearest position to one in m, `(3,)`, from which a camera sees the floor from above."""
@@ -412,10 +402,7 @@ class Scene:
 
     def _draw_lines(self, name: str, lines: Array, width: float, colour: Colour) -> viser.MeshHandle:
         """Draws lines `(B, n, 3)` as one mesh; each segment of a thick line of viser's costs about as much."""
-        vertices, faces = ribbons(lines, width)
-        return self._scene.add_mesh_simple(
-            name, vertices, faces, color=colour, side="double", cast_shadow=False, receive_shadow=False
-        )
+        return add_mesh(self._scene, name, *ribbons(lines, width), color=colour, side="double")
 
     def show_recordings(self, recordings: Sequence[Recording], magnified: int) -> None:
         """Draws the references and the paths of finished runs, with deviations `magnified` times."""
@@ -483,8 +470,7 @@ class Scene:
                 names = near[row]
                 more = f" + {len(names) - 2}" if len(names) > 3 else ""
                 text = ", ".join(names[: 2 if more else 3]) + more
-                if label.text != text:
-                    label.text = text
+                label.text = text
                 label.position = here[row] + [0, 0, self._top - self._radius + LABEL_ABOVE * self.length]
 
     def show_payload(self, row: int, perturbation: Perturbation) -> None:
@@ -518,13 +504,10 @@ class Scene:
     def show_ends(self, ends: Array | None) -> None:
         """Draws outlines of a robot at its start and its goal, poses in m, m, rad, `(2, 3)`; None hides them."""
         for k, mark in enumerate(self._ends):
-            if mark.visible != (ends is not None):
-                mark.visible = ends is not None
+            mark.visible = ends is not None
             if ends is not None:
                 x, y, theta = ends[k]
-                place = np.array([x, y, self._height(x, y) + ABOVE])
-                if not np.array_equal(mark.position, place) or not np.allclose(mark.wxyz, quaternion(theta)):
-                    mark.position, mark.wxyz = place, quaternion(theta)
+                mark.position, mark.wxyz = (x, y, self._height(x, y) + ABOVE), quaternion(theta)
 
     def show_scans(self, scans: Sequence[tuple[Array, Array] | None]) -> None:
         """Draws what `Session.scan` returns, for each of the first robots; no scans hide all points."""
@@ -545,15 +528,13 @@ class Scene:
         """
         arrow = self._forces[row]
         if force is None:
-            if arrow is not None and arrow.visible:
+            if arrow is not None:
                 arrow.visible = False
             return
         way = np.append(self.length * force / (HARD * self._mass), 0.0)
         if arrow is None:
             arrow = self._forces[row] = self._draw_arrows(f"/world/force/{row}", EVENT_COLOUR, 0.03)
-        ends = np.stack([np.zeros(3), way])[None].astype(np.float32)
-        if not np.array_equal(arrow.points, ends):
-            arrow.points = ends
+        arrow.points = np.stack([np.zeros(3), way])[None]
         arrow.position, arrow.visible = self._positions[row, self._chassis] + [0, 0, self._top / 2], True
 
     def _draw_arrows(self, name: str, colour: Colour, thick: float) -> viser.ArrowsHandle:
@@ -583,8 +564,7 @@ class Scene:
             lengths = touch.forces / (self._mass * GRAVITY), touch.slips / (SLIDING * self._max_speed)
             for drawn, ways in zip(arrows, lengths, strict=True):
                 seen = np.linalg.norm(ways, axis=1) > LEAST_ARROW
-                if drawn.visible != seen.any():
-                    drawn.visible = bool(seen.any())
+                drawn.visible = bool(seen.any())
                 if drawn.visible:
                     start = places[seen]
                     drawn.points = np.stack([start, start + self.length * ways[seen] @ turn.reshape(3, 3)], axis=1)
@@ -602,9 +582,9 @@ class Scene:
         for k, (x, y) in enumerate(points):
             mesh = disc(radius * np.column_stack([np.cos(turn), np.sin(turn)]))
             self._way.append(
-                self._scene.add_mesh_simple(
-                    f"/world/way/{k}", *mesh, color=GOAL_COLOUR, side="double", cast_shadow=False,
-                    receive_shadow=False, position=(x, y, self._height(x, y) + 2 * ABOVE),
+                add_mesh(
+                    self._scene, f"/world/way/{k}", *mesh, color=GOAL_COLOUR, side="double",
+                    position=(x, y, self._height(x, y) + 2 * ABOVE),
                 )
             )  # fmt: skip
         if way is not None:
@@ -623,10 +603,9 @@ class Scene:
             normal, point = self._floor
             along, across = np.cross([0.0, 1, 0], normal), np.cross(normal, [1.0, 0, 0])
             corners = [point - GRIP_BELOW * normal + GRIP * (a * along + b * across) for a, b in SQUARE]
-            self._grip = self._scene.add_mesh_simple(
-                "/world/grip", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]), side="double",
-                cast_shadow=False, receive_shadow=False,
-            )  # fmt: skip
+            self._grip = add_mesh(
+                self._scene, "/world/grip", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]), side="double"
+            )
             self._grip.on_drag(_in_order(dragged))
 
     def hold_robot(self, dragged: Dragged | None) -> None:
@@ -733,12 +712,9 @@ def _segments(ways: Array) -> Array:
 
 def _show_segments(lines: viser.LineSegmentsHandle, ends: Array | None, height: float) -> None:
     """Draws segments between points on the floor in m, `(k, 2, 2)`, at a height in m; None hides them."""
-    if lines.visible != (ends is not None):
-        lines.visible = ends is not None
+    lines.visible = ends is not None
     if ends is not None:
-        points = np.pad(ends, [(0, 0), (0, 0), (0, 1)], constant_values=height).astype(np.float32)
-        if not np.array_equal(lines.points, points):
-            lines.points = points
+        lines.points = np.pad(ends, [(0, 0), (0, 0), (0, 1)], constant_values=height)
 
 
 def _rough(model: mujoco.MjModel, geoms: Sequence[int]) -> trimesh.Trimesh:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import viser
 
 from mrctl.kernel import Array, Row, Rows
 from mrctl.theory.kinematics import UP
-from mrctl.viewer.shapes import disc, ribbons
+from mrctl.viewer.shapes import add_mesh, disc, ribbons
 
 SIGMAS = 3.0  # size of the ellipse in standard deviations: it holds 98.9 % of a plane normal distribution
 FIX_AGE = 2.0  # s, after which a fix has faded
@@ -64,22 +62,21 @@ class Marks:
             colour: Colour of the robot.
         """
         name, self._level = f"/world/sensors/{row}", LEVEL + NEXT_ROBOT * row
-        plain: dict[str, Any] = {"side": "double", "cast_shadow": False, "receive_shadow": False}
         self._root = scene.add_frame(name, show_axes=False, visible=False)
-        self._estimate = scene.add_mesh_simple(
-            f"{name}/estimate", *ribbons(outline(footprint), 0.014), color=colour, **plain
-        )
+        arrow = ribbons(outline(footprint), 0.014)
+        self._estimate = add_mesh(scene, f"{name}/estimate", *arrow, color=colour, side="double")
         circle = np.column_stack([np.cos(TURN), np.sin(TURN)])
         point = disc(0.016 * circle)
-        self._truth = scene.add_mesh_simple(f"{name}/truth", *point, color=(20, 20, 20), **plain)
+        self._truth = add_mesh(scene, f"{name}/truth", *point, color=(20, 20, 20), side="double")
         self._ellipse = scene.add_frame(f"{name}/ellipse", show_axes=False)
-        self._area = scene.add_mesh_simple(f"{name}/ellipse/area", *disc(circle), color=colour, opacity=0.5, **plain)
-        rim = ribbons(np.pad((1 - RIM / 2) * circle, [(0, 0), (0, 1)])[None], RIM)
-        self._rim = scene.add_mesh_simple(f"{name}/ellipse/rim", *rim, color=colour, **plain)
+        area, rim = disc(circle), ribbons(np.pad((1 - RIM / 2) * circle, [(0, 0), (0, 1)])[None], RIM)
+        self._area = add_mesh(scene, f"{name}/ellipse/area", *area, color=colour, opacity=0.5, side="double")
+        self._rim = add_mesh(scene, f"{name}/ellipse/rim", *rim, color=colour, side="double")
         dark = np.tile(np.array(colour, np.uint8) // 2, (MAX_FIXES, 1))
         self._fixes = scene.add_batched_meshes_simple(
             f"{name}/fixes", *point, np.tile([1.0, 0, 0, 0], (MAX_FIXES, 1)), np.zeros((MAX_FIXES, 3)),
-            batched_colors=dark, batched_opacities=np.zeros(MAX_FIXES), lod="off", **plain,
+            batched_colors=dark, batched_opacities=np.zeros(MAX_FIXES), lod="off",
+            side="double", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
     def show(self, here: Array, log: Rows, period: float, latency: int, magnified: int) -> None:

@@ -1,9 +1,12 @@
-"""Simple shapes, as vertices and triangles."""
+"""Simple shapes, as vertices and triangles, and how they are added to a scene."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import trimesh
+import viser
 from numpy.typing import NDArray
 
 from mrctl.kernel import Array
@@ -60,3 +63,8 @@ def sides(outlines: Outlines) -> Array:
     rims = outlines.discs[:, None, :2] + outlines.discs[:, None, 2:] * np.column_stack([np.cos(turn), np.sin(turn)])
     round_ones = np.stack([rims[:, :-1], rims[:, 1:]], axis=2).reshape(-1, 2, 2)
     return np.concatenate([round_ones, outlines.edges.reshape(-1, 2, 2)])
+
+
+def add_mesh(scene: viser.SceneApi, name: str, vertices: NDArray, faces: NDArray, **options: Any) -> viser.MeshHandle:  # noqa: ANN401
+    """Adds a mesh that neither casts nor receives shadows; the options are those of `add_mesh_simple`."""
+    return scene.add_mesh_simple(name, vertices, faces, cast_shadow=False, receive_shadow=False, **options)
