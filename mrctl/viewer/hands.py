@@ -12,7 +12,7 @@ import viser
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.theory.obstacles import Pose
-from mrctl.viewer.page import block, write
+from mrctl.viewer.page import block
 from mrctl.viewer.scene import HARD, Scene
 from mrctl.viewer.session import Session
 
@@ -98,14 +98,14 @@ class Hands:
         self.forget()
         self._waits, self._endings.visible = what, what == "way"
         self._show_grips()
-        write(self._picking, block("picking", text))
+        self._picking.content = block("picking", text)
 
     def forget(self) -> None:
         """Waits for nothing any longer."""
         self._waits, self._points, self._grabbed, self._endings.visible = "", [], None, False
         self._scene.show_way([], None)
         self._show_grips()
-        write(self._picking, "")
+        self._picking.content = ""
 
     def _show_grips(self) -> None:
         """Lets visitors drag what they may drag at present."""
@@ -169,7 +169,7 @@ class Hands:
             return self._finish(goal)
         self._points.append(point)
         self._scene.show_ends(np.array([goal, goal]))
-        write(self._picking, block("picking", "Click on the floor towards where they shall look there."))
+        self._picking.content = block("picking", "Click on the floor towards where they shall look there.")
 
     def _finish(self, goal: Pose) -> None:
         self.forget()

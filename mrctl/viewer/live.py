@@ -33,7 +33,7 @@ from mrctl.viewer.deviation import drawn
 from mrctl.viewer.embed import LONGEST
 from mrctl.viewer.hands import Hands, rounded
 from mrctl.viewer.looks import looks
-from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
+from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
 from mrctl.viewer.scene import HARD, MAX_MARKED, Scene
@@ -230,7 +230,7 @@ class Live(Page):
             spread = max(np.inf if s.source == "odometry" else s["fix_position_noise"] for s in sensing)
             self.set_marks(any(s.source != "truth" for s in sensing), spread)
         watch = [story.watch for story in STORIES.values() if [arranged(s) for s in story.scenarios] == session.start]
-        write(self._story, block("story", *watch) if watch else "")
+        self._story.content = block("story", *watch) if watch else ""
         self._latencies = [s.periods("fix_latency", session.period) for s in sensing]
         self._scene.show_reference(first)
         self._scene.forget_trails()
@@ -444,7 +444,7 @@ class Live(Page):
             done += robots
             if (now := time.monotonic()) > last + 0.5:
                 last = now
-                write(self._status, block("status", f"driving again up to {self.time:.2f} s: {done / total:.0%}"))
+                self._status.content = block("status", f"driving again up to {self.time:.2f} s: {done / total:.0%}")
 
         return tell
 
@@ -557,7 +557,7 @@ class Live(Page):
                 lines.append(warning(f"{label} stopped: {reason}"))
         if session.tick:
             lines += arrivals(self._labels, self._record(), self._ends)
-        write(self._status, block("status", *lines))
+        self._status.content = block("status", *lines)
         happened = sum(event.time <= self.time for scenario in session.saved() for event in scenario.events)
         happened += session.retunes
         if happened != self._happened:  # such as those that the scenarios brought along
@@ -614,7 +614,7 @@ class Live(Page):
         for event in sorted(scenario.events, key=lambda e: e.time):
             lines.append(f"<b>{event.time:.2f} s</b> {html.escape(_in_words(event, before))}")
             before |= {n: v for n in CHANGEABLE if (v := getattr(event, n)) is not None}
-        write(self._timeline, block("timeline", *(reversed(lines[-50:]) if lines else ["no events yet"])))
+        self._timeline.content = block("timeline", *(reversed(lines[-50:]) if lines else ["no events yet"]))
         driven = self.session.driven()
         ticks = np.minimum(np.round(np.array(self._event_times()) / self.session.period).astype(int), len(driven) - 1)
         self._scene.show_events(driven[ticks[ticks >= 0]])
@@ -637,7 +637,7 @@ class Live(Page):
             lines.append(f"{channel}: K_p {gains.k_p:.3g} {k_p}, K_i {gains.k_i:.3g} {k_i}")
         if self.session.retunes:
             lines.append(f"slowed {self.session.retunes} times, as the PID oscillated")
-        write(self._gains, block("gains", *lines))
+        self._gains.content = block("gains", *lines)
 
 
 def _in_periods(name: str, value: Any, period: float) -> Any:  # noqa: ANN401

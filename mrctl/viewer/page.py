@@ -123,7 +123,7 @@ class Page(ABC):
     @message.setter
     def message(self, text: str) -> None:
         self._message = text
-        write(self._notice, block("message", warning(text)) if text else "")
+        self._notice.content = block("message", warning(text)) if text else ""
 
     def add_drawing(self) -> None:
         """Adds the inputs that say how deviations, estimates and fixes are drawn, in the present context of the GUI."""
@@ -228,7 +228,7 @@ class Page(ABC):
                 "Outline: estimated posture. Black point: true position. Ellipse: 3σ of x and y (98.9 %). "
                 f"Small points: fixes of the last {sensors.FIX_AGE:g} s. {size}"
             )
-        write(self._sensed, block("sensors", *lines))
+        self._sensed.content = block("sensors", *lines)
 
     def choose_speed(self, name: str) -> None:
         """Sets how fast simulated time passes, by the name of a speed in `SPEEDS`."""
@@ -339,9 +339,3 @@ def warning(text: str) -> str:
 def block(name: str, *lines: str) -> str:
     """Returns lines as an HTML block with the id `mrctl-NAME`."""
     return f'<div style="margin:0.4em 1em;max-height:9em;overflow:auto" id="mrctl-{name}">{"<br>".join(lines)}</div>'
-
-
-def write(handle: viser.GuiHtmlHandle, content: str) -> None:
-    """Replaces the content of a part of the page, if it differs."""
-    if handle.content != content:
-        handle.content = content

@@ -10,7 +10,7 @@ from typing_extensions import override
 
 from mrctl.physics.parameters import read_robot
 from mrctl.results.metrics import METRICS
-from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning, write
+from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
 from mrctl.viewer.scatter import KNOWN, Scatter, in_words, numbers_of
@@ -207,7 +207,7 @@ class Replay(Page):
         lines += [line for line in known if line]
         if self._kept:
             lines.append(f"kept as ghosts: runs {', '.join(map(str, sorted(self._kept)))}")
-        write(self._status, block("status", *lines))
+        self._status.content = block("status", *lines)
         self.describe_estimates(self._labels, last)
         if self.time != self._plotted:
             self._plotted = self.time
