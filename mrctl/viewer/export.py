@@ -78,11 +78,11 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
         serializer = server.get_scene_serializer()
         for time in np.arange(0, duration, 1 / PICTURE_RATE):
             for row, recording in enumerate(recordings):
-                scene.show(row, recording.qpos(recording.index(time)))
-                scene.show_payload(row, recording.perturbation(time))
-                scene.show_force(row, pushed(recording.scenario, recording.start + time))
+                scene.robots.show(row, recording.qpos(recording.index(time)))
+                scene.robots.show_payload(row, recording.perturbation(time))
+                scene.arrows.show_force(row, pushed(recording.scenario, recording.start + time))
             scene.show_obstacles(recordings[0].start + time)
-            scene.show_ends(ends(recordings[0].scenario, recordings[0].start + time))
+            scene.navigation.show_ends(ends(recordings[0].scenario, recordings[0].start + time))
             scene.show_targets(np.stack([r.log[r.index(time)] for r in recordings]), magnified)
             scene.flush(follow=False)
             serializer.insert_sleep(1 / PICTURE_RATE)

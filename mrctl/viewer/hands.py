@@ -12,8 +12,9 @@ import viser
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.theory.obstacles import Pose
+from mrctl.viewer.arrows import HARD
 from mrctl.viewer.page import block
-from mrctl.viewer.scene import HARD, Scene
+from mrctl.viewer.scene import Scene
 from mrctl.viewer.session import Session
 
 GOAL_HINT = "Drag on the floor from where the robots shall go to where they shall look there; or click twice."
@@ -111,7 +112,7 @@ class Hands:
         """Lets visitors drag what they may drag at present."""
         floor = {"": None, "goal": self._drag_goal, "way": self._drag_point}[self._waits]
         self._scene.hold_floor(floor and partial(self._dragged, floor))
-        self._scene.hold_robot(partial(self._dragged, self._drag_push) if self._pushes.value else None)
+        self._scene.robots.hold(partial(self._dragged, self._drag_push) if self._pushes.value else None)
 
     def _dragged(self, action: Callable[[str, Array, Array], None], event: viser.SceneNodeDragEvent) -> None:
         """Queues an action with the places on the floor in m, `(2,)`, from and to which a visitor drags."""
@@ -129,7 +130,7 @@ class Hands:
         """Shows, and at the end sets, the goal at the start of a drag."""
         if self._waits == "goal":
             goal = (float(start[0]), float(start[1]), float(np.arctan2(*(end - start)[::-1])))
-            self._scene.show_ends(np.array([goal, goal]))
+            self._scene.navigation.show_ends(np.array([goal, goal]))
             if phase == "end":
                 self._finish(goal)
 
@@ -147,7 +148,7 @@ class Hands:
     def _drag_push(self, phase: str, start: Array, end: Array) -> None:  # noqa: ARG002 (the robot may have moved)
         """Pushes all robots at the end of a drag from the first one; before, the page draws an arrow."""
         robot = self._session.robot
-        fx, fy = HARD * robot.mass * (end - self._scene.place(0)) / self._scene.length
+        fx, fy = HARD * robot.mass * (end - self._scene.robots.positions[0, :2]) / self._scene.length
         self.pull = None if phase == "end" else (float(fx), float(fy))
         if phase == "end":
             self._apply(push=(*rounded(fx, fy), 0.0))
@@ -163,12 +164,12 @@ class Hands:
             self._points.append(point)
             return self._show_way()
         place = self._points[0] if self._points else point
-        ahead = point - (place if self._points else self._scene.place(0))
+        ahead = point - (place if self._points else self._scene.robots.positions[0, :2])
         goal = (float(place[0]), float(place[1]), float(np.arctan2(ahead[1], ahead[0])))
         if self._points:
             return self._finish(goal)
         self._points.append(point)
-        self._scene.show_ends(np.array([goal, goal]))
+        self._scene.navigation.show_ends(np.array([goal, goal]))
         self._picking.content = block("picking", "Click on the floor towards where they shall look there.")
 
     def _finish(self, goal: Pose) -> None:

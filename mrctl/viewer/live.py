@@ -28,15 +28,16 @@ from mrctl.theory.obstacles import Pose
 from mrctl.theory.perturbation import Perturbation
 from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot, RobotFile
+from mrctl.viewer.arrows import HARD
 from mrctl.viewer.controls import ANEW, WORLDS, Controls
 from mrctl.viewer.deviation import drawn
 from mrctl.viewer.embed import LONGEST
 from mrctl.viewer.hands import Hands, rounded
-from mrctl.viewer.looks import looks
+from mrctl.viewer.looks import MAX_MARKED, looks
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
-from mrctl.viewer.scene import HARD, MAX_MARKED, Scene
+from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
@@ -314,7 +315,7 @@ class Live(Page):
 
     def _show_search(self) -> None:
         self._tree.visible = len(self._searched) > 0
-        self._scene.show_search(self._searched if self._tree.value else NOTHING)
+        self._scene.navigation.show_search(self._searched if self._tree.value else NOTHING)
 
     @override
     def choose_speed(self, name: str) -> None:
@@ -502,7 +503,7 @@ class Live(Page):
             return
         self._drawn = now
         for row in range(session.size):
-            self._scene.show(row, self._qpos(row))
+            self._scene.robots.show(row, self._qpos(row))
         logs, scans = [], []
         if marked:
             scans = [session.scan(row) for row in range(min(session.size, MAX_MARKED))] if self._back is None else []
@@ -513,14 +514,15 @@ class Live(Page):
                 self._scene.show_targets(self._record(), self._deviation)
             self._scene.show_obstacles(self.time)
             self._scene.show_sensors(logs, session.period, self._latencies, magnified)
-            self._scene.show_scans(scans)
+            self._scene.navigation.show_scans(scans)
             push = pushed(max(session.saved(), key=lambda s: len(s.events)), self.time)
             for row in range(session.size):
-                self._scene.show_force(row, push if row or self._hands.pull is None else np.array(self._hands.pull))
+                force = push if row or self._hands.pull is None else np.array(self._hands.pull)
+                self._scene.arrows.show_force(row, force)
             shown = range(min(session.size, MAX_MARKED) if fan else 0)
             touching = range(min(session.size, MAX_MARKED) if touch and session.tick else 0)
-            self._scene.show_contacts([session.contacts(row) for row in touching])
-            self._scene.show_considered([session.considered(row) for row in shown])
+            self._scene.arrows.show_contacts([session.contacts(row) for row in touching])
+            self._scene.navigation.show_considered([session.considered(row) for row in shown])
             self._scene.flush(self._follow.value)
         self.chase()
 
@@ -620,13 +622,13 @@ class Live(Page):
         self._scene.show_events(driven[ticks[ticks >= 0]])
         soon = self.time + self.session.preview * self.session.period
         self._ends = ends(scenario, soon)
-        self._scene.show_ends(self._ends)
+        self._scene.navigation.show_ends(self._ends)
         way = followed(scenario, soon)
         if way != self._way and any(event.reference for event in self.session.added):
             self._way = way
             self._scene.draw_references([way])
         for row, saved in enumerate(self.session.saved()):
-            self._scene.show_payload(row, state(saved, self.time)["perturbation"])
+            self._scene.robots.show_payload(row, state(saved, self.time)["perturbation"])
         self._controls.designed = self.session.designed()
         self._controls.suit(self.session.robot)
         present = self._now()

@@ -1,4 +1,4 @@
-"""Labels and colours that identify the robots of a page."""
+"""Labels and colours of a page, most of which identify its robots."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import NamedTuple
 from mrctl.results.controllers import colours_of
 
 Colour = tuple[int, int, int]
+EVENT_COLOUR: Colour = (217, 119, 6)
+MAX_MARKED = 4  # number of robots whose estimates and targets are drawn
 
 
 class Look(NamedTuple):

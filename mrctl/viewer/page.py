@@ -21,8 +21,9 @@ from mrctl.kernel import Array, Rows
 from mrctl.loop.goals import arrived
 from mrctl.record import InputError
 from mrctl.viewer import deviation, sensors
+from mrctl.viewer.looks import MAX_MARKED
 from mrctl.viewer.recording import Recording, looks_of
-from mrctl.viewer.scene import MAX_MARKED, Scene
+from mrctl.viewer.scene import Scene
 from mrctl.viewer.server import MANNERS, PHONE, SOFT_LIGHT, Server
 
 FRAME, REFRESH = 1 / 25, 1 / 12  # s of wall time between two pictures, and between two updates of the plots

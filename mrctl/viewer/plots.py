@@ -13,8 +13,7 @@ from viser import uplot
 from mrctl.kernel import Array, Rows
 from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.results.dataset import blank
-from mrctl.viewer.looks import Colour, Look, pale
-from mrctl.viewer.scene import EVENT_COLOUR
+from mrctl.viewer.looks import EVENT_COLOUR, Colour, Look, pale
 from mrctl.viewer.score import lessons, table
 
 SHARE_WINDOW = 1.0  # s over which the share of the feedback is averaged

@@ -10,11 +10,12 @@ from typing_extensions import override
 
 from mrctl.physics.parameters import read_robot
 from mrctl.results.metrics import METRICS
+from mrctl.viewer.looks import MAX_MARKED
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
 from mrctl.viewer.scatter import KNOWN, Scatter, in_words, numbers_of
-from mrctl.viewer.scene import MAX_MARKED, Scene
+from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
@@ -171,10 +172,10 @@ class Replay(Page):
             return
         self._drawn = now
         for row, recording in enumerate(self.recordings):
-            self._scene.show(row, recording.qpos(recording.index(self.time)))
-            self._scene.show_payload(row, recording.perturbation(self.time))
-            self._scene.show_force(row, pushed(recording.scenario, recording.start + self.time))
-        self._scene.show_ends(ends(self.recordings[0].scenario, self.recordings[0].start + self.time))
+            self._scene.robots.show(row, recording.qpos(recording.index(self.time)))
+            self._scene.robots.show_payload(row, recording.perturbation(self.time))
+            self._scene.arrows.show_force(row, pushed(recording.scenario, recording.start + self.time))
+        self._scene.navigation.show_ends(ends(self.recordings[0].scenario, self.recordings[0].start + self.time))
         period, logs, scans = self.recordings[0].period, [], []
         if marked:
             met = [recording.scan(recording.index(self.time)) for recording in self.recordings[:MAX_MARKED]]
@@ -188,7 +189,7 @@ class Replay(Page):
             self._scene.show_targets(now, self._deviation)
             self._scene.show_obstacles(self.recordings[0].start + self.time)
             self._scene.show_sensors(logs, period, self._latencies, magnified)
-            self._scene.show_scans(scans)
+            self._scene.navigation.show_scans(scans)
             self._scene.flush(self._follow.value)
         self.chase()
 

@@ -231,7 +231,7 @@ def test_events_of_the_scenario():
     server = Server(port=0)
     drop = Event(time=0.05, perturbation=Perturbation(payload=8.0))
     live = Live([Scenario(events=(drop,))], server)
-    (box,) = live._scene._payloads
+    (box,) = live._scene.robots._payloads
     for _ in range(4):
         live.session.step()
     live.refresh()
@@ -285,9 +285,9 @@ def test_robots(live):
         assert np.hypot(log["longitudinal_error"], log["lateral_error"]).max() < 0.1 and live.message == ""
         live.draw()
         live.refresh()
-        assert all(part.cast_shadow for part in live._scene._held)  # of the new robot, too
+        assert all(part.cast_shadow for part in live._scene.robots.held)  # of the new robot, too
     live._set_soft(False)
-    assert not any(part.cast_shadow for part in live._scene._held)
+    assert not any(part.cast_shadow for part in live._scene.robots.held)
     live.ask(live._choose_robot, "nosuch")
     live._run_requests()
     assert "not one of the choices" in live.message and live._robot.value == "car"
@@ -305,7 +305,7 @@ def test_looking_back(live):
     live._look_back(1.5)
     live.draw()
     live.refresh()
-    then, frames = former[150], [frames[live._scene._chassis] for frames in live._scene._frames]
+    then, frames = former[150], [frames[live._scene.robots._chassis] for frames in live._scene.robots._frames]
     for frame, row in zip(frames, then, strict=True):
         assert frame.position == pytest.approx([row["x"], row["y"], row["z"]], abs=1e-6)
     assert live._controls._inputs["perturbation", "payload"].value == pytest.approx(10.0) and live._return.visible

@@ -60,7 +60,7 @@ def test_map(server):
     """A map that differs from the world is drawn as the outlines of what it has; without one nothing is."""
     known = Obstacles(shapes=(Box(x=3.0, y=1.5, length=0.4, width=0.2), Disc(x=1.0, y=-1.0, radius=0.3)))
     live = Live([DRIVE.replace(map=known)], server)
-    drawn = live._scene._map
+    drawn = live._scene.navigation._map
     rims = [
         shapely.box(2.8, 1.4, 3.2, 1.6).exterior,
         shapely.Point(1.0, -1.0).buffer(0.3, 256).exterior,
@@ -71,7 +71,7 @@ def test_map(server):
     assert shapely.unary_union([shapely.LineString(ends) for ends in drawn.points[..., :2]]).length == pytest.approx(
         sum(rim.length for rim in rims), rel=0.01
     )
-    assert not Live([DRIVE], server)._scene._map.visible
+    assert not Live([DRIVE], server)._scene.navigation._map.visible
 
 
 def test_obstacles_move(server, tmp_path):
@@ -107,7 +107,7 @@ def test_replay_of_a_mission(server, tmp_path):
         replay.draw()
         replay.refresh()
         assert replay._status.content.count("has arrived") == there
-    start, goal = replay._scene._ends
+    start, goal = replay._scene.navigation._ends
     assert start.visible and start.position[:2] == pytest.approx([0, 0], abs=1e-9)
     assert goal.position[:2] == pytest.approx([1.5, -0.6]) and 2 * np.arcsin(goal.wxyz[3]) == pytest.approx(-0.5)
     titles = {handle.title: handle for handle in replay._plots._handles}
@@ -140,7 +140,7 @@ def test_clearance_live(server):
     handle = next(handle for handle in live._plots._handles if handle.title == "clearance, m")
     step = max(1, round(WINDOW / live.session.period) // SAMPLES)
     assert np.array_equal(handle.data[1], clearance[::step].astype(np.float32))
-    assert not live._scene._ends[0].visible  # a line has no end
+    assert not live._scene.navigation._ends[0].visible  # a line has no end
 
 
 @pytest.mark.parametrize("localisation", ["scan", "particles"])
@@ -152,7 +152,7 @@ def test_scan(server, localisation):
     for _ in range(25):
         live.session.step()
     live.draw()
-    points, particles = live._scene._scans
+    points, particles = live._scene.navigation._scans
     x, y, z = points.points.T
     walls = shapely.union_all([shapely.Polygon(shape.vertices) for shape in WALLS.shapes])
     assert len(x) > 15 and points.visible and (z > 0.5).all()
@@ -197,7 +197,7 @@ def test_scans_of_a_replay(who, server, tmp_path, monkeypatch):
     replay.sensors.value = True
     replay._scrub(0.5)
     replay.draw()
-    points = replay._scene._scans[0]
+    points = replay._scene.navigation._scans[0]
     assert points.visible and points.points[:, :2] == pytest.approx(scans[12], abs=1e-6)  # 1.27 s
     replay.sensors.value = False
     replay.draw()
@@ -276,7 +276,7 @@ def test_avoiders(server, tmp_path, avoid):
             x, y, theta = x + 1e-3 * v * np.cos(theta), y + 1e-3 * v * np.sin(theta), theta + 1e-3 * omega
         assert way[-1] == pytest.approx([x, y], abs=3e-3)
     assert np.hypot(*(chosen[1] - chosen[0])) == pytest.approx(0.05 * stage.last[0, 0]) and np.ptp(some[:, -1, 1]) > 0.5
-    lines = live._scene._fans[0]
+    lines = live._scene.navigation._fans[0]
     assert all(drawn.visible for drawn in lines) and np.allclose(lines[1].points[0, 0, :2], chosen[0], atol=1e-6)
     live._fan.value = False
     live.draw()
@@ -347,7 +347,7 @@ def test_search(server):
     live = Live([own.replace(goal=None)], server, "none", plan.searched)
     live._tree.value = True
     live._show_search()
-    drawn = live._scene._search
+    drawn = live._scene.navigation._search
     assert drawn.visible and np.allclose(drawn.points[..., :2], plan.searched, atol=1e-6)
     live._searched = live.session.head_for((3.0, -1.0, 0.0)).searched
     live._show_search()
@@ -451,7 +451,7 @@ def test_clicks(server):
     assert bound is not None and bound[1] == pytest.approx([2, 1, np.pi / 2], abs=0.1)
     assert "way to (2.00, 1.00) m" in live._timeline.content and live._hands._picking.content == ""
     live.refresh()
-    goal = live._scene._ends[1]
+    goal = live._scene.navigation._ends[1]
     assert goal.visible and goal.position[:2] == pytest.approx([2, 1])
     assert event.time == 0.01 * (1 + live.session.preview)
 

@@ -10,7 +10,7 @@ from mjviser.conversions import merge_geoms
 
 from mrctl.physics import mjcf
 from mrctl.theory.robot import CAR, RobotFile
-from mrctl.viewer.scene import SEEN, _rough
+from mrctl.viewer.robots import SEEN, _rough
 from mrctl.viewer.shapes import ribbons
 
 
