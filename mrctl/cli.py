@@ -919,9 +919,11 @@ def _view_with(arguments: list[str]) -> Callable[..., None]:
             if scenario != default:
                 raise InputError(f"view: {file} has its own scenarios; flags of a scenario need a live session")
             _check_exists(file)
+            if compare:
+                raise InputError("compare: it needs a scenario; the ghosts of a replay are chosen in the page")
             from mrctl.viewer import view as viewing
 
-            return viewing.replay(file, compare, number, export, host, port, code)
+            return viewing.replay(file, number, export, host, port, code)
         if number is not None:
             raise InputError("run: chooses a run of a result or a sweep; a live session has none")
         _check_world(scenario.world, scenario.robot)

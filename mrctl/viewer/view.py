@@ -10,7 +10,6 @@ from mrctl.loop.simulation import simulate
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import Avoid
 from mrctl.navigation.mission import prepared as prepare
-from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
 if TYPE_CHECKING:
@@ -80,20 +79,11 @@ def mission(
     _serve(lambda server: Live([own, *others], server, avoid, plan.searched), host, port)
 
 
-def replay(
-    folder: Path,
-    compare: Sequence[FeedforwardName],
-    run: int | None,
-    export: Path | None,
-    host: str,
-    port: int,
-    code: bool = True,
-) -> None:
+def replay(folder: Path, run: int | None, export: Path | None, host: str, port: int, code: bool) -> None:
     """Shows the replay of a result or a sweep in the browser, or exports it.
 
     Args:
         folder: Folder of the result or the sweep.
-        compare: Must be empty.
         run: Number of the run that is shown first.
         export: File to write instead of serving a page.
         host: Address to listen on.
@@ -101,16 +91,13 @@ def replay(
         code: Whether a sweep may run the Python files that it names.
 
     Raises:
-        InputError: The folder is refused, as by `mrctl.open`; the server cannot listen on the address; or options
-            contradict each other.
+        InputError: The folder is refused, as by `mrctl.open`; or the server cannot listen on the address.
     """
     from mrctl.viewer.export import export as write
     from mrctl.viewer.export import refuse_existing
     from mrctl.viewer.recording import MAX_SHOWN, Library, looks_of
     from mrctl.viewer.replay import Replay
 
-    if compare:
-        raise InputError("compare: it needs a scenario; the ghosts of a replay are chosen in the page")
     if export is not None:
         refuse_existing(export)
     library = Library(folder / "result.zarr" if (folder / "result.zarr").is_dir() else folder, code)
