@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,7 +14,7 @@ from tqdm import tqdm
 from mrctl.control.design import M_S, M_T, SPEEDS, plants, sensitivity
 from mrctl.control.design import motion as motion_design
 from mrctl.control.kanayama import Kanayama
-from mrctl.control.margins import learning_ratio, margins, sampled_loop
+from mrctl.control.margins import Gains, learning_ratio, margins, sampled_loop
 from mrctl.control.pid import Pid
 from mrctl.experiments.response import Response, measure, refine, safety
 from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder, write_json
@@ -25,8 +25,9 @@ from mrctl.results import plots
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
 from mrctl.sensing.tiers import TIERS, Sensing
+from mrctl.theory.linear import Linear
 from mrctl.theory.perturbation import Perturbation
-from mrctl.theory.robot import CAR, RobotFile
+from mrctl.theory.robot import CAR, Robot, RobotFile
 
 RESPONSES = {"design": "designed", "measured": "measured", "hierarchy": "measured with motion controller"}
 STYLES: dict[str, dict[str, Any]] = {
@@ -126,47 +127,70 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
     for steering in offered:
         _, nominal = mjcf.build(world, steering, robot=robot)
         pids = [pid.replace(delay=delay) for delay in delays]
-        common = Scenario.from_dict(
-            {"world": world, "robot": robot.model_dump(), "steering": steering, "sensing": {"tier": "ideal"}}
-        )
-        period, rigid = common.control_period, steering == "rigid"
-        gains = [one.channels(nominal, rigid, period=period) for one in pids]
-        motions = [
-            motion_design(nominal, rigid, both, delay, period) for delay, both in zip(delays, gains, strict=True)
-        ]
-        still = Kanayama(k_x=0, k_y=0, k_theta=0)
-        scenarios = [
-            common.replace(
-                pid=one,
-                perturbation=Perturbation(control_delay=delay),
-                kanayama=found.kanayama if moves else still,
-                prefilter=found.prefilter,
-            )
-            for moves in (False, True)
-            for one, delay, found in zip(pids, delays, motions, strict=True)
-        ]
-        for delay, both, found in zip(delays, gains, motions, strict=True):
-            lags = dict(zip(("v_lag", "omega_lag"), found.lag, strict=True))
-            suits = found.kanayama.model_dump() | {"prefilter": found.prefilter} | lags
-            kanayama = np.array([suits[name] for name in ("k_x", "k_y", "k_theta")])
-            whole = sensitivity(nominal, rigid, both, kanayama, found.prefilter, delay, period)
-            suits |= {"sensitivity": whole.tolist()}
-            table["motion"].append({"steering": steering, "delay": delay} | suits)
+        fixed = {"world": world, "robot": robot.model_dump(), "steering": steering, "sensing": {"tier": "ideal"}}
+        common, rigid = Scenario.from_dict(fixed), steering == "rigid"
+        designs = [_designed(nominal, rigid, one, delay, period) for one, delay in zip(pids, delays, strict=True)]
+        table["motion"] += [{"steering": steering} | _motion_row(nominal, rigid, one, period) for one in designs]
+        still = [one._replace(kanayama=Kanayama(k_x=0, k_y=0, k_theta=0)) for one in designs]
+        scenarios = [one.applied(common) for one in (*still, *designs)]
         channels = (0, 1) if steering == offered[0] else (1,)
         for channel in tqdm(channels, unit="loop", desc=steering):
             plant = plants(nominal, rigid, channel)[0]
             frequency, measured = measure(scenarios, channel, SPEEDS[0] * nominal.max_speed)
-            for k, delay in enumerate(delays):
-                loop = sampled_loop(frequency, plant, gains[k][channel], period, delay)
-                t = dict(zip(RESPONSES, (loop / (1 + loop), measured[k], measured[len(delays) + k]), strict=True))
-                row = {"steering": steering, "channel": channel, "delay": delay}
-                made = {"static_gain": plant.gain, "plant_lag": plant.lag, **gains[k][channel]._asdict()}
-                made["ratio"] = learning_ratio(plant.gain, plant.lag, gains[k][channel])
-                judged = {name: _judge(frequency, t[name], period, delay) for name in RESPONSES}
-                table["loops"].append(row | made | judged)
-                table["responses"].append(row | {name: _parts(one) for name, one in t.items()})
+            for one, alone, whole in zip(designs, *np.split(measured, 2), strict=True):
+                loop = sampled_loop(frequency, plant, one.gains[channel], period, one.delay)
+                t = dict(zip(RESPONSES, (loop / (1 + loop), alone, whole), strict=True))
+                row = {"steering": steering, "channel": channel, "delay": one.delay}
+                judged = {name: _judge(frequency, t[name], period, one.delay) for name in RESPONSES}
+                table["loops"].append(row | _gains(plant, one.gains[channel]) | judged)
+                table["responses"].append(row | {name: _parts(response) for name, response in t.items()})
             table["frequency"] = frequency.tolist()
     return table
+
+
+class _Design(NamedTuple):
+    """The controllers of one steering arrangement that are designed for one loop delay."""
+
+    delay: float
+    """Loop delay in s."""
+    pid: Pid
+    gains: tuple[Gains, Gains]
+    """PI gains of both channels."""
+    kanayama: Kanayama
+    prefilter: float
+    """Time constant in s."""
+    lag: tuple[float, float]
+    """Lags of V and θ̇ in s."""
+
+    def applied(self, scenario: Scenario) -> Scenario:
+        """Returns a scenario with these controllers and this delay."""
+        return scenario.replace(
+            pid=self.pid,
+            perturbation=Perturbation(control_delay=self.delay),
+            kanayama=self.kanayama,
+            prefilter=self.prefilter,
+        )
+
+
+def _designed(robot: Robot, rigid: bool, pid: Pid, delay: float, period: float) -> _Design:
+    gains = pid.channels(robot, rigid, period=period)
+    return _Design(delay, pid, gains, *motion_design(robot, rigid, gains, delay, period))
+
+
+def _motion_row(robot: Robot, rigid: bool, design: _Design, period: float) -> dict[str, Any]:
+    """Returns a row of `motion` without its steering: the motion controller, and max |S| of both channels under it."""
+    kanayama = design.kanayama
+    gains = np.array([kanayama.k_x, kanayama.k_y, kanayama.k_theta])
+    whole = sensitivity(robot, rigid, design.gains, gains, design.prefilter, design.delay, period)
+    lags = dict(zip(("v_lag", "omega_lag"), design.lag, strict=True))
+    row = {"delay": design.delay} | kanayama.model_dump() | {"prefilter": design.prefilter} | lags
+    return row | {"sensitivity": whole.tolist()}
+
+
+def _gains(plant: Linear, gains: Gains) -> dict[str, float]:
+    """Returns the plant, the gains of its PI controller, and the ratio of the learning condition."""
+    made = {"static_gain": plant.gain, "plant_lag": plant.lag, **gains._asdict()}
+    return made | {"ratio": learning_ratio(plant.gain, plant.lag, gains)}
 
 
 def _parts(response: Response) -> dict[str, list[float]]:
