@@ -37,7 +37,7 @@ from mrctl.theory.clearance import clearances
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.references import check, enlarged
-from mrctl.theory.robot import ANY_ANGLE, Tyres
+from mrctl.theory.robot import ANY_ANGLE, Robot, Tyres
 from mrctl.theory.timing import RESERVE
 
 LEAST = 8  # smallest number of robots for which a thread pays
@@ -255,55 +255,64 @@ class Simulation:
         from mrctl.loop.announcement import announced  # imported here because it needs Numba
 
         announced()
-        scenarios = [arranged(s) for s in scenarios]
+        self.scenarios = scenarios = [arranged(s) for s in scenarios]
         first, size = scenarios[0], len(scenarios)
-        self.scenarios = scenarios
         self.ticks, self.tick, self.period = max(s.ticks for s in scenarios), 0, first.control_period
         obstacles = [s.obstacles for s in scenarios]
         models, robot = mjcf.build_each(obstacles, first.world, first.steering, first.physics_step, first.robot)
         self.model = models[0]
         self._reverses = mjcf.reverses(self.model, first.steering)
-        for scenario in scenarios:
-            for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
-                check(reference, robot, self._reverses)
+        self._check_references(robot)
         factories: dict[str, Any] = {name: factory for name, factory in stages.items() if factory}
         users = {name: UserStage(name, factory, robot, size) for name, factory in factories.items()}
-        names = named_stages(stages)
-        self._feedforward = named(first.prior, names.pop("feedforward", first.learner))
-        self._label = " + ".join([self._feedforward, *names.values()])
+        own_estimator, self._stages = users.pop("estimator", None), named_stages(stages)
 
         self.preview = first.sensing.periods("delay", self.period)
         self.courses = (RestartingCourses if restarting else Courses)(scenarios, self.preview)
-        substeps = round(self.period / first.physics_step)
-        self.plant: Plant = build(models, robot, substeps, worthwhile(threads, size), obstacles)
-        later = [event.perturbation for scenario in scenarios for event in scenario.events]
-        for k, perturbation in enumerate(later):  # before anything is computed
-            if perturbation is not None and perturbation not in later[:k]:
-                self.plant.check(perturbation)
-        own = users.pop("estimator", None)
-        sensing, scanner = [s.sensing for s in scenarios], None
+        self.plant = self._build_plant(models, robot, worthwhile(threads, size))
         self.hierarchy = UserHierarchy(scenarios, robot, users) if users else Hierarchy(scenarios, robot)
-        if self.hierarchy.looks or any(s.localisation != "fixes" for s in sensing):
-            scanner = Scanner(sensing, self.period, obstacles)
-        self.hierarchy.scanner = scanner
-        self.sensors = Sensors(sensing, [s.seed for s in scenarios], self.period)
-        # The engine integrates positions with the velocities at the end of a step: velocities are half a step behind.
-        skew = first.physics_step / 2
-        known = [s.known for s in scenarios] if scanner else ()
-        parts = sensing, robot, self.sensors, self.plant.imu, skew, self._tyres(first), scanner, known
-        self.estimator = UserEstimator(own, *parts) if own else Estimator(first.sensing.source, *parts)
+        self.hierarchy.scanner = self._build_scanner()
+        self.sensors = Sensors([s.sensing for s in scenarios], [s.seed for s in scenarios], self.period)
+        self.estimator = self._build_estimator(own_estimator)
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period, self.preview)
         self.log = Log(1 if restarting else self.ticks, size)
-        self._failure_time = np.full(size, np.nan)
         self.goals = Goals(scenarios, timed=not restarting)
+        self._failure_time = np.full(size, np.nan)
         self._learned: dict[int, Array] = {}  # what each robot had adapted when its run ended, flat
+        self._start()
 
-        goal, _ = self.courses.at(0)
-        poses = np.stack([start_pose(s, goal["pose"][row]) for row, s in enumerate(scenarios)])
-        self.plant.reset(poses, goal["twist"])
-        self.hierarchy.reset(goal["twist"], goal["acceleration"], self.plant.reading["steering_angle"])
-        for row, scenario in enumerate(scenarios):
-            self.estimator.start(row, self.plant.reading[row], scenario.seed, 0)
+    def _check_references(self, robot: Robot) -> None:
+        """Refuses references, also those of events, that the robot cannot follow."""
+        for scenario in self.scenarios:
+            for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
+                check(reference, robot, self._reverses)
+
+    def _build_plant(self, models: Sequence[Any], robot: Robot, threads: int) -> Plant:
+        """Builds the physics; refuses perturbations of events, before anything is computed."""
+        substeps = round(self.period / self.scenarios[0].physics_step)
+        plant = build(models, robot, substeps, threads, [s.obstacles for s in self.scenarios])
+        later = [event.perturbation for scenario in self.scenarios for event in scenario.events]
+        for k, perturbation in enumerate(later):
+            if perturbation is not None and perturbation not in later[:k]:
+                plant.check(perturbation)
+        return plant
+
+    def _build_scanner(self) -> Scanner | None:
+        """Builds the lidars, if a motion stage or the localisation of a robot takes their scans."""
+        sensing = [s.sensing for s in self.scenarios]
+        if self.hierarchy.looks or any(s.localisation != "fixes" for s in sensing):
+            return Scanner(sensing, self.period, [s.obstacles for s in self.scenarios])
+        return None
+
+    def _build_estimator(self, own: UserStage | None) -> Estimator:
+        """Builds the estimator: the user's, if there is one, or that of the scenarios."""
+        first, scanner = self.scenarios[0], self.hierarchy.scanner
+        # The engine integrates positions with the velocities at the end of a step: velocities are half a step behind.
+        skew = first.physics_step / 2
+        known = [s.known for s in self.scenarios] if scanner else ()
+        sensing, robot = [s.sensing for s in self.scenarios], self.plant.robot
+        parts = sensing, robot, self.sensors, self.plant.imu, skew, self._tyres(first), scanner, known
+        return UserEstimator(own, *parts) if own else Estimator(first.sensing.source, *parts)
 
     def _tyres(self, scenario: Scenario) -> Tyres:
         """Measures the tyres of the nominal robot on a level floor, where the estimator needs them."""
@@ -312,6 +321,15 @@ class Simulation:
         if scenario.world == "flat" and not scenario.obstacles.shapes:
             return tyres.measure(self.model)
         return tyres.measure(mjcf.load("flat", scenario.steering, scenario.physics_step, scenario.robot))
+
+    def _start(self) -> None:
+        """Sets the robots on their references with the twist of these; controllers and estimates start from there."""
+        goal, _ = self.courses.at(0)
+        poses = np.stack([start_pose(s, goal["pose"][row]) for row, s in enumerate(self.scenarios)])
+        self.plant.reset(poses, goal["twist"])
+        self.hierarchy.reset(goal["twist"], goal["acceleration"], self.plant.reading["steering_angle"])
+        for row, scenario in enumerate(self.scenarios):
+            self.estimator.start(row, self.plant.reading[row], scenario.seed, 0)
 
     @property
     def running(self) -> bool:
@@ -443,36 +461,55 @@ class Simulation:
 
     def result(self) -> xr.Dataset:
         """Returns the signals so far or, once every run has ended, those of the whole time, with NaN after the ends."""
-        stage = self.hierarchy.learner
-        learned = stage.adapted() if isinstance(stage, Learner) else np.zeros((0, 0))
-        for row, kept in self._learned.items() if learned.size else ():
-            learned[row] = kept
-        weights = learned if learned.size else None
-        size, robot = len(self.scenarios), self.plant.robot
-        length = self.tick if self.running else self.ticks
+        size, length = len(self.scenarios), self.tick if self.running else self.ticks
         for tick in range(self.tick, length):
             self.log.blank(tick, slice(None))
-        names = [self._label] * size, [self._feedforward] * size
+        first, others = self.scenarios[0], dict(self._stages)
+        feedforward = named(first.prior, others.pop("feedforward", first.learner))
+        names = [" + ".join([feedforward, *others.values()])] * size, [feedforward] * size
         log, failure = self.log.ticks[:length], self.plant.failure
-        found = dataset.dataset(self.scenarios, *names, log, failure, self._failure_time, weights)
+        found = dataset.dataset(self.scenarios, *names, log, failure, self._failure_time, self._weights())
+        scanned = {}
+        if self.estimator.scanner:
+            scanned["scanned"] = "run", np.ones(size, bool), {"long_name": "whether its lidar scanned"}
         faults = {name: ("run", np.array(texts, object)) for name, texts in self.faults.items()}
-        constants = {  # with which the features of a commanded motion are computed
+        return found.assign(
+            self._coefficients() | self._clearance(length) | scanned | faults | self._constants() | self._gains()
+        )
+
+    def _weights(self) -> Array | None:
+        """Returns what each robot has learned, as of its end if it has ended, flat; None if nothing is learned."""
+        stage = self.hierarchy.learner
+        learned = stage.adapted() if isinstance(stage, Learner) else np.zeros((0, 0))
+        if not learned.size:
+            return None
+        for row, kept in self._learned.items():
+            learned[row] = kept
+        return learned
+
+    def _coefficients(self) -> dict[str, Any]:
+        """Variables with the coefficients of `parameters`, where the learner has some."""
+        if (coefficients := self.parameters()) is None:
+            return {}
+        axes, units = ("run", "feature", "channel"), {"units": "V"}
+        known, true = coefficients
+        return {"parameters": (axes, known, units), "true_parameters": (axes, true, units)}
+
+    def _constants(self) -> dict[str, Any]:
+        """Variables with which the features of a commanded motion are computed."""
+        size, robot = len(self.scenarios), self.plant.robot
+        return {
             "half_track": ("run", np.full(size, robot.half_track), {"units": "m"}),
             "feature_scale": (("run", "feature"), np.tile(feature_scale(robot), (size, 1))),
         }
+
+    def _gains(self) -> dict[str, Any]:
+        """Variables with the present gains of the controllers."""
         gains = {}
         for name, (unit, meaning) in dataset.GAINS.items():
             values = self.hierarchy.gains[name].copy()
             gains[name] = ("run", "channel")[: values.ndim], values, {"units": unit, "long_name": meaning}
-        scanned = {}
-        if self.estimator.scanner:
-            scanned["scanned"] = "run", np.ones(size, bool), {"long_name": "whether its lidar scanned"}
-        parameters = {}
-        if (coefficients := self.parameters()) is not None:
-            axes, units = ("run", "feature", "channel"), {"units": "V"}
-            known, true = coefficients
-            parameters = {"parameters": (axes, known, units), "true_parameters": (axes, true, units)}
-        return found.assign(parameters | self._clearance(length) | scanned | faults | constants | gains)
+        return gains
 
     @property
     def faults(self) -> dict[str, list[str]]:
