@@ -179,14 +179,7 @@ def at(field: Field, x: float, y: float) -> tuple[float, float, float]:
         y: y of the point in m.
     """
     distance, origin, resolution = field
-    rows, columns = distance.shape
-    column, row = (x - origin[0]) / resolution - 0.5, (y - origin[1]) / resolution - 0.5
-    inside = 0.0 <= column <= columns - 1 and 0.0 <= row <= rows - 1
-    column, row = min(max(column, 0.0), columns - 1.0), min(max(row, 0.0), rows - 1.0)
-    k, i = min(int(column), max(columns - 2, 0)), min(int(row), max(rows - 2, 0))
-    k1, i1 = min(k + 1, columns - 1), min(i + 1, rows - 1)
-    u, v = column - k, row - i
-    a, b, c, d = distance[i, k], distance[i, k1], distance[i1, k], distance[i1, k1]
+    a, b, c, d, u, v, inside = around(distance, origin[0], origin[1], resolution, x, y)
     value = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
     if not inside:
         return value, 0.0, 0.0
@@ -207,14 +200,29 @@ def value(distance: Array, left: float, low: float, resolution: float, x: float,
         x: x of the point in m.
         y: y of the point in m.
     """
+    a, b, c, d, u, v, _ = around(distance, left, low, resolution, x, y)
+    return (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
+
+
+@kernel
+def around(
+    distance: Array, left: float, low: float, resolution: float, x: float, y: float
+) -> tuple[float, float, float, float, float, float, bool]:
+    """Returns the distances of the four cells whose centres are around a point, and where it is between them.
+
+    The arguments are those of `value`.
+
+    Returns:
+        The distances in m, row by row; the shares of the way to the next column and to the next row, 0 to 1; and
+        whether the point is between the outermost centres. If not, the nearest point that is takes its place.
+    """
     rows, columns = distance.shape
     column, row = (x - left) / resolution - 0.5, (y - low) / resolution - 0.5
+    inside = 0.0 <= column <= columns - 1 and 0.0 <= row <= rows - 1
     column, row = min(max(column, 0.0), columns - 1.0), min(max(row, 0.0), rows - 1.0)
     k, i = min(int(column), max(columns - 2, 0)), min(int(row), max(rows - 2, 0))
     k1, i1 = min(k + 1, columns - 1), min(i + 1, rows - 1)
-    u, v = column - k, row - i
-    a, b, c, d = distance[i, k], distance[i, k1], distance[i1, k], distance[i1, k1]
-    return (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
+    return distance[i, k], distance[i, k1], distance[i1, k], distance[i1, k1], column - k, row - i, inside
 
 
 def rectangles(occupied: NDArray[np.bool]) -> NDArray[np.int64]:
