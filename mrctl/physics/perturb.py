@@ -68,38 +68,9 @@ def perturb(
     p = perturbation
     scratch = scratch or mujoco.MjData(nominal)
     robot = robot or read_robot(nominal, scratch=scratch)
-    chassis, bodies = nominal.body("chassis").id, bodies_of(nominal)
-    model.body_mass[:] = nominal.body_mass
-    model.body_inertia[:] = nominal.body_inertia
-    model.body_mass[bodies] *= p.mass_factor
-    model.body_inertia[bodies] *= p.mass_factor
-    model.body_inertia[chassis, _upright_axis(nominal, chassis)] *= p.inertia_factor
-    model.body_ipos[chassis] = nominal.body_ipos[chassis]
-    model.body_iquat[chassis] = nominal.body_iquat[chassis]
-    if p.payload > 0:
-        position = np.array([p.payload_x, p.payload_y, p.payload_z - robot.wheel_radius])
-        _add_point_mass(model, chassis, p.payload, position)
-    for wheel, factor in (("wheel_left", p.left_radius_factor), ("wheel_right", p.right_radius_factor)):
-        geom = nominal.geom(wheel).id
-        model.geom_size[geom] = nominal.geom_size[geom] * factor
-        model.geom_rbound[geom] = nominal.geom_rbound[geom] * factor
-        model.geom_aabb[geom] = nominal.geom_aabb[geom] * factor
-    motors = [nominal.actuator(name).id for name in MOTORS]
-    friction = p.drive_friction_factor * np.array([p.left_drive_friction_factor, p.right_drive_friction_factor])
-    resistance = p.resistance_factor * np.array([p.left_resistance_factor, p.right_resistance_factor])
-    constant = p.motor_constant_factor * np.array([p.left_motor_constant_factor, p.right_motor_constant_factor])
-    model.actuator_gainprm[motors] = nominal.actuator_gainprm[motors]
-    model.actuator_gainprm[motors, 0] *= resistance
-    model.actuator_gainprm[motors, 1] *= constant
-    # A <dcmotor> holds L/R; the winding keeps its inductance L when its resistance changes.
-    model.actuator_dynprm[motors] = nominal.actuator_dynprm[motors]
-    model.actuator_dynprm[motors, 0] /= resistance
-    inputs = nominal.actuator_ctrladr[motors]
-    model.actuator_ctrlrange[inputs] = nominal.actuator_ctrlrange[inputs] * max(1.0, p.supply_factor)
-    # The no-load torque k_M I_0 is a loss: it grows with the drive friction, and not with the motor constant. The model
-    # holds one current, with which the mean constant of the two motors gives their mean loss.
-    no_load = nominal.numeric("no_load_current").data * friction.mean() / constant.mean()
-    model.numeric("no_load_current").data[:] = no_load
+    _perturb_bodies(nominal, model, p, robot.wheel_radius)
+    _perturb_wheels(nominal, model, p)
+    _perturb_motors(nominal, model, p)
     model.pair_friction[:] = nominal.pair_friction
     model.pair_friction[:, :2] *= p.tyre_friction_factor
     model.pair_friction[left_tyre_pairs(nominal), :2] *= p.left_tyre_friction_factor
@@ -112,13 +83,61 @@ def perturb(
     height = at_rest(model, scratch)[1][2] + np.mean([model.geom(wheel).size[0] for wheel in REAR])
     if height < 0:
         raise InputError("perturbation.payload_z: the centre of mass lies below the ground")
-    factors = dict(zip(REAR, friction, strict=True))
+    factors = dict(zip(REAR, _drive_frictions(p), strict=True))
     for wheel in (*REAR, *rolling_fronts(nominal)):
         dof = nominal.joint(wheel).dofadr[0] + np.arange(len(nominal.joint(wheel).frictionloss))
         drive = robot.drive_loss * (factors[wheel] - 1) if wheel in factors else 0.0
         rolling = robot.rolling_coefficient * (after[wheel] - before[wheel])
         model.dof_frictionloss[dof] = nominal.dof_frictionloss[dof] + drive + rolling
     mujoco.mj_setConst(model, scratch)
+
+
+def _perturb_bodies(nominal: mujoco.MjModel, model: mujoco.MjModel, p: Perturbation, wheel_radius: float) -> None:
+    """Writes masses and inertias, with the payload on the chassis."""
+    chassis, bodies = nominal.body("chassis").id, bodies_of(nominal)
+    model.body_mass[:] = nominal.body_mass
+    model.body_inertia[:] = nominal.body_inertia
+    model.body_mass[bodies] *= p.mass_factor
+    model.body_inertia[bodies] *= p.mass_factor
+    model.body_inertia[chassis, _upright_axis(nominal, chassis)] *= p.inertia_factor
+    model.body_ipos[chassis] = nominal.body_ipos[chassis]
+    model.body_iquat[chassis] = nominal.body_iquat[chassis]
+    if p.payload > 0:
+        position = np.array([p.payload_x, p.payload_y, p.payload_z - wheel_radius])
+        _add_point_mass(model, chassis, p.payload, position)
+
+
+def _perturb_wheels(nominal: mujoco.MjModel, model: mujoco.MjModel, p: Perturbation) -> None:
+    """Writes the radii of the driven wheels."""
+    for wheel, factor in (("wheel_left", p.left_radius_factor), ("wheel_right", p.right_radius_factor)):
+        geom = nominal.geom(wheel).id
+        model.geom_size[geom] = nominal.geom_size[geom] * factor
+        model.geom_rbound[geom] = nominal.geom_rbound[geom] * factor
+        model.geom_aabb[geom] = nominal.geom_aabb[geom] * factor
+
+
+def _perturb_motors(nominal: mujoco.MjModel, model: mujoco.MjModel, p: Perturbation) -> None:
+    """Writes resistances, motor constants and supply of the motors, and their no-load current."""
+    motors = [nominal.actuator(name).id for name in MOTORS]
+    resistance = p.resistance_factor * np.array([p.left_resistance_factor, p.right_resistance_factor])
+    constant = p.motor_constant_factor * np.array([p.left_motor_constant_factor, p.right_motor_constant_factor])
+    model.actuator_gainprm[motors] = nominal.actuator_gainprm[motors]
+    model.actuator_gainprm[motors, 0] *= resistance
+    model.actuator_gainprm[motors, 1] *= constant
+    # A <dcmotor> holds L/R; the winding keeps its inductance L when its resistance changes.
+    model.actuator_dynprm[motors] = nominal.actuator_dynprm[motors]
+    model.actuator_dynprm[motors, 0] /= resistance
+    inputs = nominal.actuator_ctrladr[motors]
+    model.actuator_ctrlrange[inputs] = nominal.actuator_ctrlrange[inputs] * max(1.0, p.supply_factor)
+    # The no-load torque k_M I_0 is a loss: it grows with the drive friction, and not with the motor constant. The model
+    # holds one current, with which the mean constant of the two motors gives their mean loss.
+    no_load = nominal.numeric("no_load_current").data * _drive_frictions(p).mean() / constant.mean()
+    model.numeric("no_load_current").data[:] = no_load
+
+
+def _drive_frictions(p: Perturbation) -> Array:
+    """Returns the factors on the friction of the left and the right drive, `(2,)`."""
+    return p.drive_friction_factor * np.array([p.left_drive_friction_factor, p.right_drive_friction_factor])
 
 
 def limit_current(nominal: mujoco.MjModel, model: mujoco.MjModel, limit: float) -> None:
