@@ -144,74 +144,84 @@ class Live(Page):
         self._plots.time.max = HOUR
         self.on(self._plots.time, self._look_back)
         with tabs.add_tab("Drive"):
-            self.on(gui.add_button_group("Watch", tuple(STORIES)), self._tell)
-            self._story = gui.add_html("")
-            self._status = gui.add_html("")
-            self._play = gui.add_button_group("", ("play", "pause", "step", "reset"))
-            self.on(self._play, self._command)
-            self._return = gui.add_button("Return to the present", visible=False)
-            self.on(self._return, lambda _: self._look_back(self.session.time))
-            speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
-            self.on(speed, self.choose_speed)
-            self.add_cameras()
-            self._follow = gui.add_checkbox("Camera follows", False, hint="The first robot stays in the middle.")
-            for label, choices in buttons(self.session.robot).items():
-                group = gui.add_button_group(label, tuple(choices))
-                self.on(group, partial(self._press, label))
-            self._hands = Hands(
-                self.server, self.on, self.ask, self._command, self._go_on, self._apply_event,
-                self._head_for, self._look_back,
-            )  # fmt: skip
-            self._fan = gui.add_checkbox("Avoider", self.session.avoid != "none", hint=FAN_HINT)
-            self._touch = gui.add_checkbox("Contact forces", False, hint=TOUCH_HINT)
-            self._tree = gui.add_checkbox("Search", False, hint="Draws the arcs that the search for the plan drove.")
-            self.on(self._tree, lambda _: self._show_search())
-            self.add_drawing()
-            self._timeline = gui.add_html("")
-            save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
+            self._add_drive(gui)
+        self._add_keys()
+        self._controls = Controls(gui, partial(self.ask, self._note_input), self.session.robot, CHANGEABLE)
+        self._controls.designed = self.session.designed()
+        first = self.session.start[0]
+        with tabs.add_tab("Robot"):
+            self._controls.add(first, only=["perturbation"])
+        with tabs.add_tab("Controllers"):
+            self._add_controllers(gui, first)
+        with tabs.add_tab("Run"):
+            self._add_run(gui, first)
 
-            @save.on_click
-            async def _(event: viser.GuiEvent) -> None:
-                self.ask(self._save, event.client)
+    def _add_drive(self, gui: viser.GuiApi) -> None:
+        self.on(gui.add_button_group("Watch", tuple(STORIES)), self._tell)
+        self._story = gui.add_html("")
+        self._status = gui.add_html("")
+        self._play = gui.add_button_group("", ("play", "pause", "step", "reset"))
+        self.on(self._play, self._command)
+        self._return = gui.add_button("Return to the present", visible=False)
+        self.on(self._return, lambda _: self._look_back(self.session.time))
+        speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1×")
+        self.on(speed, self.choose_speed)
+        self.add_cameras()
+        self._follow = gui.add_checkbox("Camera follows", False, hint="The first robot stays in the middle.")
+        for label, choices in buttons(self.session.robot).items():
+            group = gui.add_button_group(label, tuple(choices))
+            self.on(group, partial(self._press, label))
+        self._hands = Hands(
+            self.server, self.on, self.ask, self._command, self._go_on, self._apply_event,
+            self._head_for, self._look_back,
+        )  # fmt: skip
+        self._fan = gui.add_checkbox("Avoider", self.session.avoid != "none", hint=FAN_HINT)
+        self._touch = gui.add_checkbox("Contact forces", False, hint=TOUCH_HINT)
+        self._tree = gui.add_checkbox("Search", False, hint="Draws the arcs that the search for the plan drove.")
+        self.on(self._tree, lambda _: self._show_search())
+        self.add_drawing()
+        self._timeline = gui.add_html("")
+        save = gui.add_button("Save session", icon=viser.Icon.DOWNLOAD, hint="A scenario that repeats it exactly.")
 
-            self.add_download()
+        @save.on_click
+        async def _(event: viser.GuiEvent) -> None:
+            self.ask(self._save, event.client)
 
+        self.add_download()
+
+    def _add_keys(self) -> None:
         self.add_key("space", "Play or pause", lambda: self._command("pause" if self.playing else "play"))
         self.add_key("N", "Step", lambda: self._command("step"))
         self.add_key("R", "Reset", lambda: self._command("reset"))
         self.add_key("F", "Camera follows", lambda: setattr(self._follow, "value", not self._follow.value))
         for key, (group, choices) in zip(KEYS, buttons(self.session.robot).items(), strict=True):
             self.add_key(key, next(iter(choices)).capitalize(), partial(self._press, group, next(iter(choices))))
-
         self.add_key("G", "Set a goal", self._hands.await_goal)
         self.add_key("P", "Draw a way", self._hands.draw_way)
 
-        self._controls = Controls(gui, partial(self.ask, self._note_input), self.session.robot, CHANGEABLE)
-        self._controls.designed = self.session.designed()
-        first, changing = self.session.start[0], [name for name in Scenario.model_fields if name not in HIDDEN]
-        with tabs.add_tab("Robot"):
-            self._controls.add(first, only=["perturbation"])
-        with tabs.add_tab("Controllers"):
-            gui.add_html(block("anew", f"A change of an input with{ANEW} begins another run; the others act at once."))
-            self._controls.add(first, only=CONTROLLER)
-            with gui.add_folder("compare with" + ANEW):
-                self._ghosts: dict[FeedforwardName, viser.GuiCheckboxHandle] = {
-                    name: gui.add_checkbox(title_of(name), False) for name in FEEDFORWARDS
-                }
-                for name, ghost in self._ghosts.items():
-                    self.on(ghost, partial(self._compare, name))
-            self._learning = gui.add_checkbox("learning", True)
-            self.on(self._learning, lambda on: self._apply_event(learning=on))
-            self._gains = gui.add_html("")
-            self._controls.add(first, only=[n for n in changing if n not in (*NEW_RUN, "perturbation", *CONTROLLER)])
-        with tabs.add_tab("Run"):
-            self._robots = {robot.path: robot for robot in (*(RobotFile(path=p) for p in SHIPPED), first.robot)}
-            gui.add_html(block("all-anew", f"A change of any of these inputs begins another run ({ANEW.strip()})."))
-            hint = "Another robot begins another run, with the steering and a reference that suit it."
-            names, now = tuple(self._robots), first.robot.path
-            self._robot = gui.add_dropdown("robot" + ANEW, names, initial_value=now, hint=hint)
-            self.on(self._robot, self._choose_robot)
-            self._controls.add(first, only=NEW_RUN)
+    def _add_controllers(self, gui: viser.GuiApi, first: Scenario) -> None:
+        gui.add_html(block("anew", f"A change of an input with{ANEW} begins another run; the others act at once."))
+        self._controls.add(first, only=CONTROLLER)
+        with gui.add_folder("compare with" + ANEW):
+            self._ghosts: dict[FeedforwardName, viser.GuiCheckboxHandle] = {
+                name: gui.add_checkbox(title_of(name), False) for name in FEEDFORWARDS
+            }
+            for name, ghost in self._ghosts.items():
+                self.on(ghost, partial(self._compare, name))
+        self._learning = gui.add_checkbox("learning", True)
+        self.on(self._learning, lambda on: self._apply_event(learning=on))
+        self._gains = gui.add_html("")
+        elsewhere = *HIDDEN, *NEW_RUN, "perturbation", *CONTROLLER
+        self._controls.add(first, only=[name for name in Scenario.model_fields if name not in elsewhere])
+
+    def _add_run(self, gui: viser.GuiApi, first: Scenario) -> None:
+        self._robots = {robot.path: robot for robot in (*(RobotFile(path=p) for p in SHIPPED), first.robot)}
+        gui.add_html(block("all-anew", f"A change of any of these inputs begins another run ({ANEW.strip()})."))
+        hint = "Another robot begins another run, with the steering and a reference that suit it."
+        names, now = tuple(self._robots), first.robot.path
+        self._robot = gui.add_dropdown("robot" + ANEW, names, initial_value=now, hint=hint)
+        self.on(self._robot, self._choose_robot)
+        self._controls.add(first, only=NEW_RUN)
 
     def _show_session(self) -> None:
         """Shows the robots of a new session in the scene and in the plots."""
