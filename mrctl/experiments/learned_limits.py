@@ -21,13 +21,13 @@ import xarray as xr
 
 from mrctl.control.features import INPUTS, feature_scale
 from mrctl.experiments.journal import Computation, Journal
-from mrctl.experiments.mission_suite import PATIENCE, ROOMY, SHAPE, TIE, Mode, drawn
 from mrctl.experiments.mission_suite import PLANTS as SHARED
+from mrctl.experiments.mission_suite import ROOMY, SHAPE, TIE, Mode, drawn
 from mrctl.experiments.tables import Table, centre_cell, frame, share_cell, wins_cell, word_of
 from mrctl.loop.learned import kept, save_learned
 from mrctl.loop.simulation import arranged, simulate
 from mrctl.navigation.generators import corridor
-from mrctl.navigation.mission import SLIM, planned, reached
+from mrctl.navigation.mission import PATIENCE, SLIM, planned, reached
 from mrctl.navigation.planning import Plan
 from mrctl.navigation.vehicle import robot_of
 from mrctl.record import InputError

@@ -24,7 +24,7 @@ from mrctl.experiments.mission_suite import PLANTS, Mode, drawn
 from mrctl.experiments.tables import Table, centre_cell, frame, share_cell, wins_cell, word_of
 from mrctl.loop.simulation import simulate
 from mrctl.navigation.generators import Task, slalom
-from mrctl.navigation.mission import PERIOD, avoiding, outcomes, prepared
+from mrctl.navigation.mission import PATIENCE, PERIOD, avoiding, outcomes, prepared
 from mrctl.navigation.planning import Plan
 from mrctl.navigation.vehicle import robot_of
 from mrctl.record import InputError
@@ -54,7 +54,6 @@ WORLDS = {"quick": 4, "core": 30}
 GATES, SPACING = 2, 2.0  # of the slalom; m
 CROSSINGS = (3.0, 5.0)  # m, where the discs cross the way, on average
 RADIUS = 0.2  # m, of the discs
-PATIENCE = 2  # time of a run over that of its plan, after which it is out of time
 MOST_LAG = 1.0  # s
 PACE = 8  # simulated s in a s of one core
 TIE = PERIOD

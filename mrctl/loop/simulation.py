@@ -37,11 +37,10 @@ from mrctl.theory.clearance import clearances
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.references import check, enlarged
-from mrctl.theory.robot import ANY_ANGLE, Robot, Tyres
+from mrctl.theory.robot import ANY_ANGLE, LIMITS, Robot, Tyres
 from mrctl.theory.timing import RESERVE
 
 LEAST = 8  # smallest number of robots for which a thread pays
-LIMITS = ("max_speed", "max_rotation", "max_acceleration", "max_rotation_acceleration", "steering_limit")
 
 
 def simulate(
@@ -203,7 +202,7 @@ def suited(scenario: Scenario) -> Scenario:
     """
     scenario = arranged(scenario)
     model, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
-    names = LIMITS if robot.steering_limit < ANY_ANGLE else LIMITS[:-1]  # a caster swings to any angle
+    names = (*LIMITS, "steering_limit") if robot.steering_limit < ANY_ANGLE else LIMITS  # a caster swings to any angle
     careful = robot.replace(**{name: RESERVE * getattr(robot, name) for name in names})
     found = enlarged(scenario.reference, careful, mjcf.reverses(model, scenario.steering))
     return scenario.replace(reference=found or scenario.reference)

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from mrctl.kernel import Array
 from mrctl.record import InputError, Record
 from mrctl.theory.obstacles import Box, Disc, Known, Obstacle, Obstacles, Polygon, Pose
+from mrctl.theory.spline import Plane
 
 THICK = 0.1  # m, thickness of walls
-
-Plane = NDArray[np.complexfloating]
 
 
 class Task(Record):

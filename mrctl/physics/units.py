@@ -21,14 +21,13 @@ import numpy as np
 from mrctl.kernel import Array
 from mrctl.physics.elements import bodies_of
 from mrctl.record import InputError
-from mrctl.theory.robot import ANY_ANGLE, GRAVITY, Robot
+from mrctl.theory.robot import ANY_ANGLE, GRAVITY, LIMITS, Robot
 
 RPM = 30 / math.pi  # rpm of 1 rad/s
 GYRATION = 0.05, 1.0  # least and largest radius of gyration over the size of a robot
 LENGTHS = (
     "com_offset", "com_height", "wheel_radius", "front_wheel_radius", "half_track", "wheelbase", "trail",
 )  # fmt: skip
-LIMITS = "max_speed", "max_rotation", "max_acceleration", "max_rotation_acceleration"
 
 
 class Bound(NamedTuple):

@@ -14,6 +14,7 @@ from mrctl.record import Record
 
 GRAVITY = 9.81  # m/s²
 ANY_ANGLE = math.pi / 2  # rad, the steering limit of a robot without a steered wheel
+LIMITS = "max_speed", "max_rotation", "max_acceleration", "max_rotation_acceleration"  # fields of `Robot`
 Steering = Literal["compliant", "caster", "rigid"]
 STEERINGS: tuple[Steering, ...] = ("compliant", "caster", "rigid")
 

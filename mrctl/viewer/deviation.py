@@ -6,6 +6,7 @@ import numpy as np
 import viser
 
 from mrctl.kernel import Array, Row, Rows
+from mrctl.viewer.looks import Colour
 from mrctl.viewer.shapes import Mesh, add_mesh, ball, bar
 
 CHOICES = ("automatic", "1×", "10×", "100×")
@@ -40,9 +41,7 @@ class Target:
     the ball is a node of its own, and only the length of the line is late.
     """
 
-    def __init__(
-        self, scene: viser.SceneApi, row: int, height: float, thick: float, colour: tuple[int, int, int]
-    ) -> None:
+    def __init__(self, scene: viser.SceneApi, row: int, height: float, thick: float, colour: Colour) -> None:
         """Adds the target to a scene; it is invisible until `show`.
 
         Args:
@@ -55,7 +54,7 @@ class Target:
         name, self._height = f"/world/target/{row}", height
         self._root = scene.add_frame(name, show_axes=False, visible=False)
 
-        def add(part: str, mesh: Mesh, colour: tuple[int, int, int]) -> viser.MeshHandle:
+        def add(part: str, mesh: Mesh, colour: Colour) -> viser.MeshHandle:
             return add_mesh(scene, f"{name}/{part}", *mesh, color=colour, flat_shading=True)
 
         add("pin", bar(np.array([0, 0, -self._height]), np.zeros(3), thick / 2), PIN_COLOUR)

@@ -7,6 +7,7 @@ import viser
 
 from mrctl.kernel import Array, Row, Rows
 from mrctl.theory.kinematics import UP
+from mrctl.viewer.looks import Colour
 from mrctl.viewer.shapes import add_mesh, disc, ribbons
 
 SIGMAS = 3.0  # size of the ellipse in standard deviations: it holds 98.9 % of a plane normal distribution
@@ -52,7 +53,7 @@ class Marks:
     heading is not magnified.
     """
 
-    def __init__(self, scene: viser.SceneApi, row: int, footprint: Array, colour: tuple[int, int, int]) -> None:
+    def __init__(self, scene: viser.SceneApi, row: int, footprint: Array, colour: Colour) -> None:
         """Adds the marks to a scene; they are invisible until `show`.
 
         Args:
