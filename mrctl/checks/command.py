@@ -134,7 +134,8 @@ def cause_line(finding: Finding) -> str:
     """Returns the causes of a failed check, and its worst value after their repair, in one line."""
     if not finding.causes:
         return UNEXPLAINED
-    return f"cause: {', '.join(c.cause for c in finding.causes)}; once repaired, {finding.causes[0].evidence}"
+    evidence = finding.causes[0].evidence
+    return f"cause: {', '.join(c.cause for c in finding.causes)}" + (f"; once repaired, {evidence}" if evidence else "")
 
 
 def _width(cell: str) -> int:

@@ -53,7 +53,7 @@ class Explanation(NamedTuple):
     Attributes:
         cause: Name of the fault.
         text: What is odd in the model, and what to do about it.
-        evidence: The quantity that was farthest out of tolerance, with all faults repaired.
+        evidence: The quantity that was farthest out of tolerance, with all faults repaired; "" where none can be.
     """
 
     cause: str
@@ -125,7 +125,8 @@ class Examination:
         report = self._measure(check, model)
         if _passes(report):
             return Finding(check, report)
-        return Finding(check, report, _wrong_unit(model) if check.name == "units" else self._explain(check, report))
+        causes = _impossible(model, report) if check.name == "units" else self._explain(check, report)
+        return Finding(check, report, causes)
 
     def _measure(self, check: Check, model: mujoco.MjModel) -> Report:
         """Measures the values of a check within the time that is left."""
@@ -170,11 +171,15 @@ class Examination:
             return []
 
 
-def _wrong_unit(model: mujoco.MjModel) -> tuple[Explanation, ...]:
-    """Names the quantity of an impossible robot that is in a wrong unit, by arithmetic instead of a drive."""
+def _impossible(model: mujoco.MjModel, report: Report) -> tuple[Explanation, ...]:
+    """Names what makes a robot impossible, or the quantity in a wrong unit, by arithmetic instead of a drive."""
     found = mistake(model, read_robot(model))
     if found is None:
-        return ()
+        worst = max((c for c in report if not c.passed), key=excess)
+        low, high = worst.expected - worst.tolerance, worst.expected + worst.tolerance
+        value = f"{worst.quantity} is {worst.measured:.3g} {worst.unit}".strip()
+        text = f"{value}, that of a robot {low:.3g} to {high:.3g}"
+        return (Explanation("impossible number", text, ""),)
     worst = min(bounds(found.robot), key=lambda bound: bound.margin)
     return (Explanation("wrong unit", found.text, f"{worst.quantity}: {worst.value:.3g} {worst.unit}".strip()),)
 

@@ -101,6 +101,16 @@ def test_names_the_unit(mistake: str, robot: str, tmp_path: Path, capsys: pytest
     assert said[0] in line and len(messages(err)) == 1
 
 
+def test_impossible_number(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Where no single unit is wrong, the impossible number is the cause, and what depends on it is not measured."""
+    text = (models_folder() / "turtlebot.xml").read_text()
+    (tmp_path / "mine.xml").write_text(re.sub('mass="[0-9.]+"', 'mass="3e7"', text))
+    assert cli.main(["check", str(tmp_path / "mine.xml")]) == 1
+    out = capsys.readouterr().out
+    assert "- impossible number: mass over the cube of the size is 5.29e+09 kg/m³, that of a robot" in out
+    assert "time step" not in out and "waits for units: stance" in out and "1 failed, 23 skipped" in out
+
+
 @pytest.mark.parametrize("factor", [0.3, 1.0, 3.0])
 @pytest.mark.parametrize("robot", ["flat", "turtlebot", "racecar"])
 def test_other_robots_are_possible(robot: str, factor: float) -> None:
@@ -135,7 +145,7 @@ def test_ends_in_time(
 ) -> None:
     """The whole takes little more than its limit, even if no unit is suspected; no error of a check ends it."""
     monkeypatch.setattr(examination, "SECONDS", 1.0)
-    monkeypatch.setattr(examination, "_wrong_unit", lambda model: ())
+    monkeypatch.setattr(examination, "_impossible", lambda model, report: ())
     (tmp_path / "mine.xml").write_text(ROBOT.replace(*MISTAKES[mistake]))
     start = time.process_time()
     status = cli.main(["check", str(tmp_path / "mine.xml")])
