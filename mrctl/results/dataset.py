@@ -208,13 +208,18 @@ def dataset(
         "feedforward": ("run", np.array(feedforwards, object)),
         "steering": ("run", np.array([s.steering for s in scenarios], object)),
         "seed": ("run", np.array([s.seed for s in scenarios])),
-        "lap_time": ("run", np.array([s.reference.period for s in scenarios]), {"units": "s"}),
+        "lap_time": ("run", np.array([lap_time(s) for s in scenarios]), {"units": "s"}),
         "samples": ("run", np.array([s.ticks for s in scenarios]), {"long_name": "samples of the run if it lasts"}),
     }
     if weights is not None:
         variables["weights"] = (("run", "weight"), weights, {"long_name": "what was learned, flat"})
         coords["weight"] = np.arange(weights.shape[1])  # networks of different sizes align on it
     return xr.Dataset(variables, coords)
+
+
+def lap_time(scenario: Scenario) -> float:
+    """Returns the time of a lap in s; NaN for a run to a goal, all of which counts as one lap."""
+    return scenario.reference.period if scenario.goal is None else np.nan
 
 
 def combine(groups: Sequence[tuple[Sequence[int], xr.Dataset]], scenarios: Sequence[Scenario]) -> xr.Dataset:

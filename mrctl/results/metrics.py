@@ -94,7 +94,7 @@ def control_period(result: xr.Dataset) -> float:
 
 
 def laps_of(run: xr.Dataset) -> Laps:
-    """Divides one run (no `run` dimension) into whole laps; a run that is shorter than a lap counts as one lap.
+    """Divides one run (no `run` dimension) into whole laps; a run to a goal, or one shorter than a lap, counts as one.
 
     Samples after the last whole lap are left out, but a failure among them counts as one in that lap.
 

@@ -9,6 +9,7 @@ import numpy as np
 from typing_extensions import override
 
 from mrctl.physics.parameters import read_robot
+from mrctl.results.dataset import lap_time
 from mrctl.results.metrics import METRICS
 from mrctl.viewer.looks import MAX_MARKED
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
@@ -110,7 +111,8 @@ class Replay(Page):
         self._deviation = self.magnified_deviation(self._log)
         self._scene.show_recordings(recordings, self._deviation)
         self._times, self._events = times, event_times(recordings)
-        self._lap = round(recordings[0].scenario.reference.period / recordings[0].period)
+        lap = lap_time(recordings[0].scenario) / recordings[0].period
+        self._lap = round(lap) if np.isfinite(lap) else len(self._log)
         self._laps = whole_laps(self._log, self._lap, recordings[0].period, read_robot(recordings[0].model))
         learned = [np.full((8, 2), np.nan) if r.parameter_error is None else r.parameter_error for r in recordings]
         self._parameter_error = None if np.isnan(learned).all() else np.stack(learned)

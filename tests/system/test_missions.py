@@ -45,6 +45,9 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
         x, y = (driven[name].values[::10] for name in ("x", "y"))  # every 0.1 s: a subset of the differences
         assert robot["jerk"] == pytest.approx(np.sqrt(np.mean(np.diff([x, y], 3) ** 2 * 2)) / 1e-3, rel=0.1)
         assert 0 < robot["planning_time"] < 600
+    laps = mrctl.per_lap(result)  # all of a mission is one lap, however long its plan takes
+    errors = [robot["position_rmse"] for robot in mission["robots"]]
+    assert laps["laps"].values.tolist() == [1, 1] and laps["position_rmse"].values[:, 0] == pytest.approx(errors)
     assert "jerk, m/s³" in printed and "planning, s" in printed
     again = refused(capsys, "navigate", "doorway:3", "--out", str(out))
     assert "nothing was overwritten" in again
