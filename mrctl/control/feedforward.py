@@ -34,9 +34,10 @@ class Feedforward(Protocol):
     The voltage of the prior is added to its output.
 
     A stage serves B robots; its memory belongs in arrays with a leading axis B, so that robots cannot mix. It may have
-    three further members: `weight_norm`, a float64 array `(B,)` for the results; `restore(rows)`, with which the guard
-    (`mrctl.control.guard`) resets the robots with these indices to their initial weights; and `guarded`, which is False
-    where the guard shall not watch it.
+    four further members: `reset(period, delay)`, which is called before all other methods with the control period and
+    the delay of the loop that the controller knows, both in s; `weight_norm`, a float64 array `(B,)` for the results;
+    `restore(rows)`, with which the guard (`mrctl.control.guard`) resets the robots with these indices to their initial
+    weights; and `guarded`, which is False where the guard shall not watch it.
     """
 
     def output(self, command: Array, derivative: Array) -> Array:

@@ -418,6 +418,10 @@ def text(table: dict[str, Any]) -> str:
             fresh[-1].append(f"{number(ratio['value'])} [{number(ratio['low'])}, {number(ratio['high'])}]")
             fresh[-1].append(f"{one['failed']}/{table['budget']['fresh']}")
     found = [f"found in {tier}" for tier in tiers]
+
+    def level(tier: str) -> bool:
+        return tiers[tier]["fresh"][tier]["to_shipped"]["high"] >= 1
+
     parts = [
         f"{table['entry']}: {1 + table['budget']['generations'] * table['budget']['population']} settings a tier.",
         markdown(["setting", "shipped", *found], settings),
@@ -425,6 +429,7 @@ def text(table: dict[str, Any]) -> str:
         markdown(["tier", "shipped", "found"], trained),
         f"The same in {table['budget']['fresh']} fresh worlds, with 95 % intervals:",
         markdown(["tier", "settings", "over model", "over shipped", "failed"], fresh),
+        *(f"What was found in {tier} is no better there than the shipped settings." for tier in tiers if level(tier)),
         "\n".join(f"mrctl run --sensing.tier {tier} {found['flags']}" for tier, found in tiers.items()),
     ]
     return "\n\n".join(parts)

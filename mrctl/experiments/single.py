@@ -21,9 +21,9 @@ from mrctl.scenario import Scenario
 from mrctl.sweep import store
 
 COLUMNS = {
-    "longitudinal_rmse": ("x error, mm", 1e3),
-    "lateral_rmse": ("y error, mm", 1e3),
-    "heading_rmse": ("θ error, mrad", 1e3),
+    "longitudinal_rmse": ("longitudinal, mm", 1e3),
+    "lateral_rmse": ("lateral, mm", 1e3),
+    "heading_rmse": ("heading, mrad", 1e3),
     "position_rmse": ("position, mm", 1e3),
     "v_rmse": ("V, mm/s", 1e3),
     "omega_rmse": ("θ̇, mrad/s", 1e3),

@@ -162,6 +162,9 @@ class UserHierarchy(Hierarchy):
         self._wanted: Rows | None = None  # reference of the user's motion controller, until its next call
         self._new: dict[int, Reference] = {}  # references that it has not been told yet, by robot
         super().__init__(scenarios, robot, self._feedforward_stage.stage if self._feedforward_stage else None)
+        stage, delay = self._feedforward_stage, scenarios[0].sensing.loop_delay(self.period) * self.period
+        if stage and callable(getattr(stage.stage, "reset", None)):
+            stage.ask("reset", self.period, delay)
         if self._has("assign"):
             stages["motion"].ask("assign", tuple(scenarios))
         for name in (name for stage in stages for name in REPLACED.get(stage, ())):

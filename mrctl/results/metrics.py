@@ -18,7 +18,7 @@ from mrctl.control.features import feature_matrix
 from mrctl.control.guard import GUARD_ACTIONS, NONE, REASONS
 from mrctl.kernel import Array
 from mrctl.record import InputError
-from mrctl.results.dataset import check_kind, require
+from mrctl.results.dataset import FAULTS, check_kind, require
 
 METRICS: dict[str, tuple[str, str]] = {
     "longitudinal_rmse": ("m", "RMS longitudinal error"),
@@ -157,6 +157,7 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
     scaled = {"half_track", "feature_scale"} <= set(runs.variables)
     data = {name: runs[name].transpose("run", "time").values.astype(float) for name in SAMPLED}
     values = {name: np.full((size, max(counts, default=0)), np.nan) for name in METRICS}
+    begins = not runs["time"].values[:1].any()
     groups: dict[tuple[int, ...], list[int]] = {}
     for row, laps in enumerate(divisions):
         groups.setdefault(tuple(laps.edges), []).append(row)
@@ -166,6 +167,8 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
             # The step into a lap belongs to it, so that the variation of all laps adds up to that of the run.
             stepping = ("voltage_left", "voltage_right", "guard")
             steps = {name: data[name][rows, max(start - 1, 0) : end] for name in stepping}
+            if start == 0 and begins:  # before a run the guard has not acted
+                steps["guard"] = np.pad(steps["guard"], [(0, 0), (1, 0)])
             for name, value in lap_metrics(rates, steps, period).items():
                 values[name][rows, lap] = value
             if scaled and end - start > 1:
@@ -389,8 +392,9 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
 
     Returns:
         Columns label, feedforward, steering, seed (those there are), laps, failed, failure_time, `METRICS` in that lap,
-        and laps_to_converge, the first lap from which on the position error stays within 1.2 times its final value;
-        `attrs["failed"]` is the number of failed runs, `attrs["units"]` the units by column.
+        and laps_to_converge, the first lap from which on the position error stays within 1.2 times its final value; for
+        what `simulate` returns also those of `dataset.FAULTS` that a run has. `attrs["failed"]` is the number of failed
+        runs, `attrs["units"]` the units by column.
 
     Raises:
         InputError: No run has that lap.
@@ -407,6 +411,8 @@ def summary(result: xr.Dataset, lap: int = -1) -> pd.DataFrame:
     columns |= {name: laps[name].values for name in ("laps", "failed", "failure_time")}
     columns |= {name: np.where(there, laps[name].values[rows, np.where(there, index, 0)], np.nan) for name in METRICS}
     columns["laps_to_converge"] = laps_to_converge(laps, "position_rmse").values
+    faults = {name: np.atleast_1d(result[name].values) for name in FAULTS if name in result}
+    columns |= {name: texts for name, texts in faults.items() if texts.any()}
     table = pd.DataFrame(columns, index=pd.Index(laps["run"].values, name="run"))
     units = {name: unit for name, (unit, _) in METRICS.items()} | {"laps_to_converge": "1"}
     table.attrs = {"failed": int(laps["failed"].sum()), "units": units}

@@ -163,6 +163,12 @@ class Store:
                 f"{path}: mrctl {store.writer} began this sweep and this is mrctl {__version__}, whose results may "
                 f"differ; finish it with mrctl {store.writer} or choose another folder"
             )
+        began = store.manifest["models"]
+        if changed := [name for name, digest in manifest["models"].items() if began.get(name, digest) != digest]:
+            raise InputError(
+                f"{path}: {changed[0]} has changed since this sweep was begun; finish it with the former one or choose "
+                "another folder"
+            )
         if difference := _difference(store.manifest, manifest):
             raise InputError(f"{path}: begun with another {difference}; finish it as it was or choose another folder")
         for left in [*path.glob(".*.tmp"), *path.glob("parts/.*.tmp"), *path.glob("signals.zarr/**/*.partial")]:

@@ -352,6 +352,49 @@ def test_not_finite(stage):
         same(whole.isel(run=run), sound.isel(run=run))
 
 
+def test_fault_is_in_the_summary():
+    """A feedforward that never works drives as the model does, and the summary says why."""
+
+    class Broken:
+        def __init__(self, robot, size):
+            self.size = size
+
+        def output(self, command, derivative):
+            return np.full((self.size, 2), np.nan)
+
+        def learn(self, feedback, saturated, twist, voltage):
+            pass
+
+    table = mrctl.summary(simulate(THREE, feedforward=Broken))
+    assert table["feedforward_fault"].tolist() == ["feedforward Broken: not finite, tick 0"] * 3
+    assert (table["guard_actions"] >= 1).all() and not table["failed"].any()
+    assert "feedforward_fault" not in mrctl.summary(simulate(THREE[:1]))
+
+
+def test_feedforward_knows_the_loop():
+    """Its method `reset` is called before all others, with the control period and the delay that is known."""
+    told = []
+
+    class Law:
+        def __init__(self, robot, size):
+            self.size = size
+
+        def reset(self, period, delay):
+            told.append((period, delay))
+
+        def output(self, command, derivative):
+            assert told
+            return np.zeros((self.size, 2))
+
+        def learn(self, feedback, saturated, twist, voltage):
+            pass
+
+    for tier in ("ideal", "lab", "field"):
+        scenario = mrctl.Scenario(laps=1, reference=mrctl.Line(length=0.5), sensing=mrctl.Sensing(tier=tier))
+        simulate(scenario, feedforward=Law)
+        assert told.pop() == (0.01, pytest.approx(scenario.sensing.loop_delay(0.01) * 0.01)) and not told
+
+
 def test_blown_up_robot():
     """A user's stage receives no NaN from a robot that blew up."""
 

@@ -229,7 +229,8 @@ def test_changed_sweep(file, store, capsys, whole):
         line = refused(capsys, "sweep", file, "--out", store)
     assert f"mrctl {mrctl.__version__} began this sweep and this is mrctl 9.1" in line
     with mock.patch("mrctl.physics.mjcf.digest", lambda model: "another"):
-        assert "begun with another models.flat (" in refused(capsys, "sweep", file, "--out", store)
+        line = refused(capsys, "sweep", file, "--out", store)
+        assert "flat has changed since this sweep was begun; finish it with the former one" in line
     with mock.patch("mrctl.sweep.jobs.code_digest", lambda: "another"):  # a law was edited, the version stays
         assert 'now "another")' in refused(capsys, "sweep", file, "--out", store)
         with pytest.raises(InputError, match="has other laws than the process that began the store"):

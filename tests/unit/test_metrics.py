@@ -178,6 +178,14 @@ def test_padded_run():
     assert laps["laps"].values.tolist() == [4, 2] and metrics.summary(result)["v_rmse"][1] == 1
 
 
+def test_guard_from_the_start():
+    """A fallback in the first tick counts as an action of the first lap, and in an interval of a run does not."""
+    result = make(laps=2, guard=lambda t: t < LAP / 2)
+    assert metrics.per_lap(result)["guard_actions"].values.tolist() == [[1.0, 0.0]]
+    later = result.assign_coords(time=result["time"] + LAP)
+    assert metrics.per_lap(later)["guard_actions"].values.tolist() == [[0.0, 0.0]]
+
+
 def test_single_run():
     """A squeezed run gives the same numbers as the run in its batch, and keeps its label."""
     result = make(runs=2, v=np.array([[1.0], [2.0]]))
