@@ -248,7 +248,7 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
     if first["type"] == "extra_forbidden":
         *parents, name = first["loc"]
         known = [field for one in _records_at(record, parents) for field in one.model_fields]
-        nearest = difflib.get_close_matches(str(name), known, 1)
+        nearest = difflib.get_close_matches(str(name), known, 1) or [one for one in known if name in one.split("_")]
         message = f"there is no such field; did you mean {nearest[0]}?" if nearest else "there is no such field"
     if first["type"] in ("model_type", "model_attributes_type"):
         names = {one.named_by for one in _records_at(record, first["loc"])} - {""}

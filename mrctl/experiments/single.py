@@ -134,7 +134,7 @@ def _report(
     name = str(result["feedforward"].values[0]) + (f", own stages {own}" if own else "")
     steering, course = result["steering"].values[0], scenario.reference
     lines = [
-        f"RMSE per lap against the reference, a {course.kind} of {course.period:.3g} s; feedforward {name}, "
+        f"RMSE per lap against the reference ({course.kind}, {course.period:.3g} s a lap); feedforward {name}, "
         f"steering {steering}"
     ]
     lines += [f"failed {failure}"] if failure else []

@@ -218,6 +218,7 @@ def test_names_in_the_place_of_records():
         ({"lap": 3}, "lap: there is no such field; did you mean laps?"),
         ({"events": [{"tim": 1}]}, "events.0.tim: there is no such field; did you mean time? (and 1 more)"),
         ({"colour": 1, "laps": 0}, "colour: there is no such field (and 1 more)"),
+        ({"perturbation": {"mass": 2}}, "perturbation.mass: there is no such field; did you mean mass_factor?"),
         ({"sensing": {"teir": "lab"}}, "sensing.teir: there is no such field; did you mean tier?"),
         (
             {"reference": {"kind": "circle", "perod": 3}},
