@@ -300,6 +300,8 @@ def _one_line(box: str, command: str) -> str:
                 similar.append(flag)
         nearest = difflib.get_close_matches(match[1], similar, 1)
         return f"no flag is called {match[1]}" + (f"; did you mean {nearest[0]}?" if nearest else "")
+    if match := re.match(r"Unrecognized options: (\S+\.xml)", text):
+        return f"{match[1]}: the file of a robot is given as --robot {match[1]}"
     if not (match := re.match(r"Error parsing (\S+): (.*)", text)):
         return text
     parts = match[1].removeprefix("--").split(".")
@@ -519,8 +521,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
 
         text, outcome = mission.run(world, chosen, goal, start, known, compare, speed, margin, avoid, out, json)
         _report(text, out, json)
-        if outcome != "arrived":
-            raise _Incomplete(f"the robot did not arrive: {outcome}")
+        _expect_arrival(outcome)
 
     navigate.__annotations__["scenario"] = Annotated[type(part), tyro.conf.arg(name="")]
     return navigate
@@ -602,9 +603,15 @@ def _repeat_mission(folder: Path, arguments: Sequence[str], out: Path | None, js
         raise InputError(f"{new[0].removeprefix('--')}: {folder} holds a mission, which is driven as it was")
     from mrctl.experiments import mission
 
-    text, _, departs = mission.repeat(folder, out, json)
+    text, outcome, departs = mission.repeat(folder, out, json)
     _report(text, out, json)
     _judge(folder, departs, json)
+    _expect_arrival(outcome)
+
+
+def _expect_arrival(outcome: str) -> None:
+    if outcome != "arrived":
+        raise _Incomplete(f"the robot did not arrive: {outcome}")
 
 
 def _judge(folder: Path, departs: str, json: bool) -> None:

@@ -226,7 +226,13 @@ def prepared(
 ) -> tuple[Plan, Scenario]:
     """Returns a plan, and the scenario that drives it; arguments and errors are those of `navigate`."""
     reactive = avoid in REACTIVE
-    found, reference = either_way(task, scenario, speed, margin, avoid)
+    try:
+        found, reference = either_way(task, scenario, speed, margin, avoid)
+    except InputError as fault:
+        if not (reactive and reverses(scenario) and str(fault).startswith("goal: no way")):
+            raise
+        either_way(task, scenario, speed, margin, "none")  # raises, too, if there is no way in reverse
+        raise InputError(f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may") from None
     laps = PATIENCE if avoid == "none" else WAITING
     own = {"obstacles": task.obstacles, "map": task.map, "reference": reference, "laps": laps}
     if reactive:  # the designed prefilter is that of Kanayama's controller, whose loop is faster
@@ -345,20 +351,21 @@ def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
         A row for each robot: `outcome` (arrived, collided, stuck, out of time, or why it failed), `time` in s, `length`
         of its path in m, `spl`, success weighted by path length, ℓ / max(ℓ, length) or 0 unless it arrived, with the
         length ℓ of the plan (Anderson et al., "On evaluation of embodied navigation agents", 2018), the smallest
-        `clearance` in m, `position_rmse` in m, `jerk` in m/s³ (`jerk_of`), `energy` in J, and `expanded`, the number of
-        poses that the search expanded.
+        `clearance` in m (0 after a collision), `position_rmse` in m, `jerk` in m/s³ (`jerk_of`), `energy` in J, and
+        `expanded`, the number of poses that the search expanded.
     """
     runs, period, rows = as_runs(result), control_period(result), []
     for row in range(runs.sizes["run"]):
         driven = runs.isel(run=row).dropna("time", subset=["x"])
         there, failure = reached(driven, goal), driven["failure"].item()
         length = float(np.hypot(np.diff(driven["x"]), np.diff(driven["y"])).sum())
+        clearance = float(driven["clearance"].min()) if "clearance" in driven else np.inf
         rows.append({
             "outcome": "arrived" if there else {"": "out of time", "collision": "collided"}.get(failure, failure),
-            "time": float(driven["time"][-1]),
+            "time": float(driven["failure_time"] if failure else driven["time"][-1]),
             "length": length,
             "spl": there * found.length / max(found.length, length),
-            "clearance": float(driven["clearance"].min()) if "clearance" in driven else np.inf,
+            "clearance": 0.0 if failure == "collision" else clearance,  # the tick of the contact is not recorded
             "position_rmse": float(np.sqrt(np.mean(driven["longitudinal_error"] ** 2 + driven["lateral_error"] ** 2))),
             "jerk": jerk_of(np.column_stack([driven["x"].values, driven["y"].values]), period),
             "energy": float(driven["power"].sum()) * period,

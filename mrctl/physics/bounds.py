@@ -69,7 +69,8 @@ def compiling(path: str | Path) -> Iterator[None]:
     except Exception as error:
         if not isinstance(error, (ValueError, MemoryError, RuntimeError)) and type(error).__name__ != "FatalError":
             raise
-        raise InputError(f"{path}: {' '.join(str(error).split()) or type(error).__name__}") from None
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
 
 
 def check_bounds(path: Path) -> None:

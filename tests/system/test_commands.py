@@ -291,6 +291,7 @@ def test_bad_scenario_is_one_line(
         (["run", "--laps", "1.5"], "laps: '1.5' is not a whole number"),
         (["run", "--map", "hall.yaml"], "map: has no flag; set it in a scenario file"),
         (["run", "--sensing.teir", "field"], "no flag is called --sensing.teir; did you mean --sensing.tier?"),
+        (["identify", "mule.xml"], "mule.xml: the file of a robot is given as --robot mule.xml"),
         (["navigate", "doorway:1", "--sensing.lidar.nois", "3"], "did you mean --sensing.lidar.noise?"),
         (["run", "--lapz=3"], "no flag is called --lapz"),
         (["sweep", "x.toml", "--out", "y", "--wxyz", "3"], "no flag is called --wxyz"),

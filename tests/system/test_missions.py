@@ -107,8 +107,10 @@ def test_outcomes() -> None:
     course = mrctl.Line(heading=np.pi / 2, speed=0.2)
     mover = Box(x=-0.4, y=-1.0, length=0.2, width=0.2, course=course)  # from (1, −0.4) along +y
     task = Task(obstacles=Obstacles(shapes=(still, mover)), start=(0.0, 0.0, 0.0), goal=(3.0, 0.0, 0.0))
-    hit = navigate(task, PID).table.iloc[0]
-    assert hit["outcome"] == "collided" and hit["spl"] == 0 and hit["length"] < 1.5 and hit["clearance"] < 0.01
+    mission = navigate(task, PID)
+    hit = mission.table.iloc[0]
+    assert hit["outcome"] == "collided" and hit["spl"] == 0 and hit["length"] < 1.5 and hit["clearance"] == 0
+    assert hit["time"] == float(mission.result["failure_time"].item()) and mission.result["clearance"].min() < 0.01
     free = task.replace(obstacles=Obstacles(shapes=(still,)))
     late = navigate(free, PID.replace(perturbation={"supply_factor": 0.2}))
     assert late.table["outcome"].tolist() == ["out of time"] and late.table["spl"].tolist() == [0]
@@ -156,6 +158,10 @@ def test_ends() -> None:
         (["none.toml", "--goal", "3", "0", "0"], "none.toml"),
         (["none.yaml", "--goal", "3", "0", "0"], "none.yaml"),
         (["doorway:3", "--goal", "9", "0", "0"], "goal: no way to (9.00, 0.00) was found"),
+        (
+            ["parking_bay:1", "--avoid", "mppi", "--robot", "turtlebot"],
+            "avoid: mppi never plans in reverse, and forward there is no way; barrier may",
+        ),
         (["yard.toml", "--goal", "3,0"], "goal: 3,0 is not x, y and θ in m, m, rad, as in --goal 2,0,0"),
         (["yard.toml", "--goal=3,0,left"], "goal: 3,0,left is not x, y and θ"),
         (["yard.toml", "--goal", "3,0,0", "--start=nan,0,0"], "start: nan,0,0 is not x, y and θ"),
@@ -253,8 +259,9 @@ def test_map_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys:
     Path("map.toml").write_text(wall)
     Path("world.toml").write_text(wall + '[[shapes]]\nkind = "box"\nx = 2.0\nlength = 0.2\nwidth = 0.4\n')
     flags = "navigate", "world.toml", "--goal", "4,0,0", "--map", "map.toml"
-    assert cli.main([*flags, "--json"]) == 1
-    blind = json.loads(capsys.readouterr().out)
+    assert cli.main([*flags, "--json", "--out", "hit"]) == 1
+    assert cli.main(["navigate", "hit", "--json"]) == 1 and "did not arrive: collided" in capsys.readouterr().err
+    blind = json.loads(Path("hit/mission.json").read_text())
     assert blind["robots"][0]["outcome"] == "collided" and len(blind["task"]["map"]["shapes"]) == 1
     assert cli.main([*flags, "--avoid", "mppi", "--out", "driven"]) == 0
     Path("map.toml").unlink()
