@@ -300,6 +300,10 @@ def _one_line(box: str, command: str) -> str:
                 similar.append(flag)
         nearest = difflib.get_close_matches(match[1], similar, 1)
         return f"no flag is called {match[1]}" + (f"; did you mean {nearest[0]}?" if nearest else "")
+    if match := re.match(r"Unrecognized or misplaced options: (\S+) \(applied to mrctl (\S+)( \S+)?\)", text):
+        if match[3]:
+            return f"{match[1]}: is no flag of{match[3]}, and those of mrctl {match[2]} stand before it"
+        return f"{match[1]}: is no flag of mrctl {match[2]}"
     if match := re.match(r"Unrecognized options: (\S+\.xml)", text):
         return f"{match[1]}: the file of a robot is given as --robot {match[1]}"
     if not (match := re.match(r"Error parsing (\S+): (.*)", text)):

@@ -222,9 +222,16 @@ class Episodes:
         for row, seed in enumerate(seeds):
             self.begin(row, seed, perturbations[row])
 
-    def act(self, action: Array) -> None:
-        """Sets the action of the coming tick, `(B, 2)`."""
-        self._action[:] = action
+    def act(self, action: Array, scale: Array | float = 1.0) -> None:
+        """Sets the action of the coming tick, `(B, 2)`, or `(2,)` for one robot, times a scale.
+
+        Raises:
+            InputError: It has another shape.
+        """
+        size = self._action.shape
+        if (shape := np.shape(action)) != size and not (shape == (2,) and size == (1, 2)):
+            raise InputError(f"action: has shape {shape}, and {size if size[0] > 1 else (2,)} is expected")
+        self._action[:] = action * scale
 
     def step(self) -> None:
         """Computes one control period; if others advance the physics, `send` comes before it, the rest after it."""

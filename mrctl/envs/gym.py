@@ -126,7 +126,7 @@ class TrackingEnv(gymnasium.Env):
             the robot has failed or arrived: the reason, or "" for an arrival.
         """
         loop = self.episodes
-        loop.act(action * loop.bound)
+        loop.act(np.asarray(action), loop.bound)
         with np.errstate(invalid="ignore", over="ignore"):
             loop.step()
             (seen,), (reward,) = loop.observe()
@@ -256,7 +256,7 @@ class TrackingVectorEnv(VectorEnv):
             their scenario `(B,)`, and a dictionary like that of `TrackingEnv`, of arrays `(B,)`.
         """
         loop, begun = self.episodes, np.flatnonzero(self._over)
-        loop.act(actions * loop.bound)
+        loop.act(np.asarray(actions), loop.bound)
         with np.errstate(invalid="ignore", over="ignore"):
             loop.step()
             for row in begun:

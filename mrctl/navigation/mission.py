@@ -84,7 +84,9 @@ class Mission(NamedTuple):
 
 
 class Order(Record):
-    """All that a mission is a function of: with the same versions of the packages, the same order gives the same bits.
+    """All that a mission is a function of, but for the files that it names, such as that of a robot.
+
+    With the same files and versions of the packages, the same order gives the same bits.
 
     The fields are the arguments of `navigate`. `mission.json`, which `mrctl navigate … --out` writes, contains them.
     """

@@ -181,8 +181,12 @@ class _Adoption:
             body = self.model.body(self.model.geom_bodyid[g])
             centre = self.data.geom_xpos[g]
             if all(np.hypot(*(centre - other.centre)[:2]) > LEVEL * self.radius for other in casters):
-                caster = self._contact(g, body.name, self._roller(body.name))
-                casters.append(caster._replace(radius=centre[2] - floor))  # so that it touches the wheels' floor
+                caster, radius = self._contact(g, body.name, self._roller(body.name)), centre[2] - floor
+                if radius <= 0:
+                    raise InputError(
+                        f"caster: the centre of the one on {body.name} is {-radius:.3g} m below the floor of the wheels"
+                    )
+                casters.append(caster._replace(radius=radius))  # so that it touches the wheels' floor
         if not casters:
             track = np.linalg.norm(self.rear[0].centre - self.rear[1].centre)
             unit = f"; their radius is {self.radius:.4g} m: is it in mm or cm?" if self.radius > track else ""

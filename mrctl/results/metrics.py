@@ -107,8 +107,9 @@ def laps_of(run: xr.Dataset) -> Laps:
     lap = float(run["lap_time"]) / period if "lap_time" in run.coords else np.inf
     if lap < 1:
         raise InputError(f"lap_time: {lap * period:g} s is shorter than the control period of {period:g} s")
-    count = int(samples / lap + 1e-6) if np.isfinite(lap) else 0
-    edges = np.rint(np.arange(count + 1) * lap).astype(np.intp) if count else np.array([0, samples])
+    # A run has a whole number of samples, up to half a sample less than its laps.
+    count = int((samples + 0.5) / lap + 1e-6) if np.isfinite(lap) else 0
+    edges = np.rint(np.arange(count + 1) * lap).clip(max=samples).astype(np.intp) if count else np.array([0, samples])
     if not failed:
         return Laps(edges, None)
     dead = len(alive) if alive.all() else int(np.argmin(alive))

@@ -220,9 +220,10 @@ class Controls:
             _update(handle, min=min(handle.min, value), max=max(handle.max, value))
 
     def _set(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
-        if path in self._sliders:
-            self._fit(path, value)
-        _update(self._inputs[path], value=value)
+        handle = self._inputs[path]
+        if path in self._sliders:  # an end that was moved stays, for a hand may come back
+            _update(handle, min=min(handle.min, value), max=max(handle.max, value))
+        _update(handle, value=value)
 
     def suit(self, robot: Robot) -> None:
         """Gives the sliders the ranges that suit a robot."""

@@ -35,7 +35,8 @@ STORIES = {
             events=(Event(time=6.0, perturbation=_LOAD), Event(time=18.0, push=(0.0, 20.0, 0.0))),
         ),
         "At 6 s a load of two and a half times its mass falls on the racing car, and at 18 s it is pushed: PID alone "
-        "gets ever further from the reference until its run ends, and the learner drives on, 2 to 3 cm off.",
+        "gets ever further from the reference until its run ends, and the learner drives on, 5 cm off in the lap of "
+        "the load and 2 to 3 cm later.",
     ),
     "draining battery": _story(
         Scenario(laps=5, events=_SAG),

@@ -158,6 +158,15 @@ def test_lap_count():
     assert metrics.per_lap(make(lap=0.1, laps=10)).sizes["lap"] == 10  # 0.1 is not a binary fraction
 
 
+@given(ticks=st.floats(20, 2000), laps=st.integers(1, 40))
+def test_every_lap_counts(ticks, laps):
+    """A run of so many laps has as many, also where a lap is no whole number of samples."""
+    samples = round(laps * ticks)
+    run = make(laps=samples, lap=DT).isel(run=0).assign_coords(lap_time=ticks * DT)
+    edges = metrics.laps_of(run).edges
+    assert len(edges) == laps + 1 and edges[-1] == samples and np.abs(np.diff(edges) - ticks).max() <= 1
+
+
 def test_mixed_lap_times():
     """Runs with different lap times are padded with NaN, not failed; each keeps its own last lap."""
     result = make(runs=2, laps=4, v=lambda t: t).assign_coords(lap_time=("run", [LAP, 2 * LAP]))
