@@ -221,8 +221,12 @@ class Controls:
 
     def _set(self, path: tuple[str, ...], value: Any) -> None:  # noqa: ANN401
         handle = self._inputs[path]
-        if path in self._sliders:  # an end that was moved stays, for a hand may come back
-            _update(handle, min=min(handle.min, value), max=max(handle.max, value))
+        if path in self._sliders:
+            low, high = self._sliders[path][1]
+            if low <= value <= high:
+                _update(handle, min=low, max=high)
+            else:  # an end that was moved stays, for a hand may come back
+                _update(handle, min=min(handle.min, value), max=max(handle.max, value))
         _update(handle, value=value)
 
     def suit(self, robot: Robot) -> None:

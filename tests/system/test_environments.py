@@ -493,6 +493,18 @@ def test_refused(make, message):
         make()
 
 
+def test_action_of_another_shape():
+    """It is refused by name, and one number is not taken for two."""
+    env, vector = TrackingEnv(SHORT), TrackingVectorEnv(3, SHORT)
+    env.reset(seed=0)
+    vector.reset(seed=0)
+    for action in (np.zeros(1), np.zeros(3)):
+        with pytest.raises(InputError, match=r"^action: has shape \(., ?\), and \(2,\) is expected"):
+            env.step(action)
+    with pytest.raises(InputError, match=r"and \(3, 2\) is expected"):
+        vector.step(np.zeros(2))
+
+
 def test_scenario_file(tmp_path):
     """The scenario files of the command line are the environments' too; voltages of an agent are no oscillation."""
     file = tmp_path / "scenario.toml"

@@ -180,6 +180,10 @@ def test_sliders(live):
     live._run_requests()
     live._apply_inputs()
     assert live.session.state()["perturbation"].payload == 60.0 and live.message == ""
+    visitor_sets(live, handle, 40.0)
+    live._run_requests()
+    live._apply_inputs()
+    assert (handle.value, handle.max) == (40.0, 60.0)  # one can go back up
     live._press("Payload", "remove")
     assert (handle.value, handle.max) == (0.0, 20.0)
     visitor_sets(live, handle, 300.0)
