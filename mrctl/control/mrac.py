@@ -9,13 +9,14 @@ m_k is the parameter of the acceleration of channel k. The commanded motion x_c 
 
     U_k = φ(x_c, ẋ_c)ᵀ â_k + K_k e_k + K_i,k z_k,       e = x_c − x,  ż = e                        (the PID)
     â̇_k = P [η_k φ(x_c, ẋ_c) e_k − w (wᵀ â_k − H U_k)/ρ² − σ (â_k − a_0)] + projection
-    d/dt P⁻¹ = −λ P⁻¹ + w wᵀ/ρ²,    λ = λ_0 (1 − tr P/tr P_0) ≥ 0
+    d/dt P⁻¹ = −λ (P⁻¹ − P_0⁻¹) + w wᵀ/ρ²,    P(0) = P_0
 
 - w = H φ(x, ẋ) with H = 1/(T s + 1)², so that H U_k = wᵀ a_k without differentiation: the prediction error.
-- P is the gain of least squares with bounded-gain forgetting: without excitation it grows to P_0 and not further.
+- P is the gain of least squares with the memory 1/λ. In each direction it returns to P_0 when w no longer excites it,
+  and never exceeds it, P ≤ P_0. (Slotine and Li bound P by a λ that falls to zero with P_0 − P in the norm. A course
+  that leaves some directions without excitation then ends the forgetting in all of them, and adaptation with it.)
 - σ = 0 while ‖â_k − a_0‖ ≤ R and grows linearly to σ_0 at 2 R; a_0 are the parameters of the prior, zero for `none`.
-- The projection keeps â_k in the ball of radius 2 R about a_0. Where it leaves the ball, it is projected, in the metric
-  P⁻¹, on the half-space that touches the ball there.
+- The projection keeps â_k in the ball of radius 2 R about a_0, by the nearest point of the ball in the metric P⁻¹.
 
 **Theorem.** Let the robot obey the equation of each channel with constant parameters, ‖a_k − a_0‖ ≤ R, m_k > 0, without
 disturbance, saturation and delay, and let the feedback be stronger than what f takes from it: for some ε ≥ 0
@@ -26,16 +27,16 @@ Then, with ã_k = â_k − a_k,
 
     V = ½ Σ_k [η_k (m_k e_k² + K_i,k z_k²) + ã_kᵀ P⁻¹ ã_k],      V̇ ≤ −Σ_k [ε η_k e_k² + (wᵀ ã_k)²/(2 ρ²)] ≤ 0
 
-so that e, z and â are bounded, e and wᵀ ã are square integrable, and for a bounded command e → 0 if ε > 0. If w is
-persistently exciting, P stays below P_0, so that λ ≥ λ_1 > 0; V̇ then contains −½ λ_1 Σ ã_kᵀ P⁻¹ ã_k, and ã → 0 too.
+so that e, z and â are bounded, e and wᵀ ã are square integrable, and for a bounded command e → 0 if ε > 0. V̇ also
+contains −½ λ Σ ã_kᵀ (P⁻¹ − P_0⁻¹) ã_k. If w is persistently exciting, P⁻¹ − P_0⁻¹ ≥ c P⁻¹ with c > 0, and ã → 0 too.
 
 *Proof.* The equation of the robot less the law is m_k ė_k = −K_k e_k − K_i,k z_k − φ_cᵀ ã_k − (f_k(x_c) − f_k(x)),
-because m_k ẋ_c,k + f_k(x_c) = φ_cᵀ a_k. In V̇, η_k e_k φ_cᵀ ã_k cancels with the first term of the adaptation, and
-e_k K_i,k z_k with the derivative of the integral; what e and f leave is at most −ε η_k e_k² by (A). The second term of
-the adaptation gives −(wᵀ ã_k)²/ρ², of which the derivative of P⁻¹ takes back one half; the rest of that derivative is
-−½ λ ã_kᵀ P⁻¹ ã_k. The leak gives −σ ã_kᵀ (â_k − a_0) ≤ −σ ‖â_k − a_0‖ (‖â_k − a_0‖ − R) ≤ 0, as σ = 0 where the last
-bracket is negative. The half-space contains the ball, so also a_k, and a projection on a convex set brings â_k no
-farther from any of its points. ∎
+because m_k ẋ_c,k + f_k(x_c) = φ_cᵀ a_k. In V̇, η_k e_k φ_cᵀ ã_k cancels with the first term of the adaptation, and e_k
+K_i,k z_k with the derivative of the integral; what e and f leave is at most −ε η_k e_k² by (A). The second term of the
+adaptation gives −(wᵀ ã_k)²/ρ², of which the derivative of P⁻¹ takes back one half; the rest of that derivative is −½ λ
+ã_kᵀ (P⁻¹ − P_0⁻¹) ã_k ≤ 0, as P⁻¹ starts at P_0⁻¹ and cannot fall below it. The leak gives −σ ã_kᵀ (â_k − a_0) ≤ −σ
+‖â_k − a_0‖ (‖â_k − a_0‖ − R) ≤ 0, as σ = 0 where the last bracket is negative. The ball contains a_k, and a projection
+on a convex set brings â_k no farther from any of its points. ∎
 
 About (A): with η_k in proportion to the back-EMF, as here, Σ η_k e_k U_k is a power. Back-EMF and friction dissipate,
 and of the products V θ̇ and θ̇² remains l (V_c e_ω² − ω_c e_V e_ω), where l, in V s², is minus the coefficient of ω²
@@ -60,6 +61,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from mrctl.control.cholesky import factor, forward, solve
 from mrctl.control.features import INPUTS, SLOW, feature_scale, features, linear, symmetric_product
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner
 from mrctl.control.matching import MATCHED, SETTLED, low_pass, match, note_sent, queues
@@ -69,39 +71,32 @@ from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.robot import Robot
 
 SIGNALS = INPUTS + 2  # filtered signals: the features and the voltage of the two channels
+NEWTON, NEAR = 100, 1e-6  # largest number of steps of the projection; share by which its result may exceed the ball
 
 
 @kernel
 def predict(s: Row) -> None:
-    """The prediction error: one step of least squares with bounded-gain forgetting, the same gain for both channels.
+    """The prediction error: one step of least squares that forgets towards P₀, the same gain for both channels.
 
-        P ← P/(1 − λ h),    K = P w/(ρ²/h + wᵀ P w),    b_k ← b_k + K (residual_k − wᵀ b_k),    P ← P − K (P w)ᵀ
+        M ← M − λ h (M − M₀) + w wᵀ h/ρ²,    b_k ← b_k + M⁻¹ w (residual_k − wᵀ b_k) h/ρ²,    M = P⁻¹
 
-    P⁻¹ then grows by h times −λ P⁻¹ + w wᵀ/ρ², and ãᵀ P⁻¹ ã falls in each step, however long the period is.
+    ãᵀ M ã falls in each step, however long the period is.
 
     Args:
         s: In and out: a record of `MRAC`.
     """
-    trace = 0.0
-    for i in range(INPUTS):
-        trace += s.P[i, i]
-    growth = 1 / (1 - s.forgetting * max(0.0, 1 - trace / s.trace))
     for i in range(INPUTS):
         for j in range(INPUTS):
-            s.P[i, j] *= growth
-    symmetric_product(s.P, s.w, s.direction)
-    total = s.r
-    for i in range(INPUTS):
-        total += s.w[i] * s.direction[i]
+            s.M[i, j] += s.w[i] * s.w[j] / s.r - s.forgetting * s.M[i, j]
+        s.M[i, i] += s.forgetting * s.least
+    factor(s.M, s.L)
+    solve(s.L, s.w, s.direction)
     for k in range(2):
         innovation = s.residual[k]
         for i in range(INPUTS):
             innovation -= s.w[i] * s.b[i, k]
         for i in range(INPUTS):
-            s.b[i, k] += s.direction[i] / total * innovation
-    for i in range(INPUTS):
-        for j in range(INPUTS):
-            s.P[i, j] -= s.direction[i] * s.direction[j] / total
+            s.b[i, k] += s.direction[i] * innovation / s.r
 
 
 @kernel
@@ -112,7 +107,7 @@ def track(k: int, s: Row) -> None:
         k: Channel.
         s: In and out: a record of `MRAC`.
     """
-    symmetric_product(s.P, s.phi_c, s.direction)
+    solve(s.L, s.phi_c, s.direction)
     for i in range(INPUTS):
         s.b[i, k] += s.tracking[k] * s.direction[i] * s.error[k]
 
@@ -121,30 +116,68 @@ def track(k: int, s: Row) -> None:
 def confine(k: int, s: Row) -> None:
     """Switching σ-modification and projection of the parameters of channel k.
 
-        b ← b − s P b,    s = min(max(h σ, s_2R), s_R),    s_r = ‖b‖ (‖b‖ − r)/(bᵀ P b)
-        σ = σ_0 min(‖b‖/R − 1, 1) where ‖b‖ > R;    s_2R, the projection, only where ‖b‖ > 2 R
+        b ← b − s P b,    s = min(h σ, ‖b‖ (‖b‖ − R)/(bᵀ P b)),    σ = σ_0 min(‖b‖/R − 1, 1) where ‖b‖ > R
 
-    s_R ends a very fast leak where gᵀ b = R, with g = b/‖b‖ before the step.
+    A very fast leak ends where gᵀ b = R, with g = b/‖b‖ before the step.
 
     Args:
         k: Channel.
         s: In and out: a record of `MRAC`.
     """
-    square, radius, b = 0.0, s.radius[k], s.b[:, k]
-    for i in range(INPUTS):
-        square += b[i] * b[i]
-    if square <= radius * radius:
+    radius, b = s.radius[k], s.b[:, k]
+    size = np.sqrt(dot(b, b))
+    if size <= radius:
         return
-    symmetric_product(s.P, b, s.direction)
-    size, power = np.sqrt(square), 0.0
-    for i in range(INPUTS):
-        power += b[i] * s.direction[i]
-    share = s.leak * min(size / radius - 1, 1.0)
-    if size > 2 * radius:
-        share = max(share, (size - 2 * radius) * size / power)
-    share = min(share, (size - radius) * size / power)
+    solve(s.L, b, s.direction)
+    share = min(s.leak * min(size / radius - 1, 1.0), (size - radius) * size / dot(b, s.direction))
     for i in range(INPUTS):
         b[i] -= share * s.direction[i]
+    project(s.M, b, 2 * radius, s.shifted, s.direction)
+
+
+@kernel
+def project(M: Array, b: Array, radius: float, shifted: Array, q: Array) -> None:
+    """Moves a vector to the point of a ball about the origin that is nearest to it in a metric.
+
+        min (x − b)ᵀ M (x − b)  subject to  ‖x‖ ≤ r:    (M + μ 1) x = M b,    ‖x‖ = r,    μ ≥ 0
+
+    μ is found by Newton's method on 1/‖x‖ − 1/r, from 0 on, which converges from below: Moré and Sorensen, "Computing a
+    trust region step", SIAM J. Sci. Stat. Comput. 4(3), 1983.
+
+    Args:
+        M: Metric, symmetric and positive definite, `(n, n)`.
+        b: In and out: the vector, `(n,)`.
+        radius: Radius r of the ball.
+        shifted: Scratch, `(n, n)`.
+        q: Scratch, `(n,)`.
+    """
+    n, mu = b.shape[0], 0.0
+    size = np.sqrt(dot(b, b))
+    if size <= radius:
+        return
+    target = np.empty(n)
+    symmetric_product(M, b, target)
+    for _ in range(NEWTON):
+        for i in range(n):
+            for j in range(n):
+                shifted[i, j] = M[i, j]
+            shifted[i, i] += mu
+        factor(shifted, shifted)
+        solve(shifted, target, b)
+        size = np.sqrt(dot(b, b))
+        if size <= radius * (1 + NEAR):
+            return
+        forward(shifted, b, q)
+        mu += size * size / dot(q, q) * (size / radius - 1)
+
+
+@kernel
+def dot(x: Array, y: Array) -> float:
+    """The product xᵀ y."""
+    total = 0.0
+    for i in range(x.shape[0]):
+        total += x[i] * y[i]
+    return total
 
 
 @kernel
@@ -239,7 +272,7 @@ class Mrac(Record):
     noise: Annotated[float, Field(gt=0, le=10)] = 0.02
     """Noise density ρ of the prediction error in V √s; the smaller, the faster the prediction error is followed."""
     memory: Annotated[float, Field(ge=0.1, le=1e6)] = 20.0
-    """Memory 1/λ₀ of least squares in s."""
+    """Memory 1/λ of least squares in s."""
     spread: Annotated[float, Field(gt=0, le=100)] = 3.0
     """Standard deviation of the parameters at the start in V; its square is the diagonal of P₀."""
     tracking: Annotated[float, Field(ge=0, le=1e3)] = 2.0
@@ -261,8 +294,8 @@ class Mrac(Record):
 MRAC = np.dtype(
     [
         ("r", "f8"),  # variance ρ²/h of a sample, V²
-        ("forgetting", "f8"),  # λ₀ h
-        ("trace", "f8"),  # tr P₀, V²
+        ("forgetting", "f8"),  # λ h
+        ("least", "f8"),  # diagonal of M₀, 1/V²
         ("tracking", "f8", 2),  # η_k h of the two channels, 1/V per m/s (1/V² on a steering channel)
         ("leak", "f8"),  # σ₀ h, 1/V²
         ("radius", "f8", 2),  # R of the two channels, V (rad/s on a steering channel)
@@ -283,7 +316,9 @@ MRAC = np.dtype(
         ("residual", "f8", 2),  # filtered voltage less that of the prior, V
         ("error", "f8", 2),  # x_c − x, m/s and rad/s
         ("b", "f8", (INPUTS, 2)),  # â − a_0, V
-        ("P", "f8", (INPUTS, INPUTS)),  # gain of least squares, V²
+        ("M", "f8", (INPUTS, INPUTS)),  # P⁻¹, the inverse of the gain of least squares, 1/V²
+        ("L", "f8", (INPUTS, INPUTS)),  # its factor, M = L Lᵀ, 1/V
+        ("shifted", "f8", (INPUTS, INPUTS)),  # scratch of the projection, 1/V²
         ("direction", "f8", INPUTS),  # scratch: P times a vector, V² and V
         ("norm", "f8"),  # ‖â − a_0‖ of both channels, V
     ],
@@ -298,7 +333,7 @@ class ModelReferenceAdaptive(Learner):
         rows: One record of `MRAC` a robot.
     """
 
-    respond, learn_one, learned = respond, learn, ("b", "P")
+    respond, learn_one, learned = respond, learn, ("b", "M")
 
     def __init__(self, robot: Robot, settings: list[Mrac], rigid: bool, period: float, delay: int = 0) -> None:
         """Makes the learners.
@@ -317,7 +352,7 @@ class ModelReferenceAdaptive(Learner):
         weight = np.array([emf[0], STEERING_SHARE if rigid else emf[1]])
         for row, s in zip(rows, settings, strict=True):
             row["r"], row["forgetting"] = s.noise**2 / period, min(period / s.memory, 0.5)
-            row["trace"], row["P"] = INPUTS * s.spread**2, s.spread**2 * np.eye(INPUTS)
+            row["least"], row["M"] = s.spread**-2, s.spread**-2 * np.eye(INPUTS)
             row["tracking"] = s.tracking * period * weight
             row["leak"], row["radius"] = s.leak * period, s.radius * robot.supply * unit
             row["share"], row["hand_over"] = period / (period + s.filter), s.hand_over

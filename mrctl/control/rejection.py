@@ -17,12 +17,14 @@ from typing import NamedTuple
 import numpy as np
 
 from mrctl.control.design import Motion, points
+from mrctl.control.guard import ARM
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains
 from mrctl.kernel import Array
 from mrctl.theory.linear import Linear
 from mrctl.theory.robot import Robot
 
+DIRECTIONS = 32  # combinations of two errors in which the peak of their length is looked for
 HORIZON = 10.0  # s over which responses are added up, rounded up to 2ⁿ periods
 
 
@@ -32,12 +34,13 @@ class Peaks(NamedTuple):
     Attributes:
         velocity: From a disturbance in V (rad/s on a steering channel) to the error of the velocity for the same
             command, in m/s or rad/s.
-        position: From that disturbance to the longitudinal or lateral error in m. Both are infinite where the loop is
+        posture: From that disturbance to what it contributes to the posture error of the guard in m: the longitudinal
+            error, or the length of lateral error and `ARM` times the heading error. Both are infinite where the loop is
             unstable.
     """
 
     velocity: float
-    position: float
+    posture: float
 
 
 def rejection(
@@ -65,12 +68,12 @@ def _rejection(
     found = []
     alone = motion._replace(kanayama=Kanayama(k_x=0.0, k_y=0.0, k_theta=0.0))
     for channel in range(2):
-        velocity = position = 0.0
+        velocity = posture = 0.0
         for speed, plant in points(robot, rigid, channel):
             parts = robot, rigid, channel, plant, gains[channel]
             velocity = max(velocity, Loop(*parts, alone, speed, delay, period).sums()[0])
-            position = max(position, Loop(*parts, motion, speed, delay, period).sums()[1])
-        found.append(Peaks(velocity, position))
+            posture = max(posture, Loop(*parts, motion, speed, delay, period).sums()[1])
+        found.append(Peaks(velocity, posture))
     return found[0], found[1]
 
 
@@ -82,8 +85,9 @@ class Loop:
             filtered correction, the position and heading errors, the voltages that have not acted yet, and the rates of
             the correction over which the motion is predicted.
         pulse: State after a disturbance of one unit that lasts one period.
-        errors: Rows that give the velocity error and the position error of a state.
-        state: Index of the velocity, the integral, the position error and the heading error in the state, by name.
+        errors: Rows that give the velocity error, the position error and `ARM` times the heading error of a state.
+        state: Index of the velocity, the integral, the filtered correction, the position error and the heading error in
+            the state, by name.
     """
 
     def __init__(
@@ -128,21 +132,27 @@ class Loop:
 
         self.step = np.stack([after(column, 0.0) for column in np.eye(size)], axis=1)
         self.pulse = after(np.zeros(size), 1.0)
-        self.errors = np.zeros((2, size))
-        self.errors[0, c], self.errors[0, 0], self.errors[1, p] = 1.0, -1.0, 1.0
-        self.state = {"velocity": 0, "integral": i, "position": p, "heading": h}
+        self.errors = np.zeros((3, size))
+        self.errors[0, c], self.errors[0, 0], self.errors[1, p], self.errors[2, h] = 1.0, -1.0, 1.0, ARM
+        self.state = {"velocity": 0, "integral": i, "correction": c, "position": p, "heading": h}
         self._doublings = int(np.ceil(np.log2(HORIZON / period)))
 
     def response(self, state: Array) -> Array:
-        """Velocity error and position error that follow from a state, tick by tick, `(2, n)`."""
+        """Velocity error, position error and `ARM` times the heading error that follow from a state, `(3, n)`."""
         states, power = state[:, None], self.step
         for _ in range(self._doublings):  # x(n … 2n) = Aⁿ x(0 … n)
             states, power = np.hstack([states, power @ states]), power @ power
         return self.errors @ states
 
     def sums(self) -> tuple[float, float]:
-        """‖G‖₁ of the velocity error and of the position error; infinite where the loop is unstable."""
+        """‖G‖₁ of the velocity error and of the posture error; infinite where the loop is unstable.
+
+        The length of two errors never exceeds L if no combination cos φ e₁ + sin φ e₂ does.
+        """
         if np.abs(np.linalg.eigvals(self.step)).max() > 1 + 1e-9:
             return np.inf, np.inf
-        velocity, position = np.abs(self.response(self.pulse)).sum(axis=1)
-        return float(velocity), float(position)
+        velocity, *posture = self.response(self.pulse)
+        angles = np.pi / DIRECTIONS * np.arange(DIRECTIONS)
+        combined = np.column_stack([np.cos(angles), np.sin(angles)]) @ np.array(posture)
+        between = np.cos(np.pi / (2 * DIRECTIONS))  # of the worst combination with the next one that is looked at
+        return float(np.abs(velocity).sum()), float(np.abs(combined).sum(axis=1).max() / between)

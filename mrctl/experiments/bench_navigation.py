@@ -26,8 +26,8 @@ from mrctl.physics.obstacles import multi_ray
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.sensing.lidar import Lidar
-from mrctl.sensing.localisation import BEAMS
-from mrctl.sensing.particles import LEAST, Particles, weigh
+from mrctl.sensing.localisation import BEAMS, RAYS
+from mrctl.sensing.particles import HIT, LEAST, Particles, weigh
 from mrctl.theory.clearance import clearance
 from mrctl.theory.grid import field_of
 from mrctl.theory.obstacles import Box, Disc, Obstacles, Surroundings
@@ -135,16 +135,18 @@ def _particles(turns: int) -> dict[str, Any]:
     outlines = Surroundings(Obstacles(shapes=(*walls, *inside))).at(0.0)
     field = field_of(outlines, np.full(2, -7.0), np.full(2, 7.0), 0.05)
     pose = np.zeros(3)
-    points = lidar.points(lidar.scan(pose, outlines, random), BEAMS["particles"])
+    scan = lidar.scan(pose, outlines, random)
+    points, rays = lidar.points(scan, BEAMS["particles"]), lidar.rays(scan, RAYS)
     filtered, weights = Particles(field, 0, pose, np.full(3, 0.02)), np.empty(LEAST)
     first = filtered.particles.copy()
+    likelihoods = partial(weigh.compiled, first, points, rays[:0], field, HIT, weights)
 
     def update() -> None:
         filtered.particles = first.copy()
-        filtered.update(0.0, 0.0, points)
+        filtered.update(0.0, 0.0, points, rays)
 
     name = f"particle filter, {LEAST} particles, {len(points)} beams"
-    return _pair(name, update, "its likelihoods alone", partial(weigh.compiled, first, points, field, weights), turns)
+    return _pair(name, update, "its likelihoods alone", likelihoods, turns)
 
 
 def _mppi(turns: int) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def titled(name: str) -> str:
 def verdict(row: Row, rival: str, metric: str = "position_rmse", window: str = "last") -> int:
     """Compares two feedforwards in one case: −1 is below the rival with 95 % confidence, 1 is above it, 0 is level.
 
-    The test pairs the runs (sign test with Wilson's interval); differences that the integrator cannot resolve are ties.
+    The test pairs the runs (exact sign test); differences that the integrator cannot resolve are ties.
     """
     stated = row[metric] if window == "last" else row[metric][window]
     beats = stated[f"beats_{titled(rival)}"]

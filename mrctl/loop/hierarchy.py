@@ -365,7 +365,8 @@ class Hierarchy:
     def _tolerate(self, row: int) -> None:
         """Computes anew the deviation D that the guard of one robot tolerates, which depends on both controllers."""
         guard = self.state["guard"]
-        guard["harmless"][row] = guarding.harmless(guard["region"][row], np.array(self._rejection(row)))
+        found = guarding.harmless(guard["region"][row], np.array(self._rejection(row)))
+        guard["harmless"][row], guard["harmless_to_posture"][row] = found
 
     def _rejection(self, row: int) -> tuple[Peaks, Peaks]:
         """Peak-to-peak gains from a voltage to the errors of one robot under its controllers."""

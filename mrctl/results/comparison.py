@@ -43,7 +43,7 @@ class Ratio(NamedTuple):
 
 
 class Superiority(NamedTuple):
-    """The probability that A beats B in the same run, with its confidence interval, over all pairs."""
+    """The probability that A beats B in the same run, ties as half, with its confidence interval, over all pairs."""
 
     value: float
     low: float
@@ -104,7 +104,9 @@ def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_00
 def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 0.0) -> Superiority:
     """Estimates the probability that A has a smaller error than B in the same run; ties count half, failures as inf.
 
-    The interval is Wilson's (1927) score interval, which keeps its width where all pairs agree; a bootstrap would not.
+    The interval holds ½ only if the two-sided sign test, which leaves out ties, does not tell A and B apart: it is the
+    exact interval (Clopper and Pearson 1934) of the share of wins among the pairs that are not ties, whose number is
+    taken as given. Where all pairs are ties, it allows for the largest share of other pairs that may remain unseen.
 
     Args:
         a: One number a run (n,); NaN or infinite where it failed.
@@ -124,8 +126,22 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 
     wins, ties, n = int(((first < second) & ~tied).sum()), int(tied.sum()), len(first)
     if not n:
         return Superiority(np.nan, np.nan, np.nan, 0, 0, 0)
-    p = (wins + ties / 2) / n
-    return Superiority(p, *wilson(p, n, level), wins, ties, n - wins - ties)
+    if ties == n:
+        unseen = clopper_pearson(0, n, level)[1]
+        low, high = (1 - unseen) / 2, (1 + unseen) / 2
+    else:
+        low, high = ((ties / 2 + (n - ties) * end) / n for end in clopper_pearson(wins, n - ties, level))
+    return Superiority((wins + ties / 2) / n, low, high, wins, ties, n - wins - ties)
+
+
+def clopper_pearson(count: int, n: int, level: float = 0.95) -> tuple[float, float]:
+    """Returns the exact interval of the share of `count` in n trials (Clopper and Pearson, Biometrika 26(4), 1934)."""
+    from scipy.special import betaincinv
+
+    half = (1 - level) / 2
+    low = float(betaincinv(count, n - count + 1, half)) if count else 0.0
+    high = float(betaincinv(count + 1, n - count, 1 - half)) if count < n else 1.0
+    return low, high
 
 
 def wilson(share: float, n: int, level: float = 0.95) -> tuple[float, float]:

@@ -5,12 +5,15 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.kernel import Array
 from mrctl.record import Record
 from mrctl.theory.obstacles import Outlines, turned
 from mrctl.theory.rays import cast
+
+SHY = 0.2  # m before what a beam met, up to which there is nothing for sure
 
 
 class Lidar(Record):
@@ -88,7 +91,33 @@ class Lidar(Record):
         Returns:
             x and y in the robot's frame in m, `(n, 2)`; beams that returned nothing are left out.
         """
-        used = np.arange(0, self.beams, -(-self.beams // most))
+        used = self._spread(most)
         used = used[np.isfinite(ranges[used])]
-        angles = self.first + self.step * used
-        return ranges[used, None] * np.column_stack([np.cos(angles), np.sin(angles)]) + [self.x, 0.0]
+        return self._ends(used, ranges[used])
+
+    def rays(self, ranges: Array, most: int) -> Array:
+        """Returns the parts of beams of a scan on which there is nothing.
+
+        They end `SHY` before what the beam met, or at the largest range. A beam that returns nothing though it meets
+        an obstacle is not told from one that meets none.
+
+        Args:
+            ranges: Ranges of a scan in m, `(beams,)`.
+            most: Largest number of beams to use, evenly spread over the view.
+
+        Returns:
+            x and y of start and end in the robot's frame in m, `(n, 4)`.
+        """
+        used = self._spread(most)
+        free = np.where(np.isfinite(ranges[used]), ranges[used] - SHY, self.range)
+        ends = self._ends(used[free > 0], free[free > 0])
+        return np.column_stack([np.full(len(ends), self.x), np.zeros(len(ends)), ends])
+
+    def _spread(self, most: int) -> NDArray[np.intp]:
+        """Returns the indices of at most so many beams, evenly spread over the view."""
+        return np.arange(0, self.beams, -(-self.beams // most))
+
+    def _ends(self, beams: NDArray[np.intp], ranges: Array) -> Array:
+        """Returns the points at these ranges in m on some beams, x and y in the robot's frame in m, `(n, 2)`."""
+        angles = self.first + self.step * beams
+        return ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]) + [self.x, 0.0]

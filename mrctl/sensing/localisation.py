@@ -13,7 +13,7 @@ import numpy as np
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.sensing.particles import MOST, SPREAD, TRIALS, Particles, anywhere, best_of, free
-from mrctl.sensing.scan_matching import match
+from mrctl.sensing.scan_matching import agreement, match
 from mrctl.sensing.scanner import Scanner
 from mrctl.sensing.sensors import Sensors
 from mrctl.sensing.tiers import Sensing
@@ -21,6 +21,7 @@ from mrctl.theory.grid import field_of, map_area
 from mrctl.theory.obstacles import Obstacles, Surroundings
 
 BEAMS = {"scan": 120, "particles": 60}  # largest number of beams of a scan that are used
+RAYS = 20  # largest number of beams that are followed through the map
 SETTLED = 0.2  # m between fix and estimate in x and y, below which a search has ended
 AGREES = 0.5  # share of the points of a scan that must lie on the map for a fix
 
@@ -61,6 +62,7 @@ class Localiser:
         self.filters: list[Particles | None] = [None] * len(sensing)
         self._odometry = np.zeros((len(sensing), 2))  # distance in m and turn in rad since the last scan
         self._sought: list[Array | None] = [None] * len(sensing)  # poses at which matching may find the robot, `(n, 3)`
+        self._random = [np.random.default_rng(0)] * len(sensing)
 
     def start(self, row: int, pose: Array, deviation: Array, seed: int) -> tuple[Array, Array]:
         """Starts one robot at an estimate of its pose, or anywhere on the map if its start is unknown.
@@ -76,7 +78,8 @@ class Localiser:
             mean and standard deviations of the free places of the map, with any heading.
         """
         self._odometry[row], self._sought[row] = 0.0, None
-        chart, sensing, random = self._maps[row], self._sensing[row], np.random.default_rng([seed, 8])
+        self._random[row] = random = np.random.default_rng([seed, 8])
+        chart, sensing = self._maps[row], self._sensing[row]
         if chart is None:
             return pose, deviation
         unknown = sensing.start_unknown
@@ -108,17 +111,17 @@ class Localiser:
             sensing, scan, chart = self._sensing[row], self._scanner.scans[row], self._maps[row]
             if sensing.localisation == "fixes" or scan is None or chart is None:
                 continue
-            points = sensing.lidar.points(scan, BEAMS[sensing.localisation])
+            points, rays = sensing.lidar.points(scan, BEAMS[sensing.localisation]), sensing.lidar.rays(scan, RAYS)
             if particles := self.filters[row]:
-                found = particles.update(float(self._odometry[row, 0]), float(self._odometry[row, 1]), points)
+                found = particles.update(float(self._odometry[row, 0]), float(self._odometry[row, 1]), points, rays)
             elif (poses := self._sought[row]) is not None:
                 way, turn = self._odometry[row]
                 heading = poses[:, 2] + turn / 2
                 poses = poses + np.column_stack(
                     [way * np.cos(heading), way * np.sin(heading), np.full(len(poses), turn)]
                 )
-                best, shares = best_of(poses, points, chart)
-                found, share = best[0], shares[0]
+                best, _ = best_of(poses, points, rays, chart, self._random[row])
+                found, share = best[0], agreement.compiled(points, best[0], chart)
                 now["fix_arrives"][row] &= share >= AGREES
                 self._sought[row] = best if share >= AGREES else poses
                 if begun[row] and np.abs(found[:2] - estimate[row, :2]).max() < SETTLED:

@@ -10,6 +10,7 @@ localization for poorly modelled mobile robots", IEEE ICRA 2000): of many random
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
 from mrctl.sensing.scan_matching import agreement, fit
@@ -27,6 +28,9 @@ AGREE = 0.8  # share of a scan's points that lie on the map, below which the fil
 RESET, CLOSE = 0.2, 0.02  # share of the particles that are then drawn from the scan; deviation about it in m and rad
 SPREAD = 0.1  # m and rad, least deviation of the particles at the start
 TRIALS, SEEDS, KEPT = 4000, 40, 5  # random poses, those matched with the scan, and the best, which seed particles
+APART = 0.3  # m and rad, least distance between them
+COARSE, FINER = 0.5, 0.2  # m, deviation of a point from the map by which random poses are judged, and those around them
+NEAR, AROUND = 0.15, 50  # m and rad, deviation of such poses, and their number
 
 
 class Particles:
@@ -59,31 +63,33 @@ class Particles:
                 self._sought = start + deviation * self._random.standard_normal((TRIALS, 3))
         self.pose, self.spread = self.particles.mean(axis=0), self.particles.std(axis=0)
 
-    def update(self, way: float, turn: float, points: Array) -> Array:
+    def update(self, way: float, turn: float, points: Array, rays: Array) -> Array:
         """Moves the particles as the robot moved by its odometry, weighs them by a scan, and resamples.
 
         Args:
             way: Distance that the robot drove since the last update in m, negative in reverse.
             turn: Angle by which it turned in rad.
             points: Points of the scan in the robot's frame in m, `(k, 2)`; sixty are enough.
+            rays: Parts of beams on which there is nothing, as `Lidar.rays` returns them, `(m, 4)`. They cost much time,
+                and count as long as the robot is being looked for: in the first update, and while many particles are.
 
         Returns:
             `pose`, `(3,)`.
         """
         random, n = self._random, len(self.particles)
+        looked_for = rays if self._sought is not None or n > LEAST else rays[:0]
         if self._sought is not None:
-            best, _ = best_of(self._sought, points, self._field)
+            best, shares = best_of(self._sought, points, rays, self._field, random)
             count, self._sought = int(RESET * n), None
-            drawn = best[random.integers(len(best), size=count)]
+            drawn = best[random.choice(len(best), count, p=shares)]
             self.particles[:count] = drawn + CLOSE * random.standard_normal((count, 3))
         move.compiled(self.particles, way, turn, random.standard_normal((n, 3)))
-        weights = np.empty(n)
-        weigh.compiled(self.particles, points, self._field, weights)
+        weights = likelihoods(self.particles, points, looked_for, self._field, HIT)
         average.compiled(self.particles, weights, self.pose, self.spread)
         lost = len(points) > 0 and agreement.compiled(points, self.pose, self._field) < AGREE
         fresh = np.zeros((1, 3))
         if lost:
-            fresh = best_of(anywhere(self._free, TRIALS, random), points, self._field)[0]
+            fresh = best_of(anywhere(self._free, TRIALS, random), points, rays, self._field, random)[0]
         found = np.empty((MOST, 3))
         count = resample.compiled(
             self.particles, weights, random.uniform(size=(MOST, 2)), random.standard_normal((MOST, 3)), fresh,
@@ -105,25 +111,58 @@ def anywhere(places: Array, count: int, random: np.random.Generator) -> Array:
     return np.column_stack([own, random.uniform(-np.pi, np.pi, count)])
 
 
-def best_of(poses: Array, points: Array, field: Field) -> tuple[Array, Array]:
+def best_of(poses: Array, points: Array, rays: Array, field: Field, random: np.random.Generator) -> tuple[Array, Array]:
     """Matches a scan from those of many poses that explain it best.
+
+    The poses are sparse, and are judged coarsely. The likeliest that are not near each other look for a better pose
+    around them, and from there scan matching goes on, whose range is small in the heading.
 
     Args:
         poses: Poses in m, m, rad, `(n, 3)`.
         points: Points of the scan in the robot's frame in m, `(k, 2)`.
+        rays: Parts of its beams on which there is nothing, start and end in the robot's frame in m, `(m, 4)`.
         field: Distance field of the map.
+        random: Source of random numbers.
 
     Returns:
-        The `KEPT` likeliest of the matched poses, the likeliest first, `(KEPT, 3)`; and the shares of the points that
-        lie on the map from them, `(KEPT,)`.
+        The `KEPT` likeliest of the matched poses, or fewer, none near another, the likeliest first, `(m, 3)`; and their
+        probabilities, for which the density of the given poses is the prior, `(m,)`.
     """
+    few = points[:: max(1, len(points) // 20)]
+    seeds = poses[apart(poses, likelihoods(poses, few, rays[:0], field, COARSE), SEEDS)]
+    around = seeds[:, None] + NEAR * random.standard_normal((len(seeds), AROUND, 3))
+    around[:, 0] = seeds
+    weights = likelihoods(around.reshape(-1, 3), few, rays[:0], field, FINER).reshape(around.shape[:2])
+    found = around[np.arange(len(seeds)), weights.argmax(axis=1)]
+    for pose in found:
+        fit.compiled(points, pose, field)
+    near = [1 + np.count_nonzero(within(poses, pose)) for pose in found]
+    weights = near * likelihoods(found, points, rays, field, HIT)
+    best = apart(found, weights, KEPT)
+    return found[best], weights[best] / weights[best].sum()
+
+
+def likelihoods(poses: Array, points: Array, rays: Array, field: Field, deviation: float) -> Array:
+    """Returns the weights of `weigh`, `(n,)`; for its arguments see there."""
     weights = np.empty(len(poses))
-    weigh.compiled(poses, points[:: max(1, len(points) // 20)], field, weights)
-    best = poses[np.argsort(-weights, kind="stable")[:SEEDS]]
-    shares, weights = np.array([fit.compiled(points, pose, field) for pose in best]), np.empty(len(best))
-    weigh.compiled(best, points, field, weights)
-    order = np.argsort(-weights, kind="stable")[:KEPT]
-    return best[order], shares[order]
+    weigh.compiled(poses, points, rays, field, deviation, weights)
+    return weights
+
+
+def apart(poses: Array, weights: Array, most: int) -> NDArray[np.intp]:
+    """Returns the places of the likeliest poses, at most so many, none of which is near a likelier one."""
+    left, found = np.argsort(-weights, kind="stable"), []
+    while len(found) < most and len(left):
+        found.append(left[0])
+        left = left[~within(poses[left], poses[left[0]])]
+    return np.array(found)
+
+
+def within(poses: Array, pose: Array) -> NDArray[np.bool]:
+    """Tells which poses are less than `APART` from another one in x, y and θ."""
+    away = np.abs(poses - pose)
+    away[:, 2] = np.abs(np.angle(np.exp(1j * away[:, 2])))
+    return np.all(away <= APART, axis=1)
 
 
 @kernel
@@ -141,13 +180,18 @@ def move(particles: Array, way: float, turn: float, noise: Array) -> None:
 
 
 @kernel
-def weigh(particles: Array, points: Array, field: Field, weights: Array) -> None:
+def weigh(particles: Array, points: Array, rays: Array, field: Field, deviation: float, weights: Array) -> None:
     """Weighs particles by the likelihood field, p = exp(−d²/2σ²) + `RANDOM` for each point of the scan.
+
+    For each ray p = `RANDOM` if the map has something on it, and 1 + `RANDOM` otherwise: so a robot does not look
+    through a wall, at points that lie on another one, or see nothing where there is one.
 
     Args:
         particles: Poses in m, m, rad, `(n, 3)`.
         points: Points of the scan in the robot's frame in m, `(k, 2)`.
+        rays: Parts of its beams on which there is nothing, start and end in the robot's frame in m, `(m, 4)`.
         field: Distance field of the map.
+        deviation: σ in m.
         weights: Out: weights, whose sum is 1, `(n,)`.
     """
     n, most = len(particles), -np.inf
@@ -163,13 +207,17 @@ def weigh(particles: Array, points: Array, field: Field, weights: Array) -> None
             column, row = x + c * points[m, 0] - s * points[m, 1], y + s * points[m, 0] + c * points[m, 1]
             if 0.0 <= column < columns and 0.0 <= row < rows:
                 d = distance[int(row), int(column)]
-                product *= np.exp(-0.5 * (d / HIT) ** 2) + RANDOM
+                product *= np.exp(-0.5 * (d / deviation) ** 2) + RANDOM
             else:
                 product *= RANDOM
             if product < 1e-200:
                 log += np.log(product)
                 product = 1.0
         log += np.log(product)
+        for m in range(len(rays)):
+            x0, y0 = x + c * rays[m, 0] - s * rays[m, 1], y + s * rays[m, 0] + c * rays[m, 1]
+            x1, y1 = x + c * rays[m, 2] - s * rays[m, 3], y + s * rays[m, 2] + c * rays[m, 3]
+            log += np.log((1.0 if is_free(distance, resolution, x0, y0, x1, y1) else 0.0) + RANDOM)
         weights[i] = log
         most = max(most, log)
     total = 0.0
@@ -178,6 +226,32 @@ def weigh(particles: Array, points: Array, field: Field, weights: Array) -> None
         total += weights[i]
     for i in range(n):
         weights[i] /= total
+
+
+@kernel
+def is_free(distance: Array, resolution: float, x0: float, y0: float, x1: float, y1: float) -> bool:
+    """Tells whether nothing is on a ray, by steps of the distance to the nearest obstacle (sphere tracing, Hart 1996).
+
+    Args:
+        distance: Distances of a field in m, `(rows, columns)`.
+        resolution: Side of a cell in m.
+        x0: Column of the start, as the ends may be between the centres of cells.
+        y0: Row of the start.
+        x1: Column of the end.
+        y1: Row of the end.
+    """
+    rows, columns = distance.shape
+    length = np.hypot(x1 - x0, y1 - y0)
+    dx, dy, way = (x1 - x0) / length, (y1 - y0) / length, 0.0
+    while way < length:
+        column, row = x0 + way * dx, y0 + way * dy
+        if not (0.0 <= column < columns and 0.0 <= row < rows):
+            return True  # beyond the map there is nothing
+        away = distance[int(row), int(column)] / resolution
+        if away < 0.0:
+            return False
+        way += max(away, 1.0)
+    return True
 
 
 @kernel

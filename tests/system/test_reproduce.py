@@ -10,7 +10,6 @@ from matplotlib.image import imread
 
 from mrctl import cli
 from mrctl.experiments import kanayama, paper
-from mrctl.scenario import COMPARED
 
 pytestmark = pytest.mark.xdist_group("reproduce")  # what its tests share is made once
 
@@ -42,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(paper, "PAPER", ("none", "model", "true_model", "fel"))  # those that the tests below ask for
         patch.setattr(paper, "DRAWS", 1)  # replicates in the table of the tiers; one shows what its test asks for
         tier_runs = paper.real
-        patch.setattr(paper, "real", lambda tier: [run.replace(laps=4) for run in tier_runs(tier)])
+        patch.setattr(paper, "real", lambda tier: [(name, run.replace(laps=4)) for name, run in tier_runs(tier)])
         assert cli.main(["reproduce", "--out", str(out)]) == 0
     return out
 
@@ -100,8 +99,9 @@ def test_network_beats_pid_in_other_arrangements(table: dict, steering: str, pla
 def test_tiers(table: dict) -> None:
     """Everything is driven in each tier, and with all four constants wrong every learner is ahead of PID alone."""
     rows = {(r["sensing"], r["plant"], r["feedforward"]): r for r in table["tiers"]}
-    assert set(rows) == set(product(("ideal", "lab", "field"), ("nominal", "all"), (*COMPARED, "hindsight")))
-    for tier, name in product(("ideal", "lab", "field"), COMPARED):
+    plants = "nominal", "all", "delay 20 ms"
+    assert set(rows) == set(product(("ideal", "lab", "field"), plants, (*paper.REAL, "hindsight")))
+    for tier, name in product(("ideal", "lab", "field"), paper.REAL):
         if name != "none":
             assert rows[tier, "all", name]["position_rmse"] < rows[tier, "all", "none"]["position_rmse"], (tier, name)
 

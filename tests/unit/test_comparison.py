@@ -1,5 +1,8 @@
 """Statistics against closed forms, published values and values worked out by hand."""
 
+from itertools import product
+from math import comb
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -77,13 +80,31 @@ def test_superiority():
 
 
 @pytest.mark.parametrize(
-    ("wins", "n", "low", "high"),
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+    ("count", "n", "wilson", "exact"),
+    [
+        (81, 263, (0.2553, 0.3662), (0.2527, 0.3676)),
+        (15, 148, (0.0624, 0.1605), (0.0578, 0.1617)),
+        (0, 20, (0.0, 0.1611), (0.0, 0.1684)),
+        (1, 29, (0.0061, 0.1718), (0.0009, 0.1776)),
+    ],
 )
-def test_superiority_interval(wins, n, low, high):
-    """The examples of Newcombe (1998), table I, method 3."""
-    found = comparison.superiority([0.0] * wins + [2.0] * (n - wins), [1.0] * n)
-    assert (found.low, found.high) == pytest.approx((low, high), abs=6e-5)
+def test_share_intervals(count, n, wilson, exact):
+    """The examples of Newcombe (1998), table I, methods 3 and 5."""
+    assert comparison.wilson(count / n, n) == pytest.approx(wilson, abs=6e-5)
+    assert comparison.clopper_pearson(count, n) == pytest.approx(exact, abs=6e-5)
+
+
+@pytest.mark.parametrize("level", [0.9, 0.95])
+def test_superiority_is_the_sign_test(level):
+    """The interval leaves out ½ where the exact sign test of the pairs that are not ties, by hand, says so."""
+    for wins, ties, losses in product(range(0, 16, 3), (0, 1, 12, 40), range(9)):
+        if not wins + ties + losses:
+            continue
+        found = comparison.superiority([0] * wins + [1] * ties + [2] * losses, [1] * (wins + ties + losses), level)
+        n = wins + losses
+        tail = sum(comb(n, k) for k in range(max(wins, losses), n + 1)) / 2**n
+        assert (found.low > 0.5 or found.high < 0.5) == (2 * tail < 1 - level)
+        assert found.low <= found.value <= found.high and found.high - found.low > 1e-3
 
 
 @given(st.lists(st.tuples(*[st.floats(0, 10) | st.just(float("nan"))] * 2), min_size=1))

@@ -24,6 +24,7 @@ from mrctl.control.design import (
     sensitivity,
     whole_loop,
 )
+from mrctl.control.guard import ARM
 from mrctl.control.pid import Pid
 from mrctl.control.rejection import Loop
 from mrctl.record import InputError
@@ -291,13 +292,13 @@ def test_whole_loop(robot, steering, late):
         plant = plants(robot, rigid, channel)[0]
         held = plant.held(H)
         state, integral, c, place, heading = np.zeros(len(plant.b)), 0.0, 0.0, 0.0, 0.0
-        sent, rates, totals, errors = [0.0] * late, [0.0] * late, np.zeros(ticks), np.zeros((2, ticks))
+        sent, rates, totals, errors = [0.0] * late, [0.0] * late, np.zeros(ticks), np.zeros((3, ticks))
         static, lag = (
             (robot.velocity_gain, robot.velocity_time_constant),
             (robot.rotation_gain, robot.rotation_time_constant),
         )[channel]
         for n in range(ticks):
-            errors[:, n] = c - state[0], -place
+            errors[:, n] = c - state[0], -place, -ARM * heading
             v, x, y = state[0], place, heading
             for rate in rates:  # prediction from the measurement to the moment at which the voltage acts
                 if channel == 0:

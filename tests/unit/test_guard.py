@@ -173,8 +173,11 @@ def test_blame_fades():
 
 
 def test_position_bounds_the_deviation():
-    """Where the position is the weaker, D follows from it."""
-    assert Bench(gains=((0.001, 0.05), (0.5, 0.01))).g["harmless"][0] == pytest.approx(module.TOLERATED / 0.05)
+    """Where the posture is the weaker, its bound follows from it: both channels at once reach 0.15 m."""
+    g = Bench(gains=((0.001, 0.05), (0.5, 0.01))).g
+    found = g["harmless_to_posture"]
+    assert found[0] * 0.05 == pytest.approx(module.TOLERATED / np.sqrt(2)) and found[0] < g["harmless"][0]
+    assert found[1] == g["harmless"][1] == pytest.approx(g["region"][1] / 0.5)
 
 
 def test_unstable_loop():

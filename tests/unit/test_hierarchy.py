@@ -243,7 +243,7 @@ def test_guard_knows_both_controllers(robot):
     gains, design = Kanayama(k_x=0.02, k_y=0.02, k_theta=0.1), Pid(time_constant=0.4)  # so slow that the posture counts
 
     def tolerated(hierarchy):
-        return hierarchy.state["guard"]["harmless"]
+        return hierarchy.state["guard"]["harmless_to_posture"]
 
     start = build(robot)
     prefilter = float(start.state["limiter"]["time_constant"][0])  # which an event does not change
