@@ -106,7 +106,7 @@ def _report(
     laps = metrics.per_lap(result)
     if out is not None:
         save(result, out / "result.zarr")
-        if "weights" in result and not result["failed"].any():
+        if "weights" in result and not result["failed"].any() and np.isfinite(result["weights"]).all():
             save_learned(out / "learned.safetensors", result)
         _draw(result, laps, out)
     row, reason = laps.isel(run=0), str(result["failure"].values[0])
