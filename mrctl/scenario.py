@@ -51,7 +51,7 @@ COMPARED: tuple[FeedforwardName, ...] = tuple(
 )
 """Feedforwards that the tables compare: all with a prior and, without one, PID alone and the paper's network."""
 LONGEST = 10_000_000
-"""Largest number of control periods in a run; the log takes 456 bytes for each."""
+"""Largest number of control periods in a run; the log takes 488 bytes for each."""
 
 Spread = Annotated[float, Field(ge=0, le=0.2)]
 

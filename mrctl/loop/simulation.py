@@ -275,7 +275,7 @@ class Simulation:
         self.sensors = Sensors([s.sensing for s in scenarios], [s.seed for s in scenarios], self.period)
         self.estimator = self._build_estimator(own_estimator)
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period, self.preview)
-        self.log = Log(1 if restarting else self.ticks, size)
+        self.log = Log(1 if restarting else self.ticks, size, self.hierarchy.rigid)
         self.goals = Goals(scenarios, timed=not restarting)
         self._failure_time = np.full(size, np.nan)
         self._learned: dict[int, Array] = {}  # what each robot had adapted when its run ended, flat
