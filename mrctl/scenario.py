@@ -127,8 +127,7 @@ class Scenario(Record):
     observer: Observer = Observer()
     """Settings of the learner `observer`."""
     learned: str | None = None
-    """File of `save_learned`, from which the learner, or a feedforward of your own, starts; by default it starts from
-    nothing."""
+    """File of `save_learned`, from which the learner, or a feedforward of your own, starts."""
     indi: Indi = Indi()
     """Settings of the learner `indi`."""
     l1: L1 = L1()
