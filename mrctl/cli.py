@@ -704,13 +704,14 @@ def suite(
         feedforward: Feedforwards to compare, such as fel or model+composite; hindsight is, for each run, the better one
             of model and of coefficients fitted to that run. By default those in the tables of RESULTS.md, with --full
             all.
-        controller: Controllers of your own to compare, such as my_file.py:MyFeedforward or motion=my_file.py:MyMotion.
+        controller: Controllers of your own to compare, such as my_file.py:MyFeedforward, the same behind the nominal
+            model as model+my_file.py:MyFeedforward, or motion=my_file.py:MyMotion.
         seeds: Number of replicates of each case; by default 20, or 3 with --quick.
         random: Number of random scenarios; by default 30, with --quick 6, with --full 1,000 in each tier.
         quick: Run a few cases with few laps, in two minutes; the tables support no claim.
         full: Run all cases, in every tier, in hours.
-        held_out: Instead, drive this one feedforward, or my_file.py:MyFeedforward, through 40 cells that no setting was
-            chosen on, beside model, true_model and model+observer.
+        held_out: Instead, drive this one feedforward, or one of your own as for --controller, through 40 cells that no
+            setting was chosen on, beside model, true_model and model+observer.
         workers: Number of processes on this machine; by default one for each core.
         out: Folder for report.html, the tables in Markdown and JSON, the figures and the runs; by default suite,
             suite_quick, suite_full or held_out.

@@ -51,7 +51,7 @@ COMPARED: tuple[FeedforwardName, ...] = tuple(
 )
 """Feedforwards that the tables compare: all with a prior and, without one, PID alone and the paper's network."""
 LONGEST = 10_000_000
-"""Largest number of control periods in a run; the log takes 456 bytes for each."""
+"""Largest number of control periods in a run; the log takes 488 bytes for each."""
 
 Spread = Annotated[float, Field(ge=0, le=0.2)]
 
@@ -127,7 +127,7 @@ class Scenario(Record):
     observer: Observer = Observer()
     """Settings of the learner `observer`."""
     learned: str | None = None
-    """File of `save_learned`, from which the learner starts; by default it starts from nothing."""
+    """File of `save_learned`, from which the learner, or a feedforward of your own, starts."""
     indi: Indi = Indi()
     """Settings of the learner `indi`."""
     l1: L1 = L1()
@@ -179,8 +179,6 @@ class Scenario(Record):
             whole(perturbation.control_delay, self.control_period, f"{name}.control_delay", "control_period")
         if self.learner in MODEL_BASED and self.prior == "none":
             raise ValueError(f"prior: the learner {self.learner} compares the robot with a model; set prior to model")
-        if self.learned and self.learner in ("none", "indi"):
-            raise ValueError(f"learned: the learner {self.learner} keeps nothing that a run could start from")
         if not 1 <= self.duration / self.control_period <= LONGEST:
             raise ValueError(f"laps: a run of {self.duration:g} s is not between 1 and {LONGEST:,} control periods")
         self.sensing.check(self.control_period, self.duration)

@@ -34,10 +34,18 @@ class Feedforward(Protocol):
     The voltage of the prior is added to its output.
 
     A stage serves B robots; its memory belongs in arrays with a leading axis B, so that robots cannot mix. It may have
-    four further members: `reset(period, delay)`, which is called before all other methods with the control period and
-    the delay of the loop that the controller knows, both in s; `weight_norm`, a float64 array `(B,)` for the results;
-    `restore(rows)`, with which the guard (`mrctl.control.guard`) resets the robots with these indices to their initial
-    weights; and `guarded`, which is False where the guard shall not watch it.
+    further members:
+
+    - `reset(period, delay)` is called before all other methods with the control period and the delay of the loop that
+      the controller knows, both in s.
+    - `weight_norm`, a float64 array `(B,)`, is recorded in the results.
+    - `restore(rows)` resets the robots with these indices to their initial weights, for the guard
+      (`mrctl.control.guard`).
+    - `guarded` is False where the guard shall not watch it.
+    - `adapted()` returns what each robot has learned, a dict of arrays `(B, …)` by name, whose shapes stay the same;
+      `mrctl.save_learned` writes those of one robot to a file.
+    - `adopt(row, learned)` lets one robot start from such a file, a dict of the same arrays without the axis B. It is
+      called after `reset` and after each `restore`, for robots whose scenario names a file in `learned`.
     """
 
     def output(self, command: Array, derivative: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -97,6 +98,18 @@ class ModuleLearning:
         for name, value in self.state.items():
             value[rows] = self.initial[name][rows]
         self._tick[rows], self.weight_norm[rows] = 0, 0.0
+
+    def adapted(self) -> dict[str, torch.Tensor]:
+        """Returns the parameters of each robot, and those of its module at the start, which its output refers to."""
+        return self.state | {f"initial.{name}": value for name, value in self.initial.items()}
+
+    def adopt(self, row: int, learned: Mapping[str, Array]) -> None:
+        """Lets one robot start from a row of `adapted`."""
+        for name, value in self.state.items():
+            value[row] = torch.from_numpy(learned[name])
+            self.initial[name][row] = torch.from_numpy(learned[f"initial.{name}"])
+        moved = {name: (value - self.initial[name])[[row]] for name, value in self.state.items()}
+        self.weight_norm[row] = float(_square(moved).sqrt())
 
     def _forward(self, parameters: dict[str, torch.Tensor], features: Array) -> torch.Tensor:
         x = torch.from_numpy(features)

@@ -60,9 +60,17 @@ def save_weights(path: str | Path, weights: Array) -> None:
     """Writes flat weights of `fel`, `(n,)`, as a safetensors file.
 
     Raises:
-        InputError: The file cannot be written.
+        InputError: These are no weights of `fel`, or the file cannot be written.
     """
-    write_arrays(path, unflatten(weights))
+    flat = np.asarray(weights)
+    units, left = divmod(flat.size - OUTPUTS * (INPUTS + 1), INPUTS + 1 + OUTPUTS)
+    if flat.ndim != 1 or flat.dtype.kind not in "fiu" or units < 1 or left:
+        kind = f"shape {flat.shape}" if flat.dtype.kind in "fiu" else f"type {type(weights).__name__}"
+        raise InputError(
+            f"weights: {kind} is not the flat weights of fel, (11 hidden + 18,), such as result.weights.values[0]; "
+            "mrctl.save_learned saves what any learner has adapted"
+        )
+    write_arrays(path, unflatten(flat))
 
 
 def load_weights(path: str | Path, hidden: int) -> Array:
@@ -89,7 +97,7 @@ def write_arrays(path: str | Path, arrays: Mapping[str, Array], metadata: dict[s
     """
     from safetensors.numpy import save
 
-    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    contiguous = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     data = save(contiguous, metadata={"mrctl": __version__} | (metadata or {}))
     try:
         Path(path).write_bytes(data)

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from mrctl.control.pid import Pid
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
-from mrctl.scenario import Event, Scenario, replicates
+from mrctl.scenario import FEEDFORWARDS, Event, Scenario, replicates
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Lemniscate, StopAndGo, Waypoints, random_spline
@@ -69,7 +69,15 @@ class Case(NamedTuple):
 
 
 Choices = Mapping[str, dict[str, Any]]
-"""What drives the runs, by name: a `feedforward` of mrctl or a `controller` of the user."""
+"""What drives the runs, by name: a `feedforward` of mrctl, or a `controller` of the user and the `prior` beside it."""
+
+
+def pair_of(choice: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns prior and learner of what drives the runs, as fields of a scenario."""
+    if choice.get("feedforward") in FEEDFORWARDS:
+        return FEEDFORWARDS[choice["feedforward"]]
+    return {"prior": choice.get("prior", "none"), "learner": "none"}
+
 
 Laps = Mapping[str, xr.Dataset]
 """Metrics lap by lap of all runs, `(run, lap)`, by feedforward."""

@@ -104,7 +104,7 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
     """Drives one feedforward and its rivals through the cells; writes `table.md` and `table.json`, and logs it.
 
     Args:
-        entry: Name of the feedforward, or one of the user's as `my_file.py:MyController`.
+        entry: Name of the feedforward, or one of the user's, as for `suite.by_name`.
         count: Number of replicates of each cell.
         workers: Number of processes; by default one for each core.
         out: Folder for the results.
@@ -117,7 +117,10 @@ def judge(entry: str, count: int, workers: int | None, out: Path) -> str:
     """
     if entry in RIVALS or (entry not in FEEDFORWARDS and ".py:" not in entry):
         names = ", ".join(name for name in FEEDFORWARDS if name not in RIVALS)
-        raise InputError(f"held_out: {entry!r} is neither one of {names} nor of the form my_file.py:MyController")
+        raise InputError(
+            f"held_out: {entry!r} is neither one of {names} nor of the form my_file.py:MyController, "
+            "with or without model+ in front"
+        )
     if not 1 <= count <= len(HELD_OUT_SEEDS):
         raise InputError(f"seeds: {count} is not between 1 and {len(HELD_OUT_SEEDS):,}")
     known = entry in FEEDFORWARDS

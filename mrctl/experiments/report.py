@@ -18,7 +18,7 @@ from mrctl.control.feedforward import Prior
 from mrctl.control.pid import Pid
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
-from mrctl.experiments.cases import BAND, REFERENCES, SLOW, Choices, Outcome
+from mrctl.experiments.cases import BAND, REFERENCES, SLOW, Choices, Outcome, pair_of
 from mrctl.experiments.suite_tables import NO_CLAIM, titled, verdict
 from mrctl.experiments.tables import Table, number
 from mrctl.loop import user_files
@@ -26,7 +26,7 @@ from mrctl.loop.simulation import Simulation
 from mrctl.results import metrics, plots
 from mrctl.results.dataset import versions
 from mrctl.results.plots import InverseMap
-from mrctl.scenario import FEEDFORWARDS, MODEL_BASED, Scenario
+from mrctl.scenario import MODEL_BASED, Scenario, named
 
 MAPLESS = ("none", "model", *REFERENCES, *(f"model+{name}" for name in MODEL_BASED))
 """Feedforwards that learn no map from motion to voltage."""
@@ -111,7 +111,7 @@ def _labelled(runs: Mapping[str, xr.Dataset]) -> xr.Dataset:
 def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
     """Drives a scenario again; evaluates the learned feedforward and the true inverse dynamics in steady motion."""
     stages: Stages = user_files.load(choice["controller"]) if "controller" in choice else {}
-    scenario = scenario.model_copy(update=FEEDFORWARDS[choice.get("feedforward", "none")])
+    scenario = scenario.model_copy(update=pair_of(choice))
     simulation = Simulation([scenario], **stages)
     while simulation.running:
         simulation.step()
@@ -153,6 +153,7 @@ def page(
         band=f"{BAND:g}",
         mode=outcome.mode,
         says={table.title: table.says for table in tables},
+        reads={table.title: table.reads for table in tables},
         no_claim=NO_CLAIM.replace("this table", "this page") if {NO_CLAIM} == {one.says for one in tables} else "",
         scorecard=scorecard(outcome),
         recoveries=recoveries(outcome),
@@ -169,7 +170,7 @@ def command(outcome: Outcome, choices: Choices) -> str:
     """Returns the command that repeats the suite."""
     words = ["mrctl", "suite", *([f"--{outcome.mode}"] if outcome.mode != "core" else [])]
     words += ["--feedforward", *(name for name, one in choices.items() if "feedforward" in one)]
-    own = [one["controller"] for one in choices.values() if "controller" in one]
+    own = [named(one["prior"], one["controller"]) for one in choices.values() if "controller" in one]
     words += ["--controller", *own] if own else []
     words += ["--seeds", str(len(next(case for case in outcome.cases if case.part != "random").scenarios))]
     words += ["--random", str(_worlds(outcome))]

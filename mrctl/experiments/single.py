@@ -106,7 +106,7 @@ def _report(
     laps = metrics.per_lap(result)
     if out is not None:
         save(result, out / "result.zarr")
-        if "weights" in result and not result["failed"].any():
+        if "weights" in result and not result["failed"].any() and np.isfinite(result["weights"]).all():
             save_learned(out / "learned.safetensors", result)
         _draw(result, laps, out)
     row, reason = laps.isel(run=0), str(result["failure"].values[0])
@@ -124,6 +124,7 @@ def _report(
             "faults": faults,
             "guard": events.to_dict("records"),
             "retuned": _retuned(result.isel(run=0)),
+            "feedforward_limited": _limited(result.isel(run=0)),
         }
         return json.dumps(values, indent=1), failure
     header = ["lap", *(title for title, _ in COLUMNS.values())]
@@ -138,7 +139,7 @@ def _report(
         f"steering {steering}"
     ]
     lines += [f"failed {failure}"] if failure else []
-    lines += faults + _unreached(scenario, result.isel(run=0))
+    lines += faults + _limited(result.isel(run=0)) + _unreached(scenario, result.isel(run=0))
     if rows:
         lines.append(markdown(header, rows))
     acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]
@@ -151,6 +152,17 @@ def _retuned(run: xr.Dataset) -> list[str]:
     return [
         f"oscillation at {time[k]:.2f} s: slower {'motion controller' if moves[k] % 2 else 'PID'} from now on"
         for k in np.flatnonzero(np.diff(moves, prepend=0.0) > 0)
+    ]
+
+
+def _limited(run: xr.Dataset) -> list[str]:
+    """Says for how long the guard limited the feedforward, which is not counted as saturation."""
+    beyond = run["feedforward_limited"].values == 1
+    if not beyond.any():
+        return []
+    time, first = run.attrs["control_period"] * beyond.sum(), float(run["time"][beyond.argmax()])
+    return [
+        f"feedforward beyond the supply for {time:.2f} s, from {first:.2f} s on: the guard limited it to the supply"
     ]
 
 

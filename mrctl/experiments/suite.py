@@ -28,6 +28,7 @@ from mrctl.experiments.cases import (
     Mode,
     Outcome,
     cases,
+    pair_of,
 )
 from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, YARDSTICKS, tables, titled
 from mrctl.experiments.tables import machine, output_folder, write_json
@@ -39,7 +40,7 @@ from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority, wilson
 from mrctl.results.dataset import versions
-from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
+from mrctl.scenario import FeedforwardName, Scenario, named, replicates
 from mrctl.sweep import jobs, store
 from mrctl.sweep.plan import Sweep
 from mrctl.sweep.store import Store
@@ -47,6 +48,7 @@ from mrctl.theory.references import Circle
 
 Entry = FeedforwardName | Literal["hindsight"]
 Errors = Mapping[str, Mapping[str, Array]]
+MODEL = "model+"  # in front of a user's feedforward that adds to the nominal model
 CHUNK = 40  # runs in a job: enough for a fast batch, and few enough that no worker idles for long at the end
 STARTING, STATISTICS = 3.0, 0.15  # s for the start of a feedforward's workers, and for a row of the tables; measured
 
@@ -65,7 +67,7 @@ def suite(
     Args:
         mode: Size of the suite; see `cases`.
         feedforwards: Names of the feedforwards to compare; `hindsight` is the best fixed one for each run.
-        controllers: Feedforwards of the user, each as `my_file.py:MyController`; see `mrctl.loop.user_files`.
+        controllers: Controllers of the user, as for `by_name`.
         seeds: Number of replicates of each case, which are the same for every feedforward.
         random: Number of random scenarios.
         workers: Number of processes; by default one for each core.
@@ -100,16 +102,25 @@ def suite(
 def by_name(feedforwards: Sequence[str], controllers: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Returns what drives the runs, by the name of the feedforward or of the user's class.
 
+    Args:
+        feedforwards: Names of feedforwards of mrctl.
+        controllers: Controllers of the user, each as for `mrctl.loop.user_files`. A feedforward may have `model+` in
+            front, as in `model+my_file.py:MyController`, and then adds to the nominal model.
+
     Raises:
         InputError: A controller is bad, or its name is taken.
     """
     choices: dict[str, dict[str, Any]] = {name: {"feedforward": name} for name in feedforwards}
-    for stages in controllers:
-        name = "+".join(part.title for part in user_files.parts(stages))
+    for entry in controllers:
+        stages = entry.removeprefix(MODEL)
+        prior, parts = "none" if stages == entry else "model", user_files.parts(stages)
+        if prior == "model" and all(part.stage != "feedforward" for part in parts):
+            raise InputError(f"controller: {entry!r} has {MODEL} in front, but no feedforward that adds to the model")
+        name = named(prior, "+".join(part.title for part in parts))
         if name in choices:
             raise InputError(f"controller: the name {name} is taken")
-        choices[name] = {"controller": user_files.absolute(stages)}
-        user_files.trial(choices[name]["controller"], Scenario(laps=1))
+        choices[name] = {"controller": user_files.absolute(stages), "prior": prior}
+        user_files.trial(choices[name]["controller"], Scenario(laps=1, prior=prior, learner="none"))
     return choices
 
 
@@ -124,8 +135,7 @@ def run(chosen: Sequence[Case], choices: Choices, workers: int | None, out: Path
     print(expectation(chosen, choices, workers or cores(), out), file=sys.stderr, flush=True)
     laps, aside = {}, []
     for place, (name, choice) in enumerate(choices.items(), 1):
-        fields = FEEDFORWARDS[choice["feedforward"] if choice.get("feedforward") in FEEDFORWARDS else "none"]
-        scenarios = [s.model_copy(update=fields) for case in chosen for s in case.scenarios]
+        scenarios = [s.model_copy(update=pair_of(choice)) for case in chosen for s in case.scenarios]
         chunk = min(CHUNK, -(-len(scenarios) // 4))
         own = {"controller": choice.get("controller"), "hindsight": name == HINDSIGHT}
         sweep = Sweep.of(scenarios, record="laps", chunk=chunk, **own)

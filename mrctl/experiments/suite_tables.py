@@ -23,6 +23,9 @@ LEADING = {
     "position in lap 1": ("position_rmse", "first"),
     "position in all laps": ("position_rmse", "all"),
 }
+WON = "share of runs below {}: V / θ̇ / position [interval of position]"
+HARMLESS = f"share of runs at most {NO_WORSE:g}× PID: V / θ̇ / position [interval of position]"
+CONVERGED = f"laps to {BAND:g}× the final V / θ̇ / position"
 NO_CLAIM = "So few draws tell nothing apart: this table supports no claim."
 
 Row = dict[str, Any]
@@ -38,12 +41,13 @@ def tables(rows: Sequence[Row], mode: str) -> list[Table]:
     found = []
     few = mode == "quick" or all(row["runs"] < LEAST for row in rows)
 
-    def add(title: str, says: str, cells: pd.DataFrame) -> None:
-        found.append(Table(f"{title} ({mode})", NO_CLAIM if few else says, cells))
+    def add(title: str, says: str, cells: pd.DataFrame, reads: str = "") -> None:
+        found.append(Table(f"{title} ({mode})", NO_CLAIM if few else says, cells, reads))
 
     for part, title in PARTS.items():
         if own := [row for row in rows if row["part"] == part]:
-            add(title, resolution(rows) if part == "floor" else against(own, "last"), last_laps(own))
+            cells = last_laps(own)
+            add(title, resolution(rows) if part == "floor" else against(own, "last"), cells, reading(list(cells)))
     every = [row for row in rows if row["part"] != "floor"]
     add("Position error in mm", " ".join(against(every, window) for window in WINDOWS), positions(every))
     if not few and any(row["feedforward"] not in REFERENCES for row in rows):  # few draws call everyone level
@@ -85,8 +89,9 @@ def against(rows: Sequence[Row], window: str) -> str:
     ]
     rest = "the others are level with it" if parts else "all are level with it"
     return (
-        f"Position in {WINDOWS[window]} against `{titled(rival)}` in {cases} case{'s' * (cases > 1)} "
-        f"({' or '.join(map(str, runs))} runs each, paired, 95 %, differences up to {tie} mm are ties): "
+        f"Position error in {WINDOWS[window]} against `{titled(rival)}` in {cases} case{'s' * (cases > 1)} "
+        f"({' or '.join(map(str, runs))} runs each, compared run by run with 95 % confidence; differences up to {tie} "
+        "mm are ties): "
         f"{'; '.join([*parts, rest])}."
     )
 
@@ -128,16 +133,15 @@ def _both_steps(rows: Sequence[Row]) -> Iterator[tuple[int, int]]:
 
 
 def last_laps(rows: Sequence[Row]) -> pd.DataFrame:
-    """Makes the table of errors in the last lap, with how often each feedforward beats PID and `model`.
+    """Makes the table of errors in the last lap, with the shares of runs in which they are below PID's and `model`'s.
 
     For random scenarios it also has the share of them in which the feedforward does no harm, compared with PID alone.
     """
     header = ["case", "feedforward", "failed", *(f"{column_title(rows, metric)}; worst 5 %" for metric in COLUMNS)]
-    header += ["beats PID in V / θ̇ / position", "beats model", "guard acted"]
+    header += [*(WON.format(titled(one)) for one in YARDSTICKS), "guard acted"]
     unchanged, random = rows[0]["part"] in UNCHANGED, any("no_worse" in row["position_rmse"] for row in rows)
-    harm = f"at most {NO_WORSE:g}× PID in V / θ̇ / position", f"position over PID, 99 %; runs above {MUCH_WORSE:g}"
-    header += harm if random else ()
-    header += [f"laps to {BAND:g}× the final V / θ̇ / position"] if unchanged else []
+    header += (HARMLESS, f"position over PID, 99 %; runs above {MUCH_WORSE:g}") if random else ()
+    header += [CONVERGED] if unchanged else []
     cells = [
         [
             row["case"], row["feedforward"], f"{row['failed']}/{row['runs']}", *(_mean(row[m]) for m in COLUMNS),
@@ -147,6 +151,28 @@ def last_laps(rows: Sequence[Row]) -> pd.DataFrame:
         for row in rows
     ]  # fmt: skip
     return pd.DataFrame(cells, columns=header)
+
+
+def reading(header: Sequence[str]) -> str:
+    """Returns how to read the columns of `last_laps`, for those that a table has."""
+    centre = "median" if HARMLESS in header else "mean"
+    found = [
+        f"Errors are the {centre} over the runs that finished, with its 95 % interval; after the semicolon stands the "
+        "mean of the worst 5 % of all runs (of 20 or fewer, the worst run), which is infinite where a run failed. "
+        "Below PID, or below `model`, is the share of runs in which the error of the last lap is less than that of PID "
+        "alone, or of `model`, in the same run: 1.00 is all runs, 0.50 is no difference, a tie counts half, and a "
+        "failed run loses. The three shares are those for V, θ̇ and position; the brackets hold the "
+        "95 % interval of the share for position. Guard acted is the mean number of times in a run."
+    ]
+    if HARMLESS in header:
+        found.append(
+            f"At most {NO_WORSE:g}× PID is the share of runs whose error is at most so many times that of PID alone, "
+            "with the brackets as before. Position over PID is the 99 % quantile of that ratio; then comes the number "
+            f"of runs in which it is above {MUCH_WORSE:g}."
+        )
+    if CONVERGED in header:
+        found.append(f"The last column counts laps until the error stays within {BAND:g} times its final value.")
+    return " ".join(found)
 
 
 def positions(rows: Sequence[Row]) -> pd.DataFrame:

@@ -42,11 +42,14 @@ class Table(NamedTuple):
     says: str
     """Statement that the table supports, from paired tests."""
     cells: pd.DataFrame
+    reads: str = ""
+    """How to read its columns, where their titles do not say it all."""
 
     @property
     def markdown(self) -> str:
-        """Title, sentence and table."""
-        return f"## {self.title}\n\n{self.says}\n\n{markdown(list(self.cells), self.cells.to_numpy().tolist())}\n"
+        """Title, statement, how to read the columns, and table."""
+        cells = markdown(list(self.cells), self.cells.to_numpy().tolist())
+        return "\n\n".join(filter(None, (f"## {self.title}", self.says, self.reads, cells))) + "\n"
 
 
 def frame(rows: Sequence[Sequence[str]], header: Sequence[str]) -> pd.DataFrame:

@@ -8,6 +8,7 @@ With built-in stages a control tick of all robots is one compiled call.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,6 @@ from mrctl.control.rls import RecursiveLeastSquares
 from mrctl.control.steering import ALLOCATION, allocate, take_loss
 from mrctl.kernel import Array, Held, Row, Rows, held, kernel
 from mrctl.loop.learned import load_learned
-from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.sensing.scanner import Scanner
 from mrctl.theory.references import Reference
@@ -240,12 +240,11 @@ class Hierarchy:
         self.learner: Learner | Feedforward = learner_of(scenarios, robot) if feedforward is None else feedforward
         self.prior = Prior([None if first.prior == "none" else robot] * size, self.rigid)  # `set_truth` follows
         self._knows_truth = first.prior == "true_model"
-        self._learned = {row: load_learned(s) for row, s in enumerate(scenarios) if s.learned}
+        self._learned: dict[int, Any] = {}  # what the learners of some robots start from
         if isinstance(self.learner, Learner):
             self.learner.prior = self.prior
+            self._learned = {row: load_learned(s) for row, s in enumerate(scenarios) if s.learned}
             self._adopt(range(size))
-        elif self._learned:
-            raise InputError("learned: a feedforward of your own has to load what it learned itself")
         self._every = round(first.motion_period / first.control_period)
         self.started = 0
         self.nominal = nominal(robot, self.rigid)
@@ -487,6 +486,11 @@ class Hierarchy:
         self._adopt(rows)
         self.weight_norm[rows] = 0.0
         return True
+
+    def adapted(self) -> Array:
+        """Returns what the learner of each robot has adapted, flat, `(B, n)`; n is 0 if it keeps nothing."""
+        assert isinstance(self.learner, Learner)
+        return self.learner.adapted()
 
     def _adopt(self, rows: Iterable[int]) -> None:
         """Lets the learners of these robots start from the files that their scenarios name."""

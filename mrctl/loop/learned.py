@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +29,8 @@ KEPT = {
     "composite": {name: COMPOSITE[name].shape for name in CompositeAdaptation.learned},
 }
 """Names and shapes of what each learner keeps, except for `fel`, whose settings determine them."""
+LAYOUT = "weights_layout"
+"""Variable of a result with a feedforward of the user: its name, and names and shapes of its `weights`, as JSON."""
 
 
 def kept(scenario: Scenario) -> dict[str, tuple[int, ...]]:
@@ -50,7 +54,8 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
         run: One run of a result, such as `result.isel(run=0)`.
 
     Raises:
-        InputError: There are several runs, the learner keeps nothing, the run failed, or the file cannot be written.
+        InputError: There are several runs, the learner keeps nothing, the run failed, what it learned is not finite, or
+            the file cannot be written.
     """
     if run.sizes.get("run", 1) != 1:
         raise InputError(f"run: {run.sizes['run']} runs; choose one with isel(run=…)")
@@ -58,13 +63,20 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
     if bool(one.failed):
         raise InputError(f"learned: the run failed ({one.failure.item()}), and what it learned cannot be trusted")
     if "weights" not in one:
-        raise InputError("learned: the run has no learner of mrctl that keeps anything")
+        raise InputError("learned: no learner of the run keeps anything; one of your own needs the method adapted")
     (scenario,) = scenarios_of(one)
+    if LAYOUT in one:
+        own = json.loads(one[LAYOUT].item())
+        learner, layout = own["learner"], own["shapes"]
+    else:
+        learner, layout = scenario.learner, kept(scenario)
     flat, arrays, start = one.weights.values, {}, 0
-    for name, shape in kept(scenario).items():
+    for name, shape in layout.items():
         stop = start + int(np.prod(shape))
         arrays[name], start = flat[start:stop].reshape(shape), stop
-    write_arrays(path, arrays, {"learner": scenario.learner, "robot": scenario.robot.path})
+        if not np.isfinite(arrays[name]).all():
+            raise InputError(f"learned: {name} of {learner} is not finite, and no run could start from it")
+    write_arrays(path, arrays, {"learner": learner, "robot": scenario.robot.path})
 
 
 def load_learned(scenario: Scenario) -> Array:
@@ -73,11 +85,26 @@ def load_learned(scenario: Scenario) -> Array:
     Raises:
         InputError: The file is missing, broken, or of another learner.
     """
-    expected, notes = kept(scenario), notes_on(str(scenario.learned))
-    if (learner := notes.get("learner", scenario.learner)) != scenario.learner:
-        raise InputError(f"learned: {scenario.learned} was learned by {learner}, not by {scenario.learner}")
+    expected = kept(scenario)
+    arrays = load_arrays(scenario, scenario.learner, expected)
+    return np.concatenate([arrays[name].ravel() for name in expected])
+
+
+def load_arrays(scenario: Scenario, learner: str, expected: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
+    """Reads what a learner of this name starts from, by name; warns if another robot has learned it.
+
+    Args:
+        scenario: The scenario, whose `learned` names the file.
+        learner: One of mrctl's, or the name of the user's factory.
+        expected: Names and shapes of what it keeps of a robot.
+
+    Raises:
+        InputError: The file is missing, broken, or of another learner.
+    """
+    notes = notes_on(str(scenario.learned))
+    if (other := notes.get("learner", learner)) != learner:
+        raise InputError(f"learned: {scenario.learned} was learned by {other}, not by {learner}")
     own = scenario.robot.path
     if Path(robot := notes.get("robot", own)).name != Path(own).name:
         warnings.warn(f"learned: {scenario.learned} was learned on the robot {robot}, not on {own}", stacklevel=2)
-    arrays = read_arrays(str(scenario.learned), "learned", expected)
-    return np.concatenate([arrays[name].ravel() for name in expected])
+    return read_arrays(str(scenario.learned), "learned", expected)

@@ -22,6 +22,7 @@ from mrctl.loop.courses import Courses, RestartingCourses, start_pose
 from mrctl.loop.events import Events
 from mrctl.loop.goals import Goals
 from mrctl.loop.hierarchy import Hierarchy
+from mrctl.loop.learned import LAYOUT
 from mrctl.loop.log import DIVERGED, Log
 from mrctl.loop.user_stages import StageError, UserEstimator, UserHierarchy, UserStage
 from mrctl.physics import hull, mjcf, tyres
@@ -274,7 +275,7 @@ class Simulation:
         self.sensors = Sensors([s.sensing for s in scenarios], [s.seed for s in scenarios], self.period)
         self.estimator = self._build_estimator(own_estimator)
         self.events = Events(scenarios, self.plant, self.hierarchy, self.period, self.preview)
-        self.log = Log(1 if restarting else self.ticks, size)
+        self.log = Log(1 if restarting else self.ticks, size, self.hierarchy.rigid)
         self.goals = Goals(scenarios, timed=not restarting)
         self._failure_time = np.full(size, np.nan)
         self._learned: dict[int, Array] = {}  # what each robot had adapted when its run ended, flat
@@ -453,10 +454,21 @@ class Simulation:
 
     def _keep_learned(self, rows: Sequence[int]) -> None:
         """Keeps what robots have learned at their ends, for their learners go on in the batch."""
-        stage = self.hierarchy.learner
         if rows:
-            learned = stage.adapted() if isinstance(stage, Learner) else np.zeros((self.plant.size, 0))
+            learned = self._adapted()
             self._learned |= {row: learned[row].copy() for row in rows}
+
+    def _adapted(self) -> Array:
+        """Returns what the learners have adapted, as `Hierarchy.adapted`; a stage that cannot say it fails all runs."""
+        try:
+            return self.hierarchy.adapted()
+        except StageError as error:
+            assert isinstance(self.hierarchy, UserHierarchy)
+            for row in np.flatnonzero(~self.plant.failed).tolist():
+                self.plant.fail(row, str(error))
+                self._failure_time[row] = self.tick * self.period
+            width = sum(int(np.prod(shape)) for shape in self.hierarchy.shapes.values())
+            return np.full((self.plant.size, width), np.nan)
 
     def result(self) -> xr.Dataset:
         """Returns the signals so far or, once every run has ended, those of the whole time, with NaN after the ends."""
@@ -472,19 +484,24 @@ class Simulation:
         if self.estimator.scanner:
             scanned["scanned"] = "run", np.ones(size, bool), {"long_name": "whether its lidar scanned"}
         faults = {name: ("run", np.array(texts, object)) for name, texts in self.faults.items()}
-        return found.assign(
-            self._coefficients() | self._clearance(length) | scanned | faults | self._constants() | self._gains()
-        )
+        extra = self._coefficients() | self._layout() | self._clearance(length) | scanned | faults
+        return found.assign(extra | self._constants() | self._gains())
 
     def _weights(self) -> Array | None:
         """Returns what each robot has learned, as of its end if it has ended, flat; None if nothing is learned."""
-        stage = self.hierarchy.learner
-        learned = stage.adapted() if isinstance(stage, Learner) else np.zeros((0, 0))
+        learned = self._adapted()
         if not learned.size:
             return None
         for row, kept in self._learned.items():
             learned[row] = kept
         return learned
+
+    def _layout(self) -> dict[str, Any]:
+        """Variable `LAYOUT`, where a feedforward of the user keeps what it learns."""
+        if not (isinstance(self.hierarchy, UserHierarchy) and self.hierarchy.own_learner):
+            return {}
+        text = json.dumps({"learner": self.hierarchy.own_learner, "shapes": self.hierarchy.shapes})
+        return {LAYOUT: ("run", np.array([text] * len(self.scenarios), object))}
 
     def _coefficients(self) -> dict[str, Any]:
         """Variables with the coefficients of `parameters`, where the learner has some."""

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from mrctl.control.stages import METHODS, Stages
 from mrctl.loop.simulation import Simulation
+from mrctl.loop.user_stages import StageError
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
@@ -122,6 +123,12 @@ def _factory(part: Part) -> Any:  # noqa: ANN401
     return factory
 
 
+def without_learned(name: str, scenario: Scenario) -> Scenario:
+    """Returns the scenario without the file that a feedforward of this name starts from, which no other can read."""
+    own = any(part.stage == "feedforward" for part in parts(name))
+    return scenario.model_copy(update={"learned": None}) if own else scenario
+
+
 def trial(name: str, scenario: Scenario) -> None:
     """Tries factories and stages on two robots for three ticks, before a long computation.
 
@@ -129,10 +136,10 @@ def trial(name: str, scenario: Scenario) -> None:
         InputError: The name is refused, as by `load`; the scenario is refused; or the controller fails.
     """
     stages = load(name)
-    Simulation([scenario])  # an error of the scenario is not blamed on the controller
+    Simulation([without_learned(name, scenario)])  # an error of the scenario is not blamed on the controller
     try:
         simulation = Simulation([scenario, scenario], **stages)
-    except InputError as error:
+    except StageError as error:
         raise InputError(f"controller: {error}") from None
     for _ in range(min(3, simulation.ticks)):
         simulation.step()

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mrctl.control.feedforward import Learner
 from mrctl.control.kanayama import posture_error
 from mrctl.control.pid import pid
 from mrctl.control.stages import METHODS, Factory
 from mrctl.kernel import Array, Rows, kernel, over_rows
 from mrctl.loop.hierarchy import Hierarchy, apply_voltages, command_motion, hand_over, request_motion
+from mrctl.loop.learned import load_arrays
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.sensing.estimators import Estimator
@@ -35,6 +37,7 @@ class UserStage:
 
     Attributes:
         stage: The user's object.
+        name: Name of its factory, without settings.
         title: Names of the stage and of its factory, for messages.
     """
 
@@ -52,7 +55,8 @@ class UserStage:
         """
         if name not in METHODS:
             raise StageError(f"{name}: no such stage; there are {', '.join(METHODS)}")
-        self.title = f"{name} {getattr(factory, '__name__', type(factory).__name__)}"
+        called = getattr(factory, "__name__", type(factory).__name__)
+        self.name, self.title = called.partition("(")[0], f"{name} {called}"
         self._size = size
         try:
             self.stage: Any = factory(robot, size)
@@ -79,8 +83,7 @@ class UserStage:
             StageError: The method raised.
         """
         try:
-            answer = getattr(self.stage, method)(*values)
-            return answer.detach() if hasattr(answer, "detach") else answer
+            return _plain(getattr(self.stage, method)(*values))
         except Exception as error:  # noqa: BLE001
             raise self._raised(error) from error
 
@@ -92,25 +95,51 @@ class UserStage:
         """
         return self.checked(self.call("output", *values), (self._size, 2), "output")
 
+    def adapted(self) -> dict[str, Array]:
+        """Calls the method `adapted`, which returns arrays by name, with one row for each robot; nothing without it.
+
+        Raises:
+            StageError: The method raised, or returned something else.
+        """
+        if not callable(getattr(self.stage, "adapted", None)):
+            return {}
+        answer = self.ask("adapted")
+        if not isinstance(answer, Mapping) or not all(isinstance(name, str) for name in answer):
+            raise StageError(f"{self.title}: `adapted` returns {type(answer).__name__}, not a dict of arrays by name")
+        found = {name: self._array(_plain(array)) for name, array in answer.items()}
+        for name, array in found.items():
+            if array.shape[:1] != (self._size,):
+                rows = f"expected one row for each of {self._size} robots"
+                raise StageError(f"{self.title}: {name} of `adapted` is shape {array.shape}, {rows}")
+        return found
+
     def checked(self, answer: object, shape: tuple[int, ...], what: str) -> Array:
         """Returns an answer of the user's stage as an array of float64.
 
         Raises:
             StageError: The answer has another shape, or is not an array of numbers.
         """
-        try:
-            array = np.asarray(answer, float)
-        except Exception as error:  # noqa: BLE001
-            raise self._raised(error) from error
+        array = self._array(answer)
         if answer is None or array.shape != shape:
             found = "nothing" if answer is None else f"shape {array.shape}"
             raise StageError(f"{self.title}: {what} is {found}, expected shape {shape}")
         return array
 
+    def _array(self, answer: object) -> Array:
+        try:
+            return np.asarray(answer, float)
+        except Exception as error:  # noqa: BLE001
+            raise self._raised(error) from error
+
     def _raised(self, error: Exception) -> StageError:
         frames = traceback.extract_tb(error.__traceback__)[1:2]  # the line of the stage's own method
         place = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})" for frame in frames)
         return StageError(" ".join(f"{self.title}: {type(error).__name__}: {error}{place}".split()))
+
+
+def _plain(answer: Any) -> Any:  # noqa: ANN401
+    """Returns an answer without the gradients of torch."""
+    return answer.detach() if hasattr(answer, "detach") else answer
 
 
 @kernel
@@ -153,6 +182,7 @@ class UserHierarchy(Hierarchy):
         faults: As for `Hierarchy`, and a message for each robot for which a stage returned a number that is not finite,
             except for those whose guard replaces the feedforward.
         feedforward_faults: For each robot the message of the first tick at which its guard did so, or "".
+        shapes: Names of what the user's feedforward keeps, and their shapes for one robot.
     """
 
     def __init__(self, scenarios: Sequence[Scenario], robot: Robot, stages: dict[str, UserStage]) -> None:
@@ -170,6 +200,11 @@ class UserHierarchy(Hierarchy):
         for name in (name for stage in stages for name in REPLACED.get(stage, ())):
             self.gains[name][:] = np.nan
         self.feedforward_faults = [""] * len(scenarios)
+        self.shapes: dict[str, tuple[int, ...]] = {}
+        if keeper := self._keeper:
+            self.shapes = {name: array.shape[1:] for name, array in keeper.adapted().items()}
+            self._learned = {row: self._load(keeper, s) for row, s in enumerate(scenarios) if s.learned}
+            self._adopt(range(len(scenarios)))
 
     def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
         """Bumpless start; see `Hierarchy.reset`."""
@@ -357,7 +392,48 @@ class UserHierarchy(Hierarchy):
         if self._feedforward_stage is None:
             return super().restore(rows)
         self._feedforward_stage.call("restore", rows)
+        self._adopt(rows.tolist())
         return True
+
+    @property
+    def _keeper(self) -> UserStage | None:
+        """The user's feedforward, if it is no learner of mrctl, whose own methods keep what it adapts."""
+        return None if isinstance(self.learner, Learner) else self._feedforward_stage
+
+    @property
+    def own_learner(self) -> str:
+        """Name of the user's feedforward if it keeps what it learns, else ""."""
+        return self._keeper.name if self._keeper and self.shapes else ""
+
+    def adapted(self) -> Array:
+        """Returns what the learner of each robot has adapted, see `Hierarchy.adapted`, or the user's feedforward.
+
+        Raises:
+            StageError: The stage raised, or returned other names or shapes than at the start.
+        """
+        stage, size = self._keeper, len(self.state)
+        if stage is None:
+            return super().adapted()
+        arrays = stage.adapted()
+        if (shapes := {name: array.shape[1:] for name, array in arrays.items()}) != self.shapes:
+            raise StageError(f"{stage.title}: `adapted` has shapes {shapes} a robot, at the start {self.shapes}")
+        return np.concatenate([np.zeros((size, 0)), *(arrays[name].reshape(size, -1) for name in self.shapes)], axis=1)
+
+    def _load(self, stage: UserStage, scenario: Scenario) -> dict[str, Array]:
+        """Reads what the user's feedforward starts from for one robot."""
+        if not self.shapes or not callable(getattr(stage.stage, "adopt", None)):
+            raise InputError(f"learned: {stage.name} cannot start from a file without the methods adapted and adopt")
+        return load_arrays(scenario, stage.name, self.shapes)
+
+    def _adopt(self, rows: Iterable[int]) -> None:
+        """Lets the learners of these robots, or the user's feedforward, start from the files of their scenarios."""
+        stage = self._keeper
+        if stage is None:
+            super()._adopt(rows)
+            return
+        for row in rows:
+            if row in self._learned:
+                stage.ask("adopt", row, {name: array.copy() for name, array in self._learned[row].items()})
 
     def _finite_rows(self, stage: UserStage, answer: Array) -> Array:
         """Returns an answer with zeros in the rows that are not finite, and notes these robots in `faults`."""

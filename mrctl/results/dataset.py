@@ -76,7 +76,10 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "voltage_right": ("V", "right commanded voltage"),
     "steering_command": ("rad", "commanded steering angle"),
     "steering_rate_command": ("rad/s", "commanded steering rate"),
-    "saturated": ("1", "whether a limit acted"),
+    "saturated": (
+        "1", "whether a limit acted on the sum of feedback and feedforward: that of the supply, of the driver's "
+        "current or, with `rigid` steering, of the steering angle",
+    ),
     "weight_norm": ("1", "size of what the feedforward has learned"),
     "current_left": ("A", "left motor current"),
     "current_right": ("A", "right motor current"),
@@ -87,7 +90,13 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "z": ("m", "height of the middle between the driven wheels"),
     "roll_angle": ("rad", "roll, positive to the right; after heading and pitch, about the robot's own axis"),
     "pitch_angle": ("rad", "pitch, positive nose down; after the heading"),
-}
+    "feedforward_limited": (
+        "1", "whether prior and learner ask for more than the supply (or, with `rigid` steering, than the largest "
+        "rotation velocity), to which the guard limits them before the feedback is added",
+    ),
+    "motor_voltage_left": ("V", "voltage at the left motor, after delay, dead zone, driver, battery and current limit"),
+    "motor_voltage_right": ("V", "voltage at the right motor"),
+}  # fmt: skip
 
 # Variables with the gains of each run at its start, before any event: name: (unit, meaning). `k_p` and `k_i` have the
 # dimensions run and channel, common and second; a steering channel (`rigid`) has K_p without unit and K_i in 1/s.
@@ -113,7 +122,9 @@ WHOLE = (
 WHOLE_BEFORE_0_10_2 = "all_chunks"  # the same without their names
 CHECKSUMS = "checksums"  # attribute of a saved result: what `_checksums` returns; older results lack it
 CODECS = {"bytes", "vlen-utf8", "zstd", "blosc", "crc32c", "sharding_indexed"}  # all that mrctl ever wrote
-ADDED = ("z", "roll_angle", "pitch_angle", "retunes")  # signals that results of older versions lack
+ADDED = (  # signals that results of older versions lack
+    "z", "roll_angle", "pitch_angle", "retunes", "feedforward_limited", "motor_voltage_left", "motor_voltage_right",
+)  # fmt: skip
 
 TICK = np.dtype([(name, "f8") for name in SIGNALS])  # the signals of one robot at one control tick
 

@@ -36,7 +36,7 @@ METRICS: dict[str, tuple[str, str]] = {
     "omega_itae": ("rad s", "integral of the absolute rotation velocity error times the time since the lap began"),
     "feedback_share": ("1", "RMS feedback voltage over RMS voltage"),
     "voltage_variation": ("V", "total variation of the voltage, both wheels"),
-    "saturation_time": ("s", "time in saturation"),
+    "saturation_time": ("s", "time in which a limit acts on the sum of feedback and feedforward; see `saturated`"),
     "energy": ("J", "electrical energy"),
     "weight_norm": ("1", "norm of the learner's weights at the end of the lap"),
     "guard_actions": ("1", "times the guard on the learner stepped in"),

@@ -141,7 +141,7 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
     refusals: list[InputError] = []
     for scenario in filter(None, map(sweep.valid, range(min(sweep.size, TRIED)))):
         try:
-            Simulation([scenario])
+            Simulation([user_files.without_learned(sweep.controller, scenario) if sweep.controller else scenario])
         except InputError as error:  # the draws of one run say nothing about the others
             refusals.append(error)
             continue

@@ -74,7 +74,7 @@ def test_transfer(name, files):
 def test_refused(files, tmp_path):
     """A learner that keeps nothing, another learner's file, several runs, a user's stage: one line that says which."""
     with pytest.raises(InputError, match="^learned: the learner indi keeps nothing that a run could start from$"):
-        Scenario.from_dict({"prior": "model", "learner": "indi", "learned": "x.safetensors"})
+        Simulation([BASE.model_copy(update=FEEDFORWARDS["model+indi"] | {"learned": "x.safetensors"})])
     with pytest.raises(InputError, match=r"^learned: .*fel\.safetensors was learned by fel, not by rls$"):
         Simulation([BASE.model_copy(update={"learner": "rls", "learned": files["fel"][0]})])
     other = BASE.replace(robot="racecar", reference=Circle(radius=1.5, period=8.0), learned=files["fel"][0])
@@ -82,7 +82,7 @@ def test_refused(files, tmp_path):
         Simulation([other])
     with pytest.raises(InputError, match="^run: 2 runs; choose one"):
         mrctl.save_learned(tmp_path / "x", mrctl.simulate([BASE.model_copy(update={"laps": 1})] * 2))
-    with pytest.raises(InputError, match="^learned: the run has no learner of mrctl"):
+    with pytest.raises(InputError, match="^learned: no learner of the run keeps anything"):
         mrctl.save_learned(tmp_path / "x", mrctl.simulate(BASE.model_copy(update={"learner": "none", "laps": 1})))
     assert set(KEPT) == {"observer", "l1", "rls", "mrac", "composite"}
 

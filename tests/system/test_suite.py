@@ -403,6 +403,43 @@ def test_controller_joins(whole: Path, tmp_path: Path) -> None:
     assert content(whole)["runs/rls/runs.parquet"] == content(out)["runs/rls/runs.parquet"]
 
 
+@pytest.mark.usefixtures("plain")
+def test_controller_with_the_model(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """With `model+` in front it adds to the nominal model, as with that prior in `simulate`; the page repeats that."""
+    file, out = tmp_path / "mine.py", tmp_path / "suite"
+    file.write_text(GAIN.replace("command * self.gain", "0.2 * command * self.gain"))
+    words = ["suite", "--feedforward", "none", "--seeds", "2", "--random", "0", "--workers", "1", "--out", str(out)]
+    assert cli.main([*words, "--controller", f"{file}:Gain", f"model+{file}:Gain"]) == 0
+    table = json.loads((out / "table.json").read_text())
+    found = {r["feedforward"]: r["v_rmse"]["value"] for r in table["rows"] if r["case"] == "all"}
+    namespace: dict = {}
+    exec(file.read_text(), namespace)
+    scenarios = next(case.scenarios for case in tiny("core", 2, 0) if case.name == "all")
+    for name, prior in (("Gain", "none"), ("model+Gain", "model")):
+        runs = mrctl.simulate([s.replace(prior=prior) for s in scenarios], feedforward=namespace["Gain"])
+        assert set(runs.feedforward.values) == {name}
+        assert found[name] == pytest.approx(mrctl.summary(runs)["v_rmse"].mean(), rel=1e-12)
+    assert found["model+Gain"] != found["Gain"]
+    assert f"--controller {file}:Gain model+{file}:Gain" in (out / "report.html").read_text()
+    nothing = refused(capsys, arguments(tmp_path / "no", "--controller", f"model+motion={file}:Gain"))
+    assert "has model+ in front, but no feedforward that adds to the model" in nothing
+
+
+def test_columns_say_what_they_are(whole: Path) -> None:
+    """A share of runs has its interval explained, in the same words on the page and in Markdown, also of few draws."""
+    row = next(r for r in json.loads((whole / "table.json").read_text())["rows"] if r["case"] == "random")
+    won = row["position_rmse"]["beats_model"]
+    assert (won["low"], won["high"]) == pytest.approx(  # of the share in position, not of an error
+        stats.binomtest(won["wins"], 3).proportion_ci(method="wilson"), rel=1e-9
+    )
+    title = "share of runs below model: V / θ̇ / position [interval of position]"
+    meaning = "the brackets hold the 95 % interval of the share for position"
+    shown, page = (whole / "table.md").read_text(), Page((whole / "report.html").read_text()).words
+    assert title in shown and title in page and meaning in shown and meaning in page
+    bounds = f"[{won['low']:.2f}, {won['high']:.2f}]"
+    assert bounds in shown and bounds in page
+
+
 def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """A cell counts where the mean is no more than the rival's and the floor; each time it is driven is kept."""
     monkeypatch.setattr(held_out, "courses", lambda: {"circle": mrctl.Circle(radius=0.5, period=LAP)})
@@ -430,6 +467,10 @@ def test_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
         changes = (abs(differences[2, p] - differences[1, p]) for p in plants)
         assert row["floor"]["difference"] >= max(changes) * (1 - 1e-9)
         assert row["at_or_below"] == (differences[1, row["plant"]] <= row["floor"]["difference"])
+    (tmp_path / "mine.py").write_text(GAIN)
+    own = [*words[:1], "--held-out", f"model+{tmp_path}/mine.py:Gain", *words[3:-1], str(tmp_path / "own")]
+    assert cli.main(own) == 0
+    assert "at or below model" in capsys.readouterr().out and (tmp_path / "own" / "runs" / "model+Gain").is_dir()
     assert "is neither one of none, model+indi" in refused(capsys, ["suite", "--held-out", "model"])
     assert "one of --quick" in refused(capsys, ["suite", "--held-out", "fel", "--quick"])
     assert "names the one feedforward" in refused(capsys, ["suite", "--held-out", "fel", "--feedforward", "rls"])

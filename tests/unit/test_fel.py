@@ -407,6 +407,20 @@ def test_save_refused(tmp_path):
         save_weights(tmp_path / "nowhere" / "weights.safetensors", trained())
 
 
+@pytest.mark.parametrize(
+    ("given", "kind"),
+    [
+        (np.zeros((1, 62)), r"shape \(1, 62\)"), (np.zeros(61), r"shape \(61,\)"), (np.zeros(18), r"shape \(18,\)"),
+        (1.0, r"shape \(\)"), ("weights", "type str"), ({"hidden.bias": np.zeros(4)}, "type dict"),
+    ],
+)  # fmt: skip
+def test_no_weights(tmp_path, given, kind):
+    """What is no flat vector of weights, such as that of a batch or of another learner, is one line and no file."""
+    with pytest.raises(InputError, match=f"^weights: {kind} is not the flat weights of fel") as refused:
+        save_weights(tmp_path / "w.safetensors", given)
+    assert "\n" not in str(refused.value) and not (tmp_path / "w.safetensors").exists()
+
+
 def test_safetensors_names(tmp_path):
     """The file holds the layers by their torch names, for others to read."""
     save_weights(tmp_path / "w.safetensors", trained())
