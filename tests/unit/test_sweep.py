@@ -212,11 +212,11 @@ def test_draws_beyond_the_range_are_that_run_s_own():
 
 
 def test_chunk_is_a_function_of_the_file():
-    """64 runs, fewer where their signals would not fit in memory, or what the file says."""
-    assert sweep().chunk_size == 64
-    assert sweep(base={**BASE, "laps": 4000}).chunk_size < 4
+    """64 of many runs, fewer of few or where their signals would not fit in memory, or what the file says."""
+    assert [sweep(runs=n).chunk_size for n in (1, 20, 127, 128, 300, 1023, 1024, 10**6)] == [4, 4, 4, 8, 16, 32, 64, 64]
+    assert sweep(runs=10**6, base={**BASE, "laps": 4000}).chunk_size < 4
     assert sweep(chunk=5).chunk_size == 5
-    long = sweep(base={"laps": 100})
+    long = sweep(base={"laps": 100}, runs=10**6)
     assert long.chunk_size * long.base.ticks * len(SIGNALS) * 8 <= 2**27
 
 
