@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ast
 import contextlib
-import difflib
 import inspect
 import io
 import json as jsonlib
@@ -28,7 +27,7 @@ import pydantic
 import tyro
 
 from mrctl import __version__
-from mrctl.record import InputError, Record, printable, reading
+from mrctl.record import InputError, Record, nearest, printable, reading
 from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.sensing.tiers import LAB, TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -298,8 +297,8 @@ def _one_line(box: str, command: str) -> str:
             flag = line.split()[0] if line.startswith("--") else flag
             if line.startswith(f"in mrctl {command} "):
                 similar.append(flag)
-        nearest = difflib.get_close_matches(match[1], similar, 1)
-        return f"no flag is called {match[1]}" + (f"; did you mean {nearest[0]}?" if nearest else "")
+        meant = nearest(match[1], similar)
+        return f"no flag is called {match[1]}" + (f"; did you mean {meant}?" if meant else "")
     if match := re.match(r"Unrecognized or misplaced options: (\S+) \(applied to mrctl (\S+)( \S+)?\)", text):
         if match[3]:
             return f"{match[1]}: is no flag of{match[3]}, and those of mrctl {match[2]} stand before it"
