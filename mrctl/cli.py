@@ -136,6 +136,22 @@ def _check_world(world: str, robot: RobotFile = CAR) -> None:
         robot_path(robot)
 
 
+def _warn_if_impossible(scenario: Scenario) -> None:
+    """Says on stderr before a run if no robot could have a number of its file; mrctl's own robots need no check."""
+    from mrctl.physics.files import SHIPPED
+
+    file = scenario.robot.path if scenario.robot != CAR else scenario.world
+    if file in SHIPPED or not file.endswith(".xml"):
+        return
+    from mrctl.checks.examination import impossible
+    from mrctl.loop.simulation import arranged
+    from mrctl.physics.mjcf import load
+
+    scenario = arranged(scenario)
+    for cause in impossible(load(scenario.world, scenario.steering, robot=scenario.robot)):
+        print(f"mrctl: {printable(f'{file}: {cause.cause}: {cause.text}; see mrctl check {file}')}", file=sys.stderr)
+
+
 def _check_exists(file: Path) -> None:
     """Refuses a file or folder that does not exist, before what reads it is imported."""
     with reading(file):
@@ -428,7 +444,9 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         announced_early()
         from mrctl.experiments import single
 
-        text, failure = single.run(_suited(scenario, arguments, scenario_file), out, json, controller)
+        scenario = _suited(scenario, arguments, scenario_file)
+        _warn_if_impossible(scenario)
+        text, failure = single.run(scenario, out, json, controller)
         _report(text, out, json)
         if failure:
             raise _Incomplete(f"the run failed {failure}")
@@ -514,6 +532,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         if ":" not in world and not Path(world).is_file():
             raise InputError(f"world: no file {world}; mrctl navigate --help names the generators, such as doorway:3")
         _check_world(chosen.world, chosen.robot)
+        _warn_if_impossible(chosen)
         if view:
             from mrctl.navigation.mission import task_of
             from mrctl.viewer import view as viewing
