@@ -111,6 +111,16 @@ def test_paired(paired):
     assert len(set(itertools.chain(*seen.values()))) == (8 if paired else 24)
 
 
+def test_one_value_of_a_paired_axis_draws_the_same():
+    """So the sweep of a user's controller is comparable with that of built-in learners."""
+    found = []
+    for values in (["none", "fel"], ["none"]):
+        rows = drawn(sweep({**LAWS, "values": values, "paired": True}, MASS, runs=4))
+        found.append([(row["seed"], row[MASS["field"]]) for row in rows])
+    both, one = found
+    assert one == both[:4] == both[4:]
+
+
 @pytest.mark.parametrize(
     ("kind", "parameters", "expected"),
     [
