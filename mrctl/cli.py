@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ast
 import contextlib
-import difflib
 import inspect
 import io
 import json as jsonlib
@@ -28,7 +27,7 @@ import pydantic
 import tyro
 
 from mrctl import __version__
-from mrctl.record import InputError, Record, printable, reading
+from mrctl.record import InputError, Record, nearest, printable, reading
 from mrctl.scenario import COMPARED, FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.sensing.tiers import LAB, TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -135,6 +134,22 @@ def _check_world(world: str, robot: RobotFile = CAR) -> None:
     world_path(world)
     if robot != CAR:
         robot_path(robot)
+
+
+def _warn_if_impossible(scenario: Scenario) -> None:
+    """Says on stderr before a run if no robot could have a number of its file; mrctl's own robots need no check."""
+    from mrctl.physics.files import SHIPPED
+
+    file = scenario.robot.path if scenario.robot != CAR else scenario.world
+    if file in SHIPPED or not file.endswith(".xml"):
+        return
+    from mrctl.checks.examination import impossible
+    from mrctl.loop.simulation import arranged
+    from mrctl.physics.mjcf import load
+
+    scenario = arranged(scenario)
+    for cause in impossible(load(scenario.world, scenario.steering, robot=scenario.robot)):
+        print(f"mrctl: {printable(f'{file}: {cause.cause}: {cause.text}; see mrctl check {file}')}", file=sys.stderr)
 
 
 def _check_exists(file: Path) -> None:
@@ -298,8 +313,8 @@ def _one_line(box: str, command: str) -> str:
             flag = line.split()[0] if line.startswith("--") else flag
             if line.startswith(f"in mrctl {command} "):
                 similar.append(flag)
-        nearest = difflib.get_close_matches(match[1], similar, 1)
-        return f"no flag is called {match[1]}" + (f"; did you mean {nearest[0]}?" if nearest else "")
+        meant = nearest(match[1], similar)
+        return f"no flag is called {match[1]}" + (f"; did you mean {meant}?" if meant else "")
     if match := re.match(r"Unrecognized or misplaced options: (\S+) \(applied to mrctl (\S+)( \S+)?\)", text):
         if match[3]:
             return f"{match[1]}: is no flag of{match[3]}, and those of mrctl {match[2]} stand before it"
@@ -429,7 +444,9 @@ def _run_with(arguments: list[str]) -> Callable[..., None]:
         announced_early()
         from mrctl.experiments import single
 
-        text, failure = single.run(_suited(scenario, arguments, scenario_file), out, json, controller)
+        scenario = _suited(scenario, arguments, scenario_file)
+        _warn_if_impossible(scenario)
+        text, failure = single.run(scenario, out, json, controller)
         _report(text, out, json)
         if failure:
             raise _Incomplete(f"the run failed {failure}")
@@ -515,6 +532,7 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
         if ":" not in world and not Path(world).is_file():
             raise InputError(f"world: no file {world}; mrctl navigate --help names the generators, such as doorway:3")
         _check_world(chosen.world, chosen.robot)
+        _warn_if_impossible(chosen)
         if view:
             from mrctl.navigation.mission import task_of
             from mrctl.viewer import view as viewing

@@ -6,6 +6,7 @@ import contextlib
 import difflib
 import inspect
 import json
+import re
 import stat
 import textwrap
 import tomllib
@@ -248,8 +249,8 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
     if first["type"] == "extra_forbidden":
         *parents, name = first["loc"]
         known = [field for one in _records_at(record, parents) for field in one.model_fields]
-        nearest = difflib.get_close_matches(str(name), known, 1) or [one for one in known if name in one.split("_")]
-        message = f"there is no such field; did you mean {nearest[0]}?" if nearest else "there is no such field"
+        meant = nearest(str(name), known)
+        message = f"there is no such field; did you mean {meant}?" if meant else "there is no such field"
     if first["type"] in ("model_type", "model_attributes_type"):
         names = {one.named_by for one in _records_at(record, first["loc"])} - {""}
         message = ", or its ".join(["must be a record, or a table of its fields", *sorted(names)])
@@ -260,6 +261,22 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
         message = f"must be a list{tables}"
     more = f" (and {len(rest)} more)" if rest else ""
     return printable(": ".join(part for part in (source, field, message) if part) + more)
+
+
+def nearest(name: str, known: Sequence[str]) -> str | None:
+    """Returns the known field or flag for which a name that nobody knows probably stands; None if it is like no other.
+
+    Those that begin with the name come first, then those of the same record with a word that does, as `friction` of
+    `drive_friction_factor`, and then those of similar letters.
+    """
+    record, dot, last = name.rpartition(".")
+    begun = [one for one in known if one.startswith(name)]
+    inside = [
+        one for one in known
+        if one.startswith(record + dot) and any(w.startswith(last) for w in re.split("[._-]", one.removeprefix(record)))
+    ]  # fmt: skip
+    found = difflib.get_close_matches(name, begun or inside or known, 1, cutoff=0.0 if begun or inside else 0.6)
+    return found[0] if found else None
 
 
 def _records_at(record: type[Record] | None, path: Sequence[int | str]) -> list[type[Record]]:

@@ -29,6 +29,7 @@ from mrctl.checks.catalogue import CHECKS, Check
 from mrctl.checks.comparison import Comparison, Report, compare
 from mrctl.checks.inspections import Suspect, suspects
 from mrctl.checks.open_loop import ended, limited
+from mrctl.checks.plausibility import units
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.units import bounds, mistake
 from mrctl.record import InputError
@@ -171,6 +172,12 @@ class Examination:
             return []
 
 
+def impossible(model: mujoco.MjModel) -> tuple[Explanation, ...]:
+    """Returns the cause for which a robot fails the check `units`, by arithmetic; nothing for one that passes it."""
+    report = units(model, read_robot(model))
+    return () if _passes(report) else _impossible(model, report)
+
+
 def _impossible(model: mujoco.MjModel, report: Report) -> tuple[Explanation, ...]:
     """Names what makes a robot impossible, or the quantity in a wrong unit, by arithmetic instead of a drive."""
     found = mistake(model, read_robot(model))
@@ -181,7 +188,8 @@ def _impossible(model: mujoco.MjModel, report: Report) -> tuple[Explanation, ...
         text = f"{value}, that of a robot {low:.3g} to {high:.3g}"
         return (Explanation("impossible number", text, ""),)
     worst = min(bounds(found.robot), key=lambda bound: bound.margin)
-    return (Explanation("wrong unit", found.text, f"{worst.quantity}: {worst.value:.3g} {worst.unit}".strip()),)
+    evidence = f"{worst.quantity}: {worst.value:.3g} {worst.unit}".strip() if worst.margin > 0 else ""
+    return (Explanation("wrong unit", found.text, evidence),)
 
 
 def excess(comparison: Comparison) -> float:

@@ -17,9 +17,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mrctl.checks.open_loop import Car, is_steered, rolling_wheels
+from mrctl.checks.open_loop import Car, caster_gaps, is_steered, rolling_wheels
 from mrctl.kernel import Array
-from mrctl.physics.elements import MOTORS, REAR, fronts
+from mrctl.physics.elements import MOTORS, REAR, fronts, part
 from mrctl.physics.mjcf import steerings
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.units import reaches_limits, sufficient_gears
@@ -165,6 +165,22 @@ def _heights(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
         if abs(gap) > 1e-2 * robot.wheel_radius
     }
     return _suspect("wheel radius against axle height", odd, "correct a radius or the height of an axle", level)
+
+
+def _casters(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
+    def move(m: mujoco.MjModel, caster: Part) -> list[Assignment]:
+        data, down = mujoco.MjData(m), np.array((0.0, 0.0, -gaps[caster]))
+        mujoco.mj_kinematics(m, data)
+        position = m.geom_pos[caster]
+        return [(position, position + data.xmat[m.geom_bodyid[caster]].reshape(3, 3).T @ down)]
+
+    gaps = caster_gaps(model)
+    odd = {
+        caster: f"{part(model, caster)} ends {1e3 * abs(gap):.3g} mm {'above' if gap > 0 else 'below'} the rear wheels"
+        for caster, gap in gaps.items()
+        if abs(gap) > 1e-2 * robot.wheel_radius
+    }
+    return _suspect("caster off the floor", odd, "correct its height or its size, or the height of the axle", move)
 
 
 def _radii(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
@@ -505,7 +521,7 @@ def _degrees(model: mujoco.MjModel, robot: Robot) -> Suspect | None:
 
 
 INSPECTIONS = (
-    _edges, _centres, _axles, _places, _heights, _radii,
+    _edges, _centres, _axles, _places, _heights, _casters, _radii,
     _motors, _armature, _constant, _gear, _drag, _losses, _creep,
     _balance, _wheel_inertia, _gravity,
     _missing_contacts, _other_contacts, _condim, _grip, _short_contacts, _soft_contacts,

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mrctl.kernel import Array, Rows
-from mrctl.physics.elements import MOTORS, REAR, fronts, has, rolling_fronts
+from mrctl.physics.elements import MOTORS, REAR, bottom, fronts, has, rolling_fronts
 from mrctl.physics.mjcf import clone
 from mrctl.physics.perturb import perturb
 from mrctl.physics.readout import READING, addresses, inputs, read_all
@@ -233,6 +233,24 @@ def is_steered(model: mujoco.MjModel) -> bool:
 def rolling_wheels(model: mujoco.MjModel) -> list[str]:
     """Returns the names of all wheels that turn on a joint: the two driven ones, and those in front that roll."""
     return [*REAR, *rolling_fronts(model)]
+
+
+def caster_gaps(model: mujoco.MjModel) -> dict[int, float]:
+    """Returns how high casters end above the floor of the driven wheels in m, by the index of the file's own geom.
+
+    The robot stands on another geom at the same place, which `mrctl.physics.adopt` made to reach the floor.
+    """
+    data, found = mujoco.MjData(model), {}
+    mujoco.mj_kinematics(model, data)
+    floor = float(np.mean([data.geom(wheel).xpos[2] - model.geom(wheel).size[0] for wheel in REAR]))
+    for caster in (model.geom(name).id for name in fronts(model) if name.startswith("caster")):
+        near = np.linalg.norm(data.geom_xpos - data.geom_xpos[caster], axis=1) < 1e-6
+        near &= model.geom_bodyid == model.geom_bodyid[caster]
+        near[caster] = False
+        if near.any():
+            own = min(map(int, np.flatnonzero(near)), key=lambda geom: bottom(model, data, geom))
+            found[own] = float(bottom(model, data, own)) - floor
+    return found
 
 
 def open_circuit(model: mujoco.MjModel) -> mujoco.MjModel:

@@ -13,23 +13,25 @@ import mujoco
 import numpy as np
 
 from mrctl.checks.comparison import Report, between, compare
-from mrctl.checks.open_loop import HOLD, OFF, Car, Log, on_skid, rolling_wheels
-from mrctl.physics.elements import MOTORS, REAR
+from mrctl.checks.open_loop import HOLD, OFF, Car, Log, caster_gaps, on_skid, rolling_wheels
+from mrctl.physics.elements import MOTORS, REAR, part
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.units import bounds
+from mrctl.physics.units import bounds, extent
 from mrctl.theory.dynamics import inverse_dynamics
 from mrctl.theory.robot import Robot
 
 
 def units(model: mujoco.MjModel, robot: Robot) -> Report:
     """No number is off by the orders of magnitude of a wrong unit; the bounds are those of `mrctl.physics.units`."""
-    return [between(b.quantity, b.value, b.low, b.high, b.unit) for b in bounds(read_robot(model))]
+    true = read_robot(model)
+    return [between(b.quantity, b.value, b.low, b.high, b.unit) for b in (*bounds(true), extent(model, true))]
 
 
 def stance(model: mujoco.MjModel, robot: Robot) -> Report:
-    """On level ground the robot stands level: the radii of its wheels fit the heights of its axles.
+    """On level ground the robot stands level: the radii of its wheels and casters fit the heights of their centres.
 
-    The tolerance of 0.5° is more than sinking tyres can cause, and less than a wrong radius causes.
+    The tolerance of 0.5° is more than sinking tyres can cause, and less than a wrong radius causes. A caster, which
+    mrctl makes reach the floor, may be off it by what tilts the robot by as much.
     """
     car = Car(model)
     car.drive(1.0, OFF)
@@ -38,7 +40,16 @@ def stance(model: mujoco.MjModel, robot: Robot) -> Report:
     return [
         compare("nose up", nose, 0.0, "°", absolute=0.5),
         compare("left side up", side, 0.0, "°", absolute=0.5),
+        *(
+            compare(f"{part(model, caster)} above the floor", 1e3 * gap, 0.0, "mm", absolute=1e3 * _tilted(robot))
+            for caster, gap in caster_gaps(model).items()
+        ),
     ]
+
+
+def _tilted(robot: Robot) -> float:
+    """Returns how far off the floor a caster is in m where the robot that stands on it is tilted by 0.5°."""
+    return abs(robot.wheelbase) * float(np.tan(np.radians(0.5)))
 
 
 def _to_its_limit(

@@ -76,7 +76,7 @@ class Tracking(control.Task):
 
     def before_step(self, action: Array, physics: Physics) -> None:
         """Applies the events, measures, and sends the commands of one control period; the action has shape `(2,)`."""
-        self.episodes.act(np.asarray(action, float))
+        self.episodes.act(action)
         self.episodes.send()
 
     def after_step(self, physics: Physics) -> None:

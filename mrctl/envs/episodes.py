@@ -226,9 +226,11 @@ class Episodes:
         """Sets the action of the coming tick, `(B, 2)`, or `(2,)` for one robot, times a scale.
 
         Raises:
-            InputError: It has another shape.
+            InputError: It has another shape, or holds no real numbers.
         """
-        size = self._action.shape
+        size, action = self._action.shape, np.asarray(action)
+        if not np.can_cast(action.dtype, float, "same_kind"):
+            raise InputError(f"action: holds {action.dtype.name}, and real numbers are expected")
         if (shape := np.shape(action)) != size and not (shape == (2,) and size == (1, 2)):
             raise InputError(f"action: has shape {shape}, and {size if size[0] > 1 else (2,)} is expected")
         self._action[:] = action * scale
@@ -279,7 +281,7 @@ class Episodes:
         add_squares.compiled(self.log.now, self._squares)
 
     def metrics(self, row: int) -> dict[str, float]:
-        """Returns the `EPISODE_METRICS` of a robot's episode so far, by name; NaN if the robot has failed."""
+        """Returns the `EPISODE_METRICS` of a robot's episode so far, by name; all NaN if the robot has failed."""
         means = self._squares[row] / (self.tick - self.start[row])
         return dict(zip(EPISODE_METRICS, np.sqrt(means).tolist(), strict=True))
 

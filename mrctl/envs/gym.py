@@ -123,10 +123,13 @@ class TrackingEnv(gymnasium.Env):
         Returns:
             Observation `(n,)`, reward, whether the robot has failed or arrived, whether the scenario is at its end, and
             a dictionary, which is empty before the end of the episode. Then it holds the `metrics`, and `failure` if
-            the robot has failed or arrived: the reason, or "" for an arrival.
+            the robot has failed or arrived: the reason, or "" for an arrival. The metrics of a failure are NaN.
+
+        Raises:
+            InputError: The action has another shape, or holds no real numbers.
         """
         loop = self.episodes
-        loop.act(np.asarray(action), loop.bound)
+        loop.act(action, loop.bound)
         with np.errstate(invalid="ignore", over="ignore"):
             loop.step()
             (seen,), (reward,) = loop.observe()
@@ -254,9 +257,12 @@ class TrackingVectorEnv(VectorEnv):
         Returns:
             Observations `(B, n)`, rewards `(B,)`, which robots have failed or arrived `(B,)`, which are at the end of
             their scenario `(B,)`, and a dictionary like that of `TrackingEnv`, of arrays `(B,)`.
+
+        Raises:
+            InputError: As for `TrackingEnv`.
         """
         loop, begun = self.episodes, np.flatnonzero(self._over)
-        loop.act(np.asarray(actions), loop.bound)
+        loop.act(actions, loop.bound)
         with np.errstate(invalid="ignore", over="ignore"):
             loop.step()
             for row in begun:

@@ -20,13 +20,12 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.physics.bounds import compiling
-from mrctl.physics.elements import FRONTS, MOTORS, NUMERICS, REAR, RIGID, has
+from mrctl.physics.elements import FRONTS, MOTORS, NUMERICS, PREFIX, REAR, RIGID, bottom, has, part
 from mrctl.physics.files import robot_path
 from mrctl.record import InputError
 from mrctl.theory.kinematics import UP
 from mrctl.theory.robot import RobotFile
 
-PREFIX = "robot/"  # put before each name of the robot's file that is not replaced
 LEVEL = 0.1  # share of the wheel radius: a caster this near to the floor touches it, and two this close are one
 HINGE = mujoco.mjtJoint.mjJNT_HINGE
 DCMOTOR = '<dcmotor joint="{}" gear="N" motorconst="k k" resistance="R" armature="J" ctrlrange="-U U"/>'
@@ -183,21 +182,41 @@ class _Adoption:
             if all(np.hypot(*(centre - other.centre)[:2]) > LEVEL * self.radius for other in casters):
                 caster, radius = self._contact(g, body.name, self._roller(body.name)), centre[2] - floor
                 if radius <= 0:
+                    depth = floor - self._bottom(g)
                     raise InputError(
-                        f"caster: the centre of the one on {body.name} is {-radius:.3g} m below the floor of the wheels"
+                        f"caster: {part(self.model, g)} ends {1e3 * depth:.4g} mm below the floor of the wheels, and "
+                        "its centre is not above it; correct its height, or that of the wheels"
                     )
                 casters.append(caster._replace(radius=radius))  # so that it touches the wheels' floor
         if not casters:
             track = np.linalg.norm(self.rear[0].centre - self.rear[1].centre)
             unit = f"; their radius is {self.radius:.4g} m: is it in mm or cm?" if self.radius > track else ""
             raise InputError(
-                f"caster: beside the driven wheels nothing reaches the floor, and nothing is steered{unit}"
+                "caster: beside the driven wheels nothing reaches the floor, and nothing is steered"
+                + (unit or self._gaps(float(floor)))
             )
         distances = [(caster.centre - self.origin) @ self.ahead for caster in casters]
         if len(casters) > 2 or min(distances) * max(distances) < 0:
             names = _listed([caster.body for caster in casters])
             raise InputError(f"caster: at most two, both ahead of the axle or both behind, not on {names}")
         return sorted(casters, key=lambda caster: -(caster.centre @ self.left))
+
+    def _gaps(self, floor: float) -> str:
+        """Returns how far the lowest part and the driven wheels are from the floor, the mean of these, as a clause."""
+        wheels = {wheel.body for wheel in self.rear}
+        others = [
+            g for g in range(self.model.ngeom)
+            if self.chassis in (line := self._ancestry(self.model.geom_bodyid[g])) and not wheels & set(line)
+        ]  # fmt: skip
+        lowest = min(others, key=self._bottom, default=None)
+        if lowest is None or not np.isfinite(gap := self._bottom(lowest) - floor):
+            return ""
+        text = f"; {part(self.model, lowest)} ends {1e3 * gap:.4g} mm above the floor of the wheels"
+        left, right = (wheel.centre[2] - wheel.radius for wheel in self.rear)
+        if abs(left - right) > 1e-6:
+            lower = self.wheels[int(right < left)]
+            text += f", of which that of joint {lower!r} is {1e3 * abs(left - right):.4g} mm lower than the other"
+        return text
 
     def _roller(self, body: str) -> str:
         """Returns the joint on which a caster's body rolls, a ball or a level hinge; empty where it slides."""
@@ -267,23 +286,7 @@ class _Adoption:
 
     def _bottom(self, geom: int) -> float:
         """Returns the height of the lowest point of a geom in m; infinite for one that cannot be a wheel."""
-        size, up = self.model.geom_size[geom], np.round(self.data.geom_xmat[geom].reshape(3, 3)[2], 6)
-        height, kind, shape = self.data.geom_xpos[geom][2], self.model.geom_type[geom], mujoco.mjtGeom
-        if kind == shape.mjGEOM_SPHERE:
-            return height - size[0]
-        if kind == shape.mjGEOM_CAPSULE:
-            return height - size[0] - size[1] * abs(up[2])
-        if kind == shape.mjGEOM_CYLINDER:
-            return height - size[0] * np.sqrt(max(0.0, 1 - up[2] ** 2)) - size[1] * abs(up[2])
-        if kind == shape.mjGEOM_ELLIPSOID:
-            return height - np.linalg.norm(up * size)
-        if kind == shape.mjGEOM_MESH:
-            mesh = self.model.mesh(self.model.geom_dataid[geom])
-            points = self.model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
-            return height + (points @ up).min()
-        if kind == shape.mjGEOM_BOX:
-            return height - np.abs(up) @ size
-        return np.inf
+        return bottom(self.model, self.data, geom)
 
     # -- changes -------------------------------------------------------------------------------------------------------
 

@@ -28,6 +28,9 @@ NUMERICS = {"no_load_current": 1, "limits": 4}
 COLLISION = "collision"
 """Name of the sensor that counts the contacts of a robot's hull with obstacles; only worlds with obstacles have it."""
 
+PREFIX = "robot/"
+"""Put before each name of the file of an adopted robot that is not replaced."""
+
 RIGID = "servo_steering"
 """Name of the text element in an adopted model whose steered wheels are held by servos."""
 
@@ -71,6 +74,40 @@ def centres(model: mujoco.MjModel, data: mujoco.MjData, wheels: Sequence[str]) -
     """
     chassis = data.body("chassis")
     return np.array([rounded(chassis.xmat.reshape(3, 3).T @ (data.geom(w).xpos - chassis.xpos)) for w in wheels])
+
+
+def part(model: mujoco.MjModel, geom: int) -> str:
+    """Returns the name that a geom has in its file, or its shape and its body where it has none."""
+    kind = mujoco.mjtGeom(int(model.geom_type[geom])).name.removeprefix("mjGEOM_").lower()
+    body = model.body(model.geom_bodyid[geom]).name.removeprefix(PREFIX) or "a body without a name"
+    return model.geom(geom).name.removeprefix(PREFIX) or f"the {kind} of {body}"
+
+
+def bottom(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    """Returns the height of the lowest point of a geom in m; infinite for one that cannot be a wheel or a caster.
+
+    Args:
+        model: Compiled model.
+        data: Its data, with kinematics computed.
+        geom: Index of the geom.
+    """
+    size, up = model.geom_size[geom], np.round(data.geom_xmat[geom].reshape(3, 3)[2], 6)
+    height, kind, shape = data.geom_xpos[geom][2], model.geom_type[geom], mujoco.mjtGeom
+    if kind == shape.mjGEOM_SPHERE:
+        return height - size[0]
+    if kind == shape.mjGEOM_CAPSULE:
+        return height - size[0] - size[1] * abs(up[2])
+    if kind == shape.mjGEOM_CYLINDER:
+        return height - size[0] * np.sqrt(max(0.0, 1 - up[2] ** 2)) - size[1] * abs(up[2])
+    if kind == shape.mjGEOM_ELLIPSOID:
+        return height - np.linalg.norm(up * size)
+    if kind == shape.mjGEOM_MESH:
+        mesh = model.mesh(model.geom_dataid[geom])
+        points = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
+        return height + (points @ up).min()
+    if kind == shape.mjGEOM_BOX:
+        return height - np.abs(up) @ size
+    return np.inf
 
 
 def rounded(length: Array) -> Array:

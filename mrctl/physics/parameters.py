@@ -21,7 +21,7 @@ from mrctl.physics.elements import (
     rolling_fronts,
     rounded,
 )
-from mrctl.physics.units import mistake
+from mrctl.physics.units import mistake, too_long
 from mrctl.record import InputError
 from mrctl.theory.robot import ANY_ANGLE, GRAVITY, Robot
 
@@ -59,7 +59,8 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
     no_load = model.numeric("no_load_current").data[0]
     load = load_torques(model, data)
     if min(load.values()) <= 0:
-        raise InputError("com_offset: the centre of mass must lie over the triangle of the wheels")
+        found = "com_offset: the centre of mass must lie over the triangle of the wheels"
+        raise InputError("; ".join(filter(None, (found, too_long(model, half_track)))))
     rolling = 0.0
     if front_wheels:
         losses = sum(model.joint(wheel).frictionloss[0] for wheel in front_wheels)
@@ -67,39 +68,40 @@ def read_robot(model: mujoco.MjModel, drive_gain: float = 1.0, scratch: mujoco.M
     drives = [model.joint(wheel).frictionloss[0] - rolling * load[wheel] for wheel in REAR]
     gear_loss = np.mean(drives) - gear * constant * no_load
     limits = model.numeric("limits").data
-    robot = Robot.from_dict(
-        {
-            "mass": masses.sum(),
-            "yaw_inertia": inertia,
-            "com_offset": com[0],
-            "com_height": com[2] + radius,
-            "wheel_radius": radius,
-            "front_wheel_radius": model.geom(fronts(model)[0]).size[0],
-            "half_track": half_track,
-            "wheelbase": wheelbase,
-            "trail": trail,
-            "steering_limit": model.joint("steering").range[1] if has(model, "joint", "steering") else ANY_ANGLE,
-            **_steering(model, data),
-            "resistance": resistance,
-            "inductance": _inductance(model),
-            "torque_constant": constant,
-            "gear_ratio": gear,
-            "rotor_inertia": model.actuator_armature[motor.id],
-            "no_load_current": no_load,
-            "gear_loss": max(0.0, gear_loss),
-            "rolling_coefficient": rolling,
-            "wheel_inertia": _spin_inertia(model, "wheel_left"),
-            "front_wheel_inertia": sum(_spin_inertia(model, wheel) for wheel in front_wheels),
-            "supply": model.actuator_ctrlrange[model.actuator_ctrladr[motor.id], 1],
-            "drive_gain": drive_gain,
-            "tyre_friction": model.pair_friction[left_tyre_pairs(model)[0], 0],
-            "max_speed": limits[0],
-            "max_rotation": limits[1],
-            "max_acceleration": limits[2],
-            "max_rotation_acceleration": limits[3],
-        },
-        "robot",
-    )
+    parameters = {
+        "mass": masses.sum(),
+        "yaw_inertia": inertia,
+        "com_offset": com[0],
+        "com_height": com[2] + radius,
+        "wheel_radius": radius,
+        "front_wheel_radius": model.geom(fronts(model)[0]).size[0],
+        "half_track": half_track,
+        "wheelbase": wheelbase,
+        "trail": trail,
+        "steering_limit": model.joint("steering").range[1] if has(model, "joint", "steering") else ANY_ANGLE,
+        **_steering(model, data),
+        "resistance": resistance,
+        "inductance": _inductance(model),
+        "torque_constant": constant,
+        "gear_ratio": gear,
+        "rotor_inertia": model.actuator_armature[motor.id],
+        "no_load_current": no_load,
+        "gear_loss": max(0.0, gear_loss),
+        "rolling_coefficient": rolling,
+        "wheel_inertia": _spin_inertia(model, "wheel_left"),
+        "front_wheel_inertia": sum(_spin_inertia(model, wheel) for wheel in front_wheels),
+        "supply": model.actuator_ctrlrange[model.actuator_ctrladr[motor.id], 1],
+        "drive_gain": drive_gain,
+        "tyre_friction": model.pair_friction[left_tyre_pairs(model)[0], 0],
+        "max_speed": limits[0],
+        "max_rotation": limits[1],
+        "max_acceleration": limits[2],
+        "max_rotation_acceleration": limits[3],
+    }
+    try:
+        robot = Robot.from_dict(parameters, "robot")
+    except InputError as error:
+        raise InputError("; ".join(filter(None, (str(error), too_long(model, half_track))))) from None
     if gear_loss < -1e-9:
         wrong = mistake(model, robot)
         reason = f"; {wrong.text}" if wrong else ""

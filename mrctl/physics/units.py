@@ -19,12 +19,13 @@ import mujoco
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.physics.elements import bodies_of
+from mrctl.physics.elements import REAR, bodies_of, fronts, part, rolling_fronts
 from mrctl.record import InputError
 from mrctl.theory.robot import ANY_ANGLE, GRAVITY, LIMITS, Robot
 
 RPM = 30 / math.pi  # rpm of 1 rad/s
 GYRATION = 0.05, 1.0  # least and largest radius of gyration over the size of a robot
+LONGEST = 20.0  # largest length of a part over the track of a robot
 LENGTHS = (
     "com_offset", "com_height", "wheel_radius", "front_wheel_radius", "half_track", "wheelbase", "trail",
 )  # fmt: skip
@@ -109,11 +110,46 @@ def bounds(robot: Robot) -> list[Bound]:
     return found
 
 
+def extent(model: mujoco.MjModel, robot: Robot) -> Bound:
+    """Returns the bound on the longest part beside the wheels, whose length is no parameter of equations (1) to (3)."""
+    name, length = _longest(model)
+    return Bound(f"length of {name} over the track", length / (2 * robot.half_track), 0, LONGEST, "")
+
+
+def too_long(model: mujoco.MjModel, half_track: float) -> str:
+    """Returns which part is too long for a robot, and the unit in which its size probably is; "" where none is.
+
+    Args:
+        model: The compiled model.
+        half_track: Half of its track in m. The wheelbase does not count, as such a part may be taken for a caster.
+    """
+    (name, length), track = _longest(model), 2 * half_track
+    if not length > LONGEST * track > 0:
+        return ""
+    unit = min(("mm", 1e3), ("cm", 1e2), key=lambda unit: abs(math.log(length / unit[1] / track)))[0]
+    return f"{name} is {length:,.4g} m long, which no part of such a robot is; is it in {unit}? It must be in m"
+
+
+def _longest(model: mujoco.MjModel) -> tuple[str, float]:
+    """Returns the name of the longest geom of a robot beside those of its wheels, and its length in m."""
+    wheels = {model.geom(wheel).bodyid[0] for wheel in (*REAR, *rolling_fronts(model))}
+    bodies, contacts = {*bodies_of(model)} - wheels, {model.geom(name).id for name in fronts(model)}
+    lengths = {
+        geom: 2 * float(model.geom_aabb[geom, 3:].max())
+        for geom in range(model.ngeom)
+        if model.geom_bodyid[geom] in bodies and geom not in contacts
+    }
+    if not lengths:
+        return "chassis", 0.0
+    longest = max(lengths, key=lambda geom: lengths[geom])
+    return part(model, longest), lengths[longest]
+
+
 def mistake(model: mujoco.MjModel, robot: Robot) -> Mistake | None:
     """Finds the quantity whose conversion to another unit makes an impossible robot possible.
 
-    Of several candidates a gear of 1 that was left out comes first, then the one with the largest sum of margins in the
-    `bounds`.
+    A part that is too long comes first, as inertia and mass follow from it. Of several other candidates a gear of 1
+    that was left out comes first, then the one with the largest sum of margins in the `bounds`.
 
     Args:
         model: The compiled model, for the names of its elements.
@@ -122,6 +158,8 @@ def mistake(model: mujoco.MjModel, robot: Robot) -> Mistake | None:
     Returns:
         The mistake; None if the robot is possible, or if no conversion makes it so.
     """
+    if long := too_long(model, robot.half_track):
+        return Mistake(long, robot.replace(**_inertias(robot, robot.mass, 1.0, 1.0)))
     if _least(robot) > 0:
         return None
     able = [one for one in _candidates(model, robot) if _least(one.robot) > 0]

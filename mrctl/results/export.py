@@ -1,7 +1,7 @@
 """Results for other tools: MCAP with ROS 2 messages, CSV, Parquet, NumPy.
 
-Tables hold every signal of `results.dataset.SIGNALS` and end where a run failed. With several runs a table has a column
-`run`, and in MCAP the name of each topic begins with `/runK`.
+Tables hold every signal of `results.dataset.SIGNALS` and end where a run failed. With several runs a table has the
+columns `run` and `label`, its number and its name, and in MCAP the name of each topic begins with `/runK`.
 
 | topic            | message                                 | content                                              |
 | ---------------- | --------------------------------------- | ---------------------------------------------------- |
@@ -171,11 +171,14 @@ def _unit(name: str) -> str:
 
 def _table(whole: xr.Dataset) -> Iterator[pa.Table]:
     """Yields a table for each run, with units and meanings in its fields, and scenarios and versions in its schema."""
-    numbered = whole.sizes["run"] > 1
+    several = whole.sizes["run"] > 1
     about = {name: str(value) for name, value in whole.attrs.items()}
-    for number, columns in _runs(whole):
-        fields = [pa.field("run", pa.int64(), metadata={"units": "1"})] if numbered else []
-        arrays: list[Any] = [np.full(len(columns["time"]), number)] if numbered else []
+    for label, (number, columns) in zip(np.atleast_1d(whole["label"]), _runs(whole), strict=True):
+        fields, arrays = list[pa.Field](), list[Any]()
+        if several:
+            kinds = ("run", pa.int64()), ("label", pa.string())
+            fields += [pa.field(name, kind, metadata={"units": "1"}) for name, kind in kinds]
+            arrays += [[value] * len(columns["time"]) for value in (number, str(label))]
         for name, values in columns.items():
             meaning = "time" if name == "time" else SIGNALS[name][1]
             fields.append(pa.field(name, pa.float64(), metadata={"units": _unit(name), "long_name": meaning}))

@@ -29,6 +29,8 @@ from mrctl.scenario import Scenario
 from mrctl.theory.robot import RobotFile
 
 CHUNK_BYTES = 2**27  # largest size of the signals of a job in memory
+FEWEST, MOST = 4, 64  # runs in a job: a core does 10 runs a second in jobs of 4, 12 of 8, 14 of 16, 15 of 32, 16 of 64
+JOBS = 16  # number of jobs, at least, of a sweep that is large enough: an interrupt loses those under way
 LARGEST = 2**43  # largest size of the signals of all runs in bytes, before compression
 TRIED = 20  # number of first runs, at least one of which must have a valid scenario
 QUIET = 2.0  # s for which values are checked without a progress bar
@@ -134,7 +136,7 @@ class Sweep(Record):
     every: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Control periods between samples of a decimated record; by default 10."""
     chunk: Annotated[int, Field(ge=1, le=65536)] | None = None
-    """Number of runs in a job; by default 64, or fewer where the runs are long."""
+    """Number of runs in a job; by default 64, or fewer where the runs are long or fewer than 1,024."""
     controller: str | None = None
     """Feedforward of the user instead of the named one, as `my_file.py:MyController`, or other stages, as
     `motion=my_file.py:PurePursuit`; see `mrctl.loop.user_files`."""
@@ -215,8 +217,10 @@ class Sweep(Record):
 
     @cached_property
     def chunk_size(self) -> int:
-        """Number of runs in a job, which depends on the file alone."""
-        return self.chunk or int(np.clip(CHUNK_BYTES // (8 * len(SIGNALS) * self.base.ticks), 1, 64))
+        """Number of runs in a job; it depends on the file alone, so that the store does for any number of workers."""
+        share = 2 ** (self.size // JOBS).bit_length() // 2  # a power of two, so that runs are compressed together
+        largest = CHUNK_BYTES // (8 * len(SIGNALS) * self.base.ticks)
+        return self.chunk or max(1, min(largest, max(FEWEST, min(share, MOST))))
 
     @property
     def stride(self) -> int:

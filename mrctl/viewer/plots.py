@@ -226,8 +226,10 @@ class Plots:
         self._lessons.content = lessons(self._robots, laps, error, when)
 
     def clear(self, span: float) -> None:
-        """Draws empty charts of `span` s."""
-        self.show(np.array([0.0, span]), blank(2, len(self._robots)), self._nowhere(), 1)
+        """Draws empty charts of `span` s, and a score without numbers."""
+        nothing = blank(2, len(self._robots))
+        self.show(np.array([0.0, span]), nothing, self._nowhere(), 1)
+        self.score(nothing[0], (), None, "")
 
     def point(self, share: float | None) -> None:
         """Draws a vertical line in all charts at a share of their time, or none; their data need not be sent again."""

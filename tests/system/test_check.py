@@ -190,6 +190,24 @@ def test_broken_adopted(name, tmp_path):
     assert finding.status == "failed" and causes(finding) == {cause}
 
 
+CASTERS = {
+    "sinks": ('size="0.0176"', 'size="0.0376"', "caster_front ends 20 mm below the rear wheels"),
+    "floats": ("0.115 0 -0.0174", "0.115 0 -0.0144", "caster_front ends 3 mm above the rear wheels"),
+}
+
+
+@pytest.mark.parametrize("name", CASTERS)
+def test_caster_off_the_floor(name, tmp_path, capsys):
+    """A caster that mrctl makes reach the floor is named with its number; nothing else is measured of such a robot."""
+    old, new, says = CASTERS[name]
+    text = (models_folder() / "turtlebot.xml").read_text()
+    assert old in text
+    (tmp_path / "mine.xml").write_text(text.replace(old, new))
+    assert main(["check", str(tmp_path / "mine.xml")]) == 1
+    out = capsys.readouterr().out
+    assert f"- caster off the floor: {says}" in out and "nothing is steered" not in out and "waits for stance: " in out
+
+
 def test_two_faults(robot):
     """Each check is explained by the fault that it shows, and by both where either is enough to fail it."""
     findings = examine(robot("off centre", "damping"), "mirror", "top_speed", "stall")

@@ -291,6 +291,8 @@ def test_bad_scenario_is_one_line(
         (["run", "--laps", "1.5"], "laps: '1.5' is not a whole number"),
         (["run", "--map", "hall.yaml"], "map: has no flag; set it in a scenario file"),
         (["run", "--sensing.teir", "field"], "no flag is called --sensing.teir; did you mean --sensing.tier?"),
+        (["run", "--perturbation.mas", "2"], "--perturbation.mas; did you mean --perturbation.mass-factor?"),
+        (["navigate", "doorway:1", "--perturbation.mas", "2"], "did you mean --perturbation.mass-factor?"),
         (["check", "--robot.path", "mule.xml"], "--robot.path: is no flag of mrctl check"),
         (["run", "reference:circle", "--laps", "1"], "--laps: is no flag of reference:circle, and those of mrctl run"),
         (["identify", "mule.xml"], "mule.xml: the file of a robot is given as --robot mule.xml"),

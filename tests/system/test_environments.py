@@ -505,6 +505,16 @@ def test_action_of_another_shape():
         vector.step(np.zeros(2))
 
 
+@pytest.mark.parametrize("action", [np.array([0.1 + 1j, 0.0]), np.array(["0.1", "0"]), [None, 0.0]])
+def test_action_of_no_real_numbers(action):
+    """It is refused by name, in every environment; no imaginary part is dropped in silence."""
+    single, vector, suite = TrackingEnv(SHORT), TrackingVectorEnv(2, SHORT), SUITE["voltage"](SHORT)
+    for env, given in ((single, action), (vector, [action, action]), (suite, np.asarray(action))):
+        env.reset()
+        with pytest.raises(InputError, match=r"^action: holds \w+, and real numbers are expected$"):
+            env.step(given)
+
+
 def test_scenario_file(tmp_path):
     """The scenario files of the command line are the environments' too; voltages of an agent are no oscillation."""
     file = tmp_path / "scenario.toml"

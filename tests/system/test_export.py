@@ -34,7 +34,7 @@ ROS = get_typestore(Stores.ROS2_HUMBLE)
 
 @pytest.fixture(scope="module")
 def result():
-    return simulate([SHORT, FAILS])
+    return simulate([SHORT, FAILS.replace(name="pushed, hard")])
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +217,7 @@ def test_several(result, path, tmp_path):
 
 def long(result):
     """The result as a table, a row a run and sample, without what comes after a failure."""
-    frame = result[list(SIGNALS)].to_dataframe().reset_index()[["run", "time", *SIGNALS]]
+    frame = result[list(SIGNALS)].to_dataframe().reset_index()[["run", "label", "time", *SIGNALS]]
     return frame[np.isfinite(frame["x"])].sort_values(["run", "time"]).reset_index(drop=True)
 
 
@@ -227,13 +227,15 @@ def test_csv(result, path, tmp_path):
     export(mrctl.open(path), "csv", out)
     with open(out, newline="") as file:
         header = next(csv.reader(file))
-        table = [[float(cell) for cell in row] for row in csv.reader(file)]
-    assert header[:4] == ["run", "time [s]", "x [m]", "y [m]"] and "power [W]" in header and "saturated" in header
+        table = [[cell if k == 1 else float(cell) for k, cell in enumerate(row)] for row in csv.reader(file)]
+    assert header[:5] == ["run", "label", "time [s]", "x [m]", "y [m]"]
+    assert "power [W]" in header and "saturated" in header
     assert [name.split(" ")[0] for name in header] == list(long(result).columns)
-    assert np.array_equal(table, long(result).to_numpy())
+    assert np.array_equal(np.array(table, object), long(result).to_numpy())
+    assert {row[1] for row in table} == {"none", "pushed, hard"}  # the controller, where a scenario has no name
     export(mrctl.open(path), "csv", tmp_path / "one.csv", 1)
     one = pd.read_csv(tmp_path / "one.csv")
-    assert "run" not in one and len(one) == (long(result)["run"] == 1).sum()
+    assert not {"run", "label"} & {*one} and len(one) == (long(result)["run"] == 1).sum()
 
 
 def test_parquet(result, path, tmp_path):
@@ -245,7 +247,7 @@ def test_parquet(result, path, tmp_path):
     for name, (unit, meaning) in SIGNALS.items():
         assert table.schema.field(name).metadata == {b"units": unit.encode(), b"long_name": meaning.encode()}
     scenarios = json.loads(table.schema.metadata[b"scenarios"])
-    assert [Scenario.from_dict(one) for one in scenarios] == [SHORT, FAILS]
+    assert [Scenario.from_dict(one) for one in scenarios] == [SHORT, FAILS.replace(name="pushed, hard")]
 
 
 def test_npz(result, path, tmp_path):

@@ -608,6 +608,16 @@ def tired(path, job):
     return Outcome(job, error=f"worker {job} is tired", fatal=True) if job == 3 else compute(path, job)
 
 
+def test_a_small_sweep_keeps_what_it_has_done(file, tmp_path, whole):
+    """Without a `chunk` in its file, a sweep of 24 runs that ends early has kept most; it goes on to the same runs."""
+    file.write_text(FILE.replace("chunk = 5\n", ""))
+    with pytest.raises(InputError, match="worker 3 is tired"):
+        jobs.run(Sweep.from_toml(file), tmp_path / "store", 1, work=tired)
+    assert mrctl.open(tmp_path / "store").sizes["run"] == 12
+    jobs.run(Sweep.from_toml(file), tmp_path / "store", 2)
+    assert content(tmp_path / "store")["runs.parquet"] == whole["runs.parquet"]
+
+
 def only_rest(path, job):
     assert job >= 3
     return Outcome(job, error=f"worker {job} is tired", fatal=True) if job == 4 else compute(path, job)

@@ -12,6 +12,7 @@ from test_check import messages
 from mrctl import cli
 from mrctl.checks import examination
 from mrctl.checks.command import examination as examine
+from mrctl.experiments import mission, single
 from mrctl.physics.files import models_folder
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.units import LIMITS, bounds, mistake
@@ -101,6 +102,27 @@ def test_names_the_unit(mistake: str, robot: str, tmp_path: Path, capsys: pytest
     assert said[0] in line and len(messages(err)) == 1
 
 
+DECK = 'type="box" size="0.2 0.1 0.05" pos="0.1 0 0.03" mass="10"'
+
+
+@pytest.mark.parametrize(
+    ("deck", "unit"),
+    [
+        ('type="box" size="200 0.1 0.05" pos="0.1 0 0.03" mass="10"', "the box of {} is 400 m long.* is it in mm?"),
+        ('type="box" size="200 100 0.05" pos="0.1 0 0.03"', "the box of {} is 400 m long.* is it in mm?"),
+        ('name="deck" type="box" size="20 0.1 0.05" pos="0.1 0 0.03" mass="10"', "deck is 40 m long.* is it in cm?"),
+        ('type="box" size="200 100 50" pos="100 0 30" mass="10"', "the box of {} is 400 m long.* is it in mm?"),
+    ],
+)
+def test_a_part_too_long(deck: str, unit: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """It is named and measured, and no mass that follows from it; also where the robot would tip over."""
+    (tmp_path / "mine.xml").write_text(ROBOT.replace(DECK, deck))
+    assert DECK in ROBOT and cli.main(["check", str(tmp_path / "mine.xml")]) in (1, 2)
+    captured = capsys.readouterr()
+    said = captured.out + messages(captured.err)[0]
+    assert re.search(unit.format("chassis"), said) and "the mass of" not in said
+
+
 def test_impossible_number(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """Where no single unit is wrong, the impossible number is the cause, and what depends on it is not measured."""
     text = (models_folder() / "turtlebot.xml").read_text()
@@ -109,6 +131,28 @@ def test_impossible_number(tmp_path: Path, capsys: pytest.CaptureFixture) -> Non
     out = capsys.readouterr().out
     assert "- impossible number: mass over the cube of the size is 5.29e+09 kg/m³, that of a robot" in out
     assert "time step" not in out and "waits for units: stance" in out and "1 failed, 23 skipped" in out
+
+
+@pytest.mark.parametrize("command", [["run", "--laps", "1"], ["navigate", "doorway:3"]])
+def test_an_impossible_robot_drives_with_a_warning(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """One line on stderr points at `mrctl check`; for robots of mrctl nothing is even examined."""
+    text, file, examined = (models_folder() / "turtlebot.xml").read_text(), tmp_path / "mine.xml", []
+    impossible = examination.impossible
+    monkeypatch.setattr(examination, "impossible", lambda model: examined.append(model) or impossible(model))
+    monkeypatch.setattr(single, "run", lambda *_: ("", ""))
+    monkeypatch.setattr(mission, "run", lambda *_: ("", "arrived"))
+    for change in ("turtlebot", text, re.sub('mass="[0-9.]+"', 'mass="3e7"', text)):
+        file.write_text(change)
+        robot = "turtlebot" if change == "turtlebot" else str(file)
+        assert cli.main([*command, "--robot", robot]) == 0
+    assert len(examined) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and said.startswith(
+        f"mrctl: {file}: impossible number: mass over the cube of the size"
+    )
+    assert said.endswith(f"; see mrctl check {file}\n")
 
 
 @pytest.mark.parametrize("factor", [0.3, 1.0, 3.0])

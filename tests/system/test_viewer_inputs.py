@@ -1,6 +1,7 @@
 """What an input of the page changes is what the same scenario file would change."""
 
 import asyncio
+import re
 import time
 import typing
 
@@ -133,6 +134,23 @@ def test_design(live, steering, tier):
     live._apply_inputs()
     assert inputs["kanayama", "k_y"].value == pytest.approx(state["kanayama"]["k_y"], rel=5e-3)
     assert live.session.state()["kanayama"] == Kanayama() and live.message == ""
+
+
+def test_another_learner_before_a_tick(live):
+    """The score of the run before is gone with it, before the new run has done its first tick."""
+
+    def score():
+        live.refresh()
+        return live._plots._score.content + live._plots._lessons.content
+
+    live._restart([Scenario(learner="rls")])
+    assert not re.search(r">[0-9]", score())
+    for _ in range(20):
+        live.session.step()
+    assert re.search(r">[0-9]", score())
+    live._note_input(("learner",), "fel")
+    live._apply_inputs()
+    assert live.session.tick == 0 and not re.search(r">[0-9]", score())
 
 
 def test_typing(live):

@@ -219,6 +219,11 @@ def test_names_in_the_place_of_records():
         ({"events": [{"tim": 1}]}, "events.0.tim: there is no such field; did you mean time? (and 1 more)"),
         ({"colour": 1, "laps": 0}, "colour: there is no such field (and 1 more)"),
         ({"perturbation": {"mass": 2}}, "perturbation.mass: there is no such field; did you mean mass_factor?"),
+        ({"perturbation": {"mas": 2}}, "perturbation.mas: there is no such field; did you mean mass_factor?"),
+        (
+            {"perturbation": {"frict": 2}},
+            "perturbation.frict: there is no such field; did you mean tyre_friction_factor?",
+        ),
         ({"sensing": {"teir": "lab"}}, "sensing.teir: there is no such field; did you mean tier?"),
         (
             {"reference": {"kind": "circle", "perod": 3}},

@@ -111,6 +111,16 @@ def test_paired(paired):
     assert len(set(itertools.chain(*seen.values()))) == (8 if paired else 24)
 
 
+def test_one_value_of_a_paired_axis_draws_the_same():
+    """So the sweep of a user's controller is comparable with that of built-in learners."""
+    found = []
+    for values in (["none", "fel"], ["none"]):
+        rows = drawn(sweep({**LAWS, "values": values, "paired": True}, MASS, runs=4))
+        found.append([(row["seed"], row[MASS["field"]]) for row in rows])
+    both, one = found
+    assert one == both[:4] == both[4:]
+
+
 @pytest.mark.parametrize(
     ("kind", "parameters", "expected"),
     [
@@ -212,11 +222,11 @@ def test_draws_beyond_the_range_are_that_run_s_own():
 
 
 def test_chunk_is_a_function_of_the_file():
-    """64 runs, fewer where their signals would not fit in memory, or what the file says."""
-    assert sweep().chunk_size == 64
-    assert sweep(base={**BASE, "laps": 4000}).chunk_size < 4
+    """64 of many runs, fewer of few or where their signals would not fit in memory, or what the file says."""
+    assert [sweep(runs=n).chunk_size for n in (1, 20, 127, 128, 300, 1023, 1024, 10**6)] == [4, 4, 4, 8, 16, 32, 64, 64]
+    assert sweep(runs=10**6, base={**BASE, "laps": 4000}).chunk_size < 4
     assert sweep(chunk=5).chunk_size == 5
-    long = sweep(base={"laps": 100})
+    long = sweep(base={"laps": 100}, runs=10**6)
     assert long.chunk_size * long.base.ticks * len(SIGNALS) * 8 <= 2**27
 
 
