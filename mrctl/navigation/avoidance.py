@@ -135,9 +135,8 @@ class Following:
             latency = scenario.sensing.loop_delay(scenario.control_period) * scenario.control_period
             gains = scenario.pid.channels(robot, rigid, latency, scenario.control_period)
             designed = design(robot, rigid, gains, latency, scenario.control_period, scenario.prefilter).kanayama
-            for name in self._gains.dtype.names or ():
-                own = getattr(scenario.kanayama, name)
-                self._gains[name][row] = getattr(designed, name) if own is None else own
+            own = scenario.kanayama.completed(designed)
+            self._gains[row] = own.k_x, own.k_y, own.k_theta
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Has nothing to start."""
