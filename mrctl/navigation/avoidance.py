@@ -26,9 +26,8 @@ from mrctl.kernel import Array, kernel
 from mrctl.loop.goals import RESTING
 from mrctl.loop.simulation import arranged
 from mrctl.navigation.planning import least_clearance
-from mrctl.navigation.reactive import SHORTER, Replan, open_waypoints, plan_around
+from mrctl.navigation.replanning import SHORTER, Planner, Replan
 from mrctl.navigation.sight import Sight
-from mrctl.navigation.vehicle import robot_of
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance, outside, point_to_segment, rim
 from mrctl.theory.obstacles import Outlines, moved
@@ -183,9 +182,8 @@ class Pacing:
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Takes the missions of the robots, with their maps and with their plans as references."""
         self._follow, self._scenarios = Following(self._robot, scenarios), scenarios
-        self._own = [open_waypoints(scenario.reference) for scenario in scenarios]
-        self._sights = Sight.each(scenarios)
-        self._footprint = robot_of(scenarios[0])[0]
+        self._planners = Planner.each(self._replan, scenarios)
+        self._footprint = self._planners[0].footprint
         self._near, self._away = self._barrier(-RIM), self._barrier(AWAY)
 
     def _barrier(self, margin: float) -> Barrier:
@@ -195,13 +193,12 @@ class Pacing:
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         size = self._size
-        for sight in self._sights:
-            sight.forget()
+        for planner in self._planners:
+            planner.reset()
         self._period, self._tick, self.followed = period, 0, reference
         self._clock, self._pace = np.zeros(size), np.ones(size)  # s in motion periods, and λ
-        self._plans = [self._sampled(plan) for plan in self._own]
-        self._kept = [self._margin(plan, row) for row, plan in enumerate(self._own)]
-        self._given: list[Waypoints | None] = [None] * size  # plans that came since the start
+        self._plans = [self._sampled(planner.first) for planner in self._planners]
+        self._kept = [self._margin(planner.first, row) for row, planner in enumerate(self._planners)]
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
         self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
         self._looked = np.zeros(size, bool)  # which robots have a scan that is new
@@ -219,12 +216,12 @@ class Pacing:
 
         The clearance is negative where the discs would overlap the map on the plan.
         """
-        return self._barrier(min(KEPT, least_clearance(self._footprint, plan, self._sights[row].map) - RIM - TRACKED))
+        free = least_clearance(self._footprint, plan, self._planners[row].sight.map)
+        return self._barrier(min(KEPT, free - RIM - TRACKED))
 
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
-        self._given[row] = plan = open_waypoints(plan)
-        self._begin(row, plan)
+        self._begin(row, self._planners[row].take(plan))
 
     def _begin(self, row: int, plan: Waypoints) -> None:
         """Lets a robot drive a plan from its beginning."""
@@ -234,9 +231,9 @@ class Pacing:
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot, and looks whether its plan is free; for the arguments see `stages.Motion`."""
-        self._map_changed[row] |= self._sights[row].see(scan)
+        self._map_changed[row] |= self._planners[row].sight.see(scan)
         self._looked[row] = True
-        standing = self._sights[row].standing
+        standing = self._planners[row].sight.standing
         self._blocked[row] = np.inf
         if not len(standing.discs):
             return
@@ -269,7 +266,7 @@ class Pacing:
 
     def _share(self, row: int, request: Array, pose: Array) -> float:
         """Returns λ of one robot."""
-        sight, allowed = self._sights[row], 0.0 if self._stops[row] else 1.0
+        sight, allowed = self._planners[row].sight, 0.0 if self._stops[row] else 1.0
         if np.isfinite(self._blocked[row]):
             part = self._plans[row][int(self._clock[row]) : int(self._blocked[row]), 3]
             left = self._period * float(np.abs(part).sum()) - STANDOFF
@@ -288,30 +285,26 @@ class Pacing:
             pose: x and y in m and θ in rad, `(3,)`.
             speed: |V| in m/s.
         """
+        planner, now = self._planners[row], self._period * self._tick
         if self._stops[row]:
             if speed < RESTING:
                 self._stops[row] = False
-                if plan := self._planned(row, pose):
+                if plan := planner.plan(pose, now):
                     self._begin(row, plan)
             return
         if self._map_changed[row]:
             self._map_changed[row] = False
             left = self._period * (len(self._plans[row]) - self._clock[row])
-            plan = self._planned(row, pose)
+            plan = planner.plan(pose, now)
             self._stops[row] = plan is not None and plan.period + speed / self._brakes < SHORTER * left
-        now, standing = self._period * self._tick, self._sights[row].standing
+        standing = planner.sight.standing
         if self._clock[row] - self._anchor[row] > SLOW * WAITED / self._period or not len(standing.discs):
             self._anchor[row], self._since[row] = self._clock[row], now
         if now - self._since[row] < WAITED:
             return
         self._since[row] = now  # where there is no other plan, it tries again later
-        if plan := self._planned(row, pose):
+        if plan := planner.plan(pose, now):
             self._begin(row, plan)
-
-    def _planned(self, row: int, pose: Array) -> Waypoints | None:
-        """Makes a plan from where a robot is, around what it knows."""
-        own, now = (self._scenarios[row], self._sights[row]), self._period * self._tick
-        return plan_around(self._replan, *own, now, self._footprint, pose, self._given[row])
 
 
 def share(request: Array, pose: Array, outlines: Outlines, barrier: Barrier) -> float:

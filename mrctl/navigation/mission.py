@@ -23,7 +23,7 @@ from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
 from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.planning import Plan, least_clearance, plan, shortcut, space
-from mrctl.navigation.reactive import open_waypoints
+from mrctl.navigation.replanning import open_waypoints
 from mrctl.navigation.sdf import read_sdf
 from mrctl.navigation.vehicle import reverses, robot_of
 from mrctl.navigation.window import Window

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.navigation.chart import RADIUS
+from mrctl.navigation.replanning import SHORTER, Planner, Replan
 from mrctl.navigation.rollouts import KEPT, STEPS, Bounds, Considered, Scene
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.trail import Trail
-from mrctl.navigation.vehicle import reverses, robot_of
-from mrctl.record import InputError
+from mrctl.navigation.vehicle import reverses
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import cover
 from mrctl.theory.grid import Field, near_field
-from mrctl.theory.obstacles import Outlines
 from mrctl.theory.rays import Scan
 from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
@@ -36,46 +35,6 @@ STAYS = 1.0  # s at the end of its plan, after which a robot without a goal at w
 BACK = 0.4, 0.4  # m, length of a piece of the way back, after which it looks for another plan; m/s, its speed there
 PIECES = 5  # largest number of pieces
 FREE = 0.02  # m, clearance from what is not on the map while it goes back
-SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
-
-Replan = Callable[[Scenario, Array, Outlines, Waypoints | None], Waypoints | None]
-"""Plans for the mission of a scenario, from a pose in m, m, rad, `(3,)`, among obstacles as they are now, to the end of
-a plan that an event brought, or else to the goal of the mission; None where there is no way."""
-
-
-def open_waypoints(reference: Reference) -> Waypoints:
-    """Returns the reference of an event if it is a way with an end, such as a plan.
-
-    Raises:
-        InputError: It is another one, which robots with an avoider do not follow.
-    """
-    if not isinstance(reference, Waypoints) or reference.closed:
-        raise InputError("reference: robots with an avoider follow open waypoints alone")
-    return reference
-
-
-def plan_around(
-    replan: Replan,
-    scenario: Scenario,
-    sight: Sight,
-    time: float,
-    footprint: Array,
-    pose: Array,
-    given: Waypoints | None,
-) -> Waypoints | None:
-    """Makes a plan that keeps off what is not on the map, or else one that only does not touch it.
-
-    Args:
-        replan: Makes a plan to the goal.
-        scenario: The mission.
-        sight: What the robot knows.
-        time: Time in s.
-        footprint: Its corners in its frame in m, `(n, 2)`.
-        pose: x and y in m and θ in rad, from which it plans, `(3,)`.
-        given: The plan that came since the start, or None.
-    """
-    far = replan(scenario, pose, sight.around(time, footprint, pose), given)
-    return far or replan(scenario, pose, sight.outlines(time), given)
 
 
 class Agent:
@@ -86,47 +45,30 @@ class Agent:
     """
 
     def __init__(
-        self,
-        replan: Replan,
-        scenario: Scenario,
-        plan: Waypoints,
-        sight: Sight,
-        footprint: Array,
-        discs: Array,
-        bounds: Bounds,
-        reverses: bool,
-        field: Field,
-        start: Array,
-        period: float,
+        self, planner: Planner, bounds: Bounds, discs: Array, reverses: bool, field: Field, start: Array, period: float
     ) -> None:
         """Starts a run.
 
         Args:
-            replan: Makes a plan to the goal.
-            scenario: Its mission.
-            plan: The plan of the mission.
-            sight: What it knows.
-            footprint: Its corners in its frame in m, `(n, 2)`.
-            discs: Discs that cover it, as in `Scene`.
+            planner: Its mission, and what it knows.
             bounds: What twists it can drive.
+            discs: Discs that cover it, as in `Scene`.
             reverses: Whether it can be driven backwards.
-            field: Distance from the map around the plan.
+            field: Distance from the map around its first plan.
             start: x and y in m where it is, `(2,)`.
             period: Motion period in s.
         """
-        self._replan, self._scenario, self._sight, self._footprint = replan, scenario, sight, footprint
-        self._discs, self._bounds, self._reverses, self._period = discs, bounds, reverses, period
-        self._field, self._reach = field, reach(discs)
+        self._planner, self._bounds, self._discs, self._reverses = planner, bounds, discs, reverses
+        self._field, self._reach, self._period = field, reach(discs), period
         self.last = np.zeros(2)
-        self._given: Waypoints | None = None  # the plan that came since the start
-        self._table, self._place, self._away = self._sampled(plan), 0, 0.0  # its plan, and the robot's place on it
+        self._table, self._place, self._away = self._sampled(planner.first), 0, 0.0  # its plan, and its place on that
         self._looked = False  # whether there is a scan that is new; a robot that has failed gets none
         self._map_changed = False  # so that a shorter way may be free
         self._tried = -np.inf  # when it last looked for another plan
         self._anchor, self._since = start.copy(), 0.0  # where it last was when it had got on, and when
         self._replanned = False  # whether it has made another plan since
         self._arrived = np.inf  # when it arrived at the end of its plan
-        self._trail = Trail(footprint, min(BACK[1], bounds.speed / 2), bounds.curvature)
+        self._trail = Trail(planner.footprint, min(BACK[1], bounds.speed / 2), bounds.curvature)
         self._pieces = 0  # of the way back from `_anchor`, while it goes back
         self._approached = False  # whether it has gone back from a goal at which it did not arrive
 
@@ -136,10 +78,9 @@ class Agent:
         poses = plan.sample(self._period / FINE * np.arange(count + 1.0)).pose
         return np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
-    def follow(self, plan: Waypoints, now: float) -> None:
+    def follow(self, plan: Reference, now: float) -> None:
         """Takes a plan to another goal at a time in s."""
-        self._given = plan
-        self._take(plan)
+        self._take(self._planner.take(plan))
         self._since = now  # it may have waited at its goal, and is not stuck
         self._replanned = self._approached = self._map_changed = False
         self._pieces = 0
@@ -151,13 +92,13 @@ class Agent:
         distance, origin, resolution = self._field
         end = origin + resolution * np.array(distance.shape[::-1])
         if (low - self._reach < origin).any() or (high + self._reach > end).any():
-            self._field = field_around(self._table[:, :2], self._sight, self._reach)
+            self._field = field_around(self._table[:, :2], self._planner.sight, self._reach)
 
     def see(self, scan: Scan) -> None:
         """Takes a scan."""
         self._looked = True
-        if self._sight.see(scan):
-            self._field = field_around(self._table[:, :2], self._sight, self._reach)
+        if self._planner.sight.see(scan):
+            self._field = field_around(self._table[:, :2], self._planner.sight, self._reach)
             self._map_changed = True
 
     def locate(self, pose: Array) -> None:
@@ -168,7 +109,7 @@ class Agent:
     def scene(self, pose: Array, now: float) -> Scene:
         """Returns what roll-outs from a pose in m, m, rad, `(3,)`, are judged by at a time in s."""
         targets = self._table[np.minimum(self._place + FINE * np.arange(1, STEPS + 1), len(self._table) - 1)]
-        found, horizon = self._sight.discs(now), self._period * STEPS
+        found, horizon = self._planner.sight.discs(now), self._period * STEPS
         far = self._reach + horizon * (self._bounds.speed + np.hypot(found[:, 2], found[:, 3])) + found[:, 4]
         return Scene(targets, self._discs, self._field, found[np.hypot(*(found[:, :2] - pose[:2]).T) < far])
 
@@ -183,7 +124,7 @@ class Agent:
             speed: V in m/s.
             now: Time in s.
         """
-        if self._scenario.goal is not None or not self._at_end(pose):
+        if self._planner.scenario.goal is not None or not self._at_end(pose):
             self._arrived = np.inf
         elif self._at_end(pose, speed):
             self._arrived = min(self._arrived, now)
@@ -254,12 +195,12 @@ class Agent:
 
     def _may_go_back(self, now: float) -> bool:
         """Tells whether it could go back a piece: not where what moves may let it pass, nor twice from a goal."""
-        alone = not len(self._sight.moving(now).discs)
+        alone = not len(self._planner.sight.moving(now).discs)
         return self._reverses and alone and self._pieces < PIECES and not (self._near_end and self._approached)
 
     def _back(self, pose: Array, now: float) -> bool:
         """Lets `last` be the twist with which it goes back; returns whether it can."""
-        twist = self._trail.back(pose, self._sight.outlines(now, FREE - RADIUS))
+        twist = self._trail.back(pose, self._planner.sight.outlines(now, FREE - RADIUS))
         if twist is not None:
             self.last = twist
         return twist is not None
@@ -275,8 +216,7 @@ class Agent:
     def _planned(self, pose: Array, now: float) -> Waypoints | None:
         """Makes a plan from where it is, around what it knows."""
         self._map_changed = False
-        own = self._scenario, self._sight, now, self._footprint, pose
-        return plan_around(self._replan, *own, self._given)
+        return self._planner.plan(pose, now)
 
 
 def reach(discs: Array) -> float:
@@ -313,29 +253,24 @@ class Reactive(ABC):
 
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Takes the missions of the robots, with their maps and with their plans as references."""
-        self._scenarios, self._own = scenarios, [open_waypoints(scenario.reference) for scenario in scenarios]
-        self._sights = Sight.each(scenarios)
-        self._footprint, self._reverses = robot_of(scenarios[0])[0], reverses(scenarios[0])
-        self.bounds = [Bounds.of(self._robot, plan.speed) for plan in self._own]
+        self._planners, self._reverses = Planner.each(self._replan, scenarios), reverses(scenarios[0])
+        self.bounds = [Bounds.of(self._robot, planner.first.speed) for planner in self._planners]
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         self._period, self._tick, self._agents = period, 0, []
         self.considered: list[Considered | None] = [None] * self._size
-        discs, fields = cover(self._footprint, DISCS), dict[Hashable, Field]()
-        every = zip(self._scenarios, self._own, self._sights, self.bounds, pose, strict=True)
-        for scenario, plan, sight, bounds, start in every:
-            sight.forget()
-            if (own := (plan, scenario.known)) not in fields:
-                places = plan.sample(np.linspace(0, plan.period, 200)).pose[:, :2]
-                fields[own] = field_around(places, sight, reach(discs))
-            body = self._footprint, discs, bounds, self._reverses
-            mission = self._replan, scenario, plan, sight
-            self._agents.append(Agent(*mission, *body, fields[own], start[:2], period))
+        discs, fields = cover(self._planners[0].footprint, DISCS), dict[Hashable, Field]()
+        for planner, bounds, start in zip(self._planners, self.bounds, pose, strict=True):
+            planner.reset()
+            if (own := (planner.first, planner.scenario.known)) not in fields:
+                places = planner.first.sample(np.linspace(0, planner.first.period, 200)).pose[:, :2]
+                fields[own] = field_around(places, planner.sight, reach(discs))
+            self._agents.append(Agent(planner, bounds, discs, self._reverses, fields[own], start[:2], period))
 
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
-        self._agents[row].follow(open_waypoints(plan), self._period * self._tick)
+        self._agents[row].follow(plan, self._period * self._tick)
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot; the arguments are those of `mrctl.control.stages.Motion`."""
