@@ -18,10 +18,10 @@ from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import simulate
 from mrctl.navigation import generators
-from mrctl.navigation.avoidance import Pacing
 from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
 from mrctl.navigation.mppi import Mppi
+from mrctl.navigation.pacing import Pacing
 from mrctl.navigation.planning import Plan, least_clearance, plan, shortcut, space
 from mrctl.navigation.replanning import open_waypoints
 from mrctl.navigation.sdf import read_sdf

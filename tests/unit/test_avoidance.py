@@ -15,7 +15,8 @@ from mrctl.control.features import feature_matrix
 from mrctl.control.kanayama import Kanayama, kanayama, posture_error
 from mrctl.experiments.learned_limits import PLANTS
 from mrctl.loop.hierarchy import Hierarchy
-from mrctl.navigation.avoidance import Avoiding, Barrier, Following, Pacing, approach, avoid, nearest, share
+from mrctl.navigation.avoidance import Avoiding, Barrier, approach, avoid, nearest, share
+from mrctl.navigation.pacing import Following, Pacing
 from mrctl.navigation.vehicle import robot_of
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
