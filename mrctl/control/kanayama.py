@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import sqrt
 from typing import Annotated
 
 import numpy as np
@@ -20,6 +21,17 @@ class Kanayama(Record):
     """Lateral gain K_y in 1/m²; by default the largest that damping, the limit on θ̈ and max |S| allow."""
     k_theta: Annotated[float, Field(ge=0, le=100)] | None = None
     """Heading gain K_θ in 1/m; by default 2√K_y, critical damping of the lateral error where θ̇ has no lag."""
+
+    def completed(self, designed: Kanayama) -> Kanayama:
+        """Returns all gains: those that are not set are the designed ones, but K_θ is 2√K_y where K_y is set.
+
+        Args:
+            designed: Gains that `design.motion` found.
+        """
+        own = self.model_dump(exclude_none=True)
+        if self.k_y is not None:
+            own = {"k_theta": 2 * sqrt(self.k_y)} | own
+        return designed.model_copy(update=own)
 
 
 GAINS = np.dtype([("k_x", "f8"), ("k_y", "f8"), ("k_theta", "f8")])  # 1/s, 1/m², 1/m

@@ -289,11 +289,8 @@ class Hierarchy:
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
         """Changes the motion controller of one robot; gains that are not set are those of its last design."""
         self._kanayamas[row] = gains
-        designed = self.motions[row].kanayama.model_dump()
-        chosen = designed | gains.model_dump(exclude_none=True)
-        if gains.k_y is not None and gains.k_theta is None:
-            chosen["k_theta"] = 2 * np.sqrt(gains.k_y)
-        self.state["kanayama"][row] = chosen["k_x"], chosen["k_y"], chosen["k_theta"]
+        chosen = gains.completed(self.motions[row].kanayama)
+        self.state["kanayama"][row] = chosen.k_x, chosen.k_y, chosen.k_theta
         self._tolerate(row)
 
     def set_pid(self, row: int, design: Pid) -> None:

@@ -18,12 +18,12 @@ from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import simulate
 from mrctl.navigation import generators
-from mrctl.navigation.avoidance import Pacing
 from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
 from mrctl.navigation.mppi import Mppi
-from mrctl.navigation.planning import Plan, least_clearance, plan, shortcut, space
-from mrctl.navigation.reactive import open_waypoints
+from mrctl.navigation.pacing import Pacing
+from mrctl.navigation.planning import NoWay, Plan, least_clearance, plan, shortcut, space
+from mrctl.navigation.replanning import open_waypoints
 from mrctl.navigation.sdf import read_sdf
 from mrctl.navigation.vehicle import reverses, robot_of
 from mrctl.navigation.window import Window
@@ -227,13 +227,13 @@ def prepared(
     task: Task, scenario: Scenario, speed: float | None = None, margin: float = MARGIN, avoid: Avoid = "none"
 ) -> tuple[Plan, Scenario]:
     """Returns a plan, and the scenario that drives it; arguments and errors are those of `navigate`."""
-    reactive = avoid in REACTIVE
+    reactive, backwards = avoid in REACTIVE, reverses(scenario)
     try:
-        found, reference = either_way(task, scenario, speed, margin, avoid)
-    except InputError as fault:
-        if not (reactive and reverses(scenario) and str(fault).startswith("goal: no way")):
+        found, reference = planned(task, scenario, speed, margin, reverse=backwards and not reactive)
+    except NoWay:
+        if not (reactive and backwards):
             raise
-        either_way(task, scenario, speed, margin, "none")  # raises, too, if there is no way in reverse
+        planned(task, scenario, speed, margin, reverse=True)  # raises, too, if there is no way in reverse
         raise InputError(f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may") from None
     laps = PATIENCE if avoid == "none" else WAITING
     own = {"obstacles": task.obstacles, "map": task.map, "reference": reference, "laps": laps}
@@ -260,7 +260,7 @@ def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] |
         goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
         start = Task.from_dict({"obstacles": scenario.known, "start": pose.tolist(), "goal": goal})
         with contextlib.suppress(InputError):  # it waits, and tries again
-            return either_way(start, scenario, plan.speed, SLIM, avoid, outlines)[1]
+            return planned(start, scenario, plan.speed, SLIM, outlines, avoid not in REACTIVE and reverses(scenario))[1]
 
     def made(robot: Robot, size: int) -> Pacing | Window | Mppi:
         if avoid == "barrier":
@@ -277,18 +277,6 @@ def end_of(plan: Waypoints) -> Pose:
     return x, y, remainder(theta, 2 * pi)
 
 
-def either_way(
-    task: Task, scenario: Scenario, speed: float | None, margin: float, avoid: Avoid, outlines: Outlines | None = None
-) -> tuple[Plan, Waypoints]:
-    """Returns `planned`, with a plan that reverses where there is no other and the robot can drive it."""
-    try:
-        return planned(task, scenario, speed, margin, outlines)
-    except InputError:
-        if avoid in REACTIVE or not reverses(scenario):
-            raise
-        return planned(task, scenario, speed, margin, outlines, reverse=True)
-
-
 def planned(
     task: Task,
     scenario: Scenario,
@@ -299,7 +287,8 @@ def planned(
 ) -> tuple[Plan, Waypoints]:
     """Returns the plan and its reference; arguments and errors are those of `navigate`.
 
-    The outlines are by default those of the obstacles on the map, and the plan reverses only if it may.
+    The outlines are by default those of the obstacles on the map. The plan reverses only if it may, and where there is
+    none forward that the robot can drive.
     """
     if arrived(np.array(task.start), 0.0, np.array(task.goal)):
         raise InputError("goal: the robot starts there")
@@ -308,8 +297,36 @@ def planned(
     corners, robot = robot_of(scenario)
     if speed is not None and not 0 < speed <= robot.max_speed:
         raise InputError(f"speed: must be above 0 and at most {robot.max_speed:g} m/s, not {speed:g}")
+    speed = RESERVE * robot.max_speed if speed is None else speed
+    outlines = Surroundings(task.known).at(0.0) if outlines is None else outlines
+    try:
+        return _planned(task, corners, robot, speed, margin, outlines, reverse=False)
+    except InputError:  # there is no way, or none that the robot can drive
+        if not reverse:
+            raise
+        return _planned(task, corners, robot, speed, margin, outlines, reverse=True)
+
+
+def _planned(
+    task: Task, corners: Array, robot: Robot, speed: float, margin: float, outlines: Outlines, reverse: bool
+) -> tuple[Plan, Waypoints]:
+    """Returns a plan that only drives forward, or one that reverses wherever that is cheaper, and its reference.
+
+    Args:
+        task: World, start and goal.
+        corners: Corners of the robot in its frame in m, `(n, 2)`.
+        robot: The robot.
+        speed: Largest speed in m/s.
+        margin: Clearance that the plan keeps in m.
+        outlines: The obstacles.
+        reverse: Whether the plan may reverse.
+
+    Raises:
+        NoWay: There is no way.
+        InputError: Start or goal is within the margin of an obstacle, or the robot cannot drive the plan, or would
+            touch an obstacle on it.
+    """
     known = task.known
-    outlines = Surroundings(known).at(0.0) if outlines is None else outlines
     radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (
         WIDER if reverse else 1
     )
@@ -322,7 +339,7 @@ def planned(
     def attempt(arc: float) -> tuple[Plan, Waypoints]:
         found = plan(where, np.array(task.start), np.array(task.goal), arc, reverse)
         found = shortcut(where, found, arc, reverse)
-        return found, found.reference(RESERVE * robot.max_speed if speed is None else speed, Limits.of(robot))
+        return found, found.reference(speed, Limits.of(robot))
 
     found, reference = attempt(radius)
     try:

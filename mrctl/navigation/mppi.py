@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.navigation.reactive import Reactive, Replan
+from mrctl.navigation.reactive import Reactive
+from mrctl.navigation.replanning import Replan
 from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Scene, roll_out
 from mrctl.record import InputError
 from mrctl.theory.robot import Robot

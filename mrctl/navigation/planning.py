@@ -40,6 +40,10 @@ SLACK = 2.0  # cells, by which the way around the obstacles may be too long
 MOST_CELLS = 1_000_000  # of the plane, for a search takes 288 bytes for each, and three times that with reversing
 
 
+class NoWay(InputError):
+    """The search has found no way to the goal."""
+
+
 class Space(NamedTuple):
     """Free space in which a robot plans."""
 
@@ -165,7 +169,8 @@ def plan(where: Space, start: Array, goal: Array, radius: float, reverse: bool, 
         most: Largest number of poses that the search makes.
 
     Raises:
-        InputError: The start or the goal is in an obstacle or off the map, or no way was found.
+        InputError: The start or the goal is in an obstacle or off the map.
+        NoWay: No way was found.
     """
     start, goal = np.asarray(start, float), np.asarray(goal, float)
     low, high = (
@@ -186,7 +191,7 @@ def plan(where: Space, start: Array, goal: Array, radius: float, reverse: bool, 
     found, made, expanded = search.compiled(start, goal, float(radius), step, reverse, ahead, where, best, tree)
     if found < 0:
         why = "there is none" if found == -1 else f"{most:,} poses were not enough"
-        raise InputError(f"goal: no way to ({goal[0]:.2f}, {goal[1]:.2f}) was found; {why}")
+        raise NoWay(f"goal: no way to ({goal[0]:.2f}, {goal[1]:.2f}) was found; {why}")
     return _traced(tree, int(made), int(found), radius, reverse, int(expanded))
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import ceil, floor, pi, remainder, sqrt
+from math import ceil, floor, pi, remainder
 from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
 
+from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains
 from mrctl.control.stages import Motion, Stages
 from mrctl.kernel import Array, Rows
@@ -234,14 +235,10 @@ class Session:
         sim, k = self._place[0]
         rigid, over = self.start[0].steering == "rigid", sim.hierarchy.motions[k]
         _, delay = sim.hierarchy.lengthened(k, self.state()["pid"])
-        own = self.state()["kanayama"].k_y
-        k_y = over.kanayama.k_y if own is None else own
-        assert k_y is not None
+        kanayama = Kanayama(k_y=self.state()["kanayama"].k_y).completed(over.kanayama)  # K_θ follows a K_y that is set
         values: dict[tuple[str, ...], float | None] = {
             ("prefilter",): over.prefilter,
-            ("kanayama", "k_x"): over.kanayama.k_x,
-            ("kanayama", "k_y"): k_y,
-            ("kanayama", "k_theta"): 2 * sqrt(k_y),
+            **{("kanayama", name): value for name, value in kanayama.model_dump().items()},
             ("pid", "time_constant"): 0.0,
             ("pid", "delay"): delay,
         }

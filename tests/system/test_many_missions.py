@@ -96,6 +96,29 @@ def test_other_refusals_are_final(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(searches) == 1
 
 
+def test_second_plan_reverses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that reverses plans again where it cannot drive the plan forward; bad settings are never planned with."""
+    scenario, tried = Scenario.from_dict({"robot": {"path": "turtlebot"}}), []
+    task = task_of("doorway:3", scenario)
+
+    def refuses(reference: object, robot: object, reverse: bool) -> None:
+        tried.append(reverse)
+        if not reverse:
+            raise InputError("reference: rotation 4 rad/s exceeds the robot's max_rotation")
+
+    monkeypatch.setattr(mission, "check", refuses)
+    prepared(task, scenario)
+    assert tried == [False, False, True]  # the second time without its steering limit
+    with pytest.raises(InputError, match="exceeds the robot's max_rotation"):
+        prepared(task, scenario, avoid="mppi")  # which never plans in reverse; but there is a way forward
+    searches = []
+    monkeypatch.setattr(mission, "plan", lambda *arguments: searches.append(arguments))
+    for bad in ({"margin": -1.0}, {"speed": 9.0}):
+        with pytest.raises(InputError, match=f"^{next(iter(bad))}: must be "):
+            prepared(task, scenario, **bad)
+    assert not searches
+
+
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.full)])
 @pytest.mark.parametrize("robot", ["", "turtlebot", pytest.param("racecar", marks=pytest.mark.full)])
 def test_parks(robot: str, seed: int) -> None:

@@ -1,5 +1,7 @@
 """The barrier filter: the nearest twist by two independent solvers, no collision, idle where clear, and its braking."""
 
+from typing import Any
+
 import numpy as np
 import osqp
 import pytest
@@ -10,10 +12,11 @@ from test_obstacles import judged, random_shapes
 
 from mrctl import Box, Obstacles, RobotFile, Scenario, Sensing, Waypoints
 from mrctl.control.features import feature_matrix
-from mrctl.control.kanayama import kanayama, posture_error
+from mrctl.control.kanayama import Kanayama, kanayama, posture_error
 from mrctl.experiments.learned_limits import PLANTS
 from mrctl.loop.hierarchy import Hierarchy
-from mrctl.navigation.avoidance import Avoiding, Barrier, Following, Pacing, approach, avoid, nearest, share
+from mrctl.navigation.avoidance import Avoiding, Barrier, approach, avoid, nearest, share
+from mrctl.navigation.pacing import Following, Pacing
 from mrctl.navigation.vehicle import robot_of
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
@@ -152,10 +155,10 @@ def test_idle_when_clear() -> None:
             assert avoid(request, pose, outlines, BARRIER).tolist() == request.tolist()
 
 
-@pytest.mark.parametrize("prefilter", [None, 0.3])
-def test_following_has_the_gains_of_the_hierarchy(prefilter: float | None) -> None:
-    """Beside the filter the robot follows with the gains that it has without, also where the prefilter is given."""
-    scenario = Scenario(sensing=Sensing(tier="field"), prefilter=prefilter)
+@pytest.mark.parametrize("given", [{}, {"prefilter": 0.3}, {"kanayama": Kanayama(k_y=4.0)}])
+def test_following_has_the_gains_of_the_hierarchy(given: dict[str, Any]) -> None:
+    """Beside the filter the robot follows with the gains that it has without, also where a part of them is given."""
+    scenario = Scenario(sensing=Sensing(tier="field"), **given)
     robot = mjcf.build(scenario.world, scenario.steering)[1]
     pose, reference = np.array([[0.1, 0.2, 0.3]]), np.array([[0.0, 0.0, 0.0, 0.5, 0.2, 0.0, 0.0]])
     error, request = np.empty(3), np.empty(2)

@@ -10,7 +10,7 @@ from test_obstacles import judged, random_shapes
 from mrctl import Box, Disc, InputError, Limits, Obstacles
 from mrctl.navigation import planning
 from mrctl.navigation.generators import cellular, corridor, parking_bay
-from mrctl.navigation.planning import cost_to_go, plan, shortcut, space
+from mrctl.navigation.planning import NoWay, cost_to_go, plan, shortcut, space
 from mrctl.navigation.steer import sample, steer
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Surroundings, turned
@@ -75,7 +75,7 @@ def test_parking():
     found = plan(where, task.start, task.goal, RADIUS, True)
     drivable(where, found, task.start, task.goal, True)
     assert found.directions.min() == -1
-    with pytest.raises(InputError, match="no way"):
+    with pytest.raises(NoWay, match="no way"):
         plan(where, task.start, task.goal, RADIUS, False)
 
 

@@ -1,0 +1,214 @@
+"""A plan in time whose clock the braking filter slows: the motion stage `barrier` of missions.
+
+A robot that follows a plan in time is not helped by the nearest twist that the filter of `avoidance` allows: the plan
+goes on without it, and its controller then asks for a way across obstacles. `Pacing` therefore slows the plan itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mrctl.control.design import motion as design
+from mrctl.control.kanayama import GAINS, kanayama, posture_error
+from mrctl.kernel import Array
+from mrctl.loop.goals import RESTING
+from mrctl.loop.simulation import arranged
+from mrctl.navigation.avoidance import Barrier, approach, share
+from mrctl.navigation.planning import least_clearance
+from mrctl.navigation.replanning import SHORTER, Planner, Replan
+from mrctl.scenario import Scenario
+from mrctl.theory.clearance import clearance, rim
+from mrctl.theory.rays import Scan
+from mrctl.theory.references import Reference, Waypoints
+from mrctl.theory.robot import Robot
+
+BRAKING = 0.5  # share of the robot's acceleration that the filter counts on, for the robot lags behind the twist
+RIM = 0.02  # m, radius of the discs around the robot, which reach as far beyond its footprint
+KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from what is on the map and from what moves; chosen
+TRACKED = 0.01  # m, by which the margin KEPT is smaller than what the discs have on the plan, at least
+STANDOFF = 1.0  # m before a blocked place of its plan, where the robot stops, so that it can drive around it; chosen
+SLOW, WAITED = 0.1, 1.0  # mean λ over so many s, below which a robot makes another plan; chosen
+SPACING = 0.05  # m, of the places of a plan that are looked at
+
+
+class Following:
+    """Kanayama's motion controller, with the gains that scenarios have or that are designed for them."""
+
+    def __init__(self, robot: Robot, scenarios: Sequence[Scenario]) -> None:
+        """Takes the nominal robot, and the scenario of each robot."""
+        self._gains = np.zeros(len(scenarios), GAINS)
+        for row, scenario in enumerate(scenarios):
+            rigid = arranged(scenario).steering == "rigid"
+            latency = scenario.sensing.loop_delay(scenario.control_period) * scenario.control_period
+            gains = scenario.pid.channels(robot, rigid, latency, scenario.control_period)
+            designed = design(robot, rigid, gains, latency, scenario.control_period, scenario.prefilter).kanayama
+            own = scenario.kanayama.completed(designed)
+            self._gains[row] = own.k_x, own.k_y, own.k_theta
+
+    def output(self, pose: Array, twist: Array, reference: Array) -> Array:
+        """Returns the requested twists, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
+        error, requests = np.empty(3), np.empty((len(pose), 2))
+        for row in range(len(pose)):
+            posture_error.compiled(pose[row], reference[row, :3], error)
+            kanayama.compiled(error, reference[row, 3:5], self._gains[row], requests[row])
+        return requests
+
+
+class Pacing:
+    """A motion stage that follows a plan with Kanayama's law, and slows the clock of the plan where the filter asks.
+
+    With the clock s of the plan, the request u(s) of Kanayama's law, and the largest λ ≤ 1 for which λ u is allowed,
+
+        u_c = λ u(s),    ds/dt = λ
+
+    (path-velocity decomposition: Kant and Zucker, "Toward efficient trajectory planning", IJRR 5(3), 1986). The robot
+    drives the curvature that the plan asks for, and in the time s its error of posture obeys the same equations as
+    without obstacles. λ changes no faster than the robot can follow.
+
+    Where something that stands and is not on the map blocks the plan, the robot stops `STANDOFF` before it, and drives
+    on along another plan. Where the map has changed and another plan would take less than `SHORTER` of the time that is
+    left, it also stops, because a plan begins at rest, and drives on along that.
+
+    Attributes:
+        followed: What the robots follow, as in `mrctl.control.stages.Motion`, `(B, 7)`.
+    """
+
+    def __init__(self, robot: Robot, size: int, replan: Replan) -> None:
+        """Makes the stage.
+
+        Args:
+            robot: Nominal robot.
+            size: Number of robots.
+            replan: Makes a plan to the goal.
+        """
+        self._robot, self._size, self._replan = robot, size, replan
+        self._brakes = BRAKING * robot.max_acceleration
+
+    def assign(self, scenarios: Sequence[Scenario]) -> None:
+        """Takes the missions of the robots, with their maps and with their plans as references."""
+        self._follow, self._scenarios = Following(self._robot, scenarios), scenarios
+        self._planners = Planner.each(self._replan, scenarios)
+        self._footprint = self._planners[0].footprint
+        self._near, self._away = self._barrier(-RIM), self._barrier(AWAY)
+
+    def _barrier(self, margin: float) -> Barrier:
+        """Returns the filter that keeps this clearance in m."""
+        return Barrier(rim(self._footprint, RIM), margin, self._brakes, self._scenarios[0].motion_period)
+
+    def reset(self, pose: Array, reference: Array, period: float) -> None:
+        """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
+        size = self._size
+        for planner in self._planners:
+            planner.reset()
+        self._period, self._tick, self.followed = period, 0, reference
+        self._clock, self._pace = np.zeros(size), np.ones(size)  # s in motion periods, and λ
+        self._plans = [self._sampled(planner.first) for planner in self._planners]
+        self._kept = [self._margin(planner.first, row) for row, planner in enumerate(self._planners)]
+        self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
+        self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
+        self._looked = np.zeros(size, bool)  # which robots have a scan that is new
+        self._map_changed = np.zeros(size, bool)  # so that a shorter way may be free
+        self._stops = np.zeros(size, bool)  # which stop for a shorter way
+
+    def _sampled(self, plan: Waypoints) -> Array:
+        """Returns a plan as `output` gets it, for each motion period, `(n, 7)`."""
+        step, sensing, period = self._scenarios[0].control_period, self._scenarios[0].sensing, self._period
+        ticks = round(period / step) * np.arange(int(plan.period / period) + 2) + sensing.periods("delay", step)
+        return np.hstack(plan.sample(np.asarray(step * ticks, float)))
+
+    def _margin(self, plan: Waypoints, row: int) -> Barrier:
+        """Returns the filter for the map of one robot, with less clearance than the plan has.
+
+        The clearance is negative where the discs would overlap the map on the plan.
+        """
+        free = least_clearance(self._footprint, plan, self._planners[row].sight.map)
+        return self._barrier(min(KEPT, free - RIM - TRACKED))
+
+    def follow(self, row: int, plan: Reference) -> None:
+        """Takes another plan for one robot, which is a way to another goal."""
+        self._begin(row, self._planners[row].take(plan))
+
+    def _begin(self, row: int, plan: Waypoints) -> None:
+        """Lets a robot drive a plan from its beginning."""
+        self._plans[row], self._kept[row] = self._sampled(plan), self._margin(plan, row)
+        self._clock[row], self._anchor[row], self._blocked[row] = 0.0, 0.0, np.inf
+        self._map_changed[row] = self._stops[row] = False
+
+    def see(self, row: int, scan: Scan) -> None:
+        """Takes a scan of one robot, and looks whether its plan is free; for the arguments see `stages.Motion`."""
+        self._map_changed[row] |= self._planners[row].sight.see(scan)
+        self._looked[row] = True
+        standing = self._planners[row].sight.standing
+        self._blocked[row] = np.inf
+        if not len(standing.discs):
+            return
+        plan = self._plans[row]
+        first = min(int(self._clock[row]), len(plan) - 2)
+        way = np.cumsum(np.abs(plan[first:, 3])) * self._period
+        ahead = first + np.searchsorted(way, np.arange(0.0, way[-1], SPACING))
+        free = [clearance(self._footprint, plan[k, :3], standing) for k in ahead]
+        if len(blocked := ahead[np.array(free) <= 0]):
+            self._blocked[row] = blocked[0]
+
+    def output(self, pose: Array, twist: Array, reference: Array) -> Array:
+        """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
+        for row in np.flatnonzero(self._looked):  # robots that have failed do not look
+            self._get_on(int(row), pose[row], abs(float(twist[row, 0])))
+        self._looked[:] = False
+        now = np.empty((len(pose), 7))
+        for row, plan in enumerate(self._plans):
+            first = min(int(self._clock[row]), len(plan) - 2)
+            now[row] = plan[first] + min(self._clock[row] - first, 1.0) * (plan[first + 1] - plan[first])
+        requests, twists = self._follow.output(pose, twist, now), now[:, 3:5].copy()
+        free = [self._share(row, *own) for row, own in enumerate(zip(requests, pose, strict=True))]
+        change = self._period * self._robot.max_acceleration / np.maximum(np.abs(twists[:, 0]), 1e-9)
+        pace = np.minimum(np.clip(free, self._pace - change, self._pace + BRAKING * change), 1.0)[:, None]
+        now[:, 3:5] = pace * twists
+        now[:, 5:] = pace**2 * now[:, 5:] + (pace - self._pace[:, None]) / self._period * twists
+        self._pace, self._clock = pace[:, 0], self._clock + pace[:, 0]
+        self._tick, self.followed = self._tick + 1, now
+        return pace * requests
+
+    def _share(self, row: int, request: Array, pose: Array) -> float:
+        """Returns λ of one robot."""
+        sight, allowed = self._planners[row].sight, 0.0 if self._stops[row] else 1.0
+        if np.isfinite(self._blocked[row]):
+            part = self._plans[row][int(self._clock[row]) : int(self._blocked[row]), 3]
+            left = self._period * float(np.abs(part).sum()) - STANDOFF
+            allowed = approach.compiled(left, self._brakes, self._period) / max(abs(float(request[0])), 1e-9)
+        moving = sight.moving(self._period * self._tick)
+        around = (sight.map, self._kept[row]), (sight.standing, self._near), (moving, self._away)
+        return min(
+            allowed, *(share(request, pose, *each) for each in around if len(each[0].discs) + len(each[0].rings))
+        )
+
+    def _get_on(self, row: int, pose: Array, speed: float) -> None:
+        """Gives a robot another plan, if what stands there has hardly let it get on, or if the map lets it.
+
+        Args:
+            row: Which robot.
+            pose: x and y in m and θ in rad, `(3,)`.
+            speed: |V| in m/s.
+        """
+        planner, now = self._planners[row], self._period * self._tick
+        if self._stops[row]:
+            if speed < RESTING:
+                self._stops[row] = False
+                if plan := planner.plan(pose, now):
+                    self._begin(row, plan)
+            return
+        if self._map_changed[row]:
+            self._map_changed[row] = False
+            left = self._period * (len(self._plans[row]) - self._clock[row])
+            plan = planner.plan(pose, now)
+            self._stops[row] = plan is not None and plan.period + speed / self._brakes < SHORTER * left
+        standing = planner.sight.standing
+        if self._clock[row] - self._anchor[row] > SLOW * WAITED / self._period or not len(standing.discs):
+            self._anchor[row], self._since[row] = self._clock[row], now
+        if now - self._since[row] < WAITED:
+            return
+        self._since[row] = now  # where there is no other plan, it tries again later
+        if plan := planner.plan(pose, now):
+            self._begin(row, plan)

@@ -1,0 +1,84 @@
+"""Plans that a robot makes on its way, around what it knows; the motion stages of missions share them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from mrctl.kernel import Array
+from mrctl.navigation.sight import Sight
+from mrctl.navigation.vehicle import robot_of
+from mrctl.record import InputError
+from mrctl.scenario import Scenario
+from mrctl.theory.obstacles import Outlines
+from mrctl.theory.references import Reference, Waypoints
+
+SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
+
+Replan = Callable[[Scenario, Array, Outlines, Waypoints | None], Waypoints | None]
+"""Plans for the mission of a scenario, from a pose in m, m, rad, `(3,)`, among obstacles as they are now, to the end of
+a plan that an event brought, or else to the goal of the mission; None where there is no way."""
+
+
+def open_waypoints(reference: Reference) -> Waypoints:
+    """Returns the reference of an event if it is a way with an end, such as a plan.
+
+    Raises:
+        InputError: It is another one, which robots with an avoider do not follow.
+    """
+    if not isinstance(reference, Waypoints) or reference.closed:
+        raise InputError("reference: robots with an avoider follow open waypoints alone")
+    return reference
+
+
+class Planner:
+    """Mission and knowledge of one robot, and the plans that follow from them.
+
+    Attributes:
+        scenario: The mission.
+        first: The plan of the mission.
+        sight: What the robot knows of its surroundings.
+        footprint: Its corners in its frame in m, `(n, 2)`.
+    """
+
+    def __init__(self, replan: Replan, scenario: Scenario, sight: Sight, footprint: Array) -> None:
+        """Takes what makes plans, and the attributes.
+
+        Raises:
+            InputError: The reference of the scenario is no plan.
+        """
+        self.scenario, self.first = scenario, open_waypoints(scenario.reference)
+        self.sight, self.footprint, self._replan = sight, footprint, replan
+        self._given: Waypoints | None = None  # the plan that came since the start
+
+    @classmethod
+    def each(cls, replan: Replan, scenarios: Sequence[Scenario]) -> list[Planner]:
+        """Makes the planner of each robot of a batch, in which all have the same footprint."""
+        footprint, sights = robot_of(scenarios[0])[0], Sight.each(scenarios)
+        return [cls(replan, *own, footprint) for own in zip(scenarios, sights, strict=True)]
+
+    def reset(self) -> None:
+        """Forgets the plan that was taken, and all that scans have shown."""
+        self._given = None
+        self.sight.forget()
+
+    def take(self, plan: Reference) -> Waypoints:
+        """Takes the plan of an event, to whose end all later plans lead; returns it.
+
+        Raises:
+            InputError: It is no plan.
+        """
+        self._given = open_waypoints(plan)
+        return self._given
+
+    def plan(self, pose: Array, time: float) -> Waypoints | None:
+        """Makes a plan that keeps off what is not on the map, or else one that only does not touch it.
+
+        Args:
+            pose: x and y in m and θ in rad, from which it leads, `(3,)`.
+            time: Time in s.
+
+        Returns:
+            The plan, or None where there is no way.
+        """
+        far = self._replan(self.scenario, pose, self.sight.around(time, self.footprint, pose), self._given)
+        return far or self._replan(self.scenario, pose, self.sight.outlines(time), self._given)
