@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -180,9 +180,14 @@ def compare(table: pd.DataFrame, scenarios: Sequence[Scenario]) -> list[dict[str
         table: What `summary` returns, a row for each scenario.
         scenarios: The runs, PID alone among them.
     """
+
+    def world(one: Scenario) -> Hashable:
+        return one.name, one.steering, one.sensing, one.reference, one.seed
+
+    alone = {world(one): k for k, one in enumerate(scenarios) if one.feedforward == "none"}
     rows = []
     for k, one in enumerate(scenarios):
-        bare = scenarios.index(one.model_copy(update=FEEDFORWARDS["none"]))
+        bare = alone[world(one)]
         row: dict[str, Any] = {
             "steering": table["steering"].iloc[k],
             "plant": one.name,
