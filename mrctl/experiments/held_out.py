@@ -2,7 +2,7 @@
 
 A setting that was chosen on some runs looks better on them than it is (selection bias). These cells were written down
 before any tuning; their courses, plants and seeds are used nowhere else. A learner is named, with its settings, before
-it is driven through them, and a log keeps every such drive.
+it is driven through them, and the folder that it is driven into logs each drive, also one that was interrupted.
 """
 
 from __future__ import annotations

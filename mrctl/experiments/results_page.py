@@ -233,7 +233,7 @@ def held_out_text(table: str, log: str) -> str:
     tables = [text for title, text in sections(table).items() if title]
     lines = [json.loads(line) for line in log.splitlines()]
     driven = [f"- {one['time']}, {one['entry']}, mrctl {one['mrctl']}: {one.get('says') or 'begun'}" for one in lines]
-    return "\n\n".join([*tables, "Every time that the cells were driven:", "\n".join(driven)])
+    return "\n\n".join([*tables, "Drives through the cells that the folder of this one has logged:", "\n".join(driven)])
 
 
 def tune_text(table: Table) -> str:

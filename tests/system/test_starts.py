@@ -63,8 +63,9 @@ STARTS = {
     "1 m": {"start_position_noise": 1.0, "start_heading_noise": 0.5},
     "unknown": UNKNOWN,
 }
-LEAST = {"fix": 1.0, "0.3 m": 1.0, "1 m": 0.5, "unknown": 0.0}  # share that arrives in each kind of world
 WORLDS = ("cellular", "doorway", "warehouse", "slalom")
+# Share that arrives. Slaloms look alike from many places.
+LEAST = {"fix": (1.0, 1.0), "0.3 m": (1.0, 0.9), "1 m": (0.9, 0.5), "unknown": (0.7, 0.0)}
 COUNTS = [(2, WORLDS[:2], ("0.3 m",)), pytest.param((12, WORLDS, tuple(STARTS)), marks=pytest.mark.full)]
 
 
@@ -82,7 +83,7 @@ def test_missions(counts):
                 result = simulate([s.replace(sensing={"localisation": name, **STARTS[start]}) for s in own])
                 there[name] = int((result["failure"] == "").sum())
             print(f"{world}, {start}: " + ", ".join(f"{n} of {count} arrive with {name}" for name, n in there.items()))
-            assert min(there.values()) >= LEAST[start] * count
+            assert min(there.values()) >= LEAST[start][world == "slalom"] * count
 
 
 def test_without_localisation():
