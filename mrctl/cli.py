@@ -719,9 +719,9 @@ def suite(
     It prints how long it will take before it starts: by default less than half an hour on two cores.
 
     Args:
-        feedforward: Feedforwards to compare, such as fel or model+composite; hindsight is, for each run, the better one
-            of model and of coefficients fitted to that run. By default those in the tables of RESULTS.md, with --full
-            all.
+        feedforward: Feedforwards to compare, such as fel or model+composite; hindsight is the best fixed one for each
+            run, either model or coefficients fitted to that run afterwards. By default those in the tables of
+            RESULTS.md, with --full all.
         controller: Controllers of your own to compare, such as my_file.py:MyFeedforward, the same behind the nominal
             model as model+my_file.py:MyFeedforward, or motion=my_file.py:MyMotion.
         seeds: Number of replicates of each case; by default 20, or 3 with --quick.

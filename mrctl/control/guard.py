@@ -196,8 +196,8 @@ class Guard(Record):
     """Largest errors of V and θ̇, as a share of the robot's largest ones, with which a learner may go on; at least
     0.27 m/s and 0.75 rad/s."""
     oscillation: Annotated[float, Field(gt=0, le=1)] = 0.25
-    """Share of D by which the PID's output must swing, and the learner deviate, for an oscillation to count; D is the
-    deviation from the fallback in V (rad/s on a steering channel) that keeps the errors within their bounds."""
+    """Share of D, by more than which the PID's output must swing, and the learner deviate from the fallback, for an
+    oscillation to count; a deviation of D in V (rad/s on a steering channel) cannot take the errors out of bounds."""
     growth: Annotated[float, Field(ge=1, le=100)] = 3.0
     """Factor by which the posture error may exceed the smallest one so far; 0.15 m are tolerated in any case."""
     hold: Annotated[float, Field(gt=0, le=100)] = 1.0

@@ -69,8 +69,8 @@ class Pid(Record):
     delay: Annotated[float, Field(ge=0, le=LONGEST_DELAY)] | None = None
     """Delay from measurement to voltage in s that the design of the gains assumes; by default that of `sensing`."""
     retune: bool = True
-    """Whether an oscillation slows the controllers for the rest of the run: first motion controller and learner, at the
-    next one the PID, and so on, each as for 10 ms more delay; without effect with `time_constant`."""
+    """Whether each oscillation slows the controllers for the rest of the run, as 10 ms more delay would: in turn the
+    motion controller with the learner, and the PID; without effect with `time_constant`."""
     lag: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Time constant in s by which, as the design assumes, the measured velocities lag behind the true ones."""
     derivative_time: Annotated[float, Field(ge=0, le=0.5)] = 0.0

@@ -1,4 +1,4 @@
-"""A fixed feedforward in hindsight: the one of a learner that had known the whole run at its start.
+"""The best fixed feedforward for each run: the nominal model, or coefficients fitted to that run afterwards.
 
     U_ff = cᵀ φ_c,    c ← c + argmin_Δ Σ |U_fb − Δᵀ φ_c|²,    φ_c = the 8 features of equation (3) at the command
 

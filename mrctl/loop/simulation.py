@@ -52,9 +52,9 @@ def simulate(
     One scenario runs through dm_control, several run together on MuJoCo's batch engine, with the same bits.
 
     Args:
-        scenarios: One scenario, or several. Those that differ in world, robot, laws, estimator, steering, delay or
-            rates, in the kinds or much in the number of their obstacles or, without a goal, in length run in batches of
-            their own.
+        scenarios: One scenario, or several. They run in one batch if they have the same world, robot, laws, estimator,
+            steering, delay and rates, obstacles of the same kinds in about the same number and, unless they have goals,
+            the same length; else in several.
         progress: Whether to show a progress bar.
         threads: Number of threads for control and physics, which does not change the result; 0 for all cores.
         stages: The user's stages `motion`, `feedback`, `feedforward`, `steering` or `estimator` in place of the
