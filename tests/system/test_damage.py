@@ -252,7 +252,7 @@ def piped(store: Path) -> None:
 
 @pytest.mark.parametrize(
     ("made", "says"),
-    [(larger, "not that of the sweep"), (longer, "declares 19 GB"), (taller, "declares 1 GB"), (piped, "a pipe")],
+    [(larger, "not that of the sweep"), (longer, "declares 20 GB"), (taller, "declares 1 GB"), (piped, "a pipe")],
 )
 def test_foreign_store_is_bounded(
     whole: Path, tmp_path: Path, made: Callable[[Path], None], says: str, capsys: pytest.CaptureFixture
