@@ -110,10 +110,10 @@ class Scenario(Record):
     laps: Annotated[int, Field(ge=1, le=10_000)] = 8
     """The robot drives this number of laps."""
     prior: PriorName = "none"
-    """Model that the feedforward knows at the start: none, the nominal robot or, as a yardstick, the true one."""
+    """Model that the feedforward starts from: none, the nominal one or, as a yardstick, the true one."""
     learner: LearnerName = "fel"
-    """Law whose output is added to that of the prior; `observer`, `indi` and `l1` need a model as prior, and `none`
-    adds nothing."""
+    """Law that adds to the output of the prior, which for `observer`, `indi` and `l1` must be a model; `none` adds
+    nothing."""
     sensing: Sensing = Sensing()
     """Sensors, estimator, motor driver, battery, steering servo and delay, which a tier sets."""
     kanayama: Kanayama = Kanayama()
