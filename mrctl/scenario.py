@@ -110,7 +110,7 @@ class Scenario(Record):
     laps: Annotated[int, Field(ge=1, le=10_000)] = 8
     """The robot drives this number of laps."""
     prior: PriorName = "none"
-    """Model that the feedforward starts from: none, the nominal one or, as a yardstick, the true one."""
+    """Model of the robot that the feedforward starts from; `true_model` is a yardstick."""
     learner: LearnerName = "fel"
     """Law that adds to the output of the prior, which for `observer`, `indi` and `l1` must be a model; `none` adds
     nothing."""
