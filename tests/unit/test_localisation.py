@@ -6,7 +6,7 @@ from test_obstacles import random_shapes
 
 from mrctl import Box, Disc, Obstacles
 from mrctl.sensing.lidar import Lidar
-from mrctl.sensing.particles import LEAST, MOST, Particles
+from mrctl.sensing.particles import LEAST, MOST, Particles, is_free
 from mrctl.sensing.scan_matching import match
 from mrctl.theory.clearance import clearance
 from mrctl.theory.grid import at, field_of
@@ -161,6 +161,25 @@ def test_unknown_start():
         assert np.array_equal(same, again)
     assert not np.array_equal(same, other)
     assert errors(same, drive[-1][0])[0] < 0.05 and len(filters[0].particles) < 2 * LEAST
+
+
+def test_rays():
+    """A beam is free up to what it met, and not beyond: the scan is cast on the shapes, the map is a grid."""
+    exact, blocked = Lidar(noise=0.0), []
+    for seed in range(10):
+        room = Room(seed)
+        pose = room.free()
+        scan = exact.scan(pose, room.outlines, room.random)
+        rays = exact.rays(scan, 60)
+        ranges = np.hypot(*(rays[:, 2:] - rays[:, :2]).T) + 0.2
+        beyond = np.column_stack([rays[:, :2], rays[:, 2:] * ((ranges + 0.06) / (ranges - 0.2))[:, None]])
+        assert ranges == pytest.approx(scan[::6][scan[::6] > 0.2])
+        for kind, ends in (("free", rays), ("beyond", beyond)):
+            places = [turned(ends[:, k : k + 2], pose) / room.field.resolution + 80 for k in (0, 2)]
+            free = [is_free.compiled(room.field.distance, 0.05, *a, *b) for a, b in zip(*places, strict=True)]
+            blocked.append((kind, 1 - np.mean(free)))
+    assert np.mean([share for kind, share in blocked if kind == "free"]) < 0.02  # but for beams that graze a corner
+    assert np.mean([share for kind, share in blocked if kind == "beyond"]) > 0.9
 
 
 def test_turned_half_way_round():
