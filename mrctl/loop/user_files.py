@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import ast
 import hashlib
-import importlib.util
 import re
 import sys
 from functools import lru_cache, partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from mrctl.control.stages import METHODS, Stages
@@ -90,13 +90,19 @@ def digest(name: str) -> str:
     return hashlib.sha256(b"".join(part.path.read_bytes() for part in parts(name))).hexdigest()
 
 
-@lru_cache
 def load(name: str) -> Stages:
     """Runs the files and returns the factories by stage, as keywords for `simulate`.
+
+    The files run once as long as they stay the same; the same file name in another directory is another file.
 
     Raises:
         InputError: The name is refused, as by `parts`; a file raises; or a file has no such attribute to call.
     """
+    return _load(absolute(name), digest(name))
+
+
+@lru_cache
+def _load(name: str, _digest: str) -> Stages:
     factories: Any = {part.stage: _factory(part) for part in parts(name)}
     return factories
 
@@ -104,12 +110,12 @@ def load(name: str) -> Stages:
 def _factory(part: Part) -> Any:  # noqa: ANN401
     path, attribute = part.path, part.attribute
     module_name = f"mrctl_controller_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
-    spec = importlib.util.spec_from_file_location(module_name, path)
-    assert spec and spec.loader
-    module = sys.modules[module_name] = importlib.util.module_from_spec(spec)  # dataclasses look the module up there
+    module = sys.modules[module_name] = ModuleType(module_name)  # dataclasses look the module up there
+    module.__file__ = str(path)
     sys.path.insert(0, str(path.parent))  # as for a script, so that the file can import its neighbours
     try:
-        spec.loader.exec_module(module)
+        # Python's own cache of compiled files takes an edit within a second that keeps the size for no edit.
+        exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
     except (Exception, SystemExit) as error:
         raise InputError(" ".join(f"controller: {path}: {type(error).__name__}: {error}".split())) from None
     finally:

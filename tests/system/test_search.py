@@ -156,6 +156,17 @@ def test_settings_of_a_user(file, tmp_path):
             user_files.parts(f"{file}:{text}")
 
 
+def test_edited_file_of_a_user(tmp_path, monkeypatch):
+    """In one process, an edited file is loaded anew, and the same name in another directory is another file."""
+    for folder, gain in (("one", 1), ("two", 2), ("one", 3)):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "own.py").write_text(f"def own(robot, size):\n    return {gain}\n")
+        monkeypatch.chdir(tmp_path / folder)
+        stages = user_files.load("own.py:own")
+        assert stages["feedforward"](None, 1) == gain
+        assert user_files.load("feedforward=own.py:own") is stages
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
