@@ -43,6 +43,7 @@ HARD = {
 STEPS = (*(name for name in UNCERTAIN if name != "mass -50 %"), "all")
 LASTING = ("left_radius_factor", "right_radius_factor", "slope")  # fields that do not change while a robot drives
 FLOOR, HALF = ("nominal", "all"), ", half the step"  # plants that are also driven with half the physics step
+LATE = 20  # laps before a late step, after which what a learner knows of the former plant has long been confirmed
 NO_SPREAD = (0.0, 0.0, 0.0)  # no initial offset, which would hide what learning costs in lap 1
 FAST, SHORT, LONG = 9.0, 12.0, 18.0  # s, lap times: near the robot's limits, the benchmark's, a slow one to learn on
 LAP_TIMES = (8.0, 10.0, 12.0, 16.0, 20.0, 24.0, 30.0)  # s, of random splines; few, so that runs share a batch
@@ -128,6 +129,7 @@ PARTS = {
     "fault": "One motor, the current limit, the battery, the grip",
     "course": "Courses at changing speed",
     "step": "A step, and the return",
+    "late": "A step after twenty laps, and two laps with it",
     "learning": "Learning carried to another course, switched on, and off",
     "tier": "Other sensors",
     "steering": "Other steering arrangements",
@@ -166,6 +168,9 @@ def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
             Event(time=2 * third * SHORT, perturbation=Perturbation()),
         )
         add("step", f"{name}, on and off", third + 1, 2 * third + 1, laps=3 * third, events=events)
+    if not quick:
+        late = Event(time=LATE * SHORT, perturbation=PERTURBATIONS["all"])
+        add("late", f"all, after {LATE} laps", LATE + 1, laps=LATE + 2, events=(late,))
     carried = Event(time=third * SHORT, learning=False, reference=slowed(loop(), SHORT))
     for name in ("all",) if quick else FLOOR:
         case = {"laps": third + 2, "events": (carried,), "perturbation": PERTURBATIONS[name]}

@@ -71,6 +71,16 @@ def figures(outcome: Outcome, choices: Choices) -> dict[str, tuple[Any, str]]:
         plots.laps_by_case(steps, "position_rmse", (stepped[0].change, stepped[0].back)),
         f"Position error lap by lap; the plant changes at the first dotted line and back at the second. {mean}",
     )
+    if late := {case.name: case for case in outcome.cases if case.part == "late"}:
+        drawn["late_step"] = (
+            plots.laps_by_case(
+                {name: _labelled(found[name]) for name in late},
+                "position_rmse",
+                [case.change for case in late.values()],
+            ),
+            "Position error lap by lap; the plant changes at the dotted line, when learners have long converged on the "
+            f"former one. {mean}",
+        )
     share = {**steady, stepped[-1].name: steps[stepped[-1].name]}
     drawn["feedback_share"] = (
         plots.laps_by_case(share, "feedback_share"),

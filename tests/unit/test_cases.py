@@ -24,7 +24,7 @@ def test_complete_and_paired(mode):
     """Every part is there under names of their own; each case has the same seeds, and runs of one length."""
     found = cases.cases(mode, 3, 2)
     assert {case.part for case in found} == set(cases.PARTS) - {
-        "quick": {"steering", "tier"}, "core": {"steering"}, "full": set(),
+        "quick": {"late", "steering", "tier"}, "core": {"steering"}, "full": set(),
     }[mode]  # fmt: skip
     assert len({case.name for case in found}) == len(found)
     for case in found:
@@ -61,6 +61,10 @@ def test_steps_are_where_the_laps_say():
                 assert abs(getattr(back, name) - 1) <= width
                 assert (getattr(back, name) == getattr(start, name)) == ("radius" in name)
             assert back.slope == start.slope
+        if case.part == "late":
+            (event,) = events
+            assert 1 + event.time / case.scenarios[0].reference.period == case.change > 20
+            assert case.change + 1 == case.scenarios[0].laps and event.perturbation != case.scenarios[0].perturbation
 
 
 def test_other_course_begins_where_the_lap_ends():
