@@ -26,7 +26,7 @@ from mrctl.physics.obstacles import multi_ray
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.sensing.lidar import Lidar
-from mrctl.sensing.localisation import BEAMS, RAYS
+from mrctl.sensing.localisation import POINTS, RAYS
 from mrctl.sensing.particles import HIT, LEAST, Particles, weigh
 from mrctl.theory.clearance import clearance
 from mrctl.theory.grid import field_of
@@ -136,7 +136,7 @@ def _particles(turns: int) -> dict[str, Any]:
     field = field_of(outlines, np.full(2, -7.0), np.full(2, 7.0), 0.05)
     pose = np.zeros(3)
     scan = lidar.scan(pose, outlines, random)
-    points, rays = lidar.points(scan, BEAMS["particles"]), lidar.rays(scan, RAYS)
+    points, rays = lidar.points(scan, POINTS["particles"]), lidar.rays(scan, RAYS)
     filtered, weights = Particles(field, 0, pose, np.full(3, 0.02)), np.empty(LEAST)
     first = filtered.particles.copy()
     likelihoods = partial(weigh.compiled, first, points, rays[:0], field, HIT, weights)

@@ -86,13 +86,12 @@ class Lidar(Record):
 
         Args:
             ranges: Ranges of a scan in m, `(beams,)`.
-            most: Largest number of beams to use, evenly spread over the view.
+            most: Largest number of points, evenly spread over the beams that met something.
 
         Returns:
-            x and y in the robot's frame in m, `(n, 2)`; beams that returned nothing are left out.
+            x and y in the robot's frame in m, `(n, 2)`.
         """
-        used = self._spread(most)
-        used = used[np.isfinite(ranges[used])]
+        used = thinned(np.flatnonzero(np.isfinite(ranges)), most)
         return self._ends(used, ranges[used])
 
     def rays(self, ranges: Array, most: int) -> Array:
@@ -108,16 +107,17 @@ class Lidar(Record):
         Returns:
             x and y of start and end in the robot's frame in m, `(n, 4)`.
         """
-        used = self._spread(most)
+        used = thinned(np.arange(self.beams), most)
         free = np.where(np.isfinite(ranges[used]), ranges[used] - SHY, self.range)
         ends = self._ends(used[free > 0], free[free > 0])
         return np.column_stack([np.full(len(ends), self.x), np.zeros(len(ends)), ends])
-
-    def _spread(self, most: int) -> NDArray[np.intp]:
-        """Returns the indices of at most so many beams, evenly spread over the view."""
-        return np.arange(0, self.beams, -(-self.beams // most))
 
     def _ends(self, beams: NDArray[np.intp], ranges: Array) -> Array:
         """Returns the points at these ranges in m on some beams, x and y in the robot's frame in m, `(n, 2)`."""
         angles = self.first + self.step * beams
         return ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]) + [self.x, 0.0]
+
+
+def thinned(beams: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """Returns at most so many of some beams, evenly spread over them."""
+    return beams[:: max(1, -(-len(beams) // most))]

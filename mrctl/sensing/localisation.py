@@ -20,7 +20,7 @@ from mrctl.sensing.tiers import Sensing
 from mrctl.theory.grid import field_of, map_area
 from mrctl.theory.obstacles import Obstacles, Surroundings
 
-BEAMS = {"scan": 120, "particles": 60}  # largest number of beams of a scan that are used
+POINTS = {"scan": 120, "particles": 60}  # largest number of points of a scan that are used
 RAYS = 20  # largest number of beams that are followed through the map
 SETTLED = 0.2  # m between fix and estimate in x and y, below which a search has ended
 AGREES = 0.5  # share of the points of a scan that must lie on the map for a fix
@@ -111,7 +111,7 @@ class Localiser:
             sensing, scan, chart = self._sensing[row], self._scanner.scans[row], self._maps[row]
             if sensing.localisation == "fixes" or scan is None or chart is None:
                 continue
-            points, rays = sensing.lidar.points(scan, BEAMS[sensing.localisation]), sensing.lidar.rays(scan, RAYS)
+            points, rays = sensing.lidar.points(scan, POINTS[sensing.localisation]), sensing.lidar.rays(scan, RAYS)
             if particles := self.filters[row]:
                 found = particles.update(float(self._odometry[row, 0]), float(self._odometry[row, 1]), points, rays)
             elif (poses := self._sought[row]) is not None:

@@ -102,8 +102,7 @@ def test_interrupted_on_a_cluster_resumed_at_home(cluster, tmp_path):
     assert 4 <= len(Store(store).done()) < 12
     (tmp_path / "go").touch()
     sweep = Sweep.from_toml(file)
-    jobs.run(sweep, store, 2)
-    jobs.run(sweep, tmp_path / "cluster", scheduler=address)
+    assert jobs.run(sweep, store, 2).aside == jobs.run(sweep, tmp_path / "cluster", scheduler=address).aside == {}
     assert content(store) == content(tmp_path / "cluster")
 
 

@@ -81,6 +81,32 @@ def test_lidar():
     assert np.isinf(Lidar(range=1.0).scan(np.zeros(3), wall, np.random.default_rng(0))).all()
 
 
+def test_points_of_a_sparse_scan():
+    """The points of a scan that meets little are all of them; of one that meets much they are spread over the view."""
+    open_world = Surroundings(Obstacles(shapes=(Disc(x=3, radius=0.3), Disc(x=-2, y=2, radius=0.2)))).at(0.0)
+    scan = Lidar().scan(np.zeros(3), open_world, np.random.default_rng(0))
+    met = int(np.isfinite(scan).sum())
+    assert 10 < met < 30
+    np.testing.assert_array_equal(Lidar().points(scan, 60), Lidar().points(scan))
+    angles = np.arctan2(*Lidar().points(np.full(360, 5.0), 60).T[::-1])
+    assert np.diff(np.sort(angles)) == pytest.approx(2 * np.pi / 60)
+
+
+def test_three_pillars():
+    """In the open, from 0.3 m and 0.2 rad beside the truth, one scan of three pillars tells where the robot is."""
+    pillars = Obstacles(shapes=tuple(Disc(x=x, y=y, radius=0.25) for x, y in ((2.0, 0.7), (3.5, -0.6), (-1.5, 1.2))))
+    outlines = Surroundings(pillars).at(0.0)
+    field, away = field_of(outlines, np.full(2, -5.0), np.full(2, 5.0), 0.05), []
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        spread = np.array([0.3, 0.3, 0.2])
+        filters = Particles(field, seed, spread * random.standard_normal(3), spread)
+        found = filters.update(0.0, 0.0, *seen(LIDAR.scan(np.zeros(3), outlines, random)))
+        away.append(errors(found, np.zeros(3)))
+    position, heading = np.abs(away).T
+    assert position.max() < 0.02 and np.sqrt(np.mean(position**2)) < 0.012 and np.sqrt(np.mean(heading**2)) < 0.005
+
+
 def test_field():
     """The field of shapes is their distance, up to the interpolation between cells."""
     room = Room(0)
