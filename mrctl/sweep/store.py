@@ -265,7 +265,12 @@ class Store:
         return self.path / "parts" / f"{job:06d}.parquet"
 
     def write(self, job: int, rows: pa.Table, signals: Array | None) -> None:
-        """Writes the results of a job: signals `(runs, samples, signals)`, then rows, which show that it is done."""
+        """Writes the results of a job: signals `(runs, samples, signals)`, then rows, which show that it is done.
+
+        Dask cannot stop a job that runs: it may end after another machine has finished the sweep, with the same results.
+        """
+        if self.complete and not self._lost(job):
+            return
         if signals is not None:
             runs = self.runs(job)
             self._signals[runs.start : runs.stop] = signals  # zarr renames a whole shard

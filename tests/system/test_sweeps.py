@@ -116,6 +116,13 @@ def test_workers_change_nothing(sweep, tmp_path, whole, workers):
     assert report.runs == 24 and not report.aside and report.failed == len(failures(sweep))
 
 
+def test_late_worker(finished, tmp_path, whole):
+    """A job that ends after the sweep was finished elsewhere leaves the store as it is."""
+    shutil.copytree(finished, tmp_path / "store")
+    assert not jobs.compute(str(tmp_path / "store"), 1).error
+    assert content(tmp_path / "store") == whole
+
+
 def failures(sweep):
     return [run for run in range(sweep.size) if sweep.valid(run) is None]
 
