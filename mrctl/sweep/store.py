@@ -267,7 +267,7 @@ class Store:
     def write(self, job: int, rows: pa.Table, signals: Array | None) -> None:
         """Writes the results of a job: signals `(runs, samples, signals)`, then rows, which show that it is done.
 
-        Dask cannot stop a job that runs: it may end after another machine has finished the sweep, with the same results.
+        Dask cannot stop a job that runs: it may end after another machine has finished the sweep.
         """
         if self.complete and not self._lost(job):
             return
