@@ -23,6 +23,7 @@ from mrctl.physics.hull import footprint
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank, combine, dataset
 from mrctl.scenario import Event, Scenario
+from mrctl.sensing.prediction import advance
 from mrctl.theory.clearance import clearance, clearances
 from mrctl.theory.obstacles import Pose, Surroundings, turned
 from mrctl.theory.references import Reference, Waypoints, check
@@ -162,9 +163,10 @@ class Session:
                 sim.add(event)
 
     def head_for(self, goal: Pose) -> Plan:
-        """Plans a way for the first robot from where it is, and gives it to every robot as an event.
+        """Plans a way for the first robot, and gives it to every robot as an event.
 
-        The plan keeps 5 cm from obstacles on the map, or 2 cm where the robot is nearer than that now.
+        The plan begins where that robot is when it follows it, with the twist that it is asked for now. It keeps 5 cm
+        from obstacles on the map, or 2 cm where the robot is nearer than that then.
 
         Args:
             goal: x and y in m and θ in rad.
@@ -172,14 +174,16 @@ class Session:
         Raises:
             InputError: The robot has stopped, the goal is in an obstacle, or there is no way.
         """
-        x, y, theta = self._pose("goal")
+        (x, y, theta), twist = self._pose("goal"), self._twist()
+        x, y, theta, *_ = advance.compiled(x, y, theta, *twist, 0.0, 0.0, self.preview * self.period)
         first = self.start[0]
         start = x, y, remainder(theta, 2 * pi)
         task = Task.from_dict({"obstacles": first.obstacles, "map": first.map, "start": start, "goal": goal})
         near = clearance(self._footprint, np.array(start), Surroundings(first.known).at(0.0))
         plan = followed(self.saved()[0], self.time)
         speed = plan.speed if isinstance(plan, Waypoints) else None
-        found, driven = prepared(task, first, speed, MARGIN if near > MARGIN else SLIM, self.avoid)
+        margin = MARGIN if near > MARGIN else SLIM
+        found, driven = prepared(task, first, speed, margin, self.avoid, twist)
         self.apply(reference=driven.reference)
         return found
 
@@ -221,6 +225,12 @@ class Session:
         if sim.plant.failed[k]:
             raise InputError(f"{what}: the first robot has stopped; a reset starts again")
         return sim.plant.reading["pose"][k].copy()
+
+    def _twist(self) -> tuple[float, float]:
+        """Returns the twist that the first robot is asked for, V in m/s and θ̇ in rad/s."""
+        sim, k = self._place[0]
+        velocity, turn = sim.hierarchy.command[k].tolist()
+        return velocity, turn
 
     def state(self, time: float | None = None) -> dict[str, Any]:
         """Returns the values of the fields `CHANGEABLE`, and `learning`, at a time in s, by default now."""
