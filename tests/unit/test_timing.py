@@ -201,7 +201,7 @@ def test_every_limit_holds(name, radii, closed, speed, supply, smoothing):
 @settings(max_examples=60)
 @given(
     st.sampled_from(sorted(ROBOTS)), st.lists(st.floats(0.2, 2), min_size=3, max_size=8), st.floats(0.2, 1),
-    st.floats(0.2, 1), st.floats(0.05, 0.5), st.floats(0, 1.5), st.floats(-1, 1),
+    st.floats(0.2, 1), st.floats(0.05, 0.5), st.floats(1e-3, 1.5), st.floats(-1, 1),
 )  # fmt: skip
 def test_every_limit_holds_from_a_start_speed(name, radii, speed, supply, smoothing, start, curvature):
     """So they do from every speed and curvature; position and speed are continuous, and it begins with that speed.
