@@ -297,7 +297,7 @@ class Waypoints(Record):
     reverse; only for an open curve with `timing` = `limits`."""
     start_speed: Annotated[float, Field(ge=0, le=20)] = 0.0
     """Speed along the path at the beginning in m/s, or the largest from which the limits can be kept, if that is less;
-    only for an open curve with `timing` = `limits`."""
+    only for an open curve with `timing` = `limits`. Less than 1 mm/s counts as rest."""
     start_curvature: Annotated[float, Field(ge=-20, le=20)] = 0.0
     """Curvature in 1/m with which an open curve begins, positive to the left; exact where its first two points are near
     each other."""
@@ -375,7 +375,8 @@ class Waypoints(Record):
 
     @property
     def _law(self) -> SmoothLaw:
-        return _time_law(self.points, self.closed, self.start_curvature, self.speed, self.limits, self.start_speed)  # type: ignore[arg-type]
+        start = self.start_speed if self.start_speed >= 1e-3 else 0.0
+        return _time_law(self.points, self.closed, self.start_curvature, self.speed, self.limits, start)  # type: ignore[arg-type]
 
     @property
     def period(self) -> float:
