@@ -238,7 +238,7 @@ def prepared(
     """
     reactive, backwards = avoid in REACTIVE, reverses(scenario)
     try:
-        found, reference = planned(task, scenario, speed, margin, reverse=backwards and not reactive, twist=twist)
+        found, reference = planned(task, scenario, speed, margin, None, backwards and not reactive, twist, not reactive)
     except NoWay:
         if not (reactive and backwards):
             raise
@@ -271,8 +271,8 @@ def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] |
         goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
         start = Task.from_dict({"obstacles": scenario.known, "start": pose.tolist(), "goal": goal})
         with contextlib.suppress(InputError):  # it waits, and tries again
-            back = avoid not in REACTIVE and reverses(scenario)
-            return planned(start, scenario, plan.speed, SLIM, outlines, back, (float(twist[0]), float(twist[1])))[1]
+            keeps, now = avoid not in REACTIVE, (float(twist[0]), float(twist[1]))
+            return planned(start, scenario, plan.speed, SLIM, outlines, keeps and reverses(scenario), now, keeps)[1]
 
     def made(robot: Robot, size: int) -> Pacing | Window | Mppi:
         if avoid == "barrier":
@@ -297,6 +297,7 @@ def planned(
     outlines: Outlines | None = None,
     reverse: bool = False,
     twist: tuple[float, float] = (0.0, 0.0),
+    keeps: bool = True,
 ) -> tuple[Plan, Waypoints]:
     """Returns the plan and its reference; arguments and errors are those of `navigate`.
 
@@ -307,7 +308,8 @@ def planned(
     this twist: first the arc on which it drives, for as far as it needs to come to rest, and on from there, so that it
     can drive the plan whatever follows. Where that arc is within the margin of an obstacle, or no way leads on from it,
     the plan begins at the robot, straight and with the largest speed from which the limits can be kept; the robot is
-    off it until it is as slow. A plan for a robot that stands or reverses begins at rest.
+    off it until it is as slow. So does a plan for a robot that goes along it at its own pace, which it need not keep.
+    A plan for a robot that stands or reverses begins at rest.
     """
     if arrived(np.array(task.start), 0.0, np.array(task.goal)):
         raise InputError("goal: the robot starts there")
@@ -319,11 +321,11 @@ def planned(
     speed = RESERVE * robot.max_speed if speed is None else speed
     outlines = Surroundings(task.known).at(0.0) if outlines is None else outlines
     try:
-        return _planned(task, corners, robot, speed, margin, outlines, False, twist)
+        return _planned(task, corners, robot, speed, margin, outlines, False, twist, keeps)
     except InputError:  # there is no way, or none that the robot can drive
         if not reverse:
             raise
-        return _planned(task, corners, robot, speed, margin, outlines, True, twist)
+        return _planned(task, corners, robot, speed, margin, outlines, True, twist, keeps)
 
 
 def _planned(
@@ -335,6 +337,7 @@ def _planned(
     outlines: Outlines,
     reverse: bool,
     twist: tuple[float, float],
+    keeps: bool,
 ) -> tuple[Plan, Waypoints]:
     """Returns a plan that only drives forward, or one that reverses wherever that is cheaper, and its reference.
 
@@ -347,6 +350,7 @@ def _planned(
         outlines: The obstacles.
         reverse: Whether the plan may reverse.
         twist: V in m/s and θ̇ in rad/s at the start.
+        keeps: Whether the robot keeps the plan in time.
 
     Raises:
         NoWay: There is no way.
@@ -360,7 +364,7 @@ def _planned(
     start, goal, limits = np.array(task.start), np.array(task.goal), Limits.of(robot)
     velocity, turn = twist if twist[0] > RESTING else (0.0, 0.0)
     arc, curvature = start[None], 0.0  # on which it comes to rest
-    if velocity:
+    if velocity and keeps:
         curvature = float(np.clip(turn / velocity, -1 / radius, 1 / radius))
         arc = run_out(start, velocity, curvature, limits)
     ends = np.array([start[:2], arc[-1, :2], goal[:2]])
