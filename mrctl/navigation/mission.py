@@ -15,14 +15,14 @@ import pandas as pd
 import xarray as xr
 
 from mrctl.kernel import Array
-from mrctl.loop.goals import arrived
+from mrctl.loop.goals import RESTING, arrived
 from mrctl.loop.simulation import simulate
 from mrctl.navigation import generators
 from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
 from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.pacing import Pacing
-from mrctl.navigation.planning import NoWay, Plan, least_clearance, plan, shortcut, space
+from mrctl.navigation.planning import NoWay, Plan, least_clearance, plan, run_out, shortcut, space
 from mrctl.navigation.replanning import open_waypoints
 from mrctl.navigation.sdf import read_sdf
 from mrctl.navigation.vehicle import reverses, robot_of
@@ -30,6 +30,7 @@ from mrctl.navigation.window import Window
 from mrctl.record import InputError, Record, read_file
 from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
+from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Obstacles, Outlines, Pose, Surroundings
 from mrctl.theory.references import Waypoints, check
 from mrctl.theory.robot import ANY_ANGLE, Robot
@@ -224,12 +225,20 @@ def navigate(
 
 
 def prepared(
-    task: Task, scenario: Scenario, speed: float | None = None, margin: float = MARGIN, avoid: Avoid = "none"
+    task: Task,
+    scenario: Scenario,
+    speed: float | None = None,
+    margin: float = MARGIN,
+    avoid: Avoid = "none",
+    twist: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Plan, Scenario]:
-    """Returns a plan, and the scenario that drives it; arguments and errors are those of `navigate`."""
+    """Returns a plan, and the scenario that drives it; arguments and errors are those of `navigate`.
+
+    The plan is made for a robot that drives with a twist at its start, V in m/s and θ̇ in rad/s; see `planned`.
+    """
     reactive, backwards = avoid in REACTIVE, reverses(scenario)
     try:
-        found, reference = planned(task, scenario, speed, margin, reverse=backwards and not reactive)
+        found, reference = planned(task, scenario, speed, margin, None, backwards and not reactive, twist, not reactive)
     except NoWay:
         if not (reactive and backwards):
             raise
@@ -255,12 +264,15 @@ def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] |
     if avoid == "none":
         return None
 
-    def replan(scenario: Scenario, pose: Array, outlines: Outlines, given: Waypoints | None) -> Waypoints | None:
+    def replan(
+        scenario: Scenario, pose: Array, twist: Array, outlines: Outlines, given: Waypoints | None
+    ) -> Waypoints | None:
         plan = open_waypoints(scenario.reference)
         goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
         start = Task.from_dict({"obstacles": scenario.known, "start": pose.tolist(), "goal": goal})
         with contextlib.suppress(InputError):  # it waits, and tries again
-            return planned(start, scenario, plan.speed, SLIM, outlines, avoid not in REACTIVE and reverses(scenario))[1]
+            keeps, now = avoid not in REACTIVE, (float(twist[0]), float(twist[1]))
+            return planned(start, scenario, plan.speed, SLIM, outlines, keeps and reverses(scenario), now, keeps)[1]
 
     def made(robot: Robot, size: int) -> Pacing | Window | Mppi:
         if avoid == "barrier":
@@ -284,11 +296,20 @@ def planned(
     margin: float,
     outlines: Outlines | None = None,
     reverse: bool = False,
+    twist: tuple[float, float] = (0.0, 0.0),
+    keeps: bool = True,
 ) -> tuple[Plan, Waypoints]:
     """Returns the plan and its reference; arguments and errors are those of `navigate`.
 
     The outlines are by default those of the obstacles on the map. The plan reverses only if it may, and where there is
     none forward that the robot can drive.
+
+    The twist is that of the robot at the start, V in m/s and θ̇ in rad/s. If it drives forward, the plan begins with
+    this twist: first the arc on which it drives, for as far as it needs to come to rest, and on from there, so that it
+    can drive the plan whatever follows. Where that arc is within the margin of an obstacle, or no way leads on from it,
+    the plan begins at the robot, straight and with the largest speed from which the limits can be kept; the robot is
+    off it until it is as slow. So does a plan for a robot that goes along it at its own pace, which it need not keep.
+    A plan for a robot that stands or reverses begins at rest.
     """
     if arrived(np.array(task.start), 0.0, np.array(task.goal)):
         raise InputError("goal: the robot starts there")
@@ -300,15 +321,23 @@ def planned(
     speed = RESERVE * robot.max_speed if speed is None else speed
     outlines = Surroundings(task.known).at(0.0) if outlines is None else outlines
     try:
-        return _planned(task, corners, robot, speed, margin, outlines, reverse=False)
+        return _planned(task, corners, robot, speed, margin, outlines, False, twist, keeps)
     except InputError:  # there is no way, or none that the robot can drive
         if not reverse:
             raise
-        return _planned(task, corners, robot, speed, margin, outlines, reverse=True)
+        return _planned(task, corners, robot, speed, margin, outlines, True, twist, keeps)
 
 
 def _planned(
-    task: Task, corners: Array, robot: Robot, speed: float, margin: float, outlines: Outlines, reverse: bool
+    task: Task,
+    corners: Array,
+    robot: Robot,
+    speed: float,
+    margin: float,
+    outlines: Outlines,
+    reverse: bool,
+    twist: tuple[float, float],
+    keeps: bool,
 ) -> tuple[Plan, Waypoints]:
     """Returns a plan that only drives forward, or one that reverses wherever that is cheaper, and its reference.
 
@@ -320,6 +349,8 @@ def _planned(
         margin: Clearance that the plan keeps in m.
         outlines: The obstacles.
         reverse: Whether the plan may reverse.
+        twist: V in m/s and θ̇ in rad/s at the start.
+        keeps: Whether the robot keeps the plan in time.
 
     Raises:
         NoWay: There is no way.
@@ -330,30 +361,44 @@ def _planned(
     radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (
         WIDER if reverse else 1
     )
-    ends = np.array([task.start[:2], task.goal[:2]])
+    start, goal, limits = np.array(task.start), np.array(task.goal), Limits.of(robot)
+    velocity, turn = twist if twist[0] > RESTING else (0.0, 0.0)
+    arc, curvature = start[None], 0.0  # on which it comes to rest
+    if velocity and keeps:
+        curvature = float(np.clip(turn / velocity, -1 / radius, 1 / radius))
+        arc = run_out(start, velocity, curvature, limits)
+    ends = np.array([start[:2], arc[-1, :2], goal[:2]])
     low, high = ends.min(axis=0) - 3 * radius, ends.max(axis=0) + 3 * radius  # room to turn
     if known.shapes:
         low, high = np.minimum(low, known.bounds[0]), np.maximum(high, known.bounds[1])
     where = space(outlines, corners, low, high, cell=float(np.ptp(corners[:, 1])) / CELLS, margin=margin)
 
-    def attempt(arc: float) -> tuple[Plan, Waypoints]:
-        found = plan(where, np.array(task.start), np.array(task.goal), arc, reverse)
-        found = shortcut(where, found, arc, reverse)
-        return found, found.reference(speed, Limits.of(robot))
+    def attempt(radius: float, arc: Array, curvature: float) -> tuple[Plan, Waypoints]:
+        found = plan(where, arc[-1], goal, radius, reverse)
+        found = shortcut(where, found, radius, reverse).after(arc)
+        return found, found.reference(speed, limits, velocity=velocity, curvature=curvature)
 
-    found, reference = attempt(radius)
-    try:
-        check(reference, robot, reverse)
-    except InputError as fault:
-        check(reference, robot.replace(steering_limit=ANY_ANGLE), reverse)  # wider arcs help the steering alone
+    def after(arc: Array, curvature: float) -> tuple[Plan, Waypoints]:
+        found, reference = attempt(radius, arc, curvature)
         try:
-            found, reference = attempt(GENTLER * radius)
             check(reference, robot, reverse)
-        except InputError:
-            raise fault from None
-    if least_clearance(corners, reference, outlines) <= 0:
-        raise InputError(f"plan: its smooth path touches an obstacle in spite of the margin of {margin:g} m; set more")
-    return found, reference
+        except InputError as fault:
+            check(reference, robot.replace(steering_limit=ANY_ANGLE), reverse)  # wider arcs help the steering alone
+            try:
+                found, reference = attempt(GENTLER * radius, arc, curvature)
+                check(reference, robot, reverse)
+            except InputError:
+                raise fault from None
+        if least_clearance(corners, reference, outlines) <= 0:
+            raise InputError(
+                f"plan: its smooth path touches an obstacle in spite of the margin of {margin:g} m; set more"
+            )
+        return found, reference
+
+    if len(arc) > 1 and min(clearance(corners, pose, outlines) for pose in arc) > margin:
+        with contextlib.suppress(InputError):  # no way leads on from it
+            return after(arc, curvature)
+    return after(start[None], 0.0)
 
 
 def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:

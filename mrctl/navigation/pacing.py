@@ -68,8 +68,8 @@ class Pacing:
     without obstacles. λ changes no faster than the robot can follow.
 
     Where something that stands and is not on the map blocks the plan, the robot stops `STANDOFF` before it, and drives
-    on along another plan. Where the map has changed and another plan would take less than `SHORTER` of the time that is
-    left, it also stops, because a plan begins at rest, and drives on along that.
+    on along another plan. Where the map has changed and another plan takes less than `SHORTER` of the time that is
+    left, it drives on along that. If the plan cannot begin with about the speed of the robot, it stops before.
 
     Attributes:
         followed: What the robots follow, as in `mrctl.control.stages.Motion`, `(B, 7)`.
@@ -104,7 +104,9 @@ class Pacing:
             planner.reset()
         self._period, self._tick, self.followed = period, 0, reference
         self._clock, self._pace = np.zeros(size), np.ones(size)  # s in motion periods, and λ
-        self._plans = [self._sampled(planner.first) for planner in self._planners]
+        self._driven = np.zeros((size, 2))  # twists of the plans at their paces, m/s and rad/s
+        delay = self._scenarios[0].sensing.periods("delay", self._scenarios[0].control_period)
+        self._plans = [self._sampled(planner.first, delay) for planner in self._planners]
         self._kept = [self._margin(planner.first, row) for row, planner in enumerate(self._planners)]
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
         self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
@@ -112,10 +114,15 @@ class Pacing:
         self._map_changed = np.zeros(size, bool)  # so that a shorter way may be free
         self._stops = np.zeros(size, bool)  # which stop for a shorter way
 
-    def _sampled(self, plan: Waypoints) -> Array:
-        """Returns a plan as `output` gets it, for each motion period, `(n, 7)`."""
-        step, sensing, period = self._scenarios[0].control_period, self._scenarios[0].sensing, self._period
-        ticks = round(period / step) * np.arange(int(plan.period / period) + 2) + sensing.periods("delay", step)
+    def _sampled(self, plan: Waypoints, delay: int) -> Array:
+        """Returns a plan as `output` gets it, for each motion period, `(n, 7)`.
+
+        Args:
+            plan: The plan.
+            delay: Control periods after its beginning at which the voltage of the first one acts.
+        """
+        step, period = self._scenarios[0].control_period, self._period
+        ticks = round(period / step) * np.arange(int(plan.period / period) + 2) + delay
         return np.hstack(plan.sample(np.asarray(step * ticks, float)))
 
     def _margin(self, plan: Waypoints, row: int) -> Barrier:
@@ -131,8 +138,11 @@ class Pacing:
         self._begin(row, self._planners[row].take(plan))
 
     def _begin(self, row: int, plan: Waypoints) -> None:
-        """Lets a robot drive a plan from its beginning."""
-        self._plans[row], self._kept[row] = self._sampled(plan), self._margin(plan, row)
+        """Lets a robot drive a plan from its beginning, at the pace at which it keeps its speed."""
+        self._plans[row], self._kept[row] = self._sampled(plan, 0), self._margin(plan, row)
+        velocity, first = self._driven[row, 0], self._plans[row][0, 3]
+        if velocity * first > 0:
+            self._pace[row] = min(1.0, velocity / first)
         self._clock[row], self._anchor[row], self._blocked[row] = 0.0, 0.0, np.inf
         self._map_changed[row] = self._stops[row] = False
 
@@ -155,7 +165,7 @@ class Pacing:
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
         for row in np.flatnonzero(self._looked):  # robots that have failed do not look
-            self._get_on(int(row), pose[row], abs(float(twist[row, 0])))
+            self._get_on(int(row), pose[row], float(twist[row, 0]))
         self._looked[:] = False
         now = np.empty((len(pose), 7))
         for row, plan in enumerate(self._plans):
@@ -167,7 +177,7 @@ class Pacing:
         pace = np.minimum(np.clip(free, self._pace - change, self._pace + BRAKING * change), 1.0)[:, None]
         now[:, 3:5] = pace * twists
         now[:, 5:] = pace**2 * now[:, 5:] + (pace - self._pace[:, None]) / self._period * twists
-        self._pace, self._clock = pace[:, 0], self._clock + pace[:, 0]
+        self._pace, self._clock, self._driven = pace[:, 0], self._clock + pace[:, 0], pace * twists
         self._tick, self.followed = self._tick + 1, now
         return pace * requests
 
@@ -184,31 +194,36 @@ class Pacing:
             allowed, *(share(request, pose, *each) for each in around if len(each[0].discs) + len(each[0].rings))
         )
 
-    def _get_on(self, row: int, pose: Array, speed: float) -> None:
+    def _get_on(self, row: int, pose: Array, velocity: float) -> None:
         """Gives a robot another plan, if what stands there has hardly let it get on, or if the map lets it.
 
         Args:
             row: Which robot.
             pose: x and y in m and θ in rad, `(3,)`.
-            speed: |V| in m/s.
+            velocity: V in m/s.
         """
-        planner, now = self._planners[row], self._period * self._tick
+        planner, now, asked = self._planners[row], self._period * self._tick, self._driven[row]
         if self._stops[row]:
-            if speed < RESTING:
+            if abs(velocity) < RESTING:
                 self._stops[row] = False
-                if plan := planner.plan(pose, now):
+                if plan := planner.plan(pose, asked, now):
                     self._begin(row, plan)
             return
         if self._map_changed[row]:
             self._map_changed[row] = False
             left = self._period * (len(self._plans[row]) - self._clock[row])
-            plan = planner.plan(pose, now)
-            self._stops[row] = plan is not None and plan.period + speed / self._brakes < SHORTER * left
+            if plan := planner.plan(pose, asked, now):
+                excess = asked[0] - plan.sample(np.zeros(1)).twist[0, 0]
+                at_once = excess**2 < 2 * self._robot.max_acceleration * TRACKED  # so far it is off while it brakes
+                if plan.period + (0.0 if at_once else abs(velocity) / self._brakes) < SHORTER * left:
+                    if at_once:
+                        self._begin(row, plan)
+                    self._stops[row] = not at_once
         standing = planner.sight.standing
         if self._clock[row] - self._anchor[row] > SLOW * WAITED / self._period or not len(standing.discs):
             self._anchor[row], self._since[row] = self._clock[row], now
         if now - self._since[row] < WAITED:
             return
         self._since[row] = now  # where there is no other plan, it tries again later
-        if plan := planner.plan(pose, now):
+        if plan := planner.plan(pose, asked, now):
             self._begin(row, plan)

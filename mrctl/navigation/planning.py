@@ -101,7 +101,16 @@ class Plan(NamedTuple):
         """Length in m."""
         return float(np.hypot(*np.diff(self.poses[:, :2], axis=0).T).sum())
 
-    def reference(self, speed: float, limits: Limits, spacing: float = 0.25) -> Waypoints:
+    def after(self, arc: Array) -> Plan:
+        """Returns the plan with an arc before it, poses in m, m, rad, `(k, 3)`, that is driven forward to its start."""
+        poses, forward = np.concatenate([arc[:-1], self.poses]), np.ones(len(arc) - 1)
+        directions = np.concatenate([[0.0], forward, self.directions[1:]])
+        length = float(np.hypot(*np.diff(arc[:, :2], axis=0).T).sum())
+        return self._replace(poses=poses, directions=directions, cost=self.cost + length)
+
+    def reference(
+        self, speed: float, limits: Limits, spacing: float = 0.25, velocity: float = 0.0, curvature: float = 0.0
+    ) -> Waypoints:
         """Returns the plan as a reference: splines of continuous curvature, with the time law under all limits.
 
         Where the plan changes its direction, a spline ends at rest and without curvature, and another one begins.
@@ -110,6 +119,8 @@ class Plan(NamedTuple):
             speed: Largest speed in m/s.
             limits: Limits of the time law, such as `Limits.of(robot)`.
             spacing: Distance of the points that the spline goes through in m.
+            velocity: V at the start in m/s; a plan that sets out in reverse begins at rest.
+            curvature: Curvature at the start in 1/m.
 
         Raises:
             InputError: The speed is not positive, or a spline turns too far from the plan at a change of direction.
@@ -120,7 +131,32 @@ class Plan(NamedTuple):
         points = np.concatenate([legs[0][:1], *(leg[1:] for leg in legs)])
         cusps = np.cumsum([len(leg) - 1 for leg in legs[:-1]], dtype=int).tolist()
         values = {"points": points.tolist(), "closed": False, "timing": "limits", "speed": speed, "limits": limits}
-        return Waypoints.from_dict(values | {"cusps": [*([0] if self.directions[1] < 0 else []), *cusps]}, "plan")
+        if self.directions[1] < 0:
+            cusps = [0, *cusps]
+        elif velocity > 0:
+            values |= {"start_speed": min(velocity, speed), "start_curvature": curvature}
+        return Waypoints.from_dict(values | {"cusps": cusps}, "plan")
+
+
+def run_out(start: Array, velocity: float, curvature: float, limits: Limits) -> Array:
+    """Returns the arc on which a robot that drives forward can come to rest under limits.
+
+    Args:
+        start: x and y in m and θ in rad, `(3,)`.
+        velocity: V in m/s, positive.
+        curvature: Curvature of the arc in 1/m.
+        limits: The limits; the time law keeps the speed for half of `smoothing` at first.
+
+    Returns:
+        Poses from the start on, at most 5 cm apart, `(n, 3)`.
+    """
+    length = velocity * limits.smoothing / 2 + velocity**2 / (2 * limits.acceleration)
+    way = np.linspace(0, length, int(np.ceil(length / CHECK)) + 1)
+    chord = way * np.sinc(curvature * way / (2 * np.pi))
+    heading = start[2] + curvature * way / 2
+    return np.column_stack([
+        start[0] + chord * np.cos(heading), start[1] + chord * np.sin(heading), start[2] + curvature * way
+    ])  # fmt: skip
 
 
 def _points(poses: Array, spacing: float) -> Array:

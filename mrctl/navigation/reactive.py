@@ -216,7 +216,7 @@ class Agent:
     def _planned(self, pose: Array, now: float) -> Waypoints | None:
         """Makes a plan from where it is, around what it knows."""
         self._map_changed = False
-        return self._planner.plan(pose, now)
+        return self._planner.plan(pose, self.last, now)
 
 
 def reach(discs: Array) -> float:

@@ -14,9 +14,10 @@ from mrctl.theory.references import Reference, Waypoints
 
 SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
 
-Replan = Callable[[Scenario, Array, Outlines, Waypoints | None], Waypoints | None]
-"""Plans for the mission of a scenario, from a pose in m, m, rad, `(3,)`, among obstacles as they are now, to the end of
-a plan that an event brought, or else to the goal of the mission; None where there is no way."""
+Replan = Callable[[Scenario, Array, Array, Outlines, Waypoints | None], Waypoints | None]
+"""Plans for the mission of a scenario, from a pose in m, m, rad, `(3,)`, and a twist in m/s and rad/s, `(2,)`, among
+obstacles as they are now, to the end of a plan that an event brought, or else to the goal of the mission; None where
+there is no way."""
 
 
 def open_waypoints(reference: Reference) -> Waypoints:
@@ -70,15 +71,18 @@ class Planner:
         self._given = open_waypoints(plan)
         return self._given
 
-    def plan(self, pose: Array, time: float) -> Waypoints | None:
+    def plan(self, pose: Array, twist: Array, time: float) -> Waypoints | None:
         """Makes a plan that keeps off what is not on the map, or else one that only does not touch it.
 
         Args:
             pose: x and y in m and θ in rad, from which it leads, `(3,)`.
+            twist: V in m/s and θ̇ in rad/s with which it begins if the robot drives forward, `(2,)`; what the robot was
+                asked for last, which has no noise.
             time: Time in s.
 
         Returns:
             The plan, or None where there is no way.
         """
-        far = self._replan(self.scenario, pose, self.sight.around(time, self.footprint, pose), self._given)
-        return far or self._replan(self.scenario, pose, self.sight.outlines(time), self._given)
+        start = self.scenario, pose, twist
+        far = self._replan(*start, self.sight.around(time, self.footprint, pose), self._given)
+        return far or self._replan(*start, self.sight.outlines(time), self._given)

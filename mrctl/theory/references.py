@@ -287,17 +287,27 @@ class Waypoints(Record):
     stop_time: Duration = 2.0
     """Duration in s of the braking at the end of an open curve, whose speed is constant before."""
     timing: Literal["constant", "limits"] = "constant"
-    """Keep the speed all along the path (`constant`), or drive nearly as fast as the `limits` allow, from rest on an
-    open curve; `mrctl.theory.timing.smooth` says how much time the continuous acceleration costs."""
+    """Keep the speed all along the path (`constant`), or drive nearly as fast as the `limits` allow, on an open curve
+    from `start_speed`; `mrctl.theory.timing.smooth` says how much time the continuous acceleration costs."""
     limits: Limits = Limits()
     """Limits that `timing` = `limits` keeps, besides the speed; by default those of the default car, whatever robot
     drives. `Limits.of(robot)` are those of another one."""
     cusps: tuple[Annotated[int, Field(ge=0)], ...] = ()
     """Indices of the points at which the robot stops and drives on in the other direction, with 0 for a start in
     reverse; only for an open curve with `timing` = `limits`."""
+    start_speed: Annotated[float, Field(ge=0, le=20)] = 0.0
+    """Speed along the path at the beginning in m/s, or the largest from which the limits can be kept, if that is less;
+    only for an open curve with `timing` = `limits`. Less than 1 mm/s counts as rest."""
+    start_curvature: Annotated[float, Field(ge=-20, le=20)] = 0.0
+    """Curvature in 1/m with which an open curve begins, positive to the left; exact where its first two points are near
+    each other."""
 
     @model_validator(mode="after")
     def _regular(self) -> Waypoints:
+        if self.start_speed and (self.closed or self.timing != "limits"):
+            raise ValueError("start_speed: only an open curve with timing = limits has one")
+        if self.start_curvature and self.closed:
+            raise ValueError("start_curvature: only an open curve has one")
         if self.cusps:
             return self._turning()
         least = 3 if self.closed else 2
@@ -336,9 +346,10 @@ class Waypoints(Record):
     def _parts(self) -> list[tuple[Waypoints, bool]]:
         """The curves between the cusps, and whether each is driven in reverse."""
         places = [0, *(cusp for cusp in self.cusps if cusp), len(self.points) - 1]
-        first = 0 in self.cusps
+        first, rest = 0 in self.cusps, {"start_speed": 0.0, "start_curvature": 0.0}
+        whole = self.model_copy(update={"cusps": ()})
         return [
-            (self.model_copy(update={"points": self.points[a : b + 1], "cusps": ()}), (k + first) % 2 == 1)
+            (whole.model_copy(update={"points": self.points[a : b + 1], **(rest if k else {})}), (k + first) % 2 == 1)
             for k, (a, b) in enumerate(pairwise(places))
         ]
 
@@ -360,11 +371,12 @@ class Waypoints(Record):
 
     @property
     def _path(self) -> Spline:
-        return spline(self.points, self.closed)
+        return spline(self.points, self.closed, self.start_curvature)
 
     @property
     def _law(self) -> SmoothLaw:
-        return _time_law(self.points, self.closed, self.speed, self.limits)  # type: ignore[arg-type]
+        start = self.start_speed if self.start_speed >= 1e-3 else 0.0
+        return _time_law(self.points, self.closed, self.start_curvature, self.speed, self.limits, start)  # type: ignore[arg-type]
 
     @property
     def period(self) -> float:
@@ -378,7 +390,7 @@ class Waypoints(Record):
     def sample(self, t: Array) -> Motion:
         """Samples the spline at the times t in s, shape (T,).
 
-        A closed spline is periodic with four continuous derivatives. An open one has no curvature at its ends.
+        A closed spline is periodic with four continuous derivatives. An open one has no curvature at its end.
         """
         if self.cusps:
             return self._sample_parts(t)
@@ -395,11 +407,18 @@ class Waypoints(Record):
 
 
 @lru_cache(maxsize=512)  # a comparison has hundreds of plans, whose scenarios ask for their durations repeatedly
-def _time_law(points: tuple[tuple[float, float], ...], closed: bool, speed: float, limits: Limits) -> SmoothLaw:
+def _time_law(
+    points: tuple[tuple[float, float], ...],
+    closed: bool,
+    curvature: float,
+    speed: float,
+    limits: Limits,
+    start: float,
+) -> SmoothLaw:
     """The time law along the spline through the points."""
-    curve = spline(points, closed)
-    path = sample_path(lambda s: curve.at(s)[2:], curve.s, closed, limits, speed)
-    return smooth(path, limits, speed)
+    curve = spline(points, closed, curvature)
+    path = sample_path(lambda s: curve.at(s)[2:], curve.s, closed, limits, speed, start)
+    return smooth(path, limits, speed, start)
 
 
 def random_spline(

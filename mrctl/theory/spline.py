@@ -24,19 +24,26 @@ def plane(points: tuple[tuple[float, float], ...], closed: bool) -> Plane:
 class Spline:
     """A planar quintic spline by arc length s; its own parameter u is the accumulated chord length, both in m."""
 
-    def __init__(self, points: tuple[tuple[float, float], ...], closed: bool) -> None:
+    def __init__(self, points: tuple[tuple[float, float], ...], closed: bool, curvature: float = 0.0) -> None:
         """Interpolates points.
+
+        An open spline has no curvature and no sharpness at its ends, or begins with the second and third derivative of
+        an arc through its first two points.
 
         Args:
             points: Points (x, y) in m in their order, no two neighbours alike.
             closed: Whether the curve goes on from the last point to the first.
+            curvature: Curvature of the arc with which an open curve begins in 1/m, positive to the left.
         """
         from scipy.interpolate import make_interp_spline  # imported here, so that settings are read without scipy
 
         p = plane(points, closed)
         knots = np.append(0, np.cumsum(np.abs(np.diff(p))))
         straight = [(2, np.zeros(2)), (3, np.zeros(2))]
-        ends = "periodic" if closed else (straight, straight)
+        chord = p[1] - p[0]
+        bend = 1j * curvature * chord / abs(chord) * np.exp(-0.5j * curvature * abs(chord))
+        turning = [(n, np.array([d.real, d.imag])) for n, d in ((2, bend), (3, 1j * curvature * bend))]
+        ends = "periodic" if closed else (turning if curvature else straight, straight)
         curve = make_interp_spline(knots, np.stack([p.real, p.imag], -1), k=5, bc_type=ends)  # type: ignore[arg-type]
         self.curves = [curve, *(curve.derivative(n) for n in (1, 2, 3))]
         self.u = np.append(np.linspace(knots[:-1], knots[1:], 64, endpoint=False).T, knots[-1])

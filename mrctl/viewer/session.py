@@ -23,6 +23,7 @@ from mrctl.physics.hull import footprint
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import blank, combine, dataset
 from mrctl.scenario import Event, Scenario
+from mrctl.sensing.prediction import advance
 from mrctl.theory.clearance import clearance, clearances
 from mrctl.theory.obstacles import Pose, Surroundings, turned
 from mrctl.theory.references import Reference, Waypoints, check
@@ -162,9 +163,10 @@ class Session:
                 sim.add(event)
 
     def head_for(self, goal: Pose) -> Plan:
-        """Plans a way for the first robot from where it is, and gives it to every robot as an event.
+        """Plans a way for the first robot, and gives it to every robot as an event.
 
-        The plan keeps 5 cm from obstacles on the map, or 2 cm where the robot is nearer than that now.
+        The plan begins where that robot is when it follows it, with the twist that it is asked for now. It keeps 5 cm
+        from obstacles on the map, or 2 cm where the robot is nearer than that then.
 
         Args:
             goal: x and y in m and θ in rad.
@@ -172,19 +174,22 @@ class Session:
         Raises:
             InputError: The robot has stopped, the goal is in an obstacle, or there is no way.
         """
-        x, y, theta = self._pose("goal")
+        (x, y, theta), twist = self._coming("goal")
         first = self.start[0]
         start = x, y, remainder(theta, 2 * pi)
         task = Task.from_dict({"obstacles": first.obstacles, "map": first.map, "start": start, "goal": goal})
         near = clearance(self._footprint, np.array(start), Surroundings(first.known).at(0.0))
         plan = followed(self.saved()[0], self.time)
         speed = plan.speed if isinstance(plan, Waypoints) else None
-        found, driven = prepared(task, first, speed, MARGIN if near > MARGIN else SLIM, self.avoid)
+        margin = MARGIN if near > MARGIN else SLIM
+        found, driven = prepared(task, first, speed, margin, self.avoid, twist)
         self.apply(reference=driven.reference)
         return found
 
     def way(self, points: Sequence[Array], closed: bool) -> Waypoints:
         """Returns a way from the first robot, straight ahead at first, through points, at the speed of its reference.
+
+        One that does not return begins with the speed of the robot, or with the largest that its limits allow.
 
         Args:
             points: Places in m, `(2,)` each.
@@ -196,7 +201,7 @@ class Session:
         """
         if self.avoid != "none":
             raise InputError(f"way: with --avoid {self.avoid} the robots take goals alone")
-        x, y, theta = self._pose("way")
+        (x, y, theta), (velocity, _) = self._coming("way")
         reach = abs(self.robot.wheelbase)
         ahead = x + reach * np.cos(theta), y + reach * np.sin(theta)
         now = followed(self.saved()[0], self.time)
@@ -206,6 +211,7 @@ class Session:
         found = Waypoints.from_dict({
             "points": [(x, y), ahead, *map(tuple, points)], "closed": closed, "timing": "limits",
             "speed": min(speed, RESERVE * self.robot.max_speed), "limits": Limits.of(self.robot),
+            "start_speed": 0.0 if closed else max(0.0, velocity),
         })  # fmt: skip
         check(found, self.robot, reverse=False)
         if len(self._footprint):
@@ -215,12 +221,18 @@ class Session:
                 raise InputError("way: meets an obstacle near ({:.2f}, {:.2f}) m".format(*poses[near.argmin(), :2]))
         return found
 
-    def _pose(self, what: str) -> Array:
-        """Returns where the first robot is, x and y in m and θ in rad; refuses one that has stopped."""
+    def _coming(self, what: str) -> tuple[tuple[float, float, float], tuple[float, float]]:
+        """Returns where the first robot is when it follows a new reference, and how it drives; refuses a stopped one.
+
+        Returns:
+            x and y in m and θ in rad; and the twist that it is asked for now, V in m/s and θ̇ in rad/s.
+        """
         sim, k = self._place[0]
         if sim.plant.failed[k]:
             raise InputError(f"{what}: the first robot has stopped; a reset starts again")
-        return sim.plant.reading["pose"][k].copy()
+        (x, y, theta), (v, omega) = sim.plant.reading["pose"][k].tolist(), sim.hierarchy.command[k].tolist()
+        x, y, theta, *_ = advance.compiled(x, y, theta, v, omega, 0.0, 0.0, self.preview * self.period)
+        return (x, y, theta), (v, omega)
 
     def state(self, time: float | None = None) -> dict[str, Any]:
         """Returns the values of the fields `CHANGEABLE`, and `learning`, at a time in s, by default now."""

@@ -7,10 +7,11 @@ import pytest
 import shapely
 from test_obstacles import judged, random_shapes
 
-from mrctl import Box, Disc, InputError, Limits, Obstacles
+from mrctl import Box, Disc, InputError, Limits, Obstacles, Scenario
 from mrctl.navigation import planning
-from mrctl.navigation.generators import cellular, corridor, parking_bay
-from mrctl.navigation.planning import NoWay, cost_to_go, plan, shortcut, space
+from mrctl.navigation.generators import Task, cellular, corridor, parking_bay
+from mrctl.navigation.mission import planned
+from mrctl.navigation.planning import NoWay, cost_to_go, plan, run_out, shortcut, space
 from mrctl.navigation.steer import sample, steer
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Surroundings, turned
@@ -259,6 +260,58 @@ def test_reference():
     pose, (v, omega), _ = (part.T for part in reference.sample(np.linspace(0, reference.period, 500)))
     assert reference.cusps == (0,) and v.min() < -0.5 and v.max() < 1e-9 and np.abs(omega).max() < 1e-9
     assert np.allclose(pose[:, -1], (-1, 0, 0), atol=1e-6)
+
+
+@pytest.mark.parametrize("curvature", [0.0, -1.2])
+def test_run_out(curvature):
+    """It is an arc, by fine steps of the unicycle, on which a plan begins with about the speed and ends at rest."""
+    arc, pose, limits = (
+        run_out(np.array([1.0, -2.0, 0.5]), 0.7, curvature, Limits()),
+        np.array([1.0, -2.0, 0.5]),
+        Limits(),
+    )
+    length = 0.7 * limits.smoothing / 2 + 0.7**2 / (2 * limits.acceleration)
+    for _ in range(10_000):
+        middle = pose[2] + curvature * length / 20_000
+        pose = pose + length / 10_000 * np.array([np.cos(middle), np.sin(middle), curvature])
+    assert np.allclose(arc[0], (1.0, -2.0, 0.5)) and np.allclose(arc[-1], pose, atol=1e-6)
+    assert np.hypot(*np.diff(arc[:, :2], axis=0).T).max() <= planning.CHECK
+    way = planning.Plan(arc, np.append(0.0, np.ones(len(arc) - 1)), length, 0)
+    course = way.reference(0.7, limits, velocity=0.7, curvature=curvature)
+    assert course.sample(np.zeros(1)).twist[0] == pytest.approx([0.7, 0.7 * curvature], rel=0.1)
+
+
+TWISTS = [(0.7, 0.0), (0.7, 0.8), (1.2, -0.5)]
+
+
+@pytest.mark.parametrize("twist", TWISTS)
+@pytest.mark.parametrize("goal", [(3, 0.5, 0), (1, 2, 3.1), (-2, 0, 3.1)])
+def test_begins_as_the_robot_drives(twist, goal):
+    """A plan for a robot that drives begins with its pose, θ̇ / V and about its V, wherever it leads."""
+    task = Task(obstacles=Obstacles(shapes=(Disc(x=0.0, y=-6.0),)), start=(0.2, 0.1, 0.3), goal=goal)
+    found, course = planned(task, Scenario(), None, 0.05, twist=twist)
+    motion = course.sample(np.zeros(1))
+    v, omega = motion.twist[0]
+    assert np.allclose(motion.pose[0], task.start, atol=6e-3)
+    assert 0.75 * twist[0] < v < 1.0001 * twist[0] and omega / v == pytest.approx(twist[1] / twist[0], abs=0.02)
+    assert np.allclose(found.poses[0], task.start) and found.directions[0] == 0 and np.all(found.directions[1:] == 1)
+    assert np.hypot(*np.diff(found.poses[:, :2], axis=0).T).max() < planning.CHECK + 1e-9
+
+
+def test_begins_where_it_can():
+    """Before a wall a plan begins at the robot, as slowly as it must; one that stands or reverses gets it from rest."""
+    wall = Box(x=0.9, y=0.0, length=0.2, width=1.0)
+    task = Task(obstacles=Obstacles(shapes=(wall,)), start=(0, 0, 0), goal=(0.2, 2.2, 3.1))
+    still = planned(task, Scenario(), None, 0.02)
+    for twist in ((0.0, 0.0), (0.04, 0.3), (-0.5, 0.0)):
+        assert planned(task, Scenario(), None, 0.02, twist=twist)[1] == still[1]
+    found, course = planned(task, Scenario(), None, 0.02, twist=(0.9, 0.4))
+    assert np.array_equal(found.poses, still[0].poses) and course.start_curvature == 0
+    assert 0 < course.sample(np.zeros(1)).twist[0, 0] < 0.6 and course.period < still[1].period
+    free = task.replace(obstacles=Obstacles(shapes=(Box(x=0.0, y=3.0, length=0.2, width=0.2),)), goal=(-2, 0, 0))
+    back = planned(free, Scenario(steering="rigid"), None, 0.02, None, True, (0.5, 0.0))[1]
+    v = back.sample(np.linspace(0, back.period, 2000)).twist[:, 0]
+    assert v[0] == pytest.approx(0.5, rel=0.1)
 
 
 @pytest.mark.parametrize(

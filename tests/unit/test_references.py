@@ -357,3 +357,41 @@ def test_bad_cusps(changes: dict, words: str) -> None:
     """Cusps that no robot can drive are refused."""
     with pytest.raises(InputError, match=words):
         Waypoints.from_dict(CUSPS | {"cusps": (2, 4)} | changes)
+
+
+@pytest.mark.parametrize("curvature", [-1.5, 0.7])
+def test_start_of_a_turning_robot(curvature: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A spline that begins on an arc has its heading, curvature and speed there; with cusps only its first part has."""
+    s = np.array([0.0, 0.05, 0.25, 0.5, 0.75, 1.0, 1.25])
+    p = (np.exp(1j * curvature * s) - 1) / (1j * curvature)
+    points = [(z.real, z.imag) for z in p]
+    course = Waypoints(
+        points=points, closed=False, timing="limits", speed=0.7, start_speed=0.5, start_curvature=curvature
+    )
+    pose, (v, omega), _ = (part[0] for part in course.sample(np.zeros(1)))
+    assert np.allclose(pose, 0, atol=1e-3) and v == pytest.approx(0.5) and omega == pytest.approx(0.5 * curvature, 2e-3)
+    near = course.sample(np.linspace(0, 0.6, 50))
+    assert np.allclose(near.twist[:, 1] / near.twist[:, 0], curvature, atol=0.06 * abs(curvature))
+    monkeypatch.setattr("mrctl.theory.references.KINK", 1.0)
+    turning = Waypoints.from_dict(CUSPS | {"cusps": (2, 4), "start_speed": 0.3, "start_curvature": 0.01})
+    (first, _), *others = turning._parts
+    assert (first.start_speed, first.start_curvature) == (0.3, 0.01)
+    assert all(part.start_speed == part.start_curvature == 0 for part, _ in others)
+    assert turning.sample(np.zeros(1)).twist[0, 0] == pytest.approx(0.3, rel=0.01)
+    assert Waypoints.from_dict(turning.model_dump(mode="json")) == turning
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"start_speed": 0.5}, "start_speed: only an open curve"),
+        ({"start_speed": 0.5, "closed": False}, "start_speed: only an open curve"),
+        ({"start_speed": -0.5}, "start_speed"),
+        ({"start_curvature": 0.5}, "start_curvature: only an open curve"),
+        ({"start_curvature": 50.0, "closed": False}, "start_curvature"),
+    ],
+)
+def test_bad_start(changes: dict, words: str) -> None:
+    """A start speed without a time law that keeps limits, and a start of a closed curve are refused."""
+    with pytest.raises(InputError, match=f"^{words}"):
+        Waypoints.from_dict(changes)

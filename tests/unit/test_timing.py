@@ -64,8 +64,8 @@ class Judged(LinearConstraint):
         return canlinear_colloc_to_interpolate(*self.parameters, gridpoints, identical=True)
 
 
-def judge(s, k, dk, robot, limits, speed, near):
-    """Duration of each interval by TOPP-RA from rest to rest.
+def judge(s, k, dk, robot, limits, speed, near, start=0.0):
+    """Duration of each interval by TOPP-RA from a start speed to rest, and the largest controllable start speed.
 
     Its limits must be linear in u and x, so √x is linearised at the law `near`. That is its tangent from above: the
     solution keeps upper limits on the voltage, and is the same if and only if the law is optimal.
@@ -78,7 +78,7 @@ def judge(s, k, dk, robot, limits, speed, near):
     single, double = (inverse_dynamics(n * along, n**2 * turn, robot) - d for n in (1, 2))
     b, c = (double - 2 * single) / 2, (4 * single - double) / 2
     root = np.sqrt(np.append(near[1:-1], near[-2] / 2))
-    root = np.append(np.sqrt(near[1] / 2), root)[:, None]
+    root = np.append(np.sqrt(max(near[0], near[1] / 2)), root)[:, None]
     alpha, volts = limits.rotation_acceleration, limits.voltage
     still = np.maximum(np.abs(k), 1e-9)
     constraint = Judged(
@@ -88,8 +88,10 @@ def judge(s, k, dk, robot, limits, speed, near):
         np.minimum(speed**2, np.minimum((limits.rotation / still) ** 2, limits.lateral_acceleration / still)),
     )
     line = toppra.SplineInterpolator(s[[0, -1]], s[[0, -1]])
-    _, found, _ = TOPPRA([constraint], line, gridpoints=s, solver_wrapper="seidel").compute_parameterization(0, 0)
-    return 2 * np.diff(s) / (found[1:] + found[:-1])
+    solver = TOPPRA([constraint], line, gridpoints=s, solver_wrapper="seidel")
+    largest = np.sqrt(solver.compute_controllable_sets(0, 0)[0, 1])
+    _, found, _ = solver.compute_parameterization(min(start, largest * (1 - 1e-9)), 0)
+    return 2 * np.diff(s) / (found[1:] + found[:-1]), largest
 
 
 @pytest.mark.parametrize(
@@ -104,11 +106,30 @@ def test_toppra(name, share, count):
         path, limits = open_course._law.law.path, course.limits
         law = fastest(path, limits, course.speed)
         _, _, v, _ = law.at(law.times)
-        judged = judge(path.s[::2], path.curvature[::2], path.sharpness[::2], robot, limits, course.speed, v**2)
+        judged, _ = judge(path.s[::2], path.curvature[::2], path.sharpness[::2], robot, limits, course.speed, v**2)
         assert 0.98 < law.duration / judged.sum() < 1.02
         free = fastest(path, limits.model_copy(update={"inverse": ()}), course.speed)
         bound += free.duration < 0.99 * law.duration
     assert share == 1 or bound > count / 2  # the voltage is what limits the speed
+
+
+@pytest.mark.parametrize(("name", "share"), [("car", 1), ("car", 0.5), ("racecar", 0.25)])
+def test_toppra_start_speed(name, share):
+    """From a start speed, too; one that is too large becomes the largest one that TOPP-RA finds to be controllable."""
+    robot = ROBOTS[name].model_copy(update={"supply": share * ROBOTS[name].supply})
+    refused = 0
+    for course in splines(robot, 0.9, 6):
+        for part in (0.2, 0.6, 2.0):
+            start = min(20.0, part * course.speed)
+            path = course.model_copy(update={"closed": False, "start_speed": start})._law.law.path
+            law = fastest(path, course.limits, course.speed, start)
+            _, _, v, _ = law.at(law.times)
+            shape = path.s[::2], path.curvature[::2], path.sharpness[::2]
+            judged, largest = judge(*shape, robot, course.limits, course.speed, v**2, start)
+            assert 0.98 < law.duration / judged.sum() < 1.02
+            assert v[0] == law.start == pytest.approx(min(start, largest), rel=0.02)
+            refused += law.start < start
+    assert 6 <= refused < 18
 
 
 def test_toppra_laps():
@@ -120,7 +141,7 @@ def test_toppra_laps():
         s = np.concatenate([path.s[:-1:2], path.s[:-1:2] + path.length, path.s[::2] + 2 * path.length])
         k, dk = (np.append(np.tile(shape[:-1:2], 3), shape[-1]) for shape in (path.curvature, path.sharpness))
         near = np.append(np.tile(v[:-1], 3), v[-1]) ** 2
-        judged = judge(s, k, dk, CAR, course.limits, course.speed, near).reshape(3, -1)
+        judged = judge(s, k, dk, CAR, course.limits, course.speed, near)[0].reshape(3, -1)
         assert law.duration == pytest.approx(judged[1].sum(), rel=0.002)
         assert v[0] == pytest.approx(v[-1], rel=1e-9) and v.min() > 0
 
@@ -137,11 +158,18 @@ def keeps_limits(course, robot, top):
     assert motion.twist[:, 0].min() >= -1e-12
     jerk = np.abs(np.diff(motion.acceleration[:, 0])) / (course.period / 20000)
     assert jerk.max() <= 2 * limits.acceleration / smoothing * (1 + 1e-6)
+    start = course._law.law.start
     if not course.closed:
         ends = motion.pose[[0, -1], :2] - np.array(course.points)[[0, -1]]
         np.testing.assert_allclose(ends, 0, atol=1e-9)
-        np.testing.assert_allclose(motion.twist[[0, -1]], 0, atol=1e-9)
-    least = fastest(course._law.law.path, limits, top).duration
+        np.testing.assert_allclose(motion.twist[-1], 0, atol=1e-9)
+        assert motion.twist[0, 0] == pytest.approx(start, abs=1e-9)
+        np.testing.assert_allclose(motion.acceleration[[0, -1], 0], 0, atol=1e-6)
+        driven = np.cumsum(np.hypot(*np.diff(motion.pose[:, :2], axis=0).T))
+        advanced = np.cumsum((motion.twist[1:, 0] + motion.twist[:-1, 0]) / 2) * course.period / 20000
+        np.testing.assert_allclose(driven, advanced, atol=1e-5)
+        smoothing /= 1 if start == 0 else 2  # by which it lasts longer
+    least = fastest(course._law.law.path, limits, top, 0.0 if course.closed else start).duration
     assert least <= (course.period - (0 if course.closed else smoothing)) * (1 + 1e-9)
     return share, course.period / least
 
@@ -168,6 +196,30 @@ def test_every_limit_holds(name, radii, closed, speed, supply, smoothing):
     except InputError:
         reject()
     keeps_limits(*drawn)
+
+
+@settings(max_examples=60)
+@given(
+    st.sampled_from(sorted(ROBOTS)), st.lists(st.floats(0.2, 2), min_size=3, max_size=8), st.floats(0.2, 1),
+    st.floats(0.2, 1), st.floats(0.05, 0.5), st.floats(1e-3, 1.5), st.floats(-1, 1),
+)  # fmt: skip
+def test_every_limit_holds_from_a_start_speed(name, radii, speed, supply, smoothing, start, curvature):
+    """So they do from every speed and curvature; position and speed are continuous, and it begins with that speed.
+
+    It is no less than what the limits allow at the start, or the largest from which they can be kept: a little more is
+    not held there.
+    """
+    try:
+        course, robot, top = polygon(name, radii, False, speed, supply, smoothing)
+        course = course.replace(start_speed=start * top, start_curvature=curvature)
+    except InputError:
+        reject()
+    keeps_limits(course, robot, top)
+    first = course._law.law.start
+    assert first <= course.start_speed
+    if first < course.start_speed:
+        again = course.replace(start_speed=(first + course.start_speed) / 2)
+        assert again._law.law.start == pytest.approx(first, rel=0.02, abs=1e-3)
 
 
 @pytest.mark.full
@@ -246,6 +298,35 @@ def test_straight_line(length):
     np.testing.assert_allclose(law.at(t)[1:], [a * t**2 / 2, a * t, [a, a]], rtol=1e-6)
     peak = min(v, a * expected / 2)
     assert law.at(np.array([expected / 2]))[2] == pytest.approx(peak, rel=0.02)
+
+
+@pytest.mark.parametrize("length", [0.05, 0.2, 1.0])
+def test_start_speed_on_a_straight_line(length):
+    """It is kept for half the smoothing, and is at most that from which the robot can brake to rest on the line."""
+    line = Waypoints(
+        points=((0, 0), (length, 0)), closed=False, speed=1.2, timing="limits", limits=NO_VOLTAGE, start_speed=0.9
+    )
+    half, a = NO_VOLTAGE.smoothing / 2, NO_VOLTAGE.acceleration
+    largest = a * (np.sqrt(half**2 + 2 * length / a) - half)  # v half + v²/(2 a) = length
+    motion = line.sample(np.array([0.0, line.period]))
+    assert motion.twist[0, 0] == pytest.approx(min(0.9, largest), rel=5e-3)
+    assert abs(motion.acceleration[0, 0]) < 1e-9 and motion.pose[1, 0] == pytest.approx(length)
+    if largest > 0.9:  # it speeds up and brakes
+        way = length - 0.9 * half
+        top = np.sqrt(a * way + 0.9**2 / 2)
+        expected = (2 * top - 0.9) / a if top < 1.2 else 2.1 / a - 0.6 / a + (way - (2.88 - 0.81) / (2 * a)) / 1.2
+        assert line.period == pytest.approx(expected + 2 * half, rel=2e-3)
+
+
+def test_no_start_speed():
+    """Without one, or with one that counts as rest, the law is the same to the last bit; a small one changes little."""
+    line = Waypoints(points=((0, 0), (1, 0.5), (2, 0)), closed=False, timing="limits")
+    t = np.linspace(0, line.period, 500)
+    rest = np.hstack(line.sample(t))
+    for start in (0.0, 1e-200, 9e-4):
+        same = line.replace(start_speed=start, start_curvature=0.0)
+        assert np.hstack(same.sample(t)).tobytes() == rest.tobytes()
+    np.testing.assert_allclose(line.replace(start_speed=1e-3).sample(t).twist, line.sample(t).twist, atol=5e-3)
 
 
 def test_straight_line_at_low_voltage():
