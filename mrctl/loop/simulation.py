@@ -279,6 +279,7 @@ class Simulation:
         self.goals = Goals(scenarios, timed=not restarting)
         self._failure_time = np.full(size, np.nan)
         self._learned: dict[int, Array] = {}  # what each robot had adapted when its run ended, flat
+        self._sensed = False  # whether the coming tick is sensed
         self._start()
 
     def _check_references(self, robot: Robot) -> None:
@@ -365,9 +366,8 @@ class Simulation:
     def step(self) -> None:
         """Computes one control period, as in figure 3; an error of a user's stage fails all robots, which share it."""
         try:
-            self.events.apply(self.tick)
-            now, goal = self.courses.at(self.tick)
-            seen = self.estimator.measure(self.tick, self.plant.state, self.hierarchy.derivative)
+            now, _ = self.courses.at(self.tick)
+            seen, goal = self.sense()
             self.plant.step(self.hierarchy.update(seen, goal), self.hierarchy.faults)
             self.log.record(self.tick, self.plant.state, seen, now, self.hierarchy.state)
         except StageError as error:
@@ -375,7 +375,7 @@ class Simulation:
         self.judge()
 
     def sense(self) -> tuple[Rows, Rows]:
-        """Does the first three lines of `step` before it; further calls in the same tick only return the result.
+        """Applies the events of the coming tick and measures; further calls before `judge` only return the result.
 
         Returns:
             Estimate of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each; both are
@@ -384,9 +384,12 @@ class Simulation:
         Raises:
             StageError: The user's estimator raised, or returned something of another shape.
         """
-        self.events.apply(self.tick)
+        if not self._sensed:
+            self.events.apply(self.tick)
+            self.estimator.measure(self.tick, self.plant.state, self.hierarchy.derivative)
+            self._sensed = True
         _, goal = self.courses.at(self.tick)
-        return self.estimator.measure(self.tick, self.plant.state, self.hierarchy.derivative), goal
+        return self.estimator.seen, goal
 
     def _abort(self, reason: str) -> None:
         """Fails all robots before the physics; the records until now are kept."""
@@ -401,7 +404,7 @@ class Simulation:
             for row in np.flatnonzero(np.abs(log.now["lateral_error"]) > DIVERGED):
                 if self.scenarios[row].goal is None:  # a robot with a goal may wait, or leave its reference
                     plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
-        self.tick += 1
+        self.tick, self._sensed = self.tick + 1, False
         if plant.running < plant.size:
             new = plant.failed & np.isnan(self._failure_time)
             new[list(self._learned)] = False
@@ -429,7 +432,7 @@ class Simulation:
         plant, tick = self.plant, self.tick
         if scenario.perturbation != self.scenarios[row].perturbation:
             self.events.perturb(row, scenario.perturbation)
-        self.scenarios[row] = scenario
+        self.scenarios[row], self._sensed = scenario, False
         self.courses.restart(row, tick)
         self.hierarchy.renew(row, scenario)
         self.events.restart(row, scenario, tick)

@@ -462,9 +462,8 @@ class UserEstimator(Estimator):
         self._started = False
         self.faults = [""] * len(self.seen)
 
-    def estimate(self, tick: int, plant: Rows) -> Rows:
+    def estimate(self, tick: int, plant: Rows) -> None:
         """Estimates posture and twist of all robots; see `Estimator.estimate`."""
-        self.locate(tick, plant)
         memory, sensors = self.memory, self.sensors
         if not self._started:
             self._stage.call("reset", memory["mean"][:, :3], memory["mean"][:, 3:], sensors.period)
@@ -486,4 +485,4 @@ class UserEstimator(Estimator):
         memory["valid"] = np.isfinite(memory["answer"]).all(axis=1)
         for row in np.flatnonzero(~memory["valid"]):
             self.faults[row] = self.faults[row] or f"{self._stage.title}: not finite, tick {tick}"
-        return super().estimate(tick, plant)
+        super().estimate(tick, plant)

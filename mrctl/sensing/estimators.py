@@ -212,7 +212,6 @@ class Estimator:
         self._geometry = np.array([(robot.wheel_radius, robot.half_track, imu[0], skew, *tyres)], GEOMETRY)
         self.seen = np.zeros(len(sensing), SEEN)
         self.memory = np.zeros(len(sensing), ESTIMATORS[name][1])
-        self._located = self._measured = -1  # last tick in which the method of this name was called
         self.scanner, self.localiser = scanner, None
         if scanner and any(s.localisation != "fixes" for s in sensing):
             self.localiser = Localiser(sensing, sensors, scanner, robot.wheel_radius, known)
@@ -230,7 +229,6 @@ class Estimator:
             seed: Seed of the errors of the first fix and twist.
             tick: The coming control tick.
         """
-        self._measured = -1  # a tick is measured again if all robots of an environment begin again in it
         sensing, sensor, period = self._sensing[row], self.sensors.sensors[row], self.sensors.period
         random, seen = np.random.default_rng([seed, 3]), self.seen[row]
         self.seen[row], self.memory[row] = np.zeros((), SEEN), np.zeros((), self.memory.dtype)
@@ -245,7 +243,6 @@ class Estimator:
         memory["mean"][:size] = np.append(reading["pose"], reading["twist"]) + deviation * random.standard_normal(size)
         if self.scanner:
             self.scanner.start(row, seed, tick)
-            self._located = -1  # the tick may have been located before a robot of an environment began again in it
         if self.localiser:
             started = self.localiser.start(row, memory["mean"][:3], deviation[:3], seed)
             memory["mean"][:3], deviation[:3] = started
@@ -265,7 +262,7 @@ class Estimator:
             memory["inertial"] = memory["mean"][3]
 
     def measure(self, tick: int, plant: Rows, derivative: Array) -> Rows:
-        """Samples the sensors and estimates; further calls in the same tick only return the result.
+        """Samples the sensors and estimates.
 
         Args:
             tick: Control tick.
@@ -276,38 +273,32 @@ class Estimator:
         Returns:
             `seen`, `(B,)`.
         """
-        if tick != self._measured:
-            self._measured, sensors = tick, self.sensors
-            if self._compiled:
-                sensors.draw(tick)
-                self._sense(tick, plant, derivative, sensors.period, self._held.place)
-            else:
-                sensors.command(tick - 1, derivative)
-                sensors.measure(tick, plant)
-                self.estimate(tick, plant)
+        sensors = self.sensors
+        if self._compiled:
+            sensors.draw(tick)
+            self._sense(tick, plant, derivative, sensors.period, self._held.place)
+        else:
+            sensors.command(tick - 1, derivative)
+            sensors.measure(tick, plant)
+            self._locate(tick, plant)
+            self.estimate(tick, plant)
         return self.seen
 
-    def locate(self, tick: int, plant: Rows) -> None:
-        """Scans, and makes fixes from the scans, where there are lidars; further calls in the same tick do nothing."""
-        if self.scanner and tick != self._located:
-            self._located = tick
+    def _locate(self, tick: int, plant: Rows) -> None:
+        """Scans, and makes fixes from the scans, where there are lidars."""
+        if self.scanner:
             self.scanner.scan(tick, plant["reading"]["pose"], plant["failed"])
-            if self.localiser:
-                self.localiser.locate(tick, self.seen["estimate"])
+        if self.localiser:
+            self.localiser.locate(tick, self.seen["estimate"])
 
-    def estimate(self, tick: int, plant: Rows) -> Rows:
-        """Estimates posture and twist of all robots.
+    def estimate(self, tick: int, plant: Rows) -> None:
+        """Estimates posture and twist of all robots from what the sensors have sampled, and writes them to `seen`.
 
         Args:
             tick: Control tick.
             plant: Record of `PLANT` of each robot, `(B,)`.
-
-        Returns:
-            `seen`, `(B,)`.
         """
         sensors = self.sensors
-        self.locate(tick, plant)
         self._estimate(
             tick, plant, sensors.ring, sensors.sensors, self._geometry[0], sensors.period, self.memory, self.seen
         )
-        return self.seen
