@@ -161,6 +161,7 @@ class Learner(ABC):
         arrays: Memory and constants of the kernels, a tuple of arrays.
         prior: The prior that is added to its output; at first nothing.
         guarded: Whether the guard watches it.
+        restorable: Whether the guard can reset it, as every learner of mrctl.
         learned: Fields of `rows` that hold what it has adapted, from which another run can start.
         weight_norm: Norm of the weights, `(B,)`.
     """
@@ -168,6 +169,7 @@ class Learner(ABC):
     respond: ClassVar[Kernel]
     learn_one: ClassVar[Kernel]
     guarded: ClassVar[bool] = True
+    restorable: ClassVar[bool] = True
     learned: ClassVar[tuple[str, ...]] = ()
     rows: Rows
     arrays: tuple[Any, ...]

@@ -15,7 +15,6 @@ import xarray as xr
 from tqdm import tqdm
 
 from mrctl.control.features import feature_scale
-from mrctl.control.feedforward import Learner
 from mrctl.control.stages import Stages
 from mrctl.kernel import Array, Rows
 from mrctl.loop.courses import Courses, RestartingCourses, start_pose
@@ -24,7 +23,8 @@ from mrctl.loop.goals import Goals
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.learned import LAYOUT
 from mrctl.loop.log import DIVERGED, Log
-from mrctl.loop.user_stages import StageError, UserEstimator, UserHierarchy, UserStage
+from mrctl.loop.user_hierarchy import UserHierarchy
+from mrctl.loop.user_stages import StageError, UserEstimator, UserFeedforward, UserStage
 from mrctl.physics import hull, mjcf, tyres
 from mrctl.physics import obstacles as walls
 from mrctl.physics.plant import Plant, build
@@ -462,15 +462,16 @@ class Simulation:
             self._learned |= {row: learned[row].copy() for row in rows}
 
     def _adapted(self) -> Array:
-        """Returns what the learners have adapted, as `Hierarchy.adapted`; a stage that cannot say it fails all runs."""
+        """Returns what the learners have adapted, as `Learner.adapted`; a stage that cannot say it fails all runs."""
+        learner = self.hierarchy.learner
         try:
-            return self.hierarchy.adapted()
+            return learner.adapted()
         except StageError as error:
-            assert isinstance(self.hierarchy, UserHierarchy)
+            assert isinstance(learner, UserFeedforward)
             for row in np.flatnonzero(~self.plant.failed).tolist():
                 self.plant.fail(row, str(error))
                 self._failure_time[row] = self.tick * self.period
-            width = sum(int(np.prod(shape)) for shape in self.hierarchy.shapes.values())
+            width = sum(int(np.prod(shape)) for shape in learner.shapes.values())
             return np.full((self.plant.size, width), np.nan)
 
     def result(self) -> xr.Dataset:
@@ -501,9 +502,10 @@ class Simulation:
 
     def _layout(self) -> dict[str, Any]:
         """Variable `LAYOUT`, where a feedforward of the user keeps what it learns."""
-        if not (isinstance(self.hierarchy, UserHierarchy) and self.hierarchy.own_learner):
+        learner = self.hierarchy.learner
+        if not (isinstance(learner, UserFeedforward) and learner.shapes):
             return {}
-        text = json.dumps({"learner": self.hierarchy.own_learner, "shapes": self.hierarchy.shapes})
+        text = json.dumps({"learner": learner.stage.name, "shapes": learner.shapes})
         return {LAYOUT: ("run", np.array([text] * len(self.scenarios), object))}
 
     def _coefficients(self) -> dict[str, Any]:
@@ -561,9 +563,8 @@ class Simulation:
             Two arrays `(B, 8, 2)` in V, NaN where a robot has failed and where the second channel is steering; None
             if the learner has no such coefficients.
         """
-        learner, hierarchy = self.hierarchy.learner, self.hierarchy
-        learned = learner.parameters if isinstance(learner, Learner) else None
-        if learned is None:
+        hierarchy = self.hierarchy
+        if (learned := hierarchy.learner.parameters) is None:
             return None
         scale = feature_scale(self.plant.robot)[:, None]
         known = scale * hierarchy.prior.rows["c"] + learned

@@ -102,6 +102,29 @@ def user(
             s.estimate[k] = memory.answer[k]
 
 
+@kernel
+def receive(tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Row, s: Row) -> None:
+    """Writes to the record of `SEEN` what has arrived from the sensors; the arguments are those of `truth`."""
+    wheels = ring[max(s.start, tick - sensor.encoder_latency) % len(ring), i]
+    force = ring[max(s.start, tick - sensor.accelerometer_latency) % len(ring), i]
+    s.gyro = ring[max(s.start, tick - sensor.gyro_latency) % len(ring), i].gyro
+    for k in range(2):
+        s.encoder[k], s.acceleration[k] = wheels.encoder[k], force.acceleration[k]
+        s.lost[k] = true.lost[k]
+        s.wheel_speeds[k] = geometry.wheel_radius * wheels.rate[k]
+    taken = ring[(tick - sensor.fix_latency) % len(ring), i]
+    arrives = taken.fix_arrives and tick - sensor.fix_latency >= s.start
+    for k in range(3):
+        s.fix[k] = taken.fix[k] if arrives else np.nan
+
+
+@kernel
+def receive_all(tick: int, plant: Rows, ring: Rows, sensors: Rows, geometry: Row, seen: Rows) -> None:
+    """Calls `receive` for all robots."""
+    for i in range(len(seen)):
+        receive(tick, plant[i], ring, i, sensors[i], geometry, seen[i])
+
+
 observe = truth  # the estimator of `estimate`, which `Kernel.calling` replaces
 
 
@@ -124,20 +147,10 @@ def estimate(
     """
     for i in range(len(seen)):
         s, sensor = seen[i], sensors[i]
+        receive(tick, plant[i], ring, i, sensor, geometry, s)
         observe(tick, plant[i], ring, i, sensor, geometry, period, memory[i], s)
         predict(s.estimate, tick, tick + s.delay, ring, i, period, s)
-        wheels = ring[max(s.start, tick - sensor.encoder_latency) % len(ring), i]
-        force = ring[max(s.start, tick - sensor.accelerometer_latency) % len(ring), i]
-        s.gyro = ring[max(s.start, tick - sensor.gyro_latency) % len(ring), i].gyro
-        for k in range(2):
-            s.encoder[k], s.acceleration[k] = wheels.encoder[k], force.acceleration[k]
-            s.lost[k] = plant[i].lost[k]
-            s.wheel_speeds[k] = geometry.wheel_radius * wheels.rate[k]
         s.slip = slip_ratio(s.wheel_speeds, s.estimate[3], s.estimate[4], geometry.half_track, period, s.slip)
-        taken = ring[(tick - sensor.fix_latency) % len(ring), i]
-        arrives = taken.fix_arrives and tick - sensor.fix_latency >= s.start
-        for k in range(3):
-            s.fix[k] = taken.fix[k] if arrives else np.nan
 
 
 @kernel

@@ -233,7 +233,7 @@ class Session:
         not those of any; the gains on the steering are None unless it is rigid.
         """
         sim, k = self._place[0]
-        rigid, over = self.start[0].steering == "rigid", sim.hierarchy.motions[k]
+        rigid, over = self.start[0].steering == "rigid", sim.hierarchy.settings[k].design
         _, delay = sim.hierarchy.lengthened(k, self.state()["pid"])
         kanayama = Kanayama(k_y=self.state()["kanayama"].k_y).completed(over.kanayama)  # K_θ follows a K_y that is set
         values: dict[tuple[str, ...], float | None] = {
