@@ -16,22 +16,16 @@ from numpy.typing import NDArray
 
 from mrctl.control import delay as late
 from mrctl.control import guard as guarding
-from mrctl.control.composite import CompositeAdaptation
 from mrctl.control.delay import DELAY, watch_delay
 from mrctl.control.design import Motion, motion
-from mrctl.control.feedforward import Learner, NoLearner, Prior, inverse_dynamics, learn_nothing, nothing
-from mrctl.control.fel import FeedbackErrorLearning
+from mrctl.control.feedforward import Learner, Loop, Prior, inverse_dynamics, learn_nothing, nothing
 from mrctl.control.guard import BACK_OFF, GUARD, UNSURE, guard
-from mrctl.control.indi import IncrementalInversion
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
-from mrctl.control.l1 import L1Adaptive
+from mrctl.control.learners import LEARNERS
 from mrctl.control.limiter import LIMITER, limit
-from mrctl.control.mrac import ModelReferenceAdaptive
 from mrctl.control.nominal import nominal
-from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import PID, Pid, pid
 from mrctl.control.rejection import Peaks, rejection
-from mrctl.control.rls import RecursiveLeastSquares
 from mrctl.control.steering import ALLOCATION, allocate, take_loss
 from mrctl.kernel import Array, Held, Row, Rows, held, kernel
 from mrctl.loop.learned import load_learned
@@ -165,28 +159,10 @@ def update(moves: bool, seen: Rows, goal: Rows, period: float, place: int) -> tu
 
 def learner_of(scenarios: Sequence[Scenario], robot: Robot) -> Learner:
     """Returns the learner that a uniform group of scenarios names."""
-    first = scenarios[0]
-    rigid, period = first.steering == "rigid", first.control_period
-    delay = first.sensing.loop_delay(period)
-    match first.learner:
-        case "none":
-            return NoLearner(robot, len(scenarios), rigid, period)
-        case "observer":
-            return DisturbanceObserver(robot, [s.observer for s in scenarios], rigid, period)
-        case "indi":
-            return IncrementalInversion(robot, [s.indi for s in scenarios], rigid, period, delay)
-        case "l1":
-            return L1Adaptive(robot, [s.l1 for s in scenarios], rigid, period, delay)
-        case "mrac":
-            return ModelReferenceAdaptive(robot, [s.mrac for s in scenarios], rigid, period, delay)
-        case "composite":
-            settings = [s.composite for s in scenarios]
-            return CompositeAdaptation(robot, settings, rigid, period, prior=first.prior != "none", delay=delay)
-        case "rls":
-            return RecursiveLeastSquares(robot, [s.rls for s in scenarios], rigid, period, delay)
-        case "fel":
-            seeds = [s.seed for s in scenarios]
-            return FeedbackErrorLearning(robot, [s.fel for s in scenarios], seeds, rigid, period, delay)
+    first, period = scenarios[0], scenarios[0].control_period
+    delay, seeds = first.sensing.loop_delay(period), [s.seed for s in scenarios]
+    loop = Loop(robot, first.steering == "rigid", period, delay, first.prior != "none", seeds)
+    return LEARNERS[first.learner](loop, [getattr(s, s.learner, None) for s in scenarios])
 
 
 @dataclass
