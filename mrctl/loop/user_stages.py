@@ -16,7 +16,7 @@ from mrctl.kernel import Array, Rows
 from mrctl.loop.learned import load_arrays, load_learned
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
-from mrctl.sensing.estimators import Estimator, receive_all
+from mrctl.sensing.estimators import Estimator
 from mrctl.theory.robot import Robot
 
 
@@ -247,14 +247,14 @@ class UserEstimator(Estimator):
 
     def estimate(self, tick: int, plant: Rows) -> None:
         """Estimates posture and twist of all robots; see `Estimator.estimate`."""
-        memory, seen, sensors, period = self.memory, self.seen, self.sensors, self.sensors.period
+        memory, seen, period = self.memory, self.seen, self.sensors.period
         if not self._started:
             self._stage.call("reset", memory["mean"][:, :3], memory["mean"][:, 3:], period)
             self._started = True
-        receive_all(tick, plant, sensors.ring, sensors.sensors, self._geometry[0], seen)
+        self.receive(tick, plant)
         new = ~np.all(np.isnan(seen["fix"]), axis=1)
         fix = np.where(new[:, None], seen["fix"], 0.0)
-        age = np.where(new, sensors.sensors["fix_latency"] * period, -1.0)
+        age = np.where(new, self.sensors.sensors["fix_latency"] * period, -1.0)
         answer = self._stage.call("output", seen["encoder"], seen["gyro"], seen["acceleration"], fix, age)
         memory["answer"] = self._stage.checked(answer, (len(memory), 5), "output")
         memory["valid"] = np.isfinite(memory["answer"]).all(axis=1)

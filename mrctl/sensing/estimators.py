@@ -304,6 +304,11 @@ class Estimator:
         if self.localiser:
             self.localiser.locate(tick, self.seen["estimate"])
 
+    def receive(self, tick: int, plant: Rows) -> None:
+        """Writes what has arrived from the sensors of all robots to `seen`, which `estimate` does too."""
+        sensors = self.sensors
+        receive_all(tick, plant, sensors.ring, sensors.sensors, self._geometry[0], self.seen)
+
     def estimate(self, tick: int, plant: Rows) -> None:
         """Estimates posture and twist of all robots from what the sensors have sampled, and writes them to `seen`.
 
