@@ -274,17 +274,14 @@ class Estimator:
             memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
             memory["inertial"] = memory["mean"][3]
 
-    def measure(self, tick: int, plant: Rows, derivative: Array) -> Rows:
-        """Samples the sensors and estimates.
+    def measure(self, tick: int, plant: Rows, derivative: Array) -> None:
+        """Samples the sensors and estimates, and writes the result to `seen`.
 
         Args:
             tick: Control tick.
             plant: Record of `PLANT` of each robot, `(B,)`.
             derivative: Derivative of the twist that was commanded in the last tick, in m/s² and rad/s², `(B, 2)`, with
                 which estimates are predicted.
-
-        Returns:
-            `seen`, `(B,)`.
         """
         sensors = self.sensors
         if self._compiled:
@@ -295,7 +292,6 @@ class Estimator:
             sensors.measure(tick, plant)
             self._locate(tick, plant)
             self.estimate(tick, plant)
-        return self.seen
 
     def _locate(self, tick: int, plant: Rows) -> None:
         """Scans, and makes fixes from the scans, where there are lidars."""
