@@ -17,6 +17,7 @@ from mrctl.control.guard import Guard
 from mrctl.control.indi import Indi
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.l1 import L1
+from mrctl.control.learners import LEARNERS, LearnerName
 from mrctl.control.mrac import Mrac
 from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
@@ -29,8 +30,7 @@ from mrctl.theory.references import Lemniscate, Reference
 from mrctl.theory.robot import CAR, RobotFile, Steering
 
 PriorName = Literal["none", "model", "true_model"]
-LearnerName = Literal["none", "observer", "indi", "l1", "fel", "rls", "mrac", "composite"]
-MODEL_BASED = ("observer", "indi", "l1")
+MODEL_BASED = tuple(name for name, law in LEARNERS.items() if law.needs_model)
 """Learners that compare the robot with a model, so that the prior must be a model."""
 
 

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import INPUTS, SLOW, feature_scale, features, symmetric_product
-from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, explained
+from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, explained
 from mrctl.control.matching import SETTLED, histories, note_sent, recall
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
@@ -364,36 +364,24 @@ class CompositeAdaptation(Learner):
         weight_norm: Euclidean norm of a, `(B,)`.
     """
 
-    respond, learn_one, learned = respond, learn, ("a", "P")
+    respond, learn_one, record, learned = respond, learn, COMPOSITE, ("a", "P")
 
-    def __init__(
-        self, robot: Robot, settings: list[Composite], rigid: bool, period: float, prior: bool = True, delay: int = 0
-    ) -> None:
-        """Makes the learners.
-
-        Args:
-            robot: The nominal robot.
-            settings: Settings of each robot.
-            rigid: Whether channel two is steering.
-            period: Control period in s.
-            prior: Whether a model is the prior; otherwise P₀ allows weights as large as those of a model.
-            delay: Delay from measurement to voltage in control periods.
-        """
-        super().__init__(robot, len(settings), rigid, period)
-        scale = feature_scale(robot)
-        self.rows = rows = np.zeros(len(settings), COMPOSITE)
+    def __init__(self, loop: Loop, settings: list[Composite]) -> None:
+        """Takes the loop, and the settings of each robot; without a prior, P₀ allows weights as large as a model's."""
+        super().__init__(loop, settings)
+        rows, (robot, rigid, period, *_) = self.rows, loop
         unit = np.array([1.0, STEERING_SCALE if rigid else 1.0])
         for row, s in zip(rows, settings, strict=True):
             memory, brief_memory = np.exp(-period / np.array([s.memory, s.disturbance_memory]))
             row["f"][:, :FEATURES], row["f"][:, FEATURES] = memory, brief_memory
-            row["stationary"] = stationary(s, robot, rigid, prior)
+            row["stationary"] = stationary(s, robot, rigid, loop.prior)
             row["step"] = s.step * np.array([1.0, STEERING_SHARE if rigid else 1.0])
             row["dead_zone"] = s.dead_zone * unit
             row["noise"] = s.noise * unit
             row["scatter"] = SCATTER * unit * (1.0, robot.half_track)
             row["brief"], row["lasting"] = period / (period + BRIEF), period / (period + LASTING)
             row["filter"] = period / (period + s.filter)
-        self.arrays = rows, scale, histories(len(settings), delay, FEATURES + 1)
+        self.arrays = rows, feature_scale(robot), histories(len(settings), loop.delay, FEATURES + 1)
         self.restore(np.arange(len(settings)))
 
     @property

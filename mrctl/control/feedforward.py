@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,6 +148,23 @@ class Prior:
         return voltage
 
 
+class Loop(NamedTuple):
+    """What the learners of a group of robots know of the loop in which they drive."""
+
+    robot: Robot
+    """The nominal robot."""
+    rigid: bool
+    """Whether channel two is steering."""
+    period: float
+    """Control period in s."""
+    delay: int = 0
+    """Delay from measurement to voltage in control periods."""
+    prior: bool = True
+    """Whether a model is the prior."""
+    seeds: Sequence[int] = ()
+    """Seed of each robot, which draws initial weights."""
+
+
 class Learner(ABC):
     """A learner whose two laws are kernels for one robot, so that a whole control tick is one compiled call.
 
@@ -158,9 +175,13 @@ class Learner(ABC):
         learn_one: `(i, command, feedback, frozen, twist, voltage, period, robot, prior, arrays, added)` learns, writes
             the change of the output of robot i to `added`, `(2,)`, and returns the norm of the weights. `prior` is
             the record of `PRIOR` of robot i.
+        rows: One record a robot: its memory and its settings.
         arrays: Memory and constants of the kernels, a tuple of arrays.
         prior: The prior that is added to its output; at first nothing.
         guarded: Whether the guard watches it.
+        restorable: Whether the guard can reset it, as every learner of mrctl.
+        needs_model: Whether it compares the robot with a model, so that the prior must be one.
+        record: The dtype of `rows`.
         learned: Fields of `rows` that hold what it has adapted, from which another run can start.
         weight_norm: Norm of the weights, `(B,)`.
     """
@@ -168,14 +189,18 @@ class Learner(ABC):
     respond: ClassVar[Kernel]
     learn_one: ClassVar[Kernel]
     guarded: ClassVar[bool] = True
+    restorable: ClassVar[bool] = True
+    needs_model: ClassVar[bool] = False
+    record: ClassVar[np.dtype] = np.dtype([])
     learned: ClassVar[tuple[str, ...]] = ()
-    rows: Rows
     arrays: tuple[Any, ...]
 
-    def __init__(self, robot: Robot, size: int, rigid: bool, period: float) -> None:
-        """Takes the nominal robot, the number of robots, whether channel two is steering, and the period in s."""
-        self.robot, self.period = nominal(robot, rigid), period
-        self.prior = Prior([None] * size, rigid)
+    def __init__(self, loop: Loop, settings: Sequence[Any]) -> None:
+        """Takes the loop, and the settings of each robot."""
+        size = len(settings)
+        self.robot, self.period = nominal(loop.robot, loop.rigid), loop.period
+        self.prior = Prior([None] * size, loop.rigid)
+        self.rows: Rows = np.zeros(size, self.record)
         self.weight_norm = np.zeros(size)
         self._command, self._voltage, self._added = np.zeros((3, size, 2))
 
@@ -187,6 +212,11 @@ class Learner(ABC):
     def parameters(self) -> Array | None:
         """Learned coefficients of the 8 scaled features, beside the prior's, `(B, 8, 2)` in V, or None."""
         return None
+
+    @classmethod
+    def kept(cls, settings: Any) -> dict[str, tuple[int, ...]]:  # noqa: ANN401
+        """Returns names and shapes of what one robot with these settings has learned, in the order of `adapted`."""
+        return {name: cls.record[name].shape for name in cls.learned}
 
     def adapted(self) -> Array:
         """What each robot has learned, flat, `(B, n)`; n is 0 if it keeps nothing."""

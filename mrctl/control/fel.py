@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import INPUTS, OUTPUTS, feature_scale, features
-from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner
+from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop
 from mrctl.control.matching import histories, recall
-from mrctl.control.weights import initial_weights, load_weights
+from mrctl.control.weights import initial_weights, load_weights, shapes
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
-from mrctl.theory.robot import Robot
 
 # Gains of hidden units and bias, relative to the direct links W₃. A normalised step is divided among the weights in
 # proportion to their squared regressors, so these gains give most of it to the eight features. With gains of one, two
@@ -290,35 +289,30 @@ class FeedbackErrorLearning(Learner):
         weight_norm: ‖W − W₀‖, `(B,)`.
     """
 
-    respond, learn_one = respond, learn
+    respond, learn_one, record = respond, learn, FEL
 
-    def __init__(
-        self, robot: Robot, settings: list[Fel], seeds: list[int], rigid: bool, period: float, delay: int = 0
-    ) -> None:
-        """Builds the networks.
-
-        Args:
-            robot: The nominal robot, which sets the scales of the features.
-            settings: Settings of each robot; `hidden` must be the same for all.
-            seeds: Seed of the initial weights of each robot.
-            rigid: Whether channel two is steering.
-            period: Control period in s.
-            delay: Delay from measurement to voltage in control periods.
+    def __init__(self, loop: Loop, settings: list[Fel]) -> None:
+        """Takes the loop, and the settings of each robot, of which `hidden` must be the same for all.
 
         Raises:
             InputError: A weights file is missing, broken or of another shape.
         """
-        super().__init__(robot, len(settings), rigid, period)
+        super().__init__(loop, settings)
         given = [
             load_weights(s.weights, s.hidden) if s.weights else initial_weights(s.hidden, seed)
-            for s, seed in zip(settings, seeds, strict=True)
+            for s, seed in zip(settings, loop.seeds, strict=True)
         ]
         self.initial = by_columns(np.array(given))
         self.weights = self.initial.copy()
-        self.rows = fresh(settings, rigid)
+        self.rows = fresh(settings, loop.rigid)
         hidden, gradient = np.zeros((len(settings), settings[0].hidden)), np.zeros(self.initial.shape[1])
-        queue = histories(len(settings), delay, INPUTS)
-        self.arrays = self.rows, feature_scale(robot), self.weights, self.initial, hidden, gradient, queue
+        queue = histories(len(settings), loop.delay, INPUTS)
+        self.arrays = self.rows, feature_scale(loop.robot), self.weights, self.initial, hidden, gradient, queue
+
+    @classmethod
+    def kept(cls, settings: Fel) -> dict[str, tuple[int, ...]]:
+        """Returns names and shapes of the weights of one robot, in the order of files."""
+        return shapes(settings.hidden)
 
     def adapted(self) -> Array:
         """The weights, `(B, n)`, in the order of files."""

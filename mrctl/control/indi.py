@@ -45,11 +45,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import INPUTS
-from mrctl.control.feedforward import PRIOR, Learner, Prior, explained, inverse_dynamics
+from mrctl.control.feedforward import PRIOR, Learner, Loop, Prior, explained, inverse_dynamics
 from mrctl.control.matching import MATCHED, low_pass, match, note_sent, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
-from mrctl.theory.robot import Robot
 
 
 @kernel
@@ -135,23 +134,15 @@ class IncrementalInversion(Learner):
         rows: One record of `INDI` a robot.
     """
 
-    respond, learn_one, guarded = respond, learn, False
+    respond, learn_one, record = respond, learn, INDI
+    guarded, needs_model = False, True
 
-    def __init__(self, robot: Robot, settings: list[Indi], rigid: bool, period: float, delay: int = 0) -> None:
-        """Makes the stages.
-
-        Args:
-            robot: The nominal robot.
-            settings: Settings of each robot.
-            rigid: Whether channel two is steering.
-            period: Control period in s.
-            delay: Delay from measurement to voltage in control periods.
-        """
-        super().__init__(robot, len(settings), rigid, period)
-        self.rows = np.zeros(len(settings), INDI)
-        self.rows["share"] = [period / (period + s.time_constant) for s in settings]
-        self.rows["prior"] = Prior([robot] * len(settings), rigid).rows
-        self.arrays = self.rows, queues(len(settings), delay)
+    def __init__(self, loop: Loop, settings: list[Indi]) -> None:
+        """Takes the loop, and the settings of each robot."""
+        super().__init__(loop, settings)
+        self.rows["share"] = [loop.period / (loop.period + s.time_constant) for s in settings]
+        self.rows["prior"] = Prior([loop.robot] * len(settings), loop.rigid).rows
+        self.arrays = self.rows, queues(len(settings), loop.delay)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets the filters and queues of the robots with these indices."""

@@ -32,12 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.feedforward import Learner, explained
+from mrctl.control.feedforward import Learner, Loop, explained
 from mrctl.control.matching import MATCHED, match, note_sent, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.linear import steering
-from mrctl.theory.robot import Robot
 
 
 @kernel
@@ -139,26 +138,18 @@ class L1Adaptive(Learner):
         rows: One record of `PREDICTOR` a robot.
     """
 
-    respond, learn_one, guarded = respond, learn, False
-    learned = "sigma", "filtered"
+    respond, learn_one, record, learned = respond, learn, PREDICTOR, ("sigma", "filtered")
+    guarded, needs_model = False, True
 
-    def __init__(self, robot: Robot, settings: list[L1], rigid: bool, period: float, delay: int = 0) -> None:
-        """Makes the stages.
-
-        Args:
-            robot: The nominal robot.
-            settings: Settings of each robot.
-            rigid: Whether channel two is steering.
-            period: Control period in s.
-            delay: Delay from measurement to voltage in control periods.
-        """
-        super().__init__(robot, len(settings), rigid, period)
-        self.rows = rows = np.zeros(len(settings), PREDICTOR)
+    def __init__(self, loop: Loop, settings: list[L1]) -> None:
+        """Takes the loop, and the settings of each robot."""
+        super().__init__(loop, settings)
+        rows, period = self.rows, loop.period
         rates, bandwidths = (np.array([getattr(s, name) for s in settings]) for name in ("predictor", "bandwidth"))
         rows["decay"], rows["phi"] = np.exp(-rates * period), -np.expm1(-rates * period) / rates
         rows["share"] = -np.expm1(-bandwidths * period)
-        rows["lag"] = max(steering(robot).lag, period)
-        self.arrays = rows, queues(len(settings), delay)
+        rows["lag"] = max(steering(loop.robot).lag, period)
+        self.arrays = rows, queues(len(settings), loop.delay)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets predictor, adaptation and queues of the robots with these indices."""

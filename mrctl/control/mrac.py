@@ -63,12 +63,11 @@ from pydantic import Field
 
 from mrctl.control.cholesky import factor, forward, solve
 from mrctl.control.features import INPUTS, SLOW, feature_scale, features, linear, symmetric_product
-from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner
+from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop
 from mrctl.control.matching import MATCHED, SETTLED, low_pass, match, note_sent, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
-from mrctl.theory.robot import Robot
 
 SIGNALS = INPUTS + 2  # filtered signals: the features and the voltage of the two channels
 NEWTON, NEAR = 100, 1e-6  # largest number of steps of the projection; share by which its result may exceed the ball
@@ -333,20 +332,12 @@ class ModelReferenceAdaptive(Learner):
         rows: One record of `MRAC` a robot.
     """
 
-    respond, learn_one, learned = respond, learn, ("b", "M")
+    respond, learn_one, record, learned = respond, learn, MRAC, ("b", "M")
 
-    def __init__(self, robot: Robot, settings: list[Mrac], rigid: bool, period: float, delay: int = 0) -> None:
-        """Makes the learners.
-
-        Args:
-            robot: The nominal robot.
-            settings: Settings of each robot.
-            rigid: Whether channel two is steering.
-            period: Control period in s.
-            delay: Delay from measurement to voltage in control periods.
-        """
-        super().__init__(robot, len(settings), rigid, period)
-        self.rows = rows = np.zeros(len(settings), MRAC)
+    def __init__(self, loop: Loop, settings: list[Mrac]) -> None:
+        """Takes the loop, and the settings of each robot."""
+        super().__init__(loop, settings)
+        rows, (robot, rigid, period, *_) = self.rows, loop
         emf = inverse_coefficients(robot)[[0, 1], [0, 1]]  # V per m/s and per rad/s
         unit = np.array([1.0, STEERING_SCALE if rigid else 1.0])
         weight = np.array([emf[0], STEERING_SHARE if rigid else emf[1]])
@@ -357,7 +348,7 @@ class ModelReferenceAdaptive(Learner):
             row["leak"], row["radius"] = s.leak * period, s.radius * robot.supply * unit
             row["share"], row["hand_over"] = period / (period + s.filter), s.hand_over
         self._start = rows.copy()
-        self.arrays = rows, feature_scale(robot), queues(len(settings), delay)
+        self.arrays = rows, feature_scale(robot), queues(len(settings), loop.delay)
 
     @property
     def parameters(self) -> Array:

@@ -24,11 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from mrctl.control.feedforward import Learner, explained
+from mrctl.control.feedforward import Learner, Loop, explained
 from mrctl.control.matching import note_sent
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
-from mrctl.theory.robot import Robot
 
 
 @kernel
@@ -115,13 +114,12 @@ class DisturbanceObserver(Learner):
         rows: One record of `OBSERVER` a robot.
     """
 
-    respond, learn_one, guarded = respond, learn, False
-    learned = "voltage", "disturbance"
+    respond, learn_one, record, learned = respond, learn, OBSERVER, ("voltage", "disturbance")
+    guarded, needs_model = False, True
 
-    def __init__(self, robot: Robot, settings: list[Observer], rigid: bool, period: float) -> None:
-        """Takes the nominal robot, the settings of each robot, whether channel two is steering, and the period in s."""
-        super().__init__(robot, len(settings), rigid, period)
-        self.rows = np.zeros(len(settings), OBSERVER)
+    def __init__(self, loop: Loop, settings: list[Observer]) -> None:
+        """Takes the loop, and the settings of each robot."""
+        super().__init__(loop, settings)
         self.rows["time_constant"] = [s.time_constant for s in settings]
         self.arrays = self.rows, np.zeros(2)
 

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import feature_scale, features, linear
-from mrctl.control.feedforward import STEERING_SHARE, Learner
+from mrctl.control.feedforward import STEERING_SHARE, Learner, Loop
 from mrctl.control.matching import histories, recall
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
-from mrctl.theory.robot import Robot
 
 
 @kernel
@@ -122,26 +121,18 @@ class RecursiveLeastSquares(Learner):
         rows: One record of `RLS` a robot.
     """
 
-    respond, learn_one, learned = respond, learn, ("theta", "P")
+    respond, learn_one, record, learned = respond, learn, RLS, ("theta", "P")
 
-    def __init__(self, robot: Robot, settings: list[Rls], rigid: bool, period: float, delay: int = 0) -> None:
-        """Makes the learners.
-
-        Args:
-            robot: The nominal robot.
-            settings: Settings of each robot.
-            rigid: Whether channel two is steering.
-            period: Control period in s.
-            delay: Delay from measurement to voltage in control periods.
-        """
-        super().__init__(robot, len(settings), rigid, period)
-        self.rows = rows = np.zeros(len(settings), RLS)
+    def __init__(self, loop: Loop, settings: list[Rls]) -> None:
+        """Takes the loop, and the settings of each robot."""
+        super().__init__(loop, settings)
+        rows = self.rows
         rows["step"], rows["drift"] = [s.step for s in settings], [s.drift for s in settings]
         rows["bound"], rows["dead_zone"] = [s.covariance_bound for s in settings], [s.dead_zone for s in settings]
-        rows["share"] = 1.0, STEERING_SHARE if rigid else 1.0
+        rows["share"] = 1.0, STEERING_SHARE if loop.rigid else 1.0
         self._covariance = np.array([s.initial_covariance * np.eye(8) for s in settings])
         rows["P"] = self._covariance
-        self.arrays = rows, feature_scale(robot), histories(len(settings), delay, 8)
+        self.arrays = rows, feature_scale(loop.robot), histories(len(settings), loop.delay, 8)
 
     @property
     def parameters(self) -> Array:

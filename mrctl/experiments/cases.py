@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from mrctl.control.pid import Pid
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
-from mrctl.scenario import FEEDFORWARDS, Event, Scenario, replicates
+from mrctl.scenario import Event, Scenario, replicates
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
 from mrctl.theory.references import Lemniscate, StopAndGo, Waypoints, random_spline
@@ -69,17 +69,22 @@ class Case(NamedTuple):
     """Number of the lap at whose beginning it changes back; 0 if it does not."""
 
 
-Choices = Mapping[str, dict[str, Any]]
-"""What drives the runs, by name: a `feedforward` of mrctl, or a `controller` of the user and the `prior` beside it."""
+class Choice(NamedTuple):
+    """What drives the runs: a prior and a learner of mrctl, or a prior and a controller of the user."""
+
+    prior: str = "none"
+    learner: str = "none"
+    controller: str | None = None
+    """The user's controller, as for `mrctl.loop.user_files`."""
+
+    @property
+    def pair(self) -> dict[str, str]:
+        """Prior and learner, as fields of a scenario."""
+        return {"prior": self.prior, "learner": self.learner}
 
 
-def pair_of(choice: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns prior and learner of what drives the runs, as fields of a scenario."""
-    if choice.get("feedforward") in FEEDFORWARDS:
-        return FEEDFORWARDS[choice["feedforward"]]
-    return {"prior": choice.get("prior", "none"), "learner": "none"}
-
-
+Choices = Mapping[str, Choice]
+"""What drives the runs, by the name in tables."""
 Laps = Mapping[str, xr.Dataset]
 """Metrics lap by lap of all runs, `(run, lap)`, by feedforward."""
 

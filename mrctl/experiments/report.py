@@ -18,7 +18,7 @@ from mrctl.control.feedforward import Prior
 from mrctl.control.pid import Pid
 from mrctl.control.stages import Stages
 from mrctl.experiments import tuning
-from mrctl.experiments.cases import BAND, REFERENCES, SLOW, Choices, Outcome, pair_of
+from mrctl.experiments.cases import BAND, REFERENCES, SLOW, Choice, Choices, Outcome
 from mrctl.experiments.suite_tables import NO_CLAIM, titled, verdict
 from mrctl.experiments.tables import Table, number
 from mrctl.loop import user_files
@@ -118,10 +118,10 @@ def _labelled(runs: Mapping[str, xr.Dataset]) -> xr.Dataset:
     return xr.concat([one.drop_vars("scenario", errors="ignore") for one in own], "run")
 
 
-def learned(choice: Mapping[str, Any], scenario: Scenario) -> InverseMap:
+def learned(choice: Choice, scenario: Scenario) -> InverseMap:
     """Drives a scenario again; evaluates the learned feedforward and the true inverse dynamics in steady motion."""
-    stages: Stages = user_files.load(choice["controller"]) if "controller" in choice else {}
-    scenario = scenario.model_copy(update=pair_of(choice))
+    stages: Stages = user_files.load(choice.controller) if choice.controller else {}
+    scenario = scenario.model_copy(update=choice.pair)
     simulation = Simulation([scenario], **stages)
     while simulation.running:
         simulation.step()
@@ -179,8 +179,8 @@ def page(
 def command(outcome: Outcome, choices: Choices) -> str:
     """Returns the command that repeats the suite."""
     words = ["mrctl", "suite", *([f"--{outcome.mode}"] if outcome.mode != "core" else [])]
-    words += ["--feedforward", *(name for name, one in choices.items() if "feedforward" in one)]
-    own = [named(one["prior"], one["controller"]) for one in choices.values() if "controller" in one]
+    words += ["--feedforward", *(name for name, one in choices.items() if not one.controller)]
+    own = [named(one.prior, one.controller) for one in choices.values() if one.controller]
     words += ["--controller", *own] if own else []
     words += ["--seeds", str(len(next(case for case in outcome.cases if case.part != "random").scenarios))]
     words += ["--random", str(_worlds(outcome))]

@@ -23,12 +23,12 @@ from mrctl.experiments.cases import (
     SUITE_SEEDS,
     UNCHANGED,
     Case,
+    Choice,
     Choices,
     Laps,
     Mode,
     Outcome,
     cases,
-    pair_of,
 )
 from mrctl.experiments.suite_tables import COLUMNS, WINDOWS, YARDSTICKS, tables, titled
 from mrctl.experiments.tables import machine, output_folder, write_json
@@ -40,7 +40,7 @@ from mrctl.record import InputError
 from mrctl.results import metrics
 from mrctl.results.comparison import bootstrap_interval, cvar, paired_ratio, superiority, wilson
 from mrctl.results.dataset import versions
-from mrctl.scenario import FeedforwardName, Scenario, named, replicates
+from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, named, replicates
 from mrctl.sweep import jobs, store
 from mrctl.sweep.plan import Sweep
 from mrctl.sweep.store import Store
@@ -99,7 +99,7 @@ def suite(
     return outcome
 
 
-def by_name(feedforwards: Sequence[str], controllers: Sequence[str]) -> dict[str, dict[str, Any]]:
+def by_name(feedforwards: Sequence[Entry], controllers: Sequence[str]) -> Choices:
     """Returns what drives the runs, by the name of the feedforward or of the user's class.
 
     Args:
@@ -110,7 +110,7 @@ def by_name(feedforwards: Sequence[str], controllers: Sequence[str]) -> dict[str
     Raises:
         InputError: A controller is bad, or its name is taken.
     """
-    choices: dict[str, dict[str, Any]] = {name: {"feedforward": name} for name in feedforwards}
+    choices = {name: Choice() if name == HINDSIGHT else Choice(**FEEDFORWARDS[name]) for name in feedforwards}
     for entry in controllers:
         stages = entry.removeprefix(MODEL)
         prior, parts = "none" if stages == entry else "model", user_files.parts(stages)
@@ -119,8 +119,9 @@ def by_name(feedforwards: Sequence[str], controllers: Sequence[str]) -> dict[str
         name = named(prior, "+".join(part.title for part in parts))
         if name in choices:
             raise InputError(f"controller: the name {name} is taken")
-        choices[name] = {"controller": user_files.absolute(stages), "prior": prior}
-        user_files.trial(choices[name]["controller"], Scenario(laps=1, prior=prior, learner="none"))
+        own = user_files.absolute(stages)
+        user_files.trial(own, Scenario(laps=1, prior=prior, learner="none"))
+        choices[name] = Choice(prior, controller=own)
     return choices
 
 
@@ -135,9 +136,9 @@ def run(chosen: Sequence[Case], choices: Choices, workers: int | None, out: Path
     print(expectation(chosen, choices, workers or cores(), out), file=sys.stderr, flush=True)
     laps, aside = {}, []
     for place, (name, choice) in enumerate(choices.items(), 1):
-        scenarios = [s.model_copy(update=pair_of(choice)) for case in chosen for s in case.scenarios]
+        scenarios = [s.model_copy(update=choice.pair) for case in chosen for s in case.scenarios]
         chunk = min(CHUNK, -(-len(scenarios) // 4))
-        own = {"controller": choice.get("controller"), "hindsight": name == HINDSIGHT}
+        own = {"controller": choice.controller, "hindsight": name == HINDSIGHT}
         sweep = Sweep.of(scenarios, record="laps", chunk=chunk, **own)
         print(f"{name} ({place} of {len(choices)})", file=sys.stderr)
         ended = jobs.run(sweep, out / name, workers, progress=True)

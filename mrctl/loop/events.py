@@ -36,7 +36,6 @@ class Events:
         self._sensing = [s.sensing for s in scenarios]
         self._schedule: dict[int, list[tuple[int, Event]]] = defaultdict(list)
         self._references: dict[int, list[tuple[int, Reference]]] = defaultdict(list)
-        self._applied = -1  # last tick whose events were applied
         for row, scenario in enumerate(scenarios):
             self.perturb(row, scenario.perturbation)
             self._enter(row, scenario, 0)
@@ -61,7 +60,6 @@ class Events:
         If some of them perturb the plant, the perturbation of the scenario itself is applied anew.
         """
         self._schedule, self._references = _others(self._schedule, row, tick), _others(self._references, row, tick)
-        self._applied = -1
         self._enter(row, scenario, tick)
         if any(event.perturbation for event in scenario.events):
             self.perturb(row, scenario.perturbation)
@@ -69,10 +67,7 @@ class Events:
             self._hierarchy.set_truth(row, self._plant.truth[row])
 
     def apply(self, tick: int) -> None:
-        """Applies the events of a control tick; further calls in the same tick do nothing."""
-        if tick == self._applied:
-            return
-        self._applied = tick
+        """Applies the events of a control tick."""
         for row, reference in self._references.get(tick, ()):
             self._hierarchy.set_reference(row, reference)
         for row, event in self._schedule.get(tick, ()):

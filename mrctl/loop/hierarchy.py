@@ -7,7 +7,8 @@ With built-in stages a control tick of all robots is one compiled call.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,33 +16,20 @@ from numpy.typing import NDArray
 
 from mrctl.control import delay as late
 from mrctl.control import guard as guarding
-from mrctl.control.composite import CompositeAdaptation
 from mrctl.control.delay import DELAY, watch_delay
 from mrctl.control.design import Motion, motion
-from mrctl.control.feedforward import (
-    Feedforward,
-    Learner,
-    NoLearner,
-    Prior,
-    inverse_dynamics,
-    learn_nothing,
-    nothing,
-)
-from mrctl.control.fel import FeedbackErrorLearning
+from mrctl.control.feedforward import Learner, Loop, Prior, inverse_dynamics, learn_nothing, nothing
 from mrctl.control.guard import BACK_OFF, GUARD, UNSURE, guard
-from mrctl.control.indi import IncrementalInversion
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
-from mrctl.control.l1 import L1Adaptive
+from mrctl.control.learners import LEARNERS
 from mrctl.control.limiter import LIMITER, limit
-from mrctl.control.mrac import ModelReferenceAdaptive
 from mrctl.control.nominal import nominal
-from mrctl.control.observer import DisturbanceObserver
 from mrctl.control.pid import PID, Pid, pid
 from mrctl.control.rejection import Peaks, rejection
-from mrctl.control.rls import RecursiveLeastSquares
 from mrctl.control.steering import ALLOCATION, allocate, take_loss
 from mrctl.kernel import Array, Held, Row, Rows, held, kernel
 from mrctl.loop.learned import load_learned
+from mrctl.loop.user_stages import UserFeedforward, UserStage
 from mrctl.scenario import Scenario
 from mrctl.sensing.scanner import Scanner
 from mrctl.theory.references import Reference
@@ -78,7 +66,6 @@ CONTROL = np.dtype(
     align=True,
 )
 
-NO_MOTION = Motion(Kanayama(k_x=0.0, k_y=0.0, k_theta=0.0), 0.0, (0.0, 0.0))
 respond, learn_one = nothing, learn_nothing  # the learner of `update`, which `Kernel.calling` replaces
 
 
@@ -172,36 +159,41 @@ def update(moves: bool, seen: Rows, goal: Rows, period: float, place: int) -> tu
 
 def learner_of(scenarios: Sequence[Scenario], robot: Robot) -> Learner:
     """Returns the learner that a uniform group of scenarios names."""
-    first = scenarios[0]
-    rigid, period = first.steering == "rigid", first.control_period
-    delay = first.sensing.loop_delay(period)
-    match first.learner:
-        case "none":
-            return NoLearner(robot, len(scenarios), rigid, period)
-        case "observer":
-            return DisturbanceObserver(robot, [s.observer for s in scenarios], rigid, period)
-        case "indi":
-            return IncrementalInversion(robot, [s.indi for s in scenarios], rigid, period, delay)
-        case "l1":
-            return L1Adaptive(robot, [s.l1 for s in scenarios], rigid, period, delay)
-        case "mrac":
-            return ModelReferenceAdaptive(robot, [s.mrac for s in scenarios], rigid, period, delay)
-        case "composite":
-            settings = [s.composite for s in scenarios]
-            return CompositeAdaptation(robot, settings, rigid, period, prior=first.prior != "none", delay=delay)
-        case "rls":
-            return RecursiveLeastSquares(robot, [s.rls for s in scenarios], rigid, period, delay)
-        case "fel":
-            seeds = [s.seed for s in scenarios]
-            return FeedbackErrorLearning(robot, [s.fel for s in scenarios], seeds, rigid, period, delay)
+    first, period = scenarios[0], scenarios[0].control_period
+    delay, seeds = first.sensing.loop_delay(period), [s.seed for s in scenarios]
+    loop = Loop(robot, first.steering == "rigid", period, delay, first.prior != "none", seeds)
+    return LEARNERS[first.learner](loop, [getattr(s, s.learner, None) for s in scenarios])
+
+
+@dataclass
+class Settings:
+    """What the controllers of one robot are designed from, and the design of its motion controller.
+
+    Attributes:
+        pid: Settings of the PID.
+        kanayama: Gains of the motion controller; those that are not set are designed.
+        prefilter: Time constant of the prefilter in s; by default it is designed.
+        delay: Delay of the loop that the controllers know from the start, in s.
+        learned: What its learner starts from; by default nothing.
+        design: Design of its motion controller.
+    """
+
+    pid: Pid
+    kanayama: Kanayama
+    prefilter: float | None
+    delay: float
+    learned: Any
+    design: Motion = field(init=False)
 
 
 class Hierarchy:
     """Both controllers for the B robots of a uniform group (`simulation.group_of`).
 
     Attributes:
-        learner: The learner, or a user's feedforward stage in its place.
+        stages: The user's stages by name, which `UserHierarchy` calls in place of the built-in ones.
+        learner: The learner, or a user's feedforward in its place.
         prior: The prior of the feedforward, whose output is added to that of the learner.
+        settings: Settings and design of each robot.
         state: Record of `CONTROL` of each robot, `(B,)`; the following arrays are views of it.
         command: Commanded V in m/s and θ̇ in rad/s, after prefilter and limits, `(B, 2)`.
         derivative: Its derivative in m/s² and rad/s², `(B, 2)`.
@@ -217,103 +209,102 @@ class Hierarchy:
         rigid: Whether its steering is `rigid`, so that the second channel is steering.
         nominal: Its parameters for the kernels, one record of `NOMINAL`, `(1,)`.
         model: Its inverse dynamics for each robot.
-        motions: Designs of the motion controller, one for each robot.
         period: Control period in s.
+        looks: Whether the motion controller takes the scans of a lidar, as only a user's may.
+        roams: Whether it goes along the reference at its own pace or leaves it, as only a user's may.
         gains: Gains of each robot before any event, by the names and in the units of `dataset.GAINS`: `(B, 2)` for
             `k_p` and `k_i`, `(B,)` for the others.
     """
 
-    def __init__(self, scenarios: Sequence[Scenario], robot: Robot, feedforward: Feedforward | None = None) -> None:
+    def __init__(
+        self, scenarios: Sequence[Scenario], robot: Robot, stages: Mapping[str, UserStage] | None = None
+    ) -> None:
         """Wires the stages.
 
         Args:
             scenarios: A uniform group of scenarios.
             robot: The nominal robot.
-            feedforward: Feedforward stage in place of the learner that the scenarios name.
+            stages: The user's stages, by name.
 
         Raises:
             InputError: What was learned or the weights cannot be read, or do not suit the learner.
         """
         first, size = scenarios[0], len(scenarios)
-        self.robot, self.rigid = robot, first.steering == "rigid"
-        self.tick, self.period = 0, first.control_period
-        self.learner: Learner | Feedforward = learner_of(scenarios, robot) if feedforward is None else feedforward
-        self.prior = Prior([None if first.prior == "none" else robot] * size, self.rigid)  # `set_truth` follows
-        self._knows_truth = first.prior == "true_model"
-        self._learned: dict[int, Any] = {}  # what the learners of some robots start from
-        if isinstance(self.learner, Learner):
-            self.learner.prior = self.prior
-            self._learned = {row: load_learned(s) for row, s in enumerate(scenarios) if s.learned}
-            self._adopt(range(size))
+        self.robot, self.rigid, self.stages = robot, first.steering == "rigid", stages or {}
+        self.period, self.tick, self.started = first.control_period, 0, 0
         self._every = round(first.motion_period / first.control_period)
-        self.started = 0
         self.nominal = nominal(robot, self.rigid)
         self.model = Prior([robot] * size, self.rigid)
+        self.prior = Prior([None if first.prior == "none" else robot] * size, self.rigid)  # `set_truth` follows
+        self._knows_truth = first.prior == "true_model"
+        delays = [s.sensing.loop_delay(self.period) * self.period for s in scenarios]
+        if own := self.stages.get("feedforward"):
+            self.learner = UserFeedforward(own, self.prior, self.period, delays[0])
+            load = self.learner.load
+        else:
+            self.learner, load = learner_of(scenarios, robot), load_learned
+            self.learner.prior = self.prior
+        self.settings = [
+            Settings(s.pid, s.kanayama, s.prefilter, delay, load(s) if s.learned else None)
+            for s, delay in zip(scenarios, delays, strict=True)
+        ]
+        self._adopt(range(size))
         self.state = state = np.zeros(size, CONTROL)
-        self._delays = [s.sensing.loop_delay(self.period) * self.period for s in scenarios]
-        self._pids, self._kanayamas = [s.pid for s in scenarios], [s.kanayama for s in scenarios]
-        self._prefilters = [s.prefilter for s in scenarios]
-        self.motions = [NO_MOTION] * size
-        self._range = guarding.ranges(self.nominal)
-        for row, scenario in enumerate(scenarios):
-            self._design_motion(row)
-            self.set_kanayama(row, scenario.kanayama)
-            self.set_pid(row, scenario.pid)
-        self.gains: dict[str, Array] = {name: state["pid"][name].copy() for name in ("k_p", "k_i")}
-        self.gains |= {name: state["kanayama"][name].copy() for name in ("k_x", "k_y", "k_theta")}
-        self.gains["prefilter"] = state["limiter"]["time_constant"].copy()
-        rejected = np.array([self._rejection(row) for row in range(size)])
-        state["guard"] = guarding.fresh([s.guard for s in scenarios], self.nominal, rejected)
-        if not getattr(self.learner, "guarded", True):
-            state["guard"]["on"] = False
         self.command, self.derivative = state["limiter"]["command"], state["limiter"]["derivative"]
         self.feedback, self.weight_norm = state["feedback"], state["weight_norm"]
         self.output, self.saturated = state["allocation"]["command"], state["allocation"]["saturated"]
+        for row in range(size):
+            self._watch(row)
+            self._design_pid(row)
+            self._design_motion(row)
+        rejected = np.array([self._rejection(row) for row in range(size)])
+        state["guard"] = guarding.fresh([s.guard for s in scenarios], self.nominal, rejected)
+        state["guard"]["on"] &= self.learner.guarded
+        self.gains: dict[str, Array] = {name: state["pid"][name].copy() for name in ("k_p", "k_i")}
+        self.gains |= {name: state["kanayama"][name].copy() for name in ("k_x", "k_y", "k_theta")}
+        self.gains["prefilter"] = state["limiter"]["time_constant"].copy()
         if isinstance(self.learner, Learner):
             self._held = Held(self.nominal, self.model.rows, self.prior.rows, state, self.learner.arrays)
             laws = {"respond": self.learner.respond, "learn_one": self.learner.learn_one}
             self._update = update.calling(**laws, held=self._held.reader).repeated()
         self.faults: dict[int, str] = {}
         self.scanner: Scanner | None = None
-
-    @property
-    def looks(self) -> bool:
-        """Whether a stage takes the scans of a lidar, which none of the built-in ones does."""
-        return False
-
-    @property
-    def roams(self) -> bool:
-        """Whether a stage goes along the reference at its own pace or leaves it, as none of the built-in ones does."""
-        return False
+        mover = self.stages.get("motion")
+        self.looks, self.roams = bool(mover and mover.has("see")), bool(mover and mover.has("follow"))
 
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
         """Changes the motion controller of one robot; gains that are not set are those of its last design."""
-        self._kanayamas[row] = gains
-        chosen = gains.completed(self.motions[row].kanayama)
-        self.state["kanayama"][row] = chosen.k_x, chosen.k_y, chosen.k_theta
+        self.settings[row].kanayama = gains
+        self._complete(row)
         self._tolerate(row)
+
+    def _complete(self, row: int) -> None:
+        """Completes the gains of the motion controller of one robot with those of its design."""
+        own = self.settings[row]
+        chosen = own.kanayama.completed(own.design.kanayama)
+        self.state["kanayama"][row] = chosen.k_x, chosen.k_y, chosen.k_theta
 
     def set_pid(self, row: int, design: Pid) -> None:
         """Changes the PID of one robot; what an oscillation has shown of its loop stays, unless it is not watched."""
-        self._pids[row] = design
-        watch = self.state["delay"]
-        watched = design.retune and design.time_constant is None and self.watches
+        self.settings[row].pid = design
+        self._watch(row)
+        self._design_pid(row)
+        self._tolerate(row)
+
+    def _watch(self, row: int) -> None:
+        """Decides whether the loop of one robot is watched for oscillations; only that of the built-in PID can be."""
+        design, watch = self.settings[row].pid, self.state["delay"]
+        watched = design.retune and design.time_constant is None and "feedback" not in self.stages
         if not watched:
             watch["moves"][row] = 0.0
         watch["on"][row] = watched and watch["moves"][row] < late.MOST
+        supply, second = guarding.ranges(self.nominal)
         own = self.rigid and (design.steering_kp is not None or design.steering_ki is not None)
-        watch["least"][row] = late.LEAST * self._range[0], np.inf if own else late.LEAST * self._range[1]
-        self._set_gains(row)
-        self._tolerate(row)
+        watch["least"][row] = late.LEAST * supply, np.inf if own else late.LEAST * second
 
-    @property
-    def watches(self) -> bool:
-        """Whether the feedback is the PID, whose loop can be watched."""
-        return True
-
-    def _set_gains(self, row: int) -> None:
+    def _design_pid(self, row: int) -> None:
         """Computes the gains of the PID of one robot."""
-        pid, delay = self.lengthened(row, self._pids[row])
+        pid, delay = self.lengthened(row, self.settings[row].pid)
         for name, value in pid.gains(self.robot, self.rigid, delay, self.period).items():
             self.state["pid"][name][row] = value
 
@@ -329,34 +320,29 @@ class Hierarchy:
         added = steps * max(1, round(late.STEP / self.period)) * self.period
         if pid.delay is not None:
             pid = pid.model_copy(update={"delay": pid.delay + added})
-        return pid, self._delays[row] + added
+        return pid, self.settings[row].delay + added
 
     def _move(self, row: int) -> None:
-        """Makes the next move of `mrctl.control.delay` for one robot."""
-        watch = self.state["delay"]
-        watch["moves"][row] += 1 if self._moves_motion else 2
+        """Makes the next move of `mrctl.control.delay` for one robot; a user's motion controller is not slowed down."""
+        watch, slows_motion = self.state["delay"], "motion" not in self.stages
+        watch["moves"][row] += 1 if slows_motion else 2
         moves = watch["moves"][row]
         watch["on"][row] = moves < late.MOST
-        if moves <= 2 * late.SLOWED and (moves % 2 or not self._moves_motion):
+        if moves <= 2 * late.SLOWED and (moves % 2 or not slows_motion):
             self.state["guard"]["gain"][row] /= BACK_OFF
-        self._set_gains(row)
-        if self._moves_motion:
+        self._design_pid(row)
+        if slows_motion:
             self._design_motion(row)
-            self.set_kanayama(row, self._kanayamas[row])
-        else:
-            self._tolerate(row)
-
-    @property
-    def _moves_motion(self) -> bool:
-        """Whether the motion controller is that of Kanayama, which the moves slow down."""
-        return True
+        self._tolerate(row)
 
     def _design_motion(self, row: int) -> None:
         """Designs the motion controller of one robot; after odd moves it has one step of delay more than the PID."""
-        pid, delay = self.lengthened(row, self._pids[row], ahead=1)
+        own = self.settings[row]
+        pid, delay = self.lengthened(row, own.pid, ahead=1)
         gains = pid.channels(self.robot, self.rigid, delay, self.period)
-        self.motions[row] = motion(self.robot, self.rigid, gains, delay, self.period, self._prefilters[row])
-        self.state["limiter"]["time_constant"][row] = self.motions[row].prefilter
+        own.design = motion(self.robot, self.rigid, gains, delay, self.period, own.prefilter)
+        self.state["limiter"]["time_constant"][row] = own.design.prefilter
+        self._complete(row)
 
     def _tolerate(self, row: int) -> None:
         """Computes anew the deviation D that the guard of one robot tolerates, which depends on both controllers."""
@@ -366,10 +352,11 @@ class Hierarchy:
 
     def _rejection(self, row: int) -> tuple[Peaks, Peaks]:
         """Peak-to-peak gains from a voltage to the errors of one robot under its controllers."""
-        k, (pid, delay) = self.state["kanayama"][row], self.lengthened(row, self._pids[row])
+        k, own = self.state["kanayama"][row], self.settings[row]
+        pid, delay = self.lengthened(row, own.pid)
         kanayama = Kanayama(k_x=k["k_x"], k_y=k["k_y"], k_theta=k["k_theta"])
         prefilter = float(self.state["limiter"]["time_constant"][row])
-        around = Motion(kanayama, prefilter, self.motions[row].lag)
+        around = Motion(kanayama, prefilter, own.design.lag)
         gains = pid.channels(self.robot, self.rigid, delay, self.period)
         return rejection(self.robot, self.rigid, gains, around, delay, self.period)
 
@@ -395,14 +382,9 @@ class Hierarchy:
         renewed = Hierarchy([scenario], self.robot)
         self.state[row] = renewed.state[0]
         self.prior.rows[row] = renewed.prior.rows[0]
-        self._pids[row], self._kanayamas[row] = scenario.pid, scenario.kanayama
-        self._prefilters[row] = scenario.prefilter
-        self.motions[row], self._delays[row] = renewed.motions[0], renewed._delays[0]
+        self.settings[row] = renewed.settings[0]
         for name, values in self.gains.items():
             values[row] = renewed.gains[name][0]
-        self._learned.pop(row, None)
-        if 0 in renewed._learned:
-            self._learned[row] = renewed._learned[0]
         mine, other = self.learner, renewed.learner
         assert isinstance(mine, Learner) and isinstance(other, Learner)
         mine.take(row, other)
@@ -478,20 +460,15 @@ class Hierarchy:
 
     def restore(self, rows: NDArray[np.intp]) -> bool:
         """Resets the learners of these robots; returns whether the stage can be reset."""
-        assert isinstance(self.learner, Learner)
+        if not self.learner.restorable:
+            return False
         self.learner.restore(rows)
-        self._adopt(rows)
+        self._adopt(rows.tolist())
         self.weight_norm[rows] = 0.0
         return True
 
-    def adapted(self) -> Array:
-        """Returns what the learner of each robot has adapted, flat, `(B, n)`; n is 0 if it keeps nothing."""
-        assert isinstance(self.learner, Learner)
-        return self.learner.adapted()
-
     def _adopt(self, rows: Iterable[int]) -> None:
         """Lets the learners of these robots start from the files that their scenarios name."""
-        assert isinstance(self.learner, Learner)
         for row in rows:
-            if row in self._learned:
-                self.learner.adopt(row, self._learned[row])
+            if (learned := self.settings[row].learned) is not None:
+                self.learner.adopt(row, learned)

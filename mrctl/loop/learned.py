@@ -10,25 +10,13 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from mrctl.control.composite import COMPOSITE, CompositeAdaptation
-from mrctl.control.l1 import PREDICTOR, L1Adaptive
-from mrctl.control.mrac import MRAC, ModelReferenceAdaptive
-from mrctl.control.observer import OBSERVER, DisturbanceObserver
-from mrctl.control.rls import RLS, RecursiveLeastSquares
-from mrctl.control.weights import notes_on, read_arrays, shapes, write_arrays
+from mrctl.control.learners import LEARNERS
+from mrctl.control.weights import notes_on, read_arrays, write_arrays
 from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.results.dataset import scenarios_of
 from mrctl.scenario import Scenario
 
-KEPT = {
-    "observer": {name: OBSERVER[name].shape for name in DisturbanceObserver.learned},
-    "l1": {name: PREDICTOR[name].shape for name in L1Adaptive.learned},
-    "rls": {name: RLS[name].shape for name in RecursiveLeastSquares.learned},
-    "mrac": {name: MRAC[name].shape for name in ModelReferenceAdaptive.learned},
-    "composite": {name: COMPOSITE[name].shape for name in CompositeAdaptation.learned},
-}
-"""Names and shapes of what each learner keeps, except for `fel`, whose settings determine them."""
 LAYOUT = "weights_layout"
 """Variable of a result with a feedforward of the user: its name, and names and shapes of its `weights`, as JSON."""
 
@@ -39,11 +27,10 @@ def kept(scenario: Scenario) -> dict[str, tuple[int, ...]]:
     Raises:
         InputError: The learner keeps nothing.
     """
-    if scenario.learner == "fel":
-        return shapes(scenario.fel.hidden)
-    if scenario.learner not in KEPT:
+    found = LEARNERS[scenario.learner].kept(getattr(scenario, scenario.learner, None))
+    if not found:
         raise InputError(f"learned: the learner {scenario.learner} keeps nothing that a run could start from")
-    return KEPT[scenario.learner]
+    return found
 
 
 def save_learned(path: str | Path, run: xr.Dataset) -> None:

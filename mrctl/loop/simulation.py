@@ -15,7 +15,6 @@ import xarray as xr
 from tqdm import tqdm
 
 from mrctl.control.features import feature_scale
-from mrctl.control.feedforward import Learner
 from mrctl.control.stages import Stages
 from mrctl.kernel import Array, Rows
 from mrctl.loop.courses import Courses, RestartingCourses, start_pose
@@ -24,7 +23,8 @@ from mrctl.loop.goals import Goals
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.loop.learned import LAYOUT
 from mrctl.loop.log import DIVERGED, Log
-from mrctl.loop.user_stages import StageError, UserEstimator, UserHierarchy, UserStage
+from mrctl.loop.user_hierarchy import UserHierarchy
+from mrctl.loop.user_stages import StageError, UserEstimator, UserFeedforward, UserStage
 from mrctl.physics import hull, mjcf, tyres
 from mrctl.physics import obstacles as walls
 from mrctl.physics.plant import Plant, build
@@ -279,6 +279,7 @@ class Simulation:
         self.goals = Goals(scenarios, timed=not restarting)
         self._failure_time = np.full(size, np.nan)
         self._learned: dict[int, Array] = {}  # what each robot had adapted when its run ended, flat
+        self._sensed = False  # whether the coming tick is sensed
         self._start()
 
     def _check_references(self, robot: Robot) -> None:
@@ -365,9 +366,8 @@ class Simulation:
     def step(self) -> None:
         """Computes one control period, as in figure 3; an error of a user's stage fails all robots, which share it."""
         try:
-            self.events.apply(self.tick)
-            now, goal = self.courses.at(self.tick)
-            seen = self.estimator.measure(self.tick, self.plant.state, self.hierarchy.derivative)
+            now, _ = self.courses.at(self.tick)
+            seen, goal = self.sense()
             self.plant.step(self.hierarchy.update(seen, goal), self.hierarchy.faults)
             self.log.record(self.tick, self.plant.state, seen, now, self.hierarchy.state)
         except StageError as error:
@@ -375,7 +375,7 @@ class Simulation:
         self.judge()
 
     def sense(self) -> tuple[Rows, Rows]:
-        """Does the first three lines of `step` before it; further calls in the same tick only return the result.
+        """Applies the events of the coming tick and measures; further calls before `judge` only return the result.
 
         Returns:
             Estimate of each robot, a record of `SEEN`, and its reference, a record of `GOAL`, `(B,)` each; both are
@@ -384,9 +384,12 @@ class Simulation:
         Raises:
             StageError: The user's estimator raised, or returned something of another shape.
         """
-        self.events.apply(self.tick)
+        if not self._sensed:
+            self.events.apply(self.tick)
+            self.estimator.measure(self.tick, self.plant.state, self.hierarchy.derivative)
+            self._sensed = True
         _, goal = self.courses.at(self.tick)
-        return self.estimator.measure(self.tick, self.plant.state, self.hierarchy.derivative), goal
+        return self.estimator.seen, goal
 
     def _abort(self, reason: str) -> None:
         """Fails all robots before the physics; the records until now are kept."""
@@ -401,7 +404,7 @@ class Simulation:
             for row in np.flatnonzero(np.abs(log.now["lateral_error"]) > DIVERGED):
                 if self.scenarios[row].goal is None:  # a robot with a goal may wait, or leave its reference
                     plant.fail(int(row), f"lateral error over {DIVERGED:g} m")
-        self.tick += 1
+        self.tick, self._sensed = self.tick + 1, False
         if plant.running < plant.size:
             new = plant.failed & np.isnan(self._failure_time)
             new[list(self._learned)] = False
@@ -429,7 +432,7 @@ class Simulation:
         plant, tick = self.plant, self.tick
         if scenario.perturbation != self.scenarios[row].perturbation:
             self.events.perturb(row, scenario.perturbation)
-        self.scenarios[row] = scenario
+        self.scenarios[row], self._sensed = scenario, False
         self.courses.restart(row, tick)
         self.hierarchy.renew(row, scenario)
         self.events.restart(row, scenario, tick)
@@ -459,15 +462,16 @@ class Simulation:
             self._learned |= {row: learned[row].copy() for row in rows}
 
     def _adapted(self) -> Array:
-        """Returns what the learners have adapted, as `Hierarchy.adapted`; a stage that cannot say it fails all runs."""
+        """Returns what the learners have adapted, as `Learner.adapted`; a stage that cannot say it fails all runs."""
+        learner = self.hierarchy.learner
         try:
-            return self.hierarchy.adapted()
+            return learner.adapted()
         except StageError as error:
-            assert isinstance(self.hierarchy, UserHierarchy)
+            assert isinstance(learner, UserFeedforward)
             for row in np.flatnonzero(~self.plant.failed).tolist():
                 self.plant.fail(row, str(error))
                 self._failure_time[row] = self.tick * self.period
-            width = sum(int(np.prod(shape)) for shape in self.hierarchy.shapes.values())
+            width = sum(int(np.prod(shape)) for shape in learner.shapes.values())
             return np.full((self.plant.size, width), np.nan)
 
     def result(self) -> xr.Dataset:
@@ -498,9 +502,10 @@ class Simulation:
 
     def _layout(self) -> dict[str, Any]:
         """Variable `LAYOUT`, where a feedforward of the user keeps what it learns."""
-        if not (isinstance(self.hierarchy, UserHierarchy) and self.hierarchy.own_learner):
+        learner = self.hierarchy.learner
+        if not (isinstance(learner, UserFeedforward) and learner.shapes):
             return {}
-        text = json.dumps({"learner": self.hierarchy.own_learner, "shapes": self.hierarchy.shapes})
+        text = json.dumps({"learner": learner.stage.name, "shapes": learner.shapes})
         return {LAYOUT: ("run", np.array([text] * len(self.scenarios), object))}
 
     def _coefficients(self) -> dict[str, Any]:
@@ -558,9 +563,8 @@ class Simulation:
             Two arrays `(B, 8, 2)` in V, NaN where a robot has failed and where the second channel is steering; None
             if the learner has no such coefficients.
         """
-        learner, hierarchy = self.hierarchy.learner, self.hierarchy
-        learned = learner.parameters if isinstance(learner, Learner) else None
-        if learned is None:
+        hierarchy = self.hierarchy
+        if (learned := hierarchy.learner.parameters) is None:
             return None
         scale = feature_scale(self.plant.robot)[:, None]
         known = scale * hierarchy.prior.rows["c"] + learned

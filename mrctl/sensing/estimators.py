@@ -102,6 +102,29 @@ def user(
             s.estimate[k] = memory.answer[k]
 
 
+@kernel
+def receive(tick: int, true: Row, ring: Rows, i: int, sensor: Row, geometry: Row, s: Row) -> None:
+    """Writes to the record of `SEEN` what has arrived from the sensors; the arguments are those of `truth`."""
+    wheels = ring[max(s.start, tick - sensor.encoder_latency) % len(ring), i]
+    force = ring[max(s.start, tick - sensor.accelerometer_latency) % len(ring), i]
+    s.gyro = ring[max(s.start, tick - sensor.gyro_latency) % len(ring), i].gyro
+    for k in range(2):
+        s.encoder[k], s.acceleration[k] = wheels.encoder[k], force.acceleration[k]
+        s.lost[k] = true.lost[k]
+        s.wheel_speeds[k] = geometry.wheel_radius * wheels.rate[k]
+    taken = ring[(tick - sensor.fix_latency) % len(ring), i]
+    arrives = taken.fix_arrives and tick - sensor.fix_latency >= s.start
+    for k in range(3):
+        s.fix[k] = taken.fix[k] if arrives else np.nan
+
+
+@kernel
+def receive_all(tick: int, plant: Rows, ring: Rows, sensors: Rows, geometry: Row, seen: Rows) -> None:
+    """Calls `receive` for all robots."""
+    for i in range(len(seen)):
+        receive(tick, plant[i], ring, i, sensors[i], geometry, seen[i])
+
+
 observe = truth  # the estimator of `estimate`, which `Kernel.calling` replaces
 
 
@@ -124,20 +147,10 @@ def estimate(
     """
     for i in range(len(seen)):
         s, sensor = seen[i], sensors[i]
+        receive(tick, plant[i], ring, i, sensor, geometry, s)
         observe(tick, plant[i], ring, i, sensor, geometry, period, memory[i], s)
         predict(s.estimate, tick, tick + s.delay, ring, i, period, s)
-        wheels = ring[max(s.start, tick - sensor.encoder_latency) % len(ring), i]
-        force = ring[max(s.start, tick - sensor.accelerometer_latency) % len(ring), i]
-        s.gyro = ring[max(s.start, tick - sensor.gyro_latency) % len(ring), i].gyro
-        for k in range(2):
-            s.encoder[k], s.acceleration[k] = wheels.encoder[k], force.acceleration[k]
-            s.lost[k] = plant[i].lost[k]
-            s.wheel_speeds[k] = geometry.wheel_radius * wheels.rate[k]
         s.slip = slip_ratio(s.wheel_speeds, s.estimate[3], s.estimate[4], geometry.half_track, period, s.slip)
-        taken = ring[(tick - sensor.fix_latency) % len(ring), i]
-        arrives = taken.fix_arrives and tick - sensor.fix_latency >= s.start
-        for k in range(3):
-            s.fix[k] = taken.fix[k] if arrives else np.nan
 
 
 @kernel
@@ -212,7 +225,6 @@ class Estimator:
         self._geometry = np.array([(robot.wheel_radius, robot.half_track, imu[0], skew, *tyres)], GEOMETRY)
         self.seen = np.zeros(len(sensing), SEEN)
         self.memory = np.zeros(len(sensing), ESTIMATORS[name][1])
-        self._located = self._measured = -1  # last tick in which the method of this name was called
         self.scanner, self.localiser = scanner, None
         if scanner and any(s.localisation != "fixes" for s in sensing):
             self.localiser = Localiser(sensing, sensors, scanner, robot.wheel_radius, known)
@@ -230,7 +242,6 @@ class Estimator:
             seed: Seed of the errors of the first fix and twist.
             tick: The coming control tick.
         """
-        self._measured = -1  # a tick is measured again if all robots of an environment begin again in it
         sensing, sensor, period = self._sensing[row], self.sensors.sensors[row], self.sensors.period
         random, seen = np.random.default_rng([seed, 3]), self.seen[row]
         self.seen[row], self.memory[row] = np.zeros((), SEEN), np.zeros((), self.memory.dtype)
@@ -245,7 +256,6 @@ class Estimator:
         memory["mean"][:size] = np.append(reading["pose"], reading["twist"]) + deviation * random.standard_normal(size)
         if self.scanner:
             self.scanner.start(row, seed, tick)
-            self._located = -1  # the tick may have been located before a robot of an environment began again in it
         if self.localiser:
             started = self.localiser.start(row, memory["mean"][:3], deviation[:3], seed)
             memory["mean"][:3], deviation[:3] = started
@@ -264,50 +274,45 @@ class Estimator:
             memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
             memory["inertial"] = memory["mean"][3]
 
-    def measure(self, tick: int, plant: Rows, derivative: Array) -> Rows:
-        """Samples the sensors and estimates; further calls in the same tick only return the result.
+    def measure(self, tick: int, plant: Rows, derivative: Array) -> None:
+        """Samples the sensors and estimates, and writes the result to `seen`.
 
         Args:
             tick: Control tick.
             plant: Record of `PLANT` of each robot, `(B,)`.
             derivative: Derivative of the twist that was commanded in the last tick, in m/s² and rad/s², `(B, 2)`, with
                 which estimates are predicted.
-
-        Returns:
-            `seen`, `(B,)`.
         """
-        if tick != self._measured:
-            self._measured, sensors = tick, self.sensors
-            if self._compiled:
-                sensors.draw(tick)
-                self._sense(tick, plant, derivative, sensors.period, self._held.place)
-            else:
-                sensors.command(tick - 1, derivative)
-                sensors.measure(tick, plant)
-                self.estimate(tick, plant)
-        return self.seen
+        sensors = self.sensors
+        if self._compiled:
+            sensors.draw(tick)
+            self._sense(tick, plant, derivative, sensors.period, self._held.place)
+        else:
+            sensors.command(tick - 1, derivative)
+            sensors.measure(tick, plant)
+            self._locate(tick, plant)
+            self.estimate(tick, plant)
 
-    def locate(self, tick: int, plant: Rows) -> None:
-        """Scans, and makes fixes from the scans, where there are lidars; further calls in the same tick do nothing."""
-        if self.scanner and tick != self._located:
-            self._located = tick
+    def _locate(self, tick: int, plant: Rows) -> None:
+        """Scans, and makes fixes from the scans, where there are lidars."""
+        if self.scanner:
             self.scanner.scan(tick, plant["reading"]["pose"], plant["failed"])
-            if self.localiser:
-                self.localiser.locate(tick, self.seen["estimate"])
+        if self.localiser:
+            self.localiser.locate(tick, self.seen["estimate"])
 
-    def estimate(self, tick: int, plant: Rows) -> Rows:
-        """Estimates posture and twist of all robots.
+    def receive(self, tick: int, plant: Rows) -> None:
+        """Writes what has arrived from the sensors of all robots to `seen`, which `estimate` does too."""
+        sensors = self.sensors
+        receive_all(tick, plant, sensors.ring, sensors.sensors, self._geometry[0], self.seen)
+
+    def estimate(self, tick: int, plant: Rows) -> None:
+        """Estimates posture and twist of all robots from what the sensors have sampled, and writes them to `seen`.
 
         Args:
             tick: Control tick.
             plant: Record of `PLANT` of each robot, `(B,)`.
-
-        Returns:
-            `seen`, `(B,)`.
         """
         sensors = self.sensors
-        self.locate(tick, plant)
         self._estimate(
             tick, plant, sensors.ring, sensors.sensors, self._geometry[0], sensors.period, self.memory, self.seen
         )
-        return self.seen

@@ -174,7 +174,7 @@ class Store:
         for left in [*path.glob(".*.tmp"), *path.glob("parts/.*.tmp"), *path.glob("signals.zarr/**/*.partial")]:
             left.unlink(missing_ok=True)
         if store.samples and not (path / "signals.zarr" / "signals" / "zarr.json").exists():
-            store._create_signals()
+            store._array(path / "signals.zarr", len(store.signal_names))
         return store
 
     @staticmethod
@@ -375,9 +375,6 @@ class Store:
                 groups = (about.row_group(k) for k in range(about.num_row_groups))
                 values += sum(group.column(k).num_values for group in groups for k in range(group.num_columns))
         check_declared(self.path, 8 * values, stored)
-
-    def _create_signals(self) -> None:
-        self._array(self.path / "signals.zarr", len(self.signal_names))
 
     def _array(self, place: Path | MemoryStore, signals: int) -> zarr.Array:
         """Creates the array of all signals `(runs, samples, signals)` in a folder, or in memory to compare with it."""

@@ -525,7 +525,7 @@ class Live(Page):
             self._scene.show_obstacles(self.time)
             self._scene.show_sensors(logs, session.period, self._latencies, magnified)
             self._scene.navigation.show_scans(scans)
-            push = pushed(max(session.saved(), key=lambda s: len(s.events)), self.time)
+            push = pushed(session.fullest, self.time)
             for row in range(session.size):
                 force = push if row or self._hands.pull is None else np.array(self._hands.pull)
                 self._scene.arrows.show_force(row, force)
@@ -620,7 +620,7 @@ class Live(Page):
 
     def _describe(self) -> None:
         """Writes the timeline, marks the events on the track, and sets the inputs to the present values."""
-        scenario = max(self.session.saved(), key=lambda s: len(s.events))
+        scenario = self.session.fullest
         before: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE}
         lines = []
         for event in sorted(scenario.events, key=lambda e: e.time):

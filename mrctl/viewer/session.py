@@ -236,7 +236,7 @@ class Session:
 
     def state(self, time: float | None = None) -> dict[str, Any]:
         """Returns the values of the fields `CHANGEABLE`, and `learning`, at a time in s, by default now."""
-        return state(max(self.saved(), key=lambda s: len(s.events)), self.time if time is None else time)
+        return state(self.fullest, self.time if time is None else time)
 
     def designed(self) -> dict[tuple[str, ...], float | None]:
         """Returns what fields of the first robot are while they are not set, by path, as `Hierarchy` designs them.
@@ -245,7 +245,7 @@ class Session:
         not those of any; the gains on the steering are None unless it is rigid.
         """
         sim, k = self._place[0]
-        rigid, over = self.start[0].steering == "rigid", sim.hierarchy.motions[k]
+        rigid, over = self.start[0].steering == "rigid", sim.hierarchy.settings[k].design
         _, delay = sim.hierarchy.lengthened(k, self.state()["pid"])
         kanayama = Kanayama(k_y=self.state()["kanayama"].k_y).completed(over.kanayama)  # K_θ follows a K_y that is set
         values: dict[tuple[str, ...], float | None] = {
@@ -277,6 +277,11 @@ class Session:
         """Returns scenarios that repeat the session, to the end of the present lap of each robot."""
         whole = [sim.scenarios[k] for sim, k in (self._place[row] for row in range(self.size))]
         return [s.model_copy(update={"laps": max(1, ceil(self.time / s.reference.period - 1e-9))}) for s in whole]
+
+    @property
+    def fullest(self) -> Scenario:
+        """The scenario with the most events; a robot that has stopped gets no more."""
+        return max(self.saved(), key=lambda s: len(s.events))
 
     def log(self, first: int = 0, last: int | None = None) -> Rows:
         """Returns the log from a tick on, and up to another one, without it.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrctl import Circle, Event, Guard, Line, Perturbation, Scenario, Sweep, per_lap
-from mrctl.control.feedforward import NoLearner
+from mrctl.control.feedforward import Loop, NoLearner
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
@@ -111,7 +111,7 @@ def test_non_finite_stage():
     bare = [scenario.model_copy(update={"guard": Guard(on=False)}) for scenario in HEALTHY]
     whole, sound = (
         simulate(bare, feedforward=BreaksAfter),
-        simulate(bare, feedforward=lambda robot, size: NoLearner(robot, size, False, PERIOD)),
+        simulate(bare, feedforward=lambda robot, size: NoLearner(Loop(robot, False, PERIOD), [None] * size)),
     )
     tick = round(float(whole.failure_time[1]) / PERIOD) - 1
     check_record(whole.isel(run=1), f"feedforward BreaksAfter: not finite, tick {tick}")

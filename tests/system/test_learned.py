@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import mrctl
-from mrctl import FEEDFORWARDS, PERTURBATIONS, Circle, Event, InputError, Lemniscate, Scenario, Sensing
-from mrctl.loop.learned import KEPT, load_learned
+from mrctl import FEEDFORWARDS, PERTURBATIONS, Circle, Event, Fel, InputError, Lemniscate, Scenario, Sensing
+from mrctl.control import learners
+from mrctl.loop.learned import load_learned
 from mrctl.loop.simulation import Simulation
 
 COURSE, OTHER = Lemniscate(size=1.2, period=10), Circle(radius=0.8, period=8)
@@ -84,7 +85,8 @@ def test_refused(files, tmp_path):
         mrctl.save_learned(tmp_path / "x", mrctl.simulate([BASE.model_copy(update={"laps": 1})] * 2))
     with pytest.raises(InputError, match="^learned: no learner of the run keeps anything"):
         mrctl.save_learned(tmp_path / "x", mrctl.simulate(BASE.model_copy(update={"learner": "none", "laps": 1})))
-    assert set(KEPT) == {"observer", "l1", "rls", "mrac", "composite"}
+    keeping = {name for name, law in learners.LEARNERS.items() if law.kept(Fel())}
+    assert keeping == {"observer", "l1", "fel", "rls", "mrac", "composite"}
 
 
 def test_renewed(files):

@@ -78,11 +78,11 @@ def test_file(learned):
     np.testing.assert_array_equal(runs.weights.values[:, :4], stage.gain.reshape(2, 4))
     pair = [BASE.model_copy(update={"learned": path}) for path in (None, str(file))]
     hierarchy = Simulation(pair, feedforward=Own).hierarchy
-    assert not hierarchy.learner.gain[0].any()
-    np.testing.assert_array_equal(hierarchy.learner.gain[1], stage.gain[0])
+    assert not hierarchy.learner.stage.stage.gain[0].any()
+    np.testing.assert_array_equal(hierarchy.learner.stage.stage.gain[1], stage.gain[0])
     hierarchy.restore(np.arange(2))  # as the guard does
-    assert not hierarchy.learner.gain[0].any()
-    np.testing.assert_array_equal(hierarchy.learner.gain[1], stage.gain[0])
+    assert not hierarchy.learner.stage.stage.gain[0].any()
+    np.testing.assert_array_equal(hierarchy.learner.stage.stage.gain[1], stage.gain[0])
 
 
 def test_it_helps(learned, tmp_path):

@@ -18,7 +18,7 @@ from mrctl.control.composite import (
     track,
 )
 from mrctl.control.features import feature_scale
-from mrctl.control.feedforward import STEERING_SCALE, NoLearner, Prior
+from mrctl.control.feedforward import STEERING_SCALE, Loop, NoLearner, Prior
 from mrctl.theory import dynamics
 from mrctl.theory.dynamics import accelerations, inverse_coefficients, left_right
 
@@ -122,7 +122,7 @@ def test_regressor(robot, twist, rate, heading):
 
 def stage(robot, size=1, rigid=False, **settings):
     """Learners whose prior is the nominal model."""
-    pupil = CompositeAdaptation(robot, [Composite(**settings)] * size, rigid, PERIOD)
+    pupil = CompositeAdaptation(Loop(robot, rigid, PERIOD), [Composite(**settings)] * size)
     pupil.prior = Prior([robot] * size, rigid)
     return pupil
 
@@ -246,7 +246,7 @@ def test_finds_the_plant(robot):
     """Driving a plant that is not the model, the weights become what the coefficients of equation (3) differ by."""
     plant = robot.model_copy(update={"mass": 28.0, "yaw_inertia": 0.9, "resistance": 3.0, "supply": 1e3})
     pupil = stage(robot, noise=0.05, disturbance=0, step=0.002, memory=1e6)
-    model = NoLearner(robot, 1, False, PERIOD)
+    model = NoLearner(Loop(robot, False, PERIOD), [None])
     model.prior = Prior([robot], False)
     feedback, untaught = drive(pupil, plant, 40), drive(model, plant, 40)
     assert np.sqrt((feedback[-1000:] ** 2).mean()) < 0.06 * np.sqrt((untaught[-1000:] ** 2).mean())

@@ -12,7 +12,8 @@ from mrctl.control.design import motion
 from mrctl.control.oscillation import DRIFT, SMOOTH, SWING, swing
 from mrctl.control.pid import Pid
 from mrctl.loop.hierarchy import Hierarchy
-from mrctl.loop.user_stages import UserHierarchy, UserStage
+from mrctl.loop.user_hierarchy import UserHierarchy
+from mrctl.loop.user_stages import UserStage
 from mrctl.sensing.tiers import Sensing
 
 PERIOD = 0.01

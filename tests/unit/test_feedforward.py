@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mrctl.control.features import NAMES, SIGN_SPEED, feature_matrix, feature_scale, linear
-from mrctl.control.feedforward import NoLearner, Prior
+from mrctl.control.feedforward import Loop, NoLearner, Prior
 from mrctl.kernel import over_rows
 from mrctl.theory import dynamics
 from mrctl.theory.references import Lemniscate
@@ -72,7 +72,7 @@ def test_set_robot(robot):
 
 def test_none(robot):
     """`none` gives nothing and learns nothing."""
-    stage = NoLearner(robot, 50, rigid=False, period=0.01)
+    stage = NoLearner(Loop(robot, False, 0.01), [None] * 50)
     stage.learn(np.ones((50, 2)), np.zeros(50), UNUSED, UNUSED)
     np.testing.assert_array_equal(stage.output(COMMANDS, DERIVATIVES), np.zeros((50, 2)))
 

@@ -14,6 +14,7 @@ from safetensors.numpy import load_file, save_file
 
 import mrctl
 from mrctl.control.features import INPUTS, feature_matrix, feature_scale
+from mrctl.control.feedforward import Loop
 from mrctl.control.fel import (
     BIAS_GAIN,
     HIDDEN_GAIN,
@@ -76,7 +77,9 @@ def teach(stage, feedback, frozen=0.0):
 
 def taught(robot, settings=None, rigid=False, size=1):
     """A stage that has driven one motion for as long as feedback takes to answer, with its command and derivative."""
-    stage = FeedbackErrorLearning(robot, [settings or Fel(hidden=HIDDEN)] * size, list(range(size)), rigid, PERIOD)
+    stage = FeedbackErrorLearning(
+        Loop(robot, rigid, PERIOD, seeds=list(range(size))), [settings or Fel(hidden=HIDDEN)] * size
+    )
     command = RNG.uniform([-1.5, -3], [1.5, 3], (size, 2))
     derivative = RNG.uniform([-1.5, -6], [1.5, 6], (size, 2))
     for _ in range(LAG):
@@ -166,7 +169,7 @@ def test_normalised_step(robot, rigid, feedback):
 
 def test_learns(robot):
     """Taught by what was missing to an inverse two periods ago, the network finds it."""
-    stage = FeedbackErrorLearning(robot, [Fel(step=0.2, dead_zone=0.0)] * 8, list(range(8)), False, PERIOD)
+    stage = FeedbackErrorLearning(Loop(robot, False, PERIOD, seeds=list(range(8))), [Fel(step=0.2, dead_zone=0.0)] * 8)
     gains = np.array([[6.0, 1.0, 3.0, 0.5, -1.0, 0.4, 1.0, 1.0], [0.2, 5.0, 0.1, 4.0, 2.0, 0.0, -1.0, 1.0]]).T
     rng, missing, late = np.random.default_rng(0), [], [np.zeros((8, 2))] * LAG
     for _ in range(600):
@@ -256,7 +259,7 @@ def test_rows(robot, motion, feedback, data):
     def after(rows, lost=()):
         command, derivative = motion[:, rows].copy()
         command[list(lost)] = np.nan
-        stage = FeedbackErrorLearning(robot, [settings] * len(command), [0] * len(command), False, PERIOD)
+        stage = FeedbackErrorLearning(Loop(robot, False, PERIOD, seeds=[0] * len(command)), [settings] * len(command))
         for _ in range(LAG):
             stage.output(command, derivative)
             teach(stage, feedback[rows])

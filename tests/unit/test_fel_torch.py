@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch import nn
 
+from mrctl.control.feedforward import Loop
 from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.fel_torch import ModuleLearning, Network
 from mrctl.control.matching import LAG
@@ -46,7 +47,7 @@ def test_twins(robot, settings, rigid, ticks):
     rng = np.random.default_rng(2)
     module = Network(HIDDEN)
     module.load_state_dict({k: torch.tensor(v) for k, v in unflatten(initial_weights(HIDDEN, 4)).items()})
-    compiled = FeedbackErrorLearning(robot, [settings] * SIZE, [4] * SIZE, rigid, PERIOD, delay=2)
+    compiled = FeedbackErrorLearning(Loop(robot, rigid, PERIOD, 2, seeds=[4] * SIZE), [settings] * SIZE)
     general = ModuleLearning(module, robot, SIZE, settings, rigid, delay=2)
     largest = 0.0
     for tick in range(ticks):

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from mrctl import InputError
 from mrctl.control import guard as module
+from mrctl.control.feedforward import Loop
 from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.fel_torch import ModuleLearning
 from mrctl.control.guard import GUARD_ACTIONS, REASONS, Guard, fresh, guard
@@ -305,8 +306,8 @@ def stages(robot):
     """The stages that can forget."""
     torch.manual_seed(0)
     return {
-        "fel": FeedbackErrorLearning(robot, [Fel()] * 2, [3, 4], False, PERIOD),
-        "rls": RecursiveLeastSquares(robot, [Rls()] * 2, False, PERIOD),
+        "fel": FeedbackErrorLearning(Loop(robot, False, PERIOD, seeds=[3, 4]), [Fel()] * 2),
+        "rls": RecursiveLeastSquares(Loop(robot, False, PERIOD), [Rls()] * 2),
         "torch": ModuleLearning(torch.nn.Linear(8, 2), robot, 2),
     }
 

@@ -15,7 +15,8 @@ from mrctl.experiments.paper import IDEAL
 from mrctl.kernel import over_rows
 from mrctl.loop.courses import GOAL
 from mrctl.loop.hierarchy import TAKE_OVER, Hierarchy
-from mrctl.loop.user_stages import UserHierarchy, UserStage
+from mrctl.loop.user_hierarchy import UserHierarchy
+from mrctl.loop.user_stages import UserStage
 from mrctl.record import InputError
 from mrctl.scenario import FEEDFORWARDS, Scenario
 from mrctl.sensing.prediction import SEEN

@@ -6,7 +6,7 @@ from scipy.signal import lfilter, lfilter_zi
 
 from mrctl import InputError, Scenario
 from mrctl.control.design import design, plants
-from mrctl.control.feedforward import Prior
+from mrctl.control.feedforward import Loop, Prior
 from mrctl.control.indi import IncrementalInversion, Indi
 from mrctl.theory.dynamics import inverse_coefficients
 
@@ -39,7 +39,7 @@ def drive(stage, prior, inputs):
 def test_independent(robot, rigid, delay):
     """The output is H (U − M ẋ) less the model at the command; the voltage of a motion is delay + 1 ticks older."""
     n, inputs = 60, RNG.uniform(-1, 1, (60, 4, 2))
-    found = drive(IncrementalInversion(robot, [Indi()], rigid, PERIOD, delay), Prior([robot], rigid), inputs)
+    found = drive(IncrementalInversion(Loop(robot, rigid, PERIOD, delay), [Indi()]), Prior([robot], rigid), inputs)
     command, derivative, twist, voltage = inputs.transpose(1, 0, 2)
     ahead = np.array([PERIOD * derivative[max(0, k - delay) : k].sum(0) for k in range(n)])
     x = twist - ahead
@@ -66,7 +66,7 @@ def test_inversion(robot, delay):
     The forces here are no part of the model: a cubic back-EMF, a swing in time and a coupling of the two channels.
     """
     mass = np.diag(inverse_coefficients(robot)[2:4])
-    stage, prior = IncrementalInversion(robot, [Indi()], False, PERIOD, delay), Prior([robot], False)
+    stage, prior = IncrementalInversion(Loop(robot, False, PERIOD, delay), [Indi()]), Prior([robot], False)
     x, nu, f, rate, first = np.array([0.5, 0.3]), [], [], [], None
     waiting = [prior.output(x[None], np.zeros((1, 2)))[0]] * delay
     ahead = [np.zeros(2)] * delay
@@ -95,7 +95,7 @@ def test_inversion(robot, delay):
 def test_constant_force(robot):
     """Where f does not change, ẋ = ν exactly, however wrong the model of f is."""
     mass = np.diag(inverse_coefficients(robot)[2:4])
-    stage, prior = IncrementalInversion(robot, [Indi()], False, PERIOD), Prior([robot], False)
+    stage, prior = IncrementalInversion(Loop(robot, False, PERIOD), [Indi()]), Prior([robot], False)
     x = np.zeros(2)
     for tick in range(300):
         wanted = np.array([0.5 * np.cos(0.1 * tick), 0.3 * np.sin(0.2 * tick)])
@@ -145,7 +145,7 @@ def test_identity():
 
 def test_steering(robot):
     """Under rigid steering it adds the rotation that is asked for and does not come."""
-    stage, prior = IncrementalInversion(robot, [Indi()], True, PERIOD, 1), Prior([robot], True)
+    stage, prior = IncrementalInversion(Loop(robot, True, PERIOD, 1), [Indi()]), Prior([robot], True)
     command = np.array([[0.8, 0.5]])
     for _ in range(300):
         found = stage.output(command, np.zeros((1, 2))).copy()
@@ -156,7 +156,7 @@ def test_steering(robot):
 
 def test_frozen(robot):
     """It goes on while nothing may be learned, hands nothing over, and has no weights."""
-    stage, prior = IncrementalInversion(robot, [Indi()], False, PERIOD), Prior([robot], False)
+    stage, prior = IncrementalInversion(Loop(robot, False, PERIOD), [Indi()]), Prior([robot], False)
     for _ in range(20):
         stage.output(np.ones((1, 2)), np.ones((1, 2)))
         stage.prior = prior
@@ -175,7 +175,7 @@ def test_rows(robot):
     def answer(rows, lost=()):
         size = len(inputs[0, 0, rows])
         stage, prior, log = (
-            IncrementalInversion(robot, [Indi()] * size, False, PERIOD, 2),
+            IncrementalInversion(Loop(robot, False, PERIOD, 2), [Indi()] * size),
             Prior([robot] * size, False),
             [],
         )

@@ -6,7 +6,7 @@ from scipy.linalg import expm
 
 from mrctl import InputError, Scenario
 from mrctl.control.design import design, plants
-from mrctl.control.feedforward import Prior
+from mrctl.control.feedforward import Loop, Prior
 from mrctl.control.l1 import L1, L1Adaptive
 from mrctl.theory.dynamics import inverse_coefficients
 from mrctl.theory.linear import steering
@@ -22,7 +22,7 @@ def test_independent(robot, rigid, delay):
     """Predictor and adaptation as in the book, in matrices: σ̂ = −B⁻¹ Φ⁻¹ e^(A h) x̃, integrated by `expm`."""
     n, inputs = 50, RNG.uniform(-1, 1, (50, 4, 2))
     settings = L1(bandwidth=W, predictor=25.0)
-    stage, prior = L1Adaptive(robot, [settings], rigid, PERIOD, delay), Prior([robot], rigid)
+    stage, prior = L1Adaptive(Loop(robot, rigid, PERIOD, delay), [settings]), Prior([robot], rigid)
     c = inverse_coefficients(robot)
     mass = np.diag([c[2, 0], max(steering(robot).lag, PERIOD) if rigid else c[3, 1]])
     am, b = -25.0 * np.eye(2), np.linalg.inv(mass)
@@ -65,7 +65,7 @@ def test_closed_form(robot):
     prior = Prior([plain], False)
     prior.rows["c"][:, [0, 1, 4, 5, 6, 7]] = 0  # no other force than inertia
     mass = np.diag(prior.rows["c"][0, 2:4])
-    stage, x, lost = L1Adaptive(plain, [L1()], False, PERIOD), np.zeros(2), np.array([1.5, -0.7])
+    stage, x, lost = L1Adaptive(Loop(plain, False, PERIOD), [L1()]), np.zeros(2), np.array([1.5, -0.7])
     decay, left = np.exp(-A * PERIOD), []
     for tick in range(200):
         voltage = stage.output(np.zeros((1, 2)), np.zeros((1, 2)))[0].copy()
@@ -110,7 +110,7 @@ def test_margins(robot, channel):
 
 def test_steering(robot):
     """Under rigid steering σ is the rotation that comes without being asked for."""
-    stage, prior = L1Adaptive(robot, [L1()], True, PERIOD, 1), Prior([robot], True)
+    stage, prior = L1Adaptive(Loop(robot, True, PERIOD, 1), [L1()]), Prior([robot], True)
     command = np.array([[0.8, 0.5]])
     for _ in range(500):
         found = stage.output(command, np.zeros((1, 2))).copy()
@@ -121,7 +121,7 @@ def test_steering(robot):
 
 def test_frozen(robot):
     """It goes on while nothing may be learned, hands nothing over, has no weights, and forgets on `restore`."""
-    stage, prior = L1Adaptive(robot, [L1()], False, PERIOD), Prior([robot], False)
+    stage, prior = L1Adaptive(Loop(robot, False, PERIOD), [L1()]), Prior([robot], False)
     for _ in range(20):
         stage.output(np.ones((1, 2)), np.ones((1, 2)))
         stage.prior = prior
@@ -138,7 +138,7 @@ def test_rows(robot):
 
     def answer(rows, lost=()):
         size = len(inputs[0, 0, rows])
-        stage, prior, log = L1Adaptive(robot, [L1()] * size, False, PERIOD, 2), Prior([robot] * size, False), []
+        stage, prior, log = L1Adaptive(Loop(robot, False, PERIOD, 2), [L1()] * size), Prior([robot] * size, False), []
         for command, twist, voltage in inputs[:, :, rows].copy():
             twist[list(lost)] = np.nan
             log.append(stage.output(command, command).copy())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrctl.control.features import feature_matrix, feature_scale
-from mrctl.control.feedforward import Prior
+from mrctl.control.feedforward import Loop, Prior
 from mrctl.control.matching import SETTLED
 from mrctl.control.mrac import MRAC, ModelReferenceAdaptive, Mrac, confine, predict, project, track
 from mrctl.theory.dynamics import accelerations, inverse_coefficients, left_right
@@ -72,7 +72,7 @@ def lyapunov(stage, prior, true, error, integral, period):
 
 def drive(robot, settings, period, seconds, known=True, turns=False):
     """The law with PI control: V at each tick since learning began, and the errors of parameters and motion."""
-    true, stage = truth(robot), ModelReferenceAdaptive(robot, [settings], False, period)
+    true, stage = truth(robot), ModelReferenceAdaptive(Loop(robot, False, period), [settings])
     prior = Prior([robot if known else None], False)
     c, scale = inverse_coefficients(true), stage.arrays[1][:, None]
     x, integral, log, wrong = command(0.0, turns)[0] + [0.05, -0.1], np.zeros(2), [], []
@@ -207,7 +207,7 @@ def test_learns_late(robot):
     scale = feature_scale(robot)[:, None]
     found = []
     for before in (20.0, 600.0):
-        stage, prior = ModelReferenceAdaptive(robot, [Mrac()], False, PERIOD), Prior([robot], False)
+        stage, prior = ModelReferenceAdaptive(Loop(robot, False, PERIOD), [Mrac()]), Prior([robot], False)
         for tick in range(round((before + 20.0) / PERIOD)):
             c = inverse_coefficients(robot if PERIOD * tick < before else truth(robot))
             v, v_dot = 0.8 + 0.3 * np.sin(PERIOD * tick), 0.3 * np.cos(PERIOD * tick)
@@ -299,7 +299,7 @@ def test_regression(robot, rigid, delay):
     true = inverse_coefficients(truth(robot))
     if rigid:
         true[:, 1] = 0.1 * RNG.uniform(-1, 1, 8)
-    prior, stage = Prior([robot], rigid), ModelReferenceAdaptive(robot, [Mrac(tracking=0)], rigid, PERIOD, delay)
+    prior, stage = Prior([robot], rigid), ModelReferenceAdaptive(Loop(robot, rigid, PERIOD, delay), [Mrac(tracking=0)])
     t = PERIOD * np.arange(n + 1)
     x = np.array([command(one, turns=True)[0] for one in t])
     rate = np.diff(x, axis=0) / PERIOD
@@ -321,7 +321,7 @@ def test_regression(robot, rigid, delay):
 
 def test_frozen(robot):
     """While it must not learn, the parameters stay; near rest too; `restore` brings back the start."""
-    stage, prior = ModelReferenceAdaptive(robot, [Mrac()], False, PERIOD), Prior([robot], False)
+    stage, prior = ModelReferenceAdaptive(Loop(robot, False, PERIOD), [Mrac()]), Prior([robot], False)
     start = stage.rows.copy()
 
     def go(frozen, speed):
@@ -341,7 +341,7 @@ def test_frozen(robot):
 
 def test_hand_over(robot):
     """What is handed over to the PID's integral is the change of the output for the same command."""
-    stage, prior = ModelReferenceAdaptive(robot, [Mrac(hand_over=True)], False, PERIOD), Prior([robot], False)
+    stage, prior = ModelReferenceAdaptive(Loop(robot, False, PERIOD), [Mrac(hand_over=True)]), Prior([robot], False)
     for tick in range(60):
         twist = np.array([[0.8 + 0.1 * np.sin(tick), 0.3]])
         before = stage.output(twist, twist).copy()
@@ -357,7 +357,7 @@ def test_rows(robot):
 
     def answer(rows, lost=()):
         size = len(inputs[0, 0, rows])
-        stage, log = ModelReferenceAdaptive(robot, [Mrac()] * size, False, PERIOD, 2), []
+        stage, log = ModelReferenceAdaptive(Loop(robot, False, PERIOD, 2), [Mrac()] * size), []
         prior = Prior([robot] * size, False)
         for command, twist, voltage in inputs[:, :, rows].copy():
             twist[list(lost)] = np.nan

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mrctl.control.feedforward import Prior
+from mrctl.control.feedforward import Loop, Prior
 from mrctl.control.observer import DisturbanceObserver, Observer
 from mrctl.experiments.paper import IDEAL
 from mrctl.theory.dynamics import accelerations, left_right
@@ -15,7 +15,7 @@ RNG = np.random.default_rng(9)
 
 def observer(robot, size=1, rigid=False):
     """Observers whose prior is the nominal model."""
-    stage = DisturbanceObserver(robot, [Observer()] * size, rigid, PERIOD)
+    stage = DisturbanceObserver(Loop(robot, rigid, PERIOD), [Observer()] * size)
     stage.prior = Prior([robot] * size, rigid)
     return stage
 

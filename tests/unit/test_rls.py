@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mrctl.control.features import feature_matrix, feature_scale
-from mrctl.control.feedforward import Prior
+from mrctl.control.feedforward import Loop, Prior
 from mrctl.control.matching import LAG
 from mrctl.control.rls import RLS, RecursiveLeastSquares, Rls, update
 from mrctl.theory.dynamics import inverse_coefficients
@@ -75,7 +75,7 @@ def test_learns_physics(robot):
     """Taught by what a model has and it lacks, it finds the model's coefficients."""
     teacher = Prior([robot] * 2, rigid=False)
     eager = Rls(step=1, initial_covariance=1000, drift=0, covariance_bound=1e-9, dead_zone=0)
-    pupil = RecursiveLeastSquares(robot, [eager] * 2, rigid=False, period=PERIOD)
+    pupil = RecursiveLeastSquares(Loop(robot, False, PERIOD), [eager] * 2)
     scale, first, driven = feature_scale(robot), None, []
     for _ in range(200):
         driven.append(draw(2))
@@ -93,7 +93,7 @@ def test_learns_physics(robot):
 
 def test_output(robot):
     """It begins with nothing; later it is the features times the coefficients."""
-    stage, (command, derivative) = RecursiveLeastSquares(robot, [Rls()] * 3, False, PERIOD), draw(3)
+    stage, (command, derivative) = RecursiveLeastSquares(Loop(robot, False, PERIOD), [Rls()] * 3), draw(3)
     assert not stage.output(command, derivative).any()
     stage.rows["theta"][:] = RNG.normal(size=(3, 8, 2))
     x = feature_matrix(command, derivative, robot.half_track, feature_scale(robot))
@@ -105,7 +105,7 @@ def test_output(robot):
 def test_frozen(robot, feedback, saturated):
     """A voltage that did not act, or feedback within the dead zone, teaches nothing."""
     settings = Rls(step=0.05, initial_covariance=0.05, drift=1e-3, covariance_bound=0.5, dead_zone=0.02)
-    stage, coefficients = RecursiveLeastSquares(robot, [settings], False, PERIOD), RNG.normal(size=(8, 2))
+    stage, coefficients = RecursiveLeastSquares(Loop(robot, False, PERIOD), [settings]), RNG.normal(size=(8, 2))
     drive(stage, *draw(1))
     stage.rows["theta"] = coefficients
     assert not learn(stage, [feedback], saturated).any()
@@ -127,7 +127,7 @@ def test_steering_learns_slower(robot):
     found = []
     command, derivative = draw(1)
     for rigid in (False, True):
-        stage = drive(RecursiveLeastSquares(robot, [Rls()], rigid, PERIOD), command, derivative)
+        stage = drive(RecursiveLeastSquares(Loop(robot, rigid, PERIOD), [Rls()]), command, derivative)
         stage.output(command, derivative)
         learn(stage, [[1.0, 2.0]])
         found.append(stage.output(command, derivative)[0])
@@ -138,7 +138,7 @@ def test_steering_learns_slower(robot):
 @given(numbers(1, 2, bound=1.5), numbers(1, 2, bound=1.5), st.floats(0.01, 1), st.floats(1e-3, 1e3))
 def test_step(robot, command, derivative, share, initial):
     """However uncertain it is, one step moves the feedforward by no more than its share of the feedback."""
-    stage = RecursiveLeastSquares(robot, [Rls(step=share, initial_covariance=initial)], False, PERIOD)
+    stage = RecursiveLeastSquares(Loop(robot, False, PERIOD), [Rls(step=share, initial_covariance=initial)])
     drive(stage, command, derivative).output(command, derivative)
     learn(stage, [[4.0, -2.0]])
     moved = stage.output(command, derivative)[0] / [4, -2]
@@ -177,7 +177,7 @@ def test_rows(robot, x, feedback, saturated, coefficients):
     settings = Rls(step=0.05, initial_covariance=0.05, drift=1e-3, covariance_bound=0.05, dead_zone=0.02)
 
     def answer(rows, lost=()):
-        stage = RecursiveLeastSquares(robot, [settings] * len(x[rows]), rigid=True, period=PERIOD)
+        stage = RecursiveLeastSquares(Loop(robot, True, PERIOD), [settings] * len(x[rows]))
         stage.rows["x"], stage.rows["theta"] = x[rows], coefficients[rows]
         stage.rows["x"][list(lost)] = np.nan
         added = learn(stage, feedback[rows], saturated[rows])

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mrctl import Composite, Event, Fel, Kanayama, Observer, Perturbation, Pid, Rls, Scenario
-from mrctl.control.feedforward import NoLearner
+from mrctl.control.feedforward import Loop, NoLearner
 from mrctl.loop.simulation import simulate
 from mrctl.record import InputError
 from mrctl.scenario import LONGEST, replicates, whole
@@ -308,7 +308,7 @@ def test_label():
     scenario = Scenario(reference=Circle(period=4, radius=0.5), laps=1, learner="none")
 
     def mine(robot, size):
-        return NoLearner(robot, size, rigid=False, period=scenario.control_period)
+        return NoLearner(Loop(robot, False, scenario.control_period), [None] * size)
 
     assert str(simulate(scenario).label.item()) == "none"
     assert (

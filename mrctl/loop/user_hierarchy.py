@@ -1,0 +1,220 @@
+"""The hierarchy with a user's own stages, which are called between the compiled laws."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mrctl.control.feedforward import Learner
+from mrctl.control.kanayama import posture_error
+from mrctl.control.pid import pid
+from mrctl.kernel import Array, Rows, kernel, over_rows
+from mrctl.loop.hierarchy import Hierarchy, apply_voltages, command_motion, hand_over, request_motion
+from mrctl.loop.user_stages import UserStage
+from mrctl.scenario import Scenario
+from mrctl.theory.rays import Scan
+from mrctl.theory.references import Reference
+from mrctl.theory.robot import Robot
+
+REPLACED = {"motion": ("k_x", "k_y", "k_theta"), "feedback": ("k_p", "k_i")}
+"""Gains of `dataset.GAINS` that have no effect where the user has a stage of this name; a result has NaN for them."""
+
+
+@kernel
+def request_all(seen: Rows, goal: Rows, control: Rows) -> None:
+    """Calls `request_motion` for all robots."""
+    for i in range(len(control)):
+        request_motion(seen[i], goal[i], control[i])
+
+
+@kernel
+def command_all(seen: Rows, goal: Rows, robot: Rows, period: float, control: Rows) -> None:
+    """Calls limiter, prefilter and PID for all robots."""
+    for i in range(len(control)):
+        s = control[i]
+        command_motion(goal[i], robot[0], period, s)
+        pid(s.limiter.command, seen[i].twist, s.allocation.excess, period, s.pid, s.feedback)
+
+
+@kernel
+def apply_all(seen: Rows, model: Rows, robot: Rows, period: float, control: Rows) -> tuple[bool, bool]:
+    """Calls `apply_voltages` for all robots; returns whether all are finite, and whether one asks for `answer`."""
+    finite, asks = True, False
+    for i in range(len(control)):
+        finite &= apply_voltages(seen[i], model[0], robot[0], period, control[i])
+        asks |= control[i].guard.forget | control[i].delay.due
+    return finite, asks
+
+
+@kernel
+def hand_over_all(control: Rows) -> None:
+    """Calls `hand_over` for all robots."""
+    for i in range(len(control)):
+        hand_over(control[i])
+
+
+class UserHierarchy(Hierarchy):
+    """The hierarchy with stages of a user; a tick calls them between compiled loops over the built-in laws.
+
+    Attributes:
+        faults: As for `Hierarchy`, and a message for each robot for which a stage returned a number that is not finite,
+            except for those whose guard replaces the feedforward.
+        feedforward_faults: For each robot the message of the first tick at which its guard did so, or "".
+    """
+
+    def __init__(self, scenarios: Sequence[Scenario], robot: Robot, stages: dict[str, UserStage]) -> None:
+        """Wires the user's stages, by name, and for the others those of the scenarios."""
+        super().__init__(scenarios, robot, stages)
+        self.feedforward_faults = [""] * len(scenarios)
+        self._wanted: Rows | None = None  # reference of the user's motion controller, until its next call
+        self._new: dict[int, Reference] = {}  # references that it has not been told yet, by robot
+        if (stage := stages.get("motion")) and stage.has("assign"):
+            stage.ask("assign", tuple(scenarios))
+        for name in (name for stage in stages for name in REPLACED.get(stage, ())):
+            self.gains[name][:] = np.nan
+
+    def reset(self, twist: Array, acceleration: Array, steering_angle: Array, rows: int | slice = slice(None)) -> None:
+        """Bumpless start; see `Hierarchy.reset`."""
+        super().reset(twist, acceleration, steering_angle, rows)
+        if stage := self.stages.get("feedback"):
+            stage.call("reset", self.state["pid"]["integral"], self.period)
+        if stage := self.stages.get("steering"):
+            stage.call("reset", steering_angle, self.period)
+
+    def update(self, seen: Rows, goal: Rows) -> Array:
+        """Computes the commands of one control tick; see `Hierarchy.update`.
+
+        Raises:
+            StageError: A stage raised, or returned something of another shape.
+        """
+        self.faults = {}
+        state, constants = self.state, (self.nominal, self.period)
+        if stage := self.stages.get("motion"):
+            if self.tick == self.started:
+                stage.call("reset", seen["pose"], _numbers(goal), self.motion_period)
+            for row, reference in self._new.items():
+                stage.ask("follow", row, reference)
+            self._new = {}
+            self._show(stage, seen["estimate"])
+            if self.moves:
+                self._wanted = self._request(stage, seen, goal)
+        elif self.moves:
+            request_all(seen, goal, state)
+        command_all(seen, goal if self._wanted is None else self._wanted, *constants, state)
+        feedback = self.stages.get("feedback")
+        if feedback:
+            self._feed_back(feedback, seen["twist"])
+        state["feedforward"] = self.feedforward(self.command, self.derivative)
+        self._read_weight_norm()
+        finite, asks = apply_all(seen, self.model.rows, *constants, state)
+        if stage := self.stages.get("steering"):
+            self._steer(stage, seen["lost"].any(axis=1))
+        taught = state["guard"]["teaching"], state["frozen"], seen["twist"], state["voltage"]
+        if (added := self.learner.learn(*taught)) is not None:
+            state["added"] = self._sound(added)
+            hand_over_all(state)
+        if feedback and (integral := getattr(feedback.stage, "integral", None)) is not None:
+            integral[:] = state["pid"]["integral"]
+        if asks:
+            self.answer()
+        self._read_weight_norm()
+        if not finite:
+            self.faults = self.non_finite() | self.faults
+        self.tick += 1
+        return self.output
+
+    def set_reference(self, row: int, reference: Reference) -> None:
+        """Tells the user's motion controller, if it asks for that, that one robot has another reference."""
+        if self.roams:
+            self._new[row] = reference
+
+    def _show(self, stage: UserStage, estimate: Array) -> None:
+        """Hands the scans of this tick to the user's motion controller, with the poses that are estimated for it."""
+        scanner = self.scanner
+        if scanner is None or not self.looks:
+            return
+        for row in np.flatnonzero(scanner.taken == self.tick).tolist():
+            lidar, ranges = scanner.lidars[row], scanner.scans[row]
+            assert ranges is not None
+            place, time = lidar.place(estimate[row, :3]), (self.tick - self.started) * self.period
+            stage.ask("see", row, Scan(ranges.copy(), lidar.angles, lidar.range, place, time))
+
+    def _request(self, stage: UserStage, seen: Rows, goal: Rows) -> Rows | None:
+        """Calls the user's motion controller; returns the reference that it follows, if it has one of its own."""
+        state, reference = self.state, _numbers(goal)
+        request = self._finite_rows(stage, stage.output(seen["pose"], seen["twist"], reference))
+        own = getattr(stage.stage, "followed", None)
+        if own is not None:
+            own = self._finite_rows(stage, stage.checked(own, reference.shape, "`followed`"))
+            own = goal = np.ascontiguousarray(own).view(goal.dtype)[:, 0]
+        over_rows(posture_error, seen["pose"], goal["pose"], state["error"])
+        state["correction"] = request - goal["twist"]
+        return own
+
+    def _feed_back(self, stage: UserStage, twist: Array) -> None:
+        """Calls the user's feedback, and copies its integral for guard and hand-over."""
+        state = self.state
+        self.feedback[:] = self._finite_rows(stage, stage.output(self.command, twist, state["allocation"]["excess"]))
+        integral = getattr(stage.stage, "integral", None)
+        known = 0.0 if integral is None else stage.checked(integral, self.feedback.shape, "`integral`")
+        state["pid"]["integral"] = known
+        state["guard"]["hands_over"] = integral is not None
+
+    def feedforward(self, command: Array, derivative: Array) -> Array:
+        """Returns the feedforward of the prior and of the learner, the user's or a built-in one."""
+        return self.prior.output(command, derivative) + self._sound(self.learner.output(command, derivative))
+
+    def _sound(self, answer: Array) -> Array:
+        """Returns an answer of the feedforward, with zeros in the rows of a user's that are not finite.
+
+        Each of these is left to its guard, if that is on; otherwise the robot fails.
+        """
+        if isinstance(self.learner, Learner):
+            return answer
+        stage, guard = self.learner.stage, self.state["guard"]
+        broken = ~np.isfinite(answer).all(axis=1) & guard["on"]
+        guard["broken"] |= broken
+        for row in np.flatnonzero(broken):
+            fault = f"{stage.title}: not finite, tick {self.tick}"
+            self.feedforward_faults[row] = self.feedforward_faults[row] or fault
+        return self._finite_rows(stage, np.where(broken[:, None], 0.0, answer))
+
+    def _steer(self, stage: UserStage, lost: NDArray[np.bool]) -> None:
+        """Calls the user's steering, and limits it as `allocate` does; `lost` are the robots with a limited current."""
+        state, limit = self.state, self.robot.steering_limit
+        allocation, command = state["allocation"], self.command.copy()
+        if self.rigid:
+            command[:, 1] += self.feedback[:, 1] + state["guard"]["output"][:, 1]
+        answer = self._finite_rows(stage, stage.output(command, self.derivative))
+        angle = np.clip(answer[:, 0], -limit, limit)
+        beyond = angle != answer[:, 0]
+        rate = np.where(beyond, 0.0, answer[:, 1])
+        self.output[:, 2], self.output[:, 3] = np.clip(angle + rate * self.period / 2, -limit, limit), rate
+        if self.rigid:  # the fork makes θ̇, so its limit acts on the second channel
+            clipped = (self.output[:, :2] != allocation["feedback"] + allocation["feedforward"]).any(axis=1)
+            made = command[:, 0] * np.tan(angle) / self.robot.wheelbase
+            allocation["excess"][:, 1] = np.where(beyond, made - command[:, 1], 0.0)
+            allocation["saturated"] = beyond | clipped | lost
+            state["voltage"][:, 1] = command[:, 1] - self.command[:, 1] + allocation["excess"][:, 1]
+            state["frozen"] = np.any(
+                [allocation["saturated"], state["learning_off"], state["guard"]["frozen"], state["slips"]], axis=0
+            )
+
+    def _read_weight_norm(self) -> None:
+        """Reads the norm of the learner's weights, if the feedforward has it."""
+        if (norm := self.learner.weight_norm) is not None:
+            self.weight_norm[:] = norm
+
+    def _finite_rows(self, stage: UserStage, answer: Array) -> Array:
+        """Returns an answer with zeros in the rows that are not finite, and notes these robots in `faults`."""
+        broken = np.any(~np.isfinite(answer), axis=1)
+        for row in np.flatnonzero(broken):
+            self.faults.setdefault(int(row), f"{stage.title}: not finite, tick {self.tick}")
+        return np.where(broken[:, None], 0.0, answer) if broken.any() else answer
+
+
+def _numbers(goal: Rows) -> Array:
+    """Returns records of `GOAL` as the reference of `mrctl.control.stages.Motion`, `(B, 7)`."""
+    return goal.view(float).reshape(len(goal), -1)
