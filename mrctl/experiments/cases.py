@@ -149,7 +149,7 @@ def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
 
     Args:
         mode: Size of the suite: `core`, the default; `quick`, a few of its cases with fewer laps; or `full`, which adds
-            the other uncertainties, tiers and steering arrangements, and drives 8 laps in most cases.
+            the other uncertainties, tiers and steering arrangements and a late step, and drives 8 laps in most cases.
         seeds: Number of replicates of each case; all cases have the same draws. The return after a step does not bring
             back the same robot, but another draw.
         random: Number of random scenarios in `lab`; `full` has the same ones in the other tiers.
@@ -173,7 +173,7 @@ def cases(mode: Mode, seeds: int, random: int) -> list[Case]:
             Event(time=2 * third * SHORT, perturbation=Perturbation()),
         )
         add("step", f"{name}, on and off", third + 1, 2 * third + 1, laps=3 * third, events=events)
-    if not quick:
+    if full:
         late = Event(time=LATE * SHORT, perturbation=PERTURBATIONS["all"])
         add("late", f"all, after {LATE} laps", LATE + 1, laps=LATE + 2, events=(late,))
     carried = Event(time=third * SHORT, learning=False, reference=slowed(loop(), SHORT))
