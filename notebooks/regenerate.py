@@ -21,7 +21,9 @@ REPLAY = "(The replay is shown when the notebook runs.)"
 def executed(path: Path, folder: Path) -> nbformat.NotebookNode:
     """Returns a notebook after a run in a folder, with all outputs; an exception in a cell is raised."""
     notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=600, record_timing=False, resources={"metadata": {"path": folder}}).execute()
+    where = {"metadata": {"path": folder}}
+    # The kernel sends what a cell prints in as many pieces as the load of the machine makes.
+    NotebookClient(notebook, timeout=600, record_timing=False, coalesce_streams=True, resources=where).execute()
     return notebook
 
 

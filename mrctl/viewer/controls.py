@@ -21,6 +21,7 @@ WORLDS = ("flat", "slope", "rough", "patch")
 SENSORS = {"encoders": "encoder", "gyro": "gyro", "accelerometer": "accelerometer", "posture fixes": "fix"}
 DRIVER = ("dead_zone", "pwm_steps", "current_limit", "battery_resistance")
 MAPPED = ("localisation", "lidar", "start_unknown")  # fields without an input, as they need obstacles, in a file
+PLANNED = ("start_speed", "start_curvature")  # nor have these, which are for plans of robots that drive
 ANEW, ANEW_HINT = " ↻", "A change begins another run."  # behind the label of what cannot change during a run
 SEED = ("seed",)  # a number that no slider suits
 STEERING = ("steering_offset", "steering_backlash")
@@ -98,7 +99,7 @@ class Controls:
         groups = GROUPS.get(path[-1], {}) if path else {}
         grouped = [name for names in groups.values() for name in names]
         for name, field in type(record).model_fields.items():
-            if name not in (*grouped, *MAPPED) and (only is None or name in only):
+            if name not in (*grouped, *MAPPED, *PLANNED) and (only is None or name in only):
                 self._add(self._shown(record, (*path, name)), field, (*path, name))
         for group, names in groups.items():
             with self._gui.add_folder(group, expand_by_default=group == "mass and payload"):
