@@ -366,8 +366,8 @@ class Simulation:
     def step(self) -> None:
         """Computes one control period, as in figure 3; an error of a user's stage fails all robots, which share it."""
         try:
-            now, _ = self.courses.at(self.tick)
             seen, goal = self.sense()
+            now, _ = self.courses.at(self.tick)
             self.plant.step(self.hierarchy.update(seen, goal), self.hierarchy.faults)
             self.log.record(self.tick, self.plant.state, seen, now, self.hierarchy.state)
         except StageError as error:
