@@ -65,7 +65,10 @@ def sent(file, store, address):
 
 def worker_of(nanny):
     """The process of a nanny that computes: the one with the most memory."""
-    pages = {pid: int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in children(nanny.pid)}
+    pages = {}
+    for pid in children(nanny.pid):
+        with contextlib.suppress(OSError):  # a child may end meanwhile
+            pages[pid] = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return max(pages, key=pages.__getitem__)
 
 
