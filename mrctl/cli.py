@@ -48,7 +48,7 @@ IDENTIFIED = ("perturbation", "robot", "sensing")
 """Arguments of `mrctl identify` that are records; its short help lists them, as that of `run` does with its fields."""
 
 BEST: FeedforwardName = "model+composite"
-"""Feedforward with the least error under `all` in `lab` and `field`, of those in the README that do not know the plant.
+"""Feedforward that is best, or level with the best, in more cases of the suite than any other (31 of 34).
 
 `navigate` drives with it, and `view` shows it beside PID alone.
 """
@@ -533,15 +533,17 @@ def _navigate_with(arguments: list[str]) -> Callable[..., None]:
             raise InputError(f"world: no file {world}; mrctl navigate --help names the generators, such as doorway:3")
         _check_world(chosen.world, chosen.robot)
         _warn_if_impossible(chosen)
+        from mrctl.navigation.mission import Order, task_of
+
+        task = task_of(world, chosen, start, goal, known)
+        order = Order(task=task, scenario=chosen, compare=tuple(compare), speed=speed, margin=margin, avoid=avoid)
         if view:
-            from mrctl.navigation.mission import task_of
             from mrctl.viewer import view as viewing
 
-            task = task_of(world, chosen, start, goal, known)
-            return viewing.mission(task, chosen, compare, speed, margin, avoid, "127.0.0.1", port)
+            return viewing.mission(order, "127.0.0.1", port)
         from mrctl.experiments import mission
 
-        text, outcome = mission.run(world, chosen, goal, start, known, compare, speed, margin, avoid, out, json)
+        text, outcome = mission.run(world, order, out, json)
         _report(text, out, json)
         _expect_arrival(outcome)
 

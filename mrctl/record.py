@@ -112,6 +112,12 @@ class Record(BaseModel, metaclass=_Constructors):
     named_by: ClassVar[str] = ""
     """Field that a string sets which stands in the place of a record; by default none does."""
 
+    if TYPE_CHECKING:
+
+        def __hash__(self) -> int:
+            """Pydantic gives frozen records a hash."""
+            ...
+
     @classmethod
     @override
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -250,7 +256,8 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
         *parents, name = first["loc"]
         known = [field for one in _records_at(record, parents) for field in one.model_fields]
         meant = nearest(str(name), known)
-        message = f"there is no such field; did you mean {meant}?" if meant else "there is no such field"
+        others = f"there are {', '.join(known)}" if 0 < len(known) <= 12 else ""
+        message = "; ".join(["there is no such field", *filter(None, [f"did you mean {meant}?" if meant else others])])
     if first["type"] in ("model_type", "model_attributes_type"):
         names = {one.named_by for one in _records_at(record, first["loc"])} - {""}
         message = ", or its ".join(["must be a record, or a table of its fields", *sorted(names)])

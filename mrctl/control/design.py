@@ -80,7 +80,7 @@ def design(robot: Robot, rigid: bool, delay: float, lag: float = 0.0, period: fl
         lag: Time constant in s with which the measured twist follows the true one.
         period: Control period in s.
     """
-    return _design(robot, rigid, delay, lag, period)  # pyright: ignore[reportArgumentType] (frozen, so hashable)
+    return _design(robot, rigid, delay, lag, period)
 
 
 @lru_cache(maxsize=256)
@@ -193,7 +193,7 @@ def motion(
         period: Control period in s.
         prefilter: Time constant of the prefilter in s, if it is given.
     """
-    return _motion(robot, rigid, gains, delay, period, prefilter)  # pyright: ignore[reportArgumentType] (hashable)
+    return _motion(robot, rigid, gains, delay, period, prefilter)
 
 
 @lru_cache(maxsize=256)
@@ -318,17 +318,25 @@ def whole_loop(
         ahead = ahead + period * rate * z**-p
     once, horizon = period / 2 * (z + 1) / (z - 1), late * period
     position, drift = once + horizon, once**2 + horizon * once + horizon**2 / 2
-    speeds, plants = zip(*points(robot, rigid, channel), strict=True)
     k_x, k_y, k_theta = np.asarray(kanayama, float)[..., None, None]
     if channel == 0:
         request = k_x * position / (1 + k_x * moved)
         static, lag = robot.velocity_gain, robot.velocity_time_constant
     else:
-        speed = np.array(speeds)[:, None]
+        speed = np.array([speed for speed, _ in points(robot, rigid, channel)])[:, None]
         heading, lateral = speed * k_theta, speed**2 * k_y
         request = (heading * position + lateral * drift) / (1 + heading * moved + lateral * drifted)
         static, lag = robot.rotation_gain, robot.rotation_time_constant
     model = filtered if rigid and channel == 1 else (filtered + lag * rate) / static
-    response = np.array([plant.response(frequency, period) for plant in plants]) * z**-late
+    response = _responses(robot, rigid, channel, period, tuple(frequency.tolist())) * z**-late
     parts = [pi + (pi * (filtered - ahead) + forward) * request for forward in (0, model)]
     return np.asarray(response * np.array(parts), complex)
+
+
+@lru_cache(maxsize=16)  # every prefilter that is tried has the same plants
+def _responses(
+    robot: Robot, rigid: bool, channel: int, period: float, frequency: tuple[float, ...]
+) -> NDArray[np.complex128]:
+    """Returns the frequency response of the plant behind the hold at each of the `points`, `(points, frequencies)`."""
+    grid = np.array(frequency)
+    return np.array([plant.response(grid, period) for _, plant in points(robot, rigid, channel)])

@@ -40,7 +40,7 @@ class ModuleLearning:
     """Feedback-error learning of B copies of a torch module, with the update and safeguards of `fel`.
 
     The output is scale · (f_W(x) − f_W₀(x)), so that learning begins as pure PID with any module. `simulate` takes it
-    as `feedforward=lambda robot, size: ModuleLearning(module, robot, size, delay=1)`, where 1 is the delay of `lab`.
+    as `feedforward=lambda robot, size: ModuleLearning(module, robot, size)`, and tells it the delay of the loop.
 
     Attributes:
         state: Parameters W by name, each with a leading axis B.
@@ -48,13 +48,7 @@ class ModuleLearning:
     """
 
     def __init__(
-        self,
-        module: nn.Module,
-        robot: Robot,
-        size: int,
-        settings: Fel | None = None,
-        rigid: bool = False,
-        delay: int = 0,
+        self, module: nn.Module, robot: Robot, size: int, settings: Fel | None = None, rigid: bool = False
     ) -> None:
         """Copies a module for B robots.
 
@@ -64,7 +58,6 @@ class ModuleLearning:
             size: Number of robots B.
             settings: Settings of `fel`; `hidden` and `weights` have no effect.
             rigid: Whether the second channel is steering.
-            delay: Delay from measurement to voltage in control periods; 0 in `ideal`, 1 in `lab` and 2 in `field`.
 
         Raises:
             ValueError: The module has buffers, or does not map 8 inputs to 2 outputs.
@@ -87,11 +80,15 @@ class ModuleLearning:
         )
         self._step, self._leak, self._bound = float(start["step"]), float(start["leak"]), float(start["bound"])
         self._features = np.zeros((size, INPUTS))
-        self._queue, self._tick = histories(size, delay, INPUTS), np.zeros(size, int)
+        self._queue, self._tick = histories(size, 0, INPUTS), np.zeros(size, int)
         stacked, _ = stack_module_state([self._module] * size)
         self.initial = {name: value.detach().clone() for name, value in stacked.items()}
         self.state = {name: value.clone() for name, value in self.initial.items()}
         self.weight_norm = np.zeros(size)
+
+    def reset(self, period: float, delay: float) -> None:
+        """Takes the control period and the delay of the loop in s; see `Feedforward.reset`."""
+        self._queue = histories(len(self._tick), round(delay / period), INPUTS)
 
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to the parameters of the module."""

@@ -58,7 +58,7 @@ def rejection(
         delay: Delay from measurement to voltage in s.
         period: Control period in s.
     """
-    return _rejection(robot, rigid, gains, motion, delay, period)  # pyright: ignore[reportArgumentType] (hashable)
+    return _rejection(robot, rigid, gains, motion, delay, period)
 
 
 @lru_cache(maxsize=1024)

@@ -294,6 +294,11 @@ class Episodes:
         terminated = self.plant.failed.copy()
         return terminated, (self.tick - self.start >= self._lengths) & ~terminated
 
+    def failure(self, row: int) -> str:
+        """Returns why a robot has failed, with ticks counted from the beginning of its episode; "" if it has not."""
+        reason, says, tick = self.plant.failure[row].rpartition(", tick ")
+        return f"{reason}{says}{int(tick) - self.start[row]}" if says else tick
+
 
 def read(scenario: Scenario | str | Path | None) -> Scenario:
     """Returns a scenario, that in a file, or by default one lap.

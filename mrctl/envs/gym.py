@@ -134,7 +134,7 @@ class TrackingEnv(gymnasium.Env):
             loop.step()
             (seen,), (reward,) = loop.observe()
         (terminated,), (truncated,) = loop.ended()
-        info: dict[str, Any] = {"failure": loop.plant.failure[0]} if terminated else {}
+        info: dict[str, Any] = {"failure": loop.failure(0)} if terminated else {}
         if terminated or truncated:
             info |= loop.metrics(0)
         return seen, float(reward), bool(terminated), bool(truncated), info
@@ -227,10 +227,12 @@ class TrackingVectorEnv(VectorEnv):
             The observations, `(B, n)`, and an empty dictionary.
 
         Raises:
-            InputError: An option is unknown or invalid.
+            InputError: An option is unknown or invalid, or there are not as many seeds as robots.
         """
         if isinstance(seed, Sequence):
             seeds = list(seed)
+            if len(seeds) != self.num_envs:
+                raise InputError(f"seed: {len(seeds)} seeds for {self.num_envs} robots")
         else:
             super().reset(seed=seed)
             seeds = [None if seed is None else seed + i for i in range(self.num_envs)]
@@ -273,7 +275,7 @@ class TrackingVectorEnv(VectorEnv):
         self._over = terminated | truncated
         info: dict[str, Any] = {}
         for row in map(int, np.flatnonzero(self._over)):
-            reason = {"failure": loop.plant.failure[row]} if terminated[row] else {}
+            reason = {"failure": loop.failure(row)} if terminated[row] else {}
             info = self._add_info(info, reason | loop.metrics(row), row)
         return seen, reward, terminated, truncated, info
 

@@ -21,7 +21,7 @@ from mrctl.navigation.mission import Avoid, avoiding, prepared, task_of
 from mrctl.navigation.mppi import SAMPLES, SPREAD, WORTH, Mppi
 from mrctl.navigation.planning import cost_to_go, plan, space
 from mrctl.navigation.rollouts import KNOTS, STEPS, roll_out
-from mrctl.navigation.vehicle import robot_of
+from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics.obstacles import multi_ray
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
@@ -154,7 +154,7 @@ def _mppi(turns: int) -> dict[str, Any]:
     own = prepared(task_of(MISSION, SCENARIO), SCENARIO, avoid="mppi")[1]
     make = avoiding("mppi")
     assert make is not None
-    stage: Mppi = make(robot_of(own)[1], 1)
+    stage: Mppi = make(Vehicle.of(own).robot, 1)
     stage.assign([own])
     pose, twist = np.array([own.initial_pose], float), np.array([[0.5, 0.0]])
     stage.reset(pose, np.zeros((1, 7)), own.motion_period)
@@ -174,7 +174,7 @@ def _mppi(turns: int) -> dict[str, Any]:
 
 def _random_discs(worlds: int) -> dict[str, Any]:
     """Measures plans of the car, forward, among random discs, between poses that are half the side apart or more."""
-    footprint, tried = robot_of(SCENARIO)[0], []
+    footprint, tried = Vehicle.of(SCENARIO).footprint, []
     for seed in range(worlds):
         random = np.random.default_rng(seed)
         outlines = Surroundings(_discs(random, DISCS, SIDE, 0.2, 1.0)).at(0.0)

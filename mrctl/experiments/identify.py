@@ -256,7 +256,7 @@ def excite(plant: Plant, robot: Robot, sensing: Sensing, random: np.random.Gener
     for k in trange(ticks + 1, unit="tick", unit_scale=True, desc="turning" if turns else "straight on"):
         sensors.measure(k, plant.state)
         samples[k] = sensors.ring[k % len(sensors.ring)]
-        voltage[k], current[k] = plant.applied, plant.current()  # of the tick that ends
+        voltage[k], current[k] = plant.applied, plant.current  # of the tick that ends
         common, differential = period[k % len(period)].T
         command[:, 0], command[:, 1] = common - differential, common + differential
         plant.step(command)

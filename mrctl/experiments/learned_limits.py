@@ -29,7 +29,7 @@ from mrctl.loop.simulation import arranged, simulate
 from mrctl.navigation.generators import corridor
 from mrctl.navigation.mission import PATIENCE, SLIM, planned, reached
 from mrctl.navigation.planning import Plan
-from mrctl.navigation.vehicle import robot_of
+from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority
 from mrctl.results.dataset import scenarios_of
@@ -82,16 +82,16 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
         InputError: The robot does not fit most corridors.
     """
     count = DRAWS[mode]
-    corners, robot = robot_of(base)
-    width, speed = ROOMY * float(np.ptp(corners[:, 1])), RESERVE * robot.max_speed
+    vehicle = Vehicle.of(base)
+    width, speed = ROOMY * vehicle.width, RESERVE * vehicle.robot.max_speed
     complaint = f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m"
-    draws = drawn(partial(draw, base, width, speed), count, complaint)
+    draws = drawn(partial(draw, vehicle, width, speed), count, complaint)
     left = sum(plant not in journal for plant in PLANTS) * (1 + len(LIMITS))
     expected = journal.expected(left * sum(one.reference.period for one in draws) / PACE, left // (1 + len(LIMITS)))
     print(f"{left * count} runs with nominal and with learned limits, {expected}", flush=True)
     own = base.replace(**FEEDFORWARDS["model+composite"], laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
     parts = [
-        Computation(plant, partial(_fed, own.replace(perturbation=perturbation), draws, robot, speed))
+        Computation(plant, partial(_fed, own.replace(perturbation=perturbation), draws, vehicle.robot, speed))
         for plant, perturbation in PLANTS.items()
     ]
     return {
@@ -100,11 +100,11 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     }
 
 
-def draw(base: Scenario, width: float, speed: float, seed: int) -> Draw | None:
+def draw(vehicle: Vehicle, width: float, speed: float, seed: int) -> Draw | None:
     """Makes a corridor and plans a way through it; None where there is no way."""
     task = corridor(width, seed, **SHAPE)
     with suppress(InputError):
-        return Draw(seed, *planned(task, base, speed, SLIM), task.goal)
+        return Draw(seed, *planned(task, vehicle, speed, SLIM), task.goal)
 
 
 def _fed(perturbed: Scenario, draws: Sequence[Draw], robot: Robot, speed: float, threads: int) -> dict[str, list[Run]]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from mrctl.experiments.tables import json_text, markdown, number, output_folder, write_json
-from mrctl.navigation.mission import Avoid, Mission, Order, again, navigate, order_of, task_of
+from mrctl.navigation.mission import Mission, Order, order_of
 from mrctl.results import plots
 from mrctl.results.dataset import departure, open_result, save, versions
-from mrctl.scenario import FeedforwardName, Scenario
-from mrctl.theory.obstacles import Pose
 
 COLUMNS = {
     "time": ("time, s", 1.0),
@@ -29,31 +26,12 @@ FILES = ["result.zarr", "mission.json", *(file for draw in FIGURES for file in p
 """Names of the files that a mission is saved in."""
 
 
-def run(
-    world: str,
-    scenario: Scenario,
-    goal: Pose | None,
-    start: Pose | None,
-    known: str | None,
-    compare: Sequence[FeedforwardName],
-    speed: float | None,
-    margin: float,
-    avoid: Avoid,
-    out: Path | None,
-    as_json: bool,
-) -> tuple[str, str]:
+def run(world: str, order: Order, out: Path | None, as_json: bool) -> tuple[str, str]:
     """Drives a mission.
 
     Args:
-        world: World of the mission; see `mrctl.navigation.mission.task_of`, also for start, goal and `known`.
-        scenario: Scenario of the robots; see `mrctl.navigation.mission.navigate`, also for `compare` to `avoid`.
-        goal: Pose of the goal in m, m, rad, or None.
-        start: Pose of the start in m, m, rad, or None.
-        known: File of the robot's map, or None.
-        compare: Further feedforwards.
-        speed: Largest speed in m/s, or None.
-        margin: Clearance of the plan in m.
-        avoid: What keeps the robot from obstacles.
+        world: Name of its world, for the report.
+        order: The mission.
         out: Folder for `result.zarr`, `mission.json` and figures; None saves nothing.
         as_json: Whether to return JSON instead of a table.
 
@@ -61,12 +39,10 @@ def run(
         The report, with a row for each robot; and the outcome of the first robot.
 
     Raises:
-        InputError: As `task_of` and `navigate`, or the folder cannot be written or holds a result already.
+        InputError: As `navigate`, or the folder cannot be written or holds a result already.
     """
     with output_folder(out, FILES):
-        task = task_of(world, scenario, start, goal, known)
-        driven = navigate(task, scenario, compare, speed, margin, avoid, progress=True)
-    order = Order(task=task, scenario=scenario, compare=tuple(compare), speed=speed, margin=margin, avoid=avoid)
+        driven = order.drive(progress=True)
     return _report(world, order, driven, out, as_json)
 
 
@@ -82,11 +58,12 @@ def repeat(folder: Path, out: Path | None, as_json: bool) -> tuple[str, str, str
         What `run` returns; and in which signal the mission departs from the saved one, or "".
 
     Raises:
-        InputError: As `again`, or the folder has no result, or `out` cannot be written or holds a result already.
+        InputError: As `mrctl.navigation.mission.again`; or the folder has no result; or `out` cannot be written or
+            holds one already.
     """
     with output_folder(out, FILES):
         order, saved = order_of(folder), open_result(folder / "result.zarr")
-        driven = again(folder, progress=True)
+        driven = order.drive(progress=True)
     text, outcome = _report(str(folder), order, driven, out, as_json)
     return text, outcome, departure(driven.result, saved)
 

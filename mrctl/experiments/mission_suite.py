@@ -30,7 +30,7 @@ from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import simulate
 from mrctl.navigation.generators import corridor, corridor_width
 from mrctl.navigation.mission import PATIENCE, planned
-from mrctl.navigation.vehicle import robot_of
+from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import quantile_interval, superiority
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario, replicates
@@ -103,11 +103,11 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
         InputError: The robot does not fit most corridors.
     """
     count = DRAWS[mode]
-    corners, robot = robot_of(base)
-    width = ROOMY * float(np.ptp(corners[:, 1]))
-    speeds = [share * robot.max_speed for share in SPEEDS]
+    vehicle = Vehicle.of(base)
+    width = ROOMY * vehicle.width
+    speeds = [share * vehicle.robot.max_speed for share in SPEEDS]
     complaint = f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m"
-    draws = drawn(lambda seed: draw(base, seed, width, speeds), count, complaint)
+    draws = drawn(lambda seed: draw(vehicle, seed, width, speeds), count, complaint)
     size, shares = (len(CONTROLLERS), len(PLANTS), count), [*SPEEDS, "true posture"]
     times = [sum(one.references[k].period for one in draws) for k in (*range(len(SPEEDS)), -1)]
     cases = [(c, k) for c in range(len(CONTROLLERS)) for k in range(len(shares))]
@@ -120,7 +120,7 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
         own, speed = base.replace(**FEEDFORWARDS[CONTROLLERS[c]]), k
         if k == len(SPEEDS):
             own, speed = own.replace(sensing=own.sensing.replace(estimator="truth")), -1
-        tasks.append(Computation([CONTROLLERS[c], shares[k]], partial(_driven, own, draws, speed, corners)))
+        tasks.append(Computation([CONTROLLERS[c], shares[k]], partial(_driven, own, draws, speed, vehicle.footprint)))
     for (c, k), driven in zip(cases, journal.results(tasks), strict=True):
         widths = np.array(driven, float)
         if k == len(SPEEDS):
@@ -131,7 +131,7 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     for one in draws:
         fastest = one.references[-1]
         poses = fastest.sample(np.arange(0, fastest.period, 0.02)).pose
-        plans.append(corridor_width(corners, poses, one.seed, **SHAPE))
+        plans.append(corridor_width(vehicle.footprint, poses, one.seed, **SHAPE))
     return Found(needed, off, known, on_reference, np.array(plans), speeds, draws[-1].seed + 1 - count)
 
 
@@ -152,11 +152,11 @@ def drawn(make: Callable[[int], T | None], count: int, complaint: str) -> list[T
     return found
 
 
-def draw(base: Scenario, seed: int, width: float, speeds: Sequence[float]) -> Draw | None:
+def draw(vehicle: Vehicle, seed: int, width: float, speeds: Sequence[float]) -> Draw | None:
     """Plans a draw once, with the largest margin that there is a plan for, and times it for each speed.
 
     Args:
-        base: The robot.
+        vehicle: The robot.
         seed: Seed of the corridor, and of the robot on that day.
         width: Width of the corridor in m.
         speeds: Largest speeds in m/s.
@@ -164,11 +164,11 @@ def draw(base: Scenario, seed: int, width: float, speeds: Sequence[float]) -> Dr
     Returns:
         The draw, or None where no plan goes through the corridor.
     """
-    limits = Limits.of(robot_of(base)[1])
+    limits = Limits.of(vehicle.robot)
     task, rest = corridor(width, seed, **SHAPE), width * (1 - 1 / ROOMY)
     for share in MARGINS:
         try:
-            found, fastest = planned(task, base, speeds[-1], share * rest / 2)
+            found, fastest = planned(task, vehicle, speeds[-1], share * rest / 2)
         except InputError:
             continue
         return Draw(seed, [*(found.reference(speed, limits) for speed in speeds[:-1]), fastest], task.goal)

@@ -26,7 +26,7 @@ from mrctl.loop.simulation import simulate
 from mrctl.navigation.generators import Task, slalom
 from mrctl.navigation.mission import PATIENCE, PERIOD, avoiding, outcomes, prepared
 from mrctl.navigation.planning import Plan
-from mrctl.navigation.vehicle import robot_of
+from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority
 from mrctl.results.metrics import control_period
@@ -145,13 +145,13 @@ def world(base: Scenario, seed: int) -> World | None:
     A disc crosses the middle line of the slalom at about the time at which a robot is there that drives along it at 0.9
     of its largest speed.
     """
-    corners, robot = robot_of(base)
-    still, random = slalom(2 * float(np.ptp(corners[:, 1])), seed, GATES, SPACING), np.random.default_rng([seed, 1])
+    vehicle = Vehicle.of(base)
+    still, random = slalom(2 * vehicle.width, seed, GATES, SPACING), np.random.default_rng([seed, 1])
     movers = []
     for way in CROSSINGS:
         x, late = way + random.uniform(-0.5, 0.5), random.uniform(-0.5, 0.5)
         speed, heading = random.uniform(0.3, 0.9), random.choice([-1, 1]) * np.pi / 2 + random.uniform(-0.5, 0.5)
-        behind = speed * (x / (RESERVE * robot.max_speed) + late)
+        behind = speed * (x / (RESERVE * vehicle.robot.max_speed) + late)
         at = x * np.exp(-1j * heading) - behind  # as the disc counts, from the pose of its course
         movers.append(Disc(x=at.real, y=at.imag, radius=RADIUS, course=Line(heading=heading, speed=speed)))
     task = Task(obstacles=Obstacles(shapes=(*still.obstacles.shapes, *movers)), start=still.start, goal=still.goal)

@@ -63,9 +63,9 @@ def drive(scenarios: Sequence[Scenario], coefficients: Array | None, threads: in
     prior = hierarchy.prior.rows
     if coefficients is not None:
         prior["c"] = coefficients
-        motion = hierarchy.command.copy(), hierarchy.derivative.copy()
         # Starts anew, because these coefficients leave another voltage to the PID's integral.
-        hierarchy.reset(*motion, simulation.plant.reading["steering_angle"])
+        goal, _ = simulation.courses.at(0)
+        hierarchy.reset(goal["twist"], goal["acceleration"], simulation.plant.reading["steering_angle"])
     gram, seen = np.zeros((len(scenarios), 8, 8)), np.zeros((len(scenarios), 8, 2))
     while simulation.running:
         simulation.step()

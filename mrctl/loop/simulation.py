@@ -525,7 +525,7 @@ class Simulation:
         }
 
     def _gains(self) -> dict[str, Any]:
-        """Variables with the present gains of the controllers."""
+        """Variables with the gains of the controllers before any event."""
         gains = {}
         for name, (unit, meaning) in dataset.GAINS.items():
             values = self.hierarchy.gains[name].copy()

@@ -46,12 +46,12 @@ def parts(name: str) -> list[Part]:
         InputError: The name is not of the form above, names an unknown stage or a stage twice, or a file is missing.
     """
     found: list[Part] = []
-    for part in re.split(r",(?![^(]*\))", name):
-        place, _, call = part.rpartition(":")
-        before, separator, file = place.partition("=")
-        stage, file = (before, file) if separator else ("feedforward", place)
+    for part in re.split(r",(?=[^,]*\.py:)", name):
+        place, _, call = part.partition(".py:")
+        stage, separator, file = f"{place}.py".partition("=")
+        stage, file = (stage, file) if separator else ("feedforward", f"{place}.py")
         attribute, settings = _called(call)
-        if not file.endswith(".py") or not attribute:
+        if not attribute:
             raise InputError(f"controller: {part!r} is not of the form my_file.py:MyController")
         if stage not in METHODS:
             raise InputError(f"controller: {stage!r} is not a stage; there are {', '.join(METHODS)}")

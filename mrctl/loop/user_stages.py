@@ -111,6 +111,8 @@ class UserStage:
             StageError: The answer is not an array of numbers.
         """
         try:
+            if np.iscomplexobj(np.asarray(answer)):
+                raise TypeError("the numbers are complex")
             return np.asarray(answer, float)
         except Exception as error:  # noqa: BLE001
             raise self._raised(error) from error

@@ -173,7 +173,7 @@ def doorway(width: float, seed: int = 0, room: float = 4.0) -> Task:
     Args:
         width: Width of the door in m.
         seed: Seed of the door's place and of the start and the goal.
-        room: Side of a room in m.
+        room: Side of a room in m, from middle to middle of its walls.
 
     Raises:
         InputError: The door is wider than half a room.
@@ -214,7 +214,7 @@ def warehouse(
     """Makes rows of shelves with aisles all around them, in a hall with walls; a shelf is missing with probability 0.1.
 
     Args:
-        aisle: Width of the aisles in m.
+        aisle: Width of the aisles between the shelves in m; along the walls it ends in the middle of the wall.
         seed: Seed of the missing shelves, and of the aisles of start and goal.
         rows: Number of rows of shelves, across y.
         columns: Number of shelves in a row.

@@ -25,7 +25,7 @@ from mrctl.navigation.pacing import Pacing
 from mrctl.navigation.planning import NoWay, Plan, least_clearance, plan, run_out, shortcut, space
 from mrctl.navigation.replanning import open_waypoints
 from mrctl.navigation.sdf import read_sdf
-from mrctl.navigation.vehicle import reverses, robot_of
+from mrctl.navigation.vehicle import Vehicle
 from mrctl.navigation.window import Window
 from mrctl.record import InputError, Record, read_file
 from mrctl.results.metrics import as_runs, control_period
@@ -105,6 +105,10 @@ class Order(Record):
     avoid: Avoid = "none"
     """Law that keeps the robot from obstacles that its map does not have."""
 
+    def drive(self, progress: bool = False) -> Mission:
+        """Drives the mission; see `navigate`."""
+        return navigate(**{name: getattr(self, name) for name in type(self).model_fields}, progress=progress)
+
 
 def order_of(folder: str | Path) -> Order:
     """Reads the order of a mission that was driven.
@@ -128,8 +132,7 @@ def order_of(folder: str | Path) -> Order:
 
 def again(folder: str | Path, progress: bool = False) -> Mission:
     """Drives a saved mission again, with the same bits; arguments and errors are those of `order_of` and `navigate`."""
-    order = order_of(folder)
-    return navigate(**{name: getattr(order, name) for name in Order.model_fields}, progress=progress)
+    return order_of(folder).drive(progress)
 
 
 def task_of(
@@ -156,8 +159,8 @@ def task_of(
     if colon and name in GENERATORS:
         if not (seed.isdecimal() and len(seed) < 10):
             raise InputError(f"world: {world}: the seed must be a whole number from 0 to 999999999, as in {name}:3")
-        length, width = np.ptp(robot_of(scenario)[0], axis=0).tolist()
-        made = GENERATORS[name](length, width, int(seed))
+        vehicle = Vehicle.of(scenario)
+        made = GENERATORS[name](vehicle.length, vehicle.width, int(seed))
         return made.replace(start=start or made.start, goal=goal or made.goal, map=chart)
     obstacles = obstacles_of(world, "world", f" nor a generator with a seed, such as {':3, '.join(GENERATORS)}:3")
     if goal is None:
@@ -211,9 +214,15 @@ def navigate(
         progress: Whether to show a progress bar.
 
     Raises:
-        InputError: The margin is out of range, start or goal is within it of an obstacle or off the map, the robot is
-            at its goal, there is no way, or the robot cannot drive the plan or would touch an obstacle on it.
+        InputError: The task is none, there is no such feedforward, the margin is out of range, start or goal is within
+            it of an obstacle or off the map, the robot is at its goal, there is no way, or the robot cannot drive the
+            plan or would touch an obstacle on it.
     """
+    if not isinstance(task, Task):
+        raise InputError(f"task: must be a world with start and goal, such as `task_of` makes, not {task!r:.60}")
+    for name in compare:
+        if name not in FEEDFORWARDS:
+            raise InputError(f"compare: {name!r} is none of {', '.join(FEEDFORWARDS)}")
     began = perf_counter()
     found, own = prepared(task, scenario, speed, margin, avoid)
     planning_time = perf_counter() - began
@@ -236,13 +245,14 @@ def prepared(
 
     The plan is made for a robot that drives with a twist at its start, V in m/s and θ̇ in rad/s; see `planned`.
     """
-    reactive, backwards = avoid in REACTIVE, reverses(scenario)
+    reactive, vehicle = avoid in REACTIVE, Vehicle.of(scenario)
+    backwards = vehicle.reverses and not reactive
     try:
-        found, reference = planned(task, scenario, speed, margin, None, backwards and not reactive, twist, not reactive)
+        found, reference = planned(task, vehicle, speed, margin, None, backwards, twist, not reactive)
     except NoWay:
-        if not (reactive and backwards):
+        if not (reactive and vehicle.reverses):
             raise
-        planned(task, scenario, speed, margin, reverse=True)  # raises, too, if there is no way in reverse
+        planned(task, vehicle, speed, margin, reverse=True)  # raises, too, if there is no way in reverse
         raise InputError(f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may") from None
     laps = PATIENCE if avoid == "none" else WAITING
     own = {"obstacles": task.obstacles, "map": task.map, "reference": reference, "laps": laps}
@@ -265,14 +275,14 @@ def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] |
         return None
 
     def replan(
-        scenario: Scenario, pose: Array, twist: Array, outlines: Outlines, given: Waypoints | None
+        scenario: Scenario, vehicle: Vehicle, pose: Array, twist: Array, outlines: Outlines, given: Waypoints | None
     ) -> Waypoints | None:
         plan = open_waypoints(scenario.reference)
         goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
         start = Task.from_dict({"obstacles": scenario.known, "start": pose.tolist(), "goal": goal})
         with contextlib.suppress(InputError):  # it waits, and tries again
             keeps, now = avoid not in REACTIVE, (float(twist[0]), float(twist[1]))
-            return planned(start, scenario, plan.speed, SLIM, outlines, keeps and reverses(scenario), now, keeps)[1]
+            return planned(start, vehicle, plan.speed, SLIM, outlines, keeps and vehicle.reverses, now, keeps)[1]
 
     def made(robot: Robot, size: int) -> Pacing | Window | Mppi:
         if avoid == "barrier":
@@ -291,7 +301,7 @@ def end_of(plan: Waypoints) -> Pose:
 
 def planned(
     task: Task,
-    scenario: Scenario,
+    vehicle: Vehicle,
     speed: float | None,
     margin: float,
     outlines: Outlines | None = None,
@@ -315,23 +325,22 @@ def planned(
         raise InputError("goal: the robot starts there")
     if not 0 <= margin <= 10:
         raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
-    corners, robot = robot_of(scenario)
-    if speed is not None and not 0 < speed <= robot.max_speed:
-        raise InputError(f"speed: must be above 0 and at most {robot.max_speed:g} m/s, not {speed:g}")
-    speed = RESERVE * robot.max_speed if speed is None else speed
+    fastest = vehicle.robot.max_speed
+    if speed is not None and not 0 < speed <= fastest:
+        raise InputError(f"speed: must be above 0 and at most {fastest:g} m/s, not {speed:g}")
+    speed = RESERVE * fastest if speed is None else speed
     outlines = Surroundings(task.known).at(0.0) if outlines is None else outlines
     try:
-        return _planned(task, corners, robot, speed, margin, outlines, False, twist, keeps)
+        return _planned(task, vehicle, speed, margin, outlines, False, twist, keeps)
     except InputError:  # there is no way, or none that the robot can drive
         if not reverse:
             raise
-        return _planned(task, corners, robot, speed, margin, outlines, True, twist, keeps)
+        return _planned(task, vehicle, speed, margin, outlines, True, twist, keeps)
 
 
 def _planned(
     task: Task,
-    corners: Array,
-    robot: Robot,
+    vehicle: Vehicle,
     speed: float,
     margin: float,
     outlines: Outlines,
@@ -343,8 +352,7 @@ def _planned(
 
     Args:
         task: World, start and goal.
-        corners: Corners of the robot in its frame in m, `(n, 2)`.
-        robot: The robot.
+        vehicle: The robot.
         speed: Largest speed in m/s.
         margin: Clearance that the plan keeps in m.
         outlines: The obstacles.
@@ -357,7 +365,7 @@ def _planned(
         InputError: Start or goal is within the margin of an obstacle, or the robot cannot drive the plan, or would
             touch an obstacle on it.
     """
-    known = task.known
+    known, (corners, robot, _) = task.known, vehicle
     radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (
         WIDER if reverse else 1
     )
@@ -371,7 +379,7 @@ def _planned(
     low, high = ends.min(axis=0) - 3 * radius, ends.max(axis=0) + 3 * radius  # room to turn
     if known.shapes:
         low, high = np.minimum(low, known.bounds[0]), np.maximum(high, known.bounds[1])
-    where = space(outlines, corners, low, high, cell=float(np.ptp(corners[:, 1])) / CELLS, margin=margin)
+    where = space(outlines, corners, low, high, cell=vehicle.width / CELLS, margin=margin)
 
     def attempt(radius: float, arc: Array, curvature: float) -> tuple[Plan, Waypoints]:
         found = plan(where, arc[-1], goal, radius, reverse)

@@ -90,7 +90,7 @@ class Pacing:
         """Takes the missions of the robots, with their maps and with their plans as references."""
         self._follow, self._scenarios = Following(self._robot, scenarios), scenarios
         self._planners = Planner.each(self._replan, scenarios)
-        self._footprint = self._planners[0].footprint
+        self._footprint = self._planners[0].vehicle.footprint
         self._near, self._away = self._barrier(-RIM), self._barrier(AWAY)
 
     def _barrier(self, margin: float) -> Barrier:

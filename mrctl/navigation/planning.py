@@ -218,16 +218,17 @@ def plan(where: Space, start: Array, goal: Array, radius: float, reverse: bool, 
         if np.any(pose[:2] < low) or np.any(pose[:2] >= high):
             raise InputError(f"{name}: {place} is off the map, which goes from {low.round(2)} to {high.round(2)}")
         if (free := clearance(where.footprint, pose, where.outlines)) <= where.margin:
-            found = "is in an obstacle" if free <= 0 else f"is {free:.3f} m from an obstacle, within the margin"
-            raise InputError(f"{name}: the robot {found} at {place}")
+            near = f"is {free:.3f} m from an obstacle, within the margin of {where.margin:g} m"
+            raise InputError(f"{name}: the robot {'is in an obstacle' if free <= 0 else near} at {place}")
     ahead = cost_to_go(where, goal)
     step = max(1.5 * where.field.resolution, radius * 2 * np.pi / HEADINGS)
     tree = Tree(np.empty((most, 3)), np.empty(most, np.int64), *np.empty((5, most)))
     best = np.zeros((*ahead.shape, HEADINGS, 3 if reverse else 1), np.int32)  # here memory is taken when it is written
     found, made, expanded = search.compiled(start, goal, float(radius), step, reverse, ahead, where, best, tree)
     if found < 0:
-        why = "there is none" if found == -1 else f"{most:,} poses were not enough"
-        raise NoWay(f"goal: no way to ({goal[0]:.2f}, {goal[1]:.2f}) was found; {why}")
+        place = f"({goal[0]:.2f}, {goal[1]:.2f})"
+        few = f"no way to {place} was found with {most:,} poses"
+        raise NoWay(f"goal: {f'there is no way to {place}' if found == -1 else few}")
     return _traced(tree, int(made), int(found), radius, reverse, int(expanded))
 
 

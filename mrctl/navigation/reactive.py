@@ -14,7 +14,6 @@ from mrctl.navigation.replanning import SHORTER, Planner, Replan
 from mrctl.navigation.rollouts import KEPT, STEPS, Bounds, Considered, Scene
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.trail import Trail
-from mrctl.navigation.vehicle import reverses
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import cover
 from mrctl.theory.grid import Field, near_field
@@ -45,7 +44,7 @@ class Agent:
     """
 
     def __init__(
-        self, planner: Planner, bounds: Bounds, discs: Array, reverses: bool, field: Field, start: Array, period: float
+        self, planner: Planner, bounds: Bounds, discs: Array, field: Field, start: Array, period: float
     ) -> None:
         """Starts a run.
 
@@ -53,12 +52,11 @@ class Agent:
             planner: Its mission, and what it knows.
             bounds: What twists it can drive.
             discs: Discs that cover it, as in `Scene`.
-            reverses: Whether it can be driven backwards.
             field: Distance from the map around its first plan.
             start: x and y in m where it is, `(2,)`.
             period: Motion period in s.
         """
-        self._planner, self._bounds, self._discs, self._reverses = planner, bounds, discs, reverses
+        self._planner, self._bounds, self._discs = planner, bounds, discs
         self._field, self._reach, self._period = field, reach(discs), period
         self.last = np.zeros(2)
         self._table, self._place, self._away = self._sampled(planner.first), 0, 0.0  # its plan, and its place on that
@@ -68,7 +66,7 @@ class Agent:
         self._anchor, self._since = start.copy(), 0.0  # where it last was when it had got on, and when
         self._replanned = False  # whether it has made another plan since
         self._arrived = np.inf  # when it arrived at the end of its plan
-        self._trail = Trail(planner.footprint, min(BACK[1], bounds.speed / 2), bounds.curvature)
+        self._trail = Trail(planner.vehicle.footprint, min(BACK[1], bounds.speed / 2), bounds.curvature)
         self._pieces = 0  # of the way back from `_anchor`, while it goes back
         self._approached = False  # whether it has gone back from a goal at which it did not arrive
 
@@ -195,8 +193,8 @@ class Agent:
 
     def _may_go_back(self, now: float) -> bool:
         """Tells whether it could go back a piece: not where what moves may let it pass, nor twice from a goal."""
-        alone = not len(self._planner.sight.moving(now).discs)
-        return self._reverses and alone and self._pieces < PIECES and not (self._near_end and self._approached)
+        can = self._planner.vehicle.reverses and not len(self._planner.sight.moving(now).discs)
+        return can and self._pieces < PIECES and not (self._near_end and self._approached)
 
     def _back(self, pose: Array, now: float) -> bool:
         """Lets `last` be the twist with which it goes back; returns whether it can."""
@@ -253,20 +251,20 @@ class Reactive(ABC):
 
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Takes the missions of the robots, with their maps and with their plans as references."""
-        self._planners, self._reverses = Planner.each(self._replan, scenarios), reverses(scenarios[0])
+        self._planners = Planner.each(self._replan, scenarios)
         self.bounds = [Bounds.of(self._robot, planner.first.speed) for planner in self._planners]
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         self._period, self._tick, self._agents = period, 0, []
         self.considered: list[Considered | None] = [None] * self._size
-        discs, fields = cover(self._planners[0].footprint, DISCS), dict[Hashable, Field]()
+        discs, fields = cover(self._planners[0].vehicle.footprint, DISCS), dict[Hashable, Field]()
         for planner, bounds, start in zip(self._planners, self.bounds, pose, strict=True):
             planner.reset()
             if (own := (planner.first, planner.scenario.known)) not in fields:
                 places = planner.first.sample(np.linspace(0, planner.first.period, 200)).pose[:, :2]
                 fields[own] = field_around(places, planner.sight, reach(discs))
-            self._agents.append(Agent(planner, bounds, discs, self._reverses, fields[own], start[:2], period))
+            self._agents.append(Agent(planner, bounds, discs, fields[own], start[:2], period))
 
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""

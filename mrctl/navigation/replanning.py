@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from mrctl.kernel import Array
 from mrctl.navigation.sight import Sight
-from mrctl.navigation.vehicle import robot_of
+from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.obstacles import Outlines
@@ -14,10 +14,10 @@ from mrctl.theory.references import Reference, Waypoints
 
 SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
 
-Replan = Callable[[Scenario, Array, Array, Outlines, Waypoints | None], Waypoints | None]
-"""Plans for the mission of a scenario, from a pose in m, m, rad, `(3,)`, and a twist in m/s and rad/s, `(2,)`, among
-obstacles as they are now, to the end of a plan that an event brought, or else to the goal of the mission; None where
-there is no way."""
+Replan = Callable[[Scenario, Vehicle, Array, Array, Outlines, Waypoints | None], Waypoints | None]
+"""Plans for the mission of a scenario with its robot, from a pose in m, m, rad, `(3,)`, and a twist in m/s and rad/s,
+`(2,)`, among obstacles as they are now, to the end of a plan that an event brought, or else to the goal of the mission;
+None where there is no way."""
 
 
 def open_waypoints(reference: Reference) -> Waypoints:
@@ -38,24 +38,24 @@ class Planner:
         scenario: The mission.
         first: The plan of the mission.
         sight: What the robot knows of its surroundings.
-        footprint: Its corners in its frame in m, `(n, 2)`.
+        vehicle: What its plans need to know of the robot itself.
     """
 
-    def __init__(self, replan: Replan, scenario: Scenario, sight: Sight, footprint: Array) -> None:
+    def __init__(self, replan: Replan, scenario: Scenario, sight: Sight, vehicle: Vehicle) -> None:
         """Takes what makes plans, and the attributes.
 
         Raises:
             InputError: The reference of the scenario is no plan.
         """
         self.scenario, self.first = scenario, open_waypoints(scenario.reference)
-        self.sight, self.footprint, self._replan = sight, footprint, replan
+        self.sight, self.vehicle, self._replan = sight, vehicle, replan
         self._given: Waypoints | None = None  # the plan that came since the start
 
     @classmethod
     def each(cls, replan: Replan, scenarios: Sequence[Scenario]) -> list[Planner]:
-        """Makes the planner of each robot of a batch, in which all have the same footprint."""
-        footprint, sights = robot_of(scenarios[0])[0], Sight.each(scenarios)
-        return [cls(replan, *own, footprint) for own in zip(scenarios, sights, strict=True)]
+        """Makes the planner of each robot of a batch, in which all are of the same kind."""
+        vehicle, sights = Vehicle.of(scenarios[0]), Sight.each(scenarios)
+        return [cls(replan, *own, vehicle) for own in zip(scenarios, sights, strict=True)]
 
     def reset(self) -> None:
         """Forgets the plan that was taken, and all that scans have shown."""
@@ -83,6 +83,6 @@ class Planner:
         Returns:
             The plan, or None where there is no way.
         """
-        start = self.scenario, pose, twist
-        far = self._replan(*start, self.sight.around(time, self.footprint, pose), self._given)
+        start = self.scenario, self.vehicle, pose, twist
+        far = self._replan(*start, self.sight.around(time, self.vehicle.footprint, pose), self._given)
         return far or self._replan(*start, self.sight.outlines(time), self._given)

@@ -7,8 +7,8 @@ scan. A cluster is followed from scan to scan by its centre c, and an α–β fi
 
 The centre of what is seen also shifts while a robot drives past something that stands, or sees it come out from behind
 something else. A cluster therefore begins to count as moving when it occupies a place through which beams passed a
-moment ago, and stops when it is slow. Its velocity is kept while something hides a part of it, or for a moment all of
-it.
+moment ago, and stops when it is slow. Its velocity is kept while something, or the end of the view, hides a part of
+it, or for a moment all of it.
 
 A cluster becomes a row of small discs along its points, which go on with its velocity until the next scan. Discs that a
 scan does not show are remembered as long as something may hide them, those that move for a moment.
@@ -56,7 +56,7 @@ class Cluster(NamedTuple):
     moves: bool
     """Whether it moves."""
     whole: bool
-    """Whether nothing hides a part of it."""
+    """Whether nothing hides a part of it, and all of it is in the view of the lidar."""
 
 
 class Sight:
@@ -160,9 +160,14 @@ class Sight:
         return self.outlines(time, min(ROUND, max(0.0, left)))
 
     def _unknown(self, scan: Scan) -> list[tuple[Array, bool]]:
-        """Returns the points of each cluster beside the map in m, `(k, 2)`, and whether nothing hides a part of it."""
+        """Returns the points of each cluster beside the map in m, `(k, 2)`, and whether the lidar sees its whole front.
+
+        It does not where something nearer hides a part, or where the view of the lidar ends.
+        """
         ranges = scan.ranges
         met, points = np.flatnonzero(np.isfinite(ranges)), scan.points
+        blind = max(0, round(2 * np.pi / scan.step) - len(ranges))  # beams that are missing to a full turn
+        ranges = np.append(ranges, np.zeros(blind))
         if self._field is not None:
             away = np.empty(len(points))
             from_map.compiled(self._field, points, away)

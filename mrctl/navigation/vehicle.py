@@ -1,6 +1,10 @@
-"""The robot of a scenario as planners and avoiders see it: its outline, its parameters, and whether it reverses."""
+"""The robot of a scenario as planners and avoiders see it."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.physics import mjcf
@@ -9,13 +13,28 @@ from mrctl.scenario import Scenario
 from mrctl.theory.robot import Robot
 
 
-def robot_of(scenario: Scenario) -> tuple[Array, Robot]:
-    """Returns the footprint of a scenario's robot, corners in m, `(n, 2)`, and its parameters."""
-    model, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
-    return footprint(model), robot
+class Vehicle(NamedTuple):
+    """A robot on the plane."""
 
+    footprint: Array
+    """Corners of its outline in its frame in m, counter-clockwise, `(n, 2)`."""
+    robot: Robot
+    """Its nominal parameters."""
+    reverses: bool
+    """Whether it can be driven backwards."""
 
-def reverses(scenario: Scenario) -> bool:
-    """Tells whether a scenario's robot can be driven backwards."""
-    model, _ = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
-    return mjcf.reverses(model, scenario.steering)
+    @property
+    def length(self) -> float:
+        """Length in m."""
+        return float(np.ptp(self.footprint[:, 0]))
+
+    @property
+    def width(self) -> float:
+        """Width in m."""
+        return float(np.ptp(self.footprint[:, 1]))
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Vehicle:
+        """Returns the robot of a scenario."""
+        model, robot = mjcf.build(scenario.world, scenario.steering, robot=scenario.robot)
+        return cls(footprint(model), robot, mjcf.reverses(model, scenario.steering))

@@ -12,7 +12,7 @@ import numpy as np
 
 from mrctl.kernel import Array, Row
 from mrctl.physics import mjcf
-from mrctl.physics.readout import READING, addresses, inputs, motor_current, motor_parameters, read
+from mrctl.physics.readout import READING, addresses, current_limits, inputs, motor_parameters, read
 from mrctl.theory.robot import CAR, RobotFile, Steering
 
 with warnings.catch_warnings():  # without a display dm_control tries GLFW first, which warns
@@ -68,12 +68,10 @@ class CarPhysics(dm_mujoco.Physics):
     def motor_current(self) -> Array:
         """Returns the armature currents left and right in A, `(2,)`.
 
-        They are (U − k_E N ω)/R_a, or the current states of motors with inductance.
+        They are (U − k_E N ω)/R_a, or the current states of motors with inductance, within the limit of the drivers.
         """
-        model = self.model.ptr
-        return motor_current(
-            self.data.ctrl[None, inputs(model)[:2]],
-            self.wheel_rates()[None],
-            np.ascontiguousarray(self.data.act)[None],
-            *motor_parameters(model),
-        )[0]
+        model, data = self.model.ptr, self.data
+        resistance, back_emf, states = motor_parameters(model)
+        free = (data.ctrl[inputs(model)[:2]] - back_emf * self.wheel_rates()) / resistance
+        limit = current_limits(model)
+        return np.clip(data.act[states] if states else free, -limit, limit)

@@ -155,12 +155,13 @@ class Plant(ABC):
     """B robots in physics. A robot that fails stops, and keeps its last state, while the others go on.
 
     Attributes:
-        state: One record of `PLANT` for each robot; `reading`, `applied` and `failed` are views of it.
+        state: One record of `PLANT` for each robot; `reading`, `applied`, `current` and `failed` are views of it.
         models: The world of each robot with the nominal robot; where the obstacles are the same, so is the object.
         robot: The nominal robot, which is all that a controller may know.
         truth: The perturbed robots, for the prior `true_model`.
         reading: One record of `READING` for each robot, current after `reset` and `step`.
         applied: Voltages at the terminals, left and right, `(B, 2)` in V.
+        current: Armature currents left and right at the end of the last control period, `(B, 2)` in A.
         failed: Whether each robot has stopped, `(B,)`.
         failure: Why each robot failed, or "".
         running: Number of robots that have not failed.
@@ -185,7 +186,8 @@ class Plant(ABC):
         self.robot = robot
         self.truth = [robot] * size
         self.state = state = np.zeros(size, PLANT)
-        self.reading, self.applied, self.failed = state["reading"], state["applied"], state["failed"]
+        self.reading, self.failed = state["reading"], state["failed"]
+        self.applied, self.current = state["applied"], state["current"]
         self.failure = [""] * size
         self.running = size
         self.models = list(models)
@@ -261,7 +263,7 @@ class Plant(ABC):
         self._write(robot, model)
         self.truth[robot] = read_robot(model, perturbation.supply_factor, self._scratch_data)
         resistance, back_emf, _ = motor_parameters(model)
-        self.state["resistance"][robot], self.state["back_emf"][robot] = resistance[0], back_emf[0]
+        self.state["resistance"][robot], self.state["back_emf"][robot] = resistance, back_emf
         self.state["delay"][robot] = delay
         rows = self.state["driver"]
         for name in ("dead_zone", "pwm_steps", "battery_resistance"):
@@ -392,10 +394,6 @@ class Plant(ABC):
         if not self.failed[robot]:
             self.failed[robot], self.failure[robot] = True, reason
             self.running -= 1
-
-    def current(self) -> Array:
-        """Returns the armature currents left and right at the end of the last control period in A, `(B, 2)`."""
-        return self.state["current"]
 
     def contacts(self, robot: int) -> Contacts:
         """Returns the contacts of one robot in its present state; the engine's own data remain as they are."""

@@ -110,12 +110,12 @@ def inputs(model: mujoco.MjModel) -> list[int]:
 
 
 def motor_parameters(model: mujoco.MjModel) -> tuple[Array, Array, list[int]]:
-    """Returns resistance `(1, 2)` in Ω, back-EMF per wheel rate `(1, 2)` in V·s/rad, addresses of current states."""
+    """Returns resistance `(2,)` in Ω, back-EMF per wheel rate `(2,)` in V·s/rad, addresses of current states."""
     motors = [model.actuator(name).id for name in MOTORS]
     resistance = model.actuator_gainprm[motors, 0]
     back_emf = model.actuator_gainprm[motors, 1] * model.actuator_gear[motors, 0]
     acts = [int(a) for a in model.actuator_actadr[motors] if a >= 0]
-    return resistance[None], back_emf[None], acts
+    return resistance, back_emf, acts
 
 
 def current_limits(model: mujoco.MjModel) -> Array:
@@ -123,10 +123,3 @@ def current_limits(model: mujoco.MjModel) -> Array:
     motors = [model.actuator(name).id for name in MOTORS]
     torque = np.where(model.actuator_forcelimited[motors], model.actuator_forcerange[motors, 1], np.inf)
     return torque / model.actuator_gainprm[motors, 1]
-
-
-def motor_current(
-    voltage: Array, rates: Array, act: Array, resistance: Array, back_emf: Array, acts: list[int]
-) -> Array:
-    """Computes armature currents `(B, 2)` in A from applied voltages, wheel rates and activations."""
-    return act[:, acts] if acts else (voltage - back_emf * rates) / resistance

@@ -262,12 +262,14 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     """Writes a result as a zarr store, whole or not at all.
 
     Raises:
-        InputError: The path exists or cannot be written.
+        InputError: The path exists, cannot be written, or is that of a file in another format.
     """
     check_kind(result)
     from zarr.codecs import Crc32cCodec, ZstdCodec  # imported here because a run that saves nothing needs no zarr
 
     path = Path(path)
+    if path.suffix in (".nc", ".h5"):
+        raise InputError(f"{path}: a result is saved as a folder in Zarr; result.to_netcdf(path) writes NetCDF")
     if path.exists():
         raise InputError(f"{path}: exists already, nothing was overwritten")
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")

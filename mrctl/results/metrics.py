@@ -7,6 +7,7 @@ held for one control period, so an integral over time is a sum times that period
 
 from __future__ import annotations
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -147,11 +148,15 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
 
     Raises:
         InputError: The result lacks a variable, or a lap is shorter than the control period.
+
+    A result that holds only some of the samples, as that of a decimated sweep, has approximate metrics, with a warning.
     """
     require(result, ("time", *SAMPLED))
     runs = as_runs(result)
     size = runs.sizes["run"]
     period = control_period(runs)
+    if (every := round(period / runs.attrs.get("control_period", period))) > 1:
+        warnings.warn(f"time: holds one of {every} samples, so that the metrics are approximate", stacklevel=2)
     narrow = runs[[name for name in ("x", "failed", "failure_time") if name in runs]]
     divisions = [laps_of(narrow.isel(run=row)) for row in range(size)]
     counts = [len(laps.edges) - 1 for laps in divisions]

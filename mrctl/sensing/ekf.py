@@ -384,8 +384,8 @@ def step(t: int, ring: Rows, i: int, geometry: Row, period: float, delay: int, s
     if (t - start) * period < LOADING:
         jolt = max(jolt, LOAD)
     if now.grip[0] + now.grip[1] == 0:  # o is not observed, and its last correction would be integrated
-        for i in range(N):
-            s.P[OFFSET, i] = s.P[i, OFFSET] = 0.0
+        for n in range(N):
+            s.P[OFFSET, n] = s.P[n, OFFSET] = 0.0
         s.mean[OFFSET], s.P[OFFSET, OFFSET] = s.offset, START_OFFSET**2
     growth = geometry.load * now.acceleration[1]
     propagate(forward - s.mean[OFFSET], omega_dot, growth, jolt, now.grip, geometry, period, s)

@@ -196,16 +196,18 @@ class Sensing(Record):
         Raises:
             ValueError: A value that replaces the tier's is no whole number of control periods; the message names it.
         """
-        value = self[name]
-        if name.endswith("_rate"):
-            value = 1 / value if value else control_period
-        count = round(value / control_period)
+        value, rate = self[name], name.endswith("_rate")
+        time = (1 / value if value else control_period) if rate else value
+        count = round(time / control_period)
         if getattr(self, name) is None:
-            return max(count, 1 if value else 0)
-        if abs(count * control_period - value) > 1e-6 * control_period:
-            raise ValueError(
-                f"sensing.{name}: {value:g} s is not a whole multiple of control_period ({control_period:g} s)"
+            return max(count, 1 if time else 0)
+        if abs(count * control_period - time) > 1e-6 * control_period:
+            wrong = (
+                f"{value:g} Hz is no whole fraction of the control rate ({1 / control_period:g} Hz)"
+                if rate
+                else f"{value:g} s is not a whole multiple of control_period ({control_period:g} s)"
             )
+            raise ValueError(f"sensing.{name}: {wrong}")
         return count
 
     def loop_delay(self, control_period: float) -> int:

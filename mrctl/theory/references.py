@@ -470,7 +470,7 @@ def check(reference: Reference, robot: Robot, reverse: bool) -> None:
         InputError: The reference reverses or exceeds a limit; the message has the quantity, its peak, the time of the
             peak and the limit.
     """
-    _check(reference, robot, reverse)  # pyright: ignore[reportArgumentType] (frozen records are hashable)
+    _check(reference, robot, reverse)
 
 
 @lru_cache(1024)

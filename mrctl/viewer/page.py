@@ -339,4 +339,4 @@ def warning(text: str) -> str:
 
 def block(name: str, *lines: str) -> str:
     """Returns lines as an HTML block with the id `mrctl-NAME`."""
-    return f'<div style="margin:0.4em 1em;max-height:9em;overflow:auto" id="mrctl-{name}">{"<br>".join(lines)}</div>'
+    return f'<div style="margin:0.4em 1em;max-height:14em;overflow:auto" id="mrctl-{name}">{"<br>".join(lines)}</div>'

@@ -83,7 +83,7 @@ def lessons(robots: Sequence[Look], laps: Sequence[dict[str, Array]], error: Arr
     found = _table("mrctl-excitation", "excitation alone, last lap", robots, NAMES, excited)
     if error is not None:
         for k, channel in enumerate("ΣΔ"):
-            title = f"error of learned coefficient {channel}, V, {when}"
+            title = f"error of coefficient {channel}, prior and learner, V, {when}"
             found += _table(f"mrctl-coefficients-{k}", title, robots, NAMES, error[:, :, k].T)
     return found
 

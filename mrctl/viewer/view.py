@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mrctl.loop.simulation import simulate
-from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import Avoid
+from mrctl.navigation.mission import Order
 from mrctl.navigation.mission import prepared as prepare
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
@@ -46,25 +45,11 @@ def live(scenario: Scenario, compare: Sequence[FeedforwardName], export: Path | 
     print(f"page: {export}")
 
 
-def mission(
-    task: Task,
-    scenario: Scenario,
-    compare: Sequence[FeedforwardName],
-    speed: float | None,
-    margin: float,
-    avoid: Avoid,
-    host: str,
-    port: int,
-) -> None:
+def mission(order: Order, host: str, port: int) -> None:
     """Shows a mission live in the browser; at the goal the robots wait for another one.
 
     Args:
-        task: World, map, start and goal.
-        scenario: As in `mrctl.navigation.mission.navigate`.
-        compare: Feedforwards of the ghosts.
-        speed: Largest speed in m/s; by default 0.9 of the robot's.
-        margin: Clearance that the plan keeps in m.
-        avoid: What keeps the robots from obstacles that the map lacks or that move, as in `navigate`.
+        order: The mission; the further robots are ghosts.
         host: Address to listen on.
         port: Port to listen on.
 
@@ -73,10 +58,10 @@ def mission(
     """
     from mrctl.viewer.live import Live
 
-    plan, own = prepare(task, scenario, speed, margin, avoid)
+    plan, own = prepare(order.task, order.scenario, order.speed, order.margin, order.avoid)
     own = own.replace(goal=None)
-    others = [own.replace(name="", **FEEDFORWARDS[name]) for name in compare]
-    _serve(lambda server: Live([own, *others], server, avoid, plan.searched), host, port)
+    others = [own.replace(name="", **FEEDFORWARDS[name]) for name in order.compare]
+    _serve(lambda server: Live([own, *others], server, order.avoid, plan.searched), host, port)
 
 
 def replay(folder: Path, run: int | None, export: Path | None, host: str, port: int, code: bool) -> None:
@@ -111,7 +96,8 @@ def replay(folder: Path, run: int | None, export: Path | None, host: str, port: 
         return _serve(lambda server: Replay(library, shown, server), host, port)
     recordings = [library.recording(k) for k in shown]
     write(recordings, looks_of(recordings, shown), export)
-    print(f"page: {export}")
+    left_out = f" (run {shown[0]} of {len(table)}; --run takes another)" if len(shown) < len(table) else ""
+    print(f"page: {export}{left_out}")
 
 
 def _serve(page: Callable[[Server], Page], host: str, port: int) -> None:

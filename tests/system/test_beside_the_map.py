@@ -8,7 +8,7 @@ import pytest
 from mrctl import Disc, InputError, Line, Obstacles, Scenario, simulate
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import Avoid, avoiding, outcomes, prepared, task_of
-from mrctl.navigation.vehicle import robot_of
+from mrctl.navigation.vehicle import Vehicle
 from mrctl.theory.timing import RESERVE
 
 FIRST = 200_000  # seed
@@ -36,7 +36,7 @@ def unmapped(base: Scenario, seed: int) -> Task:
 
 def crossed(base: Scenario, seed: int) -> Task:
     """Makes a straight way that two discs cross at about the time at which a robot is there."""
-    robot, random, discs = robot_of(base)[1], np.random.default_rng([seed, 8]), []
+    robot, random, discs = Vehicle.of(base).robot, np.random.default_rng([seed, 8]), []
     most = min(0.8, RESERVE * robot.max_speed)
     for way in (2.0, 3.5):
         heading = random.choice([-1, 1]) * np.pi / 2 + random.uniform(-0.4, 0.4)

@@ -505,6 +505,27 @@ def test_action_of_another_shape():
         vector.step(np.zeros(2))
 
 
+def test_seeds_of_another_number():
+    """As many seeds as robots, or one."""
+    vector = TrackingVectorEnv(3, SHORT)
+    with pytest.raises(InputError, match="^seed: 2 seeds for 3 robots"):
+        vector.reset(seed=[1, 2])
+
+
+def test_tick_of_a_failure():
+    """Its tick counts from the beginning of the episode, in whichever episode it is."""
+    env, vector = TrackingEnv(SHORT, "twist"), TrackingVectorEnv(2, SHORT, "twist")
+    good, bad = np.zeros(2), np.array([np.nan, 0.0])
+    for ticks in (10, 3):
+        env.reset(seed=0)
+        for _ in range(ticks):
+            env.step(good)
+        assert env.step(bad)[4]["failure"].endswith(f"not finite, tick {ticks}")
+    vector.reset(seed=0)
+    failures = [vector.step([good, bad if tick in (4, 8) else good])[4].get("failure") for tick in range(9)]
+    assert failures[4][1].endswith("tick 4") and failures[8][1].endswith("tick 2")  # it begins in tick 6
+
+
 @pytest.mark.parametrize("action", [np.array([0.1 + 1j, 0.0]), np.array(["0.1", "0"]), [None, 0.0]])
 def test_action_of_no_real_numbers(action):
     """It is refused by name, in every environment; no imaginary part is dropped in silence."""

@@ -28,7 +28,7 @@ def driven(robot: str, seeds: range) -> tuple[dict[str, Counter[str]], int]:
         try:
             plan, drive = prepared(task, scenario)
         except InputError as error:
-            if "there is none" in str(error) or "the robot is" in str(error):  # no way, or no room to stand
+            if "there is no way" in str(error) or "the robot is" in str(error):  # no way, or no room to stand
                 continue
             print(robot, kind, seed, error)
             for tier in TIERS:

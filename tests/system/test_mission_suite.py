@@ -16,7 +16,7 @@ import mrctl.experiments.three_mppis as three
 import mrctl.navigation.mppi as mppi
 from mrctl import Lemniscate, Perturbation, Scenario, cli, simulate
 from mrctl.navigation.generators import bent_line, corridor, corridor_width
-from mrctl.navigation.vehicle import robot_of
+from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.theory.clearance import clearance, clearances
@@ -50,7 +50,7 @@ def test_corridor_width() -> None:
 
 def test_width_of_a_run() -> None:
     """In physics a run without walls touches those of a corridor that is 4 mm narrower than it needs, and no others."""
-    draw = suite.draw(Scenario(), 1, 1.5 * float(np.ptp(HULL[:, 1])), [1.35])
+    draw = suite.draw(Vehicle.of(Scenario()), 1, 1.5 * float(np.ptp(HULL[:, 1])), [1.35])
     assert draw is not None
     own = Scenario(reference=draw.references[0], goal=draw.goal, laps=2, learner="none", initial_spread=(0, 0, 0))
     free = simulate(own)
@@ -119,7 +119,7 @@ def test_learned_limits() -> None:
     wrong = Perturbation(mass_factor=1.5, supply_factor=0.8)
     course = Lemniscate(size=1.2, period=9.0)
     run = simulate(Scenario(prior="model", learner="composite", perturbation=wrong, reference=course, laps=3))
-    nominal = robot_of(Scenario())[1]
+    nominal = Vehicle.of(Scenario()).robot
     heavy = nominal.replace(mass=1.5 * nominal.mass, drive_gain=0.8)
     found = feeding.limits_of(run, nominal)
     learned, known, true = (

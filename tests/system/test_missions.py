@@ -157,7 +157,7 @@ def test_ends() -> None:
         (["yard.toml", "--goal", "3", "0", "0", "--margin", "-1"], "margin"),
         (["none.toml", "--goal", "3", "0", "0"], "none.toml"),
         (["none.yaml", "--goal", "3", "0", "0"], "none.yaml"),
-        (["doorway:3", "--goal", "9", "0", "0"], "goal: no way to (9.00, 0.00) was found"),
+        (["doorway:3", "--goal", "9", "0", "0"], "goal: there is no way to (9.00, 0.00)"),
         (
             ["parking_bay:1", "--avoid", "mppi", "--robot", "turtlebot"],
             "avoid: mppi never plans in reverse, and forward there is no way; barrier may",
@@ -185,6 +185,14 @@ def test_bad_input_is_one_line(
     Path("yard.toml").write_text('[[shapes]]\nkind = "disc"\nx = 1.5\ny = 0.8\nradius = 0.2\n')
     Path("moves.toml").write_text('[[shapes]]\nkind = "disc"\ncourse = { kind = "circle", radius = 1.0 }\n')
     assert says in refused(capsys, "navigate", *arguments)
+
+
+def test_bad_arguments() -> None:
+    """What is no task, and a feedforward that there is not, is refused by name."""
+    task = task_of("doorway:3", Scenario())
+    for given, compare, message in (("doorway:3", (), "^task: must be"), (task, "model", "^compare: 'm'")):
+        with pytest.raises(mrctl.InputError, match=message):
+            navigate(given, Scenario(), compare)
 
 
 @pytest.mark.parametrize(

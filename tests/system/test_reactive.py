@@ -11,7 +11,7 @@ from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import Avoid, avoiding, navigate, planned, prepared
 from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.rollouts import KNOTS, STEPS, Bounds, Scene, roll_out
-from mrctl.navigation.vehicle import robot_of
+from mrctl.navigation.vehicle import Vehicle
 from mrctl.theory.clearance import clearance, cover
 from mrctl.theory.grid import field_of
 from mrctl.theory.obstacles import Surroundings
@@ -277,9 +277,9 @@ def test_several_missions(avoid: Avoid) -> None:
 def test_limits() -> None:
     """What the stages ask for is within the bounds at every tick, also where the robot is thrown about."""
     task = Task(obstacles=Obstacles(shapes=(crossing(0.4),)), start=(0.0, 0.0, 0.0), goal=(4.0, 0.0, 0.0))
-    plan = planned(task, PLANNED, None, 0.05)[1]
+    plan = planned(task, Vehicle.of(PLANNED), None, 0.05)[1]
     own = PLANNED.replace(obstacles=task.obstacles, reference=plan, goal=task.goal)
-    robot, random = robot_of(own)[1], np.random.default_rng(1)
+    robot, random = Vehicle.of(own).robot, np.random.default_rng(1)
     for avoid in ("window", "mppi"):
         make = avoiding(avoid)
         assert make is not None

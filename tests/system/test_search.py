@@ -145,6 +145,12 @@ def test_settings_of_a_user(file, tmp_path):
     assert [(p.stage, p.attribute, p.settings) for p in both] == [
         ("feedforward", "Scaled", {"gain": 0.5, "more": 2}), ("steering", "Plain", {}),
     ]  # fmt: skip
+    settings = {"a": 1, "b": (2, 3), "gains": {"x": [1, 2]}, "path": "a:b, c)d"}
+    text = ", ".join(f"{name}={value!r}" for name, value in settings.items())
+    several = user_files.parts(f"motion={file}:Scaled({text}),{file}:Scaled({text}),steering={file}:Plain")
+    assert [(p.stage, p.settings) for p in several] == [
+        ("motion", settings), ("feedforward", settings), ("steering", {}),
+    ]  # fmt: skip
     circle = mrctl.Circle(radius=0.5, period=5.0)
     one = mrctl.Scenario(laps=1, reference=circle, prior="none", learner="none")
     runs = [mrctl.simulate([one], **user_files.load(f"{file}:Scaled{text}")) for text in ("(gain=0.4)", "", "(gain=1)")]

@@ -315,6 +315,7 @@ FAULTS = {
     "raises": (raises, "ZeroDivisionError: too near (test_stages.py, line "),
     "shape": (lambda answer: answer[:, :1], "output is shape (3, 1), expected shape (3, 2)"),
     "nothing": (lambda answer: None, "output is nothing, expected shape (3, 2)"),
+    "complex": (lambda answer: answer * 1j, "TypeError: the numbers are complex"),
     "text": (lambda answer: "left", "ValueError: could not convert string to float: 'left'"),
 }
 

@@ -17,7 +17,7 @@ from mrctl.experiments.learned_limits import PLANTS
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.navigation.avoidance import Avoiding, Barrier, approach, avoid, nearest, share
 from mrctl.navigation.pacing import Following, Pacing
-from mrctl.navigation.vehicle import robot_of
+from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import perturb
@@ -201,7 +201,7 @@ def test_paced_plan_is_driven_whole() -> None:
     )
     robot = mjcf.build()[1]
     scenario = Scenario(reference=plan, obstacles=Obstacles(shapes=(*wall,)), prior="model")
-    footprint = robot_of(scenario)[0]
+    footprint = Vehicle.of(scenario).footprint
     outlines, pose, period = Surroundings(scenario.obstacles).at(0.0), np.zeros((2, 3)), 0.01
     pose[:] = plan.sample(np.zeros(1)).pose
     stage = Pacing(robot, 2, lambda *_: None)

@@ -143,7 +143,7 @@ def test_stall():
             for _ in range(20):
                 plant.step(command(plant, 6.0))
             assert abs(plant.reading["twist"][-1, 0]) < 1e-3
-            assert plant.current()[-1] == pytest.approx([expected] * 2, rel=1e-3)
+            assert plant.current[-1] == pytest.approx([expected] * 2, rel=1e-3)
             assert plant.applied[-1] == pytest.approx([expected * R] * 2, rel=1e-3)
             assert plant.state["lost"][-1] == pytest.approx([expected * R - 6] * 2, abs=5e-3)
 
@@ -165,7 +165,7 @@ def test_limit_within_the_period(tmp_path, inductance):
             plant.physics.step(1)
             currents.append(plant.physics.data.actuator_force[:2] / (0.9 * 0.0234))
         plant.look()
-        assert np.abs(plant.current()).max() <= 3 + 1e-9
+        assert np.abs(plant.current).max() <= 3 + 1e-9
         assert (plant.state["lost"][0] < 0).all() if tick < 40 else (plant.state["lost"][0] > 0).all()
     assert np.abs(currents).max() <= 3 + 1e-9
     assert np.mean(np.abs(currents) > 2.99) > 0.98
@@ -191,7 +191,7 @@ def test_no_load():
         for _ in range(300):
             plant.step(command(plant, 14.0))
         current = (ROBOT.drive_loss + ROBOT.rolling_force * 0.098 / 2) / NK
-        assert plant.current()[-1] == pytest.approx([current] * 2, rel=0.03)
+        assert plant.current[-1] == pytest.approx([current] * 2, rel=0.03)
         assert not plant.state["lost"][-1].any()
         rail = SUPPLY - 0.1 * 2 * (14 / SUPPLY) * current
         assert plant.state["driver"]["scale"][-1] * SUPPLY == pytest.approx(rail, abs=2e-3)

@@ -48,7 +48,8 @@ def test_twins(robot, settings, rigid, ticks):
     module = Network(HIDDEN)
     module.load_state_dict({k: torch.tensor(v) for k, v in unflatten(initial_weights(HIDDEN, 4)).items()})
     compiled = FeedbackErrorLearning(Loop(robot, rigid, PERIOD, 2, seeds=[4] * SIZE), [settings] * SIZE)
-    general = ModuleLearning(module, robot, SIZE, settings, rigid, delay=2)
+    general = ModuleLearning(module, robot, SIZE, settings, rigid)
+    general.reset(PERIOD, 2 * PERIOD)
     largest = 0.0
     for tick in range(ticks):
         if tick == ticks // 2:  # the guard, or an environment, resets one robot

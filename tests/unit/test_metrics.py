@@ -58,6 +58,14 @@ def test_position():
     assert lap(make(x=3.0, y_ref=4.0), "position_rmse") == pytest.approx(5)
 
 
+def test_decimated():
+    """The metrics of a result without some of its samples are those of the rest, with a warning."""
+    result = make(x=3.0, y_ref=4.0)
+    with pytest.warns(UserWarning, match="one of 10 samples"):
+        found = metrics.per_lap(result.isel(time=slice(None, None, 10)))
+    assert found["position_rmse"].values == pytest.approx(5)
+
+
 @pytest.mark.parametrize("name", ["v", "omega"])
 def test_velocity_errors(name):
     """A constant error e gives RMSE e, IAE e T, ITAE e T²/2 in every lap, against the original reference."""

@@ -96,8 +96,8 @@ def test_unequal_motors():
         drive_friction_factor=2.0, left_drive_friction_factor=0.5, right_drive_friction_factor=1.5,
     )  # fmt: skip
     resistance, back_emf, _ = motor_parameters(model)
-    assert resistance[0] == pytest.approx(2.32 * 1.3 * np.array([1.0, 1.2]))
-    assert back_emf[0] == pytest.approx(43 * 0.0234 * 0.9 * np.array([1.1, 1.0]))
+    assert resistance == pytest.approx(2.32 * 1.3 * np.array([1.0, 1.2]))
+    assert back_emf == pytest.approx(43 * 0.0234 * 0.9 * np.array([1.1, 1.0]))
     rolling = NOMINAL.joint("wheel_left").frictionloss[0] - BASE.drive_loss
     losses = [model.joint(wheel).frictionloss[0] - rolling for wheel in ("wheel_left", "wheel_right")]
     assert losses == pytest.approx([BASE.drive_loss, 3 * BASE.drive_loss])

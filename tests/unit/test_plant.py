@@ -12,6 +12,7 @@ from mrctl.loop.simulation import simulate
 from mrctl.physics import mjcf
 from mrctl.physics.car import CarPhysics
 from mrctl.physics.files import models_folder
+from mrctl.physics.perturb import limit_current
 from mrctl.physics.plant import BatchPlant, PhysicsPlant, build
 from mrctl.physics.readout import READING, addresses, read
 from mrctl.physics.stand import stand
@@ -71,6 +72,21 @@ def test_readouts(world):
         assert ROBOT.torque_constant * physics.motor_current() == pytest.approx(torque, abs=1e-9)
 
 
+def test_limited_current():
+    """A driver's limit bounds the current that is read, as the engine bounds the torque."""
+    nominal = mjcf.load()
+    model = mjcf.clone(nominal)
+    limit_current(nominal, model, 2.0)
+    physics = CarPhysics.from_compiled(model)
+    physics.data.ctrl[:2] = 20.0, 1.0  # 8.6 A and 0.43 A at rest
+    physics.step()
+    physics.forward()
+    sensor = physics.named.data.sensordata
+    torque = [sensor["motor_torque_left"].item(), sensor["motor_torque_right"].item()]
+    assert ROBOT.torque_constant * physics.motor_current() == pytest.approx(torque, abs=1e-9)
+    assert physics.motor_current()[0] == pytest.approx(2.0)
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e11])
 def test_blown_up(value):
     """A value that is not finite, or huge, anywhere in the state makes the cosine of the tilt NaN."""
@@ -115,7 +131,7 @@ def test_delay(delay):
                 np.testing.assert_allclose(plant.ctrl[-1], expected, rtol=1e-12)
             assert np.array_equal(plant.applied[-1], plant.ctrl[-1, :2])
             if tick < min(delay, 3):  # 0 V would brake with more than 2 A
-                assert np.abs(plant.current()[-1]).max() < 0.05
+                assert np.abs(plant.current[-1]).max() < 0.05
             if plant.size > 1:
                 assert np.array_equal(plant.ctrl[0], command)
 
@@ -155,10 +171,10 @@ def test_current():
         for _ in range(30):
             plant.step(volts(plant, 8.0, 6.0))
         emf = 43 * 0.0234 * 0.8 * plant.reading["wheel_rates"][row]
-        assert plant.current()[row] == pytest.approx((np.array([8.0, 6.0]) - emf) / (2.32 * 1.5))
+        assert plant.current[row] == pytest.approx((np.array([8.0, 6.0]) - emf) / (2.32 * 1.5))
         if plant.size > 1:
             emf = 43 * 0.0234 * plant.reading["wheel_rates"][0]
-            assert plant.current()[0] == pytest.approx((np.array([8.0, 6.0]) - emf) / 2.32)
+            assert plant.current[0] == pytest.approx((np.array([8.0, 6.0]) - emf) / 2.32)
 
 
 def test_push():

@@ -181,6 +181,7 @@ def test_no_overwriting(result, tmp_path):
     (tmp_path / "c").mkdir()
     for name in "abc":
         refused(f"{name}: exists already", save, result.isel(run=0), tmp_path / name)
+    refused(r"d.nc: .*to_netcdf", save, result, tmp_path / "d.nc")
     assert open_result(tmp_path / "a").identical(result)
     assert (tmp_path / "b").read_text() == "mine" and not list((tmp_path / "c").iterdir())
 

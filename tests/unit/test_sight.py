@@ -78,6 +78,22 @@ def test_velocity(speed: float, rate: int) -> None:
     assert max(errors) < (0.12 if rate <= 10 else 0.25)
 
 
+def test_velocity_at_the_end_of_the_view() -> None:
+    """What leaves the view of a lidar keeps its velocity while a part of it is still seen, whose centre is slower."""
+    narrow, course = Lidar(view=np.pi / 2, beams=180), Line(heading=np.pi / 2, speed=0.6, length=20.0)
+    wall = Box(x=4.5, length=0.1, width=12.0)
+    around = Surroundings(Obstacles(shapes=(wall, Disc(x=-1.0, y=-3.0, radius=0.4, course=course))))
+    sight, random, left = Sight(Obstacles(shapes=(wall,))), np.random.default_rng(0), 0
+    for k in range(70):
+        pose = np.zeros(3)
+        sight.see(Scan(narrow.scan(pose, around.at(k / 10), random), narrow.angles, narrow.range, pose, k / 10))
+        if k >= 20:
+            place, found = around.at(k / 10).discs[0], discs(sight, k / 10)
+            assert np.abs(found[:, 2:4] - [0.0, 0.6]).max() < 0.12
+            left += place[1] - 0.4 < place[0] < place[1] + 0.4
+    assert left > 8
+
+
 def test_what_stands_stands() -> None:
     """A robot that drives past a pillar and along a wall at 1 m/s takes neither for something that moves."""
     world = Obstacles(shapes=(PILLAR, Box(x=0.0, y=-1.0, length=4.0, width=0.1)))
