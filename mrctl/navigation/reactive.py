@@ -23,7 +23,7 @@ from mrctl.theory.robot import Robot
 
 CELL = 0.04  # m, of the distance field
 AROUND = 3.0  # m around the plan, which the field covers
-DISCS = 4  # that cover the robot
+DISCS = 4  # in a row that covers the robot
 AHEAD = 100  # samples of the plan, 20 motion periods, among which its nearest place is looked for
 FINE = 5  # samples of the plan in a motion period
 OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen, like the next two
@@ -237,7 +237,11 @@ class Reactive(ABC):
     Attributes:
         bounds: What twists each robot can drive.
         considered: What led to the last twist of each robot; None before the first one, and while it goes back.
+        rows: Number of rows of the discs that cover a robot. Those of one row reach 11 to 15 cm beyond its nose, those
+            of two 4 to 6 cm.
     """
+
+    rows: int
 
     def __init__(self, robot: Robot, size: int, replan: Replan) -> None:
         """Makes the stage.
@@ -258,7 +262,7 @@ class Reactive(ABC):
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         self._period, self._tick, self._agents = period, 0, []
         self.considered: list[Considered | None] = [None] * self._size
-        discs, fields = cover(self._planners[0].vehicle.footprint, DISCS), dict[Hashable, Field]()
+        discs, fields = cover(self._planners[0].vehicle.footprint, DISCS, self.rows), dict[Hashable, Field]()
         for planner, bounds, start in zip(self._planners, self.bounds, pose, strict=True):
             planner.reset()
             if (own := (planner.first, planner.scenario.known)) not in fields:

@@ -8,22 +8,24 @@ from mrctl.kernel import Array, kernel
 from mrctl.theory.obstacles import Outlines, Surroundings, moved
 
 
-def cover(footprint: Array, count: int = 3) -> Array:
-    """Covers a footprint with equal discs in a row (Ziegler and Stiller, "Fast collision checking for intelligent
-    vehicle motion planning", IEEE Intelligent Vehicles Symposium 2010).
+def cover(footprint: Array, count: int = 3, rows: int = 1) -> Array:
+    """Covers a footprint with equal discs in rows (Ziegler and Stiller, "Fast collision checking for intelligent
+    vehicle motion planning", IEEE Intelligent Vehicles Symposium 2010, with one row).
 
     Args:
         footprint: Corners in the robot's frame in m, `(n, 2)`.
-        count: Number of discs along the x axis.
+        count: Number of discs in a row, along the x axis.
+        rows: Number of rows; with two the discs reach less far beyond nose and tail.
 
     Returns:
-        x and y of the centres in the robot's frame and radius in m, `(count, 3)`.
+        x and y of the centres in the robot's frame and radius in m, `(rows · count, 3)`.
     """  # noqa: D205
     low, high = footprint.min(axis=0), footprint.max(axis=0)
-    slice_length = (high[0] - low[0]) / count
-    x = low[0] + slice_length * (np.arange(count) + 0.5)
-    y, radius = (low[1] + high[1]) / 2, np.hypot(slice_length, high[1] - low[1]) / 2
-    return np.column_stack([x, np.full(count, y), np.full(count, radius)])
+    length, width = (high - low) / [count, rows]
+    x = low[0] + length * (np.arange(count) + 0.5)
+    y = (low[1] + high[1]) / 2 + width * (np.arange(rows) - (rows - 1) / 2)
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return np.column_stack([places, np.full(len(places), np.hypot(length, width) / 2)])
 
 
 def rim(footprint: Array, radius: float) -> Array:

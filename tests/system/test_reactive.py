@@ -15,6 +15,7 @@ from mrctl.navigation.vehicle import Vehicle
 from mrctl.theory.clearance import clearance, cover
 from mrctl.theory.grid import field_of
 from mrctl.theory.obstacles import Surroundings
+from mrctl.theory.robot import RobotFile
 
 PLANNED = Scenario(prior="model", learner="none")
 FOOTPRINT = np.array([[-0.1, -0.2], [0.44, -0.2], [0.44, 0.2], [-0.1, 0.2]])
@@ -272,6 +273,17 @@ def test_several_missions(avoid: Avoid) -> None:
     assert together["clearance"].min() > 0.0 and not together["failed"].any()
     for row, own in enumerate(drives):
         equal(simulate(own, motion=avoiding(avoid)), together, row)
+
+
+@pytest.mark.parametrize(("avoid", "ahead"), [("window", 0.2), ("mppi", 0.06)])
+@pytest.mark.parametrize("robot", ["car", *(pytest.param(r, marks=pytest.mark.full) for r in ("racecar", "turtlebot"))])
+def test_goal_before_a_wall(robot: str, avoid: Avoid, ahead: float) -> None:
+    """A robot arrives at a goal with a wall closely ahead of its nose; the plan keeps 5 cm."""
+    scenario = PLANNED.replace(robot=RobotFile(path=robot))
+    wall = Box(x=3.05 + Vehicle.of(scenario).footprint[:, 0].max() + ahead, length=0.1, width=6.0)
+    task = Task(obstacles=Obstacles(shapes=(wall,)), start=(0.0, 0.0, 0.0), goal=(3.0, 0.0, 0.0))
+    (row,) = navigate(task, scenario, avoid=avoid).table.itertuples()
+    assert row.outcome == "arrived" and row.length < 3.1
 
 
 def test_limits() -> None:

@@ -87,11 +87,16 @@ def test_moving():
     assert low == pytest.approx([-0.1, -0.5]) and high == pytest.approx([5.5, 4.1])
 
 
-@given(st.integers(1, 6))
-def test_cover(count):
-    """The discs of a footprint cover it."""
-    discs = shapely.union_all([shapely.Point(x, y).buffer(r, quad_segs=ROUND) for x, y, r in cover(FOOTPRINT, count)])
-    assert discs.buffer(1e-3).contains(shapely.Polygon(FOOTPRINT))
+@given(st.integers(1, 6), st.integers(1, 3))
+def test_cover(count, rows):
+    """The discs of a footprint cover it, and reach beyond it by their radius less half a side of a disc's part."""
+    discs, shape = cover(FOOTPRINT, count, rows), shapely.Polygon(FOOTPRINT)
+    covered = shapely.union_all([shapely.Point(x, y).buffer(r, quad_segs=ROUND) for x, y, r in discs])
+    assert covered.buffer(1e-3).contains(shape)
+    assert len(discs) == count * rows
+    low, high = FOOTPRINT.min(axis=0), FOOTPRINT.max(axis=0)
+    beyond = discs[0, 2] - (high - low) / (2 * np.array([count, rows]))
+    assert covered.bounds == pytest.approx([*(low - beyond), *(high + beyond)], abs=1e-3)
 
 
 @pytest.mark.parametrize("radius", [0.02, 0.1, 1.0])
