@@ -137,7 +137,7 @@ def _least_root(a: Array, b: Array, c: float) -> float:
     return float((2 * c / (np.sqrt(square[touching]) - b[touching])).min(initial=np.inf))
 
 
-class Motion(NamedTuple):
+class MotionDesign(NamedTuple):
     """A design of the motion controller.
 
     Attributes:
@@ -154,7 +154,7 @@ class Motion(NamedTuple):
 def motion(
     robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float = 0.0, period: float = 0.01,
     prefilter: float | None = None,
-) -> Motion:  # fmt: skip
+) -> MotionDesign:  # fmt: skip
     """Designs the motion controller over the velocity loops: gains and prefilter.
 
         x:  τ s² + s + K_x = 0,                         ζ = 1/(2 √(K_x τ))
@@ -199,7 +199,7 @@ def motion(
 @lru_cache(maxsize=256)
 def _motion(
     robot: Robot, rigid: bool, gains: tuple[Gains, Gains], delay: float, period: float, given: float | None
-) -> Motion:
+) -> MotionDesign:
     _, free = max(points(robot.model_copy(update={"fork_inertia": 0.0}), False, 1), key=lambda point: point[0])
     v_lag = 1 / (linear.common(robot).gain * gains[0].k_i)
     omega_lag = linear.TYRE_LAG + delay if rigid else 1 / (free.gain * gains[1].k_i)
@@ -226,7 +226,7 @@ def _motion(
             break
         prefilter *= 1.1
     k_x, lateral, prefilter = chosen
-    return Motion(Kanayama(k_x=k_x, k_y=lateral**2, k_theta=2 * lateral), prefilter, (v_lag, omega_lag))
+    return MotionDesign(Kanayama(k_x=k_x, k_y=lateral**2, k_theta=2 * lateral), prefilter, (v_lag, omega_lag))
 
 
 def _kept(shares: Array, peaks: Array) -> float:

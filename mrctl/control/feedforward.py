@@ -87,7 +87,7 @@ PRIOR = np.dtype(
 
 
 @kernel
-def inverse_dynamics(command: Array, derivative: Array, prior: Row, voltage: Array) -> None:
+def prior_voltage(command: Array, derivative: Array, prior: Row, voltage: Array) -> None:
     """Writes cᵀ x, the inverse of equation (3) at a motion.
 
     Args:
@@ -106,16 +106,16 @@ def explained(twist: Array, acceleration: Array, rigid: bool, prior: Row, voltag
 
     Under `rigid` steering the second channel is θ̇ itself, in rad/s: the fork makes it without a voltage.
     """
-    inverse_dynamics(twist, acceleration, prior, voltage)
+    prior_voltage(twist, acceleration, prior, voltage)
     if rigid:
         voltage[1] = twist[1]
 
 
 @kernel
-def inverse_dynamics_of_rows(command: Array, derivative: Array, prior: Rows, voltage: Array) -> None:
-    """`inverse_dynamics` of all robots."""
+def prior_voltages(command: Array, derivative: Array, prior: Rows, voltage: Array) -> None:
+    """`prior_voltage` of all robots."""
     for i in range(len(voltage)):
-        inverse_dynamics(command[i], derivative[i], prior[i], voltage[i])
+        prior_voltage(command[i], derivative[i], prior[i], voltage[i])
 
 
 class Prior:
@@ -144,7 +144,7 @@ class Prior:
     def output(self, command: Array, derivative: Array) -> Array:
         """Returns the voltages of the two channels of all robots, `(B, 2)` in V; see `Feedforward.output`."""
         voltage = np.empty((len(self.rows), 2))
-        inverse_dynamics_of_rows(_own(command), _own(derivative), self.rows, voltage)
+        prior_voltages(_own(command), _own(derivative), self.rows, voltage)
         return voltage
 
 

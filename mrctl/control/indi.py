@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.control.features import INPUTS
-from mrctl.control.feedforward import PRIOR, Learner, Loop, Prior, explained, inverse_dynamics
+from mrctl.control.feedforward import PRIOR, Learner, Loop, Prior, explained, prior_voltage
 from mrctl.control.matching import MATCHED, low_pass, match, note_sent, queues
 from mrctl.kernel import Array, Row, Rows, kernel
 from mrctl.record import Record
@@ -80,7 +80,7 @@ def measure(twist: Array, rigid: bool, period: float, queue: Rows, s: Row) -> No
 def respond(i: int, command: Array, derivative: Array, robot: Row, arrays: tuple[Any, ...], voltage: Array) -> None:
     """U = U_f − M ẋ_f − f̂(x_c); the prior adds M ẋ_c + f̂(x_c)."""
     s = arrays[0][i]
-    inverse_dynamics(command, s.zero, s.prior, s.rest)
+    prior_voltage(command, s.zero, s.prior, s.rest)
     for k in range(2):
         s.derivative[k] = derivative[k]
         voltage[k] = s.twice[k] - s.rest[k] if s.started else 0.0

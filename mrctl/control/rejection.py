@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mrctl.control.design import Motion, points
+from mrctl.control.design import MotionDesign, points
 from mrctl.control.guard import ARM
 from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains
@@ -44,7 +44,7 @@ class Peaks(NamedTuple):
 
 
 def rejection(
-    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], motion: Motion, delay: float, period: float
+    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], motion: MotionDesign, delay: float, period: float
 ) -> tuple[Peaks, Peaks]:
     """Returns the peak-to-peak gains from a disturbance voltage of each channel, the largest of several speeds.
 
@@ -63,7 +63,7 @@ def rejection(
 
 @lru_cache(maxsize=1024)
 def _rejection(
-    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], motion: Motion, delay: float, period: float
+    robot: Robot, rigid: bool, gains: tuple[Gains, Gains], motion: MotionDesign, delay: float, period: float
 ) -> tuple[Peaks, Peaks]:
     found = []
     alone = motion._replace(kanayama=Kanayama(k_x=0.0, k_y=0.0, k_theta=0.0))
@@ -71,13 +71,13 @@ def _rejection(
         velocity = posture = 0.0
         for speed, plant in points(robot, rigid, channel):
             parts = robot, rigid, channel, plant, gains[channel]
-            velocity = max(velocity, Loop(*parts, alone, speed, delay, period).sums()[0])
-            posture = max(posture, Loop(*parts, motion, speed, delay, period).sums()[1])
+            velocity = max(velocity, LinearLoop(*parts, alone, speed, delay, period).sums()[0])
+            posture = max(posture, LinearLoop(*parts, motion, speed, delay, period).sums()[1])
         found.append(Peaks(velocity, posture))
     return found[0], found[1]
 
 
-class Loop:
+class LinearLoop:
     """The linear closed loop of one channel under the motion controller.
 
     Attributes:
@@ -91,7 +91,7 @@ class Loop:
     """
 
     def __init__(
-        self, robot: Robot, rigid: bool, channel: int, plant: Linear, gains: Gains, motion: Motion, speed: float,
+        self, robot: Robot, rigid: bool, channel: int, plant: Linear, gains: Gains, motion: MotionDesign, speed: float,
         delay: float, period: float,
     ) -> None:  # fmt: skip
         """Wires the loop of one channel; the arguments are as for `rejection`, at a speed in m/s."""

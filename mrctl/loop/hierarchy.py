@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from mrctl.control import delay as late
 from mrctl.control import guard as guarding
 from mrctl.control.delay import DELAY, watch_delay
-from mrctl.control.design import Motion, motion
-from mrctl.control.feedforward import Learner, Loop, Prior, inverse_dynamics, learn_nothing, nothing
+from mrctl.control.design import MotionDesign, motion
+from mrctl.control.feedforward import Learner, Loop, Prior, learn_nothing, nothing, prior_voltage
 from mrctl.control.guard import BACK_OFF, GUARD, UNSURE, guard
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.control.learners import LEARNERS
@@ -91,7 +91,7 @@ def apply_voltages(seen: Row, model: Row, robot: Row, period: float, s: Row) -> 
     """Guard and allocation: from feedback and feedforward to voltages and steering; returns whether they are finite."""
     command, derivative, a = s.limiter.command, s.limiter.derivative, s.allocation
     if s.guard.on or s.delay.on:
-        inverse_dynamics(command, derivative, model, s.nominal)
+        prior_voltage(command, derivative, model, s.nominal)
     watch_delay(s.feedback, s.guard.output, s.nominal, period, s.delay)
     guard(
         s.guard, s.feedforward, s.nominal, s.error, command, seen.twist, s.voltage, period, robot.rigid, s.pid.integral,
@@ -143,7 +143,7 @@ def update(moves: bool, seen: Rows, goal: Rows, period: float, place: int) -> tu
         command_motion(wanted, robot[0], period, s)
         command, derivative = s.limiter.command, s.limiter.derivative
         pid(command, measured.twist, s.allocation.excess, period, s.pid, s.feedback)
-        inverse_dynamics(command, derivative, prior[i], s.prior)
+        prior_voltage(command, derivative, prior[i], s.prior)
         respond(i, command, derivative, robot[0], arrays, s.feedforward)
         for k in range(2):
             s.feedforward[k] += s.prior[k]
@@ -183,7 +183,7 @@ class Settings:
     prefilter: float | None
     delay: float
     learned: Any
-    design: Motion = field(init=False)
+    design: MotionDesign = field(init=False)
 
 
 class Hierarchy:
@@ -356,7 +356,7 @@ class Hierarchy:
         pid, delay = self.lengthened(row, own.pid)
         kanayama = Kanayama(k_x=k["k_x"], k_y=k["k_y"], k_theta=k["k_theta"])
         prefilter = float(self.state["limiter"]["time_constant"][row])
-        around = Motion(kanayama, prefilter, own.design.lag)
+        around = MotionDesign(kanayama, prefilter, own.design.lag)
         gains = pid.channels(self.robot, self.rigid, delay, self.period)
         return rejection(self.robot, self.rigid, gains, around, delay, self.period)
 

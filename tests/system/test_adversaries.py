@@ -23,7 +23,7 @@ from mrctl import (
 from mrctl.control.design import motion, points
 from mrctl.control.feedforward import Prior
 from mrctl.control.guard import ARM, TOLERATED, harmless
-from mrctl.control.rejection import Loop, rejection
+from mrctl.control.rejection import LinearLoop, rejection
 from mrctl.experiments.paper import IDEAL
 from mrctl.loop.simulation import Simulation
 from mrctl.physics import mjcf
@@ -233,7 +233,7 @@ def recovery(robot, rigid, gains, loops, delay, limits):
     for channel in range(2):
         errors = 0.0
         for speed, plant in points(robot, rigid, channel):
-            loop = Loop(robot, rigid, channel, plant, gains[channel], loops, speed, delay, PERIOD)
+            loop = LinearLoop(robot, rigid, channel, plant, gains[channel], loops, speed, delay, PERIOD)
             total = 0.0
             for name, limit in limits[channel].items():
                 state = np.zeros(len(loop.step))

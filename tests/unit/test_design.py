@@ -26,7 +26,7 @@ from mrctl.control.design import (
 )
 from mrctl.control.guard import ARM
 from mrctl.control.pid import Pid
-from mrctl.control.rejection import Loop
+from mrctl.control.rejection import LinearLoop
 from mrctl.record import InputError
 from mrctl.theory.linear import TYRE_LAG, first_order
 from mrctl.theory.robot import Robot
@@ -327,7 +327,7 @@ def test_whole_loop(robot, steering, late):
         np.testing.assert_allclose(1 / (1 + loop), spectrum, atol=1e-3)
         if not with_model:
             continue
-        linear = Loop(robot, rigid, channel, plant, gains[channel], over, speed, late * H, H)
+        linear = LinearLoop(robot, rigid, channel, plant, gains[channel], over, speed, late * H, H)
         np.testing.assert_allclose(linear.response(linear.pulse)[:, :999], errors[:, 1:1000], atol=1e-9)
 
 
