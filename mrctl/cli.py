@@ -828,6 +828,8 @@ def _identify_with(arguments: list[str]) -> Callable[..., None]:
     """Returns the `identify` command, whose short help leaves out the flags of its records."""
 
     def identify(
+        file: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[ROBOT.xml]")] = CAR.path,
+        /,
         world: str = "flat",
         robot: RobotFile = CAR,
         perturbation: Perturbation = PERTURBATIONS["nominal"],
@@ -838,13 +840,18 @@ def _identify_with(arguments: list[str]) -> Callable[..., None]:
         """Identifies the constants of equation (3) from two drives, and says which of them the sensors identify.
 
         Args:
+            file: The car, turtlebot or racecar, or the MJCF file of a robot; by default the world's own robot.
             world: The robot drives in this level world: `flat`, or the MJCF file at this path.
-            robot: Identify this robot; by default the world's own.
+            robot: The same as ROBOT.xml, with its joints and body.
             perturbation: Differences of the plant from its model.
             sensing: Encoders, gyro and motor driver; delays, accelerometer, fixes and the estimator have no effect.
             seed: This seed determines the test signals and the noise of the sensors.
             json: Print JSON instead of a table.
         """
+        if file != CAR.path:
+            if robot != CAR:
+                raise InputError("robot: give either a file or --robot")
+            robot = RobotFile.from_dict({"path": file}, "robot")
         _check_world(world, robot)
         from mrctl.experiments import identify as identification
 

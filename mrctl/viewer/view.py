@@ -58,10 +58,13 @@ def mission(order: Order, host: str, port: int) -> None:
     """
     from mrctl.viewer.live import Live
 
-    plan, own = prepare(order.task, order.scenario, order.speed, order.margin, order.avoid)
-    own = own.replace(goal=None)
-    others = [own.replace(name="", **FEEDFORWARDS[name]) for name in order.compare]
-    _serve(lambda server: Live([own, *others], server, order.avoid, plan.searched), host, port)
+    def page(server: Server) -> Live:
+        plan, own = prepare(order.task, order.scenario, order.speed, order.margin, order.avoid)
+        own = own.replace(goal=None)
+        others = [own.replace(name="", **FEEDFORWARDS[name]) for name in order.compare]
+        return Live([own, *others], server, order.avoid, plan.searched)
+
+    _serve(page, host, port)
 
 
 def replay(folder: Path, run: int | None, export: Path | None, host: str, port: int, code: bool) -> None:

@@ -295,7 +295,7 @@ def test_bad_scenario_is_one_line(
         (["navigate", "doorway:1", "--perturbation.mas", "2"], "did you mean --perturbation.mass-factor?"),
         (["check", "--robot.path", "mule.xml"], "--robot.path: is no flag of mrctl check"),
         (["run", "reference:circle", "--laps", "1"], "--laps: is no flag of reference:circle, and those of mrctl run"),
-        (["identify", "mule.xml"], "mule.xml: the file of a robot is given as --robot mule.xml"),
+        (["navigate", "doorway:1", "mule.xml"], "mule.xml: the file of a robot is given as --robot mule.xml"),
         (["navigate", "doorway:1", "--sensing.lidar.nois", "3"], "did you mean --sensing.lidar.noise?"),
         (["run", "--lapz=3"], "no flag is called --lapz"),
         (["sweep", "x.toml", "--out", "y", "--wxyz", "3"], "no flag is called --wxyz"),
@@ -440,7 +440,7 @@ def test_short_help_of_identify(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     screen = capsys.readouterr().out
     assert len(screen.splitlines()) < 30 and "mrctl identify --help-all" in screen
     short, every = (help_texts(capsys, "identify", flag) for flag in ("--help", "--help-all"))
-    assert len(short) == 3 + 3 and len(every) > 60  # flags and groups of flags
+    assert len(short) == 4 + 3 and len(every) > 60  # flags and groups of flags
     for flag in every.keys() - short.keys():
         assert f"  {flag.partition('.')[0]}.* " in screen, flag
 

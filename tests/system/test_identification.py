@@ -54,8 +54,14 @@ def test_what_sensors_cannot_tell():
 
 def test_refused(capsys):
     """One line for a robot that is not there, and for sensors that do not fit the signals."""
-    assert cli.main(["identify", "--robot.path", "none.xml"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    for words, says in (
+        (["--robot.path", "none.xml"], "no file none.xml"),
+        (["none.xml"], "no file none.xml"),
+        (["racecar", "--robot", "turtlebot"], "either a file or --robot"),
+    ):
+        assert cli.main(["identify", *words]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and says in said
     for change, message in (
         ({"gyro_rate": 4}, "gyro_rate: 4 Hz, but"),
         ({"encoder_rate": 30}, "encoder_rate: 30 Hz is no"),
