@@ -840,9 +840,9 @@ def _identify_with(arguments: list[str]) -> Callable[..., None]:
         """Identifies the constants of equation (3) from two drives, and says which of them the sensors identify.
 
         Args:
-            file: The car, turtlebot or racecar, or the MJCF file of a robot; by default the world's own robot.
+            file: The car, turtlebot or racecar, or the MJCF file of a robot; car stands for the robot of --world.
             world: The robot drives in this level world: `flat`, or the MJCF file at this path.
-            robot: The same as ROBOT.xml, with its joints and body.
+            robot: File of the robot, in place of ROBOT.xml, with the names of its joints and its chassis.
             perturbation: Differences of the plant from its model.
             sensing: Encoders, gyro and motor driver; delays, accelerometer, fixes and the estimator have no effect.
             seed: This seed determines the test signals and the noise of the sensors.

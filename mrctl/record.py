@@ -256,8 +256,11 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
         *parents, name = first["loc"]
         known = [field for one in _records_at(record, parents) for field in one.model_fields]
         meant = nearest(str(name), known)
-        others = f"there are {', '.join(known)}" if 0 < len(known) <= 12 else ""
-        message = "; ".join(["there is no such field", *filter(None, [f"did you mean {meant}?" if meant else others])])
+        message = "there is no such field"
+        if meant:
+            message += f"; did you mean {meant}?"
+        elif 0 < len(known) <= 12:
+            message += f"; there are {', '.join(known)}"
     if first["type"] in ("model_type", "model_attributes_type"):
         names = {one.named_by for one in _records_at(record, first["loc"])} - {""}
         message = ", or its ".join(["must be a record, or a table of its fields", *sorted(names)])

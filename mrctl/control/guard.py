@@ -29,7 +29,7 @@ teaches is a third of the one before (`mrac` is not taught by it), and the autho
 2. Beyond these bounds it ends in the tick in which an error leaves the region. Until then the errors are inside.
 3. From then on PID and model act alone; the PID's integral starts within D of the model, and the rest of the step in
    voltage, which fades, is within D too. From any such state the position error stays below a bound that both loops
-   give (the test below counts the rest of the step as a part of the integral): 0.22 to 0.25 m for the default robot.
+   give (the test below counts the rest of the step as a part of the integral): 0.23 to 0.27 m for the default robot.
 
 The bounds are those of the linear loops that the PID was designed for; the limits of voltage and acceleration, and what
 happens within the loop's delay, add to them: under `rigid` steering with the PID of the paper ρ reached 0.22 m with |d|

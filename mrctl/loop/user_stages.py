@@ -111,9 +111,10 @@ class UserStage:
             StageError: The answer is not an array of numbers.
         """
         try:
-            if np.iscomplexobj(np.asarray(answer)):
+            array = np.asarray(answer)
+            if array.dtype.kind == "c":
                 raise TypeError("the numbers are complex")
-            return np.asarray(answer, float)
+            return array if array.dtype == float else np.asarray(answer, float)
         except Exception as error:  # noqa: BLE001
             raise self._raised(error) from error
 

@@ -139,6 +139,8 @@ def _end(run: xr.Dataset) -> int:
 def per_lap(result: xr.Dataset) -> xr.Dataset:
     """Computes the metrics of every lap of every run.
 
+    Those of a result that holds only some of the samples, as of a decimated sweep, are approximate; a warning says so.
+
     Args:
         result: What `simulate` returns, variables (run, time), or one run of it.
 
@@ -148,8 +150,6 @@ def per_lap(result: xr.Dataset) -> xr.Dataset:
 
     Raises:
         InputError: The result lacks a variable, or a lap is shorter than the control period.
-
-    A result that holds only some of the samples, as that of a decimated sweep, has approximate metrics, with a warning.
     """
     require(result, ("time", *SAMPLED))
     runs = as_runs(result)

@@ -202,11 +202,9 @@ class Sensing(Record):
         if getattr(self, name) is None:
             return max(count, 1 if time else 0)
         if abs(count * control_period - time) > 1e-6 * control_period:
-            wrong = (
-                f"{value:g} Hz is no whole fraction of the control rate ({1 / control_period:g} Hz)"
-                if rate
-                else f"{value:g} s is not a whole multiple of control_period ({control_period:g} s)"
-            )
+            wrong = f"{value:g} s is not a whole multiple of control_period ({control_period:g} s)"
+            if rate:
+                wrong = f"{value:g} Hz is no whole fraction of the control rate ({1 / control_period:g} Hz)"
             raise ValueError(f"sensing.{name}: {wrong}")
         return count
 
