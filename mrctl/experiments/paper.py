@@ -178,13 +178,16 @@ def compare(table: pd.DataFrame, scenarios: Sequence[Scenario]) -> list[dict[str
 
     Args:
         table: What `summary` returns, a row for each scenario.
-        scenarios: The runs, PID alone among them.
+        scenarios: The runs, PID alone among them; of several runs of a scenario the first one is meant.
     """
 
     def world(one: Scenario) -> Hashable:
         return one.name, one.steering, one.sensing, one.reference, one.seed
 
-    alone = {world(one): k for k, one in enumerate(scenarios) if one.feedforward == "none"}
+    alone: dict[Hashable, int] = {}
+    for k, one in enumerate(scenarios):
+        if one.feedforward == "none":
+            alone.setdefault(world(one), k)  # not that of `hindsight`, whose scenarios are the same and come later
     rows = []
     for k, one in enumerate(scenarios):
         bare = alone[world(one)]

@@ -74,6 +74,16 @@ def test_network_beats_pid(table: dict, plant: str, lap_time: float, bounds: tup
     assert all(share <= bound for share, bound in zip(shares, bounds, strict=True)), shares
 
 
+def test_ratios_are_to_pid(table: dict) -> None:
+    """In both tables the errors are divided by those of PID alone in the same world, also those of `hindsight`."""
+    for rows, same in ((table["last_lap"], ("steering", "plant", "lap_time")), (table["tiers"], ("sensing", "plant"))):
+        world = [tuple(r[name] for name in (*same, "seed")) for r in rows]
+        pid = {w: r["position_rmse"] for w, r in zip(world, rows, strict=True) if r["feedforward"] == "none"}
+        for w, r in zip(world, rows, strict=True):
+            if pid[w] and r["position_rmse"]:  # else one of them was lost
+                assert r["position_rmse_to_pid"] == r["position_rmse"] / pid[w]
+
+
 @pytest.mark.parametrize("run", PINNED, ids=lambda run: " ".join(map(str, run)))
 def test_what_does_not_learn_keeps_its_numbers(table: dict, run: tuple[str, int, str]) -> None:
     """In the world of the paper, compliant steering, last of 8 laps; what RESULTS.md prints, within 1 %."""
