@@ -1,21 +1,24 @@
 """The delay that the velocity loop shows: when the PID's output oscillates, the controllers are designed anew.
 
 The PID is as fast as the delay of its loop allows (`design`). Where the motors act later than the controller knows, or
-the plant has several times the nominal gain, the loop oscillates. Each oscillation is answered by one move; odd and
-even moves differ:
+the plant has several times the nominal gain, the loop oscillates. Each oscillation is answered by one move:
 
-1. The motion controller is designed for `STEP` more delay, and the learner is taught with a third of the feedback, at
-   most `SLOWED` times. Both close further loops through the same delay, and a PID that is stable alone may oscillate
-   because of them. So they give way first.
-2. The PID is designed for `STEP` more delay too.
+1. The learner is taught with a third of the feedback. It closes a further loop through the same delay, and a PID that
+   is stable alone may oscillate because of it. So it gives way first; where the guard watches no learner, this move is
+   left out.
+2. The motion controller, which closes a further loop too, is designed for `STEP` more delay. The learner is taught with
+   a third once more, as it is at most `SLOWED` times.
+3. The PID is designed for `STEP` more delay too. From then on 2 and 3 take turns.
 
+The next move follows after `REST`, in which the oscillation may fade, or after `SOONEST` if it has grown by `GROWTH`.
 The moves are not taken back during a run. To lower a gain on an oscillation is the idea of adaptive augmenting control
 (Orr and VanZwieten 2012, Robust, practical adaptive control for launch vehicles); here the design of the gains replaces
 its factor.
 
 An oscillation is `SUSTAINED` half-waves of the PID's output in a row that are shorter than `SLOWEST`, and larger than
 the sum of `LEAST` of the supply and the recent peak of what explains them without an oscillating loop: the swing of the
-feedforward, or `MISMATCH` times the swing of the voltage that the nominal robot needs for the command.
+feedforward, or `MISMATCH` times the swing of the voltage that the nominal robot needs for the command. A loop that
+oscillates moves command and feedforward too, so that they explain at most `MOST_EXPLAINED` of the supply.
 """
 
 from __future__ import annotations
@@ -28,9 +31,9 @@ from mrctl.kernel import Array, Row, kernel
 STEP = 0.01
 """Delay in s that two moves add, rounded to whole control periods, *chosen*."""
 MOST = 20
-"""Largest number of moves, *chosen*."""
+"""Largest number of moves of the controllers, *chosen*."""
 SLOWED = 2
-"""Number of moves that slow the learner, *chosen*; after that it would hardly learn."""
+"""Number of times that the learner is slowed, *chosen*; after that it would hardly learn."""
 LEAST = 0.02
 """Least amplitude of a half-wave as a share of the supply (of the largest θ̇ on a steering channel), *chosen*. In 222
 random worlds in `lab` without unknown delay, the largest level that 8 half-waves in a row exceed is 0.013 of the
@@ -41,8 +44,15 @@ SLOWEST = 0.3
 """Longest half-wave in s, *chosen*."""
 MISMATCH = 2.0
 """Factor by which the robot may need more voltage than the nominal one, *chosen*."""
+MOST_EXPLAINED = 0.15
+"""Largest amplitude that command and feedforward explain, as a share of the supply (of the largest θ̇ on a steering
+channel), *chosen*."""
 REST = 2.0
 """Least time in s between two moves, in which an oscillation may fade, *chosen*."""
+GROWTH = 2.0
+"""Factor by which an oscillation must have grown since the last move to be answered before the rest is over, *chosen*."""
+SOONEST = 0.5
+"""Least time in s between two moves while the oscillation grows, *chosen*."""
 RECENT = 1.0
 """Time constant in s with which the peak of an explained swing decays."""
 
@@ -65,25 +75,33 @@ def watch_delay(feedback: Array, feedforward: Array, nominal: Array, period: flo
     for k in range(2):
         known = MISMATCH * abs(swing(nominal[k], k, period, s.nominal))
         known = max(known, abs(swing(feedforward[k], k, period, s.feedforward)))
+        known = min(known, s.most_explained[k])
         s.explained[k] = max(known, RECENT / (RECENT + period) * s.explained[k])
         wave = swing(feedback[k], k, period, s.feedback)
         count_half_waves(wave, k, s.least[k] + s.explained[k], SLOWEST, period, s.half_waves)
-        s.due |= s.half_waves.count[k] >= SUSTAINED
-    s.due &= s.rest <= 0.0
+        s.amplitude[k] = max(abs(wave), SLOWEST / (SLOWEST + period) * s.amplitude[k])
+        grows = s.amplitude[k] > GROWTH * s.answered[k] and s.rest <= REST - SOONEST
+        s.due |= s.half_waves.count[k] >= SUSTAINED and (s.rest <= 0.0 or grows)
     if s.due:
         s.rest = REST
+        for k in range(2):
+            s.answered[k] = s.amplitude[k]
 
 
 DELAY = np.dtype(
     [
         ("on", "?"),  # whether the watch acts
-        ("moves", "f8"),  # number of moves so far
+        ("moves", "f8"),  # number of moves of the controllers so far
+        ("slowed", "f8"),  # number of times that the learner has been slowed
         ("least", "f8", 2),  # least amplitude of a half-wave, V (rad/s); infinite on a channel that is not watched
+        ("most_explained", "f8", 2),  # largest amplitude that is explained without an oscillating loop, V (rad/s)
         ("feedback", SWING),  # swing of the PID's output
         ("feedforward", SWING),  # swing of the feedforward
         ("nominal", SWING),  # swing of the nominal voltage
         ("explained", "f8", 2),  # peak of what explains a swing of the PID's output, which decays, V (rad/s)
         ("half_waves", HALF_WAVES),  # of the PID's output
+        ("amplitude", "f8", 2),  # peak of the swing of the PID's output, which decays, V (rad/s)
+        ("answered", "f8", 2),  # the same when the last move was due
         ("rest", "f8"),  # time until the next move may be due, s
         ("due", "?"),  # whether the next move is due
     ],

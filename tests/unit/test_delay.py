@@ -7,7 +7,19 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from mrctl import Guard, Kanayama, Scenario
-from mrctl.control.delay import DELAY, LEAST, MISMATCH, MOST, REST, SLOWED, SLOWEST, STEP, SUSTAINED, watch_delay
+from mrctl.control.delay import (
+    DELAY,
+    LEAST,
+    MISMATCH,
+    MOST,
+    MOST_EXPLAINED,
+    REST,
+    SLOWED,
+    SLOWEST,
+    STEP,
+    SUSTAINED,
+    watch_delay,
+)
 from mrctl.control.design import motion
 from mrctl.control.oscillation import DRIFT, SMOOTH, SWING, swing
 from mrctl.control.pid import Pid
@@ -23,7 +35,7 @@ SUPPLY = 24.0
 def due(feedback, feedforward=None, nominal=None, on=True):
     """Times at which a move is due, for a PID output, a feedforward and a nominal voltage, `(T, 2)`."""
     s = np.zeros(1, DELAY)
-    s["on"], s["least"] = on, LEAST * SUPPLY
+    s["on"], s["least"], s["most_explained"] = on, LEAST * SUPPLY, MOST_EXPLAINED * SUPPLY
     times, nothing = [], np.zeros_like(feedback)
     others = (nothing if signal is None else signal for signal in (feedforward, nominal))
     for k, values in enumerate(zip(feedback, *others, strict=True)):
@@ -84,12 +96,25 @@ def test_what_is_no_oscillation():
     ring[:, 0] = 20.0 * np.exp(-0.5 * 40 * t) * np.sin(40 * np.sqrt(0.75) * t)  # ζ = 0.5
     assert not due(ring)
     own = wave(40.0, 3.0)
-    assert due(own)
+    assert due(own) and 3.0 * gain(40.0) < MOST_EXPLAINED * SUPPLY
     assert not due(own, -1.0 * own)
     assert due(own, 0.5 * own)
     assert not due(own, None, own / (0.9 * MISMATCH))
     assert due(own, None, own / (3 * MISMATCH))
     assert not due(own, on=False)
+
+
+@settings(max_examples=30, deadline=None)
+@given(frequency=st.floats(20, 60), ratio=st.floats(0.3, 5), by=st.sampled_from(["feedforward", "nominal"]))
+def test_explanation_is_bounded(frequency, ratio, by):
+    """A swing that goes through feedforward or command as well counts beyond 15 % of the supply and the threshold."""
+    bound = (LEAST + MOST_EXPLAINED) * SUPPLY / gain(frequency)
+    own = wave(frequency, ratio * bound)
+    found = due(own, **{by: 3.0 * own})
+    if ratio < 0.95:
+        assert not found
+    elif ratio > 1.3:
+        assert found
 
 
 def move(hierarchy, row=0):
@@ -103,7 +128,7 @@ def move(hierarchy, row=0):
 @pytest.mark.parametrize("own", [None, 1 / 30])
 @pytest.mark.parametrize("period", [0.01, 0.02])
 def test_moves(robot, tier, own, period):
-    """Motion controller and PID take turns; each has the gains of a robot that is designed for that delay."""
+    """First the learner alone, then motion controller and PID in turn, with the gains of a design for that delay."""
     scenario = Scenario(
         sensing=Sensing(tier=tier, delay=period), pid=Pid(delay=own), learner="fel", kanayama=Kanayama(k_x=1.5),
         control_period=period, motion_period=period,
@@ -111,6 +136,8 @@ def test_moves(robot, tier, own, period):
     h = Hierarchy([scenario], robot)
     known, step = scenario.sensing.loop_delay(period) * period, max(STEP, period)
     start = known if own is None else own
+    move(h)
+    assert h.state["guard"]["gain"][0] == pytest.approx(1 / 3) and h.state["delay"]["slowed"][0] == 1
     for done in range(6):
         pid, ahead = done // 2 * step, (done + 1) // 2 * step
         expected = Pid(delay=start + pid).gains(robot, False, known, period)
@@ -122,7 +149,7 @@ def test_moves(robot, tier, own, period):
         assert k["k_x"] == 1.5  # which the scenario gives
         assert (k["k_y"], k["k_theta"]) == pytest.approx((designed.kanayama.k_y, designed.kanayama.k_theta))
         assert h.state["limiter"]["time_constant"][0] == pytest.approx(designed.prefilter)
-        assert h.state["guard"]["gain"][0] == pytest.approx(3.0 ** -min(SLOWED, (done + 1) // 2))
+        assert h.state["guard"]["gain"][0] == pytest.approx(3.0 ** -min(SLOWED, 1 + done))
         assert h.state["delay"]["moves"][0] == done
         move(h)
 
@@ -131,7 +158,7 @@ def test_settings_during_a_run(robot):
     """After some moves new settings keep what the loop has shown, unless it is no longer watched; a new run forgets."""
     h = Hierarchy([Scenario()] * 2, robot)
     first = h.state.copy()
-    for _ in range(3):
+    for _ in range(4):  # of learner, motion controller, PID and motion controller
         move(h)
     assert np.all(h.state["pid"]["k_p"][0] < first["pid"]["k_p"][0])
     np.testing.assert_array_equal(h.state[1]["pid"], first[1]["pid"])
@@ -150,8 +177,8 @@ def test_settings_during_a_run(robot):
 
 
 def test_end_of_the_moves(robot):
-    """After the last move the watch is off."""
-    h = Hierarchy([Scenario()], robot)
+    """After the last move the watch is off; without a learner that is taught all moves are the controllers'."""
+    h = Hierarchy([Scenario(learner="none")], robot)
     for _ in range(MOST):
         assert h.state["delay"]["on"][0]
         move(h)
@@ -193,6 +220,8 @@ def test_stages_of_ones_own(robot):
     feedback.set_pid(0, Pid())
     assert not feedback.state["delay"]["on"][0]
     start = moved.state.copy()
+    move(moved)
+    np.testing.assert_array_equal(moved.state["pid"], start["pid"])  # only the learner was slowed
     move(moved)
     assert moved.state["delay"]["moves"][0] == 2
     assert np.all(moved.state["pid"]["k_p"][0] < start["pid"]["k_p"][0])
