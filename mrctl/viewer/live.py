@@ -171,10 +171,7 @@ class Live(Page):
         for label, choices in buttons(self.session.robot).items():
             group = gui.add_button_group(label, tuple(choices))
             self.on(group, partial(self._press, label))
-        self._hands = Hands(
-            self.server, self.on, self.ask, self._command, self._go_on, self._apply_event,
-            self._head_for, self._look_back,
-        )  # fmt: skip
+        self._hands = Hands(self, self._command, self._go_on, self._apply_event, self._head_for, self._look_back)
         self._fan = gui.add_checkbox("Avoider", self.session.avoid != "none", hint=FAN_HINT)
         self._touch = gui.add_checkbox("Contact forces", False, hint=TOUCH_HINT)
         self._tree = gui.add_checkbox("Search", False, hint="Draws the arcs that the search for the plan drove.")
