@@ -743,24 +743,35 @@ def suite(
         raise InputError(f"random: {random} is below 0")
     if quick + full + (held_out is not None) > 1:
         raise InputError("quick: give one of --quick, --full and --held-out")
-    if held_out is not None and (feedforward or controller or random is not None):
-        raise InputError("held_out: names the one feedforward to judge; give no other, and no random scenarios")
-    from mrctl.experiments import held_out as unseen
+    if held_out is not None:
+        if feedforward or controller or random is not None:
+            raise InputError("held_out: names the one feedforward to judge; give no other, and no random scenarios")
+        return _judge_held_out(held_out, seeds, workers, out or Path("held_out"))
     from mrctl.experiments import suite as uncertainty
     from mrctl.experiments.cases import HINDSIGHT, RANDOM, REPLICATES, Mode
 
-    if held_out is not None:
-        folder = out or Path("held_out")
-        aside = unseen.judge(held_out, REPLICATES["core"] if seeds is None else seeds, workers, folder)
-    else:
-        mode: Mode = "quick" if quick else "full" if full else "core"
-        folder = out or Path("suite" if mode == "core" else f"suite_{mode}")
-        every = (*(FEEDFORWARDS if full else COMPARED), HINDSIGHT)
-        counts = (REPLICATES[mode] if seeds is None else seeds), (RANDOM[mode] if random is None else random)
-        compared = every if feedforward is None else feedforward
-        aside = uncertainty.suite(mode, compared, controller, *counts, workers, folder).aside
-    report = "" if held_out is not None else f"\nReport: {folder / 'report.html'}"
-    print((folder / "table.md").read_text() + report)
+    mode: Mode = "quick" if quick else "full" if full else "core"
+    folder = out or Path("suite" if mode == "core" else f"suite_{mode}")
+    every = (*(FEEDFORWARDS if full else COMPARED), HINDSIGHT)
+    counts = (REPLICATES[mode] if seeds is None else seeds), (RANDOM[mode] if random is None else random)
+    compared = every if feedforward is None else feedforward
+    aside = uncertainty.suite(mode, compared, controller, *counts, workers, folder).aside
+    print(f"{(folder / 'table.md').read_text()}\nReport: {folder / 'report.html'}")
+    _expect_all(aside)
+
+
+def _judge_held_out(feedforward: str, seeds: int | None, workers: int | None, folder: Path) -> None:
+    """Drives a feedforward through cells that no setting was chosen on: `mrctl suite --held-out FEEDFORWARD`."""
+    from mrctl.experiments import held_out
+    from mrctl.experiments.cases import REPLICATES
+
+    aside = held_out.judge(feedforward, REPLICATES["core"] if seeds is None else seeds, workers, folder)
+    print((folder / "table.md").read_text())
+    _expect_all(aside)
+
+
+def _expect_all(aside: str) -> None:
+    """Fails the command if runs were set aside; the text says which."""
     if aside:
         raise _Incomplete(f"{aside}; the same command tries them again")
 

@@ -78,7 +78,7 @@ class Event(Record):
     """Whether the feedforward learns from then on."""
 
     def tick(self, period: float) -> int:
-        """The first control tick that is not before the event; `period` is the control period in s."""
+        """Returns the first control tick that is not before the event; `period` is the control period in s."""
         return ceil(self.time / period - 1e-9)
 
 

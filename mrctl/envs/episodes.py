@@ -296,8 +296,9 @@ class Episodes:
 
     def failure(self, row: int) -> str:
         """Returns why a robot has failed, with ticks counted from the beginning of its episode; "" if it has not."""
-        reason, says, tick = self.plant.failure[row].rpartition(", tick ")
-        return f"{reason}{says}{int(tick) - self.start[row]}" if says else tick
+        reason = self.plant.failure[row]
+        before, says, tick = reason.rpartition(", tick ")
+        return f"{before}{says}{int(tick) - self.start[row]}" if says else reason
 
 
 def read(scenario: Scenario | str | Path | None) -> Scenario:

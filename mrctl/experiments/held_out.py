@@ -80,24 +80,15 @@ def cells(count: int) -> list[Case]:
     Args:
         count: Number of replicates of each cell; all cells have the same draws.
     """
-    return [
-        Case(
-            f"{course}; {plant}",
-            "held-out",
-            tuple(
-                replicates(
-                    Scenario(
-                        name=f"{course}; {plant}", laps=LAPS, reference=reference, perturbation=perturbation,
-                        initial_spread=NO_SPREAD,
-                    ),
-                    count,
-                    HELD_OUT_SEEDS.start,
-                )
-            ),
-        )
-        for course, reference in courses().items()
-        for plant, perturbation in PLANTS.items()
-    ]  # fmt: skip
+    found = []
+    for course, reference in courses().items():
+        for plant, perturbation in PLANTS.items():
+            name = f"{course}; {plant}"
+            run = Scenario(
+                name=name, laps=LAPS, reference=reference, perturbation=perturbation, initial_spread=NO_SPREAD
+            )
+            found.append(Case(name, "held-out", tuple(replicates(run, count, HELD_OUT_SEEDS.start))))
+    return found
 
 
 def judge(entry: str, count: int, workers: int | None, out: Path) -> str:

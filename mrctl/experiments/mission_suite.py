@@ -226,7 +226,7 @@ def values(found: Found) -> dict[str, Any]:
 
 
 def critical_widths(found: Found, shown: str) -> Table:
-    """The critical widths at the largest speed, and in how many draws a controller needs less than two others."""
+    """Returns the table of the critical widths at the largest speed, with the wins over PID and over `model`."""
     needed, rows = found.needed[-1], []
     for plant, own in zip(PLANTS, needed.swapaxes(0, 1), strict=True):
         for name, one in zip(CONTROLLERS, own, strict=True):
@@ -255,7 +255,7 @@ def critical_widths(found: Found, shown: str) -> Table:
 
 
 def critical_speeds(found: Found, shown: str) -> Table:
-    """The critical speeds."""
+    """Returns the table of the critical speeds."""
     fits = np.cumprod(found.needed <= found.plans + SLACK, axis=0).sum(axis=0)  # how many speeds, from the slowest on
     critical, rows = np.array([0.0, *found.speeds])[fits], []
     for plant, own in zip(PLANTS, critical.swapaxes(0, 1), strict=True):
@@ -300,7 +300,7 @@ def budget(found: Found, shown: str) -> Table:
 
 
 def _quantile(samples: Array, scale: float) -> str:
-    """A quantile with its interval; of samples that were negated the scale is negative, so that the ends swap."""
+    """Returns the quantile `SHARE` times a scale, with its interval; the scale of negated samples is negative."""
     value, low, high, *_ = quantile_interval(samples, SHARE)
     low, high = sorted((scale * low, scale * high))
     return f"{_text(scale * value)} [{_text(low)}, {_text(high)}]"
@@ -311,7 +311,7 @@ def _text(value: float) -> str:
 
 
 def _against(rival: FeedforwardName, samples: Array) -> str:
-    """Who does better or worse than a rival on which plants; samples `(controllers, plants, draws)`, less is better."""
+    """Says who does better or worse than a rival, and where; samples `(controllers, plants, draws)`, less is better."""
     verdicts = {"better": [], "worse": []}
     for c, name in enumerate(CONTROLLERS):
         for p, plant in enumerate(PLANTS):

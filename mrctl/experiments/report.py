@@ -188,7 +188,7 @@ def command(outcome: Outcome, choices: Choices) -> str:
 
 
 def _worlds(outcome: Outcome) -> int:
-    """Number of random scenarios in each tier."""
+    """Returns the number of random scenarios in each tier."""
     return max((len(case.scenarios) for case in outcome.cases if case.part == "random"), default=0)
 
 

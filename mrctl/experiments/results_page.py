@@ -350,7 +350,7 @@ def _bench_section(file: Path) -> str:
 
 
 def _navigated(folders: Sequence[Path], name: str, key: str) -> str:
-    """One part of what `mrctl navigate --suite` wrote for each robot and sensing tier."""
+    """Returns one part of what `mrctl navigate --suite` wrote, for each robot and sensing tier."""
     parts = []
     for folder in folders:
         table = _read(folder / f"{name}.json", "scenario", "mode", key)

@@ -103,47 +103,60 @@ def _report(
     scenario: Scenario, result: xr.Dataset, out: Path | None, as_json: bool, own: str | None
 ) -> tuple[str, str]:
     """Returns what `run` returns, and saves the result."""
-    laps = metrics.per_lap(result)
+    laps, run = metrics.per_lap(result), result.isel(run=0)
     if out is not None:
-        save(result, out / "result.zarr")
-        if "weights" in result and not result["failed"].any() and np.isfinite(result["weights"]).all():
-            save_learned(out / "learned.safetensors", result)
-        _draw(result, laps, out)
-    row, reason = laps.isel(run=0), str(result["failure"].values[0])
-    failure = f"after {float(row['failure_time']):.2f} s: {reason}" if reason else ""
-    faults, events = faults_of(result.isel(run=0)), metrics.guard_events(result).drop(columns="run")
-    if as_json:
-        values = {
-            "scenario": scenario.model_dump(mode="json"),
-            "controller": own,
-            "versions": versions(),
-            "failed": bool(reason),
-            "failure": reason,
-            "failure_time": float(row["failure_time"]) if failure else None,
-            "laps": [{name: _number(row[name].values[k]) for name in metrics.METRICS} for k in range(row.sizes["lap"])],
-            "faults": faults,
-            "guard": events.to_dict("records"),
-            "retuned": _retuned(result.isel(run=0)),
-            "feedforward_limited": _limited(result.isel(run=0)),
-        }
-        return json.dumps(values, indent=1), failure
-    header = ["lap", *(title for title, _ in COLUMNS.values())]
-    rows = [
-        [str(k + 1), *(number(scale * float(row[name].values[k])) for name, (_, scale) in COLUMNS.items())]
-        for k in np.flatnonzero(np.isfinite(row["position_rmse"].values))
-    ]
-    name = str(result["feedforward"].values[0]) + (f", own stages {own}" if own else "")
-    steering, course = result["steering"].values[0], scenario.reference
+        _save(result, laps, out)
+    reason = str(run["failure"].values)
+    failure = f"after {float(run['failure_time']):.2f} s: {reason}" if reason else ""
+    describe = _as_json if as_json else _as_text
+    return describe(scenario, run, laps.isel(run=0), own, failure), failure
+
+
+def _as_json(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | None, failure: str) -> str:
+    """Returns the report as JSON; the arguments are those of `_as_text`."""
+    values = {
+        "scenario": scenario.model_dump(mode="json"),
+        "controller": own,
+        "versions": versions(),
+        "failed": bool(failure),
+        "failure": str(run["failure"].values),
+        "failure_time": float(run["failure_time"]) if failure else None,
+        "laps": [{name: _number(laps[name].values[k]) for name in metrics.METRICS} for k in range(laps.sizes["lap"])],
+        "faults": faults_of(run),
+        "guard": metrics.guard_events(run).drop(columns="run").to_dict("records"),
+        "retuned": _retuned(run),
+        "feedforward_limited": _limited(run),
+    }
+    return json.dumps(values, indent=1)
+
+
+def _as_text(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | None, failure: str) -> str:
+    """Returns the report as text.
+
+    Args:
+        scenario: The run.
+        run: Its result.
+        laps: Its metrics, lap by lap.
+        own: Stages of the user, or None.
+        failure: When and why it failed, or "".
+    """
+    name = str(run["feedforward"].values) + (f", own stages {own}" if own else "")
+    course = scenario.reference
     lines = [
         f"RMSE per lap against the reference ({course.kind}, {course.period:.3g} s a lap); feedforward {name}, "
-        f"steering {steering}"
+        f"steering {run['steering'].values}"
     ]
     lines += [f"failed {failure}"] if failure else []
-    lines += faults + _limited(result.isel(run=0)) + _unreached(scenario, result.isel(run=0))
+    lines += faults_of(run) + _limited(run) + _unreached(scenario, run)
+    rows = [
+        [str(k + 1), *(number(scale * float(laps[name].values[k])) for name, (_, scale) in COLUMNS.items())]
+        for k in np.flatnonzero(np.isfinite(laps["position_rmse"].values))
+    ]
     if rows:
-        lines.append(markdown(header, rows))
-    acted = [f"guard at {time:.2f} s: {action}, {why}" for time, action, why in events.itertuples(index=False)]
-    return "\n".join([*lines, *(text.removesuffix(", ") for text in acted), *_retuned(result.isel(run=0))]), failure
+        lines.append(markdown(["lap", *(title for title, _ in COLUMNS.values())], rows))
+    for _, time, action, why in metrics.guard_events(run).itertuples(index=False):
+        lines.append(f"guard at {time:.2f} s: {action}, {why}".removesuffix(", "))
+    return "\n".join(lines + _retuned(run))
 
 
 def _retuned(run: xr.Dataset) -> list[str]:
@@ -188,7 +201,11 @@ def _written() -> list[str]:
     return ["result.zarr", "learned.safetensors", *(file for name in FIGURES for file in plots.files(name))]
 
 
-def _draw(result: xr.Dataset, laps: xr.Dataset, out: Path) -> None:
+def _save(result: xr.Dataset, laps: xr.Dataset, out: Path) -> None:
+    """Writes the result, what was learned and the figures to a folder."""
+    save(result, out / "result.zarr")
+    if "weights" in result and not result["failed"].any() and np.isfinite(result["weights"]).all():
+        save_learned(out / "learned.safetensors", result)
     from mrctl.results import plots
 
     for name, function in FIGURES.items():

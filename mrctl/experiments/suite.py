@@ -290,7 +290,7 @@ def standing(name: str, errors: Mapping[str, Array], floor: Floor, median: bool)
 
 
 def no_worse(error: Array, pid: Array) -> dict[str, float | int]:
-    """Share of runs whose error is at most `NO_WORSE` times that of PID alone, with Wilson's 95 % interval.
+    """Returns the share of runs whose error is at most `NO_WORSE` times that of PID alone, with Wilson's 95 % interval.
 
     With it come the 99 % quantile of that ratio, and the number of runs in which it is above `MUCH_WORSE`. The ratio of
     a failed run, whose error is NaN, is infinite, and 0 where PID alone failed.

@@ -91,6 +91,6 @@ class Events:
 
 
 def _others(schedule: dict[int, list[tuple[int, T]]], row: int, tick: int) -> dict[int, list[tuple[int, T]]]:
-    """Returns what a schedule has for other robots than one, from a tick on."""
+    """Returns a schedule from a tick on, without the entries of one robot."""
     coming = {t: [entry for entry in entries if entry[0] != row] for t, entries in schedule.items() if t >= tick}
     return defaultdict(list, coming)

@@ -354,7 +354,7 @@ class Hierarchy:
         guard["harmless"][row], guard["harmless_to_posture"][row] = found
 
     def _rejection(self, row: int) -> tuple[Peaks, Peaks]:
-        """Peak-to-peak gains from a voltage to the errors of one robot under its controllers."""
+        """Returns the peak-to-peak gains from a voltage to the errors of one robot under its controllers."""
         k, own = self.state["kanayama"][row], self.settings[row]
         pid, delay = self.lengthened(row, own.pid)
         kanayama = Kanayama(k_x=k["k_x"], k_y=k["k_y"], k_theta=k["k_theta"])

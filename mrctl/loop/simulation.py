@@ -501,7 +501,7 @@ class Simulation:
         return learned
 
     def _layout(self) -> dict[str, Any]:
-        """Variable `LAYOUT`, where a feedforward of the user keeps what it learns."""
+        """Returns the variable `LAYOUT`, where a feedforward of the user keeps what it learns."""
         learner = self.hierarchy.learner
         if not (isinstance(learner, UserFeedforward) and learner.shapes):
             return {}
@@ -509,7 +509,7 @@ class Simulation:
         return {LAYOUT: ("run", np.array([text] * len(self.scenarios), object))}
 
     def _coefficients(self) -> dict[str, Any]:
-        """Variables with the coefficients of `parameters`, where the learner has some."""
+        """Returns variables with the coefficients of `parameters`, where the learner has some."""
         if (coefficients := self.parameters()) is None:
             return {}
         axes, units = ("run", "feature", "channel"), {"units": "V"}
@@ -517,7 +517,7 @@ class Simulation:
         return {"parameters": (axes, known, units), "true_parameters": (axes, true, units)}
 
     def _constants(self) -> dict[str, Any]:
-        """Variables with which the features of a commanded motion are computed."""
+        """Returns the variables with which the features of a commanded motion are computed."""
         size, robot = len(self.scenarios), self.plant.robot
         return {
             "half_track": ("run", np.full(size, robot.half_track), {"units": "m"}),
@@ -525,7 +525,7 @@ class Simulation:
         }
 
     def _gains(self) -> dict[str, Any]:
-        """Variables with the gains of the controllers before any event."""
+        """Returns variables with the gains of the controllers before any event."""
         gains = {}
         for name, (unit, meaning) in dataset.GAINS.items():
             values = self.hierarchy.gains[name].copy()
@@ -542,7 +542,7 @@ class Simulation:
         }
 
     def _clearance(self, length: int) -> dict[str, Any]:
-        """Distance of each robot's footprint from the nearest obstacle at each tick, where there are obstacles."""
+        """Returns the variable `clearance`, where there are obstacles: the distance of each footprint from them."""
         if not self.scenarios[0].obstacles.shapes:
             return {}
         footprint, ticks = hull.footprint(self.model), self.log.ticks[:length]

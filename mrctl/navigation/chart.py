@@ -134,20 +134,22 @@ def _without(known: Outlines, gone: NDArray[np.bool]) -> Outlines:
 def through(points: Array, scan: Scan) -> NDArray[np.bool]:
     """Tells for which points, `(k, 2)` in m, all beams pass that would meet a disc of `RADIUS` around them, `(k,)`."""
     found = np.empty(len(points), bool)
-    beams = scan.ranges, float(scan.angles[0]), scan.step, scan.reach
+    beams = scan.ranges, scan.full_turn, float(scan.angles[0]), scan.step, scan.reach
     pass_through.compiled(np.ascontiguousarray(points), *beams, scan.place, found)
     return found
 
 
 @kernel
 def pass_through(
-    points: Array, ranges: Array, first: float, step: float, most: float, place: Array, found: NDArray[np.bool]
-) -> None:
+    points: Array, ranges: Array, turn: int, first: float, step: float, most: float, place: Array,
+    found: NDArray[np.bool],
+) -> None:  # fmt: skip
     """Writes what `through` returns into `found`.
 
     Args:
         points: The points in m, `(k, 2)`.
         ranges: Ranges in m, `(n,)`; infinite where nothing returned.
+        turn: Number of beams in a full turn, n or more.
         first: Direction of the first beam from straight ahead in rad.
         step: Angle from one beam to the next in rad.
         most: Largest range in m, beyond which nothing is seen.
@@ -163,5 +165,5 @@ def pass_through(
         reach, wide = away + BESIDE[0] + BESIDE[1] * away, half / step
         found[k] = reach <= most
         for i in range(int(np.floor(beam - wide)), int(np.floor(beam + wide)) + 1):
-            around = i % max(n, int(np.round(2 * np.pi / step)))
+            around = i % turn
             found[k] &= around < n and ranges[min(around, n - 1)] > reach

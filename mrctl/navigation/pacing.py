@@ -10,11 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mrctl.control.design import motion as design
-from mrctl.control.kanayama import GAINS, kanayama, posture_error
-from mrctl.kernel import Array
+from mrctl.control.kanayama import kanayama, posture_error
+from mrctl.kernel import Array, over_rows
 from mrctl.loop.goals import RESTING
-from mrctl.loop.simulation import arranged
+from mrctl.loop.hierarchy import Hierarchy
 from mrctl.navigation.avoidance import Barrier, approach, share
 from mrctl.navigation.planning import least_clearance
 from mrctl.navigation.replanning import SHORTER, Planner, Replan
@@ -34,25 +33,18 @@ SPACING = 0.05  # m, of the places of a plan that are looked at
 
 
 class Following:
-    """Kanayama's motion controller, with the gains that scenarios have or that are designed for them."""
+    """Kanayama's motion controller, with the gains that it has in a hierarchy where no stage takes its place."""
 
     def __init__(self, robot: Robot, scenarios: Sequence[Scenario]) -> None:
-        """Takes the nominal robot, and the scenario of each robot."""
-        self._gains = np.zeros(len(scenarios), GAINS)
-        for row, scenario in enumerate(scenarios):
-            rigid = arranged(scenario).steering == "rigid"
-            latency = scenario.sensing.loop_delay(scenario.control_period) * scenario.control_period
-            gains = scenario.pid.channels(robot, rigid, latency, scenario.control_period)
-            designed = design(robot, rigid, gains, latency, scenario.control_period, scenario.prefilter).kanayama
-            own = scenario.kanayama.completed(designed)
-            self._gains[row] = own.k_x, own.k_y, own.k_theta
+        """Takes the nominal robot, and the scenario of each robot of a group."""
+        alone = [scenario.model_copy(update={"learner": "none", "learned": None}) for scenario in scenarios]
+        self._gains = Hierarchy(alone, robot).state["kanayama"]  # which do not depend on the learner
 
-    def output(self, pose: Array, twist: Array, reference: Array) -> Array:
+    def output(self, pose: Array, reference: Array) -> Array:
         """Returns the requested twists, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
-        error, requests = np.empty(3), np.empty((len(pose), 2))
-        for row in range(len(pose)):
-            posture_error.compiled(pose[row], reference[row, :3], error)
-            kanayama.compiled(error, reference[row, 3:5], self._gains[row], requests[row])
+        error, requests = np.empty((len(pose), 3)), np.empty((len(pose), 2))
+        over_rows(posture_error, pose, reference[:, :3], error)
+        over_rows(kanayama, error, reference[:, 3:5], self._gains, requests)
         return requests
 
 
@@ -171,7 +163,7 @@ class Pacing:
         for row, plan in enumerate(self._plans):
             first = min(int(self._clock[row]), len(plan) - 2)
             now[row] = plan[first] + min(self._clock[row] - first, 1.0) * (plan[first + 1] - plan[first])
-        requests, twists = self._follow.output(pose, twist, now), now[:, 3:5].copy()
+        requests, twists = self._follow.output(pose, now), now[:, 3:5].copy()
         free = [self._share(row, *own) for row, own in enumerate(zip(requests, pose, strict=True))]
         change = self._period * self._robot.max_acceleration / np.maximum(np.abs(twists[:, 0]), 1e-9)
         pace = np.minimum(np.clip(free, self._pace - change, self._pace + BRAKING * change), 1.0)[:, None]

@@ -84,7 +84,7 @@ class Agent:
         self._pieces = 0
 
     def _take(self, plan: Waypoints) -> None:
-        """Goes along a plan, with a field that reaches as far."""
+        """Goes along a plan from now on; where the distance field ends before the plan does, makes another field."""
         self._table, self._place = self._sampled(plan), 0
         low, high = self._table[:, :2].min(axis=0), self._table[:, :2].max(axis=0)
         distance, origin, resolution = self._field

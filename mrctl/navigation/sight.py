@@ -166,8 +166,7 @@ class Sight:
         """
         ranges = scan.ranges
         met, points = np.flatnonzero(np.isfinite(ranges)), scan.points
-        blind = max(0, round(2 * np.pi / scan.step) - len(ranges))  # beams that are missing to a full turn
-        ranges = np.append(ranges, np.zeros(blind))
+        ranges = np.append(ranges, np.zeros(scan.full_turn - len(ranges)))
         if self._field is not None:
             away = np.empty(len(points))
             from_map.compiled(self._field, points, away)

@@ -202,7 +202,7 @@ class _Adoption:
         return sorted(casters, key=lambda caster: -(caster.centre @ self.left))
 
     def _gaps(self, floor: float) -> str:
-        """Returns how far the lowest part and the driven wheels are from the floor, the mean of these, as a clause."""
+        """Says in a clause how far above the floor of the driven wheels the lowest of the other parts ends."""
         wheels = {wheel.body for wheel in self.rear}
         others = [
             g for g in range(self.model.ngeom)
@@ -423,11 +423,7 @@ class _Adoption:
             yield "joint", joint, f"steering_{name}"
 
     def _add_steering(self, spec: mujoco.MjSpec) -> None:
-        """Adds a servo with set-points of angle and rate, and the linkage of two steered wheels.
-
-        Ackermann's geometry turns a wheel at y to the left by atan(L tan φ/(L − y tan φ)), where φ is the steering
-        angle of the middle of the front axle and L the wheelbase.
-        """
+        """Adds a servo with set-points of angle and rate, and the linkage of two steered wheels."""
         servos = [k for k in range(len(self.model.actuator_trntype)) if self._turns_steering(k)]
         kp, kv = (sum(-self.model.actuator_biasprm[k, i] for k in servos) for i in (1, 2))
         if not kp > 0:
@@ -438,32 +434,45 @@ class _Adoption:
             raise InputError(f"steering: {_listed(self.steered)} needs a range below 90° on either side of straight on")
         anchors = [self._rotation() @ (self.data.joint(name).xanchor - self.origin) for name in self.steered]
         if len(anchors) == 2:
-            length, track = float(np.mean([a[0] for a in anchors])), float(anchors[0][1] - anchors[1][1])
-            limit = float(np.arctan(length / (length / np.tan(limit) + track / 2)))
-            inertia = sum(self.model.dof_M0[self.model.joint(name).dofadr[0]] for name in self.steered)
-            fork = spec.body("chassis").add_body(
-                name="fork", pos=(length, 0.0, float(np.mean([a[2] for a in anchors])))
-            )
-            fork.mass, fork.inertia, fork.explicitinertial = 1e-6, np.full(3, 1e-9), True
-            # The rack has the inertia of the wheels that it turns. The second term keeps its time constant J/k_v above
-            # the 2 ms of the default physics step.
-            fork.add_joint(name="steering", type=HINGE, axis=UP, armature=inertia + 0.002 * kv)
-            for name, anchor in zip(FRONTS[1:3], anchors, strict=True):
-                phi = np.linspace(-limit, limit, 201)
-                angle = np.arctan(length * np.tan(phi) / (length - anchor[1] * np.tan(phi)))
-                powers = np.linalg.lstsq(phi[:, None] ** np.arange(1, 5), angle, rcond=None)[0]
-                linkage = spec.add_equality(name=f"steering_{name}", type=mujoco.mjtEq.mjEQ_JOINT)
-                linkage.objtype = mujoco.mjtObj.mjOBJ_JOINT
-                linkage.name1, linkage.name2 = f"steering_{name}", "steering"
-                linkage.data[:5] = 0.0, *powers
-                linkage.solref[:] = 0.01, 1.0
-                spec.joint(f"steering_{name}").limited = 0  # the rack has the stops
+            limit = self._add_linkage(spec, anchors, limit, kv)
         joint = spec.joint("steering")
         joint.limited = 1
         joint.range = np.array([-limit, limit]) * (180 / np.pi if self._in_degrees(len(anchors)) else 1.0)
         servo = spec.add_actuator(name="steering", target="steering", trntype=mujoco.mjtTrn.mjTRN_JOINT)
         servo.set_to_pid(kp=kp, kv=kv)
         spec.add_text(name=RIGID, data="the wheels go where the servo says")
+
+    def _add_linkage(self, spec: mujoco.MjSpec, anchors: Sequence[Array], limit: float, kv: float) -> float:
+        """Adds a rack, with the joint `steering`, that turns two wheels; returns its limit in rad.
+
+        Ackermann's geometry turns a wheel at y to the left by atan(L tan φ/(L − y tan φ)), where φ is the steering
+        angle of the middle of the front axle and L the wheelbase.
+
+        Args:
+            spec: The world.
+            anchors: Places of the axes of the wheels in the frame of the chassis in m, `(3,)` each.
+            limit: Limit of the wheels in rad.
+            kv: Gain of the servo on the rate in N·m·s/rad.
+        """
+        length, track = float(np.mean([a[0] for a in anchors])), float(anchors[0][1] - anchors[1][1])
+        limit = float(np.arctan(length / (length / np.tan(limit) + track / 2)))
+        inertia = sum(self.model.dof_M0[self.model.joint(name).dofadr[0]] for name in self.steered)
+        fork = spec.body("chassis").add_body(name="fork", pos=(length, 0.0, float(np.mean([a[2] for a in anchors]))))
+        fork.mass, fork.inertia, fork.explicitinertial = 1e-6, np.full(3, 1e-9), True
+        # The rack has the inertia of the wheels that it turns. The second term keeps its time constant J/k_v above
+        # the 2 ms of the default physics step.
+        fork.add_joint(name="steering", type=HINGE, axis=UP, armature=inertia + 0.002 * kv)
+        for name, anchor in zip(FRONTS[1:3], anchors, strict=True):
+            phi = np.linspace(-limit, limit, 201)
+            angle = np.arctan(length * np.tan(phi) / (length - anchor[1] * np.tan(phi)))
+            powers = np.linalg.lstsq(phi[:, None] ** np.arange(1, 5), angle, rcond=None)[0]
+            linkage = spec.add_equality(name=f"steering_{name}", type=mujoco.mjtEq.mjEQ_JOINT)
+            linkage.objtype = mujoco.mjtObj.mjOBJ_JOINT
+            linkage.name1, linkage.name2 = f"steering_{name}", "steering"
+            linkage.data[:5] = 0.0, *powers
+            linkage.solref[:] = 0.01, 1.0
+            spec.joint(f"steering_{name}").limited = 0  # the rack has the stops
+        return limit
 
     def _in_degrees(self, steered: int) -> bool:
         """Tells whether the joint `steering` comes from the file and the file gives angles in degrees."""

@@ -117,9 +117,8 @@ FAULTS = {
     "feedforward_fault": "the guard lets PID and nominal model drive it",
 }
 
-WHOLE = (
-    "variables"  # attribute of a saved result: its variables, each of whose files holds all chunks, even with only NaN
-)
+# Attribute of a saved result: its variables, each of whose files holds all chunks, even with only NaN.
+WHOLE = "variables"
 WHOLE_BEFORE_0_10_2 = "all_chunks"  # the same without their names
 CHECKSUMS = "checksums"  # attribute of a saved result: what `_checksums` returns; older results lack it
 CODECS = {"bytes", "vlen-utf8", "zstd", "blosc", "crc32c", "sharding_indexed"}  # all that mrctl ever wrote
@@ -357,7 +356,7 @@ def check_declared(path: Path, declared: int, stored: int) -> None:
 
 @contextlib.contextmanager
 def reading_chunks(path: str | Path) -> Iterator[None]:
-    """Like `reading`, for chunks of zarr arrays, of which zarr goes on to read others after an error; they are stopped.
+    """Reads chunks of zarr arrays as `reading` reads files; after an error it stops zarr, which would read on.
 
     Otherwise Python prints a traceback for each of them when the process ends.
 

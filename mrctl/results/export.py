@@ -30,7 +30,7 @@ import contextlib
 import json
 import uuid
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -266,21 +266,8 @@ def _messages(columns: Columns, scenario: Scenario) -> Iterator[tuple[int, str, 
         logged = round(now * 1e9)
         body, odom = _header(logged, "base_link"), _header(logged, "odom")
 
-        def odometry(after: str, k: int = k, odom: Message = odom) -> Message:
-            seen, lateral = after == "_measured", 0.0 if after else c["v_lateral"][k]
-            names = "variance_x", "covariance_xy", "variance_y", "variance_theta", "variance_v", "variance_omega"
-            x, xy, y, theta, v, omega = (c[name][k] if seen else 0.0 for name in names)
-            at = c["x" + after][k], c["y" + after][k], c["theta" + after][k]
-            moves = {"linear": _xyz(c["v" + after][k], lateral), "angular": _xyz(z=c["omega" + after][k])}
-            return {
-                "header": odom,
-                "child_frame_id": "base_link",
-                "pose": _posture(*at, _planar(x, xy, y, theta)),
-                "twist": {"twist": moves, "covariance": _planar(v, 0.0, 0.0, omega)},
-            }
-
         for topic, after in (("odom", ""), ("reference", "_ref"), ("estimate", "_measured")):
-            yield logged, topic, "nav_msgs/msg/Odometry", odometry(after)
+            yield logged, topic, "nav_msgs/msg/Odometry", _odometry(c, k, after, odom)
         command = {"linear": _xyz(c["v_command"][k]), "angular": _xyz(z=c["omega_command"][k])}
         yield logged, "cmd_vel", "geometry_msgs/msg/TwistStamped", {"header": body, "twist": command}
         joints = {
@@ -296,16 +283,7 @@ def _messages(columns: Columns, scenario: Scenario) -> Iterator[tuple[int, str, 
             message = {"header": _header(taken["fix"][k], "odom"), "pose": pose}
             yield logged, "fix", "geometry_msgs/msg/PoseWithCovarianceStamped", message
         if new["gyro"][k]:
-            message = {
-                "header": _header(taken["gyro"][k], "imu_link"),
-                "orientation": _heading(0.0),
-                "orientation_covariance": [-1.0] + [0.0] * 8,
-                "angular_velocity": _xyz(z=c["gyro"][k]),
-                "angular_velocity_covariance": _diagonal(UNMEASURED, UNMEASURED, gyro),
-                "linear_acceleration": _xyz(c["acceleration_x"][k], c["acceleration_y"][k], GRAVITY),
-                "linear_acceleration_covariance": _diagonal(force, force, UNMEASURED),
-            }
-            yield logged, "imu", "sensor_msgs/msg/Imu", message
+            yield logged, "imu", "sensor_msgs/msg/Imu", _imu(c, k, _header(taken["gyro"][k], "imu_link"), gyro, force)
         if new["encoder"][k]:
             angles = [c["encoder_left"][k], c["encoder_right"][k]]
             joints = {"name": wheels, "position": angles, "velocity": [], "effort": []}
@@ -315,6 +293,42 @@ def _messages(columns: Columns, scenario: Scenario) -> Iterator[tuple[int, str, 
                 layout = {"dim": [{"label": "wheel", "size": 2, "stride": 2}], "data_offset": 0}
                 message = {"layout": layout, "data": [round(angle * counts / (2 * np.pi)) for angle in angles]}
                 yield logged, "encoder_counts", "std_msgs/msg/Int64MultiArray", message
+
+
+def _odometry(c: Mapping[str, list[float]], k: int, after: str, header: Message) -> Message:
+    """Returns posture and twist of a sample.
+
+    Args:
+        c: The signals, by name.
+        k: Index of the sample.
+        after: End of the names: "" for the true motion, `_ref` for the reference, `_measured` for the estimate, which
+            alone has covariances.
+        header: Header of the message.
+    """
+    seen, lateral = after == "_measured", 0.0 if after else c["v_lateral"][k]
+    names = "variance_x", "covariance_xy", "variance_y", "variance_theta", "variance_v", "variance_omega"
+    x, xy, y, theta, v, omega = (c[name][k] if seen else 0.0 for name in names)
+    at = c["x" + after][k], c["y" + after][k], c["theta" + after][k]
+    moves = {"linear": _xyz(c["v" + after][k], lateral), "angular": _xyz(z=c["omega" + after][k])}
+    return {
+        "header": header,
+        "child_frame_id": "base_link",
+        "pose": _posture(*at, _planar(x, xy, y, theta)),
+        "twist": {"twist": moves, "covariance": _planar(v, 0.0, 0.0, omega)},
+    }
+
+
+def _imu(c: Mapping[str, list[float]], k: int, header: Message, gyro: float, force: float) -> Message:
+    """Returns the samples of gyro and accelerometer, of these variances in (rad/s)² and (m/s²)²; see `_odometry`."""
+    return {
+        "header": header,
+        "orientation": _heading(0.0),
+        "orientation_covariance": [-1.0] + [0.0] * 8,
+        "angular_velocity": _xyz(z=c["gyro"][k]),
+        "angular_velocity_covariance": _diagonal(UNMEASURED, UNMEASURED, gyro),
+        "linear_acceleration": _xyz(c["acceleration_x"][k], c["acceleration_y"][k], GRAVITY),
+        "linear_acceleration_covariance": _diagonal(force, force, UNMEASURED),
+    }
 
 
 def _taken(scenario: Scenario, sensor: str, t: NDArray) -> NDArray[np.int64]:

@@ -252,27 +252,37 @@ class Estimator:
             deviation[:3] = position, position, heading
             deviation[3] = START_TWIST[0] if sensor["quantum"] else 0.0
             deviation[4] = START_TWIST[1] if sensor["gyro_sigma"] else 0.0
-        memory, size = self.memory[row], 5
-        memory["mean"][:size] = np.append(reading["pose"], reading["twist"]) + deviation * random.standard_normal(size)
+        memory = self.memory[row]
+        memory["mean"][:5] = np.append(reading["pose"], reading["twist"]) + deviation * random.standard_normal(5)
         if self.scanner:
             self.scanner.start(row, seed, tick)
         if self.localiser:
             started = self.localiser.start(row, memory["mean"][:3], deviation[:3], seed)
             memory["mean"][:3], deviation[:3] = started
         if self._name == "ekf":
-            offset = sensing["accelerometer_bias"] ** 2 + START_OFFSET**2
-            count = sensor["quantum"] ** 2 / 12
-            variances = [*deviation**2, sensing["gyro_bias"] ** 2, offset, count, count, RADIUS**2, RADIUS**2]
-            memory["acceleration_variance"] = sensor["accelerometer_sigma"] ** 2
-            memory["offset_walk"] = np.hypot(sensing["accelerometer_walk"], INCLINE)
-            memory["P"][:] = np.diag(np.maximum(variances, 1e-12))
-            memory["encoder_variance"], memory["gyro_variance"] = count, sensor["gyro_sigma"] ** 2
-            memory["bias_variance"], memory["bias_walk"] = sensing["gyro_bias"] ** 2, sensing["gyro_walk"]
-            memory["kept_tick"] = -1
-            own = sensing.localisation == "particles"  # moved by encoders and gyro, so that errors of fixes last
-            memory["drift_bound"] = np.inf if own else DRIFTING / np.sqrt(2 * FIXES - 1)
-            memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
-            memory["inertial"] = memory["mean"][3]
+            self._start_filter(row, deviation)
+
+    def _start_filter(self, row: int, deviation: Array) -> None:
+        """Sets covariance and noise of the filter of one robot.
+
+        Args:
+            row: Index of the robot.
+            deviation: Standard deviations of its first posture and twist, `(5,)`.
+        """
+        sensing, sensor, memory = self._sensing[row], self.sensors.sensors[row], self.memory[row]
+        offset = sensing["accelerometer_bias"] ** 2 + START_OFFSET**2
+        count = sensor["quantum"] ** 2 / 12
+        variances = [*deviation**2, sensing["gyro_bias"] ** 2, offset, count, count, RADIUS**2, RADIUS**2]
+        memory["acceleration_variance"] = sensor["accelerometer_sigma"] ** 2
+        memory["offset_walk"] = np.hypot(sensing["accelerometer_walk"], INCLINE)
+        memory["P"][:] = np.diag(np.maximum(variances, 1e-12))
+        memory["encoder_variance"], memory["gyro_variance"] = count, sensor["gyro_sigma"] ** 2
+        memory["bias_variance"], memory["bias_walk"] = sensing["gyro_bias"] ** 2, sensing["gyro_walk"]
+        memory["kept_tick"] = -1
+        own = sensing.localisation == "particles"  # moved by encoders and gyro, so that errors of fixes last
+        memory["drift_bound"] = np.inf if own else DRIFTING / np.sqrt(2 * FIXES - 1)
+        memory["fix_variance"] = np.maximum(sensor["fix_sigma"][[0, 0, 1]] ** 2, 1e-12)
+        memory["inertial"] = memory["mean"][3]
 
     def measure(self, tick: int, plant: Rows, derivative: Array) -> None:
         """Samples the sensors and estimates, and writes the result to `seen`.

@@ -438,15 +438,7 @@ class Store:
         period = self.manifest["control_period"] * self.manifest["stride"]
         attrs |= {"control_period": period, "unfinished": self.size - len(frame)}
         if self.manifest["sweep"]["record"] == "laps":
-            counts = frame["laps"].to_numpy()
-            number = np.arange(1, counts.max(initial=0) + 1)
-            found = {}
-            for name in METRICS:
-                values = np.full((len(frame), len(number)), np.nan)
-                column = f"{name}_per_lap"
-                for row, laps in enumerate(frame[column] if column in frame else ()):
-                    values[row, : len(laps)] = laps
-                found[name] = (("run", "lap"), values, {"units": units[name]})
+            number, found = _by_lap(frame)
             coords.pop("laps", None)  # `laps` may be an axis too
             return xr.Dataset(outcome | columns(["laps"]) | found, coords | {"lap": number}, attrs)
         if not self.samples:
@@ -481,6 +473,22 @@ def open(path: str | Path) -> xr.Dataset:
 def _drove(frame: pd.DataFrame) -> NDArray[np.bool]:
     """Tells of each row of the table whether its run drove at all, so that it has signals."""
     return ~(frame["failed"].to_numpy(bool) & ~(frame["failure_time"].to_numpy(float) > 0))
+
+
+def _by_lap(frame: pd.DataFrame) -> tuple[NDArray[np.intp], dict[str, Any]]:
+    """Returns the numbers of the laps, `(laps,)`, and the metrics of every lap as variables, NaN beyond those of a run.
+
+    Metrics that an older version of mrctl did not compute are NaN.
+    """
+    number = np.arange(1, frame["laps"].to_numpy().max(initial=0) + 1)
+    found: dict[str, Any] = {}
+    for name, (unit, _) in METRICS.items():
+        values = np.full((len(frame), len(number)), np.nan)
+        column = f"{name}_per_lap"
+        for row, laps in enumerate(frame[column] if column in frame else ()):
+            values[row, : len(laps)] = laps
+        found[name] = (("run", "lap"), values, {"units": unit})
+    return number, found
 
 
 def _plain(frame: pd.DataFrame, name: str) -> NDArray:

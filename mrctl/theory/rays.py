@@ -32,6 +32,11 @@ class Scan(NamedTuple):
         return float(self.angles[1] - self.angles[0]) if len(self.angles) > 1 else 2 * np.pi
 
     @property
+    def full_turn(self) -> int:
+        """Number of beams in a full turn: those of the scan, and those that the view leaves out."""
+        return max(len(self.ranges), round(2 * np.pi / self.step))
+
+    @property
     def points(self) -> Array:
         """Where the beams that met something did so, x and y in m, `(k, 2)`."""
         met = np.isfinite(self.ranges)

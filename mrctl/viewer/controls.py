@@ -267,7 +267,7 @@ def _words(path: tuple[str, ...]) -> str:
 
 
 def _kind(field: FieldInfo) -> FieldInfo:
-    """Returns the field itself, or the one that it is if it is set, with its limits."""
+    """Returns the field; for one that may be None, a field of its other type, with the limits of that type."""
     kinds = typing.get_args(field.annotation)
     return FieldInfo.from_annotation(kinds[0]) if len(kinds) == 2 and type(None) in kinds else field
 

@@ -20,7 +20,6 @@ from mrctl.viewer.recording import Recording, event_times, joint_log
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.sensors import magnification
 from mrctl.viewer.server import PHONE, Server
-from mrctl.viewer.session import ends, pushed
 
 PICTURE_RATE = 25  # pictures for each second of the replay
 SAMPLES = 1200  # about the largest number of samples in a curve
@@ -77,13 +76,7 @@ def _scene(recordings: Sequence[Recording], robots: Sequence[Look]) -> str:
         duration = max(r.duration for r in recordings)
         serializer = server.get_scene_serializer()
         for time in np.arange(0, duration, 1 / PICTURE_RATE):
-            for row, recording in enumerate(recordings):
-                scene.robots.show(row, recording.qpos(recording.index(time)))
-                scene.robots.show_payload(row, recording.perturbation(time))
-                scene.arrows.show_force(row, pushed(recording.scenario, recording.start + time))
-            scene.show_obstacles(recordings[0].start + time)
-            scene.navigation.show_ends(ends(recordings[0].scenario, recordings[0].start + time))
-            scene.show_targets(np.stack([r.log[r.index(time)] for r in recordings]), magnified)
+            scene.show_moment(recordings, time, magnified)
             scene.flush(follow=False)
             serializer.insert_sleep(1 / PICTURE_RATE)
         return serializer.as_html().replace("</head>", f"{PHONE}</head>", 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import viser
@@ -13,7 +13,7 @@ from mrctl.kernel import Array
 from mrctl.record import InputError
 from mrctl.theory.obstacles import Pose
 from mrctl.viewer.arrows import HARD
-from mrctl.viewer.page import block
+from mrctl.viewer.page import Page, block
 from mrctl.viewer.scene import Scene
 from mrctl.viewer.session import Session
 
@@ -38,9 +38,7 @@ class Hands:
 
     def __init__(
         self,
-        server: viser.ViserServer,
-        on: Callable[[Any, Callable[[Any], None]], None],
-        ask: Callable[..., None],
+        page: Page,
         command: Callable[[str], None],
         go_on: Callable[[], None],
         apply: Callable[..., None],
@@ -50,34 +48,32 @@ class Hands:
         """Adds the inputs, in the present context of the GUI.
 
         Args:
-            server: Server of the page.
-            on: Queues a function whenever a visitor uses an input.
-            ask: Queues a function and its arguments.
+            page: The page.
             command: Plays or pauses.
             go_on: Lets the session go on from the moment that is shown.
             apply: Applies an event, whose fields are the keywords.
             head_for: Sets a goal.
             look_back: Shows the session at an earlier time in s.
         """
-        self._ask, self._command, self._go_on = ask, command, go_on
+        self._page, self._command, self._go_on = page, command, go_on
         self._apply, self._head_for, self._look_back = apply, head_for, look_back
-        gui = server.gui
+        gui = page.server.gui
         self._pushes = gui.add_checkbox("Push by dragging", False, hint=PUSH_HINT)
-        on(self._pushes, lambda _: self._show_grips())
-        on(gui.add_button("Set a goal", icon=viser.Icon.FLAG, hint=GOAL_HINT), lambda _: self.await_goal())
-        on(gui.add_button("Draw a way", icon=viser.Icon.ROUTE, hint=WAY_HINT), lambda _: self.draw_way())
+        page.on(self._pushes, lambda _: self._show_grips())
+        page.on(gui.add_button("Set a goal", icon=viser.Icon.FLAG, hint=GOAL_HINT), lambda _: self.await_goal())
+        page.on(gui.add_button("Draw a way", icon=viser.Icon.ROUTE, hint=WAY_HINT), lambda _: self.draw_way())
         self._picking = gui.add_html("")
         self._endings = gui.add_button_group("Way", ENDINGS, visible=False)
-        on(self._endings, self._end_way)
+        page.on(self._endings, self._end_way)
         self.pull: tuple[float, float] | None = None
         self.trail = np.zeros(0, int), np.zeros((0, 1, 2))
         self._waits: Literal["", "goal", "way"] = ""  # what clicks on the floor are for
         self._points: list[Array] = []  # that were picked, in m
         self._grabbed: int | None = None  # index of the point that is dragged
 
-        @server.scene.on_click()
+        @page.server.scene.on_click()
         def _(event: viser.SceneClickEvent) -> None:
-            ask(self.click, np.array(event.ray_origin), np.array(event.ray_direction))
+            page.ask(self.click, np.array(event.ray_origin), np.array(event.ray_direction))
 
     def begin(self, scene: Scene, session: Session) -> None:
         """Acts on another scene and session from now on."""
@@ -124,7 +120,7 @@ class Hands:
             if start is not None and end is not None:
                 action(event.phase, start, end)
 
-        self._ask(act)
+        self._page.ask(act)
 
     def _drag_goal(self, phase: str, start: Array, end: Array) -> None:
         """Shows, and at the end sets, the goal at the start of a drag."""

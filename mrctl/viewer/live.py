@@ -171,10 +171,7 @@ class Live(Page):
         for label, choices in buttons(self.session.robot).items():
             group = gui.add_button_group(label, tuple(choices))
             self.on(group, partial(self._press, label))
-        self._hands = Hands(
-            self.server, self.on, self.ask, self._command, self._go_on, self._apply_event,
-            self._head_for, self._look_back,
-        )  # fmt: skip
+        self._hands = Hands(self, self._command, self._go_on, self._apply_event, self._head_for, self._look_back)
         self._fan = gui.add_checkbox("Avoider", self.session.avoid != "none", hint=FAN_HINT)
         self._touch = gui.add_checkbox("Contact forces", False, hint=TOUCH_HINT)
         self._tree = gui.add_checkbox("Search", False, hint="Draws the arcs that the search for the plan drove.")
@@ -557,19 +554,7 @@ class Live(Page):
         if now - since >= 1:
             self.factor = (session.tick - tick) * session.period / (now - since)
             self._counted = now, session.tick
-        doing = "playing" if self.playing else "paused" if session.running else "finished; reset starts again"
-        if self._back is not None:
-            doing = f"of {session.time:.2f} s; whatever you do goes on from here"
-        lap = "" if self._ends is not None else f" · lap {1 + int(self.time / session.start[0].reference.period)}"
-        factor = f" · {self.factor:.2f}× real time" if self.playing else ""
-        lines = [f"<b>{self.time:.2f} s</b>{lap} · {doing}{factor}"]
-        for row, label in enumerate(self._labels):
-            stopped = self._back is None or not np.isfinite(self._record()["x"][row])
-            if stopped and (reason := session.failure(row)):
-                lines.append(warning(f"{label} stopped: {reason}"))
-        if session.tick:
-            lines += arrivals(self._labels, self._record(), self._ends)
-        self._status.content = block("status", *lines)
+        self._status.content = block("status", *self._status_lines())
         happened = sum(event.time <= self.time for scenario in session.saved() for event in scenario.events)
         happened += sum(session.slowed)
         if happened != self._happened:  # such as those that the scenarios brought along
@@ -588,6 +573,22 @@ class Live(Page):
                 self._laps += whole_laps(log, ticks, session.period, session.robot)
             laps, when = self._laps[: self.tick // ticks], f"at {session.time:.0f} s"
             self._plots.score(now, laps, session.parameter_error(), when)
+
+    def _status_lines(self) -> list[str]:
+        """Returns what the page says of the session: time, lap and pace, who has stopped and why, and who is there."""
+        doing = "playing" if self.playing else "paused" if self.session.running else "finished; reset starts again"
+        if self._back is not None:
+            doing = f"of {self.session.time:.2f} s; whatever you do goes on from here"
+        lap = "" if self._ends is not None else f" · lap {1 + int(self.time / self.session.start[0].reference.period)}"
+        factor = f" · {self.factor:.2f}× real time" if self.playing else ""
+        lines = [f"<b>{self.time:.2f} s</b>{lap} · {doing}{factor}"]
+        for row, label in enumerate(self._labels):
+            stopped = self._back is None or not np.isfinite(self._record()["x"][row])
+            if stopped and (reason := self.session.failure(row)):
+                lines.append(warning(f"{label} stopped: {reason}"))
+        if self.session.tick:
+            lines += arrivals(self._labels, self._record(), self._ends)
+        return lines
 
     def _show_past(self) -> None:
         """Draws the last seconds, or those around the moment that is shown: curves, and trails, which change less."""
@@ -643,7 +644,11 @@ class Live(Page):
         self._controls.suit(self.session.robot)
         present = self._now()
         self._controls.show(present)
-        units = ("V/(m/s)", "V/m"), RIGID_UNITS if present.steering == "rigid" else ("V/(rad/s)", "V/rad")
+        self._write_gains(present.steering == "rigid")
+
+    def _write_gains(self, rigid: bool) -> None:
+        """Writes the present gains of the velocity PID, and how often oscillations have slowed the controllers."""
+        units = ("V/(m/s)", "V/m"), RIGID_UNITS if rigid else ("V/(rad/s)", "V/rad")
         lines = ["<b>Present gains of the velocity PID</b>"]
         for channel, gains, (k_p, k_i) in zip(("common", "second"), self.session.gains(), units, strict=True):
             lines.append(f"{channel}: K_p {gains.k_p:.3g} {k_p}, K_i {gains.k_i:.3g} {k_i}")

@@ -20,7 +20,7 @@ from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import whole_laps
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import ends, pushed
+from mrctl.viewer.session import ends
 
 SAMPLES = 800  # about the largest number of samples in a curve
 
@@ -173,11 +173,6 @@ class Replay(Page):
         if now == self._drawn:
             return
         self._drawn = now
-        for row, recording in enumerate(self.recordings):
-            self._scene.robots.show(row, recording.qpos(recording.index(self.time)))
-            self._scene.robots.show_payload(row, recording.perturbation(self.time))
-            self._scene.arrows.show_force(row, pushed(recording.scenario, recording.start + self.time))
-        self._scene.navigation.show_ends(ends(self.recordings[0].scenario, self.recordings[0].start + self.time))
         period, logs, scans = self.recordings[0].period, [], []
         if marked:
             met = [recording.scan(recording.index(self.time)) for recording in self.recordings[:MAX_MARKED]]
@@ -186,10 +181,8 @@ class Replay(Page):
             for recording, latency in zip(self.recordings, self._latencies, strict=True):
                 index = recording.index(self.time)
                 logs.append(recording.log[max(0, index + 1 - ticks - latency) : index + 1])
-        now = np.stack([recording.log[recording.index(self.time)] for recording in self.recordings])
         with self.server.atomic():
-            self._scene.show_targets(now, self._deviation)
-            self._scene.show_obstacles(self.recordings[0].start + self.time)
+            self._scene.show_moment(self.recordings, self.time, self._deviation)
             self._scene.show_sensors(logs, period, self._latencies, magnified)
             self._scene.navigation.show_scans(scans)
             self._scene.flush(self._follow.value)

@@ -31,6 +31,7 @@ from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, pat
 from mrctl.viewer.robots import SEEN, Dragged, Robots, in_order
 from mrctl.viewer.sensors import Marks
 from mrctl.viewer.server import Server
+from mrctl.viewer.session import ends, pushed
 from mrctl.viewer.shapes import add_mesh, bar, disc, ribbons
 
 # Colours of the floor: its thin lines, its thick lines, its surface.
@@ -263,6 +264,17 @@ class Scene:
         _, log, _ = joint_log(recordings)
         self.show_trails(log[np.linspace(0, len(log) - 1, PATH_POINTS).astype(int)], magnified)
         self.show_events(log[[recordings[0].index(time) for time in event_times(recordings)], 0])
+
+    def show_moment(self, recordings: Sequence[Recording], time: float, magnified: int) -> None:
+        """Shows finished runs at a time in s from their first samples, with deviations `magnified` times."""
+        for row, recording in enumerate(recordings):
+            self.robots.show(row, recording.qpos(recording.index(time)))
+            self.robots.show_payload(row, recording.perturbation(time))
+            self.arrows.show_force(row, pushed(recording.scenario, recording.start + time))
+        first = recordings[0]
+        self.show_obstacles(first.start + time)
+        self.navigation.show_ends(ends(first.scenario, first.start + time))
+        self.show_targets(np.stack([r.log[r.index(time)] for r in recordings]), magnified)
 
     def _height(self, x: float, y: float) -> float:
         try:

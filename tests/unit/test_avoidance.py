@@ -165,7 +165,7 @@ def test_following_has_the_gains_of_the_hierarchy(given: dict[str, Any]) -> None
     posture_error.compiled(pose[0], reference[0, :3], error)
     gains = Hierarchy([scenario], robot).state["kanayama"][0]
     kanayama.compiled(error, reference[0, 3:5], gains, request)
-    assert np.array_equal(Following(robot, [scenario]).output(pose, np.zeros((1, 2)), reference)[0], request)
+    assert np.array_equal(Following(robot, [scenario]).output(pose, reference)[0], request)
 
 
 def test_share() -> None:
