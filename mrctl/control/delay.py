@@ -1,14 +1,13 @@
 """The delay that the velocity loop shows: when the PID's output oscillates, the controllers are designed anew.
 
 The PID is as fast as the delay of its loop allows (`design`). Where the motors act later than the controller knows, or
-the plant has several times the nominal gain, the loop oscillates. Each oscillation is answered by one move:
+the plant has several times the nominal gain, the loop oscillates. Each oscillation is answered by one move; odd and
+even moves differ:
 
-1. The learner is taught with a third of the feedback. It closes a further loop through the same delay, and a PID that
-   is stable alone may oscillate because of it. So it gives way first; where the guard watches no learner, this move is
-   left out.
-2. The motion controller, which closes a further loop too, is designed for `STEP` more delay. The learner is taught with
-   a third once more, as it is at most `SLOWED` times.
-3. The PID is designed for `STEP` more delay too. From then on 2 and 3 take turns.
+1. The motion controller is designed for `STEP` more delay, and the learner is taught with a third of the feedback, at
+   most `SLOWED` times. Both close further loops through the same delay, and a PID that is stable alone may oscillate
+   because of them. So they give way first.
+2. The PID is designed for `STEP` more delay too.
 
 The next move follows after `REST`, in which the oscillation may fade, or after `SOONEST` if it has grown by `GROWTH`.
 The moves are not taken back during a run. To lower a gain on an oscillation is the idea of adaptive augmenting control
@@ -31,9 +30,9 @@ from mrctl.kernel import Array, Row, kernel
 STEP = 0.01
 """Delay in s that two moves add, rounded to whole control periods, *chosen*."""
 MOST = 20
-"""Largest number of moves of the controllers, *chosen*."""
+"""Largest number of moves, *chosen*."""
 SLOWED = 2
-"""Number of times that the learner is slowed, *chosen*; after that it would hardly learn."""
+"""Number of moves that slow the learner, *chosen*; after that it would hardly learn."""
 LEAST = 0.02
 """Least amplitude of a half-wave as a share of the supply (of the largest θ̇ on a steering channel), *chosen*. In 222
 random worlds in `lab` without unknown delay, the largest level that 8 half-waves in a row exceed is 0.013 of the
@@ -50,7 +49,7 @@ channel), *chosen*."""
 REST = 2.0
 """Least time in s between two moves, in which an oscillation may fade, *chosen*."""
 GROWTH = 2.0
-"""Factor by which an oscillation must have grown since the last move to be answered before the rest is over, *chosen*."""
+"""Factor by which an oscillation must have grown since the last move to be answered within the rest, *chosen*."""
 SOONEST = 0.5
 """Least time in s between two moves while the oscillation grows, *chosen*."""
 RECENT = 1.0
@@ -91,8 +90,7 @@ def watch_delay(feedback: Array, feedforward: Array, nominal: Array, period: flo
 DELAY = np.dtype(
     [
         ("on", "?"),  # whether the watch acts
-        ("moves", "f8"),  # number of moves of the controllers so far
-        ("slowed", "f8"),  # number of times that the learner has been slowed
+        ("moves", "f8"),  # number of moves so far
         ("least", "f8", 2),  # least amplitude of a half-wave, V (rad/s); infinite on a channel that is not watched
         ("most_explained", "f8", 2),  # largest amplitude that is explained without an oscillating loop, V (rad/s)
         ("feedback", SWING),  # swing of the PID's output

@@ -160,15 +160,12 @@ def _as_text(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | N
 
 
 def _retuned(run: xr.Dataset) -> list[str]:
-    """Says when controllers and learner were slowed down, because the PID oscillated."""
-    moves, slowed = (np.nan_to_num(run[name].values) for name in ("retunes", "learner_slowed"))
-    moved, taught = (np.diff(count, prepend=0.0) > 0 for count in (moves, slowed))
-    said = []
-    for k in np.flatnonzero(moved | taught):
-        slower = ["motion controller" if moves[k] % 2 else "PID"] if moved[k] else []
-        slower += ["learner"] if taught[k] else []
-        said.append(f"oscillation at {float(run['time'][k]):.2f} s: slower {' and '.join(slower)} from now on")
-    return said
+    """Says when the controllers were slowed down, because the PID oscillated."""
+    moves, time = np.nan_to_num(run["retunes"].values), run["time"].values
+    return [
+        f"oscillation at {time[k]:.2f} s: slower {'motion controller' if moves[k] % 2 else 'PID'} from now on"
+        for k in np.flatnonzero(np.diff(moves, prepend=0.0) > 0)
+    ]
 
 
 def _limited(run: xr.Dataset) -> list[str]:

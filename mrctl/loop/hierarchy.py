@@ -296,7 +296,7 @@ class Hierarchy:
         design, watch = self.settings[row].pid, self.state["delay"]
         watched = design.retune and design.time_constant is None and "feedback" not in self.stages
         if not watched:
-            watch["moves"][row], watch["slowed"][row] = 0.0, 0.0
+            watch["moves"][row] = 0.0
         watch["on"][row] = watched and watch["moves"][row] < late.MOST
         supply, second = guarding.ranges(self.nominal)
         own = self.rigid and (design.steering_kp is not None or design.steering_ki is not None)
@@ -325,14 +325,12 @@ class Hierarchy:
 
     def _move(self, row: int) -> None:
         """Makes the next move of `mrctl.control.delay` for one robot; a user's motion controller is not slowed down."""
-        watch, guard, slows_motion = self.state["delay"], self.state["guard"], "motion" not in self.stages
-        if guard["on"][row] and watch["slowed"][row] < late.SLOWED:
-            watch["slowed"][row] += 1
-            guard["gain"][row] /= BACK_OFF
-            if watch["slowed"][row] == 1:
-                return
+        watch, slows_motion = self.state["delay"], "motion" not in self.stages
         watch["moves"][row] += 1 if slows_motion else 2
-        watch["on"][row] = watch["moves"][row] < late.MOST
+        moves = watch["moves"][row]
+        watch["on"][row] = moves < late.MOST
+        if moves <= 2 * late.SLOWED and (moves % 2 or not slows_motion):
+            self.state["guard"]["gain"][row] /= BACK_OFF
         self._design_pid(row)
         if slows_motion:
             self._design_motion(row)

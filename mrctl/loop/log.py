@@ -66,7 +66,6 @@ def record(plant: Rows, seen: Rows, goal: Rows, control: Rows, rigid: bool, erro
         t.current_left, t.current_right = p.current[0], p.current[1]
         t.power = p.applied[0] * p.current[0] + p.applied[1] * p.current[1]
         t.guard, t.guard_reason, t.retunes = c.guard.action, c.guard.reason, c.delay.moves
-        t.learner_slowed = c.delay.slowed
         t.z, t.roll_angle, t.pitch_angle = state.z, state.roll, state.pitch
         t.feedforward_limited = 1.0 if c.guard.on and beyond(c.feedforward, c.guard.range, rigid) else 0.0
         t.motor_voltage_left, t.motor_voltage_right = p.applied[0], p.applied[1]

@@ -87,7 +87,6 @@ SIGNALS: dict[str, tuple[str, str]] = {
     "guard": ("1", "what the guard does: 0 nothing, 1 fallback"),
     "guard_reason": ("1", "why, as an index into `mrctl.control.guard.REASONS`"),
     "retunes": ("1", "moves that slowed the controllers as the PID oscillated; see `mrctl.control.delay`"),
-    "learner_slowed": ("1", "times that the learner was slowed as the PID oscillated"),
     "z": ("m", "height of the middle between the driven wheels"),
     "roll_angle": ("rad", "roll, positive to the right; after heading and pitch, about the robot's own axis"),
     "pitch_angle": ("rad", "pitch, positive nose down; after the heading"),
@@ -123,8 +122,7 @@ WHOLE_BEFORE_0_10_2 = "all_chunks"  # the same without their names
 CHECKSUMS = "checksums"  # attribute of a saved result: what `_checksums` returns; older results lack it
 CODECS = {"bytes", "vlen-utf8", "zstd", "blosc", "crc32c", "sharding_indexed"}  # all that mrctl ever wrote
 ADDED = (  # signals that results of older versions lack
-    "z", "roll_angle", "pitch_angle", "retunes", "learner_slowed", "feedforward_limited", "motor_voltage_left",
-    "motor_voltage_right",
+    "z", "roll_angle", "pitch_angle", "retunes", "feedforward_limited", "motor_voltage_left", "motor_voltage_right",
 )  # fmt: skip
 
 TICK = np.dtype([(name, "f8") for name in SIGNALS])  # the signals of one robot at one control tick

@@ -556,7 +556,7 @@ class Live(Page):
             self._counted = now, session.tick
         self._status.content = block("status", *self._status_lines())
         happened = sum(event.time <= self.time for scenario in session.saved() for event in scenario.events)
-        happened += sum(session.slowed)
+        happened += session.retunes
         if happened != self._happened:  # such as those that the scenarios brought along
             self._happened = happened
             self._describe()
@@ -652,9 +652,8 @@ class Live(Page):
         lines = ["<b>Present gains of the velocity PID</b>"]
         for channel, gains, (k_p, k_i) in zip(("common", "second"), self.session.gains(), units, strict=True):
             lines.append(f"{channel}: K_p {gains.k_p:.3g} {k_p}, K_i {gains.k_i:.3g} {k_i}")
-        moves, learner = self.session.slowed
-        if moves or learner:
-            lines.append(f"as the PID oscillated: controllers slowed {moves} times, learner {learner} times")
+        if self.session.retunes:
+            lines.append(f"slowed {self.session.retunes} times, as the PID oscillated")
         self._gains.content = block("gains", *lines)
 
 

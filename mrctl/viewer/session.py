@@ -268,11 +268,10 @@ class Session:
         return pid.channels(self.robot, self.start[0].steering == "rigid", delay, self.period)
 
     @property
-    def slowed(self) -> tuple[int, int]:
-        """How often the controllers and the learner of the first robot were slowed; see `mrctl.control.delay`."""
+    def retunes(self) -> int:
+        """Number of moves that have slowed the controllers of the first robot; see `mrctl.control.delay`."""
         sim, k = self._place[0]
-        watch = sim.hierarchy.state["delay"][k]
-        return int(watch["moves"]), int(watch["slowed"])
+        return int(sim.hierarchy.state["delay"]["moves"][k])
 
     def saved(self) -> list[Scenario]:
         """Returns scenarios that repeat the session, to the end of the present lap of each robot."""

@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 from mrctl import Guard, Kanayama, Scenario
 from mrctl.control.delay import (
     DELAY,
+    GROWTH,
     LEAST,
     MISMATCH,
     MOST,
@@ -16,6 +17,7 @@ from mrctl.control.delay import (
     REST,
     SLOWED,
     SLOWEST,
+    SOONEST,
     STEP,
     SUSTAINED,
     watch_delay,
@@ -89,6 +91,21 @@ def test_rest_between_moves():
     assert np.diff(found) == pytest.approx(REST, abs=2 * PERIOD)
 
 
+@settings(max_examples=40, deadline=None)
+@given(doubling=st.floats(0.3, 4.0), frequency=st.floats(20, 60))
+def test_growth_shortens_the_rest(doubling, frequency):
+    """A wave that doubles within the rest is answered once it has doubled, but not sooner than `SOONEST`."""
+    t = PERIOD * np.arange(600)
+    swings = np.zeros((600, 2))
+    swings[:, 0] = 2.0 * 2 ** (t / doubling) * np.sin(frequency * t)
+    gaps = np.diff(due(swings))
+    half = np.pi / frequency
+    decay = doubling * np.log2(np.e) * half / SLOWEST  # in it the wave grows by what a peak decays in a half-wave
+    assert len(gaps) >= 2
+    expected = np.clip(doubling * np.log2(GROWTH), SOONEST, REST)
+    np.testing.assert_allclose(gaps, expected, atol=2 * PERIOD + 2 * half + decay)
+
+
 def test_what_is_no_oscillation():
     """A push that rings out, a swing of the feedforward itself, and a watch that is off."""
     t = PERIOD * np.arange(400)
@@ -128,7 +145,7 @@ def move(hierarchy, row=0):
 @pytest.mark.parametrize("own", [None, 1 / 30])
 @pytest.mark.parametrize("period", [0.01, 0.02])
 def test_moves(robot, tier, own, period):
-    """First the learner alone, then motion controller and PID in turn, with the gains of a design for that delay."""
+    """Motion controller and PID take turns; each has the gains of a robot that is designed for that delay."""
     scenario = Scenario(
         sensing=Sensing(tier=tier, delay=period), pid=Pid(delay=own), learner="fel", kanayama=Kanayama(k_x=1.5),
         control_period=period, motion_period=period,
@@ -136,8 +153,6 @@ def test_moves(robot, tier, own, period):
     h = Hierarchy([scenario], robot)
     known, step = scenario.sensing.loop_delay(period) * period, max(STEP, period)
     start = known if own is None else own
-    move(h)
-    assert h.state["guard"]["gain"][0] == pytest.approx(1 / 3) and h.state["delay"]["slowed"][0] == 1
     for done in range(6):
         pid, ahead = done // 2 * step, (done + 1) // 2 * step
         expected = Pid(delay=start + pid).gains(robot, False, known, period)
@@ -149,7 +164,7 @@ def test_moves(robot, tier, own, period):
         assert k["k_x"] == 1.5  # which the scenario gives
         assert (k["k_y"], k["k_theta"]) == pytest.approx((designed.kanayama.k_y, designed.kanayama.k_theta))
         assert h.state["limiter"]["time_constant"][0] == pytest.approx(designed.prefilter)
-        assert h.state["guard"]["gain"][0] == pytest.approx(3.0 ** -min(SLOWED, 1 + done))
+        assert h.state["guard"]["gain"][0] == pytest.approx(3.0 ** -min(SLOWED, (done + 1) // 2))
         assert h.state["delay"]["moves"][0] == done
         move(h)
 
@@ -158,7 +173,7 @@ def test_settings_during_a_run(robot):
     """After some moves new settings keep what the loop has shown, unless it is no longer watched; a new run forgets."""
     h = Hierarchy([Scenario()] * 2, robot)
     first = h.state.copy()
-    for _ in range(4):  # of learner, motion controller, PID and motion controller
+    for _ in range(3):
         move(h)
     assert np.all(h.state["pid"]["k_p"][0] < first["pid"]["k_p"][0])
     np.testing.assert_array_equal(h.state[1]["pid"], first[1]["pid"])
@@ -177,8 +192,8 @@ def test_settings_during_a_run(robot):
 
 
 def test_end_of_the_moves(robot):
-    """After the last move the watch is off; without a learner that is taught all moves are the controllers'."""
-    h = Hierarchy([Scenario(learner="none")], robot)
+    """After the last move the watch is off."""
+    h = Hierarchy([Scenario()], robot)
     for _ in range(MOST):
         assert h.state["delay"]["on"][0]
         move(h)
@@ -220,8 +235,6 @@ def test_stages_of_ones_own(robot):
     feedback.set_pid(0, Pid())
     assert not feedback.state["delay"]["on"][0]
     start = moved.state.copy()
-    move(moved)
-    np.testing.assert_array_equal(moved.state["pid"], start["pid"])  # only the learner was slowed
     move(moved)
     assert moved.state["delay"]["moves"][0] == 2
     assert np.all(moved.state["pid"]["k_p"][0] < start["pid"]["k_p"][0])
