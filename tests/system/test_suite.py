@@ -390,7 +390,7 @@ def test_controller_joins(whole: Path, tmp_path: Path) -> None:
     file.write_text(GAIN)
     shutil.copytree(whole, out)
     before = {p: p.stat().st_mtime_ns for p in out.glob("runs/*/runs.parquet")}
-    assert cli.main(arguments(out, "--workers", 2, "--controller", f"{file}:Gain")) == 0
+    assert cli.main(arguments(out, "--workers", 1, "--controller", f"{file}:Gain")) == 0
     assert {p: p.stat().st_mtime_ns for p in before} == before
     table = json.loads((out / "table.json").read_text())
     row = next(r for r in table["rows"] if (r["case"], r["feedforward"]) == ("all", "Gain"))
