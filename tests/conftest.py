@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 
 import pytest
 from hypothesis import settings
@@ -51,6 +52,40 @@ def robot() -> Robot:
         no_load_current=0.037, gear_loss=0.1, rolling_coefficient=0.015, wheel_inertia=3.4e-3, front_wheel_inertia=1e-3,
         supply=24, tyre_friction=0.9, max_speed=1.5, max_rotation=3, max_acceleration=1.5, max_rotation_acceleration=6,
     )  # fmt: skip
+
+
+class Here:
+    """Computes the jobs of a sweep in this process, which has the laws in memory already."""
+
+    tries = 1
+
+    def __init__(self, work: Callable, path: str, _: int) -> None:
+        self._work, self._path, self._job = work, path, -1
+
+    def room(self) -> int:
+        """One job after the other."""
+        return 1
+
+    def submit(self, job: int) -> None:
+        """Keeps the number of the job."""
+        self._job = job
+
+    def wait(self) -> list:
+        """Computes the job."""
+        return [self._work(self._path, self._job)]
+
+    def close(self) -> None:
+        """Nothing is left to stop."""
+
+
+@pytest.fixture(scope="module")
+def here() -> Iterator[None]:
+    """Sweeps need no processes of their own, for tests of what they compute; that is the same (test_sweeps.py)."""
+    from mrctl.sweep import jobs
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jobs, "Processes", Here)
+        yield
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
