@@ -34,6 +34,16 @@ for name in sys.argv[1:]:
     runs = [Scenario(reference=Line(length=0.8), laps=1, prior="model", learner=name, seed=seed) for seed in range(2)]
     per_lap(simulate(runs))
 """
+COMPILE_MISSIONS = """
+from mrctl import Disc, Obstacles, Scenario, simulate
+from mrctl.navigation.generators import Task
+from mrctl.navigation.mission import avoiding, prepared
+
+task = Task(obstacles=Obstacles(shapes=(Disc(y=1.5),)), start=(0, 0, 0), goal=(1, 0, 0))
+for avoid, localisation in (("window", "scan"), ("mppi", "particles")):
+    own = Scenario.from_dict({"prior": "model", "learner": "none", "sensing": {"localisation": localisation}})
+    simulate(prepared(task, own, avoid=avoid)[1], motion=avoiding(avoid))
+"""
 
 # The same examples for everyone, no deadline (shared machines stall); `--hypothesis-profile=explore` looks further.
 settings.register_profile("mrctl", deadline=None, derandomize=True)
@@ -116,6 +126,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if hasattr(session.config, "workerinput") or cache is None or cache.get("mrctl/compiled", "") == digest:
         return
     halves = ("fel", "none", "rls", "l1"), ("composite", "observer", "indi", "mrac")
-    processes = [subprocess.Popen([sys.executable, "-c", COMPILE, *names]) for names in halves]
+    commands = [*([COMPILE, *names] for names in halves), [COMPILE_MISSIONS]]
+    processes = [subprocess.Popen([sys.executable, "-c", *command]) for command in commands]
     if not any(process.wait() for process in processes):
         cache.set("mrctl/compiled", digest)

@@ -89,6 +89,7 @@ def mission(number: int, avoid: str) -> Scenario:
             number += 2 * ALIKE
 
 
+@pytest.mark.usefixtures("here")
 @pytest.mark.parametrize(
     ("plain", "avoiders", "avoided"),
     [([1], AVOIDERS[:2], 1), pytest.param(range(160), AVOIDERS, 30, marks=pytest.mark.full)],

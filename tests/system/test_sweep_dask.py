@@ -141,7 +141,7 @@ def test_suite_of_missions(cluster, tmp_path, monkeypatch):
     """`mrctl navigate --suite` computes the same on a cluster as here, but says where it was computed."""
     for part in (mission_suite, learned_limits):
         monkeypatch.setattr(part, "DRAWS", {"quick": 1})
-    monkeypatch.setattr(mission_suite, "SPEEDS", (0.3, 0.9))
+    monkeypatch.setattr(mission_suite, "SPEEDS", (0.6, 0.9))
     monkeypatch.setattr(learned_limits, "PLANTS", {name: learned_limits.PLANTS[name] for name in ("nominal", "all")})
     monkeypatch.setattr(three_mppis, "WORLDS", {"quick": 1})
     monkeypatch.setattr(three_mppis, "PLANTS", {"nominal": three_mppis.PLANTS["nominal"]})
