@@ -64,6 +64,12 @@ def robot() -> Robot:
     )  # fmt: skip
 
 
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command writes everything but its figures, which take seconds, for tests that do not look at them."""
+    monkeypatch.setattr("mrctl.results.plots.save", lambda *_: [])
+
+
 class Here:
     """Computes the jobs of a sweep in this process, which has the laws in memory already."""
 

@@ -803,6 +803,7 @@ DOT = """(index) => {
 }"""
 
 
+@pytest.mark.usefixtures("here")
 def test_colours_of_a_sweep(tmp_path):
     """Runs have the colour of their world where a sweep varies it; where it varies the learner, of their controller."""
     base = {"laps": 1, "reference": {"kind": "circle", "period": 4.0, "radius": 0.5}, "learner": "none"}
@@ -825,6 +826,7 @@ def test_colours_of_a_sweep(tmp_path):
         server.stop()
 
 
+@pytest.mark.usefixtures("here")
 def test_sweep(browser, tmp_path):
     """All runs of a sweep in the panel: a click opens the one under the mouse, as `mrctl run` has it."""
     base = {
