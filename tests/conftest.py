@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 
 import pytest
 from hypothesis import settings
@@ -33,6 +34,16 @@ for name in sys.argv[1:]:
     runs = [Scenario(reference=Line(length=0.8), laps=1, prior="model", learner=name, seed=seed) for seed in range(2)]
     per_lap(simulate(runs))
 """
+COMPILE_MISSIONS = """
+from mrctl import Disc, Obstacles, Scenario, simulate
+from mrctl.navigation.generators import Task
+from mrctl.navigation.mission import avoiding, prepared
+
+task = Task(obstacles=Obstacles(shapes=(Disc(y=1.5),)), start=(0, 0, 0), goal=(1, 0, 0))
+for avoid, localisation in (("window", "scan"), ("mppi", "particles")):
+    own = Scenario.from_dict({"prior": "model", "learner": "none", "sensing": {"localisation": localisation}})
+    simulate(prepared(task, own, avoid=avoid)[1], motion=avoiding(avoid))
+"""
 
 # The same examples for everyone, no deadline (shared machines stall); `--hypothesis-profile=explore` looks further.
 settings.register_profile("mrctl", deadline=None, derandomize=True)
@@ -51,6 +62,46 @@ def robot() -> Robot:
         no_load_current=0.037, gear_loss=0.1, rolling_coefficient=0.015, wheel_inertia=3.4e-3, front_wheel_inertia=1e-3,
         supply=24, tyre_friction=0.9, max_speed=1.5, max_rotation=3, max_acceleration=1.5, max_rotation_acceleration=6,
     )  # fmt: skip
+
+
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command writes everything but its figures, which take seconds, for tests that do not look at them."""
+    monkeypatch.setattr("mrctl.results.plots.save", lambda *_: [])
+
+
+class Here:
+    """Computes the jobs of a sweep in this process, which has the laws in memory already."""
+
+    tries = 1
+
+    def __init__(self, work: Callable, path: str, _: int) -> None:
+        self._work, self._path, self._job = work, path, -1
+
+    def room(self) -> int:
+        """One job after the other."""
+        return 1
+
+    def submit(self, job: int) -> None:
+        """Keeps the number of the job."""
+        self._job = job
+
+    def wait(self) -> list:
+        """Computes the job."""
+        return [self._work(self._path, self._job)]
+
+    def close(self) -> None:
+        """Nothing is left to stop."""
+
+
+@pytest.fixture(scope="module")
+def here() -> Iterator[None]:
+    """Sweeps need no processes of their own, for tests of what they compute; that is the same (test_sweeps.py)."""
+    from mrctl.sweep import jobs
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jobs, "Processes", Here)
+        yield
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -81,6 +132,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if hasattr(session.config, "workerinput") or cache is None or cache.get("mrctl/compiled", "") == digest:
         return
     halves = ("fel", "none", "rls", "l1"), ("composite", "observer", "indi", "mrac")
-    processes = [subprocess.Popen([sys.executable, "-c", COMPILE, *names]) for names in halves]
+    commands = [*([COMPILE, *names] for names in halves), [COMPILE_MISSIONS]]
+    processes = [subprocess.Popen([sys.executable, "-c", *command]) for command in commands]
     if not any(process.wait() for process in processes):
         cache.set("mrctl/compiled", digest)

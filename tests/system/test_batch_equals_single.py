@@ -266,16 +266,16 @@ def test_worlds(localisation):
             reference=Circle(period=4, radius=0.5),
             sensing=Sensing(localisation=localisation),
         )
-        for seed in range(8)
+        for seed in range(5)
     ]
     alone = [simulate(run) for run in runs]
-    for rows in ([*range(8)], [7, 2, 5]):
+    for rows in ([*range(5)], [4, 2]):
         assert len({group_of(runs[row]) for row in rows}) == 1
         whole = simulate([runs[row] for row in rows])
         for run, row in enumerate(rows):
             equal(alone[row], whole, run)
     ends = [str(run["failure"].values) for run in alone]
-    assert 1 <= ends.count("collision") <= 6
+    assert 1 <= ends.count("collision") <= 4
 
 
 def test_layouts():
@@ -302,6 +302,7 @@ def first_half(path: str, job: int) -> Outcome:
 SWEPT = (6, 6), pytest.param((100, 50), marks=pytest.mark.full)
 
 
+@pytest.mark.usefixtures("here")
 @pytest.mark.parametrize("counts", SWEPT, ids=lambda counts: "-".join(map(str, counts)))
 def test_sweep(counts, tmp_path):
     """A sweep that is interrupted after half of its jobs has the bits of runs alone in the end, and so has a repeat.

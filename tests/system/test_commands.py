@@ -141,6 +141,7 @@ def test_out_holds_result_figures_and_weights(tmp_path: Path, capsys: pytest.Cap
     assert float(mrctl.per_lap(mrctl.simulate([carried]))["v_rmse"].values[0, 0]) < first
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_saved_run_again(tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     """A saved run is driven again, bit for bit; the first signal that departs is named, with the version that saved."""
     monkeypatch.chdir(tmp_path)

@@ -305,6 +305,7 @@ class Blind:
 """
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_fault_is_told_wherever_the_run_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A robot whose estimator answers NaN drives on: table, JSON, sweep, its export and the replay say so."""
     (tmp_path / "own.py").write_text(BLIND)

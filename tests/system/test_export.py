@@ -277,6 +277,7 @@ def test_run_alone(result, tmp_path, kind):
         assert out.read_bytes() == other.read_bytes()
 
 
+@pytest.mark.usefixtures("here")
 def test_sweep(tmp_path):
     """Of a sweep with signals, the runs that are asked for; one with metrics alone says what to do."""
     sweep = {"base": SHORT.model_dump(), "runs": 3}

@@ -64,6 +64,7 @@ def test_jerk() -> None:
     assert np.isnan(jerk_of(np.zeros((30, 2)), 0.01))
 
 
+@pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("avoid", get_args(Avoid))
 def test_again(avoid: Avoid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """What is saved of a mission drives it again, bit for bit, also where its world has changed since."""
@@ -81,6 +82,7 @@ def test_again(avoid: Avoid, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     assert "drive: bit-identical" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_changed_mission(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A saved mission that was changed departs, one that lacks a part is refused, and it takes no further flags."""
     out = tmp_path / "drive"
@@ -260,6 +262,7 @@ def test_short_flags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert found[0]["task"]["goal"] == [1.0, -0.1, 0.0] and found[0]["robots"][0]["outcome"] == "arrived"
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_map_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """With a map that lacks a box the plan goes through it; the mission keeps the map, and is repeated with it."""
     monkeypatch.chdir(tmp_path)

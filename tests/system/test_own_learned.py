@@ -203,6 +203,7 @@ def test_refused(learned, tmp_path):
         mrctl.save_learned(tmp_path / "x", mrctl.simulate(ELSEWHERE, feedforward=Forgetful))
 
 
+@pytest.mark.usefixtures("here", "no_figures")
 def test_command(tmp_path, monkeypatch, capsys):
     """`mrctl run --out` keeps what it learned, and `--learned` starts from it; a sweep does too."""
     monkeypatch.chdir(tmp_path)

@@ -25,7 +25,8 @@ from mrctl.scenario import Scenario
 from mrctl.sweep.plan import Sweep
 from mrctl.theory.obstacles import Obstacles
 
-pytestmark = pytest.mark.xdist_group("readme")  # what its tests share is made once
+# What its tests share is made once.
+pytestmark = [pytest.mark.xdist_group("readme"), pytest.mark.usefixtures("here")]
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = sorted(path.parent for path in (ROOT / "mrctl").glob("*/__init__.py"))
@@ -49,6 +50,12 @@ ELSEWHERE = {
     r"mrctl suite --held-out \S*": ("tests/system/test_suite.py::test_held_out", "mrctl.experiments.held_out.judge"),
     r"mrctl suite --controller \S*( model\+\S*)?": (
         "tests/system/test_suite.py::test_controller_joins", "mrctl.experiments.suite.suite",
+    ),
+    r"mrctl identify --json > .*": (
+        "tests/system/test_identification.py::test_default_robot", "mrctl.experiments.identify.run",
+    ),
+    r"mrctl identify racecar .*": (
+        "tests/system/test_identification.py::test_racing_car", "mrctl.experiments.identify.run",
     ),
     r"mrctl tune --search .*": ("tests/system/test_search.py::test_command", "mrctl.experiments.search.search"),
     r"mrctl bench": ("tests/benchmarks/test_bench.py::test_command", "mrctl.experiments.bench.run"),
@@ -239,7 +246,8 @@ def test_elsewhere(
             raise mrctl.InputError("reached")
 
         monkeypatch.setattr(function, reached)
-        assert cli.main(shlex.split(command)[1:]) == 2
+        words, _, _ = command.partition(" > ")
+        assert cli.main(shlex.split(words)[1:]) == 2
         assert capsys.readouterr().err == "mrctl: reached\n"
 
 

@@ -10,6 +10,7 @@ from matplotlib.image import imread
 
 from mrctl import cli
 from mrctl.experiments import kanayama, paper
+from mrctl.loop.simulation import simulate
 
 pytestmark = pytest.mark.xdist_group("reproduce")  # what its tests share is made once
 
@@ -41,7 +42,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(paper, "PAPER", ("none", "model", "true_model", "fel"))  # those that the tests below ask for
         patch.setattr(paper, "DRAWS", 1)  # replicates in the table of the tiers; one shows what its test asks for
         tier_runs = paper.real
-        patch.setattr(paper, "real", lambda tier: [(name, run.replace(laps=4)) for name, run in tier_runs(tier)])
+        patch.setattr(paper, "real", lambda tier: [(name, run.replace(laps=2)) for name, run in tier_runs(tier)])
+        patch.setattr(paper, "LONG", 20)
         assert cli.main(["reproduce", "--out", str(out)]) == 0
     return out
 
@@ -116,11 +118,24 @@ def test_tiers(table: dict) -> None:
             assert rows[tier, "all", name]["position_rmse"] < rows[tier, "all", "none"]["position_rmse"], (tier, name)
 
 
-def test_learning_stays_stable(table: dict) -> None:
-    """Lap 60 is at most 1.1 times lap 8."""
-    for run in table["endurance"]:
+def check_stable(rows: list[dict]) -> None:
+    for run in rows:
         for metric in ("v_rmse", "omega_rmse", "position_rmse"):
             assert run[metric]["last"] <= 1.1 * run[metric]["lap_8"]
+
+
+def test_learning_stays_stable(table: dict) -> None:
+    """Lap 20 is at most 1.1 times lap 8."""
+    assert {run["laps"] for run in table["endurance"]} == {20}
+    check_stable(table["endurance"])
+
+
+@pytest.mark.full
+def test_learning_stays_stable_for_long() -> None:
+    """Lap 60 is at most 1.1 times lap 8."""
+    runs = [paper.scenario("fel", case, laps=paper.LONG) for case in ("nominal", paper.CASE)]
+    assert paper.LONG == 60
+    check_stable(paper.endure(simulate(runs), runs))
 
 
 def test_kanayama(table: dict) -> None:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from mrctl.experiments.cases import Case
 from mrctl.loop.hindsight import best_fixed
 from mrctl.results import metrics, plots
 from mrctl.sweep import jobs
-from mrctl.sweep.pool import Outcome
+from mrctl.sweep.pool import Outcome, Processes
 from mrctl.sweep.store import Store
 from mrctl.viewer.recording import Library
 
@@ -75,14 +76,21 @@ def tiny(mode: str, seeds: int, random: int) -> list[Case]:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def small() -> Iterator[None]:
-    """Few short runs, small figures, and a PID that is not measured again."""
+def small(here: None) -> Iterator[None]:
+    """Few short runs in this process, small figures, and neither PID nor machine measured again."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(suite, "cases", tiny)
+        patch.setattr(suite, "pace", cache(suite.pace))
         patch.setitem(plots.STYLE, "savefig.dpi", 60)
         patch.setattr(tuning, "design", lambda *_: {})
         patch.setattr(tuning, "statement", lambda _: "phase margin 88 degrees")
         yield
+
+
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures take seconds."""
+    monkeypatch.setattr(report, "figures", lambda *_: {})
 
 
 def arguments(out: Path, *more: object) -> list[str]:
@@ -191,6 +199,7 @@ def test_leaders() -> None:
     assert suite_tables.leaders(rows) == [["a", *["model, rls"] * 5]]
 
 
+@pytest.mark.usefixtures("plain")
 def test_hindsight(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """The best fixed feedforward is that of `best_fixed`, and the regret of the model is what it does worse."""
     words = ["suite", "--feedforward", "model", "hindsight", "--seeds", "1", "--random", "0", "--workers", "1"]
@@ -306,7 +315,7 @@ def test_no_worse() -> None:
     assert suite.no_worse(np.where(lost[::-1], np.nan, 3.0), pid)["quantile_99"] == 1.5
 
 
-def test_goes_on_where_it_stopped(whole: Path, tmp_path: Path) -> None:
+def test_goes_on_where_it_stopped(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupted in its second feedforward, it keeps what was done; continued by two workers, it writes the same files
     as one that ran through, byte for byte, page and figures included.
     """
@@ -322,6 +331,7 @@ def test_goes_on_where_it_stopped(whole: Path, tmp_path: Path) -> None:
     assert victim.returncode == 130 and "mrctl: interrupted" in complaint.splitlines()[-1]
     assert not (out / "report.html").exists()
     stamp = done.stat().st_mtime_ns
+    monkeypatch.setattr(jobs, "Processes", Processes)
     assert cli.main(arguments(out, "--workers", 2)) == 0
     assert content(out) == content(whole) and done.stat().st_mtime_ns == stamp
 
@@ -377,12 +387,6 @@ def test_page_stands_alone(whole: Path) -> None:
     assert again == "mrctl suite --feedforward none model rls --seeds 2 --random 3"
 
 
-@pytest.fixture
-def plain(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures take seconds."""
-    monkeypatch.setattr(report, "figures", lambda *_: {})
-
-
 @pytest.mark.usefixtures("plain")
 def test_controller_joins(whole: Path, tmp_path: Path) -> None:
     """Somebody's own feedforward joins a suite that is there: only its runs are computed, and they are `simulate`'s."""
@@ -390,7 +394,7 @@ def test_controller_joins(whole: Path, tmp_path: Path) -> None:
     file.write_text(GAIN)
     shutil.copytree(whole, out)
     before = {p: p.stat().st_mtime_ns for p in out.glob("runs/*/runs.parquet")}
-    assert cli.main(arguments(out, "--workers", 2, "--controller", f"{file}:Gain")) == 0
+    assert cli.main(arguments(out, "--workers", 1, "--controller", f"{file}:Gain")) == 0
     assert {p: p.stat().st_mtime_ns for p in before} == before
     table = json.loads((out / "table.json").read_text())
     row = next(r for r in table["rows"] if (r["case"], r["feedforward"]) == ("all", "Gain"))

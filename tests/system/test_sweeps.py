@@ -34,7 +34,7 @@ from mrctl.sweep.jobs import compute
 from mrctl.sweep.pool import Outcome
 from mrctl.sweep.store import KIND, Store
 
-KILLS = [moment if moment < 2 else pytest.param(moment, marks=pytest.mark.full) for moment in range(36)]  # per victim
+KILLS = [moment if moment < 1 else pytest.param(moment, marks=pytest.mark.full) for moment in range(36)]  # per victim
 FILE = """
 runs = 12
 chunk = 5
@@ -491,7 +491,7 @@ def long(tmp_path_factory):
     """A file of a sweep of 24 jobs, and the bytes of its store."""
     folder = tmp_path_factory.mktemp("long")
     (folder / "sweep.toml").write_text(LONG)
-    jobs.run(Sweep.from_toml(folder / "sweep.toml"), folder / "store", 2)
+    jobs.run(Sweep.from_toml(folder / "sweep.toml"), folder / "store", 1)
     return folder / "sweep.toml", content(folder / "store")
 
 
@@ -536,7 +536,7 @@ def test_kill(long, tmp_path, moment, hit):
         process.kill()
         process.communicate()
         until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in below), 10)  # nobody works on for a dead sweep
-        jobs.run(Sweep.from_toml(file), store, 2)
+        jobs.run(Sweep.from_toml(file), store, 1)
     else:
         helpers = children(process.pid)
         os.kill(chance.choice([worker for one in helpers for worker in children(one)]), signal.SIGKILL)
@@ -580,7 +580,7 @@ def test_ctrl_c(long, tmp_path):
     assert last == f"mrctl: interrupted: {2 * done} of 48 runs are done; the same command goes on", stderr
     assert mrctl.open(store).sizes["run"] == 2 * done < 48
     kept = content(store)
-    jobs.run(Sweep.from_toml(file), store, 2)
+    jobs.run(Sweep.from_toml(file), store, 1)
     assert content(store) == expected
     assert {k: v for k, v in kept.items() if "signals" in k} == {k: expected[k] for k in kept if "signals" in k}
 
@@ -665,12 +665,12 @@ def test_memory_of_the_sweep_is_flat(tmp_path):
 
 def test_memory_of_a_worker_is_flat(file, tmp_path):
     """Five times the runs take no more memory."""
-    file.write_text(FILE.replace("runs = 12", "runs = 150"))
+    file.write_text(FILE.replace("runs = 12", "runs = 75"))
     sweep = Sweep.from_toml(file)
     used = []
     store = Store.begin(tmp_path, jobs._manifest(sweep))
-    for some in (range(10), range(10, 60)):
+    for some in (range(5), range(5, 30)):
         for job in some:
             assert not compute(str(store.path), job).error
         used.append(resident())
-    assert used[1] - used[0] < 10, used
+    assert used[1] - used[0] < 5, used

@@ -56,7 +56,7 @@ SLOWLY = """{
     window.requestAnimationFrame = (callback) => {
         waiting.add(++number);
         const mine = number, once = (time) => waiting.delete(mine) && callback(time);
-        setTimeout(() => draw(once), 70);
+        setTimeout(() => draw(once), 200);
         return mine;
     };
     window.cancelAnimationFrame = (given) => waiting.delete(given);
@@ -65,7 +65,10 @@ SLOWLY = """{
 
 @contextmanager
 def visit(browser, url, offline=False, known=(), slowly=False):
-    """A page, drawn slowly or as often as it can be; no error on its console is tolerated, but those that are known."""
+    """A page, drawn slowly and coarsely or as often as it can be.
+
+    No error on its console is tolerated, but those that are known.
+    """
     context = browser.new_context(viewport={"width": 1280, "height": 800}, offline=offline)
     if slowly:
         context.add_init_script(SLOWLY)
@@ -73,7 +76,7 @@ def visit(browser, url, offline=False, known=(), slowly=False):
     errors = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    page.goto(url)
+    page.goto(f"{url}/?fixedDpr=0.5" if slowly else url)  # a pixel of the scene for four of the page
     yield page
     assert [text for text in errors if text not in known] == []
     context.close()
@@ -776,11 +779,11 @@ def test_soft_light(browser):
     """A browser with a GPU switches soft light on, once; one without leaves it off."""
     with serving(lambda server: Live([BASE], server)) as (live, url):
         live.ask(live._command, "pause")
-        with visit(browser, url) as page:
+        with visit(browser, url, slowly=True) as page:
             until(lambda: node(page, ROBOT) is not None, "the scene")
             time.sleep(1.0)
             assert not live.server.soft and not page.get_by_label("Soft light").is_checked()
-        with visit(browser, url) as page:
+        with visit(browser, url, slowly=True) as page:
             page.add_init_script(ON_A_GPU)
             page.reload()
             until(lambda: live.server.soft, "soft light")
@@ -800,6 +803,7 @@ DOT = """(index) => {
 }"""
 
 
+@pytest.mark.usefixtures("here")
 def test_colours_of_a_sweep(tmp_path):
     """Runs have the colour of their world where a sweep varies it; where it varies the learner, of their controller."""
     base = {"laps": 1, "reference": {"kind": "circle", "period": 4.0, "radius": 0.5}, "learner": "none"}
@@ -822,6 +826,7 @@ def test_colours_of_a_sweep(tmp_path):
         server.stop()
 
 
+@pytest.mark.usefixtures("here")
 def test_sweep(browser, tmp_path):
     """All runs of a sweep in the panel: a click opens the one under the mouse, as `mrctl run` has it."""
     base = {
