@@ -61,6 +61,9 @@ from mrctl.sweep.signals import DIMENSIONS, lazily
 
 LARGEST = 2**28  # largest size of sweep.json in bytes
 KIND, FORMAT = "mrctl sweep", 3
+ROUNDING = 1e-12
+"""Relative difference up to which a number of a sweep is that of the store. Drawn references are computed with functions
+that another processor rounds differently; a store that it goes on with keeps its own numbers."""
 CHECKSUM = "checksum"  # key in sweep.json: the checksum of all others
 ROW_GROUP = 16384  # number of rows of the table that are written at once
 INNER = 16  # runs that are compressed together, signal by signal
@@ -544,11 +547,16 @@ def _regroup(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
 
 
 def _difference(old: object, new: object, where: str = "") -> str:
-    """Returns the first place where two trees of plain data differ, with both values, or "" if they are equal."""
+    """Returns the first place where two trees of plain data differ, with both values, or "" if they are equal.
+
+    Numbers may differ by `ROUNDING`.
+    """
     if isinstance(old, dict) and isinstance(new, dict):
         pairs = [(str(key), old.get(key), new.get(key)) for key in {**old, **new}]
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         pairs = [(str(k), *pair) for k, pair in enumerate(zip(old, new, strict=True))]
+    elif isinstance(old, float) and isinstance(new, float) and math.isclose(old, new, rel_tol=ROUNDING):
+        return ""
     else:
         return "" if old == new else f"{where} ({_short(old)}, now {_short(new)})"
     return next(filter(None, (_difference(a, b, f"{where}.{key}".strip(".")) for key, a, b in pairs)), "")

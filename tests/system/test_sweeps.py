@@ -224,10 +224,22 @@ def test_run_again(sweep, store, tmp_path, capsys):
 # --- refusals -------------------------------------------------------------------------------------
 
 
+def test_sweep_of_another_processor(file, tmp_path, whole):
+    """A sweep goes on where its numbers differ from those of the store by rounding only; it keeps those of the store."""
+    (tmp_path / "begun").mkdir()
+    begun = Store.begin(tmp_path / "begun", jobs._manifest(Sweep.from_toml(file)))
+    assert not compute(str(begun.path), 0).error
+    file.write_text(FILE.replace("0.8", repr(float(np.nextafter(0.8, 1)))))
+    assert cli.main(["sweep", str(file), "--out", str(begun.path)]) == 0
+    assert content(begun.path) == whole
+
+
 def test_changed_sweep(file, store, capsys, whole):
     """A store goes on only with the file and the versions that began it."""
     file.write_text(FILE.replace("runs = 12", "runs = 13"))
     assert "begun with another sweep.runs (12, now 13)" in refused(capsys, "sweep", file, "--out", store)
+    file.write_text(FILE.replace("0.8", "0.8000000001"))
+    assert "reference.length (0.8, now 0.8000000001)" in refused(capsys, "sweep", file, "--out", store)
     file.write_text("# a remark changes nothing\n" + FILE)
     assert cli.main(["sweep", str(file), "--out", str(store)]) == 0
     with mock.patch("mrctl.sweep.jobs.versions", lambda: {**mrctl.results.dataset.versions(), "mujoco": "9"}):
