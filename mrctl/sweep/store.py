@@ -62,8 +62,8 @@ from mrctl.sweep.signals import DIMENSIONS, lazily
 LARGEST = 2**28  # largest size of sweep.json in bytes
 KIND, FORMAT = "mrctl sweep", 3
 ROUNDING = 1e-12
-"""Relative difference up to which a number of a sweep is that of the store. Drawn references are computed with functions
-that another processor rounds differently; a store that it goes on with keeps its own numbers."""
+"""Relative difference up to which a number of a sweep is that of the store, which keeps its own. References that are
+drawn are computed with functions that another processor rounds differently."""
 CHECKSUM = "checksum"  # key in sweep.json: the checksum of all others
 ROW_GROUP = 16384  # number of rows of the table that are written at once
 INNER = 16  # runs that are compressed together, signal by signal

@@ -225,7 +225,7 @@ def test_run_again(sweep, store, tmp_path, capsys):
 
 
 def test_sweep_of_another_processor(file, tmp_path, whole):
-    """A sweep goes on where its numbers differ from those of the store by rounding only; it keeps those of the store."""
+    """A sweep goes on where its numbers differ from those of the store by rounding; the store keeps its own."""
     (tmp_path / "begun").mkdir()
     begun = Store.begin(tmp_path / "begun", jobs._manifest(Sweep.from_toml(file)))
     assert not compute(str(begun.path), 0).error
