@@ -94,13 +94,17 @@ class Here:
         """Nothing is left to stop."""
 
 
-@pytest.fixture(scope="module")
-def here() -> Iterator[None]:
-    """Sweeps need no processes of their own, for tests of what they compute; that is the same (test_sweeps.py)."""
-    from mrctl.sweep import jobs
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Computes sweeps in the test process; that worker processes compute the same is tested in test_sweeps.py."""
+    monkeypatch.setattr("mrctl.sweep.jobs.Processes", Here)
 
+
+@pytest.fixture(scope="module")
+def here_throughout() -> Iterator[None]:
+    """The same for all tests of a module, and for what they share."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jobs, "Processes", Here)
+        patch.setattr("mrctl.sweep.jobs.Processes", Here)
         yield
 
 

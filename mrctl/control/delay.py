@@ -9,10 +9,10 @@ even moves differ:
    because of them. So they give way first.
 2. The PID is designed for `STEP` more delay too.
 
-The next move follows after `REST`, in which the oscillation may fade, or after `SOONEST` if it has grown by `GROWTH`.
-The moves are not taken back during a run. To lower a gain on an oscillation is the idea of adaptive augmenting control
-(Orr and VanZwieten 2012, Robust, practical adaptive control for launch vehicles); here the design of the gains replaces
-its factor.
+The next move follows after `REST`, in which the oscillation may fade, or after `SOONEST` if the oscillation has grown
+by the factor `GROWTH`. The moves are not taken back during a run. To lower a gain on an oscillation is the idea of
+adaptive augmenting control (Orr and VanZwieten 2012, Robust, practical adaptive control for launch vehicles); here the
+design of the gains replaces its factor.
 
 An oscillation is `SUSTAINED` half-waves of the PID's output in a row that are shorter than `SLOWEST`, and larger than
 the sum of `LEAST` of the supply and the recent peak of what explains them without an oscillating loop: the swing of the
@@ -47,7 +47,7 @@ MOST_EXPLAINED = 0.15
 """Largest amplitude that command and feedforward explain, as a share of the supply (of the largest θ̇ on a steering
 channel), *chosen*."""
 REST = 2.0
-"""Least time in s between two moves, in which an oscillation may fade, *chosen*."""
+"""Least time in s between two moves while the oscillation does not grow, in which it may fade, *chosen*."""
 GROWTH = 2.0
 """Factor by which an oscillation must have grown since the last move to be answered within the rest, *chosen*."""
 SOONEST = 0.5

@@ -300,7 +300,7 @@ def budget(found: Found, shown: str) -> Table:
 
 
 def _quantile(samples: Array, scale: float) -> str:
-    """Returns the quantile `SHARE` times a scale, with its interval; the scale of negated samples is negative."""
+    """Returns the quantile at `SHARE` times the scale, with its interval; the scale of negated samples is negative."""
     value, low, high, *_ = quantile_interval(samples, SHARE)
     low, high = sorted((scale * low, scale * high))
     return f"{_text(scale * value)} [{_text(low)}, {_text(high)}]"
@@ -311,7 +311,7 @@ def _text(value: float) -> str:
 
 
 def _against(rival: FeedforwardName, samples: Array) -> str:
-    """Says who does better or worse than a rival, and where; samples `(controllers, plants, draws)`, less is better."""
+    """Returns in words who beats or loses to a rival and where; samples `(controllers, plants, draws)`, less is better."""
     verdicts = {"better": [], "worse": []}
     for c, name in enumerate(CONTROLLERS):
         for p, plant in enumerate(PLANTS):

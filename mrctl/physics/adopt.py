@@ -202,7 +202,7 @@ class _Adoption:
         return sorted(casters, key=lambda caster: -(caster.centre @ self.left))
 
     def _gaps(self, floor: float) -> str:
-        """Says in a clause how far above the floor of the driven wheels the lowest of the other parts ends."""
+        """Returns a clause on how far above the floor of the driven wheels the lowest other part ends."""
         wheels = {wheel.body for wheel in self.rear}
         others = [
             g for g in range(self.model.ngeom)

@@ -356,7 +356,7 @@ def check_declared(path: Path, declared: int, stored: int) -> None:
 def reading_chunks(path: str | Path) -> Iterator[None]:
     """Reads chunks of zarr arrays as `reading` reads files; after an error it stops zarr, which would read on.
 
-    Otherwise Python prints a traceback for each of them when the process ends.
+    Otherwise Python prints, when the process ends, a traceback for each chunk that was still being read.
 
     Raises:
         InputError: The file cannot be read.

@@ -319,7 +319,15 @@ def _odometry(c: Mapping[str, list[float]], k: int, after: str, header: Message)
 
 
 def _imu(c: Mapping[str, list[float]], k: int, header: Message, gyro: float, force: float) -> Message:
-    """Returns the samples of gyro and accelerometer, of these variances in (rad/s)² and (m/s²)²; see `_odometry`."""
+    """Returns the samples of gyro and accelerometer.
+
+    Args:
+        c: The signals, by name.
+        k: Index of the sample.
+        header: Header of the message.
+        gyro: Variance of the gyro in (rad/s)².
+        force: Variance of the accelerometer in (m/s²)².
+    """
     return {
         "header": header,
         "orientation": _heading(0.0),

@@ -85,6 +85,7 @@ def run(
         Store.prepare(path)
         with Store.locked(path):
             store = Store.begin(path, manifest)
+            sweep = Sweep.from_dict(store.manifest["sweep"], "sweep")  # whose numbers may be rounded differently
             pending = sorted(set(range(store.jobs)) - store.done())
             aside = {}
             if pending:

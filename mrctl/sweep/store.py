@@ -62,8 +62,8 @@ from mrctl.sweep.signals import DIMENSIONS, lazily
 LARGEST = 2**28  # largest size of sweep.json in bytes
 KIND, FORMAT = "mrctl sweep", 3
 ROUNDING = 1e-12
-"""Relative difference up to which a number of a sweep is that of the store, which keeps its own. References that are
-drawn are computed with functions that another processor rounds differently."""
+"""Largest relative difference between a number of a sweep and that of its store that counts as rounding; the store
+keeps its own number. Drawn references are computed with functions that another processor rounds differently."""
 CHECKSUM = "checksum"  # key in sweep.json: the checksum of all others
 ROW_GROUP = 16384  # number of rows of the table that are written at once
 INNER = 16  # runs that are compressed together, signal by signal
@@ -549,7 +549,7 @@ def _regroup(tables: Iterable[pa.Table]) -> Iterator[pa.Table]:
 def _difference(old: object, new: object, where: str = "") -> str:
     """Returns the first place where two trees of plain data differ, with both values, or "" if they are equal.
 
-    Numbers may differ by `ROUNDING`.
+    Floats count as equal up to the relative difference `ROUNDING`.
     """
     if isinstance(old, dict) and isinstance(new, dict):
         pairs = [(str(key), old.get(key), new.get(key)) for key in {**old, **new}]

@@ -575,7 +575,7 @@ class Live(Page):
             self._plots.score(now, laps, session.parameter_error(), when)
 
     def _status_lines(self) -> list[str]:
-        """Returns what the page says of the session: time, lap and pace, who has stopped and why, and who is there."""
+        """Returns what the page says of the session: time, lap and pace, who has stopped and why, and who arrived."""
         doing = "playing" if self.playing else "paused" if self.session.running else "finished; reset starts again"
         if self._back is not None:
             doing = f"of {self.session.time:.2f} s; whatever you do goes on from here"

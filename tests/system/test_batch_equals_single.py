@@ -302,7 +302,6 @@ def first_half(path: str, job: int) -> Outcome:
 SWEPT = (6, 6), pytest.param((100, 50), marks=pytest.mark.full)
 
 
-@pytest.mark.usefixtures("here")
 @pytest.mark.parametrize("counts", SWEPT, ids=lambda counts: "-".join(map(str, counts)))
 def test_sweep(counts, tmp_path):
     """A sweep that is interrupted after half of its jobs has the bits of runs alone in the end, and so has a repeat.

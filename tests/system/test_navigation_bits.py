@@ -89,7 +89,6 @@ def mission(number: int, avoid: str) -> Scenario:
             number += 2 * ALIKE
 
 
-@pytest.mark.usefixtures("here")
 @pytest.mark.parametrize(
     ("plain", "avoiders", "avoided"),
     [([1], AVOIDERS[:2], 1), pytest.param(range(160), AVOIDERS, 30, marks=pytest.mark.full)],
@@ -110,7 +109,7 @@ def test_same_bits(plain: Sequence[int], avoiders: Sequence[str], avoided: int, 
     for name, sweep in sweeps.items():
         store = tmp_path / name
         assert len(Store(store).done()) == Store(store).jobs // 2 > 0
-        jobs.run(sweep, store, 1)
+        jobs.run(sweep, store, 2)
         opened = mrctl.open(store)
         stages = user_files.load(sweep.controller) if sweep.controller else {}
         for first in range(0, sweep.size, TOGETHER):

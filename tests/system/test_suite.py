@@ -76,7 +76,7 @@ def tiny(mode: str, seeds: int, random: int) -> list[Case]:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def small(here: None) -> Iterator[None]:
+def small(here_throughout: None) -> Iterator[None]:
     """Few short runs in this process, small figures, and neither PID nor machine measured again."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(suite, "cases", tiny)

@@ -11,10 +11,10 @@ from scipy.optimize import nnls
 from test_obstacles import judged, random_shapes
 
 from mrctl import Box, Obstacles, RobotFile, Scenario, Sensing, Waypoints
+from mrctl.control.design import motion
 from mrctl.control.features import feature_matrix
-from mrctl.control.kanayama import Kanayama, kanayama, posture_error
+from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.experiments.learned_limits import PLANTS
-from mrctl.loop.hierarchy import Hierarchy
 from mrctl.navigation.avoidance import Avoiding, Barrier, approach, avoid, nearest, share
 from mrctl.navigation.pacing import Following, Pacing
 from mrctl.navigation.vehicle import Vehicle
@@ -163,8 +163,12 @@ def test_following_has_the_gains_of_the_hierarchy(given: dict[str, Any]) -> None
     pose, reference = np.array([[0.1, 0.2, 0.3]]), np.array([[0.0, 0.0, 0.0, 0.5, 0.2, 0.0, 0.0]])
     error, request = np.empty(3), np.empty(2)
     posture_error.compiled(pose[0], reference[0, :3], error)
-    gains = Hierarchy([scenario], robot).state["kanayama"][0]
-    kanayama.compiled(error, reference[0, 3:5], gains, request)
+    period = scenario.control_period
+    latency = scenario.sensing.loop_delay(period) * period
+    loops = scenario.pid.channels(robot, False, latency, period)
+    own = scenario.kanayama.completed(motion(robot, False, loops, latency, period, scenario.prefilter).kanayama)
+    gains = np.array([(own.k_x, own.k_y, own.k_theta)], GAINS)
+    kanayama.compiled(error, reference[0, 3:5], gains[0], request)
     assert np.array_equal(Following(robot, [scenario]).output(pose, reference)[0], request)
 
 

@@ -104,6 +104,7 @@ def test_growth_shortens_the_rest(doubling, frequency):
     assert len(gaps) >= 2
     expected = np.clip(doubling * np.log2(GROWTH), SOONEST, REST)
     np.testing.assert_allclose(gaps, expected, atol=2 * PERIOD + 2 * half + decay)
+    assert gaps.min() >= SOONEST - PERIOD / 2
 
 
 def test_what_is_no_oscillation():
