@@ -311,7 +311,12 @@ def _text(value: float) -> str:
 
 
 def _against(rival: FeedforwardName, samples: Array) -> str:
-    """Returns in words who beats or loses to a rival and where; samples `(controllers, plants, draws)`, less is better."""
+    """Returns in words who beats or loses to a rival, and where.
+
+    Args:
+        rival: The rival.
+        samples: What they need, `(controllers, plants, draws)`; less is better.
+    """
     verdicts = {"better": [], "worse": []}
     for c, name in enumerate(CONTROLLERS):
         for p, plant in enumerate(PLANTS):
