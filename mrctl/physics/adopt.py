@@ -187,6 +187,7 @@ class _Adoption:
                         f"caster: {part(self.model, g)} ends {1e3 * depth:.4g} mm below the floor of the wheels, and "
                         "its centre is not above it; correct its height, or that of the wheels"
                     )
+                self._refuse_wheel_that_nothing_turns(caster)
                 casters.append(caster._replace(radius=radius))  # so that it touches the wheels' floor
         if not casters:
             track = np.linalg.norm(self.rear[0].centre - self.rear[1].centre)
@@ -200,6 +201,17 @@ class _Adoption:
             names = _listed([caster.body for caster in casters])
             raise InputError(f"caster: at most two, both ahead of the axle or both behind, not on {names}")
         return sorted(casters, key=lambda caster: -(caster.centre @ self.left))
+
+    def _refuse_wheel_that_nothing_turns(self, caster: Wheel) -> None:
+        """Refuses a rolling wheel on an upright joint that has neither a servo nor, as a caster has, a trail."""
+        for name in self._hinges() if caster.joint else ():
+            carried = self._lineage(name)[0] in self._ancestry(self.model.body(caster.body).id)
+            trail = np.hypot(*(caster.centre - self.data.joint(name).xanchor)[:2])
+            if carried and abs(self._axis(name)[2]) > 0.9 and trail < LEVEL * caster.radius:
+                raise InputError(
+                    f"steering: nothing turns the joint {name!r}, and its wheel has no trail, which a caster needs; "
+                    f'if it is steered, add <position joint="{name}" kp="K" kv="D"/>'
+                )
 
     def _gaps(self, floor: float) -> str:
         """Returns a clause on how far above the floor of the driven wheels the lowest other part ends."""

@@ -338,6 +338,8 @@ ERRORS = {
     "axles at an angle": (
         document(DIFF.replace('name="b" axis="0 1 0"', 'name="b" axis="1 1 0"'), MOTORS), {}, ("wheels", "axle")),
     "no servo": (document(TRICYCLE, MOTORS), {"steering": ("s1",)}, ("steering", "'s1'", "kp")),
+    "no servo, and no names": (document(TRICYCLE, MOTORS), {}, ("steering", "no trail", '<position joint="s1"')),
+    "no servos": (document(CAR, MOTORS), {}, ("steering", "no trail", '<position joint="s1"')),
     "no stops": (
         document(TRICYCLE.replace('range="-30 30"', ""), MOTORS + SERVO.format("s1")), {}, ("steering", "range")),
     "nothing to roll on": (
