@@ -17,7 +17,7 @@ from mrctl.results.dataset import versions
 from mrctl.sweep.jobs import code_digest
 from mrctl.sweep.pool import Cluster, Outcome, carry_out, check_address
 
-SHOWING = ("envs", "viewer", "cli.py", "__main__.py")  # rooms on which no experiment depends
+SHOWING = ("envs", "viewer", "cli", "__main__.py")  # rooms on which no experiment depends
 
 
 class Computation(NamedTuple):

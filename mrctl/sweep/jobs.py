@@ -33,7 +33,7 @@ from mrctl.sweep.pool import Cluster, Outcome, Pool, Processes, Work, carry_out,
 from mrctl.sweep.store import Store
 from mrctl.theory.robot import CAR
 
-SHOWING = ("checks", "envs", "experiments", "viewer", "cli.py", "__main__.py")  # rooms on which no stored run depends
+SHOWING = ("checks", "envs", "experiments", "viewer", "cli", "__main__.py")  # rooms on which no stored run depends
 TOLERANCE = 1e-9  # relative difference within which a repeated run agrees
 ASIDE = "set aside: "
 

@@ -58,7 +58,7 @@ def watch(folder: Path, runs: int, workers: int, every: float = 5.0) -> tuple[np
     (folder / "sweep.toml").write_text(SWEEP.format(runs=runs))
     store = folder / "store"
     start = time.perf_counter()
-    command = [sys.executable, "-m", "mrctl.cli", "sweep", str(folder / "sweep.toml"), "--out", str(store)]
+    command = [sys.executable, "-m", "mrctl", "sweep", str(folder / "sweep.toml"), "--out", str(store)]
     sweep = subprocess.Popen([*command, "--workers", str(workers)], stdout=subprocess.DEVNULL)
     curve = []
     while sweep.poll() is None:

@@ -335,7 +335,7 @@ def test_bad_flags_are_one_line(arguments: list[str], says: str, capsys: pytest.
 @pytest.mark.parametrize("arguments", [["run", "--help"], ["tune", "--search", "nothing"]])
 def test_reader_of_a_pipe_that_leaves(arguments: list[str]) -> None:
     """A pipe that nobody reads any more, as after `mrctl run --help | head`, is no error, and hides none."""
-    command = [sys.executable, "-m", "mrctl.cli", *arguments]
+    command = [sys.executable, "-m", "mrctl", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout and process.stderr
     process.stdout.close()

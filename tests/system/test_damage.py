@@ -174,7 +174,7 @@ def test_damaged_shard_is_named_when_it_is_used(whole: Path, tmp_path: Path) -> 
     np.testing.assert_array_equal(found["x"][[1, 0]], undamaged["x"].values[[1, 0]])
     with pytest.raises(InputError, match="signals/c/1/0/0: damaged"):
         found.load()
-    command = [sys.executable, "-m", "mrctl.cli", "run", str(tmp_path / "store"), "--run", "2"]
+    command = [sys.executable, "-m", "mrctl", "run", str(tmp_path / "store"), "--run", "2"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr  # zarr's other readers say nothing
 

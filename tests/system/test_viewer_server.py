@@ -128,7 +128,7 @@ def test_viser_that_starts_otherwise(monkeypatch):
 
 def test_command():
     """`mrctl view` says where it is, and ends on Ctrl-C."""
-    command = [sys.executable, "-m", "mrctl.cli", "view", "--port", "0"]
+    command = [sys.executable, "-m", "mrctl", "view", "--port", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None and process.stderr is not None
         assert process.stdout.readline().startswith("open http://127.0.0.1:")

@@ -17,7 +17,8 @@ from test_viewer import (
 )
 
 from mrctl import Event, Perturbation, Scenario, Sweep, save, simulate
-from mrctl.cli import BEST, main
+from mrctl.cli import main
+from mrctl.cli.shared import BEST
 from mrctl.results.controllers import title_of
 from mrctl.scenario import FEEDFORWARDS
 from mrctl.sweep import jobs

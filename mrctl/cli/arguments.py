@@ -1,0 +1,176 @@
+"""What a command line says: short flags, the fields that it sets, and messages about what is wrong in it."""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from mrctl.record import InputError, Record, nearest
+from mrctl.scenario import Scenario
+from mrctl.theory.perturbation import Perturbation
+
+FROM_FILES = ("events", "obstacles", "map")
+"""Fields of `Scenario` that have no flags, because they come from a scenario file."""
+
+NOT_OF_MISSIONS = (*FROM_FILES, "reference", "laps", "initial_pose", "goal")
+"""Fields of `Scenario` without flags in `mrctl navigate`: they come from files, or the mission sets them."""
+
+WITH_RECORDS = "run", "navigate", "identify", "view"
+"""Commands whose short help leaves out most of the flags of a record."""
+
+SHORT = {"--robot": "--robot.path", "--localise": "--sensing.localisation"}
+"""Flags that stand for longer ones."""
+
+POSES = "--goal", "--start", "--initial-pose"
+"""Flags whose values may be written as x,y,θ."""
+
+
+def expanded(arguments: list[str]) -> list[str]:
+    """Expands short flags into full ones.
+
+    `--perturbation NAME` becomes the flags of that perturbation, which later flags override, a flag of `SHORT` the
+    longer one, and a pose x,y,θ three numbers.
+
+    Raises:
+        InputError: There is no perturbation of that name, a short flag has no value, or a pose has not three numbers.
+    """
+    found: list[str] = []
+    rest = iter(arguments)
+    for argument in rest:
+        flag, given, value = argument.partition("=")
+        if flag == "--perturbation":
+            if not (name := value if given else next(rest, "")) or name.startswith("--"):
+                raise InputError(
+                    "perturbation: needs a name, such as all, or a flag such as --perturbation.mass-factor"
+                )
+            perturbation = Perturbation.from_dict(name, "perturbation")
+            for field, changed in perturbation.model_dump(exclude_defaults=True).items():
+                found += [f"--perturbation.{field.replace('_', '-')}", str(changed)]
+        elif flag in SHORT:
+            if not (name := value if given else next(rest, "")) or name.startswith("--"):
+                raise InputError(f"{flag.removeprefix('--')}: needs a value; see mrctl {arguments[0]} --help")
+            found += [SHORT[flag], name]
+        elif given and flag in POSES:
+            found += [flag, *_pose(flag, value)]
+        else:
+            in_pose = "," in argument and found[-1:] and found[-1] in POSES
+            found += _pose(found[-1], argument) if in_pose else [argument]
+    return found
+
+
+def _pose(flag: str, text: str) -> list[str]:
+    """Splits a pose that is written as x,y,θ.
+
+    Raises:
+        InputError: There are not three numbers.
+    """
+    parts = text.split(",")
+    try:
+        if len(parts) != 3 or not all(math.isfinite(float(part)) for part in parts):
+            raise ValueError
+    except ValueError:
+        name = flag.removeprefix("--")
+        raise InputError(f"{name}: {text} is not x, y and θ in m, m, rad, as in --{name} 2,0,0") from None
+    return parts
+
+
+def fields_set(arguments: Sequence[str]) -> set[str]:
+    """Returns the fields that a command line sets; of nested ones the outermost, such as `robot` for --robot.path."""
+    flags = [argument for argument in arguments[1:] if argument.startswith(("--", "reference:"))]
+    return {re.split("[.:=]", flag.removeprefix("--"))[0].replace("_", "-") for flag in flags}
+
+
+def scenario_file_of(arguments: Sequence[str]) -> str | None:
+    """Returns the argument of `run` or `view` that is a scenario file: it ends in .toml and is no value of a flag."""
+    for previous, argument in zip(arguments, arguments[1:], strict=False):
+        is_value = previous.startswith("--") and "=" not in previous and _switch(previous) is None
+        if argument.endswith(".toml") and not argument.startswith("-") and not is_value:
+            return str(Path(argument))
+    return None
+
+
+def refuse_known(arguments: Sequence[str]) -> None:
+    """Refuses flags of a scenario's fields that have none, or that had one in an earlier version.
+
+    Raises:
+        InputError: There is such a flag; the message says what to do in its place.
+    """
+    if arguments[0] not in WITH_RECORDS:
+        return
+    for flag in arguments:
+        if flag.startswith("--"):
+            name = flag[2:].partition("=")[0].replace("-", "_")
+            Scenario.refuse_moved(name)
+            if name in FROM_FILES:
+                raise InputError(f"{name}: has no flag; set it in a scenario file, as for mrctl run scenario.toml")
+            if arguments[0] == "navigate" and name in NOT_OF_MISSIONS and name != "goal":  # it has its own --goal
+                raise InputError(f"{name}: has no flag here, because the mission sets it")
+
+
+def check_switches(arguments: Sequence[str]) -> None:
+    """Refuses a word such as true behind a flag that takes no value."""
+    for flag, word in zip(arguments[1:], arguments[2:], strict=False):
+        if word.lower() in ("true", "false", "on", "off", "yes", "no", "0", "1") and (name := _switch(flag)):
+            *path, last = name.split(".")
+            off = ".".join([*path, f"no-{last}"])
+            raise InputError(f"{name}: a switch without a value, but {word} follows it; --{name} is on, --{off} off")
+
+
+def _switch(flag: str) -> str | None:
+    """Returns the name of a flag of `run` or `view` that takes no value, such as `guard.on` for --guard.no-on."""
+    name = re.sub(r"(^--|\.)no-", r"\1", flag.replace("_", "-")).removeprefix("--")
+    return name if flag.startswith("--") and name in {"json", "code", *_switches(Scenario)} else None
+
+
+def _switches(record: type[Record], prefix: str = "") -> list[str]:
+    """Returns the flags of a record that take no value, because they are true or false, such as `guard.on`."""
+    found = []
+    for name, field in record.model_fields.items():
+        flag = prefix + name.replace("_", "-")
+        if field.annotation is bool:
+            found.append(flag)
+        elif isinstance(field.annotation, type) and issubclass(field.annotation, Record):
+            found += _switches(field.annotation, f"{flag}.")
+    return found
+
+
+def one_line(box: str, command: str) -> str:
+    """Returns the message in one of tyro's boxes, about a command, as one line.
+
+    The box is drawn in Unicode or ASCII. The message of a record that is a part of a scenario gets the whole path.
+    """
+    titled = "╭" not in box  # without box characters the title is a part of its own
+    lines = [line.strip("│| ") for line in box.splitlines() if not line.startswith(("╭", "╰", "+"))]
+    parts = re.split(r"(?:^|\n)[-─]{8,}(?:\n|$)", "\n".join(lines).strip())
+    parts = [" ".join(part.split()) for part in parts if part.strip()]
+    text = re.sub(r"\[/?bold\]", "", parts[min(titled, len(parts) - 1)]) if parts else "bad arguments"
+    if match := re.match(r"Error parsing -*([\w.-]+): no type matching (.*?) could be instantiated", text):
+        return f"{match[1]}: expected {re.sub('[{}]', '', match[2]).replace('|', ' or ')}"
+    if match := re.match(r"Error parsing -*([\w.-]+): invalid literal for int\(\) with base 10: (.*)", text):
+        return f"{match[1]}: {match[2]} is not a whole number"
+    if match := re.match(r"invalid choice (.+) for argument '-*([\w.-]+)'. Expected one of (\(.*\))", text):
+        choices = sorted(set(ast.literal_eval(match[3])) - {"None"})  # that of an optional flag which nobody gives
+        return f"{match[2]}: {match[1]} is none of {', '.join(choices)}"
+    if match := re.match(r"Unrecognized options: (-[^\s,=]+)", text):
+        flag, similar = "", []
+        for line in lines:
+            flag = line.split()[0] if line.startswith("--") else flag
+            if line.startswith(f"in mrctl {command} "):
+                similar.append(flag)
+        meant = nearest(match[1], similar)
+        return f"no flag is called {match[1]}" + (f"; did you mean {meant}?" if meant else "")
+    if match := re.match(r"Unrecognized or misplaced options: (\S+) \(applied to mrctl (\S+)( \S+)?\)", text):
+        if match[3]:
+            return f"{match[1]}: is no flag of{match[3]}, and those of mrctl {match[2]} stand before it"
+        return f"{match[1]}: is no flag of mrctl {match[2]}"
+    if match := re.match(r"Unrecognized options: (\S+\.xml)", text):
+        return f"{match[1]}: the file of a robot is given as --robot {match[1]}"
+    if not (match := re.match(r"Error parsing (\S+): (.*)", text)):
+        return text
+    parts = match[1].removeprefix("--").split(".")
+    path = ".".join(part for part in parts if part not in ("__tyro-dummy-inner__", "scenario"))
+    joint = "." if re.match(r"[\w.]+: ", match[2]) else ": "  # that of a record begins with the field
+    return f"{path}{joint}{match[2]}" if path else match[2]

@@ -1,0 +1,107 @@
+"""The command `mrctl run`: one scenario, or once more a run that was saved."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from mrctl.cli.arguments import check_switches, fields_set, scenario_file_of
+from mrctl.cli.flags import explained, with_fields
+from mrctl.cli.shared import Incomplete, check_exists, check_world, expect_same, report, suited, warn_if_impossible
+from mrctl.record import InputError
+from mrctl.scenario import Scenario
+
+
+def run_with(arguments: list[str]) -> Callable[..., None]:
+    """Returns the `run` command, whose flags take their defaults from the scenario file where one is given."""
+    scenario_file = scenario_file_of(arguments) if arguments[0] == "run" else None
+    default = Scenario.from_toml(scenario_file) if scenario_file else Scenario()
+
+    def run(
+        file: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO.toml|FOLDER]")] = None,
+        /,
+        scenario: Annotated[Scenario, tyro.conf.arg(name="")] = default,
+        out: Path | None = None,
+        json: bool = False,
+        controller: str | None = None,
+        number: Annotated[int | None, tyro.conf.arg(name="run")] = None,
+        code: bool = True,
+    ) -> None:
+        """Runs one scenario and prints its metrics lap by lap.
+
+        The exit status is 1 if the run fails.
+
+        Args:
+            file: Run this scenario file, whose values flags override; or the folder --out of a run, which is then run
+                again and compared with what it holds, and the exit status is 1 if a bit differs; or with --run a
+                sweep's store.
+            scenario: The scenario.
+            out: Write the result, the figures and the learned weights to this folder.
+            json: Print JSON instead of a table.
+            controller: Use stages of your own: my_file.py:MyFeedforward or motion=my_file.py:MyMotion,feedback=...
+            number: Drive the run of this number in a sweep's store again, and compare it with what is stored.
+            code: With --run: whether the Python files of the controller that the sweep names may be run.
+        """
+        if number is not None:
+            return _repeat(file, number, out, json, code)
+        if file is not None and file.is_dir():
+            return _repeat_saved(file, arguments, out, json, controller)
+        if file is not None and str(file) != scenario_file:
+            check_switches(arguments)
+            raise InputError(f"run: {file} is not a scenario file, whose name ends in .toml; see mrctl run --help")
+        check_world(scenario.world, scenario.robot)
+        from mrctl.kernel import announced_early
+
+        announced_early()
+        from mrctl.experiments import single
+
+        scenario = suited(scenario, arguments, scenario_file)
+        warn_if_impossible(scenario)
+        text, failure = single.run(scenario, out, json, controller)
+        report(text, out, json)
+        if failure:
+            raise Incomplete(f"the run failed {failure}")
+
+    return with_fields(run, default, explained(arguments))
+
+
+def _repeat_saved(folder: Path, arguments: Sequence[str], out: Path | None, json: bool, controller: str | None) -> None:
+    """Runs a saved run again and compares it with what was saved: `mrctl run FOLDER`."""
+    if (folder / "mission.json").exists():
+        raise InputError(f"run: {folder} holds a mission, which mrctl navigate {folder} repeats")
+    if (folder / "sweep.json").exists():
+        raise InputError(f"run: {folder} is the store of a sweep; for one of its runs give its number with --run")
+    if new := sorted(fields_set(arguments) - {"out", "json", "controller"}):
+        raise InputError(f"{new[0]}: {folder} holds a run, which is driven as it was; leave --{new[0]} out")
+    from mrctl.kernel import announced_early
+
+    announced_early()
+    from mrctl.experiments import single
+
+    text, departs = single.repeat(folder, out, json, controller)
+    report(text, out, json)
+    expect_same(folder, departs, json)
+
+
+def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code: bool) -> None:
+    """Runs one run of a sweep again and compares it with the store: `mrctl run STORE --run K`."""
+    if store is None:
+        raise InputError("run: --run needs the store of a sweep, as in mrctl run STORE --run 3")
+    check_exists(store)
+    from mrctl.experiments import single
+    from mrctl.sweep import jobs
+    from mrctl.sweep.store import Store
+
+    jobs.stages_of(store, code)
+    if out is not None or json:
+        own = Store(store).manifest["sweep"].get("controller")
+        report(single.run(jobs.scenario_of(store, number), out, json, own)[0], out, json)
+    repeated = jobs.repeat(store, number)
+    verdict = f"run {number}: {repeated.verdict}"
+    if not repeated.same:
+        raise Incomplete(verdict)
+    print(verdict, file=sys.stderr if json else sys.stdout)
