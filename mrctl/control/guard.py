@@ -24,12 +24,18 @@ teaches is a third of the one before (`mrac` is not taught by it), and the autho
 
 **What it guarantees.**
 
-1. |d| ≤ D_ρ: no d, however it oscillates or grows, takes e (for the same command) or ρ out of the region. The guard
-   leaves such a learner alone, unless the loop oscillates. With |d| ≤ D this holds for e.
-2. Beyond these bounds it ends in the tick in which an error leaves the region. Until then the errors are inside.
-3. From then on PID and model act alone; the PID's integral starts within D of the model, and the rest of the step in
-   voltage, which fades, is within D too. From any such state the position error stays below a bound that both loops
-   give (the test below counts the rest of the step as a part of the integral): 0.23 to 0.27 m for the default robot.
+1. |d| ≤ D_ρ all along: no d, however it oscillates or grows, takes ρ, or e for the same command, out of the region. The
+   guard leaves such a learner alone, unless the loop oscillates. With |d| ≤ D this holds for e. The motion controller
+   answers d too, which moves the command: against that, e is at most 1.3 ē for the default robot.
+2. An error that leaves the region while the learner is to blame ends it in the same tick. Until then the errors are
+   inside. A learner that has come back within the bounds is no longer to blame once the peak of its |d| has decayed,
+   but an error that it has caused may still grow. In the worst case found (by linear programming, for the default
+   robot and the same command) e reaches 1.10 ē with the PID of `lab`, 1.13 ē with that of `field`, and with the slow
+   one of the paper 1.7 ē, and ρ 0.22 m.
+3. After a fallback PID and model act alone. The PID's integral starts within D of the model, and the rest of the step
+   in voltage, which fades, is within D too. From any such state the position error stays below a bound that both loops
+   give: 0.23 to 0.27 m for the default robot (`recovery` in `tests/system/test_adversaries.py`, which counts the rest
+   of the step as a part of the integral).
 
 The bounds are those of the linear loops that the PID was designed for; the limits of voltage and acceleration, and what
 happens within the loop's delay, add to them: under `rigid` steering with the PID of the paper ρ reached 0.22 m with |d|

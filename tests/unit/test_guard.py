@@ -5,16 +5,23 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import toeplitz
+from scipy.optimize import linprog
 
 from mrctl import InputError
 from mrctl.control import guard as module
+from mrctl.control.design import MotionDesign
 from mrctl.control.feedforward import Loop
 from mrctl.control.fel import FeedbackErrorLearning, Fel
 from mrctl.control.fel_torch import ModuleLearning
 from mrctl.control.guard import GUARD_ACTIONS, REASONS, Guard, fresh, guard
+from mrctl.control.kanayama import Kanayama
 from mrctl.control.nominal import NOMINAL
 from mrctl.control.oscillation import DRIFT, SMOOTH
+from mrctl.control.pid import Pid
+from mrctl.control.rejection import LinearLoop
 from mrctl.control.rls import RecursiveLeastSquares, Rls
+from mrctl.theory.linear import common, yaw
 
 PERIOD = 0.01
 SUPPLY, ROTATION = 24.0, 3.0
@@ -171,6 +178,36 @@ def test_blame_fades():
         for _ in range(round(pause / PERIOD)):
             bench.tick()
         assert bench.tick(slower=(1, 0)) == action
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+def test_forgotten(robot, channel):
+    """What a learner did before the peak of its deviation decayed can leave a velocity error that nobody answers.
+
+    A linear program finds the deviation, in steps of 4 ticks, that keeps the error within the region as long as it is
+    to blame, 2.4 s, and then leaves the largest error with the slow PID of the paper. The guard does nothing.
+    """
+    gains, held, before = Pid(time_constant=0.15).channels(robot, False), 4, 60
+    motion = MotionDesign(Kanayama(k_x=0.0, k_y=0.0, k_theta=0.0), 0.05, (0.0, 0.0))
+    plant = common(robot) if channel == 0 else yaw(robot, 0.75)
+    loop = LinearLoop(robot, False, channel, plant, gains[channel], motion, 0.75, 0.0, PERIOD)
+    pulse = np.convolve(loop.response(loop.pulse)[0], np.ones(held))
+    bench = Bench(gains=np.tile([loop.sums()[0], 1e-9], (2, 1)))
+    within, region = bench.g["harmless"][channel], bench.g["region"][channel]
+    largest, worst = 0.0, np.zeros(0)
+    for after in (1, 2, 4, 8, 15):
+        number = np.arange(before + after)
+        step = toeplitz(pulse[held - 1 :: held][: len(number)], np.zeros(len(number)))
+        bound = within * (1 + PERIOD / module.RECENT) ** (held * np.maximum(before - 1 - number, 0))
+        ends = np.minimum(bound, SUPPLY)[:, None] * (-1, 1)
+        rows = np.vstack([step[:before], -step[:before]])
+        found = linprog(-step[-1], rows, np.full(2 * before, 0.98 * region), bounds=ends, method="highs")
+        if -found.fun > largest:
+            largest, worst = -found.fun, np.repeat(0.995 * found.x, held)
+    error = np.convolve(loop.response(loop.pulse)[0], worst)[: len(worst)]
+    on = np.arange(2) == channel
+    assert all(bench.tick(d * on, slower=e * on) == "none" for d, e in zip(worst, error, strict=True))
+    assert 1.2 < np.abs(error).max() / region < 1.5
 
 
 def test_position_bounds_the_deviation():
