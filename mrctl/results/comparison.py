@@ -30,7 +30,7 @@ class Interval(NamedTuple):
 
 
 class Ratio(NamedTuple):
-    """A mean of paired ratios with its confidence interval, over the `pairs` that are finite on both sides."""
+    """A mean of paired ratios with its confidence interval, over the `pairs` finite and not 0 on both sides."""
 
     value: float
     low: float
@@ -81,6 +81,7 @@ def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_00
     """Returns the geometric mean of a / b over pairs (same seed, same perturbation), with its bootstrap interval.
 
     Every pair has the same weight, however large its errors, and the ratio of b to a is the inverse of that of a to b.
+    A pair with an error of 0 has no such ratio and is left out.
 
     Args:
         a: One number a run (n,); NaN or infinite where it failed.
@@ -98,7 +99,7 @@ def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_00
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = bootstrap_interval(np.log(first[both] / second[both]), level, n, seed)
     value, low, high = np.exp(mean[:3]).tolist()
-    return Ratio(value, low, high, int(both.sum()), int((~fine[0]).sum()), int((~fine[1]).sum()))
+    return Ratio(value, low, high, mean.samples, int((~fine[0]).sum()), int((~fine[1]).sum()))
 
 
 def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 0.0) -> Superiority:

@@ -60,6 +60,12 @@ def test_paired_ratio_failures():
     assert noisy.low < noisy.value < noisy.high
 
 
+def test_paired_ratio_of_nothing():
+    """An error of 0 on either side has no ratio; its pair is left out, and not counted as one that was used."""
+    ratio = comparison.paired_ratio([0.0, 2.0, 2.0, 0.0], [1.0, 1.0, 0.0, 0.0])
+    assert (ratio.value, ratio.pairs, ratio.failed, ratio.rival_failed) == (2.0, 1, 0, 0)
+
+
 @given(st.lists(st.tuples(*[st.floats(1e-6, 1e6)] * 2), min_size=2, max_size=6))
 def test_paired_ratio_is_even_handed(pairs):
     """It is the n-th root of the product of the ratios; turned round it is one over it, which a mean is not."""
