@@ -2,7 +2,7 @@
 
 A disturbance d of a channel's voltage that never exceeds D causes an error e that never exceeds ‖G‖₁ D, where ‖G‖₁ is
 the sum of |g| over the response g of the error to a pulse of one period. No smaller bound holds for all d: sign(g),
-reversed in time, reaches it (Boyd and Barratt 1991, Linear Controller Design, section 5.1). The loops are those that
+reversed in time, reaches it (Boyd and Barratt 1991, Linear Controller Design, section 5.2). The loops are those that
 `design` designs: PI control of the linear plants, with delay and hold, around it the motion controller with its
 prefilter, and the prediction of the motion over the delay, linearised about driving straight on,
 
