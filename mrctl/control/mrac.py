@@ -13,8 +13,8 @@ m_k is the parameter of the acceleration of channel k. The commanded motion x_c 
 
 - w = H φ(x, ẋ) with H = 1/(T s + 1)², so that H U_k = wᵀ a_k without differentiation: the prediction error.
 - P is the gain of least squares with the memory 1/λ. In each direction it returns to P_0 when w no longer excites it,
-  and never exceeds it, P ≤ P_0. (Slotine and Li bound P by a λ that falls to zero with P_0 − P in the norm. A course
-  that leaves some directions without excitation then ends the forgetting in all of them, and adaptation with it.)
+  and never exceeds it, P ≤ P_0. (Slotine and Li let λ fall to zero as the norm of P reaches a bound. A course that
+  leaves some directions without excitation then ends the forgetting in all of them, and adaptation with it.)
 - σ = 0 while ‖â_k − a_0‖ ≤ R and grows linearly to σ_0 at 2 R; a_0 are the parameters of the prior, zero for `none`.
 - The projection keeps â_k in the ball of radius 2 R about a_0, by the nearest point of the ball in the metric P⁻¹.
 
@@ -27,8 +27,9 @@ Then, with ã_k = â_k − a_k,
 
     V = ½ Σ_k [η_k (m_k e_k² + K_i,k z_k²) + ã_kᵀ P⁻¹ ã_k],      V̇ ≤ −Σ_k [ε η_k e_k² + (wᵀ ã_k)²/(2 ρ²)] ≤ 0
 
-so that e, z and â are bounded, e and wᵀ ã are square integrable, and for a bounded command e → 0 if ε > 0. V̇ also
-contains −½ λ Σ ã_kᵀ (P⁻¹ − P_0⁻¹) ã_k. If w is persistently exciting, P⁻¹ − P_0⁻¹ ≥ c P⁻¹ with c > 0, and ã → 0 too.
+so that e, â and, where K_i,k > 0, z are bounded, and wᵀ ã is square integrable. If ε > 0, e is square integrable too,
+and e → 0 for bounded x_c and ẋ_c. V̇ also contains −½ λ Σ ã_kᵀ (P⁻¹ − P_0⁻¹) ã_k. If w is persistently exciting, P⁻¹ −
+P_0⁻¹ ≥ c P⁻¹ with c > 0, and ã → 0 too.
 
 *Proof.* The equation of the robot less the law is m_k ė_k = −K_k e_k − K_i,k z_k − φ_cᵀ ã_k − (f_k(x_c) − f_k(x)),
 because m_k ẋ_c,k + f_k(x_c) = φ_cᵀ a_k. In V̇, η_k e_k φ_cᵀ ã_k cancels with the first term of the adaptation, and e_k
@@ -38,9 +39,10 @@ adaptation gives −(wᵀ ã_k)²/ρ², of which the derivative of P⁻¹ takes 
 ‖â_k − a_0‖ (‖â_k − a_0‖ − R) ≤ 0, as σ = 0 where the last bracket is negative. The ball contains a_k, and a projection
 on a convex set brings â_k no farther from any of its points. ∎
 
-About (A): with η_k in proportion to the back-EMF, as here, Σ η_k e_k U_k is a power. Back-EMF and friction dissipate,
-and of the products V θ̇ and θ̇² remains l (V_c e_ω² − ω_c e_V e_ω), where l, in V s², is minus the coefficient of ω²
-in U_Σ. Forward, the feedback is stronger where l |ω_c| < 2 √(K_V D K_ω); for the default robot in `lab` this is 0.7 V
+About (A): with η_k in proportion to the back-EMF, as here, Σ η_k e_k U_k is a power. Back-EMF and friction together
+dissipate. (Friction alone may do a little work on e, as the front wheel's loss has the mean sign of the rear wheels.)
+Of the products V θ̇ and θ̇² remains l (V_c e_ω² − ω_c e_V e_ω), where l, in V s², is minus the coefficient of ω² in
+U_Σ. Forward, the feedback is stronger where l |ω_c| < 2 √(K_V D K_ω); for the default robot in `lab` this is 0.7 V
 s < 29 V s at the most.
 
 The law is sampled; one period changes V by O(h²) beyond the theorem, which the test measures. As the theorem demands,
@@ -309,7 +311,7 @@ MRAC = np.dtype(
         ("before", "f8", INPUTS),  # the same one period ago
         ("once", "f8", SIGNALS),  # features and voltages after the first filter
         ("twice", "f8", SIGNALS),  # H of features and voltages
-        ("age", "f8"),  # time since the filters began, in their time constants
+        ("age", "f8"),  # time since the filters began over T + h
         ("w", "f8", INPUTS),  # filtered features
         ("phi_c", "f8", INPUTS),  # scaled features of the commanded motion
         ("residual", "f8", 2),  # filtered voltage less that of the prior, V

@@ -149,6 +149,21 @@ def test_assumption(robot):
     assert lever * 3 < 0.03 * 2 * np.sqrt(72.9 * robot.half_track * 15.7)
 
 
+def test_dissipation(robot):
+    """Σ η e (f(x_c) − f(x)) of back-EMF and friction is never negative; that of friction alone may be.
+
+    The front wheel's loss has the mean sign of both rear wheels; without its load friction alone dissipates too.
+    """
+    at, error = RNG.uniform([-0.5, -3], [1, 3], (20000, 2)), RNG.normal(size=(20000, 2)) * (1, 1 / robot.half_track)
+    for true, friction_may in ((robot, True), (robot.model_copy(update={"com_offset": 0.0}), False)):
+        c, signs = inverse_coefficients(true), np.zeros((2, len(at), 2))
+        for k, motion in enumerate((at, at - error)):
+            signs[k] = feature_matrix(motion, np.zeros_like(motion), robot.half_track, np.ones(8))[:, 6:]
+        friction = (np.diag(c[:2]) * error * ((signs[0] - signs[1]) @ c[6:])).sum(1)
+        assert (friction.min() < -1e-6) == friction_may
+        assert (friction + np.square(np.diag(c[:2]) * error).sum(1) >= 0).all()
+
+
 def record(**values):
     s = np.zeros(1, MRAC)[0]
     for name, value in values.items():
