@@ -303,7 +303,7 @@ COMPOSITE = np.dtype(
         ("lasting", "f8"),  # weight of a new sample in the lasting mean square, and in the variance of the twist
         ("filter", "f8"),  # weight of a new sample in the two filters
         # Motion
-        ("age", "f8"),  # time since the start in time constants of the filters
+        ("age", "f8"),  # time since the start over T + h, with the time constant T of a filter and the period h
         ("heading", "f8"),  # by dead reckoning, rad
         ("now", MOTION),  # input of the first filter
         ("once", MOTION),  # output of the first filter

@@ -94,8 +94,9 @@ def margins(frequency: Array, loop: NDArray[np.complex128]) -> Margins:
 def learning_ratio(gain: float, time_constant: float, gains: Gains) -> float:
     """Ratio K_p (1 + K K_p)/(τ K_i); above 1, feedback-error learning converges with PI control of K/(τs + 1).
 
-    The condition K_p (B + b K_p) > M K_i of Gomi and Kawato (1993) holds for M V̇ + B V = b U without delay; here
-    M = τ, B = 1 and b = K.
+    This is the condition of Gomi and Kawato (1993), that the complementary sensitivity T be strictly positive real, for
+    a plant M V̇ + B V = b U without delay: K_p (B + b K_p) > M K_i, here with M = τ, B = 1 and b = K. It is sufficient
+    here: since the PID's integral hands over half of what is learned, Re T > −1 is enough (`mrctl.control.matching`).
 
     Args:
         gain: K of the plant, in output units per V.

@@ -8,10 +8,11 @@ the speed V, the yaw rate θ̇ and the fork's angle φ, the yaw model is
     J_c θ̈ + J_f φ̈ = m_f e V θ̇ − k_s φ − d_s φ̇ − t F
     (L − t) θ̈ − t φ̈ = −u/T,    u = (L − t) θ̇ − t φ̇ − V φ
 
-F is the side force of the ground on the tyre and u the side slip of its contact, which decays with T; MuJoCo's
-contacts leave out the rest of u̇, V φ̇, with which their frame turns. J_f is the inertia of fork and wheel about the
-steering axis, m_f e their mass times the distance of their centre behind it, J_c = J_f − m_f e L their coupling to
-the yaw, k_s and d_s the servo's stiffness and damping. The servo holds the commanded angle, which does not depend on
+F is the side force of the ground on the tyre in N, and u in m/s is the side slip, the sideways velocity of the contact
+in the frame of the wheel. MuJoCo lets it decay with the time constant T, but leaves −V φ̇ out of u̇, as its contacts do
+not know that their frame turns. J_f is the inertia of fork and wheel about the steering axis, m_f e their mass times
+the distance of their centre behind it, J_c = J_f − m_f e L their coupling to the yaw, k_s and d_s the servo's stiffness
+and damping. The servo holds the commanded angle, which does not depend on
 the feedback. At rates far below V/t the fork follows, φ = (L − t) θ̇/V, and its stiffness acts as a damping k_s (L −
 t)²/(t V) of the yaw: at 0.75 m/s it leaves a fifth of the static gain of the default robot's second channel.
 """

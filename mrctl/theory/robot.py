@@ -43,7 +43,8 @@ class Robot(Record):
     half_track: Positive
     """Half the distance between the rear wheels [D] in m."""
     wheelbase: float
-    """Distance of the steering axis ahead of the rear axle [L] in m; without it, of a caster, negative if behind."""
+    """Distance of the steering axis ahead of the rear axle [L] in m; if nothing is steered, that of the caster, which
+    is negative behind the axle."""
     trail: NonNegative
     """Distance of the front contact point behind the steering axis [t] in m."""
     steering_limit: Annotated[float, Field(gt=0, le=ANY_ANGLE)]
