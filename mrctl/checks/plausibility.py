@@ -16,7 +16,7 @@ from mrctl.checks.comparison import Report, between, compare
 from mrctl.checks.open_loop import HOLD, OFF, Car, Log, caster_gaps, on_skid, rolling_wheels
 from mrctl.physics.elements import MOTORS, REAR, part
 from mrctl.physics.parameters import read_robot
-from mrctl.physics.units import bounds, extent
+from mrctl.physics.units import GYRATION, bounds, extent
 from mrctl.theory.dynamics import inverse_dynamics
 from mrctl.theory.robot import Robot
 
@@ -121,5 +121,4 @@ def inertias(model: mujoco.MjModel, robot: Robot) -> Report:
         spin = body.inertia.max()  # a disc's own axis
         report.append(between(f"inertia of {name} over m r²", spin / (body.mass[0] * radius**2), 0.01, 1))
     gyration = np.sqrt(robot.yaw_inertia / robot.mass)
-    size = np.hypot(robot.wheelbase, robot.half_track)
-    return report + [between("radius of gyration over the size", gyration / size, 0.05, 1.0)]
+    return report + [between("radius of gyration over the size", gyration / robot.size, *GYRATION)]

@@ -52,7 +52,7 @@ class Pictures:
         """
         plant, physics = self._episodes.plant, self._physics(robot)
         data = physics.data
-        now, size = plant.reading[robot], np.hypot(plant.robot.wheelbase, 2 * plant.robot.half_track)
+        now, size = plant.reading[robot], plant.robot.size
         reference = self._episodes.scenarios[robot].reference
         course = reference.sample(np.linspace(0, reference.period, POINTS)).pose * [1, 1, 0] + [0, 0, 0.004]
         data.qpos[:] = plant.qpos[robot]

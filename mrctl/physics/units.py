@@ -87,7 +87,7 @@ def derived_limits(robot: Robot) -> tuple[float, float, float, float]:
 
 def bounds(robot: Robot) -> list[Bound]:
     """Lists quantities and their bounds, which are chosen: 5000 kg/m³, motors of 10⁶ rpm, tyres with μ = 3."""
-    size = math.hypot(robot.wheelbase, 2 * robot.half_track)
+    size = robot.size
     stall = robot.motor_gain * robot.supply
     loss = robot.drive_loss + robot.rolling_force * robot.wheel_radius / 2
     found = [
@@ -247,7 +247,7 @@ def _of_lengths(robot: Robot, factor: float) -> dict[str, float]:
 
 def _inertias(robot: Robot, mass: float, length: float, factor: float) -> dict[str, float]:
     """Returns wheel inertias times a factor and a typical yaw inertia, if the radius of gyration is out of bounds."""
-    size = length * math.hypot(robot.wheelbase, 2 * robot.half_track)
+    size = length * robot.size
     if GYRATION[0] <= math.sqrt(robot.yaw_inertia / mass) / size <= GYRATION[1]:
         return {}
     of_wheels = _scaled(robot, ("wheel_inertia", "front_wheel_inertia", "fork_inertia"), factor)

@@ -103,6 +103,11 @@ class Robot(Record):
         return self
 
     @property
+    def size(self) -> float:
+        """Diagonal of the rectangle of wheelbase and track, √(L² + (2D)²), in m."""
+        return math.hypot(self.wheelbase, 2 * self.half_track)
+
+    @property
     def motor_gain(self) -> float:
         """Stall torque of one drive at the wheel per volt, N k_M / R_a, in N·m/V."""
         return self.gear_ratio * self.torque_constant / self.resistance

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from math import hypot
-
 from pydantic.fields import FieldInfo
 
 from mrctl.theory.robot import Robot
@@ -71,7 +69,7 @@ def _perturbation_ranges(robot: Robot) -> dict[str, Interval]:
 
 def _reference_ranges(robot: Robot) -> dict[str, Interval]:
     """Returns the ranges of the fields of references, by name."""
-    size = hypot(robot.wheelbase, 2 * robot.half_track)
+    size = robot.size
     return {
         **dict.fromkeys(LENGTHS, (size / 2, 20 * size)),
         "shift": (-10 * size, 10 * size),
