@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -200,7 +201,7 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
 
     A row holds for lap 1, all laps and the last lap: the mean with its 95 % bootstrap interval; the floor; the mean
     difference from PID and from `model` in the same run; and the probability of beating each of the others in the same
-    run, where two errors that differ by no more than the floor of differences are a tie. In `random`, where one world
+    run, where two errors that differ by no more than the floor's tie are one. In `random`, where one world
     would dominate a mean, medians replace the means. For the last lap a row also holds the mean of the worst 5 %
     (infinite where a run failed) and the ratios to PID and to `model`. `excess` is the error beyond that of the last
     lap (after a step: of the lap before the return), integrated from the start or the step on; it has no meaning where
@@ -280,7 +281,7 @@ def standing(name: str, errors: Mapping[str, Array], floor: Floor, median: bool)
     found: dict[str, Any] = bootstrap_interval(errors[name], median=median)._asdict() | {"floor": floor._asdict()}
     for rival, theirs in errors.items():
         if rival != name:
-            beaten = superiority(errors[name], theirs, floor=floor.difference)
+            beaten = superiority(errors[name], theirs, floor=floor.tie)
             found[f"beats_{titled(rival)}"] = beaten._asdict()
             if rival in YARDSTICKS:
                 paired = (errors[name] - theirs)[np.isfinite(errors[name] - theirs)]
@@ -309,6 +310,9 @@ class Floor(NamedTuple):
     """Largest change of a mean when the physics step is halved."""
     difference: float
     """Largest change of a difference between two means, in which a change that all means share cancels."""
+    tie: float
+    """Largest difference of two errors in a run that counts as a tie: at least `difference`, and so much that the
+    paired test finds no change of any difference when the step is halved."""
 
 
 def floors(pairs: Sequence[tuple[Laps, Laps]], metric: str) -> dict[str, Floor]:
@@ -322,16 +326,24 @@ def floors(pairs: Sequence[tuple[Laps, Laps]], metric: str) -> dict[str, Floor]:
     Returns:
         The largest over the pairs; 0 without any.
     """
-    found = {window: Floor(0.0, 0.0) for window in WINDOWS}
+    found = {window: Floor(0.0, 0.0, 0.0) for window in WINDOWS}
     for whole, half in pairs:
         fine = [name for name in whole if not (whole[name]["failed"].any() or half[name]["failed"].any())]
         before, after = ({name: windows(one[name], metric) for name in fine} for one in (whole, half))
         for window, floor in found.items():
-            if len(moved := np.array([np.mean(after[name][window] - before[name][window]) for name in fine])):
-                found[window] = Floor(
-                    max(floor.mean, float(np.abs(moved).max())), max(floor.difference, float(np.ptp(moved)))
-                )
+            if changes := [after[name][window] - before[name][window] for name in fine]:
+                means = np.mean(changes, axis=1)
+                own = float(np.abs(means).max()), float(np.ptp(means))
+                ties = [unnoticed(one - other) for one, other in combinations(changes, 2)]
+                found[window] = Floor(*map(max, floor, (*own, max([own[1], *ties]))))
     return found
+
+
+def unnoticed(change: Array) -> float:
+    """Returns the least tie from which on the paired test does not tell numbers `(n,)`, one a run, from zero."""
+    ties = [0.0, *np.sort(np.abs(change)).tolist()]
+    tests = [superiority(change, np.zeros_like(change), floor=tie) for tie in ties]
+    return next((ties[k + 1] for k in range(len(tests))[::-1] if not tests[k].low <= 0.5 <= tests[k].high), 0.0)
 
 
 def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:

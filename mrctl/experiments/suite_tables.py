@@ -81,7 +81,7 @@ def against(rows: Sequence[Row], window: str) -> str:
         return "There is nothing to compare with."
     cases, runs = len({row["case"] for row in rows}), sorted({row["runs"] for row in rows})
     stands = {n: [verdict(r, rival, window=window) for r in rows if r["feedforward"] == n] for n in names if n != rival}
-    tie = number(1e3 * _window(rows[0]["position_rmse"], window)["floor"]["difference"])
+    tie = number(1e3 * _window(rows[0]["position_rmse"], window)["floor"]["tie"])
     parts = [
         f"{word} it {listed}"
         for word, sign in (("below", -1), ("above", 1))
@@ -108,7 +108,8 @@ def resolution(rows: Sequence[Row]) -> str:
     floor = {metric: [_window(stated[metric], w)["floor"] for w in WINDOWS] for metric in COLUMNS}
     moved = ", ".join(
         f"{title.split(',')[0]} {number(1e3 * max(one['mean'] for one in floor[metric]))} {title.split(', ')[1]} "
-        f"(a difference of two {number(1e3 * max(one['difference'] for one in floor[metric]))})"
+        f"(a difference of two {number(1e3 * max(one['difference'] for one in floor[metric]))}, a tie in single runs "
+        f"{number(1e3 * max(one['tie'] for one in floor[metric]))})"
         for metric, title in COLUMNS.items()
     )
     pairs = list(_both_steps(rows))

@@ -241,8 +241,21 @@ def test_floors() -> None:
     lost = laps_of([9.0, 9.0], [1.1, np.nan])
     for more in ({}, {"fel": lost}):
         found = suite.floors([(whole | more, half | more)], "v_rmse")
-        assert found["last"] == pytest.approx((0.3, 0.1)) and found["first"] == pytest.approx((0.5, 0.1))
-    assert set(suite.floors([], "v_rmse").values()) == {(0.0, 0.0)}
+        assert found["last"] == pytest.approx((0.3, 0.1, 0.1)) and found["first"] == pytest.approx((0.5, 0.1, 0.1))
+    assert set(suite.floors([], "v_rmse").values()) == {(0.0, 0.0, 0.0)}
+
+
+def test_tie() -> None:
+    """A tie is so large that the paired test finds no change by the step: 5 changes of one sign are chance, 6 are not.
+
+    Their two-sided probabilities are 2 · 2⁻⁵ = 0.06 and 2 · 2⁻⁶ = 0.03.
+    """
+    changes = np.arange(1.0, 21.0)
+    assert suite.unnoticed(changes) == suite.unnoticed(-changes) == 15 and suite.unnoticed(changes[:5]) == 0
+    assert suite.unnoticed(changes * (-1.0) ** np.arange(20)) == 0
+    still, moved = laps_of(1 + 0 * changes, 1 + 0 * changes), laps_of(1 + 0 * changes, 1 + changes)
+    found = suite.floors([({"model": still, "rls": still}, {"model": still, "rls": moved})], "v_rmse")["last"]
+    assert found == pytest.approx((10.5, 10.5, 15))
 
 
 def test_sentences() -> None:

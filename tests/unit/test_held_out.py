@@ -50,7 +50,7 @@ def test_can_be_driven(course: str) -> None:
 def test_cells_above_a_rival_are_named() -> None:
     """A cell that is above a rival beyond the floor is listed with both; where there is none, there is no list."""
 
-    error, floor = 1e-3 * np.array([1.0, 1.1, 1.2, 1.0]), Floor(difference=1e-4, mean=1e-4)
+    error, floor = 1e-3 * np.array([1.0, 1.1, 1.2, 1.0]), Floor(difference=1e-4, mean=1e-4, tie=1e-4)
     level, worse = held_out._standing(error, error, floor), held_out._standing(error + 5e-4, error, floor)
     names = ("course", "plant", "metric", "window", "rival")
     everywhere = list(product(held_out.courses(), held_out.PLANTS, COLUMNS, WINDOWS, held_out.RIVALS))
