@@ -131,9 +131,12 @@ class Agent:
         return stands
 
     def _at_end(self, pose: Array, speed: float = 0.0) -> bool:
-        """Tells whether a pose is at the end of the plan, at a speed in m/s at which the robot has arrived."""
+        """Tells whether a pose is where the plan leads, at a speed in m/s at which the robot has arrived.
+
+        That is the goal of the mission, if the plan leads there: its own end may be turned by a tenth of a radian.
+        """
         x, y, c, s = self._table[-1]
-        return bool(arrived(pose, speed, np.array([x, y, np.arctan2(s, c)])))
+        return bool(arrived(pose, speed, np.array(self._planner.goal or (x, y, np.arctan2(s, c)))))
 
     def goes_back(self, pose: Array, now: float) -> bool:
         """Looks for another plan where it needs one; tells whether it goes back instead, with the twist `last`.

@@ -9,7 +9,7 @@ from mrctl.navigation.sight import Sight
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
-from mrctl.theory.obstacles import Outlines
+from mrctl.theory.obstacles import Outlines, Pose
 from mrctl.theory.references import Reference, Waypoints
 
 SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
@@ -70,6 +70,11 @@ class Planner:
         """
         self._given = open_waypoints(plan)
         return self._given
+
+    @property
+    def goal(self) -> Pose | None:
+        """Goal of the mission, x and y in m and θ in rad; None if none, or a plan that came leads elsewhere."""
+        return self.scenario.goal if self._given is None else None
 
     def plan(self, pose: Array, twist: Array, time: float) -> Waypoints | None:
         """Makes a plan that keeps off what is not on the map, or else one that only does not touch it.

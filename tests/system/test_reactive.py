@@ -178,6 +178,21 @@ def test_dead_end(robot: str, avoid: Avoid) -> None:
     assert (found["outcome"], back > 0.3) == (("arrived", True) if robot == "turtlebot" else ("stuck", False))
 
 
+def test_turned_at_goal() -> None:
+    """A robot at the end of its plan, but turned from its goal by more than it may be, does not take that for the goal.
+
+    The end of a plan that comes in on an arc is itself turned by some hundredths of a radian.
+    """
+    task = Task(obstacles=Obstacles(shapes=(Box(x=6.0, length=0.2, width=12.0),)), start=(0, 0, 0), goal=(-1, 0, 0))
+    adaptive = Scenario.from_dict({"prior": "model", "learner": "composite"})
+    driven = navigate(task, adaptive, avoid="window")
+    run = driven.result.isel(run=0)
+    resting = run.isel(time=(run["time"] > 3) & (abs(run["v"]) < 0.01))
+    turned, off = float(resting["theta"][0]) % (2 * np.pi) - 2 * np.pi, np.hypot(resting["x"][0] + 1, resting["y"][0])
+    assert -0.3 < turned < -0.2 and off < 0.1  # after its first try
+    assert driven.table["outcome"].tolist() == ["arrived"]
+
+
 @pytest.mark.parametrize("avoid", ["window", "mppi"])
 def test_waits(avoid: Avoid) -> None:
     """A robot at the end of its plan whose run goes on, as in the viewer, waits there, after a second try at most."""
