@@ -128,7 +128,8 @@ def _pixels(path: Path) -> Array:
                 if image.mode.startswith("I"):
                     return np.asarray(image, float)[..., None] / 257  # 16 bits
                 plain = image.mode if image.mode in ("L", "LA", "RGB", "RGBA") else None
-                image = image if plain else image.convert("L" if image.mode == "1" else "RGBA")
+                colours = "RGBA" if image.has_transparency_data else "RGB"
+                image = image if plain else image.convert("L" if image.mode == "1" else colours)
                 return np.asarray(image, float).reshape(image.height, image.width, -1)
     except InputError:
         raise

@@ -48,6 +48,14 @@ def test_transparency(tmp_path):
     assert read_map(written(tmp_path, "map.png", "scale", pixels=pixels)).occupancy.tolist() == [[72, -1]]
 
 
+def test_palette(tmp_path):
+    """An image with a palette, as many programs save one, has no transparency that would brighten it."""
+    grey = np.array([[80, 205, 255]], np.uint8)  # of which 80 is occupied, and 205 unknown
+    path = written(tmp_path, "map.png", pixels=grey)
+    Image.fromarray(grey).convert("P").save(tmp_path / "map.png")
+    assert read_map(path).occupancy.tolist() == [[100, -1, 0]]
+
+
 def test_map_obstacles(tmp_path):
     """The rectangles are the occupied pixels, where the origin with its yaw puts them."""
     yaw = 0.6
