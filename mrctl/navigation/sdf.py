@@ -27,7 +27,8 @@ def read_sdf(path: str | Path) -> Obstacles:
         path: The `.world` or `.sdf` file.
 
     Raises:
-        InputError: The file is no SDF world, or one of its shapes is a mesh or not upright.
+        InputError: The file is no SDF world, a pose is relative to a frame that it names, or one of the shapes is a
+            mesh or not upright.
     """
     try:
         world = ElementTree.fromstring(read_file(path)).find("world")
@@ -41,27 +42,40 @@ def read_sdf(path: str | Path) -> Obstacles:
             model.get("name"): _pose(model) for model in world.iterfind("state/model") if model.find("pose") is not None
         }
         for model in world.iterfind("model"):
-            base = placed.get(model.get("name"), _pose(model))
-            for link in model.iterfind("link"):
-                for collision in link.iterfind("collision"):
-                    name = f"model {model.get('name')}"
-                    shapes += _shape(collision, _after(_after(base, _pose(link)), _pose(collision)), name)
+            shapes += _shapes(model, placed.get(model.get("name"), _pose(model)))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
     return Obstacles.from_dict({"shapes": shapes}, str(path))
+
+
+def _shapes(model: ElementTree.Element, base: Array) -> list[dict]:
+    """Returns the obstacles of a model at its pose `(6,)`, and of the models in it."""
+    found, name = [], f"model {model.get('name')}"
+    for link in model.iterfind("link"):
+        for collision in link.iterfind("collision"):
+            found += _shape(collision, _after(_after(base, _pose(link)), _pose(collision)), name)
+    for inner in model.iterfind("model"):
+        found += _shapes(inner, _after(base, _pose(inner)))
+    return found
 
 
 def _pose(element: ElementTree.Element) -> Array:
     """Returns x, y, z, roll, pitch and yaw of an element in m and rad, `(6,)`; zeros where it has no pose.
 
     Raises:
-        InputError: The pose is not six numbers.
+        InputError: The pose is not six numbers, or counts from another frame than that of the element around it.
     """
-    text = (element.findtext("pose") or "0 0 0 0 0 0").split()
+    pose, name = element.find("pose"), element.get("name")
+    text = ((pose is not None and pose.text) or "0 0 0 0 0 0").split()
+    if pose is not None and (frame := pose.get("relative_to")):
+        raise InputError(f"{name}: pose: is relative to {frame}, and such poses are not read")
     try:
-        return np.array([float(number) for number in text]).reshape(6)
+        found = np.array([float(number) for number in text]).reshape(6)
     except ValueError:
-        raise InputError(f"{element.get('name')}: pose: {' '.join(text)!r} is not six numbers") from None
+        raise InputError(f"{name}: pose: {' '.join(text)!r} is not six numbers") from None
+    if pose is not None and pose.get("degrees") in ("true", "1"):
+        found[3:] = np.deg2rad(found[3:])
+    return found
 
 
 def _after(base: Array, pose: Array) -> Array:

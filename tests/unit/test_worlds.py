@@ -120,6 +120,16 @@ def test_sdf(tmp_path):
     assert (wall.x, wall.y, wall.angle, wall.length) == pytest.approx((0, 2.5, np.pi / 2, 2))
 
 
+def test_sdf_inner(tmp_path):
+    """Models in models count, from the pose of the outer one, and so do angles in degrees."""
+    pose, turned = "<pose>0 1 0 0 0 1.5707963267948966</pose>", '<pose degrees="true">0 1 0 0 0 90</pose>'
+    inner = f'<model name="outer"><pose>2 0 0 0 0 0</pose><model name="wall">{turned}'
+    world = SDF.replace(f'<model name="wall">{pose}', inner).replace('<model name="f', '</model><model name="f')
+    (tmp_path / "a.world").write_text(world)
+    wall = read_sdf(tmp_path / "a.world").shapes[2]
+    assert (wall.x, wall.y, wall.angle, wall.length) == pytest.approx((2, 2.5, np.pi / 2, 2))
+
+
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
@@ -127,6 +137,7 @@ def test_sdf(tmp_path):
         ("cylinder>", "mesh>", "model unit_cylinder_0: its shape is a mesh"),
         ("0.5 0 0 0", "0.5 1 0 0", "unit_cylinder_0: is not upright"),
         ("0.5 0 0 0", "0.5", "is not six numbers"),
+        ("<pose>0.5", '<pose relative_to="door">0.5', "c: pose: is relative to door"),
         ("<radius>0.075</radius>", "", "cylinder has no valid radius"),
     ],
 )
