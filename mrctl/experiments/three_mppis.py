@@ -159,7 +159,7 @@ def world(base: Scenario, seed: int) -> World | None:
         plan, own = prepared(task, base, avoid="mppi")
     except InputError:
         return None
-    changes = {"motion_period": PERIOD, "laps": PATIENCE, "initial_spread": (0.0, 0.0, 0.0)}
+    changes = {"laps": PATIENCE, "initial_spread": (0.0, 0.0, 0.0)}
     return World(seed, plan, own.replace(**changes))
 
 

@@ -151,6 +151,15 @@ def test_keeps_off(start: float) -> None:
     assert driven.table["outcome"].tolist() == ["arrived"] and driven.table["clearance"].iloc[0] > 0.03
 
 
+def test_control_period() -> None:
+    """The motion period is 0.05 s, or the multiple of another control period next to that."""
+    task = Task(obstacles=Obstacles(), start=(0, 0, 0), goal=(1, 0, 0))
+    assert prepared(task, PLANNED, avoid="mppi")[1].motion_period == 0.05
+    slow = PLANNED.replace(control_period=0.02, motion_period=0.02)
+    assert prepared(task, slow, avoid="mppi")[1].motion_period == 0.04
+    assert navigate(task, slow, avoid="window").table["outcome"].tolist() == ["arrived"]
+
+
 def test_backs_off() -> None:
     """A robot with rigid steering that stands close before a box that the map lacks reverses to go around it."""
     box = Box(x=0.95, y=0.0, length=0.3, width=1.0)
