@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import importlib
 import re
 import sys
 from functools import lru_cache, partial
@@ -21,6 +22,9 @@ from mrctl.loop.simulation import Simulation
 from mrctl.loop.user_stages import StageError
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
+
+NOT_BESIDE = {*sys.stdlib_module_names, "mrctl"}
+"""Modules that are not taken from the folder of the file that imports them: in a clone, mrctl stands there too."""
 
 
 class Part(NamedTuple):
@@ -82,18 +86,55 @@ def absolute(name: str) -> str:
 
 
 def digest(name: str) -> str:
-    """Returns a digest of the contents of the files that a name names, without the settings.
+    """Returns a digest of the files that a name names and of those beside them that they import, without the settings.
 
     Raises:
         InputError: The name is refused, as by `parts`.
     """
-    return hashlib.sha256(b"".join(part.path.read_bytes() for part in parts(name))).hexdigest()
+    files = [file for part in parts(name) for file in (part.path, *neighbours(part.path))]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+def neighbours(path: Path) -> list[Path]:
+    """Returns the Python files in the folder of a file, or in packages there, that it imports, and what these import.
+
+    Imports are found by their text, without running a file. Modules of Python and mrctl itself are left out.
+    """
+    folder, found, queue = path.parent, set[Path](), [path]
+    while queue:
+        file = queue.pop()
+        try:
+            nodes = list(ast.walk(ast.parse(file.read_bytes())))
+        except (SyntaxError, ValueError, RecursionError):  # loading the file says so
+            continue
+        new = {one for node in nodes for one in _imported(node, file, folder)} - found - {path}
+        found |= new
+        queue += new
+    return sorted(found)
+
+
+def _imported(node: ast.AST, file: Path, folder: Path) -> list[Path]:
+    """Returns the files in a folder, or in packages there, that an import statement in one of them names."""
+    if isinstance(node, ast.Import):
+        place, names = folder, [alias.name for alias in node.names]
+    elif isinstance(node, ast.ImportFrom):
+        place = file.parents[min(node.level, len(file.parents)) - 1] if node.level else folder
+        names = [f"{node.module or ''}.{alias.name}".strip(".") for alias in node.names]
+    else:
+        return []
+    found: list[Path] = []
+    for words in (name.split(".") for name in names):
+        if place.is_relative_to(folder) and not (place == folder and words[0] in NOT_BESIDE):
+            ways = [place.joinpath(*words[:depth]) for depth in range(1, len(words) + 1)]
+            found += [one for way in ways for one in (way.with_name(f"{way.name}.py"), way / "__init__.py")]
+    return [one for one in found if one.is_file()]
 
 
 def load(name: str) -> Stages:
     """Runs the files and returns the factories by stage, as keywords for `simulate`.
 
-    The files run once as long as they stay the same; the same file name in another directory is another file.
+    The files run once as long as they and their `neighbours` stay the same; the same file name in another directory is
+    another file, as is that of a neighbour.
 
     Raises:
         InputError: The name is refused, as by `parts`; a file raises; or a file has no such attribute to call.
@@ -112,13 +153,19 @@ def _factory(part: Part) -> Any:  # noqa: ANN401
     module_name = f"mrctl_controller_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
     module = sys.modules[module_name] = ModuleType(module_name)  # dataclasses look the module up there
     module.__file__ = str(path)
+    beside = {file.relative_to(path.parent).parts[0].removesuffix(".py") for file in neighbours(path)}
+    for name in [name for name in sys.modules if name.partition(".")[0] in beside]:
+        del sys.modules[name]  # of another folder, or from before an edit
+    importlib.invalidate_caches()
     sys.path.insert(0, str(path.parent))  # as for a script, so that the file can import its neighbours
+    writes, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         # Python's own cache of compiled files takes an edit within a second that keeps the size for no edit.
         exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)
     except (Exception, SystemExit) as error:
         raise InputError(" ".join(f"controller: {path}: {type(error).__name__}: {error}".split())) from None
     finally:
+        sys.dont_write_bytecode = writes
         sys.path.remove(str(path.parent))
     if not callable(getattr(module, attribute, None)):
         raise InputError(f"controller: {path.name} has no {attribute} that can be called with a robot and a size")

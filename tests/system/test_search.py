@@ -173,6 +173,28 @@ def test_edited_file_of_a_user(tmp_path, monkeypatch):
         assert user_files.load("feedforward=own.py:own") is stages
 
 
+def test_neighbour_of_a_user_s_file(tmp_path):
+    """What a file imports from beside it belongs to it: in its digest, after an edit, and of its own folder."""
+    for folder in ("one", "two"):
+        (tmp_path / folder / "laws").mkdir(parents=True)
+        (tmp_path / folder / "laws" / "__init__.py").write_text("from .deep import GAIN\n")
+        (tmp_path / folder / "own.py").write_text(
+            "import random\nimport mrctl\nfrom laws import GAIN\ndef own(robot, size):\n    return GAIN\n"
+        )
+        for name in ("random", "mrctl"):  # Python's own and mrctl stay what they are
+            (tmp_path / folder / f"{name}.py").write_text("1 / 0\n")
+    digests = set()
+    for folder, gain in (("one", 1), ("two", 2), ("one", 3), ("two", 2)):
+        (tmp_path / folder / "laws" / "deep.py").write_text(f"GAIN = {gain}\n")
+        name = f"{tmp_path / folder / 'own.py'}:own"
+        assert user_files.load(name)["feedforward"](None, 1) == gain
+        digests.add(user_files.digest(name))
+    assert len(digests) == 3
+    beside = user_files.neighbours(tmp_path / "one" / "own.py")
+    assert beside == [tmp_path / "one" / "laws" / name for name in ("__init__.py", "deep.py")]
+    assert not list(tmp_path.rglob("*.pyc"))
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
