@@ -6,7 +6,7 @@ import json
 import os
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Unpack
 
@@ -97,6 +97,18 @@ def simulate(
 def named_stages(stages: Stages) -> dict[str, str]:
     """Returns the names of the user's factories by stage."""
     return {stage: getattr(factory, "__name__", "custom") for stage, factory in stages.items() if factory}
+
+
+def titles(scenario: Scenario, stages: Mapping[str, str]) -> tuple[str, str]:
+    """Returns the label of a run that has no name, and the name of its feedforward.
+
+    Args:
+        scenario: The run.
+        stages: Names of the user's factories by stage.
+    """
+    others = dict(stages)
+    feedforward = named(scenario.prior, others.pop("feedforward", scenario.learner))
+    return " + ".join([feedforward, *others.values()]), feedforward
 
 
 def cores() -> int:
@@ -479,9 +491,8 @@ class Simulation:
         size, length = len(self.scenarios), self.tick if self.running else self.ticks
         for tick in range(self.tick, length):
             self.log.blank(tick, slice(None))
-        first, others = self.scenarios[0], dict(self._stages)
-        feedforward = named(first.prior, others.pop("feedforward", first.learner))
-        names = [" + ".join([feedforward, *others.values()])] * size, [feedforward] * size
+        label, feedforward = titles(self.scenarios[0], self._stages)
+        names = [label] * size, [feedforward] * size
         log, failure = self.log.ticks[:length], self.plant.failure
         found = dataset.dataset(self.scenarios, *names, log, failure, self._failure_time, self._weights())
         scanned = {}

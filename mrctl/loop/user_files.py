@@ -31,10 +31,16 @@ class Part(NamedTuple):
     """One stage of a controller."""
 
     stage: str
-    path: Path
+    file: str
+    """The file as it is written in the name."""
     attribute: str
     settings: dict[str, Any]
     """Keyword arguments of the factory."""
+
+    @property
+    def path(self) -> Path:
+        """Absolute path of the file."""
+        return Path(self.file).absolute()
 
     @property
     def title(self) -> str:
@@ -49,6 +55,19 @@ def parts(name: str) -> list[Part]:
     Raises:
         InputError: The name is not of the form above, names an unknown stage or a stage twice, or a file is missing.
     """
+    found = split(name)
+    for part in found:
+        if not part.path.is_file():
+            raise InputError(f"controller: no file {part.file}")
+    return found
+
+
+def split(name: str) -> list[Part]:
+    """Splits a name into its parts, whose files need not exist.
+
+    Raises:
+        InputError: The name is not of the form above, or names an unknown stage or a stage twice.
+    """
     found: list[Part] = []
     for part in re.split(r",(?=[^,]*\.py:)", name):
         place, _, call = part.partition(".py:")
@@ -61,9 +80,7 @@ def parts(name: str) -> list[Part]:
             raise InputError(f"controller: {stage!r} is not a stage; there are {', '.join(METHODS)}")
         if stage in {known.stage for known in found}:
             raise InputError(f"controller: {stage} is given twice")
-        if not Path(file).is_file():
-            raise InputError(f"controller: no file {file}")
-        found.append(Part(stage, Path(file).absolute(), attribute, settings))
+        found.append(Part(stage, file, attribute, settings))
     return found
 
 

@@ -22,7 +22,7 @@ from mrctl import __version__
 from mrctl.control.stages import METHODS, Stages
 from mrctl.loop import user_files
 from mrctl.loop.hindsight import best_fixed
-from mrctl.loop.simulation import Simulation, arranged, cores, simulate
+from mrctl.loop.simulation import Simulation, arranged, cores, simulate, titles
 from mrctl.physics import mjcf
 from mrctl.record import InputError, printable
 from mrctl.results import metrics
@@ -285,7 +285,9 @@ def _row(sweep: Sweep, run: int, failure: str = "", **found: object) -> dict[str
     scenario = valid or sweep.base
     row: dict[str, Any] = {name: np.nan for name in (*metrics.METRICS, "lap_time")}
     row |= {name: [] for name in sweep.columns.names if name.endswith("_per_lap")} | dict.fromkeys(FAULTS, "")
-    row |= {"run": run, "label": scenario.name or scenario.feedforward, "feedforward": scenario.feedforward}
+    own = {part.stage: part.title for part in user_files.split(sweep.controller)} if sweep.controller else {}
+    label, feedforward = titles(scenario, own)
+    row |= {"run": run, "label": scenario.name or label, "feedforward": feedforward}
     row |= {
         "steering": found.get("steering") or arranged(scenario).steering,
         "seed": valid.seed if valid else values["seed"],

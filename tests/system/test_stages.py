@@ -508,6 +508,22 @@ def test_sweep(tmp_path):
     assert all(text == "motion Late: KeyError: 'late' (mine.py, line 7), tick 60" for text in failure)
 
 
+def test_refused_run_has_the_name_of_its_stage(tmp_path):
+    """In a sweep's table, a run that could not begin counts against the controller that refused it."""
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "class Pairs:\n"
+        "    def __init__(self, robot, size, gain): assert size == 2, 'not two'\n"
+        "    def output(self, command, derivative): return 0 * command\n"
+        "    def learn(self, feedback, saturated, twist, voltage): pass\n"
+    )
+    sweep = Sweep(base=SHORT, runs=3, chunk=2, controller=f"{file}:Pairs(gain=2)")
+    assert jobs.run(sweep, tmp_path / "store", workers=1).failed == 1
+    found = mrctl.open(tmp_path / "store")
+    assert found.failed.values.tolist() == [False, False, True]
+    assert set(found.feedforward.values) == set(found.label.values) == {"Pairs(gain=2)"}
+
+
 def test_company(tmp_path):
     """In a sweep, a stage that raises for one run costs no other run of its job."""
     file = tmp_path / "mine.py"
