@@ -96,9 +96,9 @@ def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code:
     from mrctl.sweep import jobs
     from mrctl.sweep.store import Store
 
-    jobs.stages_of(store, code)
+    jobs.stages_of(store, number, code)
     if out is not None or json:
-        own = Store(store).manifest["sweep"].get("controller")
+        own = jobs.sweep_of(Store(store)).driven_by(number)
         report(single.run(jobs.scenario_of(store, number), out, json, own)[0], out, json)
     repeated = jobs.repeat(store, number)
     verdict = f"run {number}: {repeated.verdict}"

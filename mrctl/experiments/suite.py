@@ -49,7 +49,6 @@ from mrctl.theory.references import Circle
 
 Entry = FeedforwardName | Literal["hindsight"]
 Errors = Mapping[str, Mapping[str, Array]]
-MODEL = "model+"  # in front of a user's feedforward that adds to the nominal model
 CHUNK = 40  # runs in a job: enough for a fast batch, and few enough that no worker idles for long at the end
 STARTING, STATISTICS = 3.0, 0.15  # s for the start of a feedforward's workers, and for a row of the tables; measured
 
@@ -113,10 +112,7 @@ def by_name(feedforwards: Sequence[Entry], controllers: Sequence[str]) -> Choice
     """
     choices = {name: Choice() if name == HINDSIGHT else Choice(**FEEDFORWARDS[name]) for name in feedforwards}
     for entry in controllers:
-        stages = entry.removeprefix(MODEL)
-        prior, parts = "none" if stages == entry else "model", user_files.parts(stages)
-        if prior == "model" and all(part.stage != "feedforward" for part in parts):
-            raise InputError(f"controller: {entry!r} has {MODEL} in front, but no feedforward that adds to the model")
+        prior, stages, parts = user_files.behind(entry)
         name = named(prior, "+".join(part.title for part in parts))
         if name in choices:
             raise InputError(f"controller: the name {name} is taken")

@@ -21,8 +21,9 @@ from mrctl.control.stages import METHODS, Stages
 from mrctl.loop.simulation import Simulation
 from mrctl.loop.user_stages import StageError
 from mrctl.record import InputError
-from mrctl.scenario import Scenario
+from mrctl.scenario import PriorName, Scenario
 
+MODEL = "model+"  # in front of the name of a feedforward that adds to the nominal model
 NOT_BESIDE = {*sys.stdlib_module_names, "mrctl"}
 """Modules that are not taken from the folder of the file that imports them: in a clone, mrctl stands there too."""
 
@@ -75,7 +76,8 @@ def split(name: str) -> list[Part]:
         stage, file = (stage, file) if separator else ("feedforward", f"{place}.py")
         attribute, settings = _called(call)
         if not attribute:
-            raise InputError(f"controller: {part!r} is not of the form my_file.py:MyController")
+            form = "my_file.py:MyController or my_file.py:MyController(gain=0.3)"
+            raise InputError(f"controller: {part!r} is not of the form {form}")
         if stage not in METHODS:
             raise InputError(f"controller: {stage!r} is not a stage; there are {', '.join(METHODS)}")
         if stage in {known.stage for known in found}:
@@ -95,6 +97,24 @@ def _called(call: str) -> tuple[str, dict[str, Any]]:
     except (SyntaxError, ValueError):
         pass
     return "", {}
+
+
+def behind(name: str) -> tuple[PriorName, str, list[Part]]:
+    """Splits a name that may have `model+` in front, as in `model+my_file.py:MyController`.
+
+    Returns:
+        The prior that the user's feedforward adds to, `none` or `model`; the name without it; and its parts.
+
+    Raises:
+        InputError: The name is refused, as by `split`, or there is no feedforward that adds to the model.
+    """
+    own = name.removeprefix(MODEL)
+    found = split(own)
+    if own == name:
+        return "none", own, found
+    if all(part.stage != "feedforward" for part in found):
+        raise InputError(f"controller: {name!r} has {MODEL} in front, but no feedforward that adds to the model")
+    return "model", own, found
 
 
 def absolute(name: str) -> str:

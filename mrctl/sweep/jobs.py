@@ -28,7 +28,7 @@ from mrctl.record import InputError, printable
 from mrctl.results import metrics
 from mrctl.results.dataset import FAULTS, SIGNALS, versions
 from mrctl.scenario import Scenario
-from mrctl.sweep.plan import TRIED, Sweep
+from mrctl.sweep.plan import CONTROLLER, Sweep
 from mrctl.sweep.pool import Cluster, Outcome, Pool, Processes, Work, carry_out, check_address
 from mrctl.sweep.store import Store
 from mrctl.theory.robot import CAR
@@ -77,8 +77,7 @@ def run(
         raise InputError("workers: not together with a scheduler" if scheduler else f"workers: {workers} is below 1")
     if scheduler is not None:
         check_address(scheduler)
-    if sweep.controller:  # absolute, so that the user's files are found from every folder
-        sweep = sweep.model_copy(update={"controller": user_files.absolute(sweep.controller)})
+    sweep = _absolute(sweep)
     work, path = work or compute, Path(out).absolute()
     try:
         manifest = _manifest(sweep)  # first, so that a refused sweep leaves nothing behind
@@ -103,6 +102,23 @@ def run(
             return Report(store.size, failed, {store.runs(job): why for job, why in sorted(aside.items())})
     except OSError as error:
         raise InputError(f"{out}: {error.strerror or error}; what was done is kept") from None
+
+
+def _absolute(sweep: Sweep) -> Sweep:
+    """Returns the sweep with absolute paths of the user's files, so that they are found from every folder.
+
+    Raises:
+        InputError: A file is missing.
+    """
+    if sweep.controller:
+        return sweep.model_copy(update={"controller": user_files.absolute(sweep.controller)})
+    axes = list(sweep.axes)
+    for place, axis in enumerate(axes):
+        if axis.field == CONTROLLER:
+            own = {value: one.own for value, one in axis.chosen.items() if one.own}
+            whole = {value: value.removesuffix(name) + user_files.absolute(name) for value, name in own.items()}
+            axes[place] = axis.replace(values=[whole.get(value, value) for value in axis.listed])
+    return sweep.replace(axes=axes) if axes != list(sweep.axes) else sweep
 
 
 def _drive(store: Store, pending: Sequence[int], pool: Pool, progress: bool) -> dict[int, str]:
@@ -139,19 +155,8 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
         InputError: A world does not compile, or the robot cannot follow the reference.
     """
     models = _models(sweep)
-    refusals: list[InputError] = []
-    for scenario in filter(None, map(sweep.valid, range(min(sweep.size, TRIED)))):
-        try:
-            Simulation([user_files.without_learned(sweep.controller, scenario) if sweep.controller else scenario])
-        except InputError as error:  # the draws of one run say nothing about the others
-            refusals.append(error)
-            continue
-        if sweep.controller:
-            user_files.trial(sweep.controller, scenario)
-        refusals.clear()
-        break
-    if refusals:
-        raise refusals[0]
+    for own, runs in sweep.drivers.items():
+        _try(sweep, own, runs)
     return {
         "sweep": sweep.model_dump(mode="json"),
         "versions": versions(),
@@ -164,6 +169,26 @@ def _manifest(sweep: Sweep) -> dict[str, Any]:
         "control_period": sweep.base.control_period,
         "signals": list(SIGNALS),
     }
+
+
+def _try(sweep: Sweep, own: str | None, runs: Sequence[int]) -> None:
+    """Builds the first of some runs that can be built, and tries the user's controller that drives it.
+
+    Raises:
+        InputError: None of these runs that are valid can be built, or the controller fails.
+    """
+    refusals: list[InputError] = []
+    for scenario in filter(None, map(sweep.valid, runs)):
+        try:
+            Simulation([user_files.without_learned(own, scenario) if own else scenario])
+        except InputError as error:  # the draws of one run say nothing about the others
+            refusals.append(error)
+            continue
+        if own:
+            user_files.trial(own, scenario)
+        return
+    if refusals:
+        raise refusals[0]
 
 
 @cache
@@ -189,7 +214,7 @@ def _models(sweep: Sweep) -> dict[str, str]:
         )
         for world, steering, robot in sweep.worlds
     }
-    return worlds | ({sweep.controller: user_files.digest(sweep.controller)} if sweep.controller else {})
+    return worlds | {own: user_files.digest(own) for own in sweep.drivers if own}
 
 
 def compute(path: str, job: int) -> Outcome:
@@ -242,28 +267,28 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
     """Drives runs; returns their rows of the table, and signals `(runs, samples, signals)` if the store keeps them."""
     rows: dict[int, dict[str, Any]] = {}
     signals = np.full((len(runs), samples, len(SIGNALS)), np.nan) if samples else None
-    batches: dict[float, dict[int, Scenario]] = {}
+    batches: dict[tuple[str | None, float], dict[int, Scenario]] = {}
     for run in runs:
         try:
             scenario = sweep.scenario(run)
-            batches.setdefault(scenario.control_period, {})[run] = scenario
+            batches.setdefault((sweep.driven_by(run), scenario.control_period), {})[run] = scenario
         except InputError as error:  # a drawn value is out of range
             rows[run] = _row(sweep, run, str(error).removeprefix(f"run {run}: "))
-    drive = driver(sweep, user_files.load(sweep.controller) if sweep.controller else {})
-    queue = list(batches.values())
-    for batch in queue:
+    queue = [(own, batch) for (own, _), batch in batches.items()]
+    for own, batch in queue:
+        drive = driver(sweep, user_files.load(own) if own else {})
         try:
             result = drive(list(batch.values()), threads=1)
         except InputError as error:
             if len(batch) == 1:
                 rows |= {run: _row(sweep, run, str(error)) for run in batch}
             else:  # a run that is impossible must not prevent the others
-                queue.extend({run: scenario} for run, scenario in batch.items())
+                queue.extend((own, {run: scenario}) for run, scenario in batch.items())
             continue
         raised = any(str(why).startswith((*METHODS,)) for why in result["failure"].values)
-        if sweep.controller and len(batch) > 1 and raised:
+        if own and len(batch) > 1 and raised:
             # A stage that raises ends its whole batch; computed alone, a run does not depend on the others.
-            queue.extend({run: scenario} for run, scenario in batch.items())
+            queue.extend((own, {run: scenario}) for run, scenario in batch.items())
             continue
         laps = metrics.per_lap(result)
         texts = {name: result[name].values for name in ("failure", *FAULTS)}
@@ -285,8 +310,8 @@ def _row(sweep: Sweep, run: int, failure: str = "", **found: object) -> dict[str
     scenario = valid or sweep.base
     row: dict[str, Any] = {name: np.nan for name in (*metrics.METRICS, "lap_time")}
     row |= {name: [] for name in sweep.columns.names if name.endswith("_per_lap")} | dict.fromkeys(FAULTS, "")
-    own = {part.stage: part.title for part in user_files.split(sweep.controller)} if sweep.controller else {}
-    label, feedforward = titles(scenario, own)
+    own = sweep.driven_by(run)
+    label, feedforward = titles(scenario, {part.stage: part.title for part in user_files.split(own)} if own else {})
     row |= {"run": run, "label": scenario.name or label, "feedforward": feedforward}
     row |= {
         "steering": found.get("steering") or arranged(scenario).steering,
@@ -320,18 +345,20 @@ def scenario_of(out: str | Path, run: int) -> Scenario:
     return sweep_of(Store(out)).scenario(run)
 
 
-def stages_of(out: str | Path, code: bool = True) -> Stages:
-    """Loads the user's stages of a stored sweep, as arguments of `simulate`; names on stderr the files that it runs.
+def stages_of(out: str | Path, run: int, code: bool = True) -> Stages:
+    """Loads the user's stages of one run, as arguments of `simulate`; names on stderr the files that it runs.
 
     Args:
         out: The store.
+        run: Number of the run.
         code: Whether the store may run the Python files that it names.
 
     Raises:
-        InputError: The store names files that it may not run, or that are missing or have changed since.
+        InputError: There is no such run, or the store names files that it may not run, or that are missing or have
+            changed since.
     """
     store = Store(out)
-    if not (controller := store.manifest["sweep"].get("controller")):
+    if not (controller := sweep_of(store).driven_by(run)):
         return {}
     if not code:
         raise InputError(f"code: {out} names {printable(controller)}, which --no-code does not allow")

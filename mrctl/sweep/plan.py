@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from itertools import product
 from multiprocessing import parent_process
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +25,7 @@ from tqdm import tqdm
 from mrctl.record import InputError, Record
 from mrctl.results.dataset import FAULTS, SIGNALS
 from mrctl.results.metrics import METRICS
-from mrctl.scenario import Scenario
+from mrctl.scenario import FEEDFORWARDS, Scenario, named
 from mrctl.theory.robot import RobotFile
 
 CHUNK_BYTES = 2**27  # largest size of the signals of a job in memory
@@ -35,6 +35,36 @@ LARGEST = 2**43  # largest size of the signals of all runs in bytes, before comp
 TRIED = 20  # number of first runs, at least one of which must have a valid scenario
 QUIET = 2.0  # s for which values are checked without a progress bar
 WHOLE = "scenario"  # the field of an axis whose values are tables of changes to the scenario
+CONTROLLER = "controller"  # the field of an axis whose values say what drives
+
+
+class Chosen(NamedTuple):
+    """What a value of an axis of controllers stands for."""
+
+    title: str
+    """Name in the table of runs, without the folder of a file."""
+    own: str | None
+    """Controller of the user, as for `mrctl.loop.user_files`, or None."""
+    fields: dict[str, str]
+    """Prior and learner, as fields of the scenario; empty where those of the scenario stay."""
+
+    @classmethod
+    def of(cls, value: str) -> Self:
+        """Reads a value: a name of `FEEDFORWARDS`, or a controller of the user as `mrctl suite` takes it.
+
+        Raises:
+            InputError: It is neither.
+        """
+        if value in FEEDFORWARDS:
+            return cls(value, None, FEEDFORWARDS[value])
+        if ".py:" not in value:
+            raise InputError(f"controller: {value!r} is neither my_file.py:MyController nor {', '.join(FEEDFORWARDS)}")
+        from mrctl.loop import user_files  # imported here because it needs the physics, which takes seconds
+
+        prior, own, parts = user_files.behind(value)
+        alone = any(part.stage == "feedforward" for part in parts)
+        fields = {"prior": prior, "learner": "none"} if alone else {}
+        return cls(named(prior, "+".join(part.title for part in parts)), own, fields)
 
 
 class Grid(Record):
@@ -53,7 +83,8 @@ class Axis(Record):
 
     field: Annotated[str, Field(min_length=1)]
     """Dotted path into the scenario, such as `perturbation.mass_factor` or `events.0.time`; or `scenario`, whose values
-    are tables of changes to the scenario, such as `{ laps = 4, perturbation = { payload = 5.0 } }`."""
+    are tables of changes to the scenario, such as `{ laps = 4, perturbation = { payload = 5.0 } }`; or `controller`,
+    whose values are feedforwards such as `model+fel`, or controllers of the user such as `my_file.py:Mine(gain=2)`."""
     values: Annotated[tuple[Any, ...], Field(min_length=1)] | None = None
     """List of values; a value may be a whole table, such as a perturbation."""
     grid: Grid | None = None
@@ -76,6 +107,8 @@ class Axis(Record):
             raise ValueError(f"{self.field}: needs exactly one of {', '.join(kinds)}")
         if not self.listed and (self.paired or self.zip):
             raise ValueError(f"{self.field}: only values and grids can be paired or zipped")
+        if self.field == CONTROLLER and not all(isinstance(value, str) for value in self.values or (None,)):
+            raise ValueError('controller: needs values that are names, such as "fel" or "my_file.py:MyController"')
         for low, high in filter(None, (self.uniform, self.loguniform)):
             if not low < high:
                 raise ValueError(f"{self.field}: {low:g} is not below {high:g}")
@@ -87,6 +120,15 @@ class Axis(Record):
         if self.grid is not None:
             return tuple(np.linspace(self.grid.start, self.grid.stop, self.grid.count).tolist())
         return self.values or ()
+
+    @cached_property
+    def chosen(self) -> dict[str, Chosen]:
+        """What the values of an axis of controllers stand for; nothing for other axes.
+
+        Raises:
+            InputError: A value is no controller.
+        """
+        return {value: Chosen.of(value) for value in self.listed} if self.field == CONTROLLER else {}
 
     @property
     def middle(self) -> float:
@@ -116,6 +158,8 @@ class Axis(Record):
 
     def cell(self, value: object) -> object:
         """Returns a value as the table of runs holds it."""
+        if isinstance(value, str) and value in self.chosen:
+            return self.chosen[value].title
         return json.dumps(value) if self.type == pa.string() and not isinstance(value, str) else value
 
 
@@ -139,7 +183,7 @@ class Sweep(Record):
     """Number of runs in a job; by default 64, or fewer where the runs are long or fewer than 1,024."""
     controller: str | None = None
     """Feedforward of the user instead of the named one, as `my_file.py:MyController`, or other stages, as
-    `motion=my_file.py:PurePursuit`; see `mrctl.loop.user_files`."""
+    `motion=my_file.py:PurePursuit`, in all runs; see `mrctl.loop.user_files`. An axis `controller` varies it."""
     hindsight: bool = False
     """Whether each run is driven with the best fixed feedforward in hindsight instead of its own; see
     `mrctl.loop.hindsight`."""
@@ -160,6 +204,7 @@ class Sweep(Record):
                 raise ValueError(f"axes: {name} is there twice")
         if self.hindsight and self.controller:
             raise ValueError("hindsight: drives with a feedforward of its own; give no controller")
+        self._check_controllers()
         if self.every and self.record != "decimated":
             raise ValueError('every: only where record = "decimated"')
         for group in self._dimensions:
@@ -173,6 +218,22 @@ class Sweep(Record):
             raise ValueError(f"record: {self.size:,} runs would keep {kept / 1e12:,.0f} TB of signals; keep metrics")
         self._check_values()
         return self
+
+    def _check_controllers(self) -> None:
+        """Refuses an axis of controllers beside something else that says what drives, or with ambiguous names."""
+        if (place := self._controlled) is None:
+            return
+        if self.controller or self.hindsight:
+            other = "controller" if self.controller else "hindsight"
+            raise ValueError(f"{other}: leave it out beside an axis controller")
+        for axis in self.axes:
+            inner = {name for value in axis.listed if axis.field == WHOLE and isinstance(value, dict) for name in value}
+            for name in ("prior", "learner"):
+                if axis.field == name or name in inner:
+                    raise ValueError(f"{axis.field}: the axis controller sets {name}; leave it out here")
+        titles = [self.axes[place].chosen[value].title for value in self.axes[place].listed]
+        if doubles := [title for title in titles if titles.count(title) > 1]:
+            raise ValueError(f"controller: two values have the name {doubles[0]} in the table")
 
     def _check_values(self) -> None:
         """Checks that each listed value and each end of a range gives a valid scenario.
@@ -209,6 +270,29 @@ class Sweep(Record):
 
     def _length(self, group: list[int]) -> int:
         return len(self.axes[group[0]].listed)
+
+    @cached_property
+    def _controlled(self) -> int | None:
+        """Index of the axis of controllers, or None."""
+        return next((number for number, axis in enumerate(self.axes) if axis.field == CONTROLLER), None)
+
+    def driven_by(self, run: int) -> str | None:
+        """Returns the controller of the user that drives one run, or None."""
+        if (place := self._controlled) is None:
+            return self.controller
+        return self.axes[place].chosen[self.values(run)[CONTROLLER]].own
+
+    @property
+    def drivers(self) -> dict[str | None, list[int]]:
+        """Controllers of the user that drive runs, None for mrctl's own, each with some of the first such runs."""
+        if (place := self._controlled) is None:
+            return {self.controller: list(range(min(self.size, TRIED)))}
+        found: dict[str | None, list[int]] = {}
+        dimension = next(number for number, group in enumerate(self._dimensions) if place in group)
+        block = int(np.prod(self._shape[dimension + 1 :], dtype=object))
+        for k, one in enumerate(self.axes[place].chosen.values()):
+            found.setdefault(one.own, []).extend(range(k * block, k * block + min(block, TRIED)))
+        return found
 
     @property
     def size(self) -> int:
@@ -277,6 +361,9 @@ class Sweep(Record):
     def _assemble(self, values: dict[str, Any], source: str = "") -> Scenario:
         data = self._plain
         for field, value in values.items():
+            if field == CONTROLLER and self._controlled is not None:
+                data = data | self.axes[self._controlled].chosen[value].fields
+                continue
             data = data | value if field == WHOLE and isinstance(value, dict) else _put(data, field, value)
             if isinstance(value, dict):  # a table is completed, so that later axes find its fields
                 data = Scenario.from_dict(data, source).model_dump(mode="json")

@@ -564,4 +564,4 @@ def _difference(old: object, new: object, where: str = "") -> str:
 
 def _short(value: object) -> str:
     text = json.dumps(value)
-    return text if len(text) < 40 else text[:36] + " ..."
+    return text if len(text) < 40 else f"{text[:16]} ... {text[-19:]}"  # of a controller, its settings are at the end

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -222,10 +222,12 @@ class Library:
         Raises:
             InputError: The folder is neither a result nor a sweep, or has no run yet; or as `jobs.stages_of`.
         """
-        self._path, self._result = path, None
+        self._path, self._result, self._code = path, None, code
+        self._drives: dict[str | None, Callable[..., xr.Dataset]] = {}  # by the user's controller
         if (path / "sweep.json").is_file():
             self.table = Store(path).frame().set_index("run", drop=False)
-            self._drive = jobs.driver(jobs.sweep_of(Store(path)), jobs.stages_of(path, code))
+            for runs in jobs.sweep_of(Store(path)).drivers.values():
+                self._drive(runs[0])
         else:
             self._result = as_runs(store.open(path))
             self.table = summary(self._result).set_index(np.arange(self._result.sizes["run"]))
@@ -246,4 +248,11 @@ class Library:
         self.check(run)
         if self._result is not None:
             return Recording(self._result.isel(run=run))
-        return Recording(self._drive([jobs.scenario_of(self._path, run)]).isel(run=0))
+        return Recording(self._drive(run)([jobs.scenario_of(self._path, run)]).isel(run=0))
+
+    def _drive(self, run: int) -> Callable[..., xr.Dataset]:
+        """Returns what drives a run of a sweep."""
+        sweep = jobs.sweep_of(Store(self._path))
+        if (own := sweep.driven_by(run)) not in self._drives:
+            self._drives[own] = jobs.driver(sweep, jobs.stages_of(self._path, run, self._code))
+        return self._drives[own]

@@ -288,7 +288,7 @@ def test_code_of_a_store(
         assert f"code: {whole}/own names {whole}/own.py:Half" in capsys.readouterr().err
     monkeypatch.setattr(jobs.user_files, "digest", lambda name: "of another file")
     with pytest.raises(InputError, match="is not the file that"):
-        jobs.stages_of(whole / "own")
+        jobs.stages_of(whole / "own", 1)
 
 
 BLIND = """

@@ -67,7 +67,11 @@ ELSEWHERE = {
     r"mrctl view [\w./]+": ("tests/system/test_viewer.py::test_replay", "mrctl.viewer.view.replay"),
 }  # fmt: skip
 # One draw of each combination in place of hundreds.
-SMALLER = {"sweep.toml": ("runs = 500", "runs = 1"), "ablation.toml": ("runs = 20", "runs = 1")}
+SMALLER = {
+    "sweep.toml": ("runs = 500", "runs = 1"),
+    "ablation.toml": ("runs = 20", "runs = 1"),
+    "steps.toml": ("runs = 20", "runs = 2"),
+}
 
 
 class Block(NamedTuple):

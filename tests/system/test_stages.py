@@ -1,5 +1,8 @@
 """A user's own stage replaces any of the four; an error in one is reported, and other runs are kept."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -13,10 +16,13 @@ from mrctl.control.pid import PID, pid
 from mrctl.control.steering import ALLOCATION, allocate
 from mrctl.experiments.paper import IDEAL
 from mrctl.kernel import over_rows
+from mrctl.loop import user_files
 from mrctl.loop.simulation import simulate
 from mrctl.results.dataset import GAINS as RECORDED
 from mrctl.results.dataset import SIGNALS
+from mrctl.scenario import FEEDFORWARDS
 from mrctl.sweep import jobs
+from mrctl.sweep.store import Store
 
 SHORT = Scenario(**IDEAL, reference=Circle(period=4, radius=0.5), laps=1, learner="none")
 THREE = [SHORT.model_copy(update={"seed": seed}) for seed in range(3)]
@@ -522,6 +528,68 @@ def test_refused_run_has_the_name_of_its_stage(tmp_path):
     found = mrctl.open(tmp_path / "store")
     assert found.failed.values.tolist() == [False, False, True]
     assert set(found.feedforward.values) == set(found.label.values) == {"Pairs(gain=2)"}
+
+
+def test_sweep_of_controllers(tmp_path, capsys, monkeypatch):
+    """A sweep drives each run with its controller; it goes on with the same bytes, and with no other controller."""
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "class Gain:\n"
+        "    def __init__(self, robot, size, gain): self.gain, self.size = gain, size\n"
+        "    def output(self, command, derivative): return self.gain * command\n"
+        "    def learn(self, feedback, saturated, twist, voltage): pass\n"
+        "class Pairs(Gain):\n"
+        "    def output(self, command, derivative):\n"
+        "        assert self.size == 2, 'not two'\n"
+        "        return 0 * command\n"
+    )
+    text = (
+        f'runs = 2\nchunk = 3\nrecord = "decimated"\n[base]\n{SHORT.to_toml()}[[axes]]\nfield = "controller"\n'
+        'values = ["fel", "mine.py:Gain(gain=2.0)", "model+mine.py:Gain(gain=0.5)", "model", "mine.py:Pairs(gain=1)"]\n'
+        "paired = true\n"
+    )
+    (tmp_path / "sweep.toml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    assert main(["sweep", "sweep.toml", "--out", "store", "--workers", "1"]) == 0
+    found = mrctl.open("store")
+    names = ["fel", "Gain(gain=2.0)", "model+Gain(gain=0.5)", "model", "Pairs(gain=1)"]
+    assert found.controller.values.tolist() == found.feedforward.values.tolist() == np.repeat(names, 2).tolist()
+    assert found.failed.values.tolist() == [False] * 8 + [True] * 2  # each of whose jobs has one of these
+    model = {"prior": "model"}
+    for place, (fields, gain) in enumerate([(FEEDFORWARDS["fel"], None), ({}, 2.0), (model, 0.5), (model, None)]):
+        own = {} if gain is None else {"feedforward": user_files.load(f"mine.py:Gain(gain={gain})")["feedforward"]}
+        run = SHORT.replace(learner="none", seed=int(found.seed[2 * place])).replace(**fields)
+        assert np.array_equal(simulate(run, **own).v.values[::10], found.v.values[2 * place], equal_nan=True)
+
+    begun = Store.begin  # as another process would have left it after one of its jobs
+    monkeypatch.setattr(Store, "begin", lambda path, manifest: [begun(path, manifest), jobs.compute(str(path), 2)][0])
+    jobs.run(Sweep.from_toml("sweep.toml"), "again", workers=1)
+    files = [f.relative_to("store") for f in Path("store").rglob("*") if f.is_file() and f.name != "lock"]
+    assert all((Path("again") / f).read_bytes() == (Path("store") / f).read_bytes() for f in files)
+    monkeypatch.undo()
+
+    monkeypatch.chdir(tmp_path.parent)
+    capsys.readouterr()
+    for run, says in ((1, 0), (3, 1), (5, 1), (8, 1)):
+        assert main(["run", str(tmp_path / "store"), "--run", str(run), *([] if says else ["--no-code"])]) == 0
+        out, err = capsys.readouterr()
+        assert "bit-identical" in out and err.count(f"mrctl: runs {file}:") == says
+    assert main(["run", str(tmp_path / "store"), "--run", "3", "--no-code"]) == 2
+    assert f"names {file}:Gain(gain=2.0), which --no-code" in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    for old, new, message in (
+        ("gain=2.0", "gain=3.0", "axes.0.values.1 .*Gain.gain=2.0.*now .*Gain.gain=3.0"),
+        ("mine.py:Pairs", "lost.py:Pairs", "controller: no file lost.py"),
+        ("gain=0.5", "pain=0.5", "unexpected keyword argument 'pain'"),
+    ):
+        (tmp_path / "sweep.toml").write_text(text.replace(old, new))
+        assert main(["sweep", "sweep.toml", "--out", "store"]) == 2
+        assert re.search(message, capsys.readouterr().err)
+    (tmp_path / "sweep.toml").write_text(text)
+    file.write_text(file.read_text().replace("0 * command", "1 * command"))
+    assert main(["sweep", "sweep.toml", "--out", "store"]) == 2
+    assert f"{file}:Gain(gain=2.0) has changed" in capsys.readouterr().err
+    assert main(["run", "store", "--run", "3"]) == 2 and main(["run", "store", "--run", "1"]) == 0
 
 
 def test_company(tmp_path):

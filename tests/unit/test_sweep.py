@@ -76,6 +76,36 @@ def test_seed_may_be_an_axis():
     assert [sweep({"field": "seed", "values": [7, 8]}).scenario(run).seed for run in range(2)] == [7, 8]
 
 
+def test_controllers():
+    """A value is a feedforward of mrctl, or a controller of the user; other stages leave prior and learner alone."""
+    values = [
+        "none",
+        "model+fel",
+        "a.py:A(gain=2)",
+        "model+a.py:A",
+        "motion=b/a.py:B(ahead=0.3)",
+        "motion=b/a.py:B,a.py:C",
+    ]
+    laps = {"field": "laps", "values": [1, 2]}
+    one = sweep(
+        laps, {"field": "controller", "values": values, "paired": True}, runs=2, base={**BASE, "learner": "rls"}
+    )
+    own = [None, None, "a.py:A(gain=2)", "a.py:A", *values[4:]]
+    pairs = ["none", "model+fel", "none", "model", "rls", "none"]
+    for laps in range(2):
+        for place, value in enumerate(values):
+            for draw in range(2):
+                run = (laps * len(values) + place) * 2 + draw
+                assert one.values(run)["controller"] == value
+                assert (one.driven_by(run), one.scenario(run).feedforward) == (own[place], pairs[place])
+                assert one.values(run)["seed"] == one.values(laps * len(values) * 2 + draw)["seed"]
+    titles = ["none", "model+fel", "A(gain=2)", "model+A", "B(ahead=0.3)", "B+C"]
+    assert [one.axes[1].cell(value) for value in values] == titles
+    assert one.drivers == {None: [0, 1, 2, 3]} | {name: [2 * k, 2 * k + 1] for k, name in enumerate(own) if name}
+    assert Sweep.from_dict(one.model_dump(mode="json")) == one
+    assert sweep(runs=3, controller="a.py:A").drivers == {"a.py:A": [0, 1, 2]}
+
+
 # --- draws ----------------------------------------------------------------------------------------
 
 
@@ -177,6 +207,24 @@ def grid(start, stop, count):
             {"record": "full", "base": {**BASE, "motion_period": 0.02}},
         ),
         ("base.laps", [], {"base": {"laps": 0}}),
+        (
+            "controller: 'feel' is neither my_file.py:MyController nor none, model",
+            [axis("controller", values=["feel"])],
+            {},
+        ),
+        ("controller: 'a.py:A.2.' is not of the form", [axis("controller", values=["a.py:A(2)"])], {}),
+        ("controller: .* no feedforward that adds", [axis("controller", values=["model+motion=a.py:A"])], {}),
+        ("controller: needs values that are names", [axis("controller", values=[1])], {}),
+        ("controller: needs values that are names", [axis("controller", uniform=[0, 1])], {}),
+        ("controller: two values have the name A", [axis("controller", values=["fel", "a.py:A", "b/a.py:A"])], {}),
+        ("controller: leave it out beside an axis", [axis("controller", values=["fel"])], {"controller": "a.py:A"}),
+        ("hindsight: leave it out beside an axis", [axis("controller", values=["fel"])], {"hindsight": True}),
+        ("learner: the axis controller sets learner", [axis("controller", values=["fel"]), LAWS], {}),
+        (
+            "scenario: the axis controller sets prior",
+            [axis("controller", values=["fel"]), axis("scenario", values=[{}, {"prior": "model"}])],
+            {},
+        ),
         ("record: Input should be", [], {"record": "some"}),
     ],
 )
