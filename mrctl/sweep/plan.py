@@ -365,7 +365,8 @@ class Sweep(Record):
                 data = data | self.axes[self._controlled].chosen[value].fields
                 continue
             data = data | value if field == WHOLE and isinstance(value, dict) else _put(data, field, value)
-            if isinstance(value, dict):  # a table is completed, so that later axes find its fields
+            inner = isinstance(value, str) and any(other.startswith(f"{field}.") for other in values)
+            if isinstance(value, dict) or inner:  # a table, or a name for one, is completed: later axes find its fields
                 data = Scenario.from_dict(data, source).model_dump(mode="json")
         return Scenario.from_dict(data, source)
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from mrctl import Circle, Event, InputError, Perturbation, RobotFile, Scenario, Sweep
+from mrctl import PERTURBATIONS, Circle, Event, InputError, Perturbation, RobotFile, Scenario, Sweep
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import plan
 from mrctl.sweep import store as folder
@@ -59,6 +59,15 @@ def test_scenario_is_the_base_with_the_values():
     )
     assert one.scenario(0) == expected
     assert one.scenario(1).perturbation == Perturbation(slope=0.1, mass_factor=1.2)
+
+
+def test_name_of_a_record_is_completed_for_later_axes():
+    """A perturbation by name has fields like one that is written as a table."""
+    one = sweep(
+        {"field": "perturbation", "values": ["nominal", "all"]}, {"field": "perturbation.payload", "values": [2.0]}
+    )
+    found = [one.scenario(run).perturbation for run in range(2)]
+    assert found == [PERTURBATIONS[name].replace(payload=2.0) for name in ("nominal", "all")]
 
 
 def test_zip():
