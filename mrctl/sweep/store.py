@@ -438,8 +438,7 @@ class Store:
         coords = columns(["run", *axes, "label", "feedforward", "steering", "seed", "lap_time"])
         outcome = columns(["failed", "failure", "failure_time", *(name for name in FAULTS if name in frame)])
         attrs = {name: json.dumps(self.manifest[name]) for name in ("sweep", "versions")}
-        period = self.manifest["control_period"] * self.manifest["stride"]
-        attrs |= {"control_period": period, "unfinished": self.size - len(frame)}
+        attrs |= {"control_period": self.manifest["control_period"], "unfinished": self.size - len(frame)}
         if self.manifest["sweep"]["record"] == "laps":
             number, found = _by_lap(frame)
             coords.pop("laps", None)  # `laps` may be an axis too
