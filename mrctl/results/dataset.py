@@ -156,6 +156,10 @@ def written_by(result: xr.Dataset) -> str:
     return json.loads(result.attrs.get("versions", "{}")).get("mrctl", "")
 
 
+NEEDED = {"scenarios", "versions", "control_period"}
+"""Attributes of a result that can be saved."""
+
+
 def check_kind(result: object) -> None:
     """Refuses what is no dataset.
 
@@ -261,9 +265,12 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     """Writes a result as a zarr store, whole or not at all.
 
     Raises:
-        InputError: The path exists, cannot be written, or is that of a file in another format.
+        InputError: The dataset is none that `open` could read, as an opened sweep, or the path exists, cannot be
+            written, or is that of a file in another format.
     """
     check_kind(result)
+    if missing := NEEDED - set(result.attrs):
+        raise InputError(f"result: has no {min(missing)}, as of simulate; result.to_zarr(path) writes any dataset")
     from zarr.codecs import Crc32cCodec, ZstdCodec  # imported here because a run that saves nothing needs no zarr
 
     path = Path(path)
@@ -468,6 +475,6 @@ def open_result(path: str | Path) -> xr.Dataset:
             result.variables[name].load()  # alone, without its coordinates
     for name in (WHOLE, WHOLE_BEFORE_0_10_2):
         result.attrs.pop(name, None)
-    if missing := {"scenarios", "versions", "control_period"} - set(result.attrs):
+    if missing := NEEDED - set(result.attrs):
         raise InputError(f"{path}: not a saved result: no {min(missing)}")
     return result

@@ -496,6 +496,8 @@ def _curves(result: xr.Dataset, window: tuple[float, float] | None, lap: int | N
     if window is not None and lap is not None:
         raise InputError("window: give a window or a lap, not both")
     runs = as_runs(result)
+    if "time" not in runs.dims:
+        raise InputError("result: holds metrics only; mrctl run STORE --run K --out DIR makes the signals of one run")
     labels = [str(label) for label in runs["label"].values]
     colours, curves = _colours(runs), []
     for row, label in enumerate(labels):

@@ -359,6 +359,7 @@ def test_leaves_settings_alone():
         (lambda r: plots.errors(r, window=(3, 1)), "window"),
         (lambda r: plots.errors(r, window=(90, 91)), "window"),
         (lambda r: plots.errors(r, window=(0, 1), lap=1), "window"),
+        (lambda r: plots.path(metrics.per_lap(r)), "result"),
         (lambda r: plots.learning_curve(r, ["speed"]), "metric"),
         (lambda r: plots.learning_curve(r, []), "metrics"),
         (lambda r: plots.laps_by_case({"a": r}, "speed"), "metric"),
