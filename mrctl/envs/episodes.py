@@ -93,7 +93,7 @@ class Episodes:
 
     - `twist`: the action is the requested twist, m/s and rad/s, in place of the motion controller.
     - `voltage`: the voltages left and right in V, in place of both controllers; the steering follows the reference.
-    - `residual`: voltages left and right in V that are added to those of the controllers.
+    - `residual`: voltages left and right in V that are added to those of the controllers, cut off at `bound`.
 
     With voltages `pid.retune` of the scenarios is False: what an agent does to them is no oscillation of a loop.
 
@@ -253,7 +253,8 @@ class Episodes:
         if self._kind == "voltage":
             command[:, :2] = np.clip(self._action, -supply, supply)
         elif self._kind == "residual":
-            command[:, :2] = np.clip(command[:, :2] + self._action, -supply, supply)
+            residual = np.clip(self._action, -self.bound, self.bound)
+            command[:, :2] = np.clip(command[:, :2] + residual, -supply, supply)
         self.plant.send(command, hierarchy.faults)
 
     def observe(self) -> tuple[Array, Array]:

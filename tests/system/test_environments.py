@@ -460,11 +460,13 @@ def test_actions():
     for action, sent in (((0.5, -0.25), (12.0, -6.0)), ((1.5, -99.0), (24.0, -24.0))):
         volts.step(np.array(action))
         assert volts.episodes.plant.applied[0].tolist() == list(sent)
-    pair = [TrackingEnv(straight) for _ in range(2)]
-    for env, action in zip(pair, (0.0, 0.25), strict=True):
+    several = [TrackingEnv(straight) for _ in range(5)]
+    for env, action in zip(several, (0.0, 0.25, 1.0, 1.5, 99.0), strict=True):
         env.reset(seed=0)
         env.step(np.full(2, action))
-    assert pair[1].episodes.plant.applied - pair[0].episodes.plant.applied == pytest.approx(1.5)
+    plain, some, largest, *beyond = (env.episodes.plant.applied for env in several)
+    assert some - plain == pytest.approx(1.5) and largest - plain == pytest.approx(6.0)
+    assert all(np.array_equal(one, largest) for one in beyond)
 
 
 @pytest.mark.parametrize(
