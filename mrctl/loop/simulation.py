@@ -59,9 +59,10 @@ def simulate(
         threads: Number of threads for control and physics, which does not change the result; 0 for all cores.
         stages: The user's stages `motion`, `feedback`, `feedforward`, `steering` or `estimator` in place of the
             scenario's: a factory, called with the nominal robot and the number of robots, which returns an object with
-            the two methods of that stage in `mrctl.control.stages`. One that raises, or returns an array of the wrong
-            shape, fails all runs that are computed together; one that returns NaN for a robot fails that run, except
-            for an estimator, which odometry then replaces, and for a feedforward, which the guard replaces if it is on.
+            the two methods of that stage in `mrctl.control.stages`. One that raises in a tick, or returns an array of
+            the wrong shape there, fails all runs that are computed together; one that returns NaN for a robot fails
+            that run, except for an estimator, which odometry then replaces, and for a feedforward, which the guard
+            replaces if it is on.
 
     Returns:
         The signals of `results.dataset.SIGNALS` with dimensions run and time (time alone for one scenario), with units;
@@ -69,7 +70,8 @@ def simulate(
 
     Raises:
         InputError: There is no scenario, or one asks for something that does not exist or that the robot cannot do, and
-            the message names the field; or the factory of a user's stage, or its method `assign`, fails.
+            the message names the field; or a user's stage fails before the first tick, in its factory, in `reset` or
+            another method that prepares it, or, for a feedforward, in its first `output`.
     """
     single = isinstance(scenarios, Scenario) or not isinstance(scenarios, Iterable)
     listed: list[Any] = [scenarios] if single else list(scenarios)
