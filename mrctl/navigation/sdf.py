@@ -12,16 +12,14 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.record import InputError, read_file
-from mrctl.theory.obstacles import Obstacles, turned
-
-FLAT = 0.02  # m, height up to which a collision shape is ground
+from mrctl.theory.obstacles import Obstacles, in_the_way, turned
 
 
 def read_sdf(path: str | Path) -> Obstacles:
     """Reads the cylinders, boxes and spheres that the models of an SDF world collide with.
 
-    Models that the world includes from other files, such as ground and sun, are left out. A pose in the world's
-    `<state>` is used in place of that of the model.
+    Models that the world includes from other files, such as ground and sun, are left out, and so is what ends below 2
+    cm or begins above 1 m. A pose in the world's `<state>` is used in place of that of the model.
 
     Args:
         path: The `.world` or `.sdf` file.
@@ -86,7 +84,7 @@ def _after(base: Array, pose: Array) -> Array:
 
 
 def _shape(collision: ElementTree.Element, pose: Array, name: str) -> list[dict]:
-    """Returns the obstacle of a collision element at its pose `(6,)`, or nothing for ground.
+    """Returns the obstacle of a collision element at its pose `(6,)`, or nothing for ground and what hangs overhead.
 
     Raises:
         InputError: The shape is not one that is read, or not upright.
@@ -105,7 +103,7 @@ def _shape(collision: ElementTree.Element, pose: Array, name: str) -> list[dict]
     except (ValueError, IndexError):
         raise InputError(f"{name}: {shape.tag} has no valid {field}") from None
     half = size[2] / 2 if shape.tag == "box" else length / 2
-    if pose[2] + half <= FLAT:
+    if not in_the_way(pose[2] - half, pose[2] + half):
         return []
     if shape.tag != "sphere" and np.abs(pose[3:5]).max() > 1e-3:
         raise InputError(f"{name}: is not upright")

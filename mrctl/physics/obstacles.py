@@ -21,7 +21,7 @@ from mrctl.physics.bounds import check_bounds, compiling
 from mrctl.physics.elements import COLLISION
 from mrctl.physics.hull import convex
 from mrctl.record import InputError
-from mrctl.theory.obstacles import Box, Disc, Obstacles, Polygon
+from mrctl.theory.obstacles import Box, Disc, Obstacles, Polygon, in_the_way
 
 HULL = "hull"  # name of the hull's geom
 BIT = 2  # of contype and conaffinity; MuJoCo's default, which floors have, is 1
@@ -135,8 +135,9 @@ def to_mjcf(obstacles: Obstacles) -> str:
 def read_mjcf(path: str | Path) -> Obstacles:
     """Reads the obstacles of an MJCF file: fixed upright boxes and cylinders, and the outlines of meshes from above.
 
-    Obstacles that `to_mjcf` wrote with a course keep it. Geoms whose tops are at most 2 cm high are floors, not
-    obstacles; planes, height fields, and geoms that collide with nothing are no obstacles either.
+    Obstacles that `to_mjcf` wrote with a course keep it. Geoms that end below 2 cm are floors and those
+    that begin above 1 m lintels, not obstacles; planes, height fields, and geoms that collide with nothing are no
+    obstacles either.
 
     Args:
         path: The MJCF file.
@@ -166,7 +167,7 @@ def read_mjcf(path: str | Path) -> Obstacles:
 
 
 def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | None:
-    """Returns the fields of a geom's obstacle, in the frame of its body if that moves; None for a floor.
+    """Returns the fields of a geom's obstacle, in the frame of its body if that moves; None for a floor or lintel.
 
     Raises:
         InputError: The geom is not upright, or is no box, cylinder or mesh.
@@ -181,8 +182,8 @@ def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | No
         points = corners @ frame.T + place
     else:
         half = size[[0, 0, 1]] if kind == shape.mjGEOM_CYLINDER else size
-        points = place + np.abs(frame[2]) @ half * np.array([[0, 0, 1.0]])
-    if points[:, 2].max() <= 0.02:
+        points = place + np.abs(frame[2]) @ half * np.array([[0, 0, -1.0], [0, 0, 1]])
+    if not in_the_way(points[:, 2].min(), points[:, 2].max()):
         return None
     name = model.geom(geom).name or f"number {geom}"
     body = model.geom_bodyid[geom]

@@ -189,6 +189,14 @@ def test_batch_equals_single():
     assert together["failure_time"].values[0] < 2.0  # the box comes from the right, and meets the robot's side
 
 
+def test_mjcf_lintel(tmp_path):
+    """A geom whose lower end is above every robot is no obstacle."""
+    geom = '<geom type="box" size="0.5 0.1 0.1" pos="{} 0 {}"/>'
+    text = geom.format(1, 1.15) + geom.format(2, 1.05) + geom.format(3, 0.1)
+    (tmp_path / "door.xml").write_text(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
+    assert [shape.x for shape in read_mjcf(tmp_path / "door.xml").shapes] == [2, 3]
+
+
 def test_mjcf(tmp_path):
     """Obstacles come back from MJCF as they were, with their courses; a floor is none."""
     (tmp_path / "a.xml").write_text(to_mjcf(MIXED))

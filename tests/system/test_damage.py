@@ -176,7 +176,8 @@ def test_damaged_shard_is_named_when_it_is_used(whole: Path, tmp_path: Path) -> 
         found.load()
     command = [sys.executable, "-m", "mrctl", "run", str(tmp_path / "store"), "--run", "2"]
     done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr  # zarr's other readers say nothing
+    said = [line for line in done.stderr.splitlines() if "compiling the laws" not in line]
+    assert done.returncode == 2 and len(said) == 1, done.stderr  # zarr's other readers say nothing
 
 
 def test_missing_shard_leaves_its_runs_out(whole: Path, tmp_path: Path) -> None:

@@ -130,6 +130,15 @@ def test_sdf_inner(tmp_path):
     assert (wall.x, wall.y, wall.angle, wall.length) == pytest.approx((2, 2.5, np.pi / 2, 2))
 
 
+def test_sdf_lintel(tmp_path):
+    """What hangs above every robot, as the lintel of a door, is no obstacle; what hangs lower is one."""
+    for height, count in ((2.2, 2), (1.4, 3)):  # of the centre of a box of 1 m
+        (tmp_path / "a.world").write_text(
+            SDF.replace("<pose>0.5 0 0.5 0 0 0</pose>", f"<pose>0.5 0 {height} 0 0 0</pose>")
+        )
+        assert len(read_sdf(tmp_path / "a.world").shapes) == count
+
+
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
