@@ -306,8 +306,10 @@ def read(scenario: Scenario | str | Path | None) -> Scenario:
     """Returns a scenario, that in a file, or by default one lap.
 
     Raises:
-        InputError: The file is not a valid scenario.
+        InputError: The file is not a valid scenario, or it is neither of these.
     """
     if isinstance(scenario, Scenario):
         return scenario
+    if scenario is not None and not isinstance(scenario, str | Path):
+        raise InputError(f"scenario: {type(scenario).__name__} is neither a Scenario nor the path of a file")
     return Scenario(laps=1) if scenario is None else Scenario.from_toml(scenario)

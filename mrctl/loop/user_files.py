@@ -59,7 +59,8 @@ def parts(name: str) -> list[Part]:
     found = split(name)
     for part in found:
         if not part.path.is_file():
-            raise InputError(f"controller: no file {part.file}")
+            where = "" if Path(part.file).is_absolute() else f" in {Path.cwd()}"
+            raise InputError(f"controller: no file {part.file}{where}")
     return found
 
 

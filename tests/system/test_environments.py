@@ -477,6 +477,7 @@ def test_actions():
         (lambda: TrackingVectorEnv(2, SHORT.model_copy(update={"motion_period": 0.05})), "motion_period: "),
         (lambda: TrackingVectorEnv(3, [SHORT]), "num_envs: 3, but 1 scenarios"),
         (lambda: TrackingEnv("nowhere.toml"), "nowhere.toml: No such file"),
+        (lambda: TrackingEnv({"laps": 1}), "scenario: dict is neither a Scenario nor the path of a file"),  # type: ignore
         (lambda: TrackingEnv(SHORT, render_mode="human"), "render_mode: 'human' is not rgb_array"),
         (lambda: TrackingEnv(SHORT, draw=lambda r: {"mass_factor": 99}).reset(), "perturbation.mass_factor: "),
         (
