@@ -32,7 +32,7 @@ from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Obstacles, Outlines, Pose, Surroundings
-from mrctl.theory.references import Waypoints, check
+from mrctl.theory.references import SLOWEST, Waypoints, check
 from mrctl.theory.robot import ANY_ANGLE, Robot
 from mrctl.theory.timing import RESERVE, Limits
 
@@ -328,8 +328,8 @@ def planned(
     if not 0 <= margin <= 10:
         raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
     fastest = vehicle.robot.max_speed
-    if speed is not None and not 0 < speed <= fastest:
-        raise InputError(f"speed: must be above 0 and at most {fastest:g} m/s, not {speed:g}")
+    if speed is not None and not SLOWEST <= speed <= fastest:
+        raise InputError(f"speed: must be between {SLOWEST:g} and {fastest:g} m/s, not {speed:g}")
     speed = RESERVE * fastest if speed is None else speed
     outlines = Surroundings(task.known).at(0.0) if outlines is None else outlines
     try:

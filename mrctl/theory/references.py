@@ -29,7 +29,8 @@ from mrctl.theory.spline import Plane, Spline, plane, spline
 from mrctl.theory.timing import RESERVE, Limits, SmoothLaw, sample_path, smooth
 
 Length = Annotated[float, Field(gt=0, le=1000)]
-Speed = Annotated[float, Field(ge=0.01, le=20)]
+SLOWEST = 0.01  # m/s, of a reference with a constant or a largest speed
+Speed = Annotated[float, Field(ge=SLOWEST, le=20)]
 Duration = Annotated[float, Field(ge=0.1, le=3600)]
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
 

@@ -83,7 +83,7 @@ def test_other_refusals_are_final(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario, searches = Scenario(), []
     task, search = task_of("doorway:3", scenario), mission.plan
     monkeypatch.setattr(mission, "plan", lambda *arguments: searches.append(arguments) or search(*arguments))
-    with pytest.raises(InputError, match=r"^speed: must be above 0 and at most 1.5 m/s, not 9$"):
+    with pytest.raises(InputError, match=r"^speed: must be between 0.01 and 1.5 m/s, not 9$"):
         prepared(task, scenario, speed=9)
     assert not searches
 
