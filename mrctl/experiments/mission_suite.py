@@ -72,6 +72,21 @@ class Draw(NamedTuple):
     goal: Pose
 
 
+class Series(NamedTuple):
+    """The drives of all draws on all plants with one controller at one speed."""
+
+    controller: FeedforwardName
+    speed: int
+    """Number of the speed."""
+    posture_known: bool = False
+    """Whether the true posture replaces the estimate."""
+
+    @property
+    def key(self) -> list[Any]:
+        """What the journal calls it."""
+        return [self.controller, "true posture" if self.posture_known else SPEEDS[self.speed]]
+
+
 class Found(NamedTuple):
     """The widths in m that the runs need, infinite where a robot did not arrive."""
 
@@ -108,25 +123,20 @@ def drive(base: Scenario, mode: Mode, journal: Journal) -> Found:
     speeds = [share * vehicle.robot.max_speed for share in SPEEDS]
     complaint = f"suite: {base.robot.path} finds no way through most corridors of {width:.2f} m"
     draws = drawn(lambda seed: draw(vehicle, seed, width, speeds), count, complaint)
-    size, shares = (len(CONTROLLERS), len(PLANTS), count), [*SPEEDS, "true posture"]
-    times = [sum(one.references[k].period for one in draws) for k in (*range(len(SPEEDS)), -1)]
-    cases = [(c, k) for c in range(len(CONTROLLERS)) for k in range(len(shares))]
-    left = [(c, k) for c, k in cases if [CONTROLLERS[c], shares[k]] not in journal]
-    seconds = sum(times[k] for _, k in left) * len(PLANTS) / PACE
+    every = [Series(name, k) for name in CONTROLLERS for k in range(len(SPEEDS))]
+    every += [Series(name, len(SPEEDS) - 1, posture_known=True) for name in CONTROLLERS]
+    left = [series for series in every if series.key not in journal]
+    seconds = sum(one.references[series.speed].period for series in left for one in draws) * len(PLANTS) / PACE
     print(f"{count * len(PLANTS) * len(left):,} runs, {journal.expected(seconds, len(left))}", flush=True)
+    size = len(CONTROLLERS), len(PLANTS), count
     needed, known, on_reference, off = np.empty((len(SPEEDS), *size)), *(np.empty(size) for _ in range(3))
-    tasks = []
-    for c, k in cases:
-        own, speed = base.replace(**FEEDFORWARDS[CONTROLLERS[c]]), k
-        if k == len(SPEEDS):
-            own, speed = own.replace(sensing=own.sensing.replace(estimator="truth")), -1
-        tasks.append(Computation([CONTROLLERS[c], shares[k]], partial(_driven, own, draws, speed, vehicle.footprint)))
-    for (c, k), driven in zip(cases, journal.results(tasks), strict=True):
-        widths = np.array(driven, float)
-        if k == len(SPEEDS):
+    drives = [Computation(series.key, partial(_driven, series, base, draws, vehicle.footprint)) for series in every]
+    for series, driven in zip(every, journal.results(drives), strict=True):
+        c, widths = CONTROLLERS.index(series.controller), np.array(driven, float)
+        if series.posture_known:
             known[c] = widths[0]
         else:
-            needed[k, c], on_reference[c], off[c] = widths
+            needed[series.speed, c], on_reference[c], off[c] = widths  # the last two end with the largest speed
     plans = []
     for one in draws:
         fastest = one.references[-1]
@@ -175,16 +185,18 @@ def draw(vehicle: Vehicle, seed: int, width: float, speeds: Sequence[float]) -> 
     return None
 
 
-def _driven(own: Scenario, draws: Sequence[Draw], speed: int, corners: Array, threads: int) -> list[Any]:
-    """Drives all draws on all plants at one speed; returns the widths that they need in m, as `_widths` does."""
-    return _widths(_simulated(own, draws, speed, threads), draws, corners).tolist()
+def _driven(series: Series, base: Scenario, draws: Sequence[Draw], corners: Array, threads: int) -> list[Any]:
+    """Drives a series; returns the widths that the runs need in m, as `_widths` does."""
+    return _widths(_simulated(series, base, draws, threads), draws, corners).tolist()
 
 
-def _simulated(own: Scenario, draws: Sequence[Draw], speed: int, threads: int) -> xr.Dataset:
-    """Drives all draws on all plants at one speed; run p · D + d is draw d of D on plant p."""
-    own = own.replace(laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
+def _simulated(series: Series, base: Scenario, draws: Sequence[Draw], threads: int) -> xr.Dataset:
+    """Drives all draws on all plants; run p · D + d is draw d of D on plant p."""
+    own = base.replace(**FEEDFORWARDS[series.controller], laps=PATIENCE, initial_spread=(0.0, 0.0, 0.0))
+    if series.posture_known:
+        own = own.replace(sensing=own.sensing.replace(estimator="truth"))
     scenarios = [
-        own.replace(perturbation=plant, reference=one.references[speed], goal=one.goal)
+        own.replace(perturbation=plant, reference=one.references[series.speed], goal=one.goal)
         for plant in PLANTS.values()
         for one in draws
     ]
