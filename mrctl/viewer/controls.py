@@ -171,8 +171,13 @@ class Controls:
         return _words(path) if path[0] in self._changeable else _words(path) + ANEW
 
     def _hint(self, path: tuple[str, ...], field: FieldInfo) -> str:
-        """Returns what stands beside an input under the mouse."""
+        """Returns what stands beside an input under the mouse; a page moves numbers beyond the limits to their ends."""
         known = field.description or ""
+        bounds = _bounds(_kind(field))
+        if len(bounds) == 2:
+            words = {Ge: "at least", Gt: "above", Le: "at most", Lt: "below"}
+            limits = ", ".join(f"{words[kind]} {bounds[kind]:g}" for kind in words if kind in bounds)
+            known = f"{known} {limits.capitalize()}.".lstrip()
         return known if path[0] in self._changeable else f"{known} {ANEW_HINT}".lstrip()
 
     def _listen(self, path: tuple[str, ...], handle: Any, whole: bool = False) -> None:  # noqa: ANN401
@@ -285,9 +290,14 @@ def _kinds(field: FieldInfo) -> dict[str, type[Record]]:
     return {k.model_fields["kind"].default: k for k in typing.get_args(field.annotation) if field.discriminator}
 
 
+def _bounds(field: FieldInfo) -> dict[type, float]:
+    """Returns the limits of a number by the kind of comparison, `Ge`, `Gt`, `Le` or `Lt`."""
+    return {type(m): getattr(m, type(m).__name__.lower()) for m in field.metadata if isinstance(m, Ge | Gt | Le | Lt)}
+
+
 def _limits(field: FieldInfo, value: float) -> tuple[float, float, float] | None:
     """Returns lower limit, upper limit and a suitable step of an input, or None for a field without both limits."""
-    bounds = {type(m): getattr(m, type(m).__name__.lower()) for m in field.metadata if isinstance(m, Ge | Gt | Le | Lt)}
+    bounds = _bounds(field)
     low, high = bounds.get(Ge, bounds.get(Gt)), bounds.get(Le, bounds.get(Lt))
     if low is None or high is None:
         return None

@@ -175,6 +175,15 @@ def test_marks(live):
     assert live._controls._inputs["learner",].label == f"learner{ANEW}" and live._robot.label == f"robot{ANEW}"
 
 
+def test_hints_say_the_limits(live):
+    """The hint of a number says what the record accepts, so that a number that the page moves is no riddle."""
+    live._restart([Scenario()])
+    hints = {path: handle.hint for path, handle in live._controls._inputs.items()}
+    assert "At least 0.01, at most 10." in hints["prefilter",]
+    assert "At least 0.05, at most 20." in hints["perturbation", "mass_factor"]
+    assert "at most" not in (hints["learner",] or "").lower()
+
+
 def test_sliders(live):
     """A slider shows the range that suits the robot; a number beyond its ends is accepted up to the record's limits."""
     payload, size = ("perturbation", "payload"), ("reference", "lemniscate", "size")
