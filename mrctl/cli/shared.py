@@ -1,4 +1,4 @@
-"""What several commands do: refuse what can be seen before an import that takes seconds, and report how it ended."""
+"""What several commands do: they refuse what can be seen before slow imports, and report how they ended."""
 
 from __future__ import annotations
 

@@ -96,7 +96,8 @@ def learning_ratio(gain: float, time_constant: float, gains: Gains) -> float:
 
     This is the condition of Gomi and Kawato (1993), that the complementary sensitivity T be strictly positive real, for
     a plant M V̇ + B V = b U without delay: K_p (B + b K_p) > M K_i, here with M = τ, B = 1 and b = K. It is sufficient
-    here: since the PID's integral hands over half of what is learned, Re T > −1 is enough (`mrctl.control.matching`).
+    in mrctl, but not necessary: the PID's integral hands over half of what is learned, so that without delay Re T > −1
+    is enough (`mrctl.control.matching`).
 
     Args:
         gain: K of the plant, in output units per V.

@@ -306,7 +306,7 @@ def read(scenario: Scenario | str | Path | None) -> Scenario:
     """Returns a scenario, that in a file, or by default one lap.
 
     Raises:
-        InputError: The file is not a valid scenario, or it is neither of these.
+        InputError: The file is not a valid scenario, or it is none of the three.
     """
     if isinstance(scenario, Scenario):
         return scenario

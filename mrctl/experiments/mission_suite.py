@@ -77,7 +77,7 @@ class Series(NamedTuple):
 
     controller: FeedforwardName
     speed: int
-    """Number of the speed."""
+    """Index of the speed in `SPEEDS`."""
     posture_known: bool = False
     """Whether the true posture replaces the estimate."""
 

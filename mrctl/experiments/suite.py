@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -197,7 +197,7 @@ def compare(chosen: Sequence[Case], found: Mapping[str, Laps]) -> list[dict[str,
 
     A row holds for lap 1, all laps and the last lap: the mean with its 95 % bootstrap interval; the floor; the mean
     difference from PID and from `model` in the same run; and the probability of beating each of the others in the same
-    run, where two errors that differ by no more than the floor's tie are one. In `random`, where one world
+    run, where two errors are a tie if they differ by no more than `Floor.tie`. In `random`, where one world
     would dominate a mean, medians replace the means. For the last lap a row also holds the mean of the worst 5 %
     (infinite where a run failed) and the ratios to PID and to `model`. `excess` is the error beyond that of the last
     lap (after a step: of the lap before the return), integrated from the start or the step on; it has no meaning where
@@ -329,17 +329,21 @@ def floors(pairs: Sequence[tuple[Laps, Laps]], metric: str) -> dict[str, Floor]:
         for window, floor in found.items():
             if changes := [after[name][window] - before[name][window] for name in fine]:
                 means = np.mean(changes, axis=1)
-                own = float(np.abs(means).max()), float(np.ptp(means))
+                difference = max(floor.difference, float(np.ptp(means)))
                 ties = [unnoticed(one - other) for one, other in combinations(changes, 2)]
-                found[window] = Floor(*map(max, floor, (*own, max([own[1], *ties]))))
+                mean = max(floor.mean, float(np.abs(means).max()))
+                found[window] = Floor(mean, difference, max(floor.tie, difference, *ties))
     return found
 
 
 def unnoticed(change: Array) -> float:
     """Returns the least tie from which on the paired test does not tell numbers `(n,)`, one a run, from zero."""
-    ties = [0.0, *np.sort(np.abs(change)).tolist()]
-    tests = [superiority(change, np.zeros_like(change), floor=tie) for tie in ties]
-    return next((ties[k + 1] for k in range(len(tests))[::-1] if not tests[k].low <= 0.5 <= tests[k].high), 0.0)
+    ties = np.append(0.0, np.sort(np.abs(change)))
+    for least, tie in pairwise(ties[::-1]):
+        test = superiority(change, np.zeros_like(change), floor=tie)
+        if not test.low <= 0.5 <= test.high:
+            return float(least)
+    return 0.0
 
 
 def _step(laps: xr.Dataset, metric: str, case: Case) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import hashlib
 import importlib
 import re
 import sys
+from collections.abc import Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 from types import ModuleType
@@ -123,13 +124,17 @@ def absolute(name: str) -> str:
     return ",".join(f"{part.stage}={part.path}:{part.title}" for part in parts(name)).removeprefix("feedforward=")
 
 
-def digest(name: str) -> str:
+def digest(name: str, beside: bool = True) -> str:
     """Returns a digest of the files that a name names and of those beside them that they import, without the settings.
+
+    Args:
+        name: The name.
+        beside: Whether the files beside them count; in stores that were written before version 0.29.0 they do not.
 
     Raises:
         InputError: The name is refused, as by `parts`.
     """
-    files = [file for part in parts(name) for file in (part.path, *neighbours(part.path))]
+    files = [file for part in parts(name) for file in (part.path, *(neighbours(part.path) if beside else ()))]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
@@ -172,7 +177,8 @@ def load(name: str) -> Stages:
     """Runs the files and returns the factories by stage, as keywords for `simulate`.
 
     The files run once as long as they and their `neighbours` stay the same; the same file name in another directory is
-    another file, as is that of a neighbour.
+    another file, as is that of a neighbour. Neighbours belong at the top of a file: an import in a function takes what
+    was loaded last under this name.
 
     Raises:
         InputError: The name is refused, as by `parts`; a file raises; or a file has no such attribute to call.
@@ -182,8 +188,30 @@ def load(name: str) -> Stages:
 
 @lru_cache
 def _load(name: str, _digest: str) -> Stages:
-    factories: Any = {part.stage: _factory(part) for part in parts(name)}
+    found = parts(name)
+    _forget_others({file: part.path.parent for part in found for file in neighbours(part.path)})
+    factories: Any = {part.stage: _factory(part) for part in found}
     return factories
+
+
+_imported_as: dict[str, str] = {}
+"""Digests of the neighbours as they were imported last, by path."""
+
+
+def _forget_others(folders: Mapping[Path, Path]) -> None:
+    """Forgets modules that have the names of neighbours, but are of another folder or from before an edit.
+
+    Args:
+        folders: The folder from which each neighbour is imported.
+    """
+    now = {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in folders}
+    edited = any(_imported_as.get(file, digest) != digest for file, digest in now.items())
+    names = {file.relative_to(folder).parts[0].removesuffix(".py") for file, folder in folders.items()}
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] in names and (edited or getattr(module, "__file__", None) not in now):
+            del sys.modules[name]
+    importlib.invalidate_caches()
+    _imported_as.update(now)
 
 
 def _factory(part: Part) -> Any:  # noqa: ANN401
@@ -191,10 +219,6 @@ def _factory(part: Part) -> Any:  # noqa: ANN401
     module_name = f"mrctl_controller_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
     module = sys.modules[module_name] = ModuleType(module_name)  # dataclasses look the module up there
     module.__file__ = str(path)
-    beside = {file.relative_to(path.parent).parts[0].removesuffix(".py") for file in neighbours(path)}
-    for name in [name for name in sys.modules if name.partition(".")[0] in beside]:
-        del sys.modules[name]  # of another folder, or from before an edit
-    importlib.invalidate_caches()
     sys.path.insert(0, str(path.parent))  # as for a script, so that the file can import its neighbours
     writes, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:

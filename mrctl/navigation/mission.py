@@ -61,7 +61,7 @@ CELLS = 4  # of the search in the width of the robot
 PATIENCE, WAITING = 2, 4  # time of a mission over that of its plan; WAITING where something keeps it from obstacles
 MARGIN = 0.05  # m, margin of a plan
 SLIM = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
-PERIOD = 0.05  # s, motion period of `window` and `mppi`, or the multiple of the control period next to that
+PERIOD = 0.05  # s, motion period of `window` and `mppi`, or the multiple of the control period nearest to it
 
 JERKED = 0.1  # s, step of the differences whose third is the jerk; chosen
 LARGEST = 64 * 2**20  # bytes of a `mission.json`, which holds the obstacles of its world
@@ -204,8 +204,8 @@ def navigate(
     Args:
         task: World, map, start and goal.
         scenario: The robot and all else. Reference, laps, goal, obstacles, map and initial pose are those of the
-            mission; with `window` and `mppi` the motion period is 0.05 s, or the multiple of the control period next to
-            that, and the prefilter, unless set, the shortest.
+            mission; with `window` and `mppi` the motion period is the multiple of the control period that is
+            nearest to 0.05 s, and the prefilter, unless set, the shortest.
         compare: Feedforwards of further robots, which drive the same plan, each alone.
         speed: Largest speed in m/s; by default 0.9 of the robot's.
         margin: Clearance that the plan keeps in m.

@@ -73,7 +73,7 @@ class Planner:
 
     @property
     def goal(self) -> Pose | None:
-        """Goal of the mission, x and y in m and θ in rad; None if none, or a plan that came leads elsewhere."""
+        """Goal of the mission, x and y in m and θ in rad; None if there is none, or a plan came since."""
         return self.scenario.goal if self._given is None else None
 
     def plan(self, pose: Array, twist: Array, time: float) -> Waypoints | None:

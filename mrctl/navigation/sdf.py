@@ -12,14 +12,15 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.record import InputError, read_file
-from mrctl.theory.obstacles import Obstacles, in_the_way, turned
+from mrctl.theory.obstacles import FLAT, OVERHEAD, Obstacles, turned
 
 
 def read_sdf(path: str | Path) -> Obstacles:
     """Reads the cylinders, boxes and spheres that the models of an SDF world collide with.
 
-    Models that the world includes from other files, such as ground and sun, are left out, and so is what ends below 2
-    cm or begins above 1 m. A pose in the world's `<state>` is used in place of that of the model.
+    Models that the world includes from other files, such as ground and sun, are left out, and so is what ends at 2 cm
+    or lower or begins at 1 m or higher. A pose in the world's `<state>` is used in place of that of the model, but not
+    of models in it.
 
     Args:
         path: The `.world` or `.sdf` file.
@@ -40,7 +41,8 @@ def read_sdf(path: str | Path) -> Obstacles:
             model.get("name"): _pose(model) for model in world.iterfind("state/model") if model.find("pose") is not None
         }
         for model in world.iterfind("model"):
-            shapes += _shapes(model, placed.get(model.get("name"), _pose(model)))
+            name = model.get("name")
+            shapes += _shapes(model, placed[name] if name in placed else _pose(model))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
     return Obstacles.from_dict({"shapes": shapes}, str(path))
@@ -103,10 +105,12 @@ def _shape(collision: ElementTree.Element, pose: Array, name: str) -> list[dict]
     except (ValueError, IndexError):
         raise InputError(f"{name}: {shape.tag} has no valid {field}") from None
     half = size[2] / 2 if shape.tag == "box" else length / 2
-    if not in_the_way(pose[2] - half, pose[2] + half):
+    if pose[2] + half <= FLAT:
         return []
     if shape.tag != "sphere" and np.abs(pose[3:5]).max() > 1e-3:
         raise InputError(f"{name}: is not upright")
+    if pose[2] - half >= OVERHEAD:
+        return []
     x, y, yaw = (float(value) for value in pose[[0, 1, 5]])
     if shape.tag == "box":
         yaw = float(np.arctan2(np.sin(yaw), np.cos(yaw)))

@@ -204,12 +204,12 @@ class _Adoption:
 
     def _refuse_wheel_that_nothing_turns(self, caster: Wheel) -> None:
         """Refuses a rolling wheel on an upright joint that has neither a servo nor, as a caster has, a trail."""
-        for name in self._hinges() if caster.joint else ():
+        for name in self._hinges() if caster.joint in self._hinges() else ():
             carried = self._lineage(name)[0] in self._ancestry(self.model.body(caster.body).id)
             trail = np.hypot(*(caster.centre - self.data.joint(name).xanchor)[:2])
             if carried and abs(self._axis(name)[2]) > 0.9 and trail < LEVEL * caster.radius:
                 raise InputError(
-                    f"steering: nothing turns the joint {name!r}, and its wheel has no trail, which a caster needs; "
+                    f"steering: the joint {name!r} has no actuator, and its wheel no trail, which a caster needs; "
                     f'if it is steered, add <position joint="{name}" kp="K" kv="D"/>'
                 )
 

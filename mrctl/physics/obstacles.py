@@ -21,7 +21,7 @@ from mrctl.physics.bounds import check_bounds, compiling
 from mrctl.physics.elements import COLLISION
 from mrctl.physics.hull import convex
 from mrctl.record import InputError
-from mrctl.theory.obstacles import Box, Disc, Obstacles, Polygon, in_the_way
+from mrctl.theory.obstacles import FLAT, OVERHEAD, Box, Disc, Obstacles, Polygon
 
 HULL = "hull"  # name of the hull's geom
 BIT = 2  # of contype and conaffinity; MuJoCo's default, which floors have, is 1
@@ -135,8 +135,8 @@ def to_mjcf(obstacles: Obstacles) -> str:
 def read_mjcf(path: str | Path) -> Obstacles:
     """Reads the obstacles of an MJCF file: fixed upright boxes and cylinders, and the outlines of meshes from above.
 
-    Obstacles that `to_mjcf` wrote with a course keep it. Geoms that end below 2 cm are floors and those
-    that begin above 1 m lintels, not obstacles; planes, height fields, and geoms that collide with nothing are no
+    Obstacles that `to_mjcf` wrote with a course keep it. Geoms that end at 2 cm or lower are floors and those that
+    begin at 1 m or higher lintels, not obstacles; planes, height fields, and geoms that collide with nothing are no
     obstacles either.
 
     Args:
@@ -183,7 +183,8 @@ def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | No
     else:
         half = size[[0, 0, 1]] if kind == shape.mjGEOM_CYLINDER else size
         points = place + np.abs(frame[2]) @ half * np.array([[0, 0, -1.0], [0, 0, 1]])
-    if not in_the_way(points[:, 2].min(), points[:, 2].max()):
+    low, high = points[:, 2].min(), points[:, 2].max()
+    if high <= FLAT:
         return None
     name = model.geom(geom).name or f"number {geom}"
     body = model.geom_bodyid[geom]
@@ -194,10 +195,13 @@ def _outline(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> dict | No
             turn.T @ (place - data.body(body).xpos),
             (points - data.body(body).xpos) @ turn,
         )
+    upright = abs(frame[2, 2]) >= 1 - 1e-9 and (kind == shape.mjGEOM_BOX or kind == shape.mjGEOM_CYLINDER)
+    if mesh is None and not upright:
+        raise InputError(f"geom {name}: not an upright box or cylinder, nor a mesh")
+    if low >= OVERHEAD:
+        return None
     if mesh is not None:
         return {"kind": "polygon", "points": convex(points[:, :2].round(6)).tolist()}
-    if abs(frame[2, 2]) < 1 - 1e-9 or not (kind == shape.mjGEOM_BOX or kind == shape.mjGEOM_CYLINDER):
-        raise InputError(f"geom {name}: not an upright box or cylinder, nor a mesh")
     values = {"x": float(place[0]), "y": float(place[1])}
     if kind == shape.mjGEOM_CYLINDER:
         return {"kind": "disc", "radius": float(size[0]), **values}

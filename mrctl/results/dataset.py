@@ -265,12 +265,15 @@ def save(result: xr.Dataset, path: str | Path) -> None:
     """Writes a result as a zarr store, whole or not at all.
 
     Raises:
-        InputError: The dataset is none that `open` could read, as an opened sweep, or the path exists, cannot be
+        InputError: The dataset, such as an opened sweep, is none that `open` could read, or the path exists, cannot be
             written, or is that of a file in another format.
     """
     check_kind(result)
     if missing := NEEDED - set(result.attrs):
-        raise InputError(f"result: has no {min(missing)}, as of simulate; result.to_zarr(path) writes any dataset")
+        raise InputError(
+            f"result: lacks the attribute {min(missing)}, without which mrctl could not open it; result.to_zarr(path) "
+            "writes any dataset"
+        )
     from zarr.codecs import Crc32cCodec, ZstdCodec  # imported here because a run that saves nothing needs no zarr
 
     path = Path(path)

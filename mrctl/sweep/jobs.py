@@ -307,7 +307,7 @@ def _compute(sweep: Sweep, runs: Sequence[int], samples: int) -> tuple[list[dict
 def _row(sweep: Sweep, run: int, failure: str = "", **found: object) -> dict[str, Any]:
     """Makes a row of the table: the description of a run, and its metrics, which are NaN unless they are `found`."""
     values, valid = sweep.values(run), sweep.valid(run)
-    scenario = valid or sweep.base
+    scenario = valid or sweep.base_of(run)
     row: dict[str, Any] = {name: np.nan for name in (*metrics.METRICS, "lap_time")}
     row |= {name: [] for name in sweep.columns.names if name.endswith("_per_lap")} | dict.fromkeys(FAULTS, "")
     own = sweep.driven_by(run)
@@ -362,8 +362,14 @@ def stages_of(out: str | Path, run: int, code: bool = True) -> Stages:
         return {}
     if not code:
         raise InputError(f"code: {out} names {printable(controller)}, which --no-code does not allow")
-    if user_files.digest(controller) != store.manifest["models"].get(controller):
-        raise InputError(f"controller: {printable(controller)} is not the file that {out} was computed with")
+    # Stores of versions before 0.29.0 have the digest without the files beside the controller.
+    if store.manifest["models"].get(controller) not in [
+        user_files.digest(controller, beside) for beside in (True, False)
+    ]:
+        raise InputError(
+            f"controller: {printable(controller)}, or a file beside it that it imports, has changed since {out} was "
+            "computed"
+        )
     print(f"mrctl: runs {printable(controller)}, which {out} names", file=sys.stderr)
     return user_files.load(controller)
 

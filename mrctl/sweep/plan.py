@@ -221,7 +221,7 @@ class Sweep(Record):
 
     def _check_controllers(self) -> None:
         """Refuses an axis of controllers beside something else that says what drives, or with ambiguous names."""
-        if (place := self._controlled) is None:
+        if not self._chosen:
             return
         if self.controller or self.hindsight:
             other = "controller" if self.controller else "hindsight"
@@ -231,7 +231,7 @@ class Sweep(Record):
             for name in ("prior", "learner"):
                 if axis.field == name or name in inner:
                     raise ValueError(f"{axis.field}: the axis controller sets {name}; leave it out here")
-        titles = [self.axes[place].chosen[value].title for value in self.axes[place].listed]
+        titles = [self._chosen[value].title for axis in self.axes if axis.field == CONTROLLER for value in axis.listed]
         if doubles := [title for title in titles if titles.count(title) > 1]:
             raise ValueError(f"controller: two values have the name {doubles[0]} in the table")
 
@@ -272,25 +272,28 @@ class Sweep(Record):
         return len(self.axes[group[0]].listed)
 
     @cached_property
-    def _controlled(self) -> int | None:
-        """Index of the axis of controllers, or None."""
-        return next((number for number, axis in enumerate(self.axes) if axis.field == CONTROLLER), None)
+    def _chosen(self) -> dict[str, Chosen]:
+        """What the values of the axis of controllers stand for; nothing where there is no such axis."""
+        return next((axis.chosen for axis in self.axes if axis.field == CONTROLLER), {})
 
     def driven_by(self, run: int) -> str | None:
         """Returns the controller of the user that drives one run, or None."""
-        if (place := self._controlled) is None:
-            return self.controller
-        return self.axes[place].chosen[self.values(run)[CONTROLLER]].own
+        return self._chosen[self.values(run)[CONTROLLER]].own if self._chosen else self.controller
+
+    def base_of(self, run: int) -> Scenario:
+        """Returns the base with what the axis of controllers sets in one run, which need not be valid itself."""
+        return self.base.replace(**self._chosen[self.values(run)[CONTROLLER]].fields) if self._chosen else self.base
 
     @property
     def drivers(self) -> dict[str | None, list[int]]:
         """Controllers of the user that drive runs, None for mrctl's own, each with some of the first such runs."""
-        if (place := self._controlled) is None:
+        if not self._chosen:
             return {self.controller: list(range(min(self.size, TRIED)))}
         found: dict[str | None, list[int]] = {}
+        place = next(number for number, axis in enumerate(self.axes) if axis.field == CONTROLLER)
         dimension = next(number for number, group in enumerate(self._dimensions) if place in group)
         block = int(np.prod(self._shape[dimension + 1 :], dtype=object))
-        for k, one in enumerate(self.axes[place].chosen.values()):
+        for k, one in enumerate(self._chosen.values()):
             found.setdefault(one.own, []).extend(range(k * block, k * block + min(block, TRIED)))
         return found
 
@@ -361,8 +364,8 @@ class Sweep(Record):
     def _assemble(self, values: dict[str, Any], source: str = "") -> Scenario:
         data = self._plain
         for field, value in values.items():
-            if field == CONTROLLER and self._controlled is not None:
-                data = data | self.axes[self._controlled].chosen[value].fields
+            if field == CONTROLLER and self._chosen:
+                data = data | self._chosen[value].fields
                 continue
             data = data | value if field == WHOLE and isinstance(value, dict) else _put(data, field, value)
             inner = isinstance(value, str) and any(other.startswith(f"{field}.") for other in values)

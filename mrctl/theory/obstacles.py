@@ -18,18 +18,14 @@ from mrctl.record import InputError, Record
 from mrctl.theory.references import Reference
 
 MOST = 20_000  # obstacles in one world; a map with more has a finer resolution than a robot needs
-FLAT, OVERHEAD = 0.02, 1.0  # m; a solid that ends below the first is ground, one that begins above the other a lintel
+FLAT = 0.02  # m, height up to which a solid is ground
+OVERHEAD = 1.0  # m, height from which on a solid hangs over robots, as the lintel of a door
 
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
 Size = Annotated[float, Field(ge=1e-3, le=1e4)]
 Angle = Annotated[float, Field(ge=-7, le=7)]
 Pose = tuple[Coordinate, Coordinate, Angle]
 """x and y in m, θ in rad."""
-
-
-def in_the_way(bottom: float, top: float) -> bool:
-    """Tells whether a solid between two heights in m can be in a robot's way: it is neither ground nor overhead."""
-    return top > FLAT and bottom < OVERHEAD
 
 
 class Disc(Record):

@@ -171,12 +171,15 @@ class Controls:
         return _words(path) if path[0] in self._changeable else _words(path) + ANEW
 
     def _hint(self, path: tuple[str, ...], field: FieldInfo) -> str:
-        """Returns what stands beside an input under the mouse; a page moves numbers beyond the limits to their ends."""
+        """Returns the text that a page shows when the mouse is over an input: its description and its limits.
+
+        A page moves a number beyond them to the nearest one.
+        """
         known = field.description or ""
         bounds = _bounds(_kind(field))
         if len(bounds) == 2:
             words = {Ge: "at least", Gt: "above", Le: "at most", Lt: "below"}
-            limits = ", ".join(f"{words[kind]} {bounds[kind]:g}" for kind in words if kind in bounds)
+            limits = ", ".join(f"{words[kind]} {bounds[kind]:.12g}" for kind in words if kind in bounds)
             known = f"{known} {limits.capitalize()}.".lstrip()
         return known if path[0] in self._changeable else f"{known} {ANEW_HINT}".lstrip()
 

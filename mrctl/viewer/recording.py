@@ -226,8 +226,9 @@ class Library:
         self._drives: dict[str | None, Callable[..., xr.Dataset]] = {}  # by the user's controller
         if (path / "sweep.json").is_file():
             self.table = Store(path).frame().set_index("run", drop=False)
-            for runs in jobs.sweep_of(Store(path)).drivers.values():
-                self._drive(runs[0])
+            drivers = jobs.sweep_of(Store(path)).drivers
+            if len(drivers) == 1:  # otherwise each is loaded when its first run is shown
+                self._drive(0)
         else:
             self._result = as_runs(store.open(path))
             self.table = summary(self._result).set_index(np.arange(self._result.sizes["run"]))

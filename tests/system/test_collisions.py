@@ -195,6 +195,10 @@ def test_mjcf_lintel(tmp_path):
     text = geom.format(1, 1.15) + geom.format(2, 1.05) + geom.format(3, 0.1)
     (tmp_path / "door.xml").write_text(f"<mujoco><worldbody>{text}</worldbody></mujoco>")
     assert [shape.x for shape in read_mjcf(tmp_path / "door.xml").shapes] == [2, 3]
+    for post in ('type="capsule" size="0.1 1.0" pos="1 0 1.1"', 'type="sphere" size="0.9" pos="0 0 1"'):
+        (tmp_path / "post.xml").write_text(f"<mujoco><worldbody><geom {post}/></worldbody></mujoco>")
+        with pytest.raises(InputError, match="not an upright box or cylinder"):  # they stand on the floor
+            read_mjcf(tmp_path / "post.xml")
 
 
 def test_mjcf(tmp_path):

@@ -287,8 +287,11 @@ def test_code_of_a_store(
     for command in (["run", "--run", "1"], ["view", "--export", "x.html"]):
         assert cli.main([command[0], str(whole / "own"), *command[1:], "--no-code"]) == 2
         assert f"code: {whole}/own names {whole}/own.py:Half" in capsys.readouterr().err
-    monkeypatch.setattr(jobs.user_files, "digest", lambda name: "of another file")
-    with pytest.raises(InputError, match="is not the file that"):
+    own = jobs.user_files.digest(f"{whole}/own.py:Half")
+    monkeypatch.setattr(jobs.user_files, "digest", lambda name, beside: "of more files" if beside else own)
+    assert jobs.stages_of(whole / "own", 1)  # as of a store from before 0.29.0
+    monkeypatch.setattr(jobs.user_files, "digest", lambda name, beside: "of another file")
+    with pytest.raises(InputError, match="has changed since"):
         jobs.stages_of(whole / "own", 1)
 
 

@@ -1,5 +1,6 @@
 """`mrctl tune --search`: the same result twice, whatever interrupts it, and the optimum where it is known."""
 
+import importlib
 import json
 from math import exp, log
 from pathlib import Path
@@ -193,6 +194,23 @@ def test_neighbour_of_a_user_s_file(tmp_path):
     beside = user_files.neighbours(tmp_path / "one" / "own.py")
     assert beside == [tmp_path / "one" / "laws" / name for name in ("__init__.py", "deep.py")]
     assert not list(tmp_path.rglob("*.pyc"))
+
+
+def test_neighbour_that_stages_share(tmp_path, monkeypatch):
+    """Two stages of one controller share what they import from beside them, with a script that imported it before."""
+    (tmp_path / "shared_by_stages.py").write_text("known = []\n")
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.py").write_text(
+            "from shared_by_stages import known\ndef own(robot, size):\n    known.append(robot)\n    return known\n"
+        )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    mine = importlib.import_module("shared_by_stages")
+    stages = user_files.load(f"{tmp_path / 'a.py'}:own,motion={tmp_path / 'b.py'}:own")
+    stages["feedforward"](1, 1)
+    assert stages["motion"](2, 1) is mine.known and mine.known == [1, 2]
+    (tmp_path / "shared_by_stages.py").write_text("known = [0]\n")
+    stages = user_files.load(f"{tmp_path / 'a.py'}:own,motion={tmp_path / 'b.py'}:own")
+    assert stages["feedforward"](1, 1) is stages["motion"](2, 1) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(

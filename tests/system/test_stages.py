@@ -23,6 +23,7 @@ from mrctl.results.dataset import SIGNALS
 from mrctl.scenario import FEEDFORWARDS
 from mrctl.sweep import jobs
 from mrctl.sweep.store import Store
+from mrctl.viewer.recording import Library
 
 SHORT = Scenario(**IDEAL, reference=Circle(period=4, radius=0.5), laps=1, learner="none")
 THREE = [SHORT.model_copy(update={"seed": seed}) for seed in range(3)]
@@ -586,6 +587,7 @@ def test_sweep_of_controllers(tmp_path, capsys, monkeypatch):
         assert main(["sweep", "sweep.toml", "--out", "store"]) == 2
         assert re.search(message, capsys.readouterr().err)
     (tmp_path / "sweep.toml").write_text(text)
+    assert Library(Path("store"), code=False).recording(1).scenario.learner == "fel"  # needs no file of them
     file.write_text(file.read_text().replace("0 * command", "1 * command"))
     assert main(["sweep", "sweep.toml", "--out", "store"]) == 2
     assert f"{file}:Gain(gain=2.0) has changed" in capsys.readouterr().err

@@ -111,6 +111,7 @@ def test_controllers():
     titles = ["none", "model+fel", "A(gain=2)", "model+A", "B(ahead=0.3)", "B+C"]
     assert [one.axes[1].cell(value) for value in values] == titles
     assert one.drivers == {None: [0, 1, 2, 3]} | {name: [2 * k, 2 * k + 1] for k, name in enumerate(own) if name}
+    assert [one.base_of(2 * place).feedforward for place in range(len(values))] == pairs
     assert Sweep.from_dict(one.model_dump(mode="json")) == one
     assert sweep(runs=3, controller="a.py:A").drivers == {"a.py:A": [0, 1, 2]}
 

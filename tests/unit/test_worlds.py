@@ -137,6 +137,10 @@ def test_sdf_lintel(tmp_path):
             SDF.replace("<pose>0.5 0 0.5 0 0 0</pose>", f"<pose>0.5 0 {height} 0 0 0</pose>")
         )
         assert len(read_sdf(tmp_path / "a.world").shapes) == count
+    lying = SDF.replace("<pose>0.5 0 0.5 0 0 0</pose>", "<pose>0.5 0 1.6 0 1.57 0</pose>")  # it reaches down to 0.6 m
+    (tmp_path / "a.world").write_text(lying)
+    with pytest.raises(InputError, match="is not upright"):
+        read_sdf(tmp_path / "a.world")
 
 
 @pytest.mark.parametrize(
