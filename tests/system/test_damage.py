@@ -288,9 +288,9 @@ def test_code_of_a_store(
         assert cli.main([command[0], str(whole / "own"), *command[1:], "--no-code"]) == 2
         assert f"code: {whole}/own names {whole}/own.py:Half" in capsys.readouterr().err
     own = jobs.user_files.digest(f"{whole}/own.py:Half")
-    monkeypatch.setattr(jobs.user_files, "digest", lambda name, beside: "of more files" if beside else own)
+    monkeypatch.setattr(jobs.user_files, "digest", lambda name, beside=True: "of more files" if beside else own)
     assert jobs.stages_of(whole / "own", 1)  # as of a store from before 0.29.0
-    monkeypatch.setattr(jobs.user_files, "digest", lambda name, beside: "of another file")
+    monkeypatch.setattr(jobs.user_files, "digest", lambda name, beside=True: "of another file")
     with pytest.raises(InputError, match="has changed since"):
         jobs.stages_of(whole / "own", 1)
 
