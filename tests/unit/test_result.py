@@ -197,7 +197,7 @@ def test_stale_partial(result, tmp_path):
 def test_what_cannot_be_opened_is_not_saved(result, tmp_path):
     """An opened sweep has no scenarios; a copy of it that `open` refuses would be lost."""
     sweep = result.drop_attrs().assign_attrs({name: result.attrs[name] for name in ("versions", "control_period")})
-    refused("result: has no scenarios", save, sweep, tmp_path / "a")
+    refused("result: lacks the attribute scenarios", save, sweep, tmp_path / "a")
     assert not list(tmp_path.iterdir())
 
 
