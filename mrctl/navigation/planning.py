@@ -113,24 +113,33 @@ class Plan(NamedTuple):
     ) -> Waypoints:
         """Returns the plan as a reference: splines of continuous curvature, with the time law under all limits.
 
-        Where the plan changes its direction, a spline ends at rest and without curvature, and another one begins.
+        It begins and ends with the headings and curvatures of the plan. Where the plan changes its direction, a spline
+        ends at rest and another one begins, with a curvature of its own.
 
         Args:
             speed: Largest speed in m/s.
             limits: Limits of the time law, such as `Limits.of(robot)`.
             spacing: Distance of the points that the spline goes through in m.
             velocity: V at the start in m/s; a plan that sets out in reverse begins at rest.
-            curvature: Curvature at the start in 1/m.
+            curvature: Curvature at the start in 1/m where V is not zero; if it is not that of the plan, the heading is
+                off by up to 0.1 rad there.
 
         Raises:
             InputError: The speed is not positive, or a spline turns too far from the plan at a change of direction.
         """
         turns = np.flatnonzero(self.directions[2:] * self.directions[1:-1] < 0) + 1
-        ends = [0, *turns.tolist(), len(self.poses) - 1]
-        legs = [_points(self.poses[a : b + 1], spacing) for a, b in pairwise(ends)]
+        places = list(pairwise([0, *turns.tolist(), len(self.poses) - 1]))
+        legs = [_points(self.poses[a : b + 1], spacing) for a, b in places]
         points = np.concatenate([legs[0][:1], *(leg[1:] for leg in legs)])
         cusps = np.cumsum([len(leg) - 1 for leg in legs[:-1]], dtype=int).tolist()
+        start, *between, end = [
+            bend
+            for leg, (a, b) in zip(legs, places, strict=True)
+            for bend in _bends(leg, self.poses[a, 2], self.poses[b, 2], self.directions[b] < 0)
+        ]
         values = {"points": points.tolist(), "closed": False, "timing": "limits", "speed": speed, "limits": limits}
+        values |= {"start_curvature": start, "end_curvature": end}
+        values["cusp_curvatures"] = list(zip(between[::2], between[1::2], strict=True))
         if self.directions[1] < 0:
             cusps = [0, *cusps]
         elif velocity > 0:
@@ -160,12 +169,37 @@ def run_out(start: Array, velocity: float, curvature: float, limits: Limits) -> 
 
 
 def _points(poses: Array, spacing: float) -> Array:
-    """Returns points at equal distances of about the spacing in m along poses, `(n, 2)`, with two more at the ends."""
-    way = np.append(0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+    """Returns points at equal distances of about the spacing in m along poses, `(n, 2)`, with two more at the ends.
+
+    The way from each pose to the next is an arc.
+    """
+    chords, turns = np.diff(poses[:, :2] @ (1, 1j)), np.diff(poses[:, 2])
+    turns -= 2 * np.pi * np.round(turns / (2 * np.pi))
+    lengths = np.abs(chords) / np.sinc(turns / (2 * np.pi))
+    way = np.append(0, np.cumsum(lengths))
     places = np.linspace(0, way[-1], max(2, round(way[-1] / spacing) + 1))
     if places[1] > 2 * CHECK:  # one more point near either end holds the heading there
         places = np.concatenate([places[:1], [CHECK], places[1:-1], [way[-1] - CHECK], places[-1:]])
-    return np.column_stack([np.interp(places, way, poses[:, k]) for k in range(2)])
+    arc = np.clip(np.searchsorted(way, places, side="right") - 1, 0, len(chords) - 1)
+    ahead = places - way[arc]
+    turn = turns[arc] * ahead / lengths[arc]
+    tangent = chords / np.abs(chords) * np.exp(-0.5j * turns)  # at the start of each arc
+    points = poses[arc, :2] @ (1, 1j) + ahead * np.sinc(turn / (2 * np.pi)) * np.exp(0.5j * turn) * tangent[arc]
+    return np.column_stack([points.real, points.imag])
+
+
+def _bends(points: Array, start: float, end: float, reverse: bool) -> tuple[float, float]:
+    """Returns the curvatures in 1/m of the arcs through the first two points and the last two, positive to the left.
+
+    Args:
+        points: Points of a way in m, `(n, 2)`.
+        start: Heading of the robot at the first in rad.
+        end: Heading of the robot at the last in rad.
+        reverse: Whether it drives in reverse.
+    """
+    first, last = np.diff(points @ (1, 1j))[[0, -1]] * (-1 if reverse else 1)
+    before, after = np.angle([first * np.exp(-1j * start), np.exp(1j * end) / last])  # half of the turns of the arcs
+    return round(2 * np.sin(before) / abs(first), 6), round(2 * np.sin(after) / abs(last), 6)
 
 
 def space(

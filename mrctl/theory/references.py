@@ -14,7 +14,7 @@ from __future__ import annotations
 import cmath
 import contextlib
 from functools import lru_cache
-from itertools import pairwise, product
+from itertools import chain, pairwise, product
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -33,6 +33,7 @@ SLOWEST = 0.01  # m/s, of a reference with a constant or a largest speed
 Speed = Annotated[float, Field(ge=SLOWEST, le=20)]
 Duration = Annotated[float, Field(ge=0.1, le=3600)]
 Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
+EndCurvature = Annotated[float, Field(ge=-20, le=20)]
 
 # Polynomials that rise from 0 to 1 on (0, 1); the first 2 (quintic) or 3 (septic) derivatives vanish at both ends.
 _QUINTIC = Polynomial([0, 0, 0, 10, -15, 6])
@@ -299,16 +300,24 @@ class Waypoints(Record):
     start_speed: Annotated[float, Field(ge=0, le=20)] = 0.0
     """Speed along the path at the beginning in m/s, or the largest from which the limits can be kept, if that is less;
     only for an open curve with `timing` = `limits`. Less than 1 mm/s counts as rest."""
-    start_curvature: Annotated[float, Field(ge=-20, le=20)] = 0.0
-    """Curvature in 1/m with which an open curve begins, positive to the left; exact where its first two points are near
-    each other."""
+    start_curvature: EndCurvature = 0.0
+    """Curvature in 1/m of the arc through the first two points with which an open curve begins, positive to the left; 0
+    for a beginning without curvature and sharpness."""
+    end_curvature: EndCurvature = 0.0
+    """Curvature in 1/m of the arc through the last two points with which an open curve ends, likewise."""
+    cusp_curvatures: tuple[tuple[EndCurvature, EndCurvature], ...] = ()
+    """Curvatures in 1/m with which the curve comes to each cusp between its ends and leaves it, positive to the left of
+    the way; empty for none."""
 
     @model_validator(mode="after")
     def _regular(self) -> Waypoints:
         if self.start_speed and (self.closed or self.timing != "limits"):
             raise ValueError("start_speed: only an open curve with timing = limits has one")
-        if self.start_curvature and self.closed:
-            raise ValueError("start_curvature: only an open curve has one")
+        for name in ("start_curvature", "end_curvature"):
+            if getattr(self, name) and self.closed:
+                raise ValueError(f"{name}: only an open curve has one")
+        if len(self.cusp_curvatures) not in (0, between := sum(cusp > 0 for cusp in self.cusps)):
+            raise ValueError(f"cusp_curvatures: has {len(self.cusp_curvatures)} pairs, but there are {between} cusps")
         if self.cusps:
             return self._turning()
         least = 3 if self.closed else 2
@@ -347,12 +356,16 @@ class Waypoints(Record):
     def _parts(self) -> list[tuple[Waypoints, bool]]:
         """The curves between the cusps, and whether each is driven in reverse."""
         places = [0, *(cusp for cusp in self.cusps if cusp), len(self.points) - 1]
-        first, rest = 0 in self.cusps, {"start_speed": 0.0, "start_curvature": 0.0}
-        whole = self.model_copy(update={"cusps": ()})
-        return [
-            (whole.model_copy(update={"points": self.points[a : b + 1], **(rest if k else {})}), (k + first) % 2 == 1)
-            for k, (a, b) in enumerate(pairwise(places))
-        ]
+        first, between = 0 in self.cusps, self.cusp_curvatures or ((0.0, 0.0),) * (len(places) - 2)
+        curvatures = [self.start_curvature, *chain.from_iterable(between), self.end_curvature]
+        whole = self.model_copy(update={"cusps": (), "cusp_curvatures": ()})
+        parts = []
+        for k, (a, b) in enumerate(pairwise(places)):
+            ends = {"start_curvature": curvatures[2 * k], "end_curvature": curvatures[2 * k + 1]}
+            rest = {"start_speed": 0.0} if k else {}
+            part = whole.model_copy(update={"points": self.points[a : b + 1], **ends, **rest})
+            parts.append((part, (k + first) % 2 == 1))
+        return parts
 
     def _sample_parts(self, t: Array) -> Motion:
         """Samples a curve with cusps at the times t in s, shape (T,); V is negative in reverse."""
@@ -372,12 +385,13 @@ class Waypoints(Record):
 
     @property
     def _path(self) -> Spline:
-        return spline(self.points, self.closed, self.start_curvature)
+        return spline(self.points, self.closed, (self.start_curvature, self.end_curvature))
 
     @property
     def _law(self) -> SmoothLaw:
         start = self.start_speed if self.start_speed >= 1e-3 else 0.0
-        return _time_law(self.points, self.closed, self.start_curvature, self.speed, self.limits, start)  # type: ignore[arg-type]
+        curvatures = self.start_curvature, self.end_curvature
+        return _time_law(self.points, self.closed, curvatures, self.speed, self.limits, start)  # type: ignore[arg-type]
 
     @property
     def period(self) -> float:
@@ -411,13 +425,13 @@ class Waypoints(Record):
 def _time_law(
     points: tuple[tuple[float, float], ...],
     closed: bool,
-    curvature: float,
+    curvatures: tuple[float, float],
     speed: float,
     limits: Limits,
     start: float,
 ) -> SmoothLaw:
     """The time law along the spline through the points."""
-    curve = spline(points, closed, curvature)
+    curve = spline(points, closed, curvatures)
     path = sample_path(lambda s: curve.at(s)[2:], curve.s, closed, limits, speed, start)
     return smooth(path, limits, speed, start)
 

@@ -21,29 +21,42 @@ def plane(points: tuple[tuple[float, float], ...], closed: bool) -> Plane:
     return np.array([complex(*point) for point in (*points, *points[: int(closed)])])
 
 
+def _end(chord: complex, curvature: float, side: int) -> list[tuple[int, Array]]:
+    """Returns the derivatives that determine an open spline at its start (side −1) or end (1), by their order.
+
+    Args:
+        chord: From the first point there to the second, x + i y in m.
+        curvature: Curvature of the arc over the chord in 1/m; 0 for an end without curvature and sharpness.
+        side: Which end.
+    """
+    if not curvature:
+        return [(2, np.zeros(2)), (3, np.zeros(2))]
+    half = np.arcsin(np.clip(curvature * abs(chord) / 2, -1, 1))  # angle between chord and tangent
+    tangent = chord / abs(chord) * np.exp(1j * side * half)
+    return [(n, np.array([d.real, d.imag])) for n, d in ((1, tangent), (2, 1j * curvature * tangent))]
+
+
 class Spline:
     """A planar quintic spline by arc length s; its own parameter u is the accumulated chord length, both in m."""
 
-    def __init__(self, points: tuple[tuple[float, float], ...], closed: bool, curvature: float = 0.0) -> None:
+    def __init__(
+        self, points: tuple[tuple[float, float], ...], closed: bool, curvatures: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
         """Interpolates points.
 
-        An open spline has no curvature and no sharpness at its ends, or begins with the second and third derivative of
-        an arc through its first two points.
+        An open spline has no curvature and no sharpness at its ends, or the tangent and the curvature of an arc through
+        the two points there.
 
         Args:
             points: Points (x, y) in m in their order, no two neighbours alike.
             closed: Whether the curve goes on from the last point to the first.
-            curvature: Curvature of the arc with which an open curve begins in 1/m, positive to the left.
+            curvatures: Curvatures of the arcs at either end of an open curve in 1/m, positive to the left; 0 for none.
         """
         from scipy.interpolate import make_interp_spline  # imported here, so that settings are read without scipy
 
         p = plane(points, closed)
         knots = np.append(0, np.cumsum(np.abs(np.diff(p))))
-        straight = [(2, np.zeros(2)), (3, np.zeros(2))]
-        chord = p[1] - p[0]
-        bend = 1j * curvature * chord / abs(chord) * np.exp(-0.5j * curvature * abs(chord))
-        turning = [(n, np.array([d.real, d.imag])) for n, d in ((2, bend), (3, 1j * curvature * bend))]
-        ends = "periodic" if closed else (turning if curvature else straight, straight)
+        ends = "periodic" if closed else tuple(map(_end, (p[1] - p[0], p[-1] - p[-2]), curvatures, (-1, 1)))
         curve = make_interp_spline(knots, np.stack([p.real, p.imag], -1), k=5, bc_type=ends)  # type: ignore[arg-type]
         self.curves = [curve, *(curve.derivative(n) for n in (1, 2, 3))]
         self.u = np.append(np.linspace(knots[:-1], knots[1:], 64, endpoint=False).T, knots[-1])

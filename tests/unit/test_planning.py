@@ -5,6 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import shapely
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 from test_obstacles import judged, random_shapes
 
 from mrctl import Box, Disc, InputError, Limits, Obstacles, Scenario
@@ -263,6 +265,28 @@ def test_reference():
     assert np.allclose(pose[:, -1], (-1, 0, 0), atol=1e-6)
 
 
+@pytest.mark.parametrize("reverse", [False, True])
+@settings(max_examples=30)
+@given(goal=st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(-3, 3)))
+def test_reference_has_the_headings_of_the_plan(reverse, goal):
+    """At start, goal and cusps the reference has the heading of the plan, and curvatures no tighter than it."""
+    where = prepared(Obstacles(shapes=(Disc(x=3.9, y=3.9),)))
+    assume(np.hypot(*goal[:2]) > 0.1)
+    found = plan(where, (0, 0, 0.4), goal, RADIUS, reverse)
+    cusps = np.flatnonzero(found.directions[2:] * found.directions[1:-1] < 0) + 1
+    ends = [0, *cusps, len(found.poses) - 1]
+    assume(all(np.hypot(*np.diff(found.poses[a : b + 1, :2], axis=0).T).sum() > 0.02 for a, b in pairwise(ends)))
+    reference = found.reference(0.5, Limits())
+    times = np.cumsum([0.0, *(part.period for part, _ in reference._parts)])
+    for time, pose in zip(times, found.poses[ends], strict=True):
+        for side in (-1e-9, 1e-9):
+            driven = reference.sample(np.array([np.clip(time + side, 0, times[-1])])).pose[0]
+            assert np.allclose(driven[:2], pose[:2], atol=1e-6)
+            assert np.cos(driven[2] - pose[2]) > 1 - 1e-8
+    curvatures = [reference.start_curvature, *np.ravel(reference.cusp_curvatures), reference.end_curvature]
+    assert np.abs(curvatures).max() < 1.001 / RADIUS
+
+
 @pytest.mark.parametrize("curvature", [0.0, -1.2])
 def test_run_out(curvature):
     """It is an arc, by fine steps of the unicycle, on which a plan begins with about the speed and ends at rest."""
@@ -279,7 +303,7 @@ def test_run_out(curvature):
     assert np.hypot(*np.diff(arc[:, :2], axis=0).T).max() <= planning.CHECK
     way = planning.Plan(arc, np.append(0.0, np.ones(len(arc) - 1)), length, 0)
     course = way.reference(0.7, limits, velocity=0.7, curvature=curvature)
-    assert course.sample(np.zeros(1)).twist[0] == pytest.approx([0.7, 0.7 * curvature], rel=0.1)
+    assert course.sample(np.zeros(1)).twist[0] == pytest.approx([0.7, 0.7 * curvature], rel=0.1, abs=1e-9)
 
 
 CAR = Vehicle.of(Scenario())
@@ -295,7 +319,7 @@ def test_begins_as_the_robot_drives(twist, goal):
     motion = course.sample(np.zeros(1))
     v, omega = motion.twist[0]
     assert np.allclose(motion.pose[0], task.start, atol=6e-3)
-    assert 0.75 * twist[0] < v < 1.0001 * twist[0] and omega / v == pytest.approx(twist[1] / twist[0], abs=0.02)
+    assert 0.74 * twist[0] < v < 1.0001 * twist[0] and omega / v == pytest.approx(twist[1] / twist[0], abs=0.02)
     assert np.allclose(found.poses[0], task.start) and found.directions[0] == 0 and np.all(found.directions[1:] == 1)
     assert np.hypot(*np.diff(found.poses[:, :2], axis=0).T).max() < planning.CHECK + 1e-9
 

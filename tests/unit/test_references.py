@@ -376,9 +376,27 @@ def test_start_of_a_turning_robot(curvature: float, monkeypatch: pytest.MonkeyPa
     turning = Waypoints.from_dict(CUSPS | {"cusps": (2, 4), "start_speed": 0.3, "start_curvature": 0.01})
     (first, _), *others = turning._parts
     assert (first.start_speed, first.start_curvature) == (0.3, 0.01)
-    assert all(part.start_speed == part.start_curvature == 0 for part, _ in others)
+    assert all(part.start_speed == part.start_curvature == part.end_curvature == 0 for part, _ in others)
     assert turning.sample(np.zeros(1)).twist[0, 0] == pytest.approx(0.3, rel=0.01)
     assert Waypoints.from_dict(turning.model_dump(mode="json")) == turning
+
+
+@given(first=st.floats(-2, 2), last=st.floats(-2, 2), heading=st.floats(-1, 1))
+def test_ends_on_arcs(first: float, last: float, heading: float) -> None:
+    """An open curve has the headings and curvatures of the arcs at its ends."""
+    assume(min(abs(first), abs(last)) > 1e-3)
+
+    def arc(curvature: float, s: float) -> complex:
+        return (np.exp(1j * curvature * s) - 1) / (1j * curvature)
+
+    points = [arc(first, s) for s in (0.0, 0.05, 0.25)]
+    points += [2 + 0.5j + np.exp(1j * heading) * arc(last, s) for s in (-0.25, -0.05, 0.0)]
+    plane = [(z.real, z.imag) for z in points]
+    course = Waypoints(
+        points=plane, closed=False, timing="limits", speed=0.5, start_curvature=first, end_curvature=last
+    )
+    (_, theta, curvature, _) = course._path.at(np.array([0.0, course._path.length]))
+    assert np.allclose(theta, (0, heading), atol=1e-4) and np.allclose(curvature, (first, last), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -389,9 +407,12 @@ def test_start_of_a_turning_robot(curvature: float, monkeypatch: pytest.MonkeyPa
         ({"start_speed": -0.5}, "start_speed"),
         ({"start_curvature": 0.5}, "start_curvature: only an open curve"),
         ({"start_curvature": 50.0, "closed": False}, "start_curvature"),
+        ({"end_curvature": -0.5}, "end_curvature: only an open curve"),
+        ({"cusp_curvatures": [(0.1, 0.2)], "closed": False}, "cusp_curvatures: has 1 pairs, but there are 0 cusps"),
+        (CUSPS | {"cusps": (0, 2), "cusp_curvatures": [(0, 0)] * 2}, "cusp_curvatures: has 2 pairs, but there are 1"),
     ],
 )
-def test_bad_start(changes: dict, words: str) -> None:
-    """A start speed without a time law that keeps limits, and a start of a closed curve are refused."""
+def test_bad_ends(changes: dict, words: str) -> None:
+    """A start speed without a time law that keeps limits, the ends of a closed curve, and wrong cusps are refused."""
     with pytest.raises(InputError, match=f"^{words}"):
         Waypoints.from_dict(changes)
