@@ -253,7 +253,7 @@ def prepared(
     except NoWay:
         if not (reactive and vehicle.reverses):
             raise
-        planned(task, vehicle, speed, margin, reverse=True)  # raises, too, if there is no way in reverse
+        _planned(task, vehicle, speed, margin, None, True, (0.0, 0.0), True)  # raises, too, if there is none in reverse
         raise InputError(f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may") from None
     laps = PATIENCE if avoid == "none" else WAITING
     own = {"obstacles": task.obstacles, "map": task.map, "reference": reference, "laps": laps}
@@ -282,9 +282,13 @@ def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] |
         plan = open_waypoints(scenario.reference)
         goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
         start = Task.from_dict({"obstacles": scenario.known, "start": pose.tolist(), "goal": goal})
-        with contextlib.suppress(InputError):  # it waits, and tries again
-            keeps, now = avoid not in REACTIVE, (float(twist[0]), float(twist[1]))
+        keeps, now = avoid not in REACTIVE, (float(twist[0]), float(twist[1]))
+        try:
             return planned(start, vehicle, plan.speed, SLIM, outlines, keeps and vehicle.reverses, now, keeps)[1]
+        except NoWay:
+            raise
+        except InputError:  # it waits, and tries again
+            return None
 
     def made(robot: Robot, size: int) -> Pacing | Window | Mppi:
         if avoid == "barrier":
@@ -330,8 +334,6 @@ def planned(
     fastest = vehicle.robot.max_speed
     if speed is not None and not SLOWEST <= speed <= fastest:
         raise InputError(f"speed: must be between {SLOWEST:g} and {fastest:g} m/s, not {speed:g}")
-    speed = RESERVE * fastest if speed is None else speed
-    outlines = Surroundings(task.known).at(0.0) if outlines is None else outlines
     try:
         return _planned(task, vehicle, speed, margin, outlines, False, twist, keeps)
     except InputError:  # there is no way, or none that the robot can drive
@@ -343,9 +345,9 @@ def planned(
 def _planned(
     task: Task,
     vehicle: Vehicle,
-    speed: float,
+    speed: float | None,
     margin: float,
-    outlines: Outlines,
+    outlines: Outlines | None,
     reverse: bool,
     twist: tuple[float, float],
     keeps: bool,
@@ -355,9 +357,9 @@ def _planned(
     Args:
         task: World, start and goal.
         vehicle: The robot.
-        speed: Largest speed in m/s.
+        speed: Largest speed in m/s; by default 0.9 of the robot's.
         margin: Clearance that the plan keeps in m.
-        outlines: The obstacles.
+        outlines: The obstacles; by default those on the map.
         reverse: Whether the plan may reverse.
         twist: V in m/s and θ̇ in rad/s at the start.
         keeps: Whether the robot keeps the plan in time.
@@ -368,6 +370,8 @@ def _planned(
             touch an obstacle on it.
     """
     known, (corners, robot, _) = task.known, vehicle
+    speed = RESERVE * robot.max_speed if speed is None else speed
+    outlines = Surroundings(known).at(0.0) if outlines is None else outlines
     radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (
         WIDER if reverse else 1
     )

@@ -546,6 +546,7 @@ def search(
     turns, lengths = np.zeros(PIECES), np.zeros(PIECES)
     tree.poses[0], tree.parents[0], tree.turns[0], tree.lengths[0], tree.costs[0] = start, -1, 0.0, 0.0, 0.0
     tree.direct[0], tree.again[0] = shortest(start, goal, radius, reverse, turns, lengths), 0.0
+    checks = int(np.ceil(step / CHECK))  # of an arc, as `free_length` makes them, to the last bit of its end
     queue, late, expanded = [(0.0, 0)], [0 for _ in range(0)], 0
     while len(queue) + len(late) > 0:
         delayed = len(queue) == 0  # there is no way but by a shortest path that was not tried
@@ -575,13 +576,14 @@ def search(
             continue
         for choice in range(6 if reverse else 3):
             turn, way = float(choice % 3 - 1), step if choice < 3 else -step
-            if free_length(pose, turn, radius, way, where, sides, end) < step:
-                continue
+            advance(pose, turn, radius, way * checks / checks, end)
             row, column, heading = cell_of(end, where)
             gear = int(np.sign(way) + 1) % gears
             cost = tree.costs[now] + cost_of(way, last)
             rival = best[row, column, heading, gear]
-            if ahead[row, column] == np.inf or (rival and tree.costs[rival - 1] <= cost):
+            if row < 0 or ahead[row, column] == np.inf or (rival and tree.costs[rival - 1] <= cost):
+                continue
+            if free_length(pose, turn, radius, way, where, sides, end) < step:  # which takes most of the time
                 continue
             tree.direct[n] = shortest(end, goal, radius, reverse, turns, lengths)
             estimate = weight * max(ahead[row, column] - SLACK * cell, tree.direct[n])

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from mrctl.kernel import Array
-from mrctl.navigation.sight import Sight
+from mrctl.navigation.planning import NoWay
+from mrctl.navigation.sight import SPACING, Sight
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.obstacles import Outlines, Pose
 from mrctl.theory.references import Reference, Waypoints
 
+# m, rad and m, within which robot and obstacles are where they were when there was no way: more than the noise. Chosen.
+SAME = 0.02, 0.05, SPACING
 SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
 
 Replan = Callable[[Scenario, Vehicle, Array, Array, Outlines, Waypoints | None], Waypoints | None]
 """Plans for the mission of a scenario with its robot, from a pose in m, m, rad, `(3,)`, and a twist in m/s and rad/s,
 `(2,)`, among obstacles as they are now, to the end of a plan that an event brought, or else to the goal of the mission;
-None where there is no way."""
+raises `NoWay` where a search has found none, and returns None where there was none for another reason."""
 
 
 def open_waypoints(reference: Reference) -> Waypoints:
@@ -50,6 +55,7 @@ class Planner:
         self.scenario, self.first = scenario, open_waypoints(scenario.reference)
         self.sight, self.vehicle, self._replan = sight, vehicle, replan
         self._given: Waypoints | None = None  # the plan that came since the start
+        self._hopeless: tuple[Array, Outlines] | None = None  # where, and among what, a search last found no way
 
     @classmethod
     def each(cls, replan: Replan, scenarios: Sequence[Scenario]) -> list[Planner]:
@@ -59,7 +65,7 @@ class Planner:
 
     def reset(self) -> None:
         """Forgets the plan that was taken, and all that scans have shown."""
-        self._given = None
+        self._given = self._hopeless = None
         self.sight.forget()
 
     def take(self, plan: Reference) -> Waypoints:
@@ -68,7 +74,7 @@ class Planner:
         Raises:
             InputError: It is no plan.
         """
-        self._given = open_waypoints(plan)
+        self._given, self._hopeless = open_waypoints(plan), None
         return self._given
 
     @property
@@ -86,8 +92,33 @@ class Planner:
             time: Time in s.
 
         Returns:
-            The plan, or None where there is no way.
+            The plan, or None where there is no way. Where a search has found none, it is not repeated until the robot
+            or an obstacle is elsewhere: that there is no way takes a search far longer than to find one.
         """
-        start = self.scenario, self.vehicle, pose, twist
-        far = self._replan(*start, self.sight.around(time, self.vehicle.footprint, pose), self._given)
-        return far or self._replan(*start, self.sight.outlines(time), self._given)
+        near, far = self.sight.outlines(time), self.sight.around(time, self.vehicle.footprint, pose)
+        if self._hopeless and _same(self._hopeless, (pose, near)):
+            return None
+        for outlines in (near,) if np.array_equal(near.discs, far.discs) else (far, near):
+            try:
+                if plan := self._replan(self.scenario, self.vehicle, pose, twist, outlines, self._given):
+                    return plan
+            except NoWay:
+                if outlines is near:
+                    self._hopeless = pose.copy(), near
+        return None
+
+
+def _same(one: tuple[Array, Outlines], other: tuple[Array, Outlines]) -> bool:
+    """Tells whether pose and obstacles are the same within `SAME`."""
+    (pose, before), (now, after) = one, other
+    turn = np.angle(np.exp(1j * (now[2] - pose[2])))
+    if (
+        np.hypot(*(now[:2] - pose[:2])) > SAME[0]
+        or abs(turn) > SAME[1]
+        or not np.array_equal(before.edges, after.edges)
+    ):
+        return False
+    if not (len(before.discs) and len(after.discs)):
+        return len(before.discs) == len(after.discs)
+    away = np.hypot(*(before.discs[:, None, :2] - after.discs[None, :, :2]).transpose(2, 0, 1))
+    return bool(max(away.min(axis=0).max(), away.min(axis=1).max()) <= SAME[2])

@@ -1,0 +1,109 @@
+"""Plans on the way: a search that has found no way is repeated when something has changed, and not before."""
+
+import numpy as np
+import pytest
+
+from mrctl import Disc, InputError, Obstacles, Scenario
+from mrctl.navigation import planning
+from mrctl.navigation.mission import prepared, task_of
+from mrctl.navigation.planning import NoWay
+from mrctl.navigation.replanning import Planner
+from mrctl.navigation.sight import Sight
+from mrctl.navigation.vehicle import Vehicle
+from mrctl.theory.obstacles import Surroundings
+from mrctl.theory.references import Waypoints
+
+WAY = Waypoints(points=((0.0, 0.0), (1.0, 0.0)), closed=False)
+REST = np.zeros(2)
+
+
+class Seen(Sight):
+    """Sees what it is told to see: discs, x and y in m, `(k, 2)`."""
+
+    def __init__(self, known: Obstacles) -> None:
+        super().__init__(known)
+        self.show()
+
+    def show(self, *discs: tuple[float, float]) -> None:
+        """Lets these be all that is seen, standing."""
+        self._found = np.array([(x, y, 0.0, 0.0, 0.0) for x, y in discs]).reshape(-1, 5)
+        shapes = tuple(Disc(x=x, y=y, radius=0.05) for x, y in discs)
+        self.standing = Surroundings(Obstacles(shapes=shapes)).at(0.0)
+
+
+class Tries:
+    """Stands for the search: counts its calls, and answers as it is told to."""
+
+    def __init__(self) -> None:
+        self.count, self.answer = 0, NoWay("goal: there is no way")
+
+    def __call__(self, *_: object) -> Waypoints | None:
+        self.count += 1
+        if isinstance(self.answer, NoWay):
+            raise self.answer
+        return self.answer
+
+
+@pytest.fixture
+def planner() -> Planner:
+    """A planner before a disc, whose search finds no way."""
+    scenario = Scenario(reference=WAY, laps=1)
+    return Planner(Tries(), scenario, Seen(Obstacles(shapes=(Disc(x=3.0, radius=0.2),))), Vehicle.of(scenario))
+
+
+def searches(planner: Planner, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> int:
+    """Returns how often the search is asked for one plan, which there is not."""
+    before = planner._replan.count
+    assert planner.plan(np.array(pose), REST, 1.0) is None
+    return planner._replan.count - before
+
+
+def test_no_way_is_not_searched_again(planner: Planner) -> None:
+    """Noise changes nothing; the robot elsewhere, an obstacle more or less, another goal or another run do."""
+    planner.sight.show((1.0, 0.0))
+    assert searches(planner) == 2  # with a margin, and without
+    assert searches(planner) == 0
+    planner.sight.show((1.01, -0.02))
+    assert searches(planner, (0.01, 0.005, -0.01)) == 0
+    assert searches(planner, (0.03, 0.0, 0.0)) == 2
+    assert searches(planner, (0.03, 0.0, 0.1)) == 2
+    planner.sight.show((1.0, 0.0), (1.0, 1.0))
+    assert searches(planner, (0.03, 0.0, 0.1)) == 2
+    planner.sight.show((1.0, 1.0))
+    assert searches(planner, (0.03, 0.0, 0.1)) == 2
+    planner.take(WAY)
+    assert searches(planner, (0.03, 0.0, 0.1)) == 2
+    planner.reset()
+    planner.sight.show((1.0, 1.0))
+    assert searches(planner, (0.03, 0.0, 0.1)) == 2
+
+
+def test_other_refusals_are_tried_again(planner: Planner) -> None:
+    """That the robot seems to be within the margin of an obstacle may be noise, and costs no search."""
+    planner._replan.answer = None
+    planner.sight.show((1.0, 0.0))
+    assert searches(planner) == searches(planner) == 2
+    planner._replan.answer = WAY
+    assert planner.plan(np.zeros(3), REST, 1.0) is WAY
+
+
+def test_margin_around_nothing(planner: Planner) -> None:
+    """Where nothing but the map is known, there is no margin to leave out in a second search."""
+    assert searches(planner) == 1 and searches(planner) == 0
+
+
+def test_no_way_is_proven_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bay that takes reversing is refused to `mppi` after one search forward, and one in reverse."""
+    scenario, tried = Scenario.from_dict({"robot": {"path": "turtlebot"}}), []
+    task, search = task_of("parking_bay:3", scenario), planning.search.compiled
+
+    class Counted:
+        @staticmethod
+        def compiled(*arguments: object) -> object:
+            tried.append(arguments[4])
+            return search(*arguments)
+
+    monkeypatch.setattr(planning, "search", Counted)
+    with pytest.raises(InputError, match="never plans in reverse"):
+        prepared(task, scenario, avoid="mppi")
+    assert tried == [False, True]
