@@ -285,6 +285,8 @@ class Simulation:
         self.courses = (RestartingCourses if restarting else Courses)(scenarios, self.preview)
         self.plant = self._build_plant(models, robot, worthwhile(threads, size))
         self.hierarchy = UserHierarchy(scenarios, robot, users) if users else Hierarchy(scenarios, robot)
+        for event in (event for scenario in scenarios for event in scenario.events):
+            self._check_gains(event)
         self.hierarchy.scanner = self._build_scanner()
         self.sensors = Sensors([s.sensing for s in scenarios], [s.seed for s in scenarios], self.period)
         self.estimator = self._build_estimator(own_estimator)
@@ -301,6 +303,13 @@ class Simulation:
         for scenario in self.scenarios:
             for reference in (scenario.reference, *(e.reference for e in scenario.events if e.reference)):
                 check(reference, robot, self._reverses)
+
+    def _check_gains(self, event: Event) -> None:
+        """Refuses an event with gains for a motion controller that has none of that kind."""
+        if event.kanayama is not None and not self.hierarchy.tunable:
+            raise InputError(
+                f"kanayama: the motion controller {self._stages['motion']} does not take gains in an event"
+            )
 
     def _build_plant(self, models: Sequence[Any], robot: Robot, threads: int) -> Plant:
         """Builds the physics; refuses perturbations of events, before anything is computed."""
@@ -368,6 +377,7 @@ class Simulation:
             raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self.period:g} s")
         if event.reference is not None and event.tick(self.period) < self.tick + self.preview:
             raise InputError(f"time: a reference must be known {self.preview * self.period:g} s before it begins")
+        self._check_gains(event)
         if event.perturbation is not None:
             self.plant.check(event.perturbation)
         if event.reference is not None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.control.feedforward import Learner
-from mrctl.control.kanayama import posture_error
+from mrctl.control.kanayama import Kanayama, posture_error
 from mrctl.control.pid import pid
 from mrctl.kernel import Array, Rows, kernel, over_rows
 from mrctl.loop.hierarchy import Hierarchy, apply_voltages, command_motion, hand_over, request_motion
@@ -124,6 +124,12 @@ class UserHierarchy(Hierarchy):
             self.faults = self.non_finite() | self.faults
         self.tick += 1
         return self.output
+
+    def set_kanayama(self, row: int, gains: Kanayama) -> None:
+        """Changes the gains of one robot; see `Hierarchy.set_kanayama`. A user's motion controller is told."""
+        super().set_kanayama(row, gains)
+        if stage := self.stages.get("motion"):
+            stage.ask("tune", row, self.settings[row].kanayama.completed(self.settings[row].design.kanayama))
 
     def set_reference(self, row: int, reference: Reference) -> None:
         """Tells the user's motion controller, if it asks for that, that one robot has another reference."""

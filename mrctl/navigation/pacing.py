@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mrctl.control.kanayama import kanayama, posture_error
+from mrctl.control.kanayama import Kanayama, kanayama, posture_error
 from mrctl.kernel import Array, over_rows
 from mrctl.loop.goals import RESTING
 from mrctl.loop.hierarchy import Hierarchy
@@ -39,6 +39,10 @@ class Following:
         """Takes the nominal robot, and the scenario of each robot of a group."""
         alone = [scenario.model_copy(update={"learner": "none", "learned": None}) for scenario in scenarios]
         self._gains = Hierarchy(alone, robot).state["kanayama"]  # which do not depend on the learner
+
+    def tune(self, row: int, gains: Kanayama) -> None:
+        """Changes the gains of one robot, all of which are set."""
+        self._gains[row] = gains.k_x, gains.k_y, gains.k_theta
 
     def output(self, pose: Array, reference: Array) -> Array:
         """Returns the requested twists, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
@@ -129,6 +133,10 @@ class Pacing:
         """Takes another plan for one robot, which is a way to another goal."""
         self._begin(row, self._planners[row].take(plan))
 
+    def tune(self, row: int, gains: Kanayama) -> None:
+        """Takes the gains that an event brings for one robot."""
+        self._follow.tune(row, gains)
+
     def _begin(self, row: int, plan: Waypoints) -> None:
         """Lets a robot drive a plan from its beginning, at the pace at which it keeps its speed."""
         self._plans[row], self._kept[row] = self._sampled(plan, 0), self._margin(plan, row)
@@ -182,9 +190,8 @@ class Pacing:
             allowed = approach.compiled(left, self._brakes, self._period) / max(abs(float(request[0])), 1e-9)
         moving = sight.moving(self._period * self._tick)
         around = (sight.map, self._kept[row]), (sight.standing, self._near), (moving, self._away)
-        return min(
-            allowed, *(share(request, pose, *each) for each in around if len(each[0].discs) + len(each[0].rings))
-        )
+        near = [each for each in around if len(each[0].discs) + len(each[0].rings)]
+        return min([allowed, *(share(request, pose, *each) for each in near)])
 
     def _get_on(self, row: int, pose: Array, velocity: float) -> None:
         """Gives a robot another plan, if what stands there has hardly let it get on, or if the map lets it.

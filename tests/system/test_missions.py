@@ -9,10 +9,11 @@ import pytest
 from test_commands import refused
 
 import mrctl
-from mrctl import Box, Disc, Obstacles, Scenario, cli
+from mrctl import Box, Disc, Event, InputError, Kanayama, Obstacles, Scenario, cli
+from mrctl.loop.simulation import Simulation
 from mrctl.navigation.avoidance import Avoiding, Barrier
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import Avoid, again, jerk_of, navigate, order_of, task_of
+from mrctl.navigation.mission import Avoid, again, avoiding, jerk_of, navigate, order_of, prepared, task_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.theory.clearance import cover
@@ -304,3 +305,34 @@ def test_filter_in_the_loop() -> None:
     assert result["failure"] == "" and 0.02 < float(result["clearance"].min()) < 0.3
     early = result["clearance"] > 1.0
     assert np.array_equal(result["v_command"].where(early, drop=True), hit["v_command"][: int(early.sum())])
+
+
+@pytest.mark.parametrize("avoid", ["none", "barrier"])
+def test_event_changes_gains(avoid: Avoid) -> None:
+    """An event with gains of Kanayama's law acts with `barrier` as with none: from the start on, as in the scenario."""
+    task, gains = Task(obstacles=Obstacles(), start=(0, 0, 0), goal=(2, 0.5, 0)), Kanayama(k_x=0.5, k_y=3.0)
+    found = [
+        navigate(task, scenario, avoid=avoid).result
+        for scenario in (
+            PID,
+            PID.replace(kanayama=gains),
+            PID.replace(events=(Event(time=0.0, kanayama=gains),)),
+            PID.replace(events=(Event(time=1.0, kanayama=gains),)),
+        )
+    ]
+    x = [run["x"].values[0] for run in found]
+    assert np.array_equal(x[1], x[2]) and not np.array_equal(x[0], x[1])
+    assert np.array_equal(x[0][:100], x[3][:100]) and not np.array_equal(x[0][:200], x[3][:200])
+
+
+@pytest.mark.parametrize("avoid", ["window", "mppi"])
+def test_event_with_gains_is_refused(avoid: Avoid) -> None:
+    """Motion controllers without gains of Kanayama's law refuse an event that changes them, also during the run."""
+    task, event = Task(obstacles=Obstacles(), start=(0, 0, 0), goal=(2, 0.5, 0)), Event(time=1.0, kanayama=Kanayama())
+    message = f"^kanayama: the motion controller {avoid} does not take gains in an event$"
+    with pytest.raises(InputError, match=message):
+        navigate(task, PID.replace(events=(event,)), avoid=avoid)
+    running = Simulation([prepared(task, PID, avoid=avoid)[1]], motion=avoiding(avoid))
+    with pytest.raises(InputError, match=message):
+        running.add(event)
+    assert running.scenarios[0].events == ()
