@@ -18,7 +18,7 @@ from mrctl.experiments.tables import markdown, number
 from mrctl.loop.simulation import simulate
 from mrctl.navigation import mission
 from mrctl.navigation.mission import Avoid, avoiding, prepared, task_of
-from mrctl.navigation.mppi import SAMPLES, SPREAD, WORTH, Mppi
+from mrctl.navigation.mppi import SAMPLES, SPREAD, TEMPERATURE, WORTH, Mppi
 from mrctl.navigation.planning import cost_to_go, plan, space
 from mrctl.navigation.rollouts import KNOTS, STEPS, roll_out
 from mrctl.navigation.vehicle import Vehicle
@@ -167,7 +167,7 @@ def _mppi(turns: int) -> dict[str, Any]:
     nominal, period, scene = np.zeros((STEPS, 2)), own.motion_period, arguments[-1]
     twists, costs = np.empty((SAMPLES, STEPS, 2)), np.empty(SAMPLES)
     state = pose[0], twist[0], twist[0], 0.0, period, bounds, scene
-    bare = partial(roll_out.compiled, knots, nominal, *state, WORTH, twists, costs)
+    bare = partial(roll_out.compiled, knots, nominal, *state, WORTH * TEMPERATURE, twists, costs)
     name = f"MPPI, {SAMPLES:,} samples of {STEPS} steps"
     return _pair(name, partial(stage.choose, *arguments), "its roll-outs alone", bare, turns)
 

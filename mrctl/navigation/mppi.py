@@ -18,7 +18,8 @@ from mrctl.theory.robot import Robot
 
 SAMPLES = 2000
 TEMPERATURE = 0.05  # λ, in units of the cost; chosen
-WORTH = 40 * TEMPERATURE  # what a sample may cost more than another one and still weigh something: exp(−40) is 4e-18
+ORDINARY = 0.2  # m/s, largest V below which λ falls as V², as the costs by which the roll-outs differ do; chosen
+WORTH = 40  # λ, that a sample may cost more than another one and still weigh something: exp(−40) is 4e-18
 KEPT = 40  # of the samples, which are kept to be looked at
 SPREAD = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
 MOST_LAG = 10.0  # s
@@ -64,12 +65,14 @@ class Mppi(Reactive):
         knots[1] = -bounds.speed, 0.0
         nominal[:-1] = nominal[1:].copy()  # a period has passed
         state = pose, twist, last, self._lag, period, bounds, scene
-        roll_out.compiled(knots, nominal, *state, WORTH, twists, costs)
-        weights = np.exp((costs.min() - costs) / TEMPERATURE)
+        temperature = TEMPERATURE * min(1.0, bounds.speed / ORDINARY) ** 2
+        worth = WORTH * temperature
+        roll_out.compiled(knots, nominal, *state, worth, twists, costs)
+        weights = np.exp((costs.min() - costs) / temperature)
         mean = (weights[:, None, None] / weights.sum() * twists).sum(axis=0)  # BLAS adds in an order of its own
         cheapest, some = twists[costs.argmin()].copy(), twists[:: SAMPLES // KEPT].copy()
         touches = costs.min() >= TOUCH
-        roll_out.compiled(knots[:1], mean, *state, WORTH, twists[:1], costs[:1])
+        roll_out.compiled(knots[:1], mean, *state, worth, twists[:1], costs[:1])
         nominal[:] = mean if touches or costs[0] < TOUCH else cheapest
         self.considered[row] = Considered(pose.copy(), some, nominal.copy())
         return nominal[0]

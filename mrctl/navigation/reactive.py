@@ -27,7 +27,8 @@ DISCS = 4  # in a row that covers the robot
 AHEAD = 100  # samples of the plan, 20 motion periods, among which its nearest place is looked for
 FINE = 5  # samples of the plan in a motion period
 OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen, like the next two
-WAITED = 1.0, 0.05  # s and m: so does one that within this time gets no farther than this
+# s, m and 1: so does one that within this time gets no farther than this, or than this share of the way at full speed
+WAITED = 1.0, 0.05, 0.5
 RETRY = 1.0  # s, least time between two plans
 STAYS = 1.0  # s at the end of its plan, after which a robot without a goal at which its run ends stays there; chosen
 # How a robot goes back from where there is no way forward; chosen, as all that follows.
@@ -178,7 +179,7 @@ class Agent:
         """
         if self._at_end(pose):
             self._since = now
-        if self._gone(pose) > WAITED[1]:
+        if self._gone(pose) > min(WAITED[1], WAITED[2] * WAITED[0] * self._bounds.speed):
             self._anchor, self._since, self._replanned = pose[:2].copy(), now, False
         lost = (self._away > OFF or now - self._since > WAITED[0]) and now - self._tried > RETRY
         lost, self._looked = lost and self._looked, False

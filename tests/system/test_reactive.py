@@ -151,6 +151,15 @@ def test_keeps_off(start: float) -> None:
     assert driven.table["outcome"].tolist() == ["arrived"] and driven.table["clearance"].iloc[0] > 0.03
 
 
+@pytest.mark.parametrize("avoid", ["window", "mppi"])
+def test_slow(avoid: Avoid) -> None:
+    """A robot whose largest speed is 2 cm/s drives at about that speed, and is not taken for one that is stuck."""
+    task = Task(obstacles=Obstacles(shapes=(Disc(x=0.3, y=0.5),)), start=(0, 0, 0), goal=(0.35, 0.0, 0.0))
+    driven = navigate(task, PLANNED, speed=0.02, avoid=avoid)
+    (row,) = driven.table.itertuples()
+    assert row.outcome == "arrived" and row.time < 1.3 * row.length / 0.02 and float(driven.result["v"].min()) > -0.01
+
+
 def test_control_period() -> None:
     """The motion period is 0.05 s, or the multiple of another control period next to that."""
     task = Task(obstacles=Obstacles(), start=(0, 0, 0), goal=(1, 0, 0))
