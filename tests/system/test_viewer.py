@@ -49,7 +49,8 @@ def browser():
 DRAG_ERROR = "Unable to preventDefault inside passive event listener invocation."  # of viser's page, with any drag
 
 
-# Chromium draws in software, and would keep both cores busy. For tests that do not click or drag in the scene.
+# Chromium draws in software, and would keep both cores busy. For tests that click on nothing in the scene and drag
+# nothing there but the camera.
 SLOWLY = """{
     const draw = window.requestAnimationFrame.bind(window), waiting = new Set();
     let number = 0;
@@ -318,7 +319,7 @@ def test_live(browser, tmp_path):
 
 def test_inputs(browser, tmp_path):
     """A slider becomes an event, a choice another run, a ghost is added; a mistake in a tick is shown, and mended."""
-    with serving(lambda server: Live([BASE], server)) as (live, url), visit(browser, url) as page:
+    with serving(lambda server: Live([BASE], server)) as (live, url), visit(browser, url, slowly=True) as page:
         until(lambda: node(page, ROBOT) is not None, "the scene")
         page.get_by_role("tab", name="Robot").click()
         slider = page.get_by_role("slider").first
@@ -838,7 +839,10 @@ def test_sweep(browser, tmp_path):
     axis = {"field": "perturbation.mass_factor", "uniform": [0.5, 2.0]}
     jobs.run(Sweep.from_dict({"runs": 6, "base": base, "axes": [axis]}), tmp_path / "store", workers=1)
     library = Library(tmp_path / "store")
-    with serving(lambda server: Replay(library, [0], server)) as (replay, url), visit(browser, url) as page:
+    with (
+        serving(lambda server: Replay(library, [0], server)) as (replay, url),
+        visit(browser, url, slowly=True) as page,
+    ):
         page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
         page.get_by_role("tab", name="All runs").click()
         scatter = replay._scatter
