@@ -169,8 +169,9 @@ def figures(result: xr.Dataset, scenarios: Sequence[Scenario], out: Path) -> Non
 
 def summary(result: xr.Dataset) -> pd.DataFrame:
     """Returns the metrics of the last lap of every run, the position error over all laps, and why it failed, or ""."""
-    over_all = metrics.over_laps(metrics.per_lap(result), "position_rmse")
-    return metrics.summary(result).assign(failure=result["failure"].values, position_all=over_all)
+    laps = metrics.per_lap(result)
+    over_all = metrics.over_laps(laps, "position_rmse")
+    return metrics.summary(laps).assign(failure=result["failure"].values, position_all=over_all)
 
 
 def compare(table: pd.DataFrame, scenarios: Sequence[Scenario]) -> list[dict[str, Any]]:
