@@ -128,18 +128,35 @@ class Held:
 
         They are described as Numba does: owners (none), number of items, bytes of one, address, shape, strides.
         """
-        from numba import typeof
-
         self._arrays = arrays
         described = [(0, 0, a.size, a.itemsize, a.ctypes.data, *a.shape, *a.strides) for a in flat(arrays)]
         self._description = np.concatenate(described, dtype=np.intp)
         self.place: int = self._description.ctypes.data
-        self.reader = _reader(typeof(arrays))
+        kinds = _kinds(arrays)
+        if kinds not in _readers:
+            from numba import typeof
+
+            _readers[kinds] = _reader(typeof(arrays))  # which looks through every field of every record
+        self.reader = _readers[kinds]
 
 
 def flat(arrays: tuple[Any, ...]) -> list[NDArray[Any]]:
     """Returns the arrays of a nested tuple of arrays."""
     return [a for entry in arrays for a in (flat(entry) if isinstance(entry, tuple) else [entry])]
+
+
+_readers: dict[tuple[Any, ...], Any] = {}
+"""The reader of each kind of arrays."""
+
+
+def _kinds(arrays: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Returns of each array of a nested tuple all that Numba's type of it depends on."""
+    return tuple(
+        (type(a), _kinds(a))
+        if isinstance(a, tuple)
+        else (a.dtype, a.dtype.isalignedstruct, a.ndim, a.flags.c_contiguous, a.flags.f_contiguous, a.flags.writeable)
+        for a in arrays
+    )
 
 
 def held(place: int) -> tuple[Any, ...]:
