@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mrctl.control.features import feature_scale
@@ -169,6 +169,7 @@ def test_lap_count():
 @given(ticks=st.floats(20, 2000), laps=st.integers(1, 40))
 def test_every_lap_counts(ticks, laps):
     """A run of so many laps has as many, also where a lap is no whole number of samples."""
+    assume(abs(laps * ticks % 1 - 0.5) > 1e-6)  # half a tick more or less is rounded either way
     samples = round(laps * ticks)
     run = make(laps=samples, lap=DT).isel(run=0).assign_coords(lap_time=ticks * DT)
     edges = metrics.laps_of(run).edges
