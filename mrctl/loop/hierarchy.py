@@ -211,7 +211,7 @@ class Hierarchy:
         model: Its inverse dynamics for each robot.
         period: Control period in s.
         looks: Whether the motion controller takes the scans of a lidar, as only a user's may.
-        tunable: Whether it takes gains of Kanayama's law, as a user's may not.
+        tunable: Whether it takes gains of Kanayama's law, which a user's need not.
         roams: Whether it goes along the reference at its own pace or leaves it, as only a user's may.
         gains: Gains of each robot before any event, by the names and in the units of `dataset.GAINS`: `(B, 2)` for
             `k_p` and `k_i`, `(B,)` for the others.

@@ -307,8 +307,9 @@ class Simulation:
     def _check_gains(self, event: Event) -> None:
         """Refuses an event with gains for a motion controller that has none of that kind."""
         if event.kanayama is not None and not self.hierarchy.tunable:
+            motion = self._stages["motion"]
             raise InputError(
-                f"kanayama: the motion controller {self._stages['motion']} does not take gains in an event"
+                f"events: kanayama at {event.time:g} s: the motion controller {motion} does not take gains in an event"
             )
 
     def _build_plant(self, models: Sequence[Any], robot: Robot, threads: int) -> Plant:

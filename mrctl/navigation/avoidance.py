@@ -14,7 +14,7 @@ among them, which `pacing` needs.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -93,6 +93,12 @@ class Avoiding:
         self._sights[row].see(scan)
         if look := getattr(self._motion, "see", None):
             look(row, scan)
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401
+        """Returns the method `follow` or `tune` of the motion stage, which a stage has or has not."""
+        if name in ("follow", "tune"):
+            return getattr(self._motion, name)
+        raise AttributeError(name)
 
     @property
     def followed(self) -> Array | None:

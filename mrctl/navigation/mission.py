@@ -56,7 +56,7 @@ GENERATORS: dict[str, Callable[[float, float, int], Task]] = {
 ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
 TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
 GENTLER = 1.2  # factor on that radius, for a second plan where the spline of the first steers beyond the limit
-WIDER = 2.0  # factor on it where a plan may reverse, for at a change of direction a spline is straight
+WIDER = 2.0  # factor on it where a plan may reverse; chosen when splines were straight at changes of direction
 CELLS = 4  # of the search in the width of the robot
 PATIENCE, WAITING = 2, 4  # time of a mission over that of its plan; WAITING where something keeps it from obstacles
 MARGIN = 0.05  # m, margin of a plan
@@ -336,10 +336,13 @@ def planned(
         raise InputError(f"speed: must be between {SLOWEST:g} and {fastest:g} m/s, not {speed:g}")
     try:
         return _planned(task, vehicle, speed, margin, outlines, False, twist, keeps)
-    except InputError:  # there is no way, or none that the robot can drive
+    except InputError as fault:  # there is no way, or none that the robot can drive
         if not reverse:
             raise
-        return _planned(task, vehicle, speed, margin, outlines, True, twist, keeps)
+        try:
+            return _planned(task, vehicle, speed, margin, outlines, True, twist, keeps)
+        except NoWay:
+            raise fault from None  # there is a way, if a search found one forward
 
 
 def _planned(

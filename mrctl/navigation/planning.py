@@ -37,6 +37,8 @@ EXPANSION = 2.0  # in place of the turn of an arc, a shortest path to the goal
 WEIGHT = 1.04  # of the heuristic, and so about the most by which a plan costs more than the cheapest; chosen
 AGAIN = 0.5  # share of the free part of a shortest path that hits something, after which another one is tried; chosen
 SLACK = 2.0  # cells, by which the way around the obstacles may be too long
+LEAST = 1e-3  # m, chord below which the heading of an end is not looked at
+STRAIGHT = 1e-12  # 1/m, in place of the curvature 0 of an end, which would leave its heading free
 MOST_CELLS = 1_000_000  # of the plane, for a search takes 288 bytes for each, and three times that with reversing
 
 
@@ -113,8 +115,8 @@ class Plan(NamedTuple):
     ) -> Waypoints:
         """Returns the plan as a reference: splines of continuous curvature, with the time law under all limits.
 
-        It begins and ends with the headings and curvatures of the plan. Where the plan changes its direction, a spline
-        ends at rest and another one begins, with a curvature of its own.
+        It begins and ends with the headings of the plan, on arcs through the points next to its ends. Where the plan
+        changes its direction, a spline ends at rest and another one begins, with a curvature of its own.
 
         Args:
             speed: Largest speed in m/s.
@@ -129,7 +131,7 @@ class Plan(NamedTuple):
         """
         turns = np.flatnonzero(self.directions[2:] * self.directions[1:-1] < 0) + 1
         places = list(pairwise([0, *turns.tolist(), len(self.poses) - 1]))
-        legs = [_points(self.poses[a : b + 1], spacing) for a, b in places]
+        legs = [_points(self.poses[a : b + 1], spacing, velocity > 0 and a == 0) for a, b in places]
         points = np.concatenate([legs[0][:1], *(leg[1:] for leg in legs)])
         cusps = np.cumsum([len(leg) - 1 for leg in legs[:-1]], dtype=int).tolist()
         start, *between, end = [
@@ -168,18 +170,21 @@ def run_out(start: Array, velocity: float, curvature: float, limits: Limits) -> 
     ])  # fmt: skip
 
 
-def _points(poses: Array, spacing: float) -> Array:
-    """Returns points at equal distances of about the spacing in m along poses, `(n, 2)`, with two more at the ends.
+def _points(poses: Array, spacing: float, near: bool) -> Array:
+    """Returns points at equal distances of about the spacing in m along poses with arcs between them, `(n, 2)`.
 
-    The way from each pose to the next is an arc.
+    Args:
+        poses: The poses.
+        spacing: The distance.
+        near: Whether there is another point near the first, which holds the heading there.
     """
     chords, turns = np.diff(poses[:, :2] @ (1, 1j)), np.diff(poses[:, 2])
     turns -= 2 * np.pi * np.round(turns / (2 * np.pi))
     lengths = np.abs(chords) / np.sinc(turns / (2 * np.pi))
     way = np.append(0, np.cumsum(lengths))
     places = np.linspace(0, way[-1], max(2, round(way[-1] / spacing) + 1))
-    if places[1] > 2 * CHECK:  # one more point near either end holds the heading there
-        places = np.concatenate([places[:1], [CHECK], places[1:-1], [way[-1] - CHECK], places[-1:]])
+    if near and places[1] > 2 * CHECK:
+        places = np.insert(places, 1, CHECK)
     arc = np.clip(np.searchsorted(way, places, side="right") - 1, 0, len(chords) - 1)
     ahead = places - way[arc]
     turn = turns[arc] * ahead / lengths[arc]
@@ -199,7 +204,8 @@ def _bends(points: Array, start: float, end: float, reverse: bool) -> tuple[floa
     """
     first, last = np.diff(points @ (1, 1j))[[0, -1]] * (-1 if reverse else 1)
     before, after = np.angle([first * np.exp(-1j * start), np.exp(1j * end) / last])  # half of the turns of the arcs
-    return round(2 * np.sin(before) / abs(first), 6), round(2 * np.sin(after) / abs(last), 6)
+    bends = [2 * np.sin(half) / max(abs(chord), LEAST) for half, chord in ((before, first), (after, last))]
+    return tuple(round(bend, 6) or STRAIGHT for bend in bends)  # type: ignore[return-value]
 
 
 def space(

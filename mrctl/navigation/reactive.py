@@ -134,8 +134,7 @@ class Agent:
     def _at_end(self, pose: Array, speed: float = 0.0) -> bool:
         """Tells whether a pose is where the plan leads, at a speed in m/s at which the robot has arrived.
 
-        That is the goal of the mission, unless another plan came since; the end of the plan itself may be turned from
-        it by a tenth of a radian.
+        That is the goal of the mission, unless another plan came since.
         """
         x, y, c, s = self._table[-1]
         return bool(arrived(pose, speed, np.array(self._planner.goal or (x, y, np.arctan2(s, c)))))

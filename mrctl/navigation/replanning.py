@@ -8,15 +8,17 @@ import numpy as np
 
 from mrctl.kernel import Array
 from mrctl.navigation.planning import NoWay
-from mrctl.navigation.sight import SPACING, Sight
+from mrctl.navigation.sight import Sight
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.obstacles import Outlines, Pose
 from mrctl.theory.references import Reference, Waypoints
 
-# m, rad and m, within which robot and obstacles are where they were when there was no way: more than the noise. Chosen.
-SAME = 0.02, 0.05, SPACING
+# m, rad and m, within which robot and obstacles are where they were when there was no way: more than the noise, and
+# more than half the distance of the discs that a scan shows. Chosen.
+SAME = 0.02, 0.05, 0.06
+AGAIN = 3.0  # s, after which a search that found no way is repeated in any case
 SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
 
 Replan = Callable[[Scenario, Vehicle, Array, Array, Outlines, Waypoints | None], Waypoints | None]
@@ -55,7 +57,8 @@ class Planner:
         self.scenario, self.first = scenario, open_waypoints(scenario.reference)
         self.sight, self.vehicle, self._replan = sight, vehicle, replan
         self._given: Waypoints | None = None  # the plan that came since the start
-        self._hopeless: tuple[Array, Outlines] | None = None  # where, and among what, a search last found no way
+        # When, where, and among what, a search last found no way.
+        self._hopeless: tuple[float, Array, Outlines] | None = None
 
     @classmethod
     def each(cls, replan: Replan, scenarios: Sequence[Scenario]) -> list[Planner]:
@@ -92,25 +95,26 @@ class Planner:
             time: Time in s.
 
         Returns:
-            The plan, or None where there is no way. Where a search has found none, it is not repeated until the robot
-            or an obstacle is elsewhere: that there is no way takes a search far longer than to find one.
+            The plan, or None where there is no way. Where a search has found none, it is not repeated within 3 s, until
+            the robot or an obstacle is elsewhere: that there is no way takes a search far longer than to find one.
         """
         near, far = self.sight.outlines(time), self.sight.around(time, self.vehicle.footprint, pose)
-        if self._hopeless and _same(self._hopeless, (pose, near)):
-            return None
+        if self._hopeless:
+            since, there, known = self._hopeless
+            if time - since < AGAIN and _same(there, known, pose, near):
+                return None
         for outlines in (near,) if np.array_equal(near.discs, far.discs) else (far, near):
             try:
                 if plan := self._replan(self.scenario, self.vehicle, pose, twist, outlines, self._given):
                     return plan
             except NoWay:
                 if outlines is near:
-                    self._hopeless = pose.copy(), near
+                    self._hopeless = time, pose.copy(), near
         return None
 
 
-def _same(one: tuple[Array, Outlines], other: tuple[Array, Outlines]) -> bool:
-    """Tells whether pose and obstacles are the same within `SAME`."""
-    (pose, before), (now, after) = one, other
+def _same(pose: Array, before: Outlines, now: Array, after: Outlines) -> bool:
+    """Tells whether pose and obstacles are the same within `SAME`, the radii of discs included."""
     turn = np.angle(np.exp(1j * (now[2] - pose[2])))
     if (
         np.hypot(*(now[:2] - pose[:2])) > SAME[0]
@@ -120,5 +124,5 @@ def _same(one: tuple[Array, Outlines], other: tuple[Array, Outlines]) -> bool:
         return False
     if not (len(before.discs) and len(after.discs)):
         return len(before.discs) == len(after.discs)
-    away = np.hypot(*(before.discs[:, None, :2] - after.discs[None, :, :2]).transpose(2, 0, 1))
+    away = np.linalg.norm(before.discs[:, None] - after.discs, axis=2)
     return bool(max(away.min(axis=0).max(), away.min(axis=1).max()) <= SAME[2])

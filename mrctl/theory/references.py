@@ -307,7 +307,7 @@ class Waypoints(Record):
     """Curvature in 1/m of the arc through the last two points with which an open curve ends, likewise."""
     cusp_curvatures: tuple[tuple[EndCurvature, EndCurvature], ...] = ()
     """Curvatures in 1/m with which the curve comes to each cusp between its ends and leaves it, positive to the left of
-    the way; empty for none."""
+    the way, as at the ends; empty where all are 0."""
 
     @model_validator(mode="after")
     def _regular(self) -> Waypoints:
@@ -317,7 +317,7 @@ class Waypoints(Record):
             if getattr(self, name) and self.closed:
                 raise ValueError(f"{name}: only an open curve has one")
         if len(self.cusp_curvatures) not in (0, between := sum(cusp > 0 for cusp in self.cusps)):
-            raise ValueError(f"cusp_curvatures: has {len(self.cusp_curvatures)} pairs, but there are {between} cusps")
+            raise ValueError(f"cusp_curvatures: must be {between} pairs, one for each cusp between the ends")
         if self.cusps:
             return self._turning()
         least = 3 if self.closed else 2
@@ -327,6 +327,9 @@ class Waypoints(Record):
         if gaps.min() < 1e-3:
             first = int(gaps.argmin())
             raise ValueError(f"points: {first} and {(first + 1) % len(self.points)} coincide")
+        for name, gap in (("start_curvature", gaps[0]), ("end_curvature", gaps[-1])):
+            if abs(getattr(self, name)) * gap >= 2:
+                raise ValueError(f"{name}: no arc through two points that are {gap:.2f} m apart has so much")
         path = self._path
         # The parameter is chord length, so a regular curve has |dp/du| near one.
         slow, where = path.slowest
@@ -405,7 +408,7 @@ class Waypoints(Record):
     def sample(self, t: Array) -> Motion:
         """Samples the spline at the times t in s, shape (T,).
 
-        A closed spline is periodic with four continuous derivatives. An open one has no curvature at its end.
+        A closed spline is periodic with four continuous derivatives. An open one has the given curvatures at its ends.
         """
         if self.cusps:
             return self._sample_parts(t)

@@ -31,7 +31,7 @@ def _end(chord: complex, curvature: float, side: int) -> list[tuple[int, Array]]
     """
     if not curvature:
         return [(2, np.zeros(2)), (3, np.zeros(2))]
-    half = np.arcsin(np.clip(curvature * abs(chord) / 2, -1, 1))  # angle between chord and tangent
+    half = np.arcsin(curvature * abs(chord) / 2)  # angle between chord and tangent
     tangent = chord / abs(chord) * np.exp(1j * side * half)
     return [(n, np.array([d.real, d.imag])) for n, d in ((1, tangent), (2, 1j * curvature * tangent))]
 
@@ -51,6 +51,7 @@ class Spline:
             points: Points (x, y) in m in their order, no two neighbours alike.
             closed: Whether the curve goes on from the last point to the first.
             curvatures: Curvatures of the arcs at either end of an open curve in 1/m, positive to the left; 0 for none.
+                Each times its chord is less than 2.
         """
         from scipy.interpolate import make_interp_spline  # imported here, so that settings are read without scipy
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import shapely
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from test_obstacles import judged, random_shapes
 
@@ -267,6 +267,7 @@ def test_reference():
 
 @pytest.mark.parametrize("reverse", [False, True])
 @settings(max_examples=30)
+@example(goal=(np.cos(0.4), np.sin(0.4), 0.4))
 @given(goal=st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(-3, 3)))
 def test_reference_has_the_headings_of_the_plan(reverse, goal):
     """At start, goal and cusps the reference has the heading of the plan, and curvatures no tighter than it."""
