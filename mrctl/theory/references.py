@@ -323,13 +323,7 @@ class Waypoints(Record):
         least = 3 if self.closed else 2
         if len(self.points) < least:
             raise ValueError(f"points: {'a closed' if self.closed else 'an open'} curve needs at least {least} points")
-        gaps = np.abs(np.diff(plane(self.points, self.closed)))
-        if gaps.min() < 1e-3:
-            first = int(gaps.argmin())
-            raise ValueError(f"points: {first} and {(first + 1) % len(self.points)} coincide")
-        for name, gap in (("start_curvature", gaps[0]), ("end_curvature", gaps[-1])):
-            if abs(getattr(self, name)) * gap >= 2:
-                raise ValueError(f"{name}: no arc through two points that are {gap:.2f} m apart has so much")
+        self._check_gaps(1e-3, "start_curvature", "end_curvature")
         path = self._path
         # The parameter is chord length, so a regular curve has |dp/du| near one.
         slow, where = path.slowest
@@ -341,6 +335,16 @@ class Waypoints(Record):
             raise ValueError(f"stop_time: too long to stop from {self.speed:g} m/s within {path.length:.2f} m")
         return self
 
+    def _check_gaps(self, least: float, first: str, last: str) -> None:
+        """Refuses neighbours that are nearer than so many m, and ends that are no arcs; takes the names of these."""
+        gaps = np.abs(np.diff(plane(self.points, self.closed)))
+        if gaps.min() < least:
+            k = int(gaps.argmin())
+            raise ValueError(f"points: {k} and {(k + 1) % len(self.points)} coincide")
+        for name, curvature, gap in ((first, self.start_curvature, gaps[0]), (last, self.end_curvature, gaps[-1])):
+            if abs(curvature) * gap >= 2:
+                raise ValueError(f"{name}: no arc through two points that are {gap:.2f} m apart has so much")
+
     def _turning(self) -> Waypoints:
         """Checks a curve with cusps, each part of it as a curve of its own."""
         if self.closed or self.timing != "limits":
@@ -348,7 +352,10 @@ class Waypoints(Record):
         if list(self.cusps) != sorted(set(self.cusps)) or self.cusps[-1] >= len(self.points) - 1:
             raise ValueError(f"cusps: must increase, and be before the last point, {len(self.points) - 1}")
         heading = None
-        for part, back in self._parts:
+        parts = self._parts
+        for k, (part, back) in enumerate(parts):
+            first = "cusp_curvatures" if k else "start_curvature"
+            part._check_gaps(1e-9, first, "cusp_curvatures" if k < len(parts) - 1 else "end_curvature")
             ends = part._path.heading[[0, -1]] + np.pi * back
             if heading is not None and abs(cmath.phase(cmath.exp(1j * (ends[0] - heading)))) > KINK:
                 raise ValueError(f"cusps: the curve turns by more than {KINK:g} rad at a cusp")

@@ -408,18 +408,11 @@ def test_ends_on_arcs(first: float, last: float, heading: float) -> None:
         ({"start_curvature": 0.5}, "start_curvature: only an open curve"),
         ({"start_curvature": 50.0, "closed": False}, "start_curvature"),
         ({"end_curvature": -0.5}, "end_curvature: only an open curve"),
-        (
-            {"end_curvature": -2, "closed": False, "points": ((0, 0), (1, 0))},
-            "end_curvature: no arc through two",
-        ),
-        (
-            {"cusp_curvatures": [(0.1, 0.2)], "closed": False},
-            "cusp_curvatures: must be 0 pairs",
-        ),
-        (
-            CUSPS | {"cusps": (0, 2), "cusp_curvatures": [(0, 0)] * 2},
-            "cusp_curvatures: must be 1 pairs",
-        ),
+        ({"end_curvature": -2, "closed": False, "points": ((0, 0), (1, 0))}, "end_curvature: no arc through two"),
+        ({"cusp_curvatures": [(0.1, 0.2)], "closed": False}, "cusp_curvatures: must be 0 pairs"),
+        (CUSPS | {"cusps": (0, 2), "cusp_curvatures": [(0, 0)] * 2}, "cusp_curvatures: must be 1 pairs"),
+        (CUSPS | {"cusps": (2,), "cusp_curvatures": [(0, 9)]}, "cusp_curvatures: no arc through two points"),
+        (CUSPS | {"cusps": (1, 2), "points": ((0, 0), (1, 0), (1, 0), (0, 0))}, "points: 0 and 1 coincide"),
     ],
 )
 def test_bad_ends(changes: dict, words: str) -> None:
