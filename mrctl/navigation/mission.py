@@ -440,14 +440,16 @@ def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
         driven = runs.isel(run=row).dropna("time", subset=["x"])
         there, failure = reached(driven, goal), driven["failure"].item()
         length = float(np.hypot(np.diff(driven["x"]), np.diff(driven["y"])).sum())
-        clearance = float(driven["clearance"].min()) if "clearance" in driven else np.inf
+        away = driven["clearance"].values if "clearance" in driven else np.zeros(0)
+        clearance = float(np.fmin.reduce(away, initial=np.inf))
+        errors = driven["longitudinal_error"] ** 2 + driven["lateral_error"] ** 2
         rows.append({
             "outcome": "arrived" if there else {"": "out of time", "collision": "collided"}.get(failure, failure),
             "time": float(driven["failure_time"] if failure else driven["time"][-1]),
             "length": length,
             "spl": there * found.length / max(found.length, length),
             "clearance": 0.0 if failure == "collision" else clearance,  # the tick of the contact is not recorded
-            "position_rmse": float(np.sqrt(np.mean(driven["longitudinal_error"] ** 2 + driven["lateral_error"] ** 2))),
+            "position_rmse": float(np.sqrt(errors.mean())) if len(errors) else np.nan,
             "jerk": jerk_of(np.column_stack([driven["x"].values, driven["y"].values]), period),
             "energy": float(driven["power"].sum()) * period,
             "expanded": found.expanded,
@@ -457,9 +459,11 @@ def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:
 
 def reached(run: xr.Dataset, goal: Pose) -> bool:
     """Returns whether a robot that did not fail has arrived at its goal when its run ends; `run` ends without NaN."""
+    if run["failure"].item():
+        return False  # perhaps in the first tick, so that there is no sample
     end = run.isel(time=-1)
     pose = np.array([float(end[name]) for name in ("x", "y", "theta")])
-    return run["failure"].item() == "" and bool(arrived(pose, float(end["v"]), np.array(goal)))
+    return bool(arrived(pose, float(end["v"]), np.array(goal)))
 
 
 def jerk_of(places: Array, period: float) -> float:

@@ -13,7 +13,7 @@ from mrctl import Box, Disc, Event, InputError, Kanayama, Obstacles, Scenario, c
 from mrctl.loop.simulation import Simulation
 from mrctl.navigation.avoidance import Avoiding, Barrier
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import Avoid, again, avoiding, jerk_of, navigate, order_of, prepared, task_of
+from mrctl.navigation.mission import Avoid, again, avoiding, jerk_of, navigate, order_of, outcomes, prepared, task_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.theory.clearance import cover
@@ -118,6 +118,23 @@ def test_outcomes() -> None:
     late = navigate(free, PID.replace(perturbation={"supply_factor": 0.2}))
     assert late.table["outcome"].tolist() == ["out of time"] and late.table["spl"].tolist() == [0]
     assert late.table["time"].iloc[0] == pytest.approx(late.result.sizes["time"] * 0.01, abs=0.02)
+
+
+def test_failure_in_the_first_tick() -> None:
+    """A robot whose stage fails at once has an outcome that says so, although there is no sample of its drive."""
+
+    class Bad:
+        def __init__(self, robot: object, size: int) -> None: ...
+
+        def reset(self, *_: object) -> None: ...
+
+        def output(self, *_: object) -> None:
+            raise ValueError("no twist")
+
+    task = Task(obstacles=Obstacles(shapes=(Disc(x=0.0, y=-3.0),)), start=(0.0, 0.0, 0.0), goal=(2.0, 0.0, 0.0))
+    plan, drive = prepared(task, Scenario(prior="model", learner="none"))
+    (row,) = outcomes(mrctl.simulate(drive, motion=Bad), task.goal, plan).itertuples()
+    assert "no twist" in row.outcome and row.length == row.spl == row.energy == 0 and np.isnan(row.position_rmse)
 
 
 def test_ends() -> None:
