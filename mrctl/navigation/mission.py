@@ -342,7 +342,9 @@ def planned(
         try:
             return _planned(task, vehicle, speed, margin, outlines, True, twist, keeps)
         except NoWay:
-            raise fault from None  # there is a way, if a search found one forward
+            if isinstance(fault, NoWay):
+                raise
+            raise fault from None  # a search has found a way, forward
 
 
 def _planned(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from test_obstacles import judged, random_shapes
 
 from mrctl import Box, Disc, InputError, Limits, Obstacles, Scenario
-from mrctl.navigation import planning
+from mrctl.navigation import mission, planning
 from mrctl.navigation.generators import Task, cellular, corridor, parking_bay
 from mrctl.navigation.mission import planned
 from mrctl.navigation.planning import NoWay, cost_to_go, plan, run_out, shortcut, space
@@ -358,6 +358,27 @@ def test_refused(start, goal, message):
     with pytest.raises(InputError, match=message) as error:
         plan(where, start, goal, RADIUS, False)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("forward", "reverse", "shown"),
+    [
+        (NoWay("goal: forward"), NoWay("goal: reverse"), "reverse"),
+        (InputError("plan: forward"), NoWay("goal: reverse"), "forward"),
+        (NoWay("goal: forward"), InputError("plan: reverse"), "reverse"),
+    ],
+)
+def test_refusal_of_both_searches(forward, reverse, shown, monkeypatch):
+    """Where neither way is driven, the message is that of the one that comes nearer: a way that cannot be driven."""
+
+    def refused(*arguments):
+        raise reverse if arguments[5] else forward
+
+    monkeypatch.setattr(mission, "_planned", refused)
+    task = Task(obstacles=Obstacles(), start=(0, 0, 0), goal=(2, 0, 0))
+    with pytest.raises(InputError, match=shown) as refusal:
+        planned(task, CAR, None, 0.05, None, True)
+    assert isinstance(refusal.value, NoWay) == (isinstance(forward, NoWay) and isinstance(reverse, NoWay))
 
 
 def test_budget():
