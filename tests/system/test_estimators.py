@@ -181,8 +181,7 @@ MEETS = {
         {}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.8)}, (0.93, 0.93, 0.88, 0.9, 0.93)
     ),
     "lifted wheel, as if on the ground": (
-        {}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.8)},
-        (0.93, 0.93, 0.93, 0.92, 0.93),  # θ̇: 0.929 of 96 draws in `field`
+        {}, {"perturbation": Perturbation(payload=12, payload_y=-0.2, payload_z=0.8)}, (0.93,) * 5
     ),
     "slipping wheel": (
         {}, {"perturbation": Perturbation(left_tyre_friction_factor=0.1 / 0.9)}, (0.96, 0.96, 0.83, 0.78, 0.94)
@@ -247,9 +246,15 @@ def test_within_three_deviations(tier, name):
     seeds = range(24 if name.startswith("lifted") else 12)
     errors, covariances, innovations, failed = watched([scenario.model_copy(update={"seed": k}) for k in seeds])
     assert not failed.any()
+    short = False
     for k, share in enumerate(least):
-        within = normalised(errors, covariances, [k])[SETTLED:] < 9
-        assert within.mean() >= share, STATES[k]
+        within = (normalised(errors, covariances, [k])[SETTLED:] < 9).mean()
+        if (tier, STATES[k], name) == ("field", "v", "lifted wheel, as if on the ground") and 0.92 < within < share:
+            short = True
+            continue
+        assert within >= share, STATES[k]
+    if short:
+        pytest.xfail("V: 0.929 of 96 draws; with the usual 24 it depends on the processor on which side of 0.93 it is")
     if name == "outlying fixes":  # of which hardly one lies within the gate
         refused = np.mean(innovations[~np.isnan(innovations)] > ekf.FIX_GATE)
         assert 0.15 < refused < 0.25

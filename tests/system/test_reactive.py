@@ -285,10 +285,13 @@ def test_shorter(avoid: Avoid) -> None:
     assert float(np.abs(driven.result["y"]).max()) < 0.3 < 0.8 < np.abs(driven.plan.poses[:, 1]).max()
     v = driven.result["v"].isel(run=0)
     first = int(np.argmax(v.values > 0.3))
-    assert float(v[first : int(np.argmax(driven.result["x"].isel(run=0).values > 3))].min()) > 0.25  # it does not stop
+    slowest = float(v[first : int(np.argmax(driven.result["x"].isel(run=0).values > 3))].min())
     again = navigate(task, PLANNED, avoid=avoid).result
     for name in ("x", "theta", "voltage_left"):
         assert again[name].values.tobytes() == driven.result[name].values.tobytes()
+    if avoid == "barrier" and 0.25 < slowest <= 0.3:
+        pytest.xfail("the new plan begins on an arc, on which the robot slows down to 0.286 m/s")
+    assert slowest > 0.3  # it does not stop
 
 
 @pytest.mark.parametrize("avoid", ["barrier", "window", "mppi"])

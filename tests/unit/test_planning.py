@@ -320,9 +320,12 @@ def test_begins_as_the_robot_drives(twist, goal):
     motion = course.sample(np.zeros(1))
     v, omega = motion.twist[0]
     assert np.allclose(motion.pose[0], task.start, atol=6e-3)
-    assert 0.74 * twist[0] < v < 1.0001 * twist[0] and omega / v == pytest.approx(twist[1] / twist[0], abs=0.02)
+    assert v < 1.0001 * twist[0] and omega / v == pytest.approx(twist[1] / twist[0], abs=0.02)
     assert np.allclose(found.poses[0], task.start) and found.directions[0] == 0 and np.all(found.directions[1:] == 1)
     assert np.hypot(*np.diff(found.poses[:, :2], axis=0).T).max() < planning.CHECK + 1e-9
+    if (goal, twist) == ((3, 0.5, 0), (0.7, 0.8)) and v <= 0.75 * twist[0]:
+        pytest.xfail("it begins with 0.742 of the robot's speed, before 0.30.0 with 0.753")
+    assert v > 0.75 * twist[0]
 
 
 def test_begins_where_it_can():
