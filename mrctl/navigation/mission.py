@@ -22,7 +22,7 @@ from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
 from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.pacing import Pacing
-from mrctl.navigation.planning import NoWay, Plan, least_clearance, plan, run_out, shortcut, space
+from mrctl.navigation.planning import NoWay, Plan, least_clearance, plan, run_out, shortcut, space, wider
 from mrctl.navigation.replanning import open_waypoints
 from mrctl.navigation.sdf import read_sdf
 from mrctl.navigation.vehicle import Vehicle
@@ -249,12 +249,14 @@ def prepared(
     reactive, vehicle = avoid in REACTIVE, Vehicle.of(scenario)
     backwards = vehicle.reverses and not reactive
     try:
-        found, reference = planned(task, vehicle, speed, margin, None, backwards, twist, not reactive)
+        found, reference = planned(task, vehicle, speed, margin, None, backwards, twist, not reactive, beyond=True)
     except NoWay:
-        if not (reactive and vehicle.reverses):
-            raise
-        _planned(task, vehicle, speed, margin, None, True, (0.0, 0.0), True)  # raises, too, if there is none in reverse
-        raise InputError(f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may") from None
+        for around in (False, True) if reactive and vehicle.reverses else ():
+            with contextlib.suppress(NoWay):
+                _planned(task, vehicle, speed, margin, None, True, (0.0, 0.0), True, around)
+                no_way = f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may"
+                raise InputError(no_way) from None
+        raise
     laps = PATIENCE if avoid == "none" else WAITING
     own = {"obstacles": task.obstacles, "map": task.map, "reference": reference, "laps": laps}
     if reactive:  # the designed prefilter is that of Kanayama's controller, whose loop is faster
@@ -283,8 +285,9 @@ def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] |
         goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
         start = Task.from_dict({"obstacles": scenario.known, "start": pose.tolist(), "goal": goal})
         keeps, now = avoid not in REACTIVE, (float(twist[0]), float(twist[1]))
+        back = keeps and vehicle.reverses
         try:
-            return planned(start, vehicle, plan.speed, SLIM, outlines, keeps and vehicle.reverses, now, keeps)[1]
+            return planned(start, vehicle, plan.speed, SLIM, outlines, back, now, keeps, beyond=True)[1]
         except NoWay:
             raise
         except InputError:  # it waits, and tries again
@@ -314,11 +317,13 @@ def planned(
     reverse: bool = False,
     twist: tuple[float, float] = (0.0, 0.0),
     keeps: bool = True,
+    beyond: bool = False,
 ) -> tuple[Plan, Waypoints]:
     """Returns the plan and its reference; arguments and errors are those of `navigate`.
 
     The outlines are by default those of the obstacles on the map. The plan reverses only if it may, and where there is
-    none forward that the robot can drive.
+    none forward that the robot can drive. It stays in the box around the map, with room to turn about start and goal.
+    Where there is no way in it, a plan that may go beyond goes around what stands at the border of the box.
 
     The twist is that of the robot at the start, V in m/s and θ̇ in rad/s. If it drives forward, the plan begins with
     this twist: first the arc on which it drives, for as far as it needs to come to rest, and on from there, so that it
@@ -334,17 +339,27 @@ def planned(
     fastest = vehicle.robot.max_speed
     if speed is not None and not SLOWEST <= speed <= fastest:
         raise InputError(f"speed: must be between {SLOWEST:g} and {fastest:g} m/s, not {speed:g}")
-    try:
-        return _planned(task, vehicle, speed, margin, outlines, False, twist, keeps)
-    except InputError as fault:  # there is no way, or none that the robot can drive
-        if not reverse:
-            raise
+
+    def either_way(around: bool) -> tuple[Plan, Waypoints]:
         try:
-            return _planned(task, vehicle, speed, margin, outlines, True, twist, keeps)
-        except NoWay:
-            if isinstance(fault, NoWay):
+            return _planned(task, vehicle, speed, margin, outlines, False, twist, keeps, around)
+        except InputError as fault:  # there is no way, or none that the robot can drive
+            if not reverse:
                 raise
-            raise fault from None  # a search has found a way, forward
+            try:
+                return _planned(task, vehicle, speed, margin, outlines, True, twist, keeps, around)
+            except NoWay:
+                if isinstance(fault, NoWay):
+                    raise
+                raise fault from None  # a search has found a way, forward
+
+    try:
+        return either_way(False)
+    except NoWay:
+        if beyond:
+            with contextlib.suppress(NoWay):
+                return either_way(True)
+        raise
 
 
 def _planned(
@@ -356,6 +371,7 @@ def _planned(
     reverse: bool,
     twist: tuple[float, float],
     keeps: bool,
+    around: bool,
 ) -> tuple[Plan, Waypoints]:
     """Returns a plan that only drives forward, or one that reverses wherever that is cheaper, and its reference.
 
@@ -368,9 +384,10 @@ def _planned(
         reverse: Whether the plan may reverse.
         twist: V in m/s and θ̇ in rad/s at the start.
         keeps: Whether the robot keeps the plan in time.
+        around: Whether the plan may go around what stands at the border of the box around the map.
 
     Raises:
-        NoWay: There is no way.
+        NoWay: There is no way; if it may go around, also where all ways from the goal stay in the box.
         InputError: Start or goal is within the margin of an obstacle, or the robot cannot drive the plan, or would
             touch an obstacle on it.
     """
@@ -391,6 +408,8 @@ def _planned(
     if known.shapes:
         low, high = np.minimum(low, known.bounds[0]), np.maximum(high, known.bounds[1])
     where = space(outlines, corners, low, high, cell=vehicle.width / CELLS, margin=margin)
+    if around:
+        where = wider(where, goal, 3 * radius)
 
     def attempt(radius: float, arc: Array, curvature: float) -> tuple[Plan, Waypoints]:
         found = plan(where, arc[-1], goal, radius, reverse)

@@ -11,6 +11,7 @@ Artificial Intelligence 1, 1970). The budget is a number of poses; ties go to th
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 from itertools import pairwise
 from typing import NamedTuple
@@ -63,6 +64,12 @@ class Space(NamedTuple):
     """Distance of the farthest corner from P in m."""
     margin: float
     """Clearance that a plan keeps in m."""
+
+    @property
+    def area(self) -> tuple[Array, Array]:
+        """Lower left and upper right corner of the rectangle in which P may be, in m, `(2,)` each."""
+        low, cells = self.field.origin, np.array(self.field.distance.shape)[::-1]
+        return low, low + self.field.resolution * cells
 
 
 class Tree(NamedTuple):
@@ -233,6 +240,24 @@ def space(
     return Space(outlines, field_of(outlines, low, high, cell), footprint, discs, depths, reach, margin)
 
 
+def wider(where: Space, goal: Array, room: float) -> Space:
+    """Returns a space with room in m, and as much as the robot needs beside it, around its area and all obstacles.
+
+    Raises:
+        NoWay: The robot cannot leave the area from the goal, or the wider one has too many cells.
+    """
+    (inner, outer), outlines, cell = where.area, where.outlines, where.field.resolution
+    corners = np.array([inner, outer, *(outlines.bounds if len(outlines.discs) or len(outlines.edges) else ())])
+    low, high = corners.min(axis=0) - room - where.reach, corners.max(axis=0) + room + where.reach
+    with contextlib.suppress(InputError):
+        wide = space(outlines, where.footprint, low, high, cell, where.margin)
+        rows, columns = np.nonzero(np.isfinite(cost_to_go(wide, goal)))
+        reached = low + cell * np.column_stack([columns, rows])
+        if np.any((reached < inner - cell) | (reached > outer)):
+            return wide
+    raise NoWay(f"goal: there is no way to ({goal[0]:.2f}, {goal[1]:.2f})")
+
+
 def plan(where: Space, start: Array, goal: Array, radius: float, reverse: bool, most: int = 500_000) -> Plan:
     """Plans a way from pose to pose.
 
@@ -249,10 +274,7 @@ def plan(where: Space, start: Array, goal: Array, radius: float, reverse: bool, 
         NoWay: No way was found.
     """
     start, goal = np.asarray(start, float), np.asarray(goal, float)
-    low, high = (
-        where.field.origin,
-        where.field.origin + where.field.resolution * np.array(where.field.distance.shape)[::-1],
-    )
+    low, high = where.area
     for name, pose in (("start", start), ("goal", goal)):
         place = f"({pose[0]:.2f}, {pose[1]:.2f})"
         if np.any(pose[:2] < low) or np.any(pose[:2] >= high):

@@ -138,12 +138,9 @@ class Obstacles(Record):
         Raises:
             InputError: No obstacle stands still.
         """
-        outlines = Surroundings(self.still).at(0.0)
-        points = [outlines.edges[:, :2], *(outlines.discs[:, :2] + s * outlines.discs[:, 2:] for s in (-1, 1))]
-        whole = np.concatenate(points)
-        if not len(whole):
+        if not self.still.shapes:
             raise InputError("obstacles: there are none that stand still, so they have no bounds")
-        return whole.min(axis=0), whole.max(axis=0)
+        return Surroundings(self.still).at(0.0).bounds
 
 
 NO_OBSTACLES = Obstacles()
@@ -187,6 +184,13 @@ class Outlines(NamedTuple):
     """The sides of polygon p are `first[p]` to `first[p + 1]` − 1, `(P + 1,)`."""
     rings: Array
     """A circle around each polygon: x and y of its centre and its radius in m, `(P, 3)`."""
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower left and upper right corner of the box around all of them, of which there are some, in m, `(2,)`."""
+        points = [self.edges[:, :2], *(self.discs[:, :2] + side * self.discs[:, 2:] for side in (-1, 1))]
+        whole = np.concatenate(points)
+        return whole.min(axis=0), whole.max(axis=0)
 
 
 class Movers(NamedTuple):

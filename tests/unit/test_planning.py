@@ -13,7 +13,7 @@ from mrctl import Box, Disc, InputError, Limits, Obstacles, Scenario
 from mrctl.navigation import mission, planning
 from mrctl.navigation.generators import Task, cellular, corridor, parking_bay
 from mrctl.navigation.mission import planned
-from mrctl.navigation.planning import NoWay, cost_to_go, plan, run_out, shortcut, space
+from mrctl.navigation.planning import NoWay, cost_to_go, least_clearance, plan, run_out, shortcut, space
 from mrctl.navigation.steer import sample, steer
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.theory.clearance import clearance
@@ -361,6 +361,35 @@ def test_refused(start, goal, message):
     with pytest.raises(InputError, match=message) as error:
         plan(where, start, goal, RADIUS, False)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("width", [2.0, 4.0, 9.0])
+@pytest.mark.parametrize("robot", ["car", "turtlebot"])
+def test_around_the_border(robot: str, width: float):
+    """A wall in the open, of any width, is gone around, hardly longer than along a string; a map may end at its box."""
+    vehicle, wall = Vehicle.of(Scenario(robot=robot)), Box(x=2.0, length=0.1, width=width)
+    task = Task(obstacles=Obstacles(shapes=(wall,)), start=(0, 0, 0), goal=(4, 0, 0))
+    found, course = planned(task, vehicle, None, 0.05, beyond=True)
+    half = width / 2 + vehicle.width / 2 + 0.05  # of the middle of a robot that drives past the end of the wall
+    string = 2 * np.hypot(1.95, half) + 0.1
+    assert string < found.length < 1.05 * string
+    assert least_clearance(vehicle.footprint, course, Surroundings(task.obstacles).at(0.0)) > 0.02
+    if width > 2:
+        with pytest.raises(NoWay):
+            planned(task, vehicle, None, 0.05)
+
+
+def test_closed_room(monkeypatch):
+    """Where the walls around the goal leave no way out of the box, it is not searched in a wider one."""
+    walls = [Box(x=x, length=0.1, width=4.1) for x in (-2, 2)] + [Box(y=y, length=4.1, width=0.1) for y in (-2, 2)]
+    searches = []
+    monkeypatch.setattr(mission, "plan", lambda *arguments: searches.append(arguments) or plan(*arguments))
+    for start, goal in (((-1, 0, 0), (4, 0, 0)), ((4, 0, 0), (-1, 0, 0))):
+        searches.clear()
+        task = Task(obstacles=Obstacles(shapes=tuple(walls)), start=start, goal=goal)
+        with pytest.raises(NoWay, match=rf"^goal: there is no way to \({goal[0]:.2f}, 0.00\)$"):
+            planned(task, CAR, None, 0.05, beyond=True)
+        assert len(searches) == (2 if goal[0] > 2 else 1)
 
 
 @pytest.mark.parametrize(

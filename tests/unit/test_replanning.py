@@ -98,7 +98,7 @@ def test_margin_around_nothing(planner: Planner) -> None:
 
 
 def test_no_way_is_proven_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bay that takes reversing is refused to `mppi` after one search forward, and one in reverse."""
+    """A bay that takes reversing is refused to `mppi` after a search forward, one beyond its lane, one in reverse."""
     scenario, tried = Scenario.from_dict({"robot": {"path": "turtlebot"}}), []
     task, search = task_of("parking_bay:3", scenario), planning.search.compiled
 
@@ -111,4 +111,4 @@ def test_no_way_is_proven_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planning, "search", Counted)
     with pytest.raises(InputError, match="never plans in reverse"):
         prepared(task, scenario, avoid="mppi")
-    assert tried == [False, True]
+    assert tried == [False, False, True]
