@@ -12,6 +12,7 @@ kernel that calls it, wherever that is written. Constants that a kernel uses mus
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import sys
@@ -51,20 +52,30 @@ class Kernel(Generic[P, T]):
     @cached_property
     def compiled(self) -> Callable[P, T]:
         """The compiled function; a call of it is 0.2 µs faster than a call of the kernel."""
+        return self._compiled(pipeline_class=_compilers()[0])
+
+    @cached_property
+    def inlined(self) -> Callable[P, T]:
+        """The compiled function for calls from other kernels."""
+        # Between kernels a call of a small one takes longer than its law, because each array is handed over in parts.
+        return self._compiled(pipeline_class=_compilers()[1], forceinline=True, no_cpython_wrapper=True)
+
+    def _compiled(self, **options: Any) -> Callable[P, T]:  # noqa: ANN401
+        """Returns the function as Numba compiles it with further options."""
         from numba import njit
 
         _known_to_numba()
         law: Any = self.law
         # Numba looks a function up on disk by its code and by what its closure holds.
-        version = repr((kernel_files_digest(), self._names()))
+        version = repr((kernel_files_digest(), self._names(), sorted(options)))
         code = law.__code__.replace(co_freevars=("version",))
         versioned = FunctionType(
             code, law.__globals__ | self._laws, law.__name__, law.__defaults__, (CellType(version),)
         )
         update_wrapper(versioned, law)
-        # Between kernels a call of a small one takes longer than its law, because each array is handed over in parts.
         # A check of each division for zero would keep loops with a division from vector instructions.
-        return njit(cache=True, nogil=True, forceinline=True, error_model="numpy")(versioned)
+        options |= {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+        return njit(**options)(versioned)
 
     def repeated(self) -> Callable[..., T]:
         """Returns the compiled function for one caller, who promises that the types of its arguments never change.
@@ -226,7 +237,46 @@ def _known_to_numba() -> None:
 
     @typeof_impl.register(Kernel)
     def _(value: Kernel, context: object) -> types.Dispatcher:  # type: ignore[reportUnusedFunction]
-        return types.Dispatcher(value.compiled)
+        return types.Dispatcher(value.inlined)
+
+
+@cache
+def _compilers() -> tuple[Any, Any]:
+    """Returns how Numba compiles kernels for calls from Python, and how for calls from other kernels.
+
+    For Python it does so without the garbage collector, which would look through all that the compiler keeps, again and
+    again. For other kernels it leaves a law as it is, for whoever calls it takes it in and is optimised as a whole.
+    Numba by itself optimises it, and makes machine code of it, at each level of calls, a quarter of the time.
+    """
+    from numba.core.codegen import JITCodeLibrary
+    from numba.core.compiler import Compiler
+
+    class ForPython(Compiler):
+        def compile_extra(self, func: Any) -> Any:  # noqa: ANN401
+            collects = gc.isenabled()
+            gc.disable()
+            try:
+                return super().compile_extra(func)
+            finally:
+                if collects:
+                    gc.enable()
+
+    class ForKernels(Compiler):
+        def define_pipelines(self) -> Any:  # noqa: ANN401
+            state = self.state
+            state.library = Lowered(state.targetctx.codegen(), state.func_id.func_qualname)
+            state.library.enable_object_caching()
+            return super().define_pipelines()
+
+    class Lowered(JITCodeLibrary):
+        def _optimize_final_module(self) -> None:
+            self._finalized = True
+            self._get_module_for_linking()  # which is a copy, and kept
+            for function in self._final_module.functions:
+                if not function.is_declaration:
+                    function.linkage = "available_externally"  # of which no machine code is made
+
+    return ForPython, ForKernels
 
 
 def over_rows(law: Kernel, *arguments: Array | float) -> None:

@@ -56,10 +56,9 @@ for name in names:
     else:
         voltages[name] = (hierarchy.prior if name == "model" else stage).output(twist, rate).copy()
 np.savez(file, **voltages)
-kernels = [k for k in gc.get_objects() if type(k) is Kernel and "compiled" in vars(k)]
-hits, misses = (
-    sum(sum(getattr(k.compiled.stats, name).values()) for k in kernels) for name in ("cache_hits", "cache_misses")
-)
+kernels = [k for k in gc.get_objects() if type(k) is Kernel]
+compiled = [vars(k)[name] for k in kernels for name in ("compiled", "inlined") if name in vars(k)]
+hits, misses = (sum(sum(getattr(c.stats, name).values()) for c in compiled) for name in ("cache_hits", "cache_misses"))
 print(mrctl.__file__, hits, misses)
 """
 
