@@ -85,6 +85,16 @@ PRIOR = np.dtype(
     align=True,
 )
 
+# The loops below pass on parts of records, as the control tick does, so that a law is compiled once for both.
+MOTION = np.dtype(
+    [
+        ("command", "f8", 2),  # V in m/s and θ̇ in rad/s
+        ("derivative", "f8", 2),  # V̇ in m/s² and θ̈ in rad/s²
+        ("voltage", "f8", 2),  # out: voltage of the two channels, V (rad/s on a steering channel)
+    ],
+    align=True,
+)
+
 
 @kernel
 def prior_voltage(command: Array, derivative: Array, prior: Row, voltage: Array) -> None:
@@ -112,10 +122,10 @@ def explained(twist: Array, acceleration: Array, rigid: bool, prior: Row, voltag
 
 
 @kernel
-def prior_voltages(command: Array, derivative: Array, prior: Rows, voltage: Array) -> None:
-    """`prior_voltage` of all robots."""
-    for i in range(len(voltage)):
-        prior_voltage(command[i], derivative[i], prior[i], voltage[i])
+def prior_voltages(motion: Rows, prior: Rows) -> None:
+    """`prior_voltage` of all robots, for records of `MOTION` and `PRIOR`."""
+    for i in range(len(motion)):
+        prior_voltage(motion[i].command, motion[i].derivative, prior[i], motion[i].voltage)
 
 
 class Prior:
@@ -143,9 +153,10 @@ class Prior:
 
     def output(self, command: Array, derivative: Array) -> Array:
         """Returns the voltages of the two channels of all robots, `(B, 2)` in V; see `Feedforward.output`."""
-        voltage = np.empty((len(self.rows), 2))
-        prior_voltages(_own(command), _own(derivative), self.rows, voltage)
-        return voltage
+        motion = np.zeros(len(self.rows), MOTION)
+        motion["command"], motion["derivative"] = command, derivative
+        prior_voltages(motion, self.rows)
+        return motion["voltage"]
 
 
 class Loop(NamedTuple):
@@ -202,7 +213,7 @@ class Learner(ABC):
         self.prior = Prior([None] * size, loop.rigid)
         self.rows: Rows = np.zeros(size, self.record)
         self.weight_norm = np.zeros(size)
-        self._command, self._voltage, self._added = np.zeros((3, size, 2))
+        self._motion, self._added = np.zeros(size, MOTION), np.zeros((size, 2))
 
     @abstractmethod
     def restore(self, rows: NDArray[np.intp]) -> None:
@@ -241,15 +252,15 @@ class Learner(ABC):
 
     def output(self, command: Array, derivative: Array) -> Array:
         """Returns the feedforward of all robots; see `Feedforward.output`."""
-        self._command[:] = command
-        law = respond_all.calling(respond=self.respond)
-        law(self._command, _own(derivative), self.robot, self.arrays, self._voltage)
-        return self._voltage
+        motion = self._motion
+        motion["command"], motion["derivative"] = command, derivative
+        respond_all.calling(respond=self.respond)(motion, self.robot, self.arrays)
+        return motion["voltage"]
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
         """Lets all robots learn; see `Feedforward.learn`."""
         learn_all.calling(learn_one=self.learn_one)(
-            self._command, _own(feedback), _own(saturated), _own(twist), _own(voltage), self.period, self.robot,
+            self._motion, _own(feedback), _own(saturated), _own(twist), _own(voltage), self.period, self.robot,
             self.prior.rows, self.arrays, self._added, self.weight_norm,
         )  # fmt: skip
         return self._added
@@ -280,22 +291,23 @@ respond, learn_one = nothing, learn_nothing  # the kernels that the loops below 
 
 
 @kernel
-def respond_all(command: Array, derivative: Array, robot: Rows, arrays: tuple[Any, ...], voltage: Array) -> None:
-    """Writes the outputs of all robots."""
-    for i in range(len(voltage)):
-        respond(i, command[i], derivative[i], robot[0], arrays, voltage[i])
+def respond_all(motion: Rows, robot: Rows, arrays: tuple[Any, ...]) -> None:
+    """Writes the outputs of all robots, to records of `MOTION`."""
+    for i in range(len(motion)):
+        respond(i, motion[i].command, motion[i].derivative, robot[0], arrays, motion[i].voltage)
 
 
 @kernel
 def learn_all(
-    command: Array, feedback: Array, frozen: Array, twist: Array, voltage: Array, period: float, robot: Rows,
+    motion: Rows, feedback: Array, frozen: Array, twist: Array, voltage: Array, period: float, robot: Rows,
     prior: Rows, arrays: tuple[Any, ...], added: Array, norm: Array,
 ) -> None:  # fmt: skip
     """Does one learning step of all robots."""
     for i in range(len(added)):
         norm[i] = learn_one(
-            i, command[i], feedback[i], frozen[i], twist[i], voltage[i], period, robot[0], prior[i], arrays, added[i]
-        )
+            i, motion[i].command, feedback[i], frozen[i], twist[i], voltage[i], period, robot[0], prior[i], arrays,
+            added[i],
+        )  # fmt: skip
 
 
 class NoLearner(Learner):
