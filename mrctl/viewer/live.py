@@ -38,10 +38,10 @@ from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
 from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import Recording
 from mrctl.viewer.scene import Scene
-from mrctl.viewer.score import whole_laps
+from mrctl.viewer.score import Metrics
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import CHANGEABLE, HOUR, Session, changed, ends, followed, pushed, state
+from mrctl.viewer.session import CHANGEABLE, HOUR, Session, begun, changed, ends, followed, pushed, state
 from mrctl.viewer.stories import STORIES
 
 WINDOW = 12.0  # s, time span of the plots
@@ -251,7 +251,7 @@ class Live(Page):
         self._drawn = self._plotted = None
         self._way: Reference | None = None  # that a visitor has brought, as drawn
         self._deviation = 1  # factor on the deviations from the reference in the picture
-        self._laps: list[dict[str, Any]] = []  # metrics of the whole laps until now
+        self._metrics = Metrics(session.robot, session.period)
         self._counted = (time.monotonic(), session.tick)
         self._happened = 0  # number of the scenarios' events that have happened
         self._describe()
@@ -560,6 +560,8 @@ class Live(Page):
         if happened != self._happened:  # such as those that the scenarios brought along
             self._happened = happened
             self._describe()
+        still = self._back is not None or not self.playing
+        self._metrics.update([session.fullest], session.log, self.tick, exact=still)
         past = session.tick, self._back, self.playing, self.deviation.value  # a pause draws what was left out before it
         if past != self._plotted:
             self._plotted = past
@@ -567,19 +569,14 @@ class Live(Page):
         if session.tick:
             now = self._record()
             self.describe_estimates(self._labels, now)
-            ticks = round(session.start[0].reference.period / session.period)
-            if session.tick >= (len(self._laps) + 1) * ticks:
-                log = session.log(len(self._laps) * ticks)
-                self._laps += whole_laps(log, ticks, session.period, session.robot)
-            laps, when = self._laps[: self.tick // ticks], f"at {session.time:.0f} s"
-            self._plots.score(now, laps, session.parameter_error(), when)
+            self._plots.score(now, self._metrics, session.parameter_error(), f"at {session.time:.0f} s")
 
     def _status_lines(self) -> list[str]:
         """Returns what the page says of the session: time, lap and pace, who has stopped and why, and who arrived."""
         doing = "playing" if self.playing else "paused" if self.session.running else "finished; reset starts again"
         if self._back is not None:
             doing = f"of {self.session.time:.2f} s; whatever you do goes on from here"
-        lap = "" if self._ends is not None else f" · lap {1 + int(self.time / self.session.start[0].reference.period)}"
+        lap = "" if self._ends is not None else f" · lap {self._lap()}"
         factor = f" · {self.factor:.2f}× real time" if self.playing else ""
         lines = [f"<b>{self.time:.2f} s</b>{lap} · {doing}{factor}"]
         for row, label in enumerate(self._labels):
@@ -590,6 +587,11 @@ class Live(Page):
             lines += arrivals(self._labels, self._record(), self._ends)
         return lines
 
+    def _lap(self) -> int:
+        """Returns the number of the present lap on the present reference."""
+        driven = self.session.fullest
+        return 1 + int((self.time - begun(driven, self.time)) / followed(driven, self.time).period + 1e-9)
+
     def _show_past(self) -> None:
         """Draws the last seconds, or those around the moment that is shown: curves, and trails, which change less."""
         session = self.session
@@ -599,7 +601,7 @@ class Live(Page):
         first = max(0, last - ticks) // step * step
         log = session.log(first, last)
         if len(log) < 2:
-            return self._plots.clear(WINDOW)
+            return self._plots.clear(WINDOW, self._metrics)
         times = np.arange(first, first + len(log), dtype=float) * session.period
         near = session.clearance(first)
         self._plots.show(times, log, None if near is None else near[: len(log)], step, self._event_times())

@@ -14,7 +14,7 @@ from mrctl.kernel import Array, Rows
 from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.results.dataset import blank
 from mrctl.viewer.looks import EVENT_COLOUR, Colour, Look, pale
-from mrctl.viewer.score import lessons, table
+from mrctl.viewer.score import Metrics, lessons, table
 
 SHARE_WINDOW = 1.0  # s over which the share of the feedback is averaged
 CURSOR_COLOUR: Colour = (107, 114, 128)
@@ -220,16 +220,16 @@ class Plots:
             values = [time, *(curve.values for curve in chart.curves)]
             _send(handle, (*(v[within][::step].astype(np.float32) for v in values), marks))
 
-    def score(self, now: Rows, laps: Sequence[dict[str, Array]], error: Array | None, when: str) -> None:
+    def score(self, now: Rows, metrics: Metrics, error: Array | None, when: str) -> None:
         """Writes the score above the charts, as `score.table` does, and below them what `score.lessons` says."""
-        self._score.content = table(self._robots, now, laps)
-        self._lessons.content = lessons(self._robots, laps, error, when)
+        self._score.content = table(self._robots, now, metrics.laps, metrics.way)
+        self._lessons.content = lessons(self._robots, metrics.laps, metrics.way, error, when)
 
-    def clear(self, span: float) -> None:
-        """Draws empty charts of `span` s, and a score without numbers."""
+    def clear(self, span: float, metrics: Metrics) -> None:
+        """Draws empty charts of `span` s, and a score without errors."""
         nothing = blank(2, len(self._robots))
         self.show(np.array([0.0, span]), nothing, self._nowhere(), 1)
-        self.score(nothing[0], (), None, "")
+        self.score(nothing[0], metrics, None, "")
 
     def point(self, share: float | None) -> None:
         """Draws a vertical line in all charts at a share of their time, or none; their data need not be sent again."""

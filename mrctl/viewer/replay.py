@@ -9,7 +9,6 @@ import numpy as np
 from typing_extensions import override
 
 from mrctl.physics.parameters import read_robot
-from mrctl.results.dataset import lap_time
 from mrctl.results.metrics import METRICS
 from mrctl.viewer.looks import MAX_MARKED
 from mrctl.viewer.page import SPEEDS, Page, arrivals, block, warning
@@ -17,7 +16,7 @@ from mrctl.viewer.plots import Plots
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, event_times, joint_log, looks_of
 from mrctl.viewer.scatter import KNOWN, Scatter, in_words, numbers_of
 from mrctl.viewer.scene import Scene
-from mrctl.viewer.score import whole_laps
+from mrctl.viewer.score import Metrics
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import ends
@@ -111,9 +110,7 @@ class Replay(Page):
         self._deviation = self.magnified_deviation(self._log)
         self._scene.show_recordings(recordings, self._deviation)
         self._times, self._events = times, event_times(recordings)
-        lap = lap_time(recordings[0].scenario) / recordings[0].period
-        self._lap = round(lap) if np.isfinite(lap) else len(self._log)
-        self._laps = whole_laps(self._log, self._lap, recordings[0].period, read_robot(recordings[0].model))
+        self._metrics = Metrics(read_robot(recordings[0].model), recordings[0].period)
         learned = [np.full((8, 2), np.nan) if r.parameter_error is None else r.parameter_error for r in recordings]
         self._parameter_error = None if np.isnan(learned).all() else np.stack(learned)
         self._labels, sensing = [robot.label for robot in robots], [r.scenario.sensing for r in recordings]
@@ -209,8 +206,10 @@ class Replay(Page):
             self._plotted = self.time
             self.scrubber.value = self._plots.time.value = self.time  # a click there again changes it again
             tick = min(round(self.time / self.recordings[0].period), len(self._log) - 1)
-            laps = self._laps[: (tick + 1) // self._lap]
-            self._plots.score(self._log[tick], laps, self._parameter_error, "at the end")
+            scenarios, first = [r.scenario for r in self.recordings], self.recordings[0]
+            begun = round(first.start / first.period)
+            self._metrics.update(scenarios, lambda a, b: self._log[a:b], tick + 1, begun, exact=not self.playing)
+            self._plots.score(self._log[tick], self._metrics, self._parameter_error, "at the end")
             start, end = self._interval.value
             self._plots.point((self.time - start) / (end - start) if end > start else 0.0)
 

@@ -1,23 +1,30 @@
-"""The score of robots while they drive, with the metrics of the tables, and what their last lap could teach."""
+"""The score of robots while they drive, with the metrics of the tables, and what their motion could teach."""
 
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from mrctl.control.features import NAMES, feature_scale
 from mrctl.kernel import Array, Rows
+from mrctl.loop.goals import arrived
 from mrctl.results.excitation import alone
 from mrctl.results.metrics import excitation, lap_metrics
+from mrctl.scenario import Scenario
 from mrctl.theory.robot import Robot
 from mrctl.viewer.looks import Look
+from mrctl.viewer.session import begun, ends, followed
 
-HEADINGS = (
+OF_LAPS = (
     "error now, mm", "RMS of last lap, mm", "best lap, mm", "feedback in last lap, %", "energy of last lap, J",
     "excitation in last lap",
 )  # fmt: skip
+OF_WAY = (
+    "error now, mm", "RMS on the way, mm", "feedback on the way, %", "energy on the way, J", "excitation on the way",
+)  # fmt: skip
+FRESH, SHARE = 1.0, 0.02  # s, and a share of a way, by which a robot drives on until its metrics are computed again
 
 # A row for each number and a column for each robot: the names of the numbers stay where many robots are scrolled.
 HEADING = "position:sticky;left:0;background:var(--mantine-color-body);padding-right:0.8em"
@@ -46,13 +53,86 @@ def whole_laps(log: Rows, ticks: int, period: float, robot: Robot) -> list[dict[
     return laps
 
 
-def table(robots: Sequence[Look], now: Rows, laps: Sequence[dict[str, Array]]) -> str:
+def on_the_way(log: Rows, goals: Array, period: float, robot: Robot) -> list[dict[str, Array]]:
+    """Returns what `whole_laps` does of a way to a goal, as one lap; none of a way that has hardly begun.
+
+    Args:
+        log: Record of `TICK` of each sample from the start of the way and of each robot, `(T, B)`; the way of a robot
+            ends with the first one in which it has arrived.
+        goals: Goals in m, m, rad, `(3,)` or `(B, 3)`; NaN for none.
+        period: Time between samples in s.
+        robot: The nominal robot.
+    """
+    if len(log) < 2:
+        return []
+    there = arrived(np.stack([log["x"], log["y"], log["theta"]], axis=-1), log["v"], goals)
+    found = []
+    for row, at in enumerate(there.T):
+        samples = max(2, int(at.argmax()) + 1) if at.any() else len(log)
+        found += whole_laps(log[:samples, row : row + 1], samples, period, robot)
+    return [{name: np.concatenate([of[name] for of in found]) for name in found[0]}]
+
+
+class Metrics:
+    """Metrics of what robots have driven on their present reference: of each whole lap, or of the way to its end.
+
+    Attributes:
+        laps: As from `whole_laps`, or from `on_the_way`.
+        way: Whether they are of a way.
+    """
+
+    def __init__(self, robot: Robot, period: float) -> None:
+        """Takes the nominal robot and the time between samples in s."""
+        self._robot, self._period = robot, period
+        self._all: list[dict[str, Array]] = []
+        self._of: tuple[int, bool] | None = None  # first sample of what `_all` is of, and whether that is a way
+        self._until = 0  # number of samples at which the metrics of a way were computed
+        self.laps, self.way = self._all, False
+
+    def update(
+        self, scenarios: Sequence[Scenario], log: Callable[[int, int], Rows], until: int, first: int = 0,
+        exact: bool = True,
+    ) -> None:  # fmt: skip
+        """Computes what is not known yet.
+
+        Args:
+            scenarios: Scenario of each robot with its events until now, or one of all robots.
+            log: Returns a record of `TICK` of the samples from one to another one, without it, `(T, B)`.
+            until: Number of samples until now.
+            first: Control tick of the first sample.
+            exact: Whether the metrics of a way are those until now, or may be a little older.
+        """
+        now = (first + until) * self._period
+        bounds = [ends(scenario, now) for scenario in scenarios]
+        begin, way = max(0, round(begun(scenarios[0], now) / self._period) - first), bounds[0] is not None
+        if (begin, way) != self._of or until < self._until:
+            self._of, self._all, self._until = (begin, way), [], 0
+        if way:
+            old = until - self._until >= max(FRESH / self._period, SHARE * (until - begin))
+            if old or (exact and until != self._until):
+                goals = np.stack([np.full(3, np.nan) if found is None else found[1] for found in bounds])
+                self._all = on_the_way(log(begin, until), goals, self._period, self._robot)
+                self._until = until
+            self.laps = self._all
+        else:
+            ticks = round(followed(scenarios[0], now).period / self._period)
+            done, known = (until - begin) // ticks, len(self._all)
+            if done > known:
+                self._all += whole_laps(
+                    log(begin + known * ticks, begin + done * ticks), ticks, self._period, self._robot
+                )
+            self.laps = self._all[:done]
+        self.way = way
+
+
+def table(robots: Sequence[Look], now: Rows, laps: Sequence[dict[str, Array]], way: bool) -> str:
     """Returns the score in HTML.
 
     Args:
         robots: Look of each robot.
         now: Record of `TICK` of each robot, `(B,)`.
-        laps: As from `whole_laps`, of the laps until now.
+        laps: As in `Metrics`.
+        way: As in `Metrics`.
     """
     nothing = np.full(len(robots), np.nan)
     errors = np.array([lap["position_rmse"] for lap in laps] or [nothing])
@@ -61,26 +141,28 @@ def table(robots: Sequence[Look], now: Rows, laps: Sequence[dict[str, Array]]) -
     columns = [
         1e3 * np.hypot(now["longitudinal_error"], now["lateral_error"]),
         1e3 * errors[-1],
-        1e3 * np.where(np.isfinite(best), best, np.nan),
+        *([] if way else [1e3 * np.where(np.isfinite(best), best, np.nan)]),
         100 * last["feedback_share"],
         last["energy"],
         last["excitation"],
     ]
-    return _table("mrctl-score", "", robots, HEADINGS, columns)
+    return _table("mrctl-score", "", robots, OF_WAY if way else OF_LAPS, columns)
 
 
-def lessons(robots: Sequence[Look], laps: Sequence[dict[str, Array]], error: Array | None, when: str) -> str:
-    """Returns what the last lap could teach about each feature, and what has been learned, in HTML.
+def lessons(robots: Sequence[Look], laps: Sequence[dict[str, Array]], way: bool, error: Array | None, when: str) -> str:
+    """Returns what the last lap or the way could teach about each feature, and what has been learned, in HTML.
 
     Args:
         robots: Look of each robot.
-        laps: As from `whole_laps`, of the laps until now.
+        laps: As in `Metrics`.
+        way: As in `Metrics`.
         error: Learned less true coefficients of the features in V, `(B, 8, 2)`, NaN where there are none; None if no
             robot has any.
         when: When this error holds.
     """
     excited = laps[-1]["alone"].T if laps else np.full((len(NAMES), len(robots)), np.nan)
-    found = _table("mrctl-excitation", "excitation alone, last lap", robots, NAMES, excited)
+    title = f"excitation alone, {'on the way' if way else 'last lap'}"
+    found = _table("mrctl-excitation", title, robots, NAMES, excited)
     if error is not None:
         for k, channel in enumerate("ΣΔ"):
             title = f"error of coefficient {channel}, prior and learner, V, {when}"

@@ -409,6 +409,11 @@ def followed(scenario: Scenario, time: float) -> Reference:
     return next((reference for reference in reversed(brought) if reference), scenario.reference)
 
 
+def begun(scenario: Scenario, time: float) -> float:
+    """Returns since when a run has followed the reference that it follows at a time in s."""
+    return max((e.time for e in scenario.events if e.reference and e.time <= time + 1e-9), default=0.0)
+
+
 def ends(scenario: Scenario, time: float) -> Array | None:
     """Returns where the robot of a run comes from and goes to at a time in s; None on a course without end.
 

@@ -174,7 +174,9 @@ def test_what_is_learned():
     assert abs(expected).max() > 0.1 and Session(scenarios[1:]).parameter_error() is None
     laps = whole_laps(session.log(), session.tick, session.period, session.robot)
     robots = [Look("A & B", (1, 2, 3)), Look("fel", (4, 5, 6))]
-    excited, common, difference = pd.read_html(io.StringIO(lessons(robots, laps, error, "now")), header=0, index_col=0)
+    excited, common, difference = pd.read_html(
+        io.StringIO(lessons(robots, laps, False, error, "now")), header=0, index_col=0
+    )
     assert [*excited.index] == [*common.index] == [*NAMES] and [*excited.columns] == ["A & B", "fel"]
     motion = single.isel(run=0)
     twist = np.stack([motion.v_command.values, motion.omega_command.values], -1)

@@ -1,10 +1,12 @@
 """What the viewer shows of missions: obstacles that move, plans and goals, clearances, scans, and goals by click."""
 
+import io
 import json
 import re
 import runpy
 
 import numpy as np
+import pandas as pd
 import pytest
 import shapely
 from test_viewer import CHROMIUM, DRAG_ERROR, PATIENCE, ROBOT, SOFTWARE, node, serving, until, visit
@@ -17,6 +19,7 @@ from mrctl.navigation.mission import avoiding, navigate, prepared, task_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.results.dataset import SIGNALS
+from mrctl.results.metrics import per_lap
 from mrctl.sensing.lidar import Lidar
 from mrctl.theory.obstacles import turned
 from mrctl.viewer import view as viewing
@@ -120,6 +123,77 @@ def test_replay_of_a_mission(server, tmp_path):
     chart = next(chart for chart in written if chart["title"] == "clearance, m")
     exported = [min(v for v in curve["values"] if v is not None) for curve in chart["curves"]]
     assert exported == pytest.approx(mission.table["clearance"], abs=0.01)
+
+
+def numbers(page):
+    """The numbers of the score, by heading and robot, NaN for a dash."""
+    (found,) = pd.read_html(io.StringIO(page._plots._score.content), header=0, index_col=0, na_values=["–"])
+    return found
+
+
+ON_THE_WAY = ["error now, mm", *(f"{what} on the way, {unit}" for what, unit in (("RMS", "mm"), ("feedback", "%")))]
+ON_THE_WAY += ["energy on the way, J", "excitation on the way"]
+
+
+def test_score_of_a_mission(server, tmp_path):
+    """A mission has no laps: the numbers are those of its table at the goal, live and in replays, and stay so there."""
+    mission = navigate(ROOM, PID, compare=["model"])
+    of = per_lap(mission.result).isel(lap=0)
+    expected = np.stack([1e3 * of.position_rmse, 100 * of.feedback_share, of.energy])
+    assert expected[0] == pytest.approx(1e3 * mission.table["position_rmse"])
+    save(mission.result, tmp_path / "result.zarr")
+    replay = Replay(Library(tmp_path / "result.zarr"), [0, 1], server)
+    half = replay.duration / 2
+    for time in (replay.duration, half):
+        replay._scrub(time)
+        replay.refresh()
+        assert [*numbers(replay).index] == ON_THE_WAY
+        assert (numbers(replay).values[1:4] == pytest.approx(expected, rel=6e-3)) == (time > half)
+    assert numbers(replay).notna().all(axis=None)
+    assert "excitation alone, on the way" in replay._plots._lessons.content
+    _, own = prepared(ROOM, PID)
+    live = Live([own.replace(goal=None), own.replace(goal=None, prior="model")], server)
+    seen = {}
+    for seconds in (0.5, 1.5, 2 * half + 1, 2 * half + 4):
+        while live.session.time < seconds:
+            live.session.step()
+        live.refresh()
+        seen[seconds] = numbers(live).values[1:4].astype(float)
+    assert [*numbers(live).index] == ON_THE_WAY
+    first, second, there, later = seen.values()
+    assert np.isnan(first).all() and np.isfinite(second).all()
+    assert there == pytest.approx(expected, rel=6e-3) and np.array_equal(there, later)
+    live._look_back(half)
+    live.refresh()
+    energy = live.session.log(0, round(half / live.session.period))["power"].sum(axis=0) * live.session.period
+    assert numbers(live).loc["energy on the way, J"].values == pytest.approx(energy, rel=6e-3)
+    live._look_back(live.session.time)
+    live._head_for((0.5, -1.2, np.pi))
+    begun = live.session.tick
+    for _ in range(300):
+        live.session.step()
+    live.refresh()
+    energy = live.session.log(begun)["power"].sum(axis=0) * live.session.period
+    assert numbers(live).loc["energy on the way, J"].values == pytest.approx(energy, rel=0.06)  # of this way alone
+
+
+def test_laps_of_another_course(server):
+    """Laps are those of the course that the robots follow: a new one begins with lap 1, of its own period."""
+    live = Live([PID.replace(reference=Circle(radius=0.6, period=4.0))], server)
+    for _ in range(450):
+        live.session.step()
+    live.refresh()
+    assert " · lap 2 · " in live._status.content and numbers(live).loc["RMS of last lap, mm"].notna().all()
+    live._apply_event(reference=Circle(radius=0.8, period=6.0))
+    since = live.session.tick + live.session.preview
+    for seconds, lap in ((5.9, 1), (6.5, 2)):
+        while live.session.tick < since + round(seconds / live.session.period):
+            live.session.step()
+        live.refresh()
+        assert f" · lap {lap} · " in live._status.content
+    error = live.session.log(since, since + 600)
+    off = 1e3 * np.sqrt(np.mean((error["x"] - error["x_ref"]) ** 2 + (error["y"] - error["y_ref"]) ** 2))
+    assert numbers(live).loc["RMS of last lap, mm"].values == pytest.approx([off], rel=6e-3)
 
 
 def test_clearance_live(server):
