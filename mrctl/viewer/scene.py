@@ -15,7 +15,7 @@ from mjviser.conversions import merge_geoms
 
 from mrctl.kernel import Array, Rows
 from mrctl.physics import mjcf
-from mrctl.physics.obstacles import quaternion
+from mrctl.physics.obstacles import HEIGHT, quaternion
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.physics.stand import ground
@@ -24,6 +24,7 @@ from mrctl.scenario import Scenario
 from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles, Surroundings
 from mrctl.theory.references import Reference
 from mrctl.viewer.arrows import Arrows
+from mrctl.viewer.cameras import fitted
 from mrctl.viewer.deviation import Target
 from mrctl.viewer.looks import EVENT_COLOUR, MAX_MARKED, Colour, Look
 from mrctl.viewer.navigation import GOAL_COLOUR, Navigation
@@ -32,7 +33,7 @@ from mrctl.viewer.robots import SEEN, Dragged, Robots, in_order
 from mrctl.viewer.sensors import Marks
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import ends, pushed
-from mrctl.viewer.shapes import add_mesh, bar, disc, ribbons
+from mrctl.viewer.shapes import add_mesh, bar, disc, ribbons, sides
 
 # Colours of the floor: its thin lines, its thick lines, its surface.
 LIGHT_FLOOR = (214, 217, 221), (190, 194, 200), (238, 240, 242)
@@ -43,12 +44,14 @@ TRAIL_POINTS_OF_ALL = 1600  # largest number of points in the trails of all robo
 PATH_POINTS = 600  # number of points in the path of a finished run
 TARGET_ABOVE = 0.15  # height of targets over the robot, in diagonals of its outline
 CLEARANCE = 0.05  # m, least height of a camera above the floor
-# Initial camera, relative to the middle of the reference and in units of its size.
-CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -1.23, 0.9]), np.array([0.0, 0.1, 0.0])
+OVERVIEW, TOP = np.array([0.0, -0.7, 0.7]), np.array([0.0, -0.01, 1.0])  # directions to cameras; no camera looks down
+ASPECT = 0.9  # of width to height of the picture in a page of which more is not known
+COURSE_TIMES = 9  # at which obstacles that move are to be seen in an overview, during a lap
 THICK = 0.012  # thickness of the lines from targets to robots, in diagonals of the robot's outline
 NEXT_TRAIL = 0.001  # m, from the height of the trails of one colour to that of the next; equal ones would flicker
 LINE_WIDTH = 0.004  # of the reference, as a share of the width of the view; trails, which are below, are twice as wide
 REACH = 0.03  # distance from a trail of clicks on it, as a share of the width of the view
+FLOOR = 80.0  # m, width of the floor that is drawn, of which the horizon hides what is far
 LEAST_VIEW = 1.2  # m, least width of the view
 SHADE = 0.35  # opacity of shadows on the floor
 GRIP, GRIP_BELOW = 50.0, 0.02  # m, half the side of the floor that can be dragged on, and its depth below the floor
@@ -130,7 +133,7 @@ class Scene:
                 self._floor = data.geom_xmat[geom].reshape(3, 3)[:, 2].copy(), data.geom_xpos[geom].copy()
                 self._floors.append(
                     self._scene.add_grid(
-                        name, 24, 24, cell_size=0.5, section_size=1, plane_opacity=1.0, shadow_opacity=0.0,
+                        name, FLOOR, FLOOR, cell_size=0.5, section_size=1, plane_opacity=1.0, shadow_opacity=0.0,
                         wxyz=turn, position=data.geom_xpos[geom],
                     )
                 )  # fmt: skip
@@ -152,12 +155,30 @@ class Scene:
         references = [scenario.reference, *(e.reference for e in scenario.events if e.reference)]
         lines = self._lines(references)
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
-        self._view = max(LEAST_VIEW, *(high - low)) + self.length
+        self._seen = self._to_see(lines.reshape(-1, 3), max(reference.period for reference in references))
+        self._view = max(np.ptp(self._seen[:, :2], axis=0))
         self.draw_references(references)
         self._factor.position = [(low[0] + high[0]) / 2, low[1] - self.length / 2, low[2]]  # in front of the robots
-        middle = (low + high) / 2
-        self._look(middle + self._view * CAMERA_POSITION, middle + self._view * CAMERA_TARGET)
+        self._look()
         self.paint()
+
+    def _to_see(self, lines: Array, duration: float) -> Array:
+        """Returns points around all that an overview shows: robots on lines, and the obstacles around these.
+
+        Args:
+            lines: Places on the lines in m, `(n, 3)`.
+            duration: Time in s in which obstacles move.
+        """
+        low, high = lines.min(axis=0), lines.max(axis=0)
+        size, reach = max(LEAST_VIEW, *(high - low)[:2]), np.hypot(*abs(self.robots.footprint).max(axis=0))
+        sides_of_robot = (-reach, reach), (-reach, reach), (0.0, self.robots.top)
+        found = [lines + np.array(corner) for corner in itertools.product(*sides_of_robot)]
+        least = [(low + high) / 2 + np.array([x, y, 0]) * LEAST_VIEW / 2 for x, y in SQUARE]
+        times = np.linspace(0, duration, COURSE_TIMES if self._surroundings.courses else 1)
+        near = np.concatenate([sides(self._surroundings.at(time)).reshape(-1, 2) for time in times])
+        near = near.clip(low[:2] - size, high[:2] + size)  # what is farther away would make all else too small
+        found += [np.column_stack([near, np.full(len(near), z)]) for z in (low[2], HEIGHT)]
+        return np.concatenate([*found, least])
 
     def draw_references(self, references: Sequence[Reference]) -> None:
         """Draws a lap of each reference on the ground, in place of those before; the cameras stay."""
@@ -175,26 +196,30 @@ class Scene:
             lines.append(np.column_stack([pose[:, :2], heights]))
         return np.stack(lines)
 
-    def _look(self, position: Array, target: Array) -> None:
+    def _look(self) -> None:
         """Sets the camera of pages to come, and of open ones if it is another than before."""
-        initial = self._server.initial_camera
+        initial, (position, target) = self._server.initial_camera, self.camera(False, ASPECT)
         if np.allclose(initial.position, position):
             return
         initial.position, initial.look_at = position, target
         for client in self._server.get_clients().values():
-            self.turn(client, position, target)
+            self.turn(client, *self.camera(False, client.camera.aspect))
 
     def turn(self, client: viser.ClientHandle, position: Array, target: Array) -> None:
         """Places a visitor's camera, in m, `(3,)` each."""
         client.camera.position, client.camera.look_at = position, target
 
-    def camera(self, top: bool) -> tuple[Array, Array]:
-        """Returns the position of a camera that sees the whole reference, and what it looks at, in m, `(3,)` each."""
-        initial = self._server.initial_camera
-        if not top:
-            return np.array(initial.position), np.array(initial.look_at)
-        middle = np.array(initial.look_at) - self._view * CAMERA_TARGET
-        return middle + self._view * np.array([0.0, -0.01, 1.6]), middle  # a camera cannot look straight down
+    def camera(self, top: bool, aspect: float) -> tuple[Array, Array]:
+        """Returns a camera that sees the whole reference, and the obstacles around it, as large as possible.
+
+        Args:
+            top: Whether it is above it.
+            aspect: Ratio of width to height of the picture.
+
+        Returns:
+            The position, and what the camera looks at, in m, `(3,)` each.
+        """
+        return fitted(self._seen, TOP if top else OVERVIEW, self._server.initial_camera.fov, aspect)
 
     def behind(self) -> tuple[Array, Array]:
         """Returns the position of a camera behind the first robot, and what it looks at, in m, `(3,)` each."""

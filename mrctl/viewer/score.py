@@ -176,7 +176,7 @@ def _table(
     """Returns a table in HTML with a row for each heading and a column for each robot."""
     names = "".join(f'<th style="{NUMBER};color:rgb{r.colour}">{html.escape(r.label)}</th>' for r in robots)
     lines = "".join(
-        f'<tr><td style="{HEADING}">{heading}</td>{_cells(values)}</tr>'
+        f'<tr><td style="{HEADING};white-space:nowrap">{heading}</td>{_cells(values)}</tr>'
         for heading, values in zip(headings, rows, strict=True)
     )
     return (

@@ -28,7 +28,7 @@ from mrctl.theory.obstacles import Surroundings
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of, path
-from mrctl.viewer.scene import CAMERA_POSITION, CAMERA_TARGET, LEAST_VIEW
+from mrctl.viewer.scene import LEAST_VIEW
 from mrctl.viewer.sensors import magnification
 
 Picture = NDArray[np.uint8]
@@ -38,7 +38,8 @@ RATES = {".mp4": 25.0, ".gif": 12.5}  # pictures a second
 LINE_POINTS, TRAIL_POINTS = 200, 100
 TRAIL = 12.0  # s that a trail shows
 GHOST_OPACITY = 0.25
-NEARER = 0.8  # distance of the camera from the track, relative to that in the page
+# Camera, relative to the middle of the reference and in units of its size.
+CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -0.964, 0.72]), np.array([0.0, 0.1, 0.0])
 WIDTH = 0.003  # of trails, as a share of the width of the view; the reference is twice as wide
 
 
@@ -118,7 +119,7 @@ def _pictures(
         view = max(LEAST_VIEW, *(high - low))
         camera = mujoco.MjvCamera()
         camera.lookat = (low + high) / 2 + view * CAMERA_TARGET
-        back = NEARER * view * (CAMERA_TARGET - CAMERA_POSITION)
+        back = view * (CAMERA_TARGET - CAMERA_POSITION)
         camera.distance = float(np.linalg.norm(back))
         camera.azimuth = np.degrees(np.arctan2(back[1], back[0]))
         camera.elevation = np.degrees(np.arcsin(back[2] / camera.distance))

@@ -23,6 +23,7 @@ from mrctl.results.metrics import per_lap
 from mrctl.sensing.lidar import Lidar
 from mrctl.theory.obstacles import turned
 from mrctl.viewer import view as viewing
+from mrctl.viewer.cameras import FULL
 from mrctl.viewer.export import _curves
 from mrctl.viewer.live import SAMPLES, WINDOW, Live
 from mrctl.viewer.page import arrivals
@@ -563,6 +564,33 @@ TO_SCREEN = """([x, y]) => {
 }"""
 
 
+IN_PICTURE = """(points) => {
+    const m = window.__viserMutable;
+    return points.map((point) => {
+        const place = m.nodeRefFromName['/world'].localToWorld(new m.camera.position.constructor(...point));
+        const { x, y } = place.project(m.camera);
+        return [x, y];
+    });
+}"""
+
+
+@pytest.mark.parametrize("goal", [(8.0, 0.5, 0.0), (0.5, 6.0, 1.5), (1.0, 0.2, 0.3)])
+def test_to_see(server, goal):
+    """An overview shows start, goal, obstacles and where they go; of what is far off, a plan's size around it."""
+    passing = Disc(x=0.5, y=-1.0, radius=0.2, course=Line(speed=0.4, length=1.0))
+    far = Box(x=60.0, length=0.2, width=90.0)
+    task = Task(obstacles=Obstacles(shapes=(*WALLS.shapes[:1], passing, far)), start=(0, 0, 0), goal=goal)
+    live = Live([prepared(task, PID)[1]], server)
+    seen, hull = shapely.MultiPoint(live._scene._seen[:, :2]).convex_hull.buffer(1e-6), footprint(mjcf.load())
+    for x, y, theta in (task.start, task.goal):
+        turn = np.array([[np.cos(theta), np.sin(theta)], [-np.sin(theta), np.cos(theta)]])
+        assert seen.covers(shapely.Polygon(hull @ turn + [x, y]))
+    for y in (-1.0, 0.0):  # of the course
+        assert seen.buffer(0.01).covers(shapely.Point(0.5, y).buffer(0.2))
+    size = max(1.2, goal[0], goal[1])
+    assert seen.bounds[2] < goal[0] + 1.5 * size and live._scene._seen[:, 2].max() == pytest.approx(0.5)
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
 def test_goal_by_click(tmp_path):
     """A visitor clicks twice on the floor: robot and ghost go there and look there; a goal in a wall is refused."""
@@ -587,6 +615,15 @@ def test_goal_by_click(tmp_path):
         with serving(lambda server: Live(scenarios, server)) as (live, url), visit(browser, url, known=known) as page:
             until(lambda: node(page, ROBOT) is not None, "the scene")
             page.locator(".mantine-Notification-closeButton").click()  # that rendering is in software
+
+            def edges():
+                places = np.array(page.evaluate(IN_PICTURE, live._scene._seen.tolist()))
+                return places.min(axis=0), places.max(axis=0)
+
+            for width in (1280, 1500):  # the overview fits into the picture, whatever its shape is
+                page.set_viewport_size({"width": width, "height": 800})
+                until(lambda: np.abs(edges()).max() == pytest.approx(FULL, abs=1e-3), "a full picture")
+                assert edges()[0] == pytest.approx(-edges()[1], abs=2e-3)
             click(page, (0.9, -0.5), (0.9, -1.2))
             until(lambda: len(live.session.saved()[0].events) == 1, "the plan")
             set_at = live.session.saved()[0].events[0].time

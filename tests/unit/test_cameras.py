@@ -1,0 +1,37 @@
+"""The camera of an overview: everything is in the picture, and fills it."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mrctl.viewer.cameras import FULL, fitted
+from mrctl.viewer.scene import OVERVIEW, TOP
+
+FOV = np.radians(75)
+
+
+def picture(points, position, target, aspect):
+    """Places of points in a picture, from −1 at one edge to 1 at the other, x to the right and y up, `(n, 2)`."""
+    ahead = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(ahead, [0, 0, 1]) / np.hypot(*ahead[:2])
+    up = np.cross(right, ahead)
+    away = points - position
+    assert (away @ ahead > 0).all()
+    return np.column_stack([away @ right / aspect, away @ up]) / (away @ ahead)[:, None] / np.tan(FOV / 2)
+
+
+@given(st.integers(0, 10**6), st.floats(0.4, 3.0), st.sampled_from([OVERVIEW, TOP]))
+def test_full_picture(seed, aspect, side):
+    """No point is outside of the margins, the points reach two opposite ones, and are in the middle."""
+    random = np.random.default_rng(seed)
+    box = np.array(list(itertools.product(*[(-1, 1)] * 3))) * random.uniform(0.1, 20, 3)
+    points = np.concatenate([box, random.uniform(-1, 1, (30, 3)) * box[-1]]) + 50 * random.normal(size=3)
+    position, target = fitted(points, side, FOV, aspect)
+    seen = picture(points, position, target, aspect)
+    assert np.abs(seen).max() == pytest.approx(FULL, abs=1e-6)
+    assert seen.min(axis=0) == pytest.approx(-seen.max(axis=0), abs=1e-6)
+    assert target[2] == pytest.approx(points[:, 2].min())
+    assert np.cross(target - position, side) == pytest.approx([0, 0, 0], abs=1e-6 * np.linalg.norm(target - position))
