@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import floor, isfinite, log10
 from typing import Any, Literal
 
@@ -86,6 +86,8 @@ class Controls:
         self._inputs: dict[tuple[str, ...], Any] = {}
         self._folders: dict[tuple[str, ...], viser.GuiFolderHandle] = {}
         self._buttons: dict[tuple[str, ...], viser.GuiButtonHandle] = {}
+        self._records: dict[str, viser.GuiFolderHandle] = {}  # folders of the fields that are records, by first name
+        self._hidden: set[str] = set()
         self.designed: Mapping[tuple[str, ...], float | None] = {}
 
     def add(self, record: Record, path: tuple[str, ...] = (), only: Sequence[str] | None = None) -> None:
@@ -109,7 +111,9 @@ class Controls:
     def _add(self, value: Any, field: FieldInfo, path: tuple[str, ...]) -> None:  # noqa: ANN401
         label, hint = self._label(path), self._hint(path, field)
         if isinstance(value, Record):
-            with self._gui.add_folder(_words(path), expand_by_default=len(path) == 1):
+            with self._gui.add_folder(_words(path), expand_by_default=len(path) == 1) as folder:
+                if len(path) == 1:
+                    self._records[path[0]] = folder
                 if not (kinds := _kinds(field)):
                     return self.add(value, path)
                 kind = type(value).model_fields["kind"].default
@@ -200,6 +204,12 @@ class Controls:
                     if path in self._sliders and value <= high:  # before the page limits it to the ends of the slider
                         handle.min, handle.max = min(handle.min, value), max(handle.max, value)
                 self._on_change(field, round(value) if whole and isfinite(value) else value)
+
+    def hide(self, names: Iterable[str]) -> None:
+        """Hides the inputs of the fields of these names, and shows those of others that it hid before."""
+        before, self._hidden = self._hidden, set(names)
+        for name in before ^ self._hidden:
+            _update(self._records.get(name) or self._inputs[name,], visible=name not in self._hidden)
 
     def show(self, record: Record, path: tuple[str, ...] = ()) -> None:
         """Sets the inputs of a record, whose path is given, to its values."""

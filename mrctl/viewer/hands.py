@@ -61,7 +61,8 @@ class Hands:
         self._pushes = gui.add_checkbox("Push by dragging", False, hint=PUSH_HINT)
         page.on(self._pushes, lambda _: self._show_grips())
         page.on(gui.add_button("Set a goal", icon=viser.Icon.FLAG, hint=GOAL_HINT), lambda _: self.await_goal())
-        page.on(gui.add_button("Draw a way", icon=viser.Icon.ROUTE, hint=WAY_HINT), lambda _: self.draw_way())
+        self._draw = gui.add_button("Draw a way", icon=viser.Icon.ROUTE, hint=WAY_HINT)
+        page.on(self._draw, lambda _: self.draw_way())
         self._picking = gui.add_html("")
         self._endings = gui.add_button_group("Way", ENDINGS, visible=False)
         page.on(self._endings, self._end_way)
@@ -79,6 +80,7 @@ class Hands:
         """Acts on another scene and session from now on."""
         self._scene, self._session = scene, session
         self.trail = np.zeros(0, int), np.zeros((0, session.size, 2))
+        self._draw.visible = session.avoid == "none"
         self.forget()
 
     def await_goal(self) -> None:
@@ -86,7 +88,8 @@ class Hands:
         self._wait("goal", "Drag on the floor, or click, where the robots shall go.")
 
     def draw_way(self) -> None:
-        """Pauses, and waits for clicks on the floor, each of which adds a point to a way."""
+        """Pauses, and waits for clicks on the floor, each of which adds a point to a way; refuses with an avoider."""
+        self._session.check_way()
         self._wait("way", "Click on the floor to add a point; drag a point to move it.")
         self._command("pause")
 

@@ -243,6 +243,7 @@ class Live(Page):
         self._scene.show_reference(first)
         self._scene.forget_trails()
         self._hands.begin(self._scene, session)
+        self._controls.hide([*(() if session.tunable else ["kanayama"]), *(PLANNED if session.avoid != "none" else ())])
         self._fan.visible = session.avoid in ("window", "mppi")
         self._show_search()
         for name, ghost in self._ghosts.items():

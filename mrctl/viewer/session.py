@@ -108,6 +108,11 @@ class Session:
         """Whether at least one robot still drives."""
         return any(sim.running for _, sim in self.simulations)
 
+    @property
+    def tunable(self) -> bool:
+        """Whether the motion controller takes gains of Kanayama's law."""
+        return all(sim.hierarchy.tunable for _, sim in self.simulations)
+
     def step(self) -> None:
         """Does one control period of every robot."""
         with np.errstate(invalid="ignore", over="ignore"):  # as in `simulate`
@@ -186,6 +191,11 @@ class Session:
         self.apply(reference=driven.reference)
         return found
 
+    def check_way(self) -> None:
+        """Raises `InputError` if robots have an avoider, which takes goals alone."""
+        if self.avoid != "none":
+            raise InputError(f"way: with --avoid {self.avoid} the robots take goals alone")
+
     def way(self, points: Sequence[Array], closed: bool) -> Waypoints:
         """Returns a way from the first robot, straight ahead at first, through points, at the speed of its reference.
 
@@ -199,8 +209,7 @@ class Session:
             InputError: The robot has stopped, cannot follow such a way, or would touch an obstacle as they are now; or
                 it has an avoider, which takes goals alone.
         """
-        if self.avoid != "none":
-            raise InputError(f"way: with --avoid {self.avoid} the robots take goals alone")
+        self.check_way()
         (x, y, theta), (velocity, _) = self._coming("way")
         reach = abs(self.robot.wheelbase)
         ahead = x + reach * np.cos(theta), y + reach * np.sin(theta)

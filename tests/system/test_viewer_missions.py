@@ -436,6 +436,36 @@ def test_another_goal(avoid, tmp_path):
             session.way([np.array([0.0, 0.0])], closed=False)
 
 
+@pytest.mark.parametrize("avoid", ["none", "barrier", "window", "mppi"])
+def test_inputs_with_an_avoider(server, avoid):
+    """There are inputs for what can change alone: no gains where another law drives than Kanayama's, and no new way."""
+    task = Task(obstacles=Obstacles(shapes=(CROSSING,)), start=(0.0, 0.0, 0.0), goal=(2.5, 0.0, 0.0))
+    live = Live([prepared(task, PID, avoid=avoid)[1].replace(goal=None)], server, avoid)
+    inputs, folders = live._controls._inputs, live._controls._records
+
+    def shown():
+        parts = {name: folders[name].visible for name in ("kanayama", "pid", "reference", "perturbation")}
+        parts |= {name: inputs[name,].visible for name in ("world", "steering", "prefilter", "seed")}
+        return {name for name, visible in parts.items() if visible} | ({"draw"} if live._hands._draw.visible else set())
+
+    every = {"kanayama", "pid", "reference", "perturbation", "world", "steering", "prefilter", "seed", "draw"}
+    planned = {"reference", "world", "steering", "draw"}
+    gone = {"none": set(), "barrier": planned}.get(avoid, planned | {"kanayama"})
+    assert shown() == every - gone
+    if avoid != "none":
+        with pytest.raises(InputError, match=f"^way: with --avoid {avoid}"):
+            live._hands.draw_way()
+        assert live.playing
+    live._apply_event(pid={"time_constant": 0.3})
+    assert shown() == every - gone
+    if avoid != "window":
+        live._note_input(("kanayama", "k_y"), 9.0)
+        live._apply_inputs()
+        assert bool(live.message) == (avoid == "mppi")
+    live._begin([PID])  # which has no avoider
+    assert shown() == every
+
+
 def test_search(server):
     """Its arcs hang together, come from the start, and are free; the page draws those of a goal that is set."""
     behind = Task(obstacles=Obstacles(shapes=(Box(x=1.5, length=0.2, width=1.0),)), start=(0, 0, 0), goal=(3, 0, 0))
