@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -234,7 +235,7 @@ def duels(outcome: Outcome) -> str:
                 cells[name][other] = Cell("–")
                 continue
             won = row["position_rmse"][f"beats_{titled(other)}"]
-            text = f"{won['value']:.2f} [{won['low']:.2f}, {won['high']:.2f}]"
+            text = f"{won['value']:.2f} [{won['low']:.2f},\u00a0{won['high']:.2f}]"
             cells[name][other] = Cell(text, np.exp(3 * (1 - 2 * won["value"])))
         cells[name]["failed"] = Cell(f"{row['failed']}/{row['runs']}")
         cells[name]["where PID did not"] = Cell(str(row.get("failed_where_pid_did_not", "")))
@@ -261,9 +262,14 @@ def _coloured(name: str, cells: dict[str, dict[str, Cell]], corner: str = "case"
     styler = Styler(frame.map(lambda cell: cell.text), uuid=name)
     styler.format(escape="html")
     styler.format_index(escape="html", axis="index")
-    styler.format_index(escape="html", axis="columns")
+    styler.format_index(_breakable, axis="columns")
     styler.apply(lambda _: frame.map(lambda cell: cell.style), axis=None)
     return styler.to_html()
+
+
+def _breakable(name: object) -> str:
+    """Returns the name of a column as HTML, of which a line may end behind each plus."""
+    return html.escape(str(name)).replace("+", "+<wbr>")
 
 
 def _plain(table: pd.DataFrame) -> str:

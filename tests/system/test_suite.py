@@ -400,6 +400,25 @@ def test_page_stands_alone(whole: Path) -> None:
     assert again == "mrctl suite --feedforward none model rls --seeds 2 --random 3"
 
 
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="needs chromium")
+def test_page_fits(whole: Path) -> None:
+    """The page is as wide as a screen or a phone: tables and figures scroll on their own, beside their first column."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
+        for width in (1280, 400):
+            page = browser.new_page(viewport={"width": width, "height": 800}, is_mobile=width == 400)
+            page.goto((whole / "report.html").as_uri())
+            assert page.evaluate("[innerWidth, document.documentElement.scrollWidth]") == [width, width]
+            page.evaluate("for (const part of document.querySelectorAll('.wide')) part.scrollLeft = 1e4")
+            first = page.locator("#T_scorecard tbody th").first.bounding_box()
+            assert first is not None and 0 <= first["x"] < 30
+            least = page.evaluate("Math.min(...[...document.images].map((image) => image.width))")
+            assert least >= 640
+        browser.close()
+
+
 @pytest.mark.usefixtures("plain")
 def test_controller_joins(whole: Path, tmp_path: Path) -> None:
     """Somebody's own feedforward joins a suite that is there: only its runs are computed, and they are `simulate`'s."""
