@@ -244,9 +244,10 @@ class Plots:
 
 def legend(robots: Sequence[Look]) -> str:
     """Returns the legend of robots and their colours in HTML."""
-    keys = [f'<span style="color:rgb{colour}">■ {html.escape(label)}</span>' for label, colour in robots]
-    keys += [f'<span style="color:rgb{REFERENCE_COLOUR}">■ reference</span>']
-    keys += [f'<span style="color:rgb{pale(robots[0].colour)}">■ pale: estimated V, θ̇</span>']
+    whole = "display:inline-block;color:rgb"  # a line ends between keys
+    keys = [f'<span style="{whole}{colour}">■ {html.escape(label)}</span>' for label, colour in robots]
+    keys += [f'<span style="{whole}{REFERENCE_COLOUR}">■ reference</span>']
+    keys += [f'<span style="{whole}{pale(robots[0].colour)}">■ pale: estimated V, θ̇</span>']
     keys += ["Σ, Δ: feedback solid, feedforward dashed."]
     if len(robots) > MAX_ROBOTS:
         keys += [f"Curves are of the first {MAX_ROBOTS} of {len(robots)} robots."]

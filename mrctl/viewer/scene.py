@@ -157,6 +157,7 @@ class Scene:
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
         self._seen = self._to_see(lines.reshape(-1, 3), max(reference.period for reference in references))
         self._view = max(np.ptp(self._seen[:, :2], axis=0))
+        self._middle = (self._seen.min(axis=0) + self._seen.max(axis=0)) / 2 * [1, 1, 0]
         self.draw_references(references)
         self._factor.position = [(low[0] + high[0]) / 2, low[1] - self.length / 2, low[2]]  # in front of the robots
         self._look()
@@ -317,9 +318,9 @@ class Scene:
         """Sends the positions of all robots to the browsers.
 
         Args:
-            follow: Whether the first robot stays in the middle of the screen, and the world moves.
+            follow: Whether the first robot stays in the middle of the overview, and the world moves.
         """
-        self._root.position = -self.robots.positions[0] * [1, 1, 0] if follow else np.zeros(3)
+        self._root.position = self._middle - self.robots.positions[0] * [1, 1, 0] if follow else np.zeros(3)
         self.robots.flush()
 
     def show_sensors(self, logs: Sequence[Rows], period: float, latencies: Sequence[int], magnified: int) -> None:

@@ -260,7 +260,9 @@ def test_live(browser, tmp_path):
         page.keyboard.press("n")  # the arrows move the camera
         until(lambda: live.session.tick == tick + 2, "a step by the key N")
         page.keyboard.press("f")
-        away = lambda: np.allclose(node(page, "/world")[:2], -node(page, ROBOT)[:2], atol=1e-3)  # noqa: E731
+        middle = live._scene._middle[:2]
+        assert middle == pytest.approx([0, 0.8], abs=0.01)  # of the circle, and of the overview
+        away = lambda: np.allclose(node(page, "/world")[:2], middle - node(page, ROBOT)[:2], atol=1e-3)  # noqa: E731
         until(lambda: live._follow.value and away(), "the camera to follow by the key F")
         page.keyboard.press("f")
         until(lambda: np.allclose(node(page, "/world"), 0), "the camera to let go")
