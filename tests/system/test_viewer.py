@@ -371,8 +371,8 @@ def test_inputs(browser, tmp_path):
         live.ask(live._note_input, ("world",), "flat")
         until(lambda: (up := page.evaluate(UP)) and np.allclose(up, [0, 0, 1]), "the floor to be level again")
         camera = until(lambda: page.evaluate(CAMERA), "the camera")
-        live.ask(live._note_input, ("reference", "radius"), 1.2)
-        until(lambda: page.evaluate(CAMERA)[2] > 1.2 * camera[2], "a view of the larger reference")
+        live.ask(live._note_input, ("reference", "radius"), 1.4)
+        until(lambda: page.evaluate(CAMERA)[2] > 1.3 * camera[2], "a view of the larger reference")
         for _ in range(2):  # each takes it down by 36°
             page.mouse.move(640, 400)
             page.mouse.down()
