@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from math import pi, remainder
 from pathlib import Path
 from time import perf_counter
@@ -251,12 +252,11 @@ def prepared(
     try:
         found, reference = planned(task, vehicle, speed, margin, None, backwards, twist, not reactive, beyond=True)
     except NoWay:
-        for around in (False, True) if reactive and vehicle.reverses else ():
-            with contextlib.suppress(NoWay):
-                _planned(task, vehicle, speed, margin, None, True, (0.0, 0.0), True, around)
-                no_way = f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may"
-                raise InputError(no_way) from None
-        raise
+        if not (reactive and vehicle.reverses):
+            raise
+        in_reverse = partial(_planned, task, vehicle, speed, margin, None, True, (0.0, 0.0), True)
+        _or_beyond(in_reverse)  # raises, too, if there is none
+        raise InputError(f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may") from None
     laps = PATIENCE if avoid == "none" else WAITING
     own = {"obstacles": task.obstacles, "map": task.map, "reference": reference, "laps": laps}
     if reactive:  # the designed prefilter is that of Kanayama's controller, whose loop is faster
@@ -323,7 +323,7 @@ def planned(
 
     The outlines are by default those of the obstacles on the map. The plan reverses only if it may, and where there is
     none forward that the robot can drive. It stays in the box around the map, with room to turn about start and goal.
-    Where there is no way in it, a plan that may go beyond goes around what stands at the border of the box.
+    Where there is no way in it, in reverse neither, a plan that may go beyond goes around what stands at its border.
 
     The twist is that of the robot at the start, V in m/s and θ̇ in rad/s. If it drives forward, the plan begins with
     this twist: first the arc on which it drives, for as far as it needs to come to rest, and on from there, so that it
@@ -353,12 +353,21 @@ def planned(
                     raise
                 raise fault from None  # a search has found a way, forward
 
+    return _or_beyond(either_way) if beyond else either_way(False)
+
+
+def _or_beyond(search: Callable[[bool], tuple[Plan, Waypoints]]) -> tuple[Plan, Waypoints]:
+    """Searches in the box around the map, and where there is no way in it, around what stands at its border.
+
+    Raises:
+        NoWay: There is no way in the box, and none around either that the robot can drive.
+    """
     try:
-        return either_way(False)
-    except NoWay:
-        if beyond:
-            with contextlib.suppress(NoWay):
-                return either_way(True)
+        return search(False)
+    except NoWay as fault:
+        if fault.at_border:
+            with contextlib.suppress(InputError):
+                return search(True)
         raise
 
 

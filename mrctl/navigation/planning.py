@@ -44,7 +44,16 @@ MOST_CELLS = 1_000_000  # of the plane, for a search takes 288 bytes for each, a
 
 
 class NoWay(InputError):
-    """The search has found no way to the goal."""
+    """The search has found no way to the goal.
+
+    Attributes:
+        at_border: Whether it came to the border of the area in which P may be, so that there may be a way beyond it.
+    """
+
+    def __init__(self, message: str, at_border: bool = True) -> None:
+        """Takes the message, and the attribute."""
+        super().__init__(message)
+        self.at_border = at_border
 
 
 class Space(NamedTuple):
@@ -241,7 +250,12 @@ def space(
 
 
 def wider(where: Space, goal: Array, room: float) -> Space:
-    """Returns a space with room in m, and as much as the robot needs beside it, around its area and all obstacles.
+    """Returns a space that extends the area, and the box around all obstacles, on each side.
+
+    Args:
+        where: The space.
+        goal: x and y in m and θ in rad, `(3,)`.
+        room: By how much it extends them, besides the reach of the robot, in m.
 
     Raises:
         NoWay: The robot cannot leave the area from the goal, or the wider one has too many cells.
@@ -286,11 +300,13 @@ def plan(where: Space, start: Array, goal: Array, radius: float, reverse: bool, 
     step = max(1.5 * where.field.resolution, radius * 2 * np.pi / HEADINGS)
     tree = Tree(np.empty((most, 3)), np.empty(most, np.int64), *np.empty((5, most)))
     best = np.zeros((*ahead.shape, HEADINGS, 3 if reverse else 1), np.int32)  # here memory is taken when it is written
-    found, made, expanded = search.compiled(start, goal, float(radius), step, reverse, ahead, where, best, tree)
+    found, made, expanded, left = search.compiled(start, goal, float(radius), step, reverse, ahead, where, best, tree)
     if found < 0:
         place = f"({goal[0]:.2f}, {goal[1]:.2f})"
         few = f"no way to {place} was found with {most:,} poses"
-        raise NoWay(f"goal: {f'there is no way to {place}' if found == -1 else few}")
+        # Where the way around the obstacles does not lead to the start, the search has not begun.
+        at_border = bool(left) or not np.isfinite(ahead[cell_of.compiled(start, where)[:2]])
+        raise NoWay(f"goal: {f'there is no way to {place}' if found == -1 else few}", at_border)
     return _traced(tree, int(made), int(found), radius, reverse, int(expanded))
 
 
@@ -549,7 +565,7 @@ def analytic_expansion(
 def search(
     start: Array, goal: Array, radius: float, step: float, reverse: bool, ahead: Array, where: Space,
     best: NDArray[np.int32], tree: Tree,
-) -> tuple[int, int, int]:  # fmt: skip
+) -> tuple[int, int, int, bool]:  # fmt: skip
     """Searches for a way.
 
     Args:
@@ -565,8 +581,8 @@ def search(
         tree: Out: the poses that the search made.
 
     Returns:
-        Index of the goal's pose (−1: there is no way, −2: there are too few poses), and numbers of poses that were made
-        and expanded.
+        Index of the goal's pose (−1: there is no way, −2: there are too few poses), numbers of poses that were made and
+        expanded, and whether an arc led out of the area.
     """
     most, n, cell = len(tree.poses), 1, where.field.resolution
     weight, gears = WEIGHT if ahead.any() else 0.0, best.shape[3]
@@ -575,19 +591,19 @@ def search(
     tree.poses[0], tree.parents[0], tree.turns[0], tree.lengths[0], tree.costs[0] = start, -1, 0.0, 0.0, 0.0
     tree.direct[0], tree.again[0] = shortest(start, goal, radius, reverse, turns, lengths), 0.0
     checks = int(np.ceil(step / CHECK))  # of an arc, as `free_length` makes them, to the last bit of its end
-    queue, late, expanded = [(0.0, 0)], [0 for _ in range(0)], 0
+    queue, late, expanded, left = [(0.0, 0)], [0 for _ in range(0)], 0, False
     while len(queue) + len(late) > 0:
         delayed = len(queue) == 0  # there is no way but by a shortest path that was not tried
         now = late.pop() if delayed else heapq.heappop(queue)[1]
         if tree.turns[now] == EXPANSION:
-            return now, n, expanded
+            return now, n, expanded, left
         pose, last = tree.poses[now], np.sign(tree.lengths[now])
         row, column, heading = cell_of(pose, where)
         if now > 0 and best[row, column, heading, int(last + 1) % gears] != now + 1:
             continue  # a cheaper pose has taken the cell
         expanded += not delayed
         if n + 7 > most:
-            return -2, n, expanded
+            return -2, n, expanded, left
         # A path that is shorter than the way around the obstacles hits one.
         if tree.direct[now] >= ahead[row, column] - SLACK * cell:
             if not delayed and tree.costs[now] < tree.again[now]:
@@ -608,6 +624,7 @@ def search(
             row, column, heading = cell_of(end, where)
             gear = int(np.sign(way) + 1) % gears
             cost = tree.costs[now] + cost_of(way, last)
+            left |= row < 0
             rival = best[row, column, heading, gear]
             if row < 0 or ahead[row, column] == np.inf or (rival and tree.costs[rival - 1] <= cost):
                 continue
@@ -619,7 +636,7 @@ def search(
             tree.again[n], best[row, column, heading, gear] = tree.again[now], n + 1
             heapq.heappush(queue, (cost + estimate, n))
             n += 1
-    return -1, n, expanded
+    return -1, n, expanded, left
 
 
 def _traced(tree: Tree, count: int, last: int, radius: float, reverse: bool, expanded: int) -> Plan:

@@ -107,10 +107,13 @@ class Agent:
 
     def scene(self, pose: Array, now: float) -> Scene:
         """Returns what roll-outs from a pose in m, m, rad, `(3,)`, are judged by at a time in s."""
-        targets = self._table[np.minimum(self._place + FINE * np.arange(1, STEPS + 1), len(self._table) - 1)]
+        last = len(self._table) - 1
+        places = self._place + FINE * np.arange(1, STEPS + 1)
+        targets, end = self._table[np.minimum(places, last)], 1 + int(np.searchsorted(places, last))
         found, horizon = self._planner.sight.discs(now), self._period * STEPS
         far = self._reach + horizon * (self._bounds.speed + np.hypot(found[:, 2], found[:, 3])) + found[:, 4]
-        return Scene(targets, self._discs, self._field, found[np.hypot(*(found[:, :2] - pose[:2]).T) < far])
+        near = found[np.hypot(*(found[:, :2] - pose[:2]).T) < far]
+        return Scene(targets, self._discs, self._field, near, end)
 
     def stands(self, pose: Array, speed: float, now: float) -> bool:
         """Tells whether it arrived at the end of its plan a while ago; then it rests there until something moves it.

@@ -64,6 +64,8 @@ class Scene(NamedTuple):
     """Distance from the obstacles on the map."""
     movers: Array
     """Discs around the others that it has seen: x and y in m, their velocities in m/s, radius in m, `(M, 5)`."""
+    end: int = STEPS
+    """Number of targets before the plan has ended; at the later ones, which are the same, the heading costs more."""
 
 
 class Considered(NamedTuple):
@@ -161,7 +163,7 @@ def roll_out(
         twists: Out: the twists of K roll-outs of n steps, `(K, n, 2)`.
         costs: Out: their costs, `(K,)`.
     """
-    targets, discs, field, movers = scene
+    targets, discs, field, movers, end = scene
     distance, left, low, resolution = field.distance, field.origin[0], field.origin[1], field.resolution
     steps, circle = len(nominal), enclosing_circle(discs)
     # The discs reach beyond the robot, and what it finds is noisy: where they touch it already, deeper is a collision.
@@ -176,9 +178,6 @@ def roll_out(
         along = k * (knots.shape[1] - 1) / (steps - 1)
         before[k] = min(int(along), knots.shape[1] - 2)
         shares[k] = along - before[k]
-    end = steps - 1  # the first of the targets at the end of the plan, all of which are the same
-    while end > 0 and targets[end - 1, 0] == targets[end, 0] and targets[end - 1, 1] == targets[end, 1]:
-        end -= 1
     cheapest = np.inf
     for n in range(len(knots)):
         x, y, c, s, v, omega, cost = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]), last[0], last[1], 0.0
@@ -205,7 +204,7 @@ def roll_out(
             x, y = x + speed * step * c, y + speed * step * s
             c, s = c * ch - s * sh, s * ch + c * sh
             dx, dy = targets[k, 0] - x, targets[k, 1] - y
-            turned = (HEADING if k <= end else HEADING_AT_END) * (1 - c * targets[k, 2] - s * targets[k, 3])
+            turned = (HEADING if k < end else HEADING_AT_END) * (1 - c * targets[k, 2] - s * targets[k, 3])
             cost += step * (PLACE * (dx * dx + dy * dy) + turned)
             free = body_clearance(x, y, c, s, (k + 1) * step, circle, discs, distance, left, low, resolution, movers)
             if free <= least:

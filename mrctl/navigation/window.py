@@ -37,6 +37,7 @@ class Window(Reactive):
         grid = np.stack(np.meshgrid(speeds, rotations), -1).reshape(-1, 1, 2)
         constant, rest = np.repeat(grid, KNOTS, axis=1), np.zeros((STEPS, 2))
         ahead, costs = np.empty((len(grid), LOOK, 2)), np.empty(len(grid))
+        scene = scene._replace(end=STEPS)  # a constant twist would rather stop before the goal than be turned there
         near = scene._replace(targets=scene.targets[:LOOK])
         roll_out.compiled(constant, rest[:LOOK], pose, twist, last, 0.0, period, bounds, near, np.inf, ahead, costs)
         stops, braking, wide = np.empty((len(grid), STEPS, 2)), np.empty(len(grid)), np.empty(len(grid))

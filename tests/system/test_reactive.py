@@ -196,30 +196,19 @@ def test_dead_end(robot: str, avoid: Avoid) -> None:
     assert (found["outcome"], back > 0.3) == (("arrived", True) if robot == "turtlebot" else ("stuck", False))
 
 
-def test_beside_its_goal() -> None:
-    """A robot that has come to rest beside its goal does not take that for the goal, and tries again."""
-    task = Task(
-        obstacles=Obstacles(shapes=(Box(x=6.0, length=0.2, width=12.0),)), start=(0, 0, 0), goal=(0.3, 0.3, 1.57)
-    )
-    adaptive = Scenario.from_dict({"prior": "model", "learner": "composite"})
-    driven = navigate(task, adaptive, avoid="window")
-    run = driven.result.isel(run=0)
-    resting = run.isel(time=(run["time"] > 1) & (abs(run["v"]) < 0.01))
-    turned, off = float(resting["theta"][0]) - 1.57, np.hypot(resting["x"][0] - 0.3, resting["y"][0] - 0.3)
-    assert abs(turned) < 0.2 and 0.1 < off < 0.25  # after its first try
-    assert driven.table["outcome"].tolist() == ["arrived"] and driven.table["time"].iloc[0] > resting["time"][0] + 2
+def test_turned_at_goal() -> None:
+    """A robot at the end of its plan, but turned from its goal by more than it may be, does not take that for the goal.
 
-
-def test_turns_to_its_goal() -> None:
-    """A robot whose plan comes in on an arc stops with the heading of its goal, at the first try.
-
-    Where the heading cost as little at the end of the plan as on the way, it stopped turned by 0.25 rad.
+    The end of a plan that comes in on an arc is itself turned by some hundredths of a radian.
     """
     task = Task(obstacles=Obstacles(shapes=(Box(x=6.0, length=0.2, width=12.0),)), start=(0, 0, 0), goal=(-1, 0, 0))
     adaptive = Scenario.from_dict({"prior": "model", "learner": "composite"})
     driven = navigate(task, adaptive, avoid="window")
+    run = driven.result.isel(run=0)
+    resting = run.isel(time=(run["time"] > 3) & (abs(run["v"]) < 0.01))
+    turned, off = float(resting["theta"][0]) % (2 * np.pi) - 2 * np.pi, np.hypot(resting["x"][0] + 1, resting["y"][0])
+    assert -0.3 < turned < -0.2 and off < 0.1  # after its first try
     assert driven.table["outcome"].tolist() == ["arrived"]
-    assert driven.table["time"].iloc[0] < 1.5 * prepared(task, adaptive, avoid="window")[1].reference.period
 
 
 @pytest.mark.parametrize("avoid", ["window", "mppi"])
@@ -285,9 +274,13 @@ def test_open_door(robot: str, avoid: Avoid) -> None:
     assert float(run["y"].values[np.argmax(run["x"].values > 2)]) < -0.7 and driven.plan.poses[:, 1].max() > 0.7
 
 
-@pytest.mark.parametrize(("robot", "avoid"), [("racecar", "barrier"), ("turtlebot", "window"), ("car", "mppi")])
+@pytest.mark.parametrize(("robot", "avoid"), [("racecar", "barrier"), ("car", "window"), ("turtlebot", "mppi")])
 def test_wall_in_the_open(robot: str, avoid: Avoid) -> None:
-    """A wall of 3 m across the way, which the map lacks and which is wider than it, is gone around."""
+    """A wall of 3 m across the way, which the map lacks and which is wider than it, is gone around.
+
+    The TurtleBot then comes to its goal on an arc. It was turned there by 0.21 rad, time and again, while the heading
+    cost as little at the end of the plan as on the way.
+    """
     post, wall = Disc(x=2.0, y=-0.6), Box(x=2.0, length=0.1, width=3.0)
     task = Task(obstacles=Obstacles(shapes=(wall,)), map=Obstacles(shapes=(post,)), start=(0, 0, 0), goal=(4, 0, 0))
     own = Scenario.from_dict({"prior": "model", "learner": "none", "robot": {"path": robot}})

@@ -389,7 +389,22 @@ def test_closed_room(monkeypatch):
         task = Task(obstacles=Obstacles(shapes=tuple(walls)), start=start, goal=goal)
         with pytest.raises(NoWay, match=rf"^goal: there is no way to \({goal[0]:.2f}, 0.00\)$"):
             planned(task, CAR, None, 0.05, beyond=True)
-        assert len(searches) == (2 if goal[0] > 2 else 1)
+        assert len(searches) == (2 if goal[0] > 2 else 1)  # the second one ends as it begins
+
+
+def test_enclosed_start(monkeypatch):
+    """Where the robot cannot leave a yard, but what it may drive on does, the way beyond the box is not searched."""
+    walls = [Box(x=x, length=0.1, width=4.1) for x in (-2, 2)] + [Box(y=y, length=4.1, width=0.1) for y in (-2, 2)]
+    walls[1:2] = [Box(x=2, y=side * 1.1875, length=0.1, width=1.825) for side in (-1, 1)]  # with a gap of 0.55 m
+    post, searches = Disc(x=4.0, y=4.0), []
+    monkeypatch.setattr(mission, "plan", lambda *arguments: searches.append(arguments) or plan(*arguments))
+    task = Task(obstacles=Obstacles(shapes=(*walls, post)), start=(-1, 0, 0), goal=(4, 0, 0))
+    with pytest.raises(NoWay) as refusal:
+        planned(task, CAR, None, 0.2, beyond=True)
+    where = searches[0][0]
+    assert len(searches) == 1 and not refusal.value.at_border
+    row, column = ((np.array([0.0, -1.0]) - where.field.origin[::-1]) / where.field.resolution).astype(int)
+    assert np.isfinite(cost_to_go(where, task.goal)[row, column])
 
 
 @pytest.mark.parametrize(
