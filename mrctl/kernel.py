@@ -56,7 +56,7 @@ class Kernel(Generic[P, T]):
 
     @cached_property
     def inlined(self) -> Callable[P, T]:
-        """The compiled function for calls from other kernels."""
+        """The compiled function for calls from other kernels; Python cannot call it."""
         # Between kernels a call of a small one takes longer than its law, because each array is handed over in parts.
         return self._compiled(pipeline_class=_compilers()[1], forceinline=True, no_cpython_wrapper=True)
 
@@ -246,7 +246,7 @@ def _compilers() -> tuple[Any, Any]:
 
     For Python it does so without the garbage collector, which would look through all that the compiler keeps, again and
     again. For other kernels it leaves a law as it is, for whoever calls it takes it in and is optimised as a whole.
-    Numba by itself optimises it, and makes machine code of it, at each level of calls, a quarter of the time.
+    Numba by itself optimises it, and makes machine code of it, at each level of calls, in two fifths of the time.
     """
     from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import Compiler
@@ -270,8 +270,8 @@ def _compilers() -> tuple[Any, Any]:
 
     class Lowered(JITCodeLibrary):
         def _optimize_final_module(self) -> None:
-            self._finalized = True
-            self._get_module_for_linking()  # which is a copy, and kept
+            self._finalized = True  # or the next line would finalise it, and so call this again
+            self._get_module_for_linking()  # keeps a copy for the callers, as long as others can see the functions
             for function in self._final_module.functions:
                 if not function.is_declaration:
                     function.linkage = "available_externally"  # of which no machine code is made

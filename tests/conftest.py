@@ -25,12 +25,8 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # Python's garbage collector took an eighth of the time of all tests.
 gc.set_threshold(50_000, 20, 100)
 
-# Without the garbage collector, which looks through all that Numba makes, laws compile in four fifths of the time.
 COMPILE = """
-import gc
 import sys
-
-gc.disable()
 
 from mrctl import Line, Scenario, per_lap, simulate
 
@@ -39,10 +35,6 @@ for name in sys.argv[1:]:
     per_lap(simulate(runs))
 """
 COMPILE_MISSIONS = """
-import gc
-
-gc.disable()
-
 from mrctl import Disc, Obstacles, Scenario, simulate
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import avoiding, prepared

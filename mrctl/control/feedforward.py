@@ -156,7 +156,7 @@ class Prior:
         motion = np.zeros(len(self.rows), MOTION)
         motion["command"], motion["derivative"] = command, derivative
         prior_voltages(motion, self.rows)
-        return motion["voltage"]
+        return np.ascontiguousarray(motion["voltage"])
 
 
 class Loop(NamedTuple):
@@ -255,7 +255,7 @@ class Learner(ABC):
         motion = self._motion
         motion["command"], motion["derivative"] = command, derivative
         respond_all.calling(respond=self.respond)(motion, self.robot, self.arrays)
-        return motion["voltage"]
+        return np.ascontiguousarray(motion["voltage"])
 
     def learn(self, feedback: Array, saturated: Array, twist: Array, voltage: Array) -> Array:
         """Lets all robots learn; see `Feedforward.learn`."""

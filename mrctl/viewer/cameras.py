@@ -17,10 +17,10 @@ def fitted(points: Array, side: Array, fov: float, aspect: float) -> tuple[Array
     camera looks at is as high as the lowest point, for a floor.
 
     Args:
-        points: Points in m, `(n, 3)`.
+        points: Points in m, not all of them the same, `(n, 3)`.
         side: Direction from the points to the camera, `(3,)`; upwards, but not straight up.
         fov: Angle of view from the lower to the upper edge of the picture in rad.
-        aspect: Ratio of width to height of the picture.
+        aspect: Ratio of width to height of the picture, positive.
     """
     ahead = -np.asarray(side) / np.linalg.norm(side)
     right = np.cross(ahead, [0.0, 0, 1])

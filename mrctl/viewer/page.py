@@ -69,7 +69,10 @@ class Page(ABC):
         @server.on_client_connect
         async def _(client: viser.ClientHandle) -> None:
             client.camera.on_update(self._keep_above())
-            client.camera.on_update(self._fit(client))
+
+            @client.camera.on_update
+            async def _(_: viser.CameraHandle) -> None:
+                self._scene.fit(client)
 
     def _keep_above(self) -> Callable[[viser.CameraHandle], Coroutine[Any, Any, None]]:
         """Returns a callback that puts a visitor's camera back above the floor, whenever it gets below.
@@ -89,23 +92,6 @@ class Page(ABC):
 
         return called
 
-    def _fit(self, client: viser.ClientHandle) -> Callable[[viser.CameraHandle], Coroutine[Any, Any, None]]:
-        """Returns a callback that fits a visitor's camera to the picture whenever that gets another shape.
-
-        It does so until the camera is moved; a page begins with a picture that is wider than between the panels.
-        """
-        shape: float | None = None
-        place = np.zeros(3)
-
-        async def called(camera: viser.CameraHandle) -> None:
-            nonlocal shape, place
-            still = self.server.initial_camera.position if shape is None else place
-            if camera.aspect != shape and np.allclose(camera.position, still, atol=1e-3):
-                shape, (place, target) = camera.aspect, self._scene.camera(False, camera.aspect)
-                self._scene.turn(client, place, target)
-
-        return called
-
     def add_cameras(self) -> None:
         """Adds the buttons that place a visitor's own camera, in the present context of the GUI."""
         group = self.server.gui.add_button_group("Camera", CAMERAS)
@@ -122,7 +108,7 @@ class Page(ABC):
         if name == "chase":
             self._chasing[client.client_id] = client
             return self.chase()
-        self._scene.turn(client, *self._scene.camera(name == "top", client.camera.aspect))
+        self._scene.overlook(client, name == "top")
 
     def chase(self) -> None:
         """Moves the cameras of visitors who chase the first robot."""

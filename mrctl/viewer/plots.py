@@ -226,7 +226,7 @@ class Plots:
         self._lessons.content = lessons(self._robots, metrics.laps, metrics.way, error, when)
 
     def clear(self, span: float, metrics: Metrics) -> None:
-        """Draws empty charts of `span` s, and a score without errors."""
+        """Draws empty charts of `span` s, and a score without present errors."""
         nothing = blank(2, len(self._robots))
         self.show(np.array([0.0, span]), nothing, self._nowhere(), 1)
         self.score(nothing[0], metrics, None, "")

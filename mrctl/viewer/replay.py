@@ -44,7 +44,7 @@ class Replay(Page):
         self.recordings: list[Recording] = []
         self.runs: list[int] = []
         self._drawn: tuple[object, ...] | None = None
-        self._plotted: float | None = None
+        self._plotted: tuple[float, bool] | None = None
         self._kept = list(runs[1:])  # the ghosts
         self._build(runs[0])
         self._show(runs)
@@ -202,8 +202,8 @@ class Replay(Page):
             lines.append(f"kept as ghosts: runs {', '.join(map(str, sorted(self._kept)))}")
         self._status.content = block("status", *lines)
         self.describe_estimates(self._labels, last)
-        if self.time != self._plotted:
-            self._plotted = self.time
+        if (self.time, self.playing) != self._plotted:  # what is playing may be shown a little late
+            self._plotted = self.time, self.playing
             self.scrubber.value = self._plots.time.value = self.time  # a click there again changes it again
             tick = min(round(self.time / self.recordings[0].period), len(self._log) - 1)
             scenarios, first = [r.scenario for r in self.recordings], self.recordings[0]

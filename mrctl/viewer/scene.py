@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import viser
 from mjviser.conversions import merge_geoms
+from scipy.spatial import ConvexHull
 
 from mrctl.kernel import Array, Rows
 from mrctl.physics import mjcf
@@ -95,7 +96,9 @@ class Scene:
         robot = read_robot(model)
         self._radius = robot.wheel_radius
         self._root = self._scene.add_frame("/world", show_axes=False)
-        self._surroundings = Surroundings(obstacles)
+        self._surroundings, self._obstacles = Surroundings(obstacles), obstacles
+        # Shape of each visitor's picture, whether the camera is above, and where it was placed.
+        self._overviews: dict[int, tuple[float, bool, Array]] = {}
         self._walls: list[viser.MeshHandle] = []
         self._movers: list[viser.MeshHandle] = []  # in the order of `Surroundings.courses`
         self._draw_world()
@@ -155,9 +158,6 @@ class Scene:
         references = [scenario.reference, *(e.reference for e in scenario.events if e.reference)]
         lines = self._lines(references)
         low, high = np.min(lines, axis=(0, 1)), np.max(lines, axis=(0, 1))
-        self._seen = self._to_see(lines.reshape(-1, 3), max(reference.period for reference in references))
-        self._view = max(np.ptp(self._seen[:, :2], axis=0))
-        self._middle = (self._seen.min(axis=0) + self._seen.max(axis=0)) / 2 * [1, 1, 0]
         self.draw_references(references)
         self._factor.position = [(low[0] + high[0]) / 2, low[1] - self.length / 2, low[2]]  # in front of the robots
         self._look()
@@ -175,15 +175,25 @@ class Scene:
         sides_of_robot = (-reach, reach), (-reach, reach), (0.0, self.robots.top)
         found = [lines + np.array(corner) for corner in itertools.product(*sides_of_robot)]
         least = [(low + high) / 2 + np.array([x, y, 0]) * LEAST_VIEW / 2 for x, y in SQUARE]
-        times = np.linspace(0, duration, COURSE_TIMES if self._surroundings.courses else 1)
-        near = np.concatenate([sides(self._surroundings.at(time)).reshape(-1, 2) for time in times])
-        near = near.clip(low[:2] - size, high[:2] + size)  # what is farther away would make all else too small
+        moving = Surroundings(Obstacles(shapes=self._obstacles.moving))
+        outlines = [moving.at(time) for time in np.linspace(0, duration, COURSE_TIMES) if moving.courses]
+        segments = np.concatenate([sides(one) for one in (Surroundings(self._obstacles.still).at(0.0), *outlines)])
+        left, right = low[:2] - size, high[:2] + size  # what is farther away would make all else too small
+        around = (segments.max(axis=1) >= left) & (segments.min(axis=1) <= right)
+        near = segments[around.all(axis=1)].reshape(-1, 2).clip(left, right)
         found += [np.column_stack([near, np.full(len(near), z)]) for z in (low[2], HEIGHT)]
-        return np.concatenate([*found, least])
+        points = np.concatenate([*found, least])
+        return points[ConvexHull(points).vertices]  # a camera that sees these sees all
 
     def draw_references(self, references: Sequence[Reference]) -> None:
-        """Draws a lap of each reference on the ground, in place of those before; the cameras stay."""
+        """Draws a lap of each reference on the ground, in place of those before; the cameras stay.
+
+        From now on an overview shows these.
+        """
         lines = self._lines(references)
+        self._seen = self._to_see(lines.reshape(-1, 3), max(reference.period for reference in references))
+        self._view = max(np.ptp(self._seen[:, :2], axis=0))
+        self._middle = (self._seen.min(axis=0) + self._seen.max(axis=0)) / 2 * [1, 1, 0]
         colours = len({look.colour for look in self._looks})
         lines[..., 2] += NEXT_TRAIL * (colours + 1)  # above all trails, which are wider
         self._draw_lines("/world/reference", lines, LINE_WIDTH * self._view, REFERENCE_COLOUR)
@@ -204,7 +214,22 @@ class Scene:
             return
         initial.position, initial.look_at = position, target
         for client in self._server.get_clients().values():
-            self.turn(client, *self.camera(False, client.camera.aspect))
+            self.overlook(client)
+
+    def overlook(self, client: viser.ClientHandle, top: bool = False) -> None:
+        """Places a visitor's camera so that all is in its picture, from the side or from above."""
+        camera = client.camera
+        if camera.image_width and camera.image_height:  # a page that is hidden has no picture
+            position, target = self.camera(top, camera.aspect)
+            self.turn(client, position, target)
+            self._overviews[client.client_id] = camera.aspect, top, position
+
+    def fit(self, client: viser.ClientHandle) -> None:
+        """Places a visitor's camera again when its picture has got another shape, until the visitor moves it."""
+        camera = client.camera
+        shape, top, place = self._overviews.get(client.client_id, (0.0, False, self._server.initial_camera.position))
+        if camera.image_height and camera.aspect != shape and np.allclose(camera.position, place, atol=1e-3):
+            self.overlook(client, top)
 
     def turn(self, client: viser.ClientHandle, position: Array, target: Array) -> None:
         """Places a visitor's camera, in m, `(3,)` each."""

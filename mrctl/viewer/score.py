@@ -53,8 +53,10 @@ def whole_laps(log: Rows, ticks: int, period: float, robot: Robot) -> list[dict[
     return laps
 
 
-def on_the_way(log: Rows, goals: Array, period: float, robot: Robot) -> list[dict[str, Array]]:
-    """Returns what `whole_laps` does of a way to a goal, as one lap; none of a way that has hardly begun.
+def on_the_way(log: Rows, goals: Array, period: float, robot: Robot) -> tuple[list[dict[str, Array]], bool]:
+    """Returns what `whole_laps` does of a way to a goal, as one lap, and whether it is final.
+
+    There is none of a way that has hardly begun. It is final when each robot has arrived, or has failed.
 
     Args:
         log: Record of `TICK` of each sample from the start of the way and of each robot, `(T, B)`; the way of a robot
@@ -64,20 +66,21 @@ def on_the_way(log: Rows, goals: Array, period: float, robot: Robot) -> list[dic
         robot: The nominal robot.
     """
     if len(log) < 2:
-        return []
+        return [], False
     there = arrived(np.stack([log["x"], log["y"], log["theta"]], axis=-1), log["v"], goals)
     found = []
     for row, at in enumerate(there.T):
         samples = max(2, int(at.argmax()) + 1) if at.any() else len(log)
         found += whole_laps(log[:samples, row : row + 1], samples, period, robot)
-    return [{name: np.concatenate([of[name] for of in found]) for name in found[0]}]
+    final = bool(np.all(there.any(axis=0) | np.isnan(log["x"][-1])))
+    return [{name: np.concatenate([of[name] for of in found]) for name in found[0]}], final
 
 
 class Metrics:
     """Metrics of what robots have driven on their present reference: of each whole lap, or of the way to its end.
 
     Attributes:
-        laps: As from `whole_laps`, or from `on_the_way`.
+        laps: As from `whole_laps`, or, of a way, at most one, from `on_the_way`.
         way: Whether they are of a way.
     """
 
@@ -87,6 +90,7 @@ class Metrics:
         self._all: list[dict[str, Array]] = []
         self._of: tuple[int, bool] | None = None  # first sample of what `_all` is of, and whether that is a way
         self._until = 0  # number of samples at which the metrics of a way were computed
+        self._final = False  # whether they do not change any more
         self.laps, self.way = self._all, False
 
     def update(
@@ -94,6 +98,8 @@ class Metrics:
         exact: bool = True,
     ) -> None:  # fmt: skip
         """Computes what is not known yet.
+
+        Laps of a recording that begins in the middle of a run begin with its first sample.
 
         Args:
             scenarios: Scenario of each robot with its events until now, or one of all robots.
@@ -106,12 +112,12 @@ class Metrics:
         bounds = [ends(scenario, now) for scenario in scenarios]
         begin, way = max(0, round(begun(scenarios[0], now) / self._period) - first), bounds[0] is not None
         if (begin, way) != self._of or until < self._until:
-            self._of, self._all, self._until = (begin, way), [], 0
+            self._of, self._all, self._until, self._final = (begin, way), [], begin, False
         if way:
             old = until - self._until >= max(FRESH / self._period, SHARE * (until - begin))
-            if old or (exact and until != self._until):
+            if not self._final and (old or (exact and until != self._until)):
                 goals = np.stack([np.full(3, np.nan) if found is None else found[1] for found in bounds])
-                self._all = on_the_way(log(begin, until), goals, self._period, self._robot)
+                self._all, self._final = on_the_way(log(begin, until), goals, self._period, self._robot)
                 self._until = until
             self.laps = self._all
         else:

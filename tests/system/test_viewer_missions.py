@@ -619,6 +619,9 @@ def test_to_see(server, goal):
         assert seen.buffer(0.01).covers(shapely.Point(0.5, y).buffer(0.2))
     size = max(1.2, goal[0], goal[1])
     assert seen.bounds[2] < goal[0] + 1.5 * size and live._scene._seen[:, 2].max() == pytest.approx(0.5)
+    near = task.replace(obstacles=Obstacles(shapes=task.obstacles.shapes[:-1]))
+    alone = Live([prepared(near, PID)[1].replace(reference=live.session.start[0].reference)], server)
+    assert np.array_equal(alone._scene._seen, live._scene._seen)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
@@ -658,6 +661,8 @@ def test_goal_by_click(tmp_path):
             until(lambda: len(live.session.saved()[0].events) == 1, "the plan")
             set_at = live.session.saved()[0].events[0].time
             until(lambda: place(page, "/world/goal") == pytest.approx([0.9, -0.5], abs=0.03), "the goal in sight")
+            page.set_viewport_size({"width": 1280, "height": 800})
+            until(lambda: np.abs(edges()).max() == pytest.approx(FULL, abs=1e-3), "a full picture of the new way")
             live.ask(live.choose_speed, "as fast as it goes")
             until(lambda: live.session.time > set_at + 2, "the robots to drive")
             until(lambda: page.inner_text("#mrctl-status").count("has arrived") == 2, "the robots at the goal")

@@ -23,12 +23,13 @@ def picture(points, position, target, aspect):
     return np.column_stack([away @ right / aspect, away @ up]) / (away @ ahead)[:, None] / np.tan(FOV / 2)
 
 
-@given(st.integers(0, 10**6), st.floats(0.4, 3.0), st.sampled_from([OVERVIEW, TOP]))
-def test_full_picture(seed, aspect, side):
+@given(st.integers(0, 10**6), st.floats(0.05, 20.0), st.sampled_from([OVERVIEW, TOP]), st.booleans())
+def test_full_picture(seed, aspect, side, flat):
     """No point is outside of the margins, the points reach two opposite ones, and are in the middle."""
     random = np.random.default_rng(seed)
     box = np.array(list(itertools.product(*[(-1, 1)] * 3))) * random.uniform(0.1, 20, 3)
     points = np.concatenate([box, random.uniform(-1, 1, (30, 3)) * box[-1]]) + 50 * random.normal(size=3)
+    points[:, 2] *= not flat
     position, target = fitted(points, side, FOV, aspect)
     seen = picture(points, position, target, aspect)
     assert np.abs(seen).max() == pytest.approx(FULL, abs=1e-6)

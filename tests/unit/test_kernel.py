@@ -1,6 +1,7 @@
 """Kernels: an edited law reaches all that call it, nothing is compiled at import, and laws can be put in place."""
 
 import ast
+import gc
 import importlib
 import io
 import os
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numba import njit
+from numba.core.errors import TypingError
 
 import mrctl
 from mrctl import Event, Line, Scenario, Sensing
@@ -35,8 +37,6 @@ from mrctl import Scenario
 from mrctl.kernel import Kernel
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.physics import mjcf
-
-gc.disable()  # compilation takes a fifth longer with it
 
 file, *names = sys.argv[1:]
 robot = mjcf.build()[1]
@@ -61,6 +61,20 @@ compiled = [vars(k)[name] for k in kernels for name in ("compiled", "inlined") i
 hits, misses = (sum(sum(getattr(c.stats, name).values()) for c in compiled) for name in ("cache_hits", "cache_misses"))
 print(mrctl.__file__, hits, misses)
 """
+
+
+@kernel
+def root(number: float) -> float:
+    """Returns the square root."""
+    if number < 0:
+        raise ValueError("negative")
+    return np.sqrt(number)
+
+
+@kernel
+def sum_of_roots(numbers: np.ndarray) -> float:
+    """Adds the square roots of all numbers, the last one first."""
+    return root(numbers[-1]) + sum_of_roots(numbers[:-1]) if len(numbers) else 0.0
 
 
 @kernel
@@ -249,6 +263,27 @@ def total(x):
 
 
 law = inner = double
+
+
+def test_kernel_in_kernel():
+    """A kernel that another one takes in can fail, call itself and be called from Python; the garbage collector stays.
+
+    It is off while Numba compiles.
+    """
+    for _ in range(2):
+        assert root(2.25) == 1.5 and sum_of_roots(np.array([1.0, 4.0, 9.0])) == 6.0
+        with pytest.raises(ValueError, match="negative"):
+            sum_of_roots(np.array([1.0, -4.0, 9.0]))
+    assert sum_of_roots.law(np.array([1.0, 4.0])) == 3.0 and gc.isenabled()
+    with pytest.raises(TypingError):
+        root("4")
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        root(4)
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
 
 
 def test_calling():
