@@ -562,6 +562,26 @@ def analytic_expansion(
 
 
 @kernel
+def room_before(goal: Array, radius: float, where: Space, sides: Array, end: Array, room: Array) -> None:
+    """Writes how long the last piece of a path to the goal may be, by direction and turn, before it hits something.
+
+    Args:
+        goal: Pose in m, m, rad, `(3,)`.
+        radius: Turning radius in m.
+        where: Obstacles and footprint.
+        sides: Scratch, `(n, 4)`.
+        end: Scratch, `(3,)`.
+        room: Out: length in m, in reverse and forward, to the right, straight and to the left, `(2, 3)`.
+    """
+    rows, columns = where.field.distance.shape
+    longest = max(2 * np.pi * radius, np.hypot(rows, columns) * where.field.resolution)
+    for direction in range(2):
+        for turn in range(3):
+            way = -longest if direction == 1 else longest  # from the goal back
+            room[direction, turn] = free_length(goal, turn - 1.0, radius, way, where, sides, end)
+
+
+@kernel
 def search(
     start: Array, goal: Array, radius: float, step: float, reverse: bool, ahead: Array, where: Space,
     best: NDArray[np.int32], tree: Tree,
@@ -592,12 +612,20 @@ def search(
     tree.direct[0], tree.again[0] = shortest(start, goal, radius, reverse, turns, lengths), 0.0
     checks = int(np.ceil(step / CHECK))  # of an arc, as `free_length` makes them, to the last bit of its end
     queue, late, expanded, left = [(0.0, 0)], [0 for _ in range(0)], 0, False
+    room = np.full((2, 3), -1.0)
     while len(queue) + len(late) > 0:
         delayed = len(queue) == 0  # there is no way but by a shortest path that was not tried
         now = late.pop() if delayed else heapq.heappop(queue)[1]
         if tree.turns[now] == EXPANSION:
             return now, n, expanded, left
         pose, last = tree.poses[now], np.sign(tree.lengths[now])
+        if delayed:  # most of these paths hit something near the goal
+            if room[0, 0] < 0:
+                room_before(goal, radius, where, sides, end, room)
+            shortest(pose, goal, radius, reverse, turns, lengths)
+            k = int(np.flatnonzero(lengths)[-1]) if lengths.any() else 0
+            if abs(lengths[k]) > room[int(lengths[k] > 0), int(turns[k]) + 1] + CHECK:
+                continue
         row, column, heading = cell_of(pose, where)
         if now > 0 and best[row, column, heading, int(last + 1) % gears] != now + 1:
             continue  # a cheaper pose has taken the cell
