@@ -65,7 +65,7 @@ class Scene(NamedTuple):
     movers: Array
     """Discs around the others that it has seen: x and y in m, their velocities in m/s, radius in m, `(M, 5)`."""
     end: int = STEPS
-    """Number of targets before the plan has ended; at the later ones, which are the same, the heading costs more."""
+    """Number of targets up to the end of the plan; all later ones are that end, at which the heading costs more."""
 
 
 class Considered(NamedTuple):

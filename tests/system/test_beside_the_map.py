@@ -5,7 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from mrctl import Disc, InputError, Line, Obstacles, Scenario, simulate
+from mrctl import Box, Disc, InputError, Line, Obstacles, Scenario, simulate
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import Avoid, avoiding, outcomes, prepared, task_of
 from mrctl.navigation.vehicle import Vehicle
@@ -52,7 +52,13 @@ def still(base: Scenario, seed: int) -> Task:
     return task_of(f"{KINDS[seed % len(KINDS)]}:{seed}", base)
 
 
-WORLDS = {"unmapped": unmapped, "crossed": crossed, "still": still}
+def walled(base: Scenario, seed: int) -> Task:
+    """Makes a flat wall of 3 m across the way, of which the map has no more than a disc beside the way."""
+    post, wall = Disc(x=2.0, y=-0.6), Box(x=2.0, length=0.1, width=3.0)
+    return Task(obstacles=Obstacles(shapes=(wall,)), map=Obstacles(shapes=(post,)), start=(0, 0, 0), goal=(4, 0, 0))
+
+
+WORLDS = {"unmapped": unmapped, "crossed": crossed, "still": still, "walled": walled}
 
 
 def driven(world: str, robot: str, avoid: Avoid, count: int) -> tuple[Counter[str], list[float]]:
@@ -110,3 +116,16 @@ def test_still(robot: str, avoid: Avoid, count: int) -> None:
     """Where the map is right the filter only slows the robots, and all arrive."""
     found, times = driven("still", robot, avoid, count)
     assert found == {"arrived": sum(found.values())} and np.mean(times) < 2
+
+
+@pytest.mark.parametrize(("robot", "avoid", "count"), cases([("car", "barrier")], AVOIDERS, 12))
+def test_walled(robot: str, avoid: Avoid, count: int) -> None:
+    """With `barrier` every robot goes around the wall, with `window` none touches it, and with `mppi` most arrive."""
+    found, _ = driven("walled", robot, avoid, count)
+    assert sum(found.values()) == count
+    if avoid == "barrier":
+        assert found["arrived"] == count
+    elif avoid == "window":
+        assert not found["collided"]
+    else:
+        assert found["arrived"] > count / 2
