@@ -139,6 +139,15 @@ def through(points: Array, scan: Scan) -> NDArray[np.bool]:
     return found
 
 
+def reached(points: Array, scan: Scan, margin: float) -> NDArray[np.bool]:
+    """Tells which points, `(k, 2)` in m, are in range and less than a margin in m beyond what a beam met, `(k,)`."""
+    dx, dy = (points - scan.place[:2]).T
+    away, turned = np.hypot(dx, dy), np.arctan2(dy, dx) - scan.place[2] - scan.angles[0]
+    beam = np.round(turned / scan.step).astype(int) % scan.full_turn
+    seen = beam < len(scan.ranges)
+    return seen & (away <= scan.reach) & (away < scan.ranges[np.where(seen, beam, 0)] + margin)
+
+
 @kernel
 def pass_through(
     points: Array, ranges: Array, turn: int, first: float, step: float, most: float, place: Array,

@@ -28,8 +28,6 @@ MOST_LAG = 10.0  # s
 class Mppi(Reactive):
     """A motion stage that samples twists around those of the period before; the same noise for every robot."""
 
-    rows = 2
-
     def __init__(self, robot: Robot, size: int, replan: Replan, lag: float = 0.0) -> None:
         """Takes the arguments of `Reactive`, and the lag that the roll-outs assume.
 

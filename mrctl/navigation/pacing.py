@@ -16,9 +16,9 @@ from mrctl.loop.goals import RESTING
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.navigation.avoidance import Barrier, approach, share
 from mrctl.navigation.planning import least_clearance
-from mrctl.navigation.replanning import SHORTER, Planner, Replan
+from mrctl.navigation.replanning import SHORTER, Planner, Replan, blocked_at
 from mrctl.scenario import Scenario
-from mrctl.theory.clearance import clearance, rim
+from mrctl.theory.clearance import rim
 from mrctl.theory.rays import Scan
 from mrctl.theory.references import Reference, Waypoints
 from mrctl.theory.robot import Robot
@@ -29,7 +29,6 @@ KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from what is on the map and 
 TRACKED = 0.01  # m, by which the margin KEPT is smaller than what the discs have on the plan, at least
 STANDOFF = 1.0  # m before a blocked place of its plan, where the robot stops, so that it can drive around it; chosen
 SLOW, WAITED = 0.1, 1.0  # mean λ over so many s, below which a robot makes another plan; chosen
-SPACING = 0.05  # m, of the places of a plan that are looked at
 
 
 class Following:
@@ -157,10 +156,9 @@ class Pacing:
         plan = self._plans[row]
         first = min(int(self._clock[row]), len(plan) - 2)
         way = np.cumsum(np.abs(plan[first:, 3])) * self._period
-        ahead = first + np.searchsorted(way, np.arange(0.0, way[-1], SPACING))
-        free = [clearance(self._footprint, plan[k, :3], standing) for k in ahead]
-        if len(blocked := ahead[np.array(free) <= 0]):
-            self._blocked[row] = blocked[0]
+        place = blocked_at(self._footprint, plan[first:, :3], way, standing)
+        if place is not None:
+            self._blocked[row] = first + place
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""

@@ -10,7 +10,7 @@ import numpy as np
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.navigation.chart import RADIUS
-from mrctl.navigation.replanning import SHORTER, Planner, Replan
+from mrctl.navigation.replanning import SHORTER, Planner, Replan, blocked_at
 from mrctl.navigation.rollouts import KEPT, STEPS, Bounds, Considered, Scene
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.trail import Trail
@@ -23,7 +23,7 @@ from mrctl.theory.robot import Robot
 
 CELL = 0.04  # m, of the distance field
 AROUND = 3.0  # m around the plan, which the field covers
-DISCS = 4  # in a row that covers the robot
+DISCS = 4, 2  # in a row, and rows, that cover the robot, and reach 4 to 6 cm beyond its nose
 AHEAD = 100  # samples of the plan, 20 motion periods, among which its nearest place is looked for
 FINE = 5  # samples of the plan in a motion period
 OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen, like the next two
@@ -33,7 +33,7 @@ RETRY = 1.0  # s, least time between two plans
 STAYS = 1.0  # s at the end of its plan, after which a robot without a goal at which its run ends stays there; chosen
 # How a robot goes back from where there is no way forward; chosen, as all that follows.
 BACK = 0.4, 0.4  # m, length of a piece of the way back, after which it looks for another plan; m/s, its speed there
-PIECES = 5  # largest number of pieces
+PIECES = 10  # largest number of pieces, as far as the `Trail` reaches
 FREE = 0.02  # m, clearance from what is not on the map while it goes back
 
 
@@ -63,6 +63,7 @@ class Agent:
         self._table, self._place, self._away = self._sampled(planner.first), 0, 0.0  # its plan, and its place on that
         self._looked = False  # whether there is a scan that is new; a robot that has failed gets none
         self._map_changed = False  # so that a shorter way may be free
+        self._blocked = False  # whether it would touch what stands beside the map on its plan
         self._tried = -np.inf  # when it last looked for another plan
         self._anchor, self._since = start.copy(), 0.0  # where it last was when it had got on, and when
         self._replanned = False  # whether it has made another plan since
@@ -86,7 +87,7 @@ class Agent:
 
     def _take(self, plan: Waypoints) -> None:
         """Goes along a plan from now on; where the distance field ends before the plan does, makes another field."""
-        self._table, self._place = self._sampled(plan), 0
+        self._table, self._place, self._blocked = self._sampled(plan), 0, False
         low, high = self._table[:, :2].min(axis=0), self._table[:, :2].max(axis=0)
         distance, origin, resolution = self._field
         end = origin + resolution * np.array(distance.shape[::-1])
@@ -94,11 +95,17 @@ class Agent:
             self._field = field_around(self._table[:, :2], self._planner.sight, self._reach)
 
     def see(self, scan: Scan) -> None:
-        """Takes a scan."""
+        """Takes a scan, and looks whether its plan is free."""
         self._looked = True
         if self._planner.sight.see(scan):
             self._field = field_around(self._table[:, :2], self._planner.sight, self._reach)
             self._map_changed = True
+        standing, rest = self._planner.sight.standing, self._table[self._place :]
+        self._blocked = False
+        if len(standing.discs) and len(rest) > 1:
+            poses = np.column_stack([rest[:, :2], np.arctan2(rest[:, 3], rest[:, 2])])
+            way = np.append(0.0, np.cumsum(np.hypot(*np.diff(rest[:, :2], axis=0).T)))
+            self._blocked = blocked_at(self._planner.vehicle.footprint, poses, way, standing) is not None
 
     def locate(self, pose: Array) -> None:
         """Finds the place on the plan that is nearest to a pose in m, m, rad, `(3,)`, of those not far ahead."""
@@ -163,8 +170,9 @@ class Agent:
                 self._shorten(pose, now)
                 return False
             other = self._planned(pose, now)
-            stuck = self._away <= OFF and (other is None or self._replanned)  # what it got here before did not help it
-        self._replanned = self._away <= OFF
+            # What it got here before did not help it.
+            stuck = self._waits(now) and self._away <= OFF and (other is None or self._replanned)
+        self._replanned = self._waits(now) and self._away <= OFF
         if stuck and self._may_go_back(now):
             self._approached |= self._near_end
             self._pieces = self._pieces + 1 if self._back(pose, now) else 0
@@ -177,17 +185,22 @@ class Agent:
     def needs_plan(self, pose: Array, now: float) -> bool:
         """Notes how far it has come, at a time in s; tells whether it needs another plan, and can make one.
 
-        It does where it is off its own, or has hardly moved for a while; at the end of its plan it needs none.
+        It does where its own is blocked, it is off that, or has hardly moved for a while; at the end of its plan it
+        needs none.
         """
         if self._at_end(pose):
             self._since = now
         if self._gone(pose) > min(WAITED[1], WAITED[2] * WAITED[0] * self._bounds.speed):
             self._anchor, self._since, self._replanned = pose[:2].copy(), now, False
-        lost = (self._away > OFF or now - self._since > WAITED[0]) and now - self._tried > RETRY
+        lost = (self._blocked or self._away > OFF or self._waits(now)) and now - self._tried > RETRY
         lost, self._looked = lost and self._looked, False
         if lost:
             self._tried = now
         return lost
+
+    def _waits(self, now: float) -> bool:
+        """Tells whether it has hardly moved for a while."""
+        return now - self._since > WAITED[0]
 
     def _gone(self, pose: Array) -> float:
         """Returns the distance in m from where it last was when it had got on."""
@@ -236,19 +249,16 @@ def field_around(places: Array, sight: Sight, reach: float) -> Field:
 
 
 class Reactive(ABC):
-    """A motion stage that asks for twists along a plan, and makes another plan when it is off this one or waits.
+    """A motion stage that asks for twists along a plan.
 
+    It makes another plan when a scan shows that this one is blocked, and when the robot is off its plan or waits.
     Where a robot waits that can reverse, and another plan is not found or does not help, it goes back a little on its
     `Trail`, and plans again.
 
     Attributes:
         bounds: What twists each robot can drive.
         considered: What led to the last twist of each robot; None before the first one, and while it goes back.
-        rows: Number of rows of the discs that cover a robot. Those of one row reach 11 to 15 cm beyond its nose, those
-            of two 4 to 6 cm.
     """
-
-    rows: int
 
     def __init__(self, robot: Robot, size: int, replan: Replan) -> None:
         """Makes the stage.
@@ -269,7 +279,7 @@ class Reactive(ABC):
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         self._period, self._tick, self._agents = period, 0, []
         self.considered: list[Considered | None] = [None] * self._size
-        discs, fields = cover(self._planners[0].vehicle.footprint, DISCS, self.rows), dict[Hashable, Field]()
+        discs, fields = cover(self._planners[0].vehicle.footprint, *DISCS), dict[Hashable, Field]()
         for planner, bounds, start in zip(self._planners, self.bounds, pose, strict=True):
             planner.reset()
             if (own := (planner.first, planner.scenario.known)) not in fields:

@@ -12,6 +12,7 @@ from mrctl.navigation.sight import Sight
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
+from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines, Pose
 from mrctl.theory.references import Reference, Waypoints
 
@@ -19,6 +20,7 @@ from mrctl.theory.references import Reference, Waypoints
 # more than half the distance of the discs that a scan shows. Chosen.
 SAME = 0.02, 0.05, 0.06
 AGAIN = 3.0  # s, after which a search that found no way is repeated in any case
+SPACING = 0.05  # m, of the places of a plan that `blocked_at` looks at
 SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
 
 Replan = Callable[[Scenario, Vehicle, Array, Array, Outlines, Waypoints | None], Waypoints | None]
@@ -36,6 +38,21 @@ def open_waypoints(reference: Reference) -> Waypoints:
     if not isinstance(reference, Waypoints) or reference.closed:
         raise InputError("reference: robots with an avoider follow open waypoints alone")
     return reference
+
+
+def blocked_at(footprint: Array, poses: Array, way: Array, outlines: Outlines) -> int | None:
+    """Returns the index of the first pose on a plan at which a robot would touch obstacles, or None.
+
+    Args:
+        footprint: Corners of the robot in its frame in m, `(n, 2)`.
+        poses: Poses on the plan, x and y in m and θ in rad, `(k, 3)`.
+        way: Length in m of the way up to each pose, `(k,)`; of the poses some are looked at, 5 cm apart.
+        outlines: The obstacles.
+    """
+    for k in np.searchsorted(way, np.arange(0.0, way[-1], SPACING)):
+        if clearance(footprint, poses[k], outlines) <= 0:
+            return int(k)
+    return None
 
 
 class Planner:

@@ -66,6 +66,8 @@ class Scene(NamedTuple):
     """Discs around the others that it has seen: x and y in m, their velocities in m/s, radius in m, `(M, 5)`."""
     end: int = STEPS
     """Number of targets up to the end of the plan; all later ones are that end, at which the heading costs more."""
+    near: float = NEAR
+    """Cost in 1/s of touching an obstacle; it falls to zero at `KEPT`."""
 
 
 class Considered(NamedTuple):
@@ -163,7 +165,7 @@ def roll_out(
         twists: Out: the twists of K roll-outs of n steps, `(K, n, 2)`.
         costs: Out: their costs, `(K,)`.
     """
-    targets, discs, field, movers, end = scene
+    targets, discs, field, movers, end, near = scene
     distance, left, low, resolution = field.distance, field.origin[0], field.origin[1], field.resolution
     steps, circle = len(nominal), enclosing_circle(discs)
     # The discs reach beyond the robot, and what it finds is noisy: where they touch it already, deeper is a collision.
@@ -211,7 +213,7 @@ def roll_out(
                 judged = True
                 cost += TOUCH * (1 + (steps - k) / steps)  # the earlier, the worse
             elif free < KEPT:
-                cost += step * NEAR * (1 - free / KEPT) ** 2
+                cost += step * near * (1 - free / KEPT) ** 2
             judged |= cost > cheapest + worth
         costs[n] = cost
         cheapest = min(cheapest, cost)

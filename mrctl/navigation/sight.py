@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrctl.kernel import Array, kernel
-from mrctl.navigation.chart import BESIDE, FAR, LEAST, RADIUS, Chart, through
+from mrctl.navigation.chart import BESIDE, FAR, LEAST, RADIUS, Chart, reached, through
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance
 from mrctl.theory.grid import Field, at, map_area, near_field
@@ -187,13 +187,17 @@ class Sight:
         return [(part, whole) for part, whole in found if len(part) >= LEAST]
 
     def _hidden(self, old: Array, new: Array, scan: Scan) -> Array:
-        """Returns the discs of before, `(k, 5)`, that the scan neither shows nor sees through."""
+        """Returns the discs of before, `(k, 5)`, that the scan neither shows nor sees through.
+
+        It shows what is near a new disc, unless that is out of range, or something else hides it.
+        """
         if not len(old):
             return old
-        places = _placed(old, scan.time)
-        gone = through(places, scan) | (_moves(old) & (scan.time - old[:, 4] > HIDDEN))
+        places, moves = _placed(old, scan.time), _moves(old)
+        gone = through(places, scan) | (moves & (scan.time - old[:, 4] > HIDDEN))
         if len(new):
-            gone |= np.hypot(*(places[:, None] - new[None, :, :2]).transpose(2, 0, 1)).min(axis=1) < 2 * SPACING
+            near = np.hypot(*(places[:, None] - new[None, :, :2]).transpose(2, 0, 1)).min(axis=1) < 2 * SPACING
+            gone |= near & (moves | reached(places, scan, 2 * SPACING))
         return old[~gone]
 
 

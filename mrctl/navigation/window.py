@@ -17,7 +17,8 @@ from mrctl.navigation.rollouts import KNOTS, STEPS, TOUCH, Considered, Scene, ro
 
 SPEEDS, ROTATIONS = 9, 15  # of the window
 MOMENT = 0.25  # s, in which the twists of the window can be reached
-LOOK = 20  # steps, over which a constant twist is looked at
+LOOK = 12  # steps, over which a constant twist is looked at; chosen, like the next two
+NEARNESS = 1.25  # 1/s, `Scene.near`; with more a robot stops before gaps, as it comes nearer to its plan so slowly
 # m, by which what the robot has found beside its map is enlarged: a roll-out neither knows the noise of the lidar, nor
 # how the robot departs from the twist, nor the side of an obstacle that no scan has shown yet. Chosen.
 RESERVE = 0.05
@@ -25,8 +26,6 @@ RESERVE = 0.05
 
 class Window(Reactive):
     """A motion stage that keeps the best constant twist."""
-
-    rows = 1  # with two it comes so near to what is ahead that no constant twist leads around it any more
 
     def choose(self, row: int, pose: Array, twist: Array, last: Array, period: float, scene: Scene) -> Array:
         """Returns the first twist towards the best one of the window."""
@@ -37,7 +36,8 @@ class Window(Reactive):
         grid = np.stack(np.meshgrid(speeds, rotations), -1).reshape(-1, 1, 2)
         constant, rest = np.repeat(grid, KNOTS, axis=1), np.zeros((STEPS, 2))
         ahead, costs = np.empty((len(grid), LOOK, 2)), np.empty(len(grid))
-        scene = scene._replace(end=STEPS)  # a constant twist would rather stop before the goal than be turned there
+        # A constant twist would rather stop before the goal than be turned there.
+        scene = scene._replace(end=STEPS, near=NEARNESS)
         near = scene._replace(targets=scene.targets[:LOOK])
         roll_out.compiled(constant, rest[:LOOK], pose, twist, last, 0.0, period, bounds, near, np.inf, ahead, costs)
         stops, braking, wide = np.empty((len(grid), STEPS, 2)), np.empty(len(grid)), np.empty(len(grid))

@@ -13,7 +13,9 @@ from mrctl.physics.elements import REAR, bodies_of, fronts, has
 from mrctl.physics.stand import steer
 from mrctl.record import InputError
 
-DIRECTIONS = np.arange(32) * (2 * np.pi / 32)  # rad, in which supports are taken; a disc loses half a per cent
+ANGLES = np.arange(32) * (2 * np.pi / 32)  # rad, in which supports are taken; a disc loses half a per cent
+LEVEL = np.column_stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(len(ANGLES))])  # these directions
+CORNERS = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T  # of a box, in half of its sides
 
 
 def footprint(model: mujoco.MjModel) -> Array:
@@ -35,14 +37,17 @@ def footprint(model: mujoco.MjModel) -> Array:
     if not geoms:
         raise InputError("footprint: the robot has no geom beside its wheels")
     limit = model.joint("steering").range[1] if has(model, "joint", "steering") else 0.0
-    data, points = mujoco.MjData(model), []
+    data, points, known = mujoco.MjData(model), [], dict[tuple[int, bytes], Array]()
     for angle in {-limit, 0.0, limit}:
         mujoco.mj_resetData(model, data)
         steer(model, data.qpos, angle)
         mujoco.mj_kinematics(model, data)
         chassis = data.body("chassis")
         for geom in geoms:
-            points.append((_extremes(model, data, geom) - chassis.xpos) @ chassis.xmat.reshape(3, 3))
+            own = geom, data.geom_xpos[geom].tobytes() + data.geom_xmat[geom].tobytes()
+            if own not in known:  # most do not move when the wheels are steered
+                known[own] = (_extremes(model, data, geom) - chassis.xpos) @ chassis.xmat.reshape(3, 3)
+            points.append(known[own])
     plane = np.concatenate(points)[:, :2].round(9)
     return convex(plane)
 
@@ -61,13 +66,12 @@ def _extremes(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Array:
     """
     kind, size, shape = model.geom_type[geom], model.geom_size[geom], mujoco.mjtGeom
     frame, centre = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
-    level = np.column_stack([np.cos(DIRECTIONS), np.sin(DIRECTIONS), np.zeros(len(DIRECTIONS))])
-    ahead = (level @ frame).round(12)  # the directions in the frame of the geom
+    ahead = (LEVEL @ frame).round(12)  # the directions in the frame of the geom
     if kind == shape.mjGEOM_MESH:
         mesh = model.mesh(model.geom_dataid[geom])
         own = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]].astype(float)
     elif kind == shape.mjGEOM_BOX:
-        own = size * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
+        own = size * CORNERS
     elif kind == shape.mjGEOM_ELLIPSOID:
         own = size**2 * ahead / np.linalg.norm(size * ahead, axis=1, keepdims=True)
     else:  # spheres, and the two ends of capsules and cylinders

@@ -118,14 +118,10 @@ def test_still(robot: str, avoid: Avoid, count: int) -> None:
     assert found == {"arrived": sum(found.values())} and np.mean(times) < 2
 
 
-@pytest.mark.parametrize(("robot", "avoid", "count"), cases([("car", "barrier")], AVOIDERS, 12))
+@pytest.mark.parametrize(
+    ("robot", "avoid", "count"), cases([("car", "barrier"), ("racecar", "window"), ("racecar", "mppi")], AVOIDERS, 24)
+)
 def test_walled(robot: str, avoid: Avoid, count: int) -> None:
-    """With `barrier` every robot goes around the wall, with `window` none touches it, and with `mppi` most arrive."""
+    """Every robot sees from afar that the wall blocks its plan, and goes around it."""
     found, _ = driven("walled", robot, avoid, count)
-    assert sum(found.values()) == count
-    if avoid == "barrier":
-        assert found["arrived"] == count
-    elif avoid == "window":
-        assert not found["collided"]
-    else:
-        assert found["arrived"] > count / 2
+    assert found == {"arrived": count}

@@ -137,6 +137,28 @@ def test_end_of_range() -> None:
         assert len(discs(sight, 0.1 * len(places))) >= 4
 
 
+def test_end_of_range_moves() -> None:
+    """A robot that goes back along a wall remembers all of it, though the place where its range ends moves along."""
+    short, sight, wall = Lidar(range=1.5), Sight(Obstacles()), Obstacles(shapes=(Box(y=0.5, length=10.0, width=0.1),))
+    for k, x in enumerate(np.arange(3.0, -1.5, -0.03)):
+        pose = np.array([x, 0.0, 0.0])
+        ranges = short.scan(pose, Surroundings(wall).at(0.0), np.random.default_rng(k))
+        sight.see(Scan(ranges, short.angles, short.range, pose, 0.1 * k))
+    along = np.sort(discs(sight, 0.0)[:, 0])
+    assert along[0] < -2.0 and along[-1] > 4.0 and np.diff(along).max() < 3 * SPACING
+
+
+def test_shadow_moves() -> None:
+    """A robot that drives past a post remembers all of the wall behind it, though the post's shadow moves along."""
+    wall, post = Box(y=3.0, length=4.0, width=0.1), Disc(y=1.0, radius=0.1)
+    sight = Sight(Obstacles())
+    for k, x in enumerate(np.arange(-1.5, 1.5, 0.03)):
+        scanned(sight, Obstacles(shapes=(wall, post)), np.array([x, 0.0, 0.0]), 0.1 * k)
+        found = discs(sight, 0.1 * k)
+        along = np.sort(found[found[:, 1] > 2.0, 0])
+        assert k == 0 or (along[0] < -1.6 and along[-1] > 1.6 and np.diff(along).max() < 3 * SPACING)
+
+
 def test_seen_through() -> None:
     """A place is seen through if every beam that would meet the disc around it goes on beyond, by geometry."""
     random = np.random.default_rng(2)
