@@ -62,9 +62,10 @@ class Pacing:
     drives the curvature that the plan asks for, and in the time s its error of posture obeys the same equations as
     without obstacles. λ changes no faster than the robot can follow.
 
-    Where something that stands and is not on the map blocks the plan, the robot stops `STANDOFF` before it, and drives
-    on along another plan. Where the map has changed and another plan takes less than `SHORTER` of the time that is
-    left, it drives on along that. If the plan cannot begin with about the speed of the robot, it stops before.
+    Where something that stands and is not on the map blocks the plan, the robot drives on along another plan that
+    begins with about its speed. If there is none, it stops `STANDOFF` before that place, and makes a plan there. Where
+    the map has changed and another plan takes less than `SHORTER` of the time that is left, it takes that; if that plan
+    cannot begin with about the speed of the robot, it stops before.
 
     Attributes:
         followed: What the robots follow, as in `mrctl.control.stages.Motion`, `(B, 7)`.
@@ -105,6 +106,7 @@ class Pacing:
         self._kept = [self._margin(planner.first, row) for row, planner in enumerate(self._planners)]
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
         self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
+        self._tried = np.full(size, -np.inf)  # s at which they last looked for a plan that they could take at once
         self._looked = np.zeros(size, bool)  # which robots have a scan that is new
         self._map_changed = np.zeros(size, bool)  # so that a shorter way may be free
         self._stops = np.zeros(size, bool)  # which stop for a shorter way
@@ -192,7 +194,10 @@ class Pacing:
         return min([allowed, *(share(request, pose, *each) for each in near)])
 
     def _get_on(self, row: int, pose: Array, velocity: float) -> None:
-        """Gives a robot another plan, if what stands there has hardly let it get on, or if the map lets it.
+        """Gives a robot another plan, if its own is blocked, or the map lets it have a shorter one.
+
+        One that it cannot take at once it takes at rest: where it stops for a shorter one, or what stands there has
+        hardly let it get on.
 
         Args:
             row: Which robot.
@@ -206,16 +211,18 @@ class Pacing:
                 if plan := planner.plan(pose, asked, now):
                     self._begin(row, plan)
             return
-        if self._map_changed[row]:
-            self._map_changed[row] = False
-            left = self._period * (len(self._plans[row]) - self._clock[row])
+        blocked = bool(np.isfinite(self._blocked[row]))
+        if self._map_changed[row] or (blocked and now - self._tried[row] >= WAITED):
+            self._map_changed[row], self._tried[row] = False, now
+            left = np.inf if blocked else self._period * (len(self._plans[row]) - self._clock[row])
             if plan := planner.plan(pose, asked, now):
                 excess = asked[0] - plan.sample(np.zeros(1)).twist[0, 0]
                 at_once = excess**2 < 2 * self._robot.max_acceleration * TRACKED  # so far it is off while it brakes
                 if plan.period + (0.0 if at_once else abs(velocity) / self._brakes) < SHORTER * left:
                     if at_once:
                         self._begin(row, plan)
-                    self._stops[row] = not at_once
+                        return
+                    self._stops[row] = not blocked
         standing = planner.sight.standing
         if self._clock[row] - self._anchor[row] > SLOW * WAITED / self._period or not len(standing.discs):
             self._anchor[row], self._since[row] = self._clock[row], now
