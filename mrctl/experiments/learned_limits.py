@@ -28,7 +28,7 @@ from mrctl.loop.learned import kept, save_learned
 from mrctl.loop.simulation import arranged, simulate
 from mrctl.navigation.generators import corridor
 from mrctl.navigation.mission import PATIENCE, SLIM, planned, reached
-from mrctl.navigation.planning import Plan
+from mrctl.navigation.plan import Plan
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority

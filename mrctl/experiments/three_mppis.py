@@ -25,7 +25,7 @@ from mrctl.experiments.tables import Table, centre_cell, frame, share_cell, wins
 from mrctl.loop.simulation import simulate
 from mrctl.navigation.generators import Task, slalom
 from mrctl.navigation.mission import PATIENCE, PERIOD, avoiding, outcomes, prepared
-from mrctl.navigation.planning import Plan
+from mrctl.navigation.plan import Plan
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority

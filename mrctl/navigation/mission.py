@@ -23,7 +23,8 @@ from mrctl.navigation.generators import Task
 from mrctl.navigation.maps import read_map
 from mrctl.navigation.mppi import Mppi
 from mrctl.navigation.pacing import Pacing
-from mrctl.navigation.planning import NoWay, Plan, least_clearance, plan, run_out, shortcut, space, wider
+from mrctl.navigation.plan import Plan, least_clearance, run_out
+from mrctl.navigation.planning import NoWay, plan, shortcut, space, wider
 from mrctl.navigation.replanning import open_waypoints
 from mrctl.navigation.sdf import read_sdf
 from mrctl.navigation.vehicle import Vehicle

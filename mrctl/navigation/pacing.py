@@ -15,7 +15,7 @@ from mrctl.kernel import Array, over_rows
 from mrctl.loop.goals import RESTING
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.navigation.avoidance import Barrier, approach, share
-from mrctl.navigation.planning import least_clearance
+from mrctl.navigation.plan import least_clearance
 from mrctl.navigation.replanning import SHORTER, Planner, Replan, blocked_at
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import rim

@@ -16,7 +16,7 @@ from mrctl.kernel import Array, Rows
 from mrctl.loop.simulation import Simulation, arranged, run, uniform
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import MARGIN, SLIM, Avoid, avoiding, prepared
-from mrctl.navigation.planning import Plan
+from mrctl.navigation.plan import Plan
 from mrctl.navigation.reactive import Reactive
 from mrctl.physics.contacts import NOTHING, Contacts
 from mrctl.physics.hull import footprint

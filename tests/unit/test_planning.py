@@ -13,7 +13,8 @@ from mrctl import Box, Disc, InputError, Limits, Obstacles, Scenario
 from mrctl.navigation import mission, planning
 from mrctl.navigation.generators import Task, cellular, corridor, parking_bay
 from mrctl.navigation.mission import planned
-from mrctl.navigation.planning import NoWay, cost_to_go, least_clearance, plan, run_out, shortcut, space
+from mrctl.navigation.plan import least_clearance, run_out
+from mrctl.navigation.planning import NoWay, cost_to_go, plan, shortcut, space
 from mrctl.navigation.steer import sample, steer
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.theory.clearance import clearance
