@@ -1,11 +1,20 @@
-"""Where a camera has to be, so that its picture is full of what it should show."""
+"""What an overview should show, and where a camera has to be so that its picture is full of that."""
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from mrctl.kernel import Array
+from mrctl.physics.obstacles import HEIGHT
+from mrctl.theory.obstacles import Obstacles, Surroundings
+from mrctl.viewer.shapes import sides
 
+OVERVIEW, TOP = np.array([0.0, -0.7, 0.7]), np.array([0.0, -0.01, 1.0])  # directions to cameras; no camera looks down
+LEAST_VIEW = 1.2  # m, least width of the view
+COURSE_TIMES = 9  # at which obstacles that move are to be seen in an overview
 FULL = 0.92  # share of width or height of a picture that is filled
 HALVINGS = 40  # of intervals of slopes
 
@@ -45,3 +54,32 @@ def fitted(points: Array, side: Array, fov: float, aspect: float) -> tuple[Array
     along, against = extents(high)
     position = (along - against) / 2 @ axes + back * ahead
     return position, position + (points[:, 2].min() - position[2]) / ahead[2] * ahead
+
+
+def to_see(lines: Array, duration: float, reach: float, top: float, obstacles: Obstacles) -> Array:
+    """Returns points around all that an overview shows: robots on lines, and the obstacles around these.
+
+    Args:
+        lines: Places on the lines in m, `(n, 3)`.
+        duration: Time in s in which obstacles move.
+        reach: Distance of the farthest corner of a robot from P in m.
+        top: Height of a robot in m.
+        obstacles: The obstacles.
+
+    Returns:
+        Corners of a convex body in m, `(k, 3)`: a camera that sees these sees all.
+    """
+    low, high = lines.min(axis=0), lines.max(axis=0)
+    size = max(LEAST_VIEW, *(high - low)[:2])
+    found = [lines + np.array(corner) for corner in itertools.product((-reach, reach), (-reach, reach), (0.0, top))]
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * LEAST_VIEW / 2
+    least = (low + high) / 2 + np.column_stack([square, np.zeros(4)])
+    moving = Surroundings(Obstacles(shapes=obstacles.moving))
+    outlines = [moving.at(time) for time in np.linspace(0, duration, COURSE_TIMES) if moving.courses]
+    segments = np.concatenate([sides(one) for one in (Surroundings(obstacles.still).at(0.0), *outlines)])
+    left, right = low[:2] - size, high[:2] + size  # what is farther away would make all else too small
+    around = (segments.max(axis=1) >= left) & (segments.min(axis=1) <= right)
+    near = segments[around.all(axis=1)].reshape(-1, 2).clip(left, right)
+    found += [np.column_stack([near, np.full(len(near), z)]) for z in (low[2], HEIGHT)]
+    points = np.concatenate([*found, least])
+    return points[ConvexHull(points).vertices]

@@ -12,11 +12,10 @@ import mujoco
 import numpy as np
 import viser
 from mjviser.conversions import merge_geoms
-from scipy.spatial import ConvexHull
 
 from mrctl.kernel import Array, Rows
 from mrctl.physics import mjcf
-from mrctl.physics.obstacles import HEIGHT, quaternion
+from mrctl.physics.obstacles import quaternion
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.pictures import REFERENCE_COLOUR
 from mrctl.physics.stand import ground
@@ -25,7 +24,7 @@ from mrctl.scenario import Scenario
 from mrctl.theory.obstacles import NO_OBSTACLES, Obstacles, Surroundings
 from mrctl.theory.references import Reference
 from mrctl.viewer.arrows import Arrows
-from mrctl.viewer.cameras import fitted
+from mrctl.viewer.cameras import OVERVIEW, TOP, fitted, to_see
 from mrctl.viewer.deviation import Target
 from mrctl.viewer.looks import EVENT_COLOUR, MAX_MARKED, Colour, Look
 from mrctl.viewer.navigation import GOAL_COLOUR, Navigation
@@ -34,7 +33,7 @@ from mrctl.viewer.robots import SEEN, Dragged, Robots, in_order
 from mrctl.viewer.sensors import Marks
 from mrctl.viewer.server import Server
 from mrctl.viewer.session import ends, pushed
-from mrctl.viewer.shapes import add_mesh, bar, disc, ribbons, sides
+from mrctl.viewer.shapes import add_mesh, bar, disc, ribbons
 
 # Colours of the floor: its thin lines, its thick lines, its surface.
 LIGHT_FLOOR = (214, 217, 221), (190, 194, 200), (238, 240, 242)
@@ -45,15 +44,12 @@ TRAIL_POINTS_OF_ALL = 1600  # largest number of points in the trails of all robo
 PATH_POINTS = 600  # number of points in the path of a finished run
 TARGET_ABOVE = 0.15  # height of targets over the robot, in diagonals of its outline
 CLEARANCE = 0.05  # m, least height of a camera above the floor
-OVERVIEW, TOP = np.array([0.0, -0.7, 0.7]), np.array([0.0, -0.01, 1.0])  # directions to cameras; no camera looks down
 ASPECT = 0.9  # of width to height of the picture in a page of which more is not known
-COURSE_TIMES = 9  # at which obstacles that move are to be seen in an overview, during a lap
 THICK = 0.012  # thickness of the lines from targets to robots, in diagonals of the robot's outline
 NEXT_TRAIL = 0.001  # m, from the height of the trails of one colour to that of the next; equal ones would flicker
 LINE_WIDTH = 0.004  # of the reference, as a share of the width of the view; trails, which are below, are twice as wide
 REACH = 0.03  # distance from a trail of clicks on it, as a share of the width of the view
 FLOOR = 80.0  # m, width of the floor that is drawn, of which the horizon hides what is far
-LEAST_VIEW = 1.2  # m, least width of the view
 SHADE = 0.35  # opacity of shadows on the floor
 GRIP, GRIP_BELOW = 50.0, 0.02  # m, half the side of the floor that can be dragged on, and its depth below the floor
 SQUARE = (-1, -1), (1, -1), (1, 1), (-1, 1)
@@ -163,35 +159,17 @@ class Scene:
         self._look()
         self.paint()
 
-    def _to_see(self, lines: Array, duration: float) -> Array:
-        """Returns points around all that an overview shows: robots on lines, and the obstacles around these.
-
-        Args:
-            lines: Places on the lines in m, `(n, 3)`.
-            duration: Time in s in which obstacles move.
-        """
-        low, high = lines.min(axis=0), lines.max(axis=0)
-        size, reach = max(LEAST_VIEW, *(high - low)[:2]), np.hypot(*abs(self.robots.footprint).max(axis=0))
-        sides_of_robot = (-reach, reach), (-reach, reach), (0.0, self.robots.top)
-        found = [lines + np.array(corner) for corner in itertools.product(*sides_of_robot)]
-        least = [(low + high) / 2 + np.array([x, y, 0]) * LEAST_VIEW / 2 for x, y in SQUARE]
-        moving = Surroundings(Obstacles(shapes=self._obstacles.moving))
-        outlines = [moving.at(time) for time in np.linspace(0, duration, COURSE_TIMES) if moving.courses]
-        segments = np.concatenate([sides(one) for one in (Surroundings(self._obstacles.still).at(0.0), *outlines)])
-        left, right = low[:2] - size, high[:2] + size  # what is farther away would make all else too small
-        around = (segments.max(axis=1) >= left) & (segments.min(axis=1) <= right)
-        near = segments[around.all(axis=1)].reshape(-1, 2).clip(left, right)
-        found += [np.column_stack([near, np.full(len(near), z)]) for z in (low[2], HEIGHT)]
-        points = np.concatenate([*found, least])
-        return points[ConvexHull(points).vertices]  # a camera that sees these sees all
-
     def draw_references(self, references: Sequence[Reference]) -> None:
         """Draws a lap of each reference on the ground, in place of those before; the cameras stay.
 
         From now on an overview shows these.
         """
         lines = self._lines(references)
-        self._seen = self._to_see(lines.reshape(-1, 3), max(reference.period for reference in references))
+        duration, reach = (
+            max(one.period for one in references),
+            float(np.hypot(*abs(self.robots.footprint).max(axis=0))),
+        )
+        self._seen = to_see(lines.reshape(-1, 3), duration, reach, self.robots.top, self._obstacles)
         self._view = max(np.ptp(self._seen[:, :2], axis=0))
         self._middle = (self._seen.min(axis=0) + self._seen.max(axis=0)) / 2 * [1, 1, 0]
         colours = len({look.colour for look in self._looks})

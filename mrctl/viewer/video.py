@@ -20,15 +20,18 @@ from tqdm import tqdm
 
 from mrctl.kernel import Array
 from mrctl.physics import mjcf
+from mrctl.physics.elements import bodies_of
+from mrctl.physics.hull import footprint
 from mrctl.physics.obstacles import quaternion
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.pictures import REFERENCE_COLOUR, SHADOW, draw_line
 from mrctl.record import InputError
+from mrctl.scenario import Scenario
 from mrctl.theory.obstacles import Surroundings
+from mrctl.viewer.cameras import LEAST_VIEW, OVERVIEW, fitted, to_see
 from mrctl.viewer.deviation import extent
 from mrctl.viewer.looks import Look
 from mrctl.viewer.recording import MAX_SHOWN, Library, Recording, joint_log, looks_of, path
-from mrctl.viewer.scene import LEAST_VIEW
 from mrctl.viewer.sensors import magnification
 
 Picture = NDArray[np.uint8]
@@ -38,8 +41,7 @@ RATES = {".mp4": 25.0, ".gif": 12.5}  # pictures a second
 LINE_POINTS, TRAIL_POINTS = 200, 100
 TRAIL = 12.0  # s that a trail shows
 GHOST_OPACITY = 0.25
-# Camera, relative to the middle of the reference and in units of its size.
-CAMERA_POSITION, CAMERA_TARGET = np.array([0.0, -0.964, 0.72]), np.array([0.0, 0.1, 0.0])
+RARE = Image.Quantize.FASTOCTREE  # keeps the colours of thin trails, where the median cut keeps shades of the floor
 WIDTH = 0.003  # of trails, as a share of the width of the view; the reference is twice as wide
 
 
@@ -77,7 +79,7 @@ def record(folder: Path, run: int | None, out: Path, code: bool = True) -> None:
 
 
 def _write_gif(pictures: Iterable[Picture], out: Path) -> None:
-    first, *others = (Image.fromarray(picture).quantize(64) for picture in pictures)
+    first, *others = (Image.fromarray(picture).quantize(64, RARE) for picture in pictures)
     first.save(out, save_all=True, append_images=others, duration=round(1000 / RATES[".gif"]), loop=0)
 
 
@@ -115,14 +117,8 @@ def _pictures(
     with renderer:
         reference = recordings[0].scenario.reference
         course = reference.sample(np.linspace(0, reference.period, LINE_POINTS)).pose * [1, 1, 0]
-        low, high = course.min(axis=0), course.max(axis=0)
-        view = max(LEAST_VIEW, *(high - low))
-        camera = mujoco.MjvCamera()
-        camera.lookat = (low + high) / 2 + view * CAMERA_TARGET
-        back = view * (CAMERA_TARGET - CAMERA_POSITION)
-        camera.distance = float(np.linalg.norm(back))
-        camera.azimuth = np.degrees(np.arctan2(back[1], back[0]))
-        camera.elevation = np.degrees(np.arcsin(back[2] / camera.distance))
+        view = max(LEAST_VIEW, *np.ptp(course, axis=0))
+        camera = _overview(model, recordings[0].scenario, course, width / height)
         data, option, nothing = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb()
         moving = Surroundings(recordings[0].scenario.obstacles)
         radius, magnified = read_robot(model).wheel_radius, magnification(extent(joint_log(recordings)[1]))
@@ -148,6 +144,23 @@ def _pictures(
                     scene, path(rows, radius, data.body("chassis").xpos[2], magnified), WIDTH * view, robot.colour
                 )
             yield _labelled(renderer.render(), f"{time:.1f} s, deviation of trails {magnified} times", robots)
+
+
+def _overview(model: mujoco.MjModel, scenario: Scenario, course: Array, aspect: float) -> mujoco.MjvCamera:
+    """Returns a camera that sees a course in m, `(n, 3)`, and the obstacles around it, as large as possible."""
+    data, robot = mujoco.MjData(model), np.isin(model.geom_bodyid, bodies_of(model))
+    mujoco.mj_kinematics(model, data)
+    up, (centre, half) = data.geom_xmat[robot, 6:], np.moveaxis(model.geom_aabb[robot].reshape(-1, 2, 3), 1, 0)
+    top = float((data.geom_xpos[robot, 2] + (up * centre).sum(axis=1) + (abs(up) * half).sum(axis=1)).max())
+    reach = float(np.hypot(*footprint(model).T).max())
+    seen = to_see(course, scenario.reference.period, reach, top, scenario.obstacles)
+    position, target = fitted(seen, OVERVIEW, float(np.radians(model.vis.global_.fovy)), aspect)
+    back = target - position
+    camera = mujoco.MjvCamera()
+    camera.lookat, camera.distance = target, float(np.linalg.norm(back))
+    camera.azimuth = np.degrees(np.arctan2(back[1], back[0]))
+    camera.elevation = np.degrees(np.arcsin(back[2] / camera.distance))
+    return camera
 
 
 def _labelled(picture: Picture, text: str, robots: Sequence[Look]) -> Picture:

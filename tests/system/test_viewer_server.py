@@ -26,6 +26,7 @@ from mrctl.cli import main
 from mrctl.viewer import server as module
 from mrctl.viewer import view as viewing
 from mrctl.viewer.live import Live
+from mrctl.viewer.looks import looks
 from mrctl.viewer.server import Server
 
 PROTOCOL = [f"viser-v{viser.__version__}"]
@@ -321,7 +322,10 @@ def test_record(tmp_path, capsys):
             assert (video.n_frames, video.size, video.info["duration"]) == (13, (640, 360), 80)
             first = np.asarray(video.convert("RGB"), float)
             video.seek(12)
-            assert (np.abs(np.asarray(video.convert("RGB"), float) - first).max(axis=-1) > 60).sum() > 500
+            last = np.asarray(video.convert("RGB"), float)
+            assert (np.abs(last - first).max(axis=-1) > 60).sum() > 500
+            (own,) = looks([""], ["none"])  # of the trail and the label
+            assert (np.abs(last - own.colour).max(axis=-1) < 40).sum() > 100
         about, *pictures = imageio_ffmpeg.read_frames(tmp_path / "run.mp4")
         assert (about["size"], about["fps"], len(pictures)) == ((1280, 720), 5, 5)
         first, last = (np.frombuffer(pictures[k], np.uint8).reshape(-1, 3).astype(float) for k in (0, -1))

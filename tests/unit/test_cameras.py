@@ -7,20 +7,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mrctl.viewer.cameras import FULL, fitted
-from mrctl.viewer.scene import OVERVIEW, TOP
+from mrctl import Scenario
+from mrctl.navigation.mission import prepared, task_of
+from mrctl.physics import mjcf
+from mrctl.physics.obstacles import HEIGHT
+from mrctl.viewer.cameras import FULL, OVERVIEW, TOP, fitted
+from mrctl.viewer.video import _overview
 
 FOV = np.radians(75)
 
 
-def picture(points, position, target, aspect):
+def picture(points, position, target, aspect, fov=FOV):
     """Places of points in a picture, from −1 at one edge to 1 at the other, x to the right and y up, `(n, 2)`."""
     ahead = (target - position) / np.linalg.norm(target - position)
     right = np.cross(ahead, [0, 0, 1]) / np.hypot(*ahead[:2])
     up = np.cross(right, ahead)
     away = points - position
     assert (away @ ahead > 0).all()
-    return np.column_stack([away @ right / aspect, away @ up]) / (away @ ahead)[:, None] / np.tan(FOV / 2)
+    return np.column_stack([away @ right / aspect, away @ up]) / (away @ ahead)[:, None] / np.tan(fov / 2)
 
 
 @given(st.integers(0, 10**6), st.floats(0.05, 20.0), st.sampled_from([OVERVIEW, TOP]), st.booleans())
@@ -36,3 +40,22 @@ def test_full_picture(seed, aspect, side, flat):
     assert seen.min(axis=0) == pytest.approx(-seen.max(axis=0), abs=1e-6)
     assert target[2] == pytest.approx(points[:, 2].min())
     assert np.cross(target - position, side) == pytest.approx([0, 0, 0], abs=1e-6 * np.linalg.norm(target - position))
+
+
+def test_video_of_a_mission():
+    """A video of a mission shows the whole slalom, up to the tops of its posts, and fills the picture with it."""
+    scenario = prepared(task_of("slalom:3", Scenario()), Scenario())[1]
+    model = mjcf.load(scenario.world, obstacles=scenario.obstacles)
+    course = scenario.reference.sample(np.linspace(0, scenario.reference.period, 50)).pose * [1, 1, 0]
+    camera = _overview(model, scenario, course, 16 / 9)
+    turn, rise = np.radians([camera.azimuth, camera.elevation])
+    ahead = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
+    around = np.linspace(0, 2 * np.pi, 40)
+    posts = [
+        [d.x + d.radius * np.cos(a), d.y + d.radius * np.sin(a), z]
+        for d, a, z in itertools.product(scenario.obstacles.shapes, around, (0.0, HEIGHT))
+    ]
+    fov = np.radians(model.vis.global_.fovy)
+    position = camera.lookat - camera.distance * ahead
+    seen = np.abs(picture(np.vstack([course, posts]), position, camera.lookat, 16 / 9, fov)).max(axis=0)
+    assert seen.max() <= FULL + 1e-6 and seen[0] > 0.75  # the robot at the ends takes the rest
