@@ -140,7 +140,10 @@ def through(points: Array, scan: Scan) -> NDArray[np.bool]:
 
 
 def reached(points: Array, scan: Scan, margin: float) -> NDArray[np.bool]:
-    """Tells which points, `(k, 2)` in m, are in range and less than a margin in m beyond what a beam met, `(k,)`."""
+    """Tells which points, `(k, 2)` in m, are in range and less than a margin in m beyond what their beam met, `(k,)`.
+
+    The beam of a point is the one nearest in direction. One that met nothing reaches all that is in range.
+    """
     dx, dy = (points - scan.place[:2]).T
     away, turned = np.hypot(dx, dy), np.arctan2(dy, dx) - scan.place[2] - scan.angles[0]
     beam = np.round(turned / scan.step).astype(int) % scan.full_turn

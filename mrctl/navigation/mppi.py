@@ -23,6 +23,7 @@ WORTH = 40  # λ, that a sample may cost more than another one and still weigh s
 KEPT = 40  # of the samples, which are kept to be looked at
 SPREAD = 0.25, 0.3  # standard deviations of what is added, over the largest V and θ̇; chosen
 MOST_LAG = 10.0  # s
+BEHIND = 0.5  # share of the way to its target that may be left at the end of a roll-out that gets on; chosen
 
 
 class Mppi(Reactive):
@@ -54,6 +55,14 @@ class Mppi(Reactive):
     def begin(self, tick: int) -> None:
         """Draws the noise of a period, whose number is the only seed."""
         self._noise = np.random.default_rng(tick).standard_normal((SAMPLES, KNOTS, 2))
+
+    def passes(self, row: int, scene: Scene) -> bool:
+        """Tells whether the mean of the twists leads a robot over at least half of the way to its target."""
+        considered = self.considered[row]
+        assert considered is not None
+        way, target = considered.paths(self._period)[1], scene.targets[-1, :2]
+        left, before = (float(np.hypot(*(target - place))) for place in (way[-1], way[0]))
+        return left < BEHIND * before
 
     def choose(self, row: int, pose: Array, twist: Array, last: Array, period: float, scene: Scene) -> Array:
         """Returns the first of the mean twists, or of the cheapest sample where only the mean touches an obstacle."""

@@ -16,7 +16,7 @@ from mrctl.loop.goals import RESTING
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.navigation.avoidance import Barrier, approach, share
 from mrctl.navigation.plan import least_clearance
-from mrctl.navigation.replanning import SHORTER, Planner, Replan, blocked_at
+from mrctl.navigation.replanning import SHORTER, SURE, Planner, Replan, blocked_at
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import rim
 from mrctl.theory.rays import Scan
@@ -106,7 +106,8 @@ class Pacing:
         self._kept = [self._margin(planner.first, row) for row, planner in enumerate(self._planners)]
         self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
         self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
-        self._tried = np.full(size, -np.inf)  # s at which they last looked for a plan that they could take at once
+        self._since_blocked = np.full(size, np.inf)  # s since which their plans are blocked
+        self._tried = np.full(size, -np.inf)  # s at which they last looked for another plan
         self._looked = np.zeros(size, bool)  # which robots have a scan that is new
         self._map_changed = np.zeros(size, bool)  # so that a shorter way may be free
         self._stops = np.zeros(size, bool)  # which stop for a shorter way
@@ -145,22 +146,20 @@ class Pacing:
         if velocity * first > 0:
             self._pace[row] = min(1.0, velocity / first)
         self._clock[row], self._anchor[row], self._blocked[row] = 0.0, 0.0, np.inf
+        self._since[row], self._since_blocked[row], self._tried[row] = self._period * self._tick, np.inf, -np.inf
         self._map_changed[row] = self._stops[row] = False
 
     def see(self, row: int, scan: Scan) -> None:
         """Takes a scan of one robot, and looks whether its plan is free; for the arguments see `stages.Motion`."""
         self._map_changed[row] |= self._planners[row].sight.see(scan)
         self._looked[row] = True
-        standing = self._planners[row].sight.standing
-        self._blocked[row] = np.inf
-        if not len(standing.discs):
-            return
-        plan = self._plans[row]
+        standing, plan, place = self._planners[row].sight.standing, self._plans[row], None
         first = min(int(self._clock[row]), len(plan) - 2)
-        way = np.cumsum(np.abs(plan[first:, 3])) * self._period
-        place = blocked_at(self._footprint, plan[first:, :3], way, standing)
-        if place is not None:
-            self._blocked[row] = first + place
+        if len(standing.discs):
+            way = np.cumsum(np.abs(plan[first:, 3])) * self._period
+            place = blocked_at(self._footprint, plan[first:, :3], way, standing)
+        self._blocked[row] = np.inf if place is None else first + place
+        self._since_blocked[row] = np.inf if place is None else min(self._since_blocked[row], scan.time)
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
@@ -196,8 +195,8 @@ class Pacing:
     def _get_on(self, row: int, pose: Array, velocity: float) -> None:
         """Gives a robot another plan, if its own is blocked, or the map lets it have a shorter one.
 
-        One that it cannot take at once it takes at rest: where it stops for a shorter one, or what stands there has
-        hardly let it get on.
+        It takes a plan that begins at about its speed at once. Otherwise it plans again at rest: when it has stopped
+        for a shorter way, or has hardly got on for a second before what stands.
 
         Args:
             row: Which robot.
@@ -211,23 +210,22 @@ class Pacing:
                 if plan := planner.plan(pose, asked, now):
                     self._begin(row, plan)
             return
-        blocked = bool(np.isfinite(self._blocked[row]))
-        if self._map_changed[row] or (blocked and now - self._tried[row] >= WAITED):
-            self._map_changed[row], self._tried[row] = False, now
-            left = np.inf if blocked else self._period * (len(self._plans[row]) - self._clock[row])
+        standing, blocked = planner.sight.standing, now - self._since_blocked[row] >= SURE
+        if self._clock[row] - self._anchor[row] > SLOW * WAITED / self._period or not len(standing.discs):
+            self._anchor[row], self._since[row] = self._clock[row], now
+        if now - self._since[row] >= WAITED:
+            self._since[row] = self._tried[row] = now  # where there is no other plan, it tries again later
+            self._map_changed[row] = False
             if plan := planner.plan(pose, asked, now):
+                self._begin(row, plan)
+        elif self._map_changed[row] or (blocked and now - self._tried[row] >= WAITED):
+            left = np.inf if blocked else self._period * (len(self._plans[row]) - self._clock[row])
+            ahead, self._map_changed[row], self._tried[row] = not self._map_changed[row], False, now
+            if plan := planner.plan(pose, asked, now, ahead):
                 excess = asked[0] - plan.sample(np.zeros(1)).twist[0, 0]
                 at_once = excess**2 < 2 * self._robot.max_acceleration * TRACKED  # so far it is off while it brakes
                 if plan.period + (0.0 if at_once else abs(velocity) / self._brakes) < SHORTER * left:
                     if at_once:
                         self._begin(row, plan)
-                        return
-                    self._stops[row] = not blocked
-        standing = planner.sight.standing
-        if self._clock[row] - self._anchor[row] > SLOW * WAITED / self._period or not len(standing.discs):
-            self._anchor[row], self._since[row] = self._clock[row], now
-        if now - self._since[row] < WAITED:
-            return
-        self._since[row] = now  # where there is no other plan, it tries again later
-        if plan := planner.plan(pose, asked, now):
-            self._begin(row, plan)
+                    else:
+                        self._stops[row] = not blocked

@@ -10,7 +10,7 @@ import numpy as np
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.navigation.chart import RADIUS
-from mrctl.navigation.replanning import SHORTER, Planner, Replan, blocked_at
+from mrctl.navigation.replanning import SHORTER, SURE, Planner, Replan, blocked_at
 from mrctl.navigation.rollouts import KEPT, STEPS, Bounds, Considered, Scene
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.trail import Trail
@@ -42,6 +42,7 @@ class Agent:
 
     Attributes:
         last: The twist that it was last asked for, V in m/s and θ̇ in rad/s, `(2,)`.
+        passes: Whether the twists that were chosen last lead around what blocks its plan.
     """
 
     def __init__(
@@ -59,11 +60,11 @@ class Agent:
         """
         self._planner, self._bounds, self._discs = planner, bounds, discs
         self._field, self._reach, self._period = field, reach(discs), period
-        self.last = np.zeros(2)
+        self.last, self.passes = np.zeros(2), False
         self._table, self._place, self._away = self._sampled(planner.first), 0, 0.0  # its plan, and its place on that
         self._looked = False  # whether there is a scan that is new; a robot that has failed gets none
         self._map_changed = False  # so that a shorter way may be free
-        self._blocked = False  # whether it would touch what stands beside the map on its plan
+        self._blocked = np.inf  # since when it would touch what stands beside the map on its plan, in s
         self._tried = -np.inf  # when it last looked for another plan
         self._anchor, self._since = start.copy(), 0.0  # where it last was when it had got on, and when
         self._replanned = False  # whether it has made another plan since
@@ -81,13 +82,13 @@ class Agent:
     def follow(self, plan: Reference, now: float) -> None:
         """Takes a plan to another goal at a time in s."""
         self._take(self._planner.take(plan))
-        self._since = now  # it may have waited at its goal, and is not stuck
+        self._since, self._tried = now, -np.inf  # it may have waited at its goal, and is not stuck
         self._replanned = self._approached = self._map_changed = False
         self._pieces = 0
 
     def _take(self, plan: Waypoints) -> None:
         """Goes along a plan from now on; where the distance field ends before the plan does, makes another field."""
-        self._table, self._place, self._blocked = self._sampled(plan), 0, False
+        self._table, self._place, self._blocked = self._sampled(plan), 0, np.inf
         low, high = self._table[:, :2].min(axis=0), self._table[:, :2].max(axis=0)
         distance, origin, resolution = self._field
         end = origin + resolution * np.array(distance.shape[::-1])
@@ -101,11 +102,12 @@ class Agent:
             self._field = field_around(self._table[:, :2], self._planner.sight, self._reach)
             self._map_changed = True
         standing, rest = self._planner.sight.standing, self._table[self._place :]
-        self._blocked = False
+        place = None
         if len(standing.discs) and len(rest) > 1:
             poses = np.column_stack([rest[:, :2], np.arctan2(rest[:, 3], rest[:, 2])])
             way = np.append(0.0, np.cumsum(np.hypot(*np.diff(rest[:, :2], axis=0).T)))
-            self._blocked = blocked_at(self._planner.vehicle.footprint, poses, way, standing) is not None
+            place = blocked_at(self._planner.vehicle.footprint, poses, way, standing)
+        self._blocked = np.inf if place is None else min(self._blocked, scan.time)
 
     def locate(self, pose: Array) -> None:
         """Finds the place on the plan that is nearest to a pose in m, m, rad, `(3,)`, of those not far ahead."""
@@ -169,7 +171,7 @@ class Agent:
             if not self.needs_plan(pose, now):
                 self._shorten(pose, now)
                 return False
-            other = self._planned(pose, now)
+            other = self._planned(pose, now, self._away <= OFF and not self._waits(now))
             # What it got here before did not help it.
             stuck = self._waits(now) and self._away <= OFF and (other is None or self._replanned)
         self._replanned = self._waits(now) and self._away <= OFF
@@ -185,14 +187,15 @@ class Agent:
     def needs_plan(self, pose: Array, now: float) -> bool:
         """Notes how far it has come, at a time in s; tells whether it needs another plan, and can make one.
 
-        It does where its own is blocked, it is off that, or has hardly moved for a while; at the end of its plan it
-        needs none.
+        It does where it does not get around what blocks its own, is off that, or has hardly moved for a while; at the
+        end of its plan it needs none.
         """
         if self._at_end(pose):
-            self._since = now
+            self._since, self._blocked = now, np.inf
         if self._gone(pose) > min(WAITED[1], WAITED[2] * WAITED[0] * self._bounds.speed):
             self._anchor, self._since, self._replanned = pose[:2].copy(), now, False
-        lost = (self._blocked or self._away > OFF or self._waits(now)) and now - self._tried > RETRY
+        blocked = now - self._blocked >= SURE and not self.passes
+        lost = (blocked or self._away > OFF or self._waits(now)) and now - self._tried > RETRY
         lost, self._looked = lost and self._looked, False
         if lost:
             self._tried = now
@@ -231,10 +234,10 @@ class Agent:
             if (other := self._planned(pose, now)) and other.period < SHORTER * left:
                 self._take(other)
 
-    def _planned(self, pose: Array, now: float) -> Waypoints | None:
-        """Makes a plan from where it is, around what it knows."""
+    def _planned(self, pose: Array, now: float, ahead: bool = False) -> Waypoints | None:
+        """Makes a plan from where it is, around what it knows; `ahead` is that of `Planner.plan`."""
         self._map_changed = False
-        return self._planner.plan(pose, self.last, now)
+        return self._planner.plan(pose, self.last, now, ahead)
 
 
 def reach(discs: Array) -> float:
@@ -251,7 +254,8 @@ def field_around(places: Array, sight: Sight, reach: float) -> Field:
 class Reactive(ABC):
     """A motion stage that asks for twists along a plan.
 
-    It makes another plan when a scan shows that this one is blocked, and when the robot is off its plan or waits.
+    It makes another plan when scans show that this one is blocked and the twists do not lead around that, and when the
+    robot is off its plan or waits.
     Where a robot waits that can reverse, and another plan is not found or does not help, it goes back a little on its
     `Trail`, and plans again.
 
@@ -311,11 +315,16 @@ class Reactive(ABC):
             else:
                 scene = agent.scene(place, now)
                 agent.last = self.choose(row, place, twist[row], agent.last, self._period, scene).copy()
+                agent.passes = self.passes(row, scene)
         self._tick += 1
         return self.last
 
     def begin(self, tick: int) -> None:  # noqa: B027 (most have nothing to do)
         """Is called once in a motion period, before `choose` for each robot."""
+
+    def passes(self, row: int, scene: Scene) -> bool:
+        """Tells whether the twists that were chosen last lead one robot around what blocks its plan."""
+        return False
 
     @abstractmethod
     def choose(self, row: int, pose: Array, twist: Array, last: Array, period: float, scene: Scene) -> Array:

@@ -21,6 +21,7 @@ from mrctl.theory.references import Reference, Waypoints
 SAME = 0.02, 0.05, 0.06
 AGAIN = 3.0  # s, after which a search that found no way is repeated in any case
 SPACING = 0.05  # m, of the places of a plan that `blocked_at` looks at
+SURE = 0.3  # s for which a plan must be blocked by what stands: what moves seems to stand at first; chosen
 SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
 
 Replan = Callable[[Scenario, Vehicle, Array, Array, Outlines, Waypoints | None], Waypoints | None]
@@ -102,7 +103,7 @@ class Planner:
         """Goal of the mission, x and y in m and θ in rad; None if there is none, or a plan came since."""
         return self.scenario.goal if self._given is None else None
 
-    def plan(self, pose: Array, twist: Array, time: float) -> Waypoints | None:
+    def plan(self, pose: Array, twist: Array, time: float, ahead: bool = False) -> Waypoints | None:
         """Makes a plan that keeps off what is not on the map, or else one that only does not touch it.
 
         Args:
@@ -110,11 +111,15 @@ class Planner:
             twist: V in m/s and θ̇ in rad/s with which it begins if the robot drives forward, `(2,)`; what the robot was
                 asked for last, which has no noise.
             time: Time in s.
+            ahead: Whether the robot still drives on, and asks because its plan is blocked somewhere ahead.
 
         Returns:
-            The plan, or None where there is no way. Where a search has found none, it is not repeated within 3 s, until
-            the robot or an obstacle is elsewhere: that there is no way takes a search far longer than to find one.
+            The plan, or None where there is no way. That there is none takes a search far longer than to find one.
+            Where one has found none, it is therefore not repeated within 3 s, until the robot or an obstacle is
+            elsewhere, and not at all while the robot drives on.
         """
+        if ahead and self._hopeless:
+            return None
         near, far = self.sight.outlines(time), self.sight.around(time, self.vehicle.footprint, pose)
         if self._hopeless:
             since, there, known = self._hopeless
@@ -123,6 +128,7 @@ class Planner:
         for outlines in (near,) if np.array_equal(near.discs, far.discs) else (far, near):
             try:
                 if plan := self._replan(self.scenario, self.vehicle, pose, twist, outlines, self._given):
+                    self._hopeless = None
                     return plan
             except NoWay:
                 if outlines is near:

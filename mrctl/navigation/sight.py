@@ -189,7 +189,7 @@ class Sight:
     def _hidden(self, old: Array, new: Array, scan: Scan) -> Array:
         """Returns the discs of before, `(k, 5)`, that the scan neither shows nor sees through.
 
-        It shows what is near a new disc, unless that is out of range, or something else hides it.
+        It shows an old disc that is near a new one, unless the old one is out of range, or something else hides it.
         """
         if not len(old):
             return old
@@ -198,7 +198,7 @@ class Sight:
         if len(new):
             near = np.hypot(*(places[:, None] - new[None, :, :2]).transpose(2, 0, 1)).min(axis=1) < 2 * SPACING
             gone |= near & (moves | reached(places, scan, 2 * SPACING))
-        return old[~gone]
+        return _apart(old[~gone])
 
 
 @kernel
@@ -221,6 +221,14 @@ def _moves(discs: Array) -> NDArray[np.bool]:
 def _outlines(places: Array) -> Outlines:
     """Returns discs around places, x and y in m first, as outlines."""
     return NOTHING._replace(discs=np.column_stack([places[:, :2], np.full(len(places), RADIUS)]))
+
+
+def _apart(discs: Array) -> Array:
+    """Returns those discs, `(k, 5)`, that are at least half of `SPACING` from every one that was seen before them."""
+    kept = np.zeros(len(discs), bool)
+    for k in np.argsort(discs[:, 4], kind="stable"):
+        kept[k] = not kept.any() or np.hypot(*(discs[kept, :2] - discs[k, :2]).T).min() >= SPACING / 2
+    return discs[kept]
 
 
 def _thinned(points: Array) -> Array:

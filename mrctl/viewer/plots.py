@@ -248,7 +248,7 @@ def legend(robots: Sequence[Look]) -> str:
     keys = [f'<span style="{whole}{colour}">■ {html.escape(label)}</span>' for label, colour in robots]
     keys += [f'<span style="{whole}{REFERENCE_COLOUR}">■ reference</span>']
     keys += [f'<span style="{whole}{pale(robots[0].colour)}">■ pale: estimated V, θ̇</span>']
-    keys += ["Σ, Δ: feedback solid, feedforward dashed."]
+    keys += ["Σ, Δ: feedback solid, feedforward dashed. Time in s."]
     if len(robots) > MAX_ROBOTS:
         keys += [f"Curves are of the first {MAX_ROBOTS} of {len(robots)} robots."]
     return f'<p style="margin:0.3em 1em;max-height:6em;overflow:auto">{" &nbsp; ".join(keys)}</p>'

@@ -83,6 +83,19 @@ def test_no_way_is_not_searched_again(planner: Planner) -> None:
     assert searches(planner, (0.03, 0.0, 0.1)) == 2
 
 
+def test_no_way_while_it_drives_on(planner: Planner) -> None:
+    """A robot that drives on towards what blocks its plan does not search again until there was a way."""
+    planner.sight.show((1.0, 0.0))
+    assert searches(planner) == 2
+    before = planner._replan.count
+    assert planner.plan(np.array((0.5, 0.1, 0.2)), REST, 9.0, ahead=True) is None and planner._replan.count == before
+    planner._replan.answer = WAY
+    assert planner.plan(np.array((0.5, 0.1, 0.2)), REST, 9.0) is WAY
+    planner._replan.answer, before = NoWay("goal: there is no way"), planner._replan.count
+    assert planner.plan(np.array((0.5, 0.1, 0.2)), REST, 10.0, ahead=True) is None
+    assert planner._replan.count == before + 2
+
+
 def test_other_refusals_are_tried_again(planner: Planner) -> None:
     """That the robot seems to be within the margin of an obstacle may be noise, and costs no search."""
     planner._replan.answer = None

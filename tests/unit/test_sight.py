@@ -146,6 +146,17 @@ def test_end_of_range_moves() -> None:
         sight.see(Scan(ranges, short.angles, short.range, pose, 0.1 * k))
     along = np.sort(discs(sight, 0.0)[:, 0])
     assert along[0] < -2.0 and along[-1] > 4.0 and np.diff(along).max() < 3 * SPACING
+    assert len(along) < 2 * np.ptp(along) / SPACING
+
+
+def test_end_of_range_stays() -> None:
+    """A robot that stands before a wall that reaches beyond its range does not remember more and more of it."""
+    short, sight, wall = Lidar(range=1.5), Sight(Obstacles()), Obstacles(shapes=(Box(y=0.5, length=10.0, width=0.1),))
+    for k in range(500):
+        ranges = short.scan(np.zeros(3), Surroundings(wall).at(0.0), np.random.default_rng(k))
+        sight.see(Scan(ranges, short.angles, short.range, np.zeros(3), 0.1 * k))
+    found = discs(sight, 0.0)
+    assert len(found) < 2 * np.ptp(found[:, 0]) / SPACING
 
 
 def test_shadow_moves() -> None:
@@ -157,6 +168,7 @@ def test_shadow_moves() -> None:
         found = discs(sight, 0.1 * k)
         along = np.sort(found[found[:, 1] > 2.0, 0])
         assert k == 0 or (along[0] < -1.6 and along[-1] > 1.6 and np.diff(along).max() < 3 * SPACING)
+    assert len(along) < 2 * np.ptp(along) / SPACING
 
 
 def test_seen_through() -> None:
