@@ -165,10 +165,8 @@ class Scene:
         From now on an overview shows these.
         """
         lines = self._lines(references)
-        duration, reach = (
-            max(one.period for one in references),
-            float(np.hypot(*abs(self.robots.footprint).max(axis=0))),
-        )
+        duration = max(reference.period for reference in references)
+        reach = float(np.hypot(*abs(self.robots.footprint).max(axis=0)))
         self._seen = to_see(lines.reshape(-1, 3), duration, reach, self.robots.top, self._obstacles)
         self._view = max(np.ptp(self._seen[:, :2], axis=0))
         self._middle = (self._seen.min(axis=0) + self._seen.max(axis=0)) / 2 * [1, 1, 0]

@@ -115,10 +115,11 @@ def _pictures(
         reason = str(error).split("\n")[0] or type(error).__name__
         raise InputError(f"record: MuJoCo cannot draw on this machine; is EGL (libegl1) installed? {reason}") from None
     with renderer:
-        reference = recordings[0].scenario.reference
-        course = reference.sample(np.linspace(0, reference.period, LINE_POINTS)).pose * [1, 1, 0]
-        view = max(LEAST_VIEW, *np.ptp(course, axis=0))
-        camera = _overview(model, recordings[0].scenario, course, width / height)
+        first = recordings[0].scenario
+        references = [first.reference, *(event.reference for event in first.events if event.reference)]
+        courses = [one.sample(np.linspace(0, one.period, LINE_POINTS)).pose * [1, 1, 0] for one in references]
+        view = max(LEAST_VIEW, *np.ptp(np.concatenate(courses), axis=0))
+        camera = _overview(model, first, np.concatenate([*courses, *map(_driven, recordings)]), width / height)
         data, option, nothing = mujoco.MjData(model), mujoco.MjvOption(), mujoco.MjvPerturb()
         moving = Surroundings(recordings[0].scenario.obstacles)
         radius, magnified = read_robot(model).wheel_radius, magnification(extent(joint_log(recordings)[1]))
@@ -131,7 +132,8 @@ def _pictures(
                 scene = renderer.scene
                 if row == 0:
                     renderer.update_scene(data, camera)
-                    draw_line(scene, course + [0, 0, 0.004], 2 * WIDTH * view, REFERENCE_COLOUR)
+                    for course in courses:
+                        draw_line(scene, course + [0, 0, 0.004], 2 * WIDTH * view, REFERENCE_COLOUR)
                 else:
                     before = scene.ngeom
                     mujoco.mjv_addGeoms(model, data, option, nothing, mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
@@ -146,14 +148,20 @@ def _pictures(
             yield _labelled(renderer.render(), f"{time:.1f} s, deviation of trails {magnified} times", robots)
 
 
-def _overview(model: mujoco.MjModel, scenario: Scenario, course: Array, aspect: float) -> mujoco.MjvCamera:
-    """Returns a camera that sees a course in m, `(n, 3)`, and the obstacles around it, as large as possible."""
+def _driven(recording: Recording) -> Array:
+    """Returns places where a robot was, on the floor in m, `(n, 3)`."""
+    rows = recording.log[np.linspace(0, len(recording.log) - 1, LINE_POINTS).astype(int)]
+    return np.column_stack([rows["x"], rows["y"], np.zeros(LINE_POINTS)])[np.isfinite(rows["x"])]
+
+
+def _overview(model: mujoco.MjModel, scenario: Scenario, places: Array, aspect: float) -> mujoco.MjvCamera:
+    """Returns a camera that sees robots at places in m, `(n, 3)`, and the obstacles around, as large as possible."""
     data, robot = mujoco.MjData(model), np.isin(model.geom_bodyid, bodies_of(model))
     mujoco.mj_kinematics(model, data)
     up, (centre, half) = data.geom_xmat[robot, 6:], np.moveaxis(model.geom_aabb[robot].reshape(-1, 2, 3), 1, 0)
     top = float((data.geom_xpos[robot, 2] + (up * centre).sum(axis=1) + (abs(up) * half).sum(axis=1)).max())
     reach = float(np.hypot(*footprint(model).T).max())
-    seen = to_see(course, scenario.reference.period, reach, top, scenario.obstacles)
+    seen = to_see(places, scenario.reference.period, reach, top, scenario.obstacles)
     position, target = fitted(seen, OVERVIEW, float(np.radians(model.vis.global_.fovy)), aspect)
     back = target - position
     camera = mujoco.MjvCamera()

@@ -331,6 +331,7 @@ def test_record(tmp_path, capsys):
         first, last = (np.frombuffer(pictures[k], np.uint8).reshape(-1, 3).astype(float) for k in (0, -1))
         assert (np.abs(last - first).max(axis=-1) > 60).sum() > 2000
     (tmp_path / "there.gif").touch()
+    capsys.readouterr()
     for name in ("run.avi", "there.gif", "none/run.gif"):
         assert main(["record", str(tmp_path / "no.zarr"), "--out", str(tmp_path / name)]) == 2
         assert capsys.readouterr().err.count("\n") == 1
