@@ -56,11 +56,11 @@ class Mppi(Reactive):
         """Draws the noise of a period, whose number is the only seed."""
         self._noise = np.random.default_rng(tick).standard_normal((SAMPLES, KNOTS, 2))
 
-    def passes(self, row: int, scene: Scene) -> bool:
+    def passes(self, row: int, period: float, scene: Scene) -> bool:
         """Tells whether the mean of the twists leads a robot over at least half of the way to its target."""
         considered = self.considered[row]
         assert considered is not None
-        way, target = considered.paths(self._period)[1], scene.targets[-1, :2]
+        way, target = considered.paths(period)[1], scene.targets[-1, :2]
         left, before = (float(np.hypot(*(target - place))) for place in (way[-1], way[0]))
         return left < BEHIND * before
 

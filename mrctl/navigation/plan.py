@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from mrctl.kernel import Array
+from mrctl.navigation.steer import CHECK
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines
 from mrctl.theory.references import Waypoints
 from mrctl.theory.timing import Limits
 
-CHECK = 0.05  # m, largest distance of the poses of a plan, which are held against the obstacles
 LEAST = 1e-3  # m, chord below which the heading of an end is not looked at
 STRAIGHT = 1e-12  # 1/m, in place of the curvature 0 of an end, which would leave its heading free
 

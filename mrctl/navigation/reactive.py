@@ -315,15 +315,18 @@ class Reactive(ABC):
             else:
                 scene = agent.scene(place, now)
                 agent.last = self.choose(row, place, twist[row], agent.last, self._period, scene).copy()
-                agent.passes = self.passes(row, scene)
+                agent.passes = self.passes(row, self._period, scene)
         self._tick += 1
         return self.last
 
     def begin(self, tick: int) -> None:  # noqa: B027 (most have nothing to do)
         """Is called once in a motion period, before `choose` for each robot."""
 
-    def passes(self, row: int, scene: Scene) -> bool:
-        """Tells whether the twists that were chosen last lead one robot around what blocks its plan."""
+    def passes(self, row: int, period: float, scene: Scene) -> bool:
+        """Tells whether the twists that were chosen last lead one robot around what blocks its plan.
+
+        The arguments are those of `choose`.
+        """
         return False
 
     @abstractmethod

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mrctl.kernel import Array, kernel
 
 PIECES = 5
+CHECK = 0.05  # m, largest distance of the poses on a way, which are held against the obstacles
 QUARTER = np.pi / 2
 TURNS = np.array(
     [

@@ -174,7 +174,7 @@ def test_control_period() -> None:
 
 def test_backs_off() -> None:
     """A robot with rigid steering that stands close before a box that the map lacks reverses to go around it."""
-    box = Box(x=0.95, y=0.0, length=0.3, width=1.0)
+    box = Box(x=0.8, y=0.0, length=0.3, width=1.0)
     task = Task(obstacles=Obstacles(shapes=(box,)), map=Obstacles(), start=(0, 0, 0), goal=(3, 0, 0))
     driven = navigate(task, PLANNED.replace(steering="rigid"), avoid="barrier")
     assert driven.table["outcome"].tolist() == ["arrived"] and float(driven.result["v"].min()) < -0.1
