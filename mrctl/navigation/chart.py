@@ -140,9 +140,9 @@ def through(points: Array, scan: Scan) -> NDArray[np.bool]:
 
 
 def reached(points: Array, scan: Scan, margin: float) -> NDArray[np.bool]:
-    """Tells which points, `(k, 2)` in m, are in range and less than a margin in m beyond what their beam met, `(k,)`.
+    """Tells which points, `(k, 2)` in m, are in view and not beyond what their beam met by a margin in m, `(k,)`.
 
-    The beam of a point is the one nearest in direction. One that met nothing reaches all that is in range.
+    The beam of a point is the one nearest in direction. A beam that met nothing reaches to the largest range.
     """
     dx, dy = (points - scan.place[:2]).T
     away, turned = np.hypot(dx, dy), np.arctan2(dy, dx) - scan.place[2] - scan.angles[0]

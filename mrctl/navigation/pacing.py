@@ -64,8 +64,8 @@ class Pacing:
 
     Where something that stands and is not on the map blocks the plan, the robot drives on along another plan that
     begins with about its speed. If there is none, it stops `STANDOFF` before that place, and makes a plan there. Where
-    the map has changed and another plan takes less than `SHORTER` of the time that is left, it takes that; if that plan
-    cannot begin with about the speed of the robot, it stops before.
+    the map has changed and another plan takes less than `SHORTER` of the time that is left, it takes that plan; if the
+    plan cannot begin with about the speed of the robot, it stops first.
 
     Attributes:
         followed: What the robots follow, as in `mrctl.control.stages.Motion`, `(B, 7)`.
@@ -195,8 +195,8 @@ class Pacing:
     def _get_on(self, row: int, pose: Array, velocity: float) -> None:
         """Gives a robot another plan, if its own is blocked, or the map lets it have a shorter one.
 
-        It takes a plan that begins at about its speed at once. Otherwise it plans again at rest: when it has stopped
-        for a shorter way, or has hardly got on for a second before what stands.
+        It takes at once a plan that begins at about its own speed. Otherwise it plans again at rest: after a stop for
+        a shorter way, or when something that stands has hardly let it get on for a second.
 
         Args:
             row: Which robot.

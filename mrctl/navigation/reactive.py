@@ -187,8 +187,8 @@ class Agent:
     def needs_plan(self, pose: Array, now: float) -> bool:
         """Notes how far it has come, at a time in s; tells whether it needs another plan, and can make one.
 
-        It does where it does not get around what blocks its own, is off that, or has hardly moved for a while; at the
-        end of its plan it needs none.
+        It needs one where its twists do not lead around what blocks its plan, where it is off its plan, or where it has
+        hardly moved for a while; at the end of its plan it needs none.
         """
         if self._at_end(pose):
             self._since, self._blocked = now, np.inf
@@ -254,7 +254,7 @@ def field_around(places: Array, sight: Sight, reach: float) -> Field:
 class Reactive(ABC):
     """A motion stage that asks for twists along a plan.
 
-    It makes another plan when scans show that this one is blocked and the twists do not lead around that, and when the
+    It makes another plan when scans show that the plan is blocked and the twists do not pass (`passes`), or when the
     robot is off its plan or waits.
     Where a robot waits that can reverse, and another plan is not found or does not help, it goes back a little on its
     `Trail`, and plans again.
@@ -323,7 +323,7 @@ class Reactive(ABC):
         """Is called once in a motion period, before `choose` for each robot."""
 
     def passes(self, row: int, period: float, scene: Scene) -> bool:
-        """Tells whether the twists that were chosen last lead one robot around what blocks its plan.
+        """Tells whether the last twists of a robot lead around what blocks its plan; by default they do not.
 
         The arguments are those of `choose`.
         """

@@ -47,7 +47,7 @@ def blocked_at(footprint: Array, poses: Array, way: Array, outlines: Outlines) -
     Args:
         footprint: Corners of the robot in its frame in m, `(n, 2)`.
         poses: Poses on the plan, x and y in m and θ in rad, `(k, 3)`.
-        way: Length in m of the way up to each pose, `(k,)`; of the poses some are looked at, 5 cm apart.
+        way: Length in m of the way up to each pose, `(k,)`; poses about 5 cm apart are looked at.
         outlines: The obstacles.
     """
     for k in np.searchsorted(way, np.arange(0.0, way[-1], SPACING)):
@@ -111,12 +111,11 @@ class Planner:
             twist: V in m/s and θ̇ in rad/s with which it begins if the robot drives forward, `(2,)`; what the robot was
                 asked for last, which has no noise.
             time: Time in s.
-            ahead: Whether the robot still drives on, and asks because its plan is blocked somewhere ahead.
+            ahead: Whether the robot asks while it drives on, because its plan is blocked farther ahead.
 
         Returns:
-            The plan, or None where there is no way. That there is none takes a search far longer than to find one.
-            Where one has found none, it is therefore not repeated within 3 s, until the robot or an obstacle is
-            elsewhere, and not at all while the robot drives on.
+            The plan, or None where there is no way. A search that finds none takes far longer than one that does. It
+            is repeated only after 3 s, or when the robot or an obstacle is elsewhere, and never while `ahead`.
         """
         if ahead and self._hopeless:
             return None

@@ -187,9 +187,9 @@ class Sight:
         return [(part, whole) for part, whole in found if len(part) >= LEAST]
 
     def _hidden(self, old: Array, new: Array, scan: Scan) -> Array:
-        """Returns the discs of before, `(k, 5)`, that the scan neither shows nor sees through.
+        """Returns the old discs, `(k, 5)`, that the scan neither shows nor sees through.
 
-        It shows an old disc that is near a new one, unless the old one is out of range, or something else hides it.
+        An old disc near a new one counts as shown, unless it is out of range, or something else hides it.
         """
         if not len(old):
             return old
@@ -224,7 +224,7 @@ def _outlines(places: Array) -> Outlines:
 
 
 def _apart(discs: Array) -> Array:
-    """Returns those discs, `(k, 5)`, that are at least half of `SPACING` from every one that was seen before them."""
+    """Returns discs, `(k, 5)`, each at least half of `SPACING` from those of them that were seen earlier."""
     kept = np.zeros(len(discs), bool)
     for k in np.argsort(discs[:, 4], kind="stable"):
         kept[k] = not kept.any() or np.hypot(*(discs[kept, :2] - discs[k, :2]).T).min() >= SPACING / 2

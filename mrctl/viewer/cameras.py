@@ -1,4 +1,4 @@
-"""What an overview should show, and where a camera has to be so that its picture is full of that."""
+"""What an overview should show, and where a camera has to be so that this fills its picture."""
 
 from __future__ import annotations
 
