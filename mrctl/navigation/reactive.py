@@ -42,7 +42,8 @@ class Agent:
 
     Attributes:
         last: The twist that it was last asked for, V in m/s and θ̇ in rad/s, `(2,)`.
-        passes: Whether the twists that were chosen last lead around what blocks its plan.
+        blocked: Time in s since when its plan leads through what stands beside the map; infinite where it does not.
+        passes: Whether the twists that were chosen last lead around that.
     """
 
     def __init__(
@@ -60,11 +61,10 @@ class Agent:
         """
         self._planner, self._bounds, self._discs = planner, bounds, discs
         self._field, self._reach, self._period = field, reach(discs), period
-        self.last, self.passes = np.zeros(2), False
+        self.last, self.blocked, self.passes = np.zeros(2), np.inf, False
         self._table, self._place, self._away = self._sampled(planner.first), 0, 0.0  # its plan, and its place on that
         self._looked = False  # whether there is a scan that is new; a robot that has failed gets none
         self._map_changed = False  # so that a shorter way may be free
-        self._blocked = np.inf  # since when it would touch what stands beside the map on its plan, in s
         self._tried = -np.inf  # when it last looked for another plan
         self._anchor, self._since = start.copy(), 0.0  # where it last was when it had got on, and when
         self._replanned = False  # whether it has made another plan since
@@ -88,7 +88,7 @@ class Agent:
 
     def _take(self, plan: Waypoints) -> None:
         """Goes along a plan from now on; where the distance field ends before the plan does, makes another field."""
-        self._table, self._place, self._blocked = self._sampled(plan), 0, np.inf
+        self._table, self._place, self.blocked = self._sampled(plan), 0, np.inf
         low, high = self._table[:, :2].min(axis=0), self._table[:, :2].max(axis=0)
         distance, origin, resolution = self._field
         end = origin + resolution * np.array(distance.shape[::-1])
@@ -107,7 +107,7 @@ class Agent:
             poses = np.column_stack([rest[:, :2], np.arctan2(rest[:, 3], rest[:, 2])])
             way = np.append(0.0, np.cumsum(np.hypot(*np.diff(rest[:, :2], axis=0).T)))
             place = blocked_at(self._planner.vehicle.footprint, poses, way, standing)
-        self._blocked = np.inf if place is None else min(self._blocked, scan.time)
+        self.blocked = np.inf if place is None else min(self.blocked, scan.time)
 
     def locate(self, pose: Array) -> None:
         """Finds the place on the plan that is nearest to a pose in m, m, rad, `(3,)`, of those not far ahead."""
@@ -191,10 +191,10 @@ class Agent:
         hardly moved for a while; at the end of its plan it needs none.
         """
         if self._at_end(pose):
-            self._since, self._blocked = now, np.inf
+            self._since, self.blocked = now, np.inf
         if self._gone(pose) > min(WAITED[1], WAITED[2] * WAITED[0] * self._bounds.speed):
             self._anchor, self._since, self._replanned = pose[:2].copy(), now, False
-        blocked = now - self._blocked >= SURE and not self.passes
+        blocked = now - self.blocked >= SURE and not self.passes
         lost = (blocked or self._away > OFF or self._waits(now)) and now - self._tried > RETRY
         lost, self._looked = lost and self._looked, False
         if lost:
@@ -315,7 +315,7 @@ class Reactive(ABC):
             else:
                 scene = agent.scene(place, now)
                 agent.last = self.choose(row, place, twist[row], agent.last, self._period, scene).copy()
-                agent.passes = self.passes(row, self._period, scene)
+                agent.passes = bool(np.isfinite(agent.blocked)) and self.passes(row, self._period, scene)
         self._tick += 1
         return self.last
 
