@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mrctl.control.feedforward import Learner
 from mrctl.control.kanayama import Kanayama, posture_error
 from mrctl.control.pid import pid
-from mrctl.kernel import Array, Rows, kernel, over_rows
+from mrctl.kernel import Array, Rows, kernel
 from mrctl.loop.hierarchy import Hierarchy, apply_voltages, command_motion, hand_over, request_motion
 from mrctl.loop.user_stages import UserStage
 from mrctl.scenario import Scenario
@@ -27,6 +27,13 @@ def request_all(seen: Rows, goal: Rows, control: Rows) -> None:
     """Calls `request_motion` for all robots."""
     for i in range(len(control)):
         request_motion(seen[i], goal[i], control[i])
+
+
+@kernel
+def errors_of_all(seen: Rows, goal: Rows, control: Rows) -> None:
+    """Calls `posture_error` for all robots."""
+    for i in range(len(control)):
+        posture_error(seen[i].pose, goal[i].pose, control[i].error)
 
 
 @kernel
@@ -155,7 +162,7 @@ class UserHierarchy(Hierarchy):
         if own is not None:
             own = self._finite_rows(stage, stage.checked(own, reference.shape, "`followed`"))
             own = goal = np.ascontiguousarray(own).view(goal.dtype)[:, 0]
-        over_rows(posture_error, seen["pose"], goal["pose"], state["error"])
+        errors_of_all(seen, goal, state)
         state["correction"] = request - goal["twist"]
         return own
 

@@ -22,7 +22,7 @@ from mrctl.control.stages import Motion
 from mrctl.kernel import Array, kernel
 from mrctl.navigation.sight import Sight
 from mrctl.scenario import Scenario
-from mrctl.theory.clearance import outside, point_to_segment
+from mrctl.theory.clearance import farthest_outside, outside, point_to_segment
 from mrctl.theory.obstacles import Outlines, moved
 from mrctl.theory.rays import Scan
 from mrctl.theory.robot import Robot
@@ -160,11 +160,13 @@ def half_planes(request: Array, pose: Array, outlines: Outlines, barrier: Barrie
         centre = np.hypot(barrier.discs[k, 0], barrier.discs[k, 1])
         reach, arm = max(reach, centre + barrier.discs[k, 2]), max(arm, centre / barrier.lever)
     fastest = np.sqrt((1 + arm * arm) * (request[0] ** 2 + (barrier.lever * request[1]) ** 2))  # m/s, of a disc
+    enough = barrier.margin + fastest * barrier.period + fastest * fastest / (2 * barrier.deceleration)  # m
     for other in range(len(discs) + len(rings)):
         p = other - len(discs)
         ring = discs[other] if p < 0 else rings[p]
-        away = np.hypot(pose[0] - ring[0], pose[1] - ring[1]) - ring[2] - reach - barrier.margin
-        if approach(away, barrier.deceleration, barrier.period) >= fastest:
+        if np.hypot(pose[0] - ring[0], pose[1] - ring[1]) - ring[2] - reach >= enough:
+            continue
+        if p >= 0 and farthest_outside(pose[0], pose[1], edges[first[p] : first[p + 1]]) - reach >= enough:
             continue
         for k in range(len(barrier.discs)):
             ahead, aside, radius = barrier.discs[k]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mrctl.control.kanayama import Kanayama, kanayama, posture_error
-from mrctl.kernel import Array, over_rows
+from mrctl.kernel import Array, Rows, kernel
 from mrctl.loop.goals import RESTING
 from mrctl.loop.hierarchy import Hierarchy
 from mrctl.navigation.avoidance import Barrier, approach, share
@@ -45,10 +45,17 @@ class Following:
 
     def output(self, pose: Array, reference: Array) -> Array:
         """Returns the requested twists, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
-        error, requests = np.empty((len(pose), 3)), np.empty((len(pose), 2))
-        over_rows(posture_error, pose, reference[:, :3], error)
-        over_rows(kanayama, error, reference[:, 3:5], self._gains, requests)
+        requests = np.empty((len(pose), 2))
+        follow_all.compiled(pose, reference, self._gains, np.empty(3), requests)
         return requests
+
+
+@kernel
+def follow_all(pose: Array, reference: Array, gains: Rows, error: Array, requests: Array) -> None:
+    """Writes what `Following.output` returns into `requests`, `(B, 2)`; `error` is scratch, `(3,)`."""
+    for i in range(len(pose)):
+        posture_error(pose[i], reference[i, :3], error)
+        kanayama(error, reference[i, 3:5], gains[i], requests[i])
 
 
 class Pacing:

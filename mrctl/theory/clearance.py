@@ -98,8 +98,11 @@ def gap(footprint: Array, pose: Array, sides: Array, outlines: Outlines) -> floa
     for k in range(len(rings)):
         x, y, radius = rings[k]
         within = max(radius + reach + nearest, 0.0)  # farther off than this it cannot be the nearest
-        if (x - pose[0]) ** 2 + (y - pose[1]) ** 2 < within * within:
-            nearest = min(nearest, polygon_to_polygon(sides, edges[first[k] : first[k + 1]]))
+        if (x - pose[0]) ** 2 + (y - pose[1]) ** 2 >= within * within:
+            continue
+        polygon = edges[first[k] : first[k + 1]]
+        if farthest_outside(pose[0], pose[1], polygon) < reach + nearest:
+            nearest = min(nearest, polygon_to_polygon(sides, polygon))
     return nearest
 
 
@@ -117,6 +120,15 @@ def outside(x: float, y: float, side: Array) -> float:
     """Returns the signed distance of a point to the right of the line through a side, `(4,)`; all in m."""
     dx, dy = side[2] - side[0], side[3] - side[1]
     return ((x - side[0]) * dy - (y - side[1]) * dx) / np.hypot(dx, dy)
+
+
+@kernel
+def farthest_outside(x: float, y: float, sides: Array) -> float:
+    """Returns the largest `outside` of the sides of a convex polygon, `(n, 4)`: no more than its distance, in m."""
+    depth = -np.inf
+    for k in range(len(sides)):
+        depth = max(depth, outside(x, y, sides[k]))
+    return depth
 
 
 @kernel
