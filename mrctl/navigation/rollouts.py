@@ -183,7 +183,7 @@ def roll_out(
     cheapest = np.inf
     for n in range(len(knots)):
         x, y, c, s, v, omega, cost = pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]), last[0], last[1], 0.0
-        drives, turns, judged = twist[0], twist[1], False
+        drives, turns, judged, free = twist[0], twist[1], False, KEPT
         for k in range(steps):
             i, share = before[k], shares[k]
             wanted = nominal[k, 0] + (1 - share) * knots[n, i, 0] + share * knots[n, i + 1, 0]
@@ -208,7 +208,10 @@ def roll_out(
             dx, dy = targets[k, 0] - x, targets[k, 1] - y
             turned = (HEADING if k < end else HEADING_AT_END) * (1 - c * targets[k, 2] - s * targets[k, 3])
             cost += step * (PLACE * (dx * dx + dy * dy) + turned)
-            free = body_clearance(x, y, c, s, (k + 1) * step, circle, discs, distance, left, low, resolution, movers)
+            if k == 0 or speed != 0.0 or rotation != 0.0 or len(movers) > 0:  # else it rests, and so does all around it
+                free = body_clearance(
+                    x, y, c, s, (k + 1) * step, circle, discs, distance, left, low, resolution, movers
+                )
             if free <= least:
                 judged = True
                 cost += TOUCH * (1 + (steps - k) / steps)  # the earlier, the worse

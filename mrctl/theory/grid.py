@@ -129,16 +129,19 @@ def measure_near(outlines: Outlines, reach: float, field: Field) -> None:
     for shape in range(len(discs) + len(rings)):
         ring = shape - len(discs)
         x, y, radius = discs[shape] if ring < 0 else rings[ring]
-        around = radius + reach
-        left, right = (x - around - origin[0]) / resolution - 0.5, (x + around - origin[0]) / resolution - 0.5
-        bottom, top = (y - around - origin[1]) / resolution - 0.5, (y + around - origin[1]) / resolution - 0.5
+        west, east, south, north, sides = x - radius, x + radius, y - radius, y + radius, edges[:0]
+        if ring >= 0:
+            sides = edges[first[ring] : first[ring + 1]]
+            west, east, south, north = sides[:, 0].min(), sides[:, 0].max(), sides[:, 1].min(), sides[:, 1].max()
+        left, right = (west - reach - origin[0]) / resolution - 0.5, (east + reach - origin[0]) / resolution - 0.5
+        bottom, top = (south - reach - origin[1]) / resolution - 0.5, (north + reach - origin[1]) / resolution - 0.5
         for i in range(max(0, int(np.ceil(bottom))), min(rows - 1, int(np.floor(top))) + 1):
             for k in range(max(0, int(np.ceil(left))), min(columns - 1, int(np.floor(right))) + 1):
                 px, py = origin[0] + (k + 0.5) * resolution, origin[1] + (i + 0.5) * resolution
                 if ring < 0:
                     away = np.hypot(x - px, y - py) - radius
                 else:
-                    away = point_to_polygon(px, py, edges[first[ring] : first[ring + 1]])
+                    away = point_to_polygon(px, py, sides)
                 distance[i, k] = min(distance[i, k], away)
 
 

@@ -43,7 +43,7 @@ def started(tmp_path_factory, count):
     nannies = []
     scheduler = dask("scheduler", "--port", "0", "--scheduler-file", str(file))
     try:
-        until(file.exists)
+        until(lambda: file.exists() and file.read_text())  # it is empty for a moment
         where = ("--scheduler-file", str(file), "--nthreads", "1", "--local-directory", str(file.parent))
         nannies += [dask("worker", *where) for _ in range(count)]
         yield json.loads(file.read_text())["address"], nannies, scheduler

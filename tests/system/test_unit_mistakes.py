@@ -168,11 +168,20 @@ def test_other_robots_are_possible(robot: str, factor: float) -> None:
 
 @pytest.mark.parametrize(
     ("mistake", "said"),
-    zip(
-        MISTAKES,
-        ("needs at least 3.2", "in kV·s/rad?", "10,000 kg", "80, which no robot has; is it in %?", "in mΩ?", "in N·mm"),
-        strict=True,
-    ),
+    [
+        *zip(
+            MISTAKES,
+            (
+                "needs at least 3.2",
+                "in kV·s/rad?",
+                "10,000 kg",
+                "80, which no robot has; is it in %?",
+                "in mΩ?",
+                "in N·mm",
+            ),
+            strict=True,
+        )
+    ],
 )
 def test_names_the_unit_where_no_limits_are_declared(
     mistake: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture
