@@ -52,6 +52,7 @@ class Courses:
         self._courses, self._place = distinct_courses(scenarios)
         self._own = len(self._courses) == len(scenarios)  # whether no two robots share a course
         self._block = range(0)
+        self._tick, self._now = -1, (np.zeros(0, GOAL), np.zeros(0, GOAL))  # what `at` returned last
 
     def at(self, tick: int) -> tuple[Rows, Rows]:
         """Returns the references at a control tick, and those at the time when the voltage of that tick acts.
@@ -59,6 +60,8 @@ class Courses:
         Returns:
             Two times a record of `GOAL` of each robot, `(B,)`.
         """
+        if tick == self._tick:
+            return self._now
         if tick not in self._block:  # only one block of samples is held, (ticks of a block, courses)
             first = tick // BLOCK * BLOCK
             self._block = range(first, min(first + BLOCK, self._ticks))
@@ -66,10 +69,12 @@ class Courses:
             self._samples = np.stack([course(s, whole) for s in self._courses], axis=1)
         row = tick - self._block.start
         now = self._samples[row] if self._own else self._samples[row].take(self._place)  # ten times as fast as [place]
-        if not self._preview:
-            return now, now
-        later = self._samples[row + self._preview]
-        return now, later if self._own else later.take(self._place)
+        later = now
+        if self._preview:
+            later = self._samples[row + self._preview]
+            later = later if self._own else later.take(self._place)
+        self._tick, self._now = tick, (now, later)
+        return self._now
 
 
 class RestartingCourses:
