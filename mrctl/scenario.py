@@ -70,8 +70,8 @@ class Event(Record):
     reference: Reference | None = None
     """Reference from then on, which begins at its own start; laps still have the period of the scenario's reference."""
     kanayama: Kanayama | None = None
-    """Gains of the motion controller from then on; refused with one that takes none, as `window`, `mppi` and a
-    stage of one's own without `tune`."""
+    """Gains of the motion controller from then on; refused if it takes none: `window`, `mppi`, and a user's stage
+    without `tune`."""
     pid: Pid | None = None
     """Settings of the velocity PID from then on; the gains of the motion controller stay, and so does the delay that
     oscillations have added."""

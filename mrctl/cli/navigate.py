@@ -47,9 +47,9 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
         for --robot.path NAME, and --localise NAME for --sensing.localisation NAME.
 
         Args:
-            world: TOML file of obstacles, yaml file of a ROS map, world in SDF, or a generator with a seed, such as
-                doorway:3; the others are cellular, corridor, parking_bay, slalom and warehouse. Or the folder --out of
-                a mission, which is then driven again and compared with what it holds, bit for bit.
+            world: TOML file of obstacles, yaml file of a ROS map, world in SDF or MJCF, or a generator with a seed,
+                such as doorway:3; the others are cellular, corridor, parking_bay, slalom and warehouse. Or the
+                folder --out of a mission, which is then driven again and compared with what it holds, bit for bit.
             scenario: The scenario.
             goal: Drive to this pose, x and y in m and θ in rad, as in 2 0 0 or 2,0,0; by default to the generator's.
             start: Start at this pose, written as for --goal; by default at that of the generator, or the origin.

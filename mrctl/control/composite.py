@@ -37,7 +37,7 @@ from pydantic import Field
 
 from mrctl.control.features import INPUTS, SLOW, feature_scale, features, symmetric_product
 from mrctl.control.feedforward import STEERING_SCALE, STEERING_SHARE, Learner, Loop, explained
-from mrctl.control.matching import SETTLED, histories, note_sent, recall
+from mrctl.control.matching import SETTLED, histories, low_pass, note_sent, recall
 from mrctl.kernel import Array, Row, kernel
 from mrctl.record import Record
 from mrctl.theory.dynamics import inverse_coefficients
@@ -170,17 +170,11 @@ def learned_voltage(a: Array, phi: Array) -> float:
 
 @kernel
 def filter_twice(signal: Array, once: Array, twice: Array, share: float, begins: bool) -> None:
-    """Passes a signal of two components through two first-order filters, which begin at its first value.
-
-        once ← once + share (signal − once),    twice ← twice + share (once − twice)
-
-    The share is that of a new sample, one period over the time constant.
-    """
+    """Passes a signal of two components through the two filters of `low_pass`, which begin at its first value."""
     for k in range(2):
         if begins:
             once[k] = twice[k] = signal[k]
-        once[k] += share * (signal[k] - once[k])
-        twice[k] += share * (once[k] - twice[k])
+        low_pass(signal[k], k, share, once, twice)
 
 
 @kernel

@@ -74,7 +74,12 @@ class Journal:
             raise InputError(f"out: {file} is damaged; choose another folder") from None
         if other:
             raise InputError(f"out: {file} holds other results ({other} differs); choose another folder")
-        file.write_text("".join(json.dumps(line) + "\n" for line in (first, *rest)))
+        whole = file.with_name(f".{file.name}.whole")  # which takes the place of the file at once, or not at all
+        try:
+            whole.write_text("".join(json.dumps(line) + "\n" for line in (first, *rest)))
+            whole.replace(file)
+        except OSError as error:
+            raise InputError(f"out: {file}: {error.strerror}") from None
 
     def __contains__(self, key: object) -> bool:
         """Tells whether the result of a key, of numbers, strings, lists and dictionaries, is there."""

@@ -364,7 +364,7 @@ class Hierarchy:
         return rejection(self.robot, self.rigid, gains, around, delay, self.period)
 
     def set_reference(self, row: int, reference: Reference) -> None:
-        """Does nothing, because the built-in motion controller reads the reference in each tick; subclasses may not."""
+        """Does nothing: the built-in law reads the reference in each tick. `UserHierarchy` tells the user's stage."""
 
     def set_learning(self, row: int, on: bool) -> None:
         """Switches learning of one robot on or off."""

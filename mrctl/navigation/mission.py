@@ -29,6 +29,7 @@ from mrctl.navigation.replanning import open_waypoints
 from mrctl.navigation.sdf import read_sdf
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.navigation.window import Window
+from mrctl.physics.obstacles import read_mjcf
 from mrctl.record import InputError, Record, read_file
 from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
@@ -44,6 +45,7 @@ READERS: dict[str, Callable[[str], Obstacles]] = {
     ".yml": lambda path: read_map(path).obstacles(),
     ".sdf": read_sdf,
     ".world": read_sdf,
+    ".xml": read_mjcf,
 }
 # Openings are twice as wide as the robot; aisles, in which it also turns, are 2.5 times as wide as it is long. A bay,
 # into which some robots go back and forth, is 2.5 times as long as the robot and 1.5 times as wide.
@@ -147,7 +149,8 @@ def task_of(
     """Reads or makes a world.
 
     Args:
-        world: TOML file of obstacles, yaml file of a ROS map, SDF world, or a generator with its seed, as `doorway:3`.
+        world: TOML file of obstacles, yaml file of a ROS map, world in SDF or MJCF, or a generator with its seed, as
+            `doorway:3`.
         scenario: Scenario with the robot, whose size sets the openings of all generators but `cellular`.
         start: x and y in m and θ in rad; by default that of the generator, or the origin.
         goal: x and y in m and θ in rad; by default that of the generator.

@@ -27,8 +27,8 @@ DISCS = 4, 2  # in a row, and rows, that cover the robot, and reach 4 to 6 cm be
 AHEAD = 100  # samples of the plan, 20 motion periods, among which its nearest place is looked for
 FINE = 5  # samples of the plan in a motion period
 OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen, like the next two
-# s, m and 1: so does one that within this time gets no farther than this, or than this share of the way at full speed
-WAITED = 1.0, 0.05, 0.5
+WAITED = 1.0  # s without headway, after which it also makes another one
+HEADWAY = 0.05, 0.5  # m, and share of the way at full speed in that time; it gets on if it covers the smaller of them
 RETRY = 1.0  # s, least time between two plans
 STAYS = 1.0  # s at the end of its plan, after which a robot without a goal at which its run ends stays there; chosen
 # How a robot goes back from where there is no way forward; chosen, as all that follows.
@@ -192,7 +192,7 @@ class Agent:
         """
         if self._at_end(pose):
             self._since, self.blocked = now, np.inf
-        if self._gone(pose) > min(WAITED[1], WAITED[2] * WAITED[0] * self._bounds.speed):
+        if self._gone(pose) > min(HEADWAY[0], HEADWAY[1] * WAITED * self._bounds.speed):
             self._anchor, self._since, self._replanned = pose[:2].copy(), now, False
         blocked = now - self.blocked >= SURE and not self.passes
         lost = (blocked or self._away > OFF or self._waits(now)) and now - self._tried > RETRY
@@ -203,7 +203,7 @@ class Agent:
 
     def _waits(self, now: float) -> bool:
         """Tells whether it has hardly moved for a while."""
-        return now - self._since > WAITED[0]
+        return now - self._since > WAITED
 
     def _gone(self, pose: Array) -> float:
         """Returns the distance in m from where it last was when it had got on."""

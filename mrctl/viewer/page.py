@@ -230,7 +230,8 @@ class Page(ABC):
         if lines:
             size = f"<b>Errors are drawn {magnified} times.</b>" if magnified > 1 else "Errors have their true size."
             lines.append(
-                "Outline: estimated posture. Black point: true position. Ellipse: 3σ of x and y (98.9 %). "
+                f"Outline: estimated posture. Black point: true position. Ellipse: {sensors.SIGMAS:g}σ of x and y "
+                f"({100 * sensors.SHARE:.1f} %). "
                 f"Small points: fixes of the last {sensors.FIX_AGE:g} s. {size}"
             )
         self._sensed.content = block("sensors", *lines)

@@ -10,7 +10,8 @@ from mrctl.theory.kinematics import UP
 from mrctl.viewer.looks import Colour
 from mrctl.viewer.shapes import add_mesh, disc, ribbons
 
-SIGMAS = 3.0  # size of the ellipse in standard deviations: it holds 98.9 % of a plane normal distribution
+SIGMAS = 3.0  # size of the ellipse in standard deviations
+SHARE = 1 - np.exp(-(SIGMAS**2) / 2)  # of a normal distribution on the plane, which the ellipse holds
 FIX_AGE = 2.0  # s, after which a fix has faded
 MAX_FIXES = 20  # number of fixes that are shown of a robot
 MAGNIFICATIONS = (1, 10, 100)

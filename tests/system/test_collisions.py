@@ -8,6 +8,7 @@ import shapely
 from mrctl import Box, Circle, Disc, InputError, Line, Obstacles, Polygon, Scenario, load_robot, simulate
 from mrctl.loop.simulation import Simulation
 from mrctl.navigation.generators import warehouse
+from mrctl.navigation.mission import obstacles_of
 from mrctl.physics import mjcf
 from mrctl.physics.elements import COLLISION
 from mrctl.physics.files import models_folder
@@ -209,6 +210,7 @@ def test_mjcf(tmp_path):
     before, after = (Surroundings(obstacles).at(1.3) for obstacles in (MIXED, found))
     assert np.allclose(before.discs, after.discs, atol=1e-6)
     assert np.allclose(sorted(before.edges.tolist()), sorted(after.edges.tolist()), atol=2e-6)
+    assert obstacles_of(str(tmp_path / "a.xml"), "world") == found  # as of a mission
     assert read_mjcf(models_folder() / "patch.xml").shapes == ()
     (tmp_path / "b.xml").write_text(
         '<mujoco><worldbody><geom name="log" type="capsule" size="1 1" zaxis="1 0 0"/></worldbody></mujoco>'

@@ -35,6 +35,22 @@ def test_kept(results, cut, tmp_path_factory):
     assert Journal(file, {"seed": 1})["last"] == [torn.cores]
 
 
+def test_killed_while_it_opens(tmp_path, monkeypatch):
+    """What was kept is still there when a journal that opens it dies in the middle of writing."""
+    file = tmp_path / "results.jsonl"
+    Journal(file, {"seed": 1})["key"] = 2.5
+
+    def torn(path, text):
+        with path.open("w") as opened:
+            opened.write(text[:5])
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("pathlib.Path.write_text", torn)
+        Journal(file, {"seed": 1})
+    assert Journal(file, {"seed": 1})["key"] == 2.5
+
+
 def test_refused(tmp_path):
     """Results that depend on something else, a damaged file and a folder are refused, and stay as they are."""
     file = tmp_path / "results.jsonl"
