@@ -274,7 +274,7 @@ class Mrac(Record):
     """Noise density ρ of the prediction error in V √s; the smaller, the faster the prediction error is followed."""
     memory: Annotated[float, Field(ge=0.1, le=1e6)] = 20.0
     """Memory 1/λ of least squares in s."""
-    spread: Annotated[float, Field(gt=0, le=100)] = 3.0
+    spread: Annotated[float, Field(ge=1e-6, le=100)] = 3.0
     """Standard deviation of the parameters at the start in V; its square is the diagonal of P₀."""
     tracking: Annotated[float, Field(ge=0, le=1e3)] = 2.0
     """Weight η of the tracking error in 1/(V² s), per volt of back-EMF of that error."""

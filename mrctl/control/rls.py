@@ -139,6 +139,11 @@ class RecursiveLeastSquares(Learner):
         """Learned coefficients of the scaled features, `(B, 8, 2)` in V."""
         return self.rows["theta"].copy()
 
+    def adopt(self, row: int, learned: Array) -> None:
+        """Starts one robot from other coefficients and their covariance."""
+        super().adopt(row, learned)
+        self.rows["norm"][row] = np.linalg.norm(self.rows["theta"][row])
+
     def restore(self, rows: NDArray[np.intp]) -> None:
         """Resets robots to zero coefficients and the initial covariance."""
         self.rows["theta"][rows], self.rows["norm"][rows], self.weight_norm[rows] = 0.0, 0.0, 0.0

@@ -118,7 +118,7 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
     if not delays:
         raise InputError("delay: at least one delay is needed")
     period = Scenario().control_period
-    if odd := [delay for delay in delays if not np.isclose(delay / period, round(delay / period))]:
+    if odd := [d for d in delays if not (np.isfinite(d) and np.isclose(d / period, round(d / period)))]:
         raise InputError(f"delay: {odd[0]:g} s is not a whole multiple of the control period ({period:g} s)")
     table: dict[str, Any] = {"versions": versions(), "machine": machine(), "robot": robot.model_dump()}
     table |= {"time_constant": pid.time_constant, "lag": pid.lag}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from typing import TypeVar
 
 import numpy as np
 
@@ -12,9 +11,6 @@ from mrctl.loop.hierarchy import Hierarchy
 from mrctl.physics.plant import Plant
 from mrctl.scenario import Event, Scenario
 from mrctl.theory.perturbation import Perturbation
-from mrctl.theory.references import Reference
-
-T = TypeVar("T")
 
 
 class Events:
@@ -35,7 +31,7 @@ class Events:
         self._plant, self._hierarchy, self._period, self._preview = plant, hierarchy, period, preview
         self._sensing = [s.sensing for s in scenarios]
         self._schedule: dict[int, list[tuple[int, Event]]] = defaultdict(list)
-        self._references: dict[int, list[tuple[int, Reference]]] = defaultdict(list)
+        self._references: dict[int, list[tuple[int, Event]]] = defaultdict(list)
         for row, scenario in enumerate(scenarios):
             self.perturb(row, scenario.perturbation)
             self._enter(row, scenario, 0)
@@ -45,14 +41,15 @@ class Events:
             self._schedule[tick + event.tick(self._period)].append((row, event))
             if event.reference is not None:
                 since = max(tick, tick + event.tick(self._period) - self._preview)
-                self._references[since].append((row, event.reference))
+                self._references[since].append((row, event))
 
     def add(self, event: Event) -> None:
-        """Schedules an event for every robot."""
-        tick, rows = event.tick(self._period), range(self._plant.size)
-        self._schedule[tick] += [(row, event) for row in rows]
+        """Schedules an event for every robot; those of one tick act in the order of their times, as in a new run."""
+        tick, due = event.tick(self._period), [(row, event) for row in range(self._plant.size)]
+        self._schedule[tick] = sorted(self._schedule[tick] + due, key=lambda entry: entry[1].time)
         if event.reference is not None:
-            self._references[tick - self._preview] += [(row, event.reference) for row in rows]
+            since = tick - self._preview
+            self._references[since] = sorted(self._references[since] + due, key=lambda entry: entry[1].time)
 
     def restart(self, row: int, scenario: Scenario, tick: int) -> None:
         """Schedules the events of a new scenario for one robot, whose time begins at this tick.
@@ -68,8 +65,9 @@ class Events:
 
     def apply(self, tick: int) -> None:
         """Applies the events of a control tick."""
-        for row, reference in self._references.get(tick, ()):
-            self._hierarchy.set_reference(row, reference)
+        for row, event in self._references.get(tick, ()):
+            if event.reference is not None:
+                self._hierarchy.set_reference(row, event.reference)
         for row, event in self._schedule.get(tick, ()):
             if event.perturbation is not None:
                 self.perturb(row, event.perturbation)
@@ -90,7 +88,7 @@ class Events:
         self._hierarchy.set_truth(row, self._plant.truth[row])
 
 
-def _others(schedule: dict[int, list[tuple[int, T]]], row: int, tick: int) -> dict[int, list[tuple[int, T]]]:
+def _others(schedule: dict[int, list[tuple[int, Event]]], row: int, tick: int) -> dict[int, list[tuple[int, Event]]]:
     """Returns a schedule from a tick on, without the entries of one robot."""
     coming = {t: [entry for entry in entries if entry[0] != row] for t, entries in schedule.items() if t >= tick}
     return defaultdict(list, coming)

@@ -110,8 +110,13 @@ def apply_voltages(seen: Row, model: Row, robot: Row, period: float, s: Row) -> 
 
 @kernel
 def hand_over(s: Row) -> None:
-    """The PID's integral gives up a share of what learning added: ∫ ← ∫ − `TAKE_OVER` · authority · added."""
+    """The PID's integral gives up a share of what learning added: ∫ ← ∫ − `TAKE_OVER` · authority · added.
+
+    Where that is not finite, the guard replaces the learner in the next tick.
+    """
     for k in range(2):
+        if not np.isfinite(s.added[k]):
+            s.guard.broken, s.added[k] = True, 0.0
         taken = TAKE_OVER * s.guard.authority * s.added[k]
         s.pid.integral[k] -= taken
         if s.guard.hands_over:

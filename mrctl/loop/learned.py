@@ -63,14 +63,15 @@ def save_learned(path: str | Path, run: xr.Dataset) -> None:
         arrays[name], start = flat[start:stop].reshape(shape), stop
         if not np.isfinite(arrays[name]).all():
             raise InputError(f"learned: {name} of {learner} is not finite, and no run could start from it")
-    write_arrays(path, arrays, {"learner": learner, "robot": scenario.robot.path})
+    notes = {"learner": learner, "robot": scenario.robot.path, "prior": scenario.prior}
+    write_arrays(path, arrays, notes | {"steering": str(one["steering"].values)})
 
 
 def load_learned(scenario: Scenario) -> Array:
     """Reads what the learner of a scenario starts from, flat, `(n,)`; warns if another robot has learned it.
 
     Raises:
-        InputError: The file is missing, broken, or of another learner.
+        InputError: As `load_arrays`.
     """
     expected = kept(scenario)
     arrays = load_arrays(scenario, scenario.learner, expected)
@@ -78,7 +79,7 @@ def load_learned(scenario: Scenario) -> Array:
 
 
 def load_arrays(scenario: Scenario, learner: str, expected: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
-    """Reads what a learner of this name starts from, by name; warns if another robot has learned it.
+    """Reads what a learner of this name starts from, by name; warns if another robot or kind of steering learned it.
 
     Args:
         scenario: The scenario, whose `learned` names the file.
@@ -86,11 +87,17 @@ def load_arrays(scenario: Scenario, learner: str, expected: Mapping[str, tuple[i
         expected: Names and shapes of what it keeps of a robot.
 
     Raises:
-        InputError: The file is missing, broken, or of another learner.
+        InputError: The file is missing, broken, or of another learner; or what it holds was learned with a prior and
+            the scenario has none, or the other way round.
     """
     notes = notes_on(str(scenario.learned))
     if (other := notes.get("learner", learner)) != learner:
         raise InputError(f"learned: {scenario.learned} was learned by {other}, not by {learner}")
+    if ((prior := notes.get("prior", scenario.prior)) == "none") != (scenario.prior == "none"):
+        raise InputError(f"learned: {scenario.learned} was learned with the prior {prior}, not with {scenario.prior}")
+    steering = scenario.steering or notes.get("steering")  # a scenario may leave it to the robot
+    if ((other := notes.get("steering", steering)) == "rigid") != (steering == "rigid"):
+        warnings.warn(f"learned: {scenario.learned} was learned with {other} steering, not {steering}", stacklevel=2)
     own = scenario.robot.path
     if Path(robot := notes.get("robot", own)).name != Path(own).name:
         warnings.warn(f"learned: {scenario.learned} was learned on the robot {robot}, not on {own}", stacklevel=2)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from mrctl.kernel import Array
 from mrctl.physics.bounds import check_bounds, compiling
@@ -88,6 +89,12 @@ def add_walls(spec: mujoco.MjSpec, obstacles: Obstacles) -> None:
         else:
             _prism(spec, name, shape.vertices, -HEIGHT, HEIGHT)
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **common)
+
+
+def moving_bodies(model: mujoco.MjModel, obstacles: Obstacles) -> NDArray[np.intp]:
+    """Returns the mocap index of each moving obstacle in a world, `(M,)`; a world may have mocap bodies of its own."""
+    names = [f"obstacle {k}" for k, shape in enumerate(obstacles.shapes) if shape.course is not None]
+    return np.array([model.body(name).mocapid[0] for name in names])
 
 
 def multi_ray(obstacles: Obstacles) -> Callable[[Array, Array, float], Array]:

@@ -25,6 +25,7 @@ from mrctl.physics import mjcf
 from mrctl.physics.car import CarPhysics
 from mrctl.physics.contacts import Contacts, contacts
 from mrctl.physics.elements import COLLISION, has
+from mrctl.physics.obstacles import moving_bodies
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.perturb import fields, limit_current, perturb, write
 from mrctl.physics.readout import READING, addresses, current_limits, imu_motion, inputs, motor_parameters, read
@@ -213,7 +214,10 @@ class Plant(ABC):
         for row, own in enumerate(obstacles):
             if own.moving:
                 worlds[own].append(row)
-        self._moving = [(Tracks(own, self._period), np.array(rows)) for own, rows in worlds.items()]
+        self._moving = [
+            (Tracks(own, self._period), np.array(rows)[:, None], moving_bodies(models[rows[0]], own))
+            for own, rows in worlds.items()
+        ]
 
     def _hold(self) -> None:
         """Lets the compiled calls of each tick find the arrays of the plant, which from then on stay where they are."""
@@ -372,10 +376,10 @@ class Plant(ABC):
     def _move(self, ahead: int) -> None:
         """Moves the moving obstacles to their poses `ahead` ticks from now."""
         position, turn = self.mocap
-        for tracks, rows in self._moving:
-            now = tracks.at(self._tick + ahead - self._began[rows])
-            position[rows, :, :2] = now[..., :2]
-            turn[rows, :, 0], turn[rows, :, 3] = np.cos(now[..., 2] / 2), np.sin(now[..., 2] / 2)
+        for tracks, rows, bodies in self._moving:
+            now = tracks.at(self._tick + ahead - self._began[rows[:, 0]])
+            position[rows, bodies, :2] = now[..., :2]
+            turn[rows, bodies, 0], turn[rows, bodies, 3] = np.cos(now[..., 2] / 2), np.sin(now[..., 2] / 2)
 
     def look(self) -> None:
         """Updates the readouts after the physics; fails robots that have tilted or whose state is not finite."""

@@ -59,6 +59,9 @@ SLIPPED = 6.0  # standard deviations of the innovation of an encoder, above whic
 GRIP = 0.08  # m/s, difference of encoder and inertial speed of a wheel above which it slips
 TWIST = 2e-3  # m/s, difference of the slip of two wheels that grip
 AVERAGE = 1.0  # s, time constant of the mean of the wheels' difference, by which another radius is found; chosen
+# m/s² and rad/s², standard deviations of V̇ and of the mean θ̈ from where the last sample of a slow sensor was taken to
+# where it is used; chosen
+HELD = 0.5, 1.0
 INERTIAL = 5.0  # rad/s, bandwidth of the observer that compares encoders with the accelerometer
 
 EKF = np.dtype(
@@ -340,7 +343,8 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
 
     It has the bandwidth ω₀ = `INERTIAL`, and its offset o is faster than that of the filter. A wheel slips if its own
     difference is larger than `GRIP` plus one count, or if it is the larger one and the two together contradict the
-    gyro.
+    gyro. Between two samples of a slow accelerometer or gyro the last one is used, which may be wrong by three times
+    `HELD` then.
 
     Args:
         now: In and out: a record of `SAMPLE`, whose `grip` and `doubt` are the result.
@@ -352,7 +356,8 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
     r, D = geometry.wheel_radius, geometry.half_track
     omega = now.gyro - s.mean[BIAS]
     ahead = s.inertial + period * (now.acceleration[0] + geometry.imu_x * omega * omega - s.offset)
-    bound = GRIP + r * sensor.quantum / (period * sensor.encoder_every)
+    waits, turn = period * (sensor.accelerometer_every - 1), HELD[1] * period * (sensor.gyro_every - 1)
+    bound = GRIP + r * sensor.quantum / (period * sensor.encoder_every) + 3 * (HELD[0] * waits + D * turn)
     left = r * (1 + s.mean[SCALE_LEFT]) * now.rate[0] - (ahead - D * omega)
     right = r * (1 + s.mean[SCALE_RIGHT]) * now.rate[1] - (ahead + D * omega)
     now.grip[0], now.grip[1] = abs(left) < bound, abs(right) < bound
@@ -360,7 +365,7 @@ def find_grip(now: Row, geometry: Row, period: float, sensor: Row, s: Row) -> No
         find_radius(left - right, now, geometry, period, s)
     P = s.P
     spread = 4 * (r / (period * sensor.encoder_every)) ** 2 * s.encoder_variance
-    spread += 4 * D * D * (s.gyro_variance + P[BIAS, BIAS])
+    spread += 4 * D * D * (s.gyro_variance + turn * turn + P[BIAS, BIAS])
     spread += s.inertial**2 * (P[SCALE_LEFT, SCALE_LEFT] + P[SCALE_RIGHT, SCALE_RIGHT])
     if abs(left - right) > 4 * np.sqrt(spread) + TWIST:  # by the gyro, one of them slips
         wheel = 0 if abs(left) > abs(right) else 1

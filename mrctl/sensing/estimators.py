@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mrctl.kernel import Array, Held, Kernel, Row, Rows, held, kernel
-from mrctl.sensing.ekf import DRIFTING, EKF, FIXES, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
+from mrctl.sensing.ekf import DRIFTING, EKF, FIXES, HELD, INCLINE, RADIUS, START_OFFSET, START_TWIST, ekf
 from mrctl.sensing.localisation import Localiser
 from mrctl.sensing.prediction import SEEN, front, predict, wrapped
 from mrctl.sensing.scanner import Scanner
@@ -273,7 +273,8 @@ class Estimator:
         offset = sensing["accelerometer_bias"] ** 2 + START_OFFSET**2
         count = sensor["quantum"] ** 2 / 12
         variances = [*deviation**2, sensing["gyro_bias"] ** 2, offset, count, count, RADIUS**2, RADIUS**2]
-        memory["acceleration_variance"] = sensor["accelerometer_sigma"] ** 2
+        held = HELD[0] if sensor["accelerometer_every"] > 1 else 0.0
+        memory["acceleration_variance"] = sensor["accelerometer_sigma"] ** 2 + held**2
         memory["offset_walk"] = np.hypot(sensing["accelerometer_walk"], INCLINE)
         memory["P"][:] = np.diag(np.maximum(variances, 1e-12))
         memory["encoder_variance"], memory["gyro_variance"] = count, sensor["gyro_sigma"] ** 2

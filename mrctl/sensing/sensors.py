@@ -183,7 +183,7 @@ class Sensors:
         counts = sensing["encoder_counts"]
         s["quantum"], s["phase"] = 2 * np.pi / counts if counts else 0.0, random["encoder"].uniform(size=2)
         for name in ("gyro", "accelerometer"):
-            # A sample is the mean since the last one, so noise of density N has the deviation N/√duration.
+            # Its noise is that of a mean since the last sample, N/√duration; the motion is that of the tick alone.
             s[f"{name}_sigma"] = sensing[f"{name}_noise"] / np.sqrt(period * s[f"{name}_every"])
             s[f"{name}_step"] = sensing[f"{name}_walk"] * np.sqrt(period)
             axes = random[name].standard_normal(2)

@@ -232,8 +232,8 @@ class Sensing(Record):
                 time, fixes are older than the run, `fix_rate` is set though fixes come from a lidar, or the start is
                 unknown and nothing looks for it.
         """
-        if self.start_unknown and (self.localisation == "fixes" or self.source == "odometry"):
-            raise ValueError("sensing.start_unknown: needs localisation by scan or particles, and not odometry alone")
+        if self.start_unknown and (self.localisation == "fixes" or self.source != "ekf"):
+            raise ValueError("sensing.start_unknown: needs localisation by scan or particles, and the estimator ekf")
         if self.localisation != "fixes":
             if self.fix_rate is not None:
                 raise ValueError("sensing.fix_rate: with a lidar the rate of fixes is that of its scans, lidar.rate")

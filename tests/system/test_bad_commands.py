@@ -108,6 +108,7 @@ OTHERS = [
     "sweep sweep.toml --out \udcff",
     "suite --quick --full", "suite --held-out magic --out s", "suite --held-out none --random 3",
     "suite --feedforward magic", "suite --controller own.py", "suite --controller raises.py:Good --out s",
+    "tune --delay nan", "tune --delay inf",
     "navigate doorway:1 --speed nan --out s", "navigate doorway:1 --goal 900 0 0 --out s/t", "tune --out full",
     "tune --delay 0.6 --out s", "navigate doorway:1 --out full", "run --laps 1 --out full", "tune nothing --out s",
     "tune nothing", "tune broken.xml", "tune --delay 0.013", "tune --delay -1", "tune --lag -1", "tune --lag nan",

@@ -162,6 +162,26 @@ def test_collision_ends_the_run():
     assert not simulate(run.replace(obstacles=wall(1.6)))["failed"]
 
 
+@pytest.mark.parametrize("size", [1, 2])
+def test_mocap_body_of_the_world(size, tmp_path):
+    """A mocap body that a world has of its own stays, and moving obstacles go on their courses, one as two."""
+    marker = '<body name="marker" mocap="true" pos="5 5 0.5"><geom type="sphere" size="0.1"/></body>'
+    world = (models_folder() / "flat.xml").read_text().replace("<worldbody>", f"<worldbody>{marker}")
+    (tmp_path / "mine.xml").write_text(world.replace('file="', f'file="{models_folder()}/'))
+    movers = [Disc(x=k - 3.0, y=2.0, radius=0.1, course=Line(heading=0.0, speed=0.3)) for k in range(2)]
+    for count in (1, 2):
+        obstacles = Obstacles(shapes=tuple(movers[:count]))
+        own = Scenario(world=str(tmp_path / "mine.xml"), obstacles=obstacles, laps=1, reference=Line(length=0.3))
+        simulation = Simulation([own] * size)
+        while simulation.running:
+            simulation.step()
+        model, places = simulation.plant.models[0], simulation.plant.mocap[0]
+        assert np.all(places[:, model.body("marker").mocapid[0]] == (5, 5, 0.5))
+        ids = [model.body(f"obstacle {k}").mocapid[0] for k in range(count)]
+        along = 0.3 * simulation.tick * simulation.period  # of the frames of their courses
+        assert np.allclose(places[:, ids, 0], along, atol=1e-9) and np.all(places[:, ids, 1] == 0)
+
+
 def test_start_in_an_obstacle():
     """A robot that would start in a collision is refused with one line."""
     with pytest.raises(InputError, match=r"initial_pose: the robot would stand in an obstacle at \("):

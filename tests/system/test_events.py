@@ -72,6 +72,17 @@ def test_same_moment():
     assert first_difference(pair.isel(run=0), pair.isel(run=1)) == 400
 
 
+def test_added_in_the_same_tick():
+    """Of two events in one tick the later one acts last, also if the earlier one is added while the run goes on."""
+    late, early = Event(time=1.005, perturbation=PAYLOAD), Event(time=1.002, perturbation=Perturbation())
+    live = Simulation([with_events(late)])
+    live.add(early)
+    while live.running:
+        live.step()
+    again = simulate(with_events(late, early))
+    assert first_difference(live.result().isel(run=0), again) == again.sizes["time"]
+
+
 @pytest.mark.parametrize("size", [1, 2])
 def test_payload_is_taken_off_again(size):
     """Dropped and removed: every parameter of the plant is the nominal one again, to the bit, and so is the prior."""

@@ -9,6 +9,7 @@ import pytest
 from mrctl import (
     FEEDFORWARDS,
     PERTURBATIONS,
+    Circle,
     Event,
     Fel,
     Guard,
@@ -224,3 +225,12 @@ def test_told():
     listed = json.loads(single.run(fast, None, True)[0])
     assert {"time", "action", "reason"} == set(listed["guard"][0])
     assert listed["laps"][0]["guard_actions"] == sum(event["action"] != "resume" for event in listed["guard"])
+
+
+def test_learner_that_is_not_finite():
+    """Where a learner adds NaN, the guard falls back to the model before the integral of the PID takes it over."""
+    broken = Scenario(learner="mrac", mrac={"noise": 1e-8}, laps=1, reference=Circle(radius=1, period=8))
+    run = simulate(broken)
+    assert not run.failed and guard_events(run)["reason"].iloc[0] == "output not finite"
+    assert np.isfinite(run.voltage_left).all()
+    assert simulate(broken.model_copy(update={"guard": OFF})).failed

@@ -103,3 +103,20 @@ def test_renewed(files):
     assert np.array_equal(own.learner.adapted()[0], load_learned(start))
     with pytest.raises(InputError, match="was learned by fel, not by rls"):
         hierarchy.renew(0, start.model_copy(update={"learned": second}))
+
+
+def test_other_voltages(files, tmp_path):
+    """What was learned beside a prior would be added to it twice, and volts are no rate of a fork."""
+    alone = BASE.model_copy(update=FEEDFORWARDS["model+rls"] | {"learned": files["model+rls"][0], "prior": "none"})
+    with pytest.raises(InputError, match=r"learned with the prior model, not with none$"):
+        mrctl.simulate(alone)
+    rigid = BASE.model_copy(update=FEEDFORWARDS["model+rls"] | {"learned": files["model+rls"][0], "steering": "rigid"})
+    with pytest.warns(UserWarning, match=r"learned with compliant steering, not rigid$"):
+        mrctl.simulate(rigid)
+
+
+def test_norm_of_what_was_learned(files):
+    """A run that starts from coefficients and does not learn has their norm from its first tick on."""
+    update = {"learned": files["model+rls"][0], "events": FROZEN, "laps": 1}
+    run = mrctl.simulate(BASE.model_copy(update=FEEDFORWARDS["model+rls"] | update))
+    assert np.allclose(run.weight_norm, np.linalg.norm(files["model+rls"][1].weights.values[:16]), rtol=1e-6)

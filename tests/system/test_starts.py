@@ -108,6 +108,7 @@ def test_batch_is_single():
     [
         ({"start_unknown": True}, "sensing.start_unknown: needs localisation by scan or particles"),
         ({"start_unknown": True, "localisation": "scan", "estimator": "odometry"}, "sensing.start_unknown: needs"),
+        ({"start_unknown": True, "localisation": "particles", "tier": "ideal"}, "sensing.start_unknown: needs"),
         ({"start_position_noise": -1}, "start_position_noise"),
         ({"start_heading_noise": 4}, "start_heading_noise"),
     ],
