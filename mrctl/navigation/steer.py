@@ -18,6 +18,7 @@ from mrctl.kernel import Array, kernel
 PIECES = 5
 CHECK = 0.05  # m, largest distance of the poses on a way, which are held against the obstacles
 QUARTER = np.pi / 2
+TINY = 1e-10  # a shorter arc or line, or one that is by as much negative, is rounding; for radius 1
 TURNS = np.array(
     [
         (1, 0, 1, 0, 0), (1, 0, -1, 0, 0), (1, -1, 1, 0, 0), (1, -1, 1, 0, 0), (1, -1, 1, -1, 0), (1, -1, 1, -1, 0),
@@ -80,7 +81,7 @@ def wrap(angle: float) -> float:
 def positive(angle: float) -> float:
     """Returns an angle in rad between 0 and 2π; one that rounding put just below a whole turn is 0."""
     found = angle - 2 * np.pi * np.floor(angle / (2 * np.pi))
-    return 0.0 if found > 2 * np.pi - 1e-12 else found
+    return 0.0 if found > 2 * np.pi - TINY else found
 
 
 @kernel
@@ -106,9 +107,13 @@ def dubins(x: float, y: float, phi: float, turns: Array, lengths: Array) -> floa
         t = p = q = 0.0
         if k == 0:  # left, straight, left
             square, e = 2 + d * d - 2 * cab + 2 * d * (sa - sb), np.arctan2(cb - ca, d + sa - sb)
+            if np.hypot(cb - ca, d + sa - sb) < TINY:  # a single arc, for the line has no direction
+                square, e = 0.0, a
             t, q = e - a, b - e
         elif k == 1:
             square, e = 2 + d * d - 2 * cab + 2 * d * (sb - sa), np.arctan2(ca - cb, d - sa + sb)
+            if np.hypot(ca - cb, d - sa + sb) < TINY:
+                square, e = 0.0, a
             t, q = a - e, e - b
         elif k == 2:
             square = d * d - 2 + 2 * cab + 2 * d * (sa + sb)
@@ -172,6 +177,9 @@ def reeds_shepp(x: float, y: float, phi: float, turns: Array, lengths: Array) ->
                 piece[0], piece[1], piece[2], piece[3] = t, -QUARTER, u, v
             else:
                 piece[0], piece[1], piece[2], piece[3], piece[4] = t, -QUARTER, u, -QUARTER, v
+            for n in range(PIECES):
+                if abs(piece[n]) < TINY:
+                    piece[n] = 0.0
             total = np.abs(piece).sum()
             if total < best:
                 best = total
@@ -184,44 +192,47 @@ def reeds_shepp(x: float, y: float, phi: float, turns: Array, lengths: Array) ->
 
 @kernel
 def word(number: int, x: float, y: float, phi: float) -> tuple[bool, float, float, float]:
-    """Solves the equations of one word for its lengths t, u and v; the first value tells whether it has them."""
+    """Solves the equations of one word for its lengths t, u and v; the first value tells whether it has them.
+
+    A length of the wrong sign that is `TINY` counts as 0.
+    """
     s, c = np.sin(phi), np.cos(phi)
     same = number in (1, 3, 9)  # first and last turn to the same side
     xi, eta = (x - s, y - 1 + c) if same else (x + s, y - 1 - c)
     rho, theta = np.hypot(xi, eta), np.arctan2(eta, xi)
     t = u = v = 0.0
     if number == 1:  # L+ S+ L+
-        t, u = theta, rho
+        t, u = theta if rho > TINY else 0.0, rho  # where there is no line, theta is noise
         v = wrap(phi - t)
-        return t >= 0 and v >= 0, t, u, v
+        return t >= -TINY and v >= -TINY, t, u, v
     if number == 2:  # L+ S+ R+
-        if rho < 2:
+        if rho < 2 - TINY:
             return False, t, u, v
-        u = np.sqrt(rho * rho - 4)
+        u = np.sqrt(max(rho * rho - 4, 0.0))
         t = wrap(theta + np.arctan2(2.0, u))
         v = wrap(t - phi)
-        return t >= 0 and v >= 0, t, u, v
+        return t >= -TINY and v >= -TINY, t, u, v
     if number == 3:  # L+ R− L
         if rho > 4:
             return False, t, u, v
         u = -2 * np.arcsin(rho / 4)
         t = wrap(theta + u / 2 + np.pi)
         v = wrap(phi - t + u)
-        return t >= 0 and u <= 0, t, u, v
+        return t >= -TINY and u <= TINY, t, u, v
     if number == 7:  # L+ R+ L− R−
         cosine = (2 + rho) / 4
         if cosine > 1:
             return False, t, u, v
         u = np.arccos(cosine)
         t, v = ends(u, -u, xi, eta, phi)
-        return t >= 0 and v <= 0, t, u, v
+        return t >= -TINY and v <= TINY, t, u, v
     if number == 8:  # L+ R− L− R+
         cosine = (20 - rho * rho) / 16
         if not 0 <= cosine <= 1:
             return False, t, u, v
         u = -np.arccos(cosine)
         t, v = ends(u, u, xi, eta, phi)
-        return t >= 0 and v >= 0, t, u, v
+        return t >= -TINY and v >= -TINY, t, u, v
     if rho < 2:
         return False, t, u, v
     if number == 9:  # L+ R− S− L−
@@ -229,17 +240,17 @@ def word(number: int, x: float, y: float, phi: float) -> tuple[bool, float, floa
         u = 2 - r
         t = wrap(theta + np.arctan2(r, -2.0))
         v = wrap(phi - QUARTER - t)
-        return t >= 0 and u <= 0 and v <= 0, t, u, v
+        return t >= -TINY and u <= TINY and v <= TINY, t, u, v
     if number == 10:  # L+ R− S− R−
         t, u = np.arctan2(xi, -eta), 2 - rho
         v = wrap(t + QUARTER - phi)
-        return t >= 0 and u <= 0 and v <= 0, t, u, v
+        return t >= -TINY and u <= TINY and v <= TINY, t, u, v
     u = 4 - np.sqrt(rho * rho - 4)  # L+ R− S− L− R+
-    if u > 0:
+    if u > TINY:
         return False, t, u, v
     t = wrap(np.arctan2((4 - u) * xi - 2 * eta, -2 * xi + (u - 4) * eta))
     v = wrap(t - phi)
-    return t >= 0 and v >= 0, t, u, v
+    return t >= -TINY and v >= -TINY, t, u, v
 
 
 @kernel
