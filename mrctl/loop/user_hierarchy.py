@@ -79,6 +79,8 @@ class UserHierarchy(Hierarchy):
         self._new: dict[int, Reference] = {}  # references that it has not been told yet, by robot
         if (stage := stages.get("motion")) and stage.has("assign"):
             stage.ask("assign", tuple(scenarios))
+        for row in range(len(scenarios)):
+            self._tune_motion(row)
         for name in (name for stage in stages for name in REPLACED.get(stage, ())):
             self.gains[name][:] = np.nan
 
@@ -135,8 +137,13 @@ class UserHierarchy(Hierarchy):
     def set_kanayama(self, row: int, gains: Kanayama) -> None:
         """Changes the gains of one robot; see `Hierarchy.set_kanayama`. A user's motion controller is told."""
         super().set_kanayama(row, gains)
-        if stage := self.stages.get("motion"):
-            stage.ask("tune", row, self.settings[row].kanayama.completed(self.settings[row].design.kanayama))
+        self._tune_motion(row)
+
+    def _tune_motion(self, row: int) -> None:
+        """Tells the user's motion controller, if it asks for that, the gains of one robot."""
+        own = self.settings[row]
+        if (stage := self.stages.get("motion")) and stage.has("tune"):
+            stage.ask("tune", row, own.kanayama.completed(own.design.kanayama))
 
     def set_reference(self, row: int, reference: Reference) -> None:
         """Tells the user's motion controller, if it asks for that, that one robot has another reference."""

@@ -10,13 +10,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mrctl.control.kanayama import Kanayama, kanayama, posture_error
+from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.loop.goals import RESTING
-from mrctl.loop.hierarchy import Hierarchy
 from mrctl.navigation.avoidance import Barrier, approach, share
 from mrctl.navigation.plan import least_clearance
-from mrctl.navigation.replanning import SHORTER, SURE, Planner, Replan, blocked_at
+from mrctl.navigation.replanning import RETRY, SHORTER, WAITED, Planner, Replan
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import rim
 from mrctl.theory.rays import Scan
@@ -28,19 +27,18 @@ RIM = 0.02  # m, radius of the discs around the robot, which reach as far beyond
 KEPT, AWAY = 0.02, 0.1  # m, margins of these discs from what is on the map and from what moves; chosen
 TRACKED = 0.01  # m, by which the margin KEPT is smaller than what the discs have on the plan, at least
 STANDOFF = 1.0  # m before a blocked place of its plan, where the robot stops, so that it can drive around it; chosen
-SLOW, WAITED = 0.1, 1.0  # mean λ over so many s, below which a robot makes another plan; chosen
+SLOW = 0.1  # mean λ over the time WAITED, below which a robot makes no headway; chosen
 
 
 class Following:
-    """Kanayama's motion controller, with the gains that it has in a hierarchy where no stage takes its place."""
+    """Kanayama's motion controller, as a part of a stage that is told its gains."""
 
-    def __init__(self, robot: Robot, scenarios: Sequence[Scenario]) -> None:
-        """Takes the nominal robot, and the scenario of each robot of a group."""
-        alone = [scenario.model_copy(update={"learner": "none", "learned": None}) for scenario in scenarios]
-        self._gains = Hierarchy(alone, robot).state["kanayama"]  # which do not depend on the learner
+    def __init__(self, size: int) -> None:
+        """Takes the number of robots."""
+        self._gains = np.zeros(size, GAINS)
 
     def tune(self, row: int, gains: Kanayama) -> None:
-        """Changes the gains of one robot, all of which are set."""
+        """Sets the gains of one robot."""
         self._gains[row] = gains.k_x, gains.k_y, gains.k_theta
 
     def output(self, pose: Array, reference: Array) -> Array:
@@ -58,8 +56,161 @@ def follow_all(pose: Array, reference: Array, gains: Rows, error: Array, request
         kanayama(error, reference[i, 3:5], gains[i], requests[i])
 
 
+class Pacer:
+    """One robot on a plan in time: its clock, how fast that goes, and when it takes another plan.
+
+    Attributes:
+        pace: λ of the last output.
+        driven: Twist of the plan at its pace, V in m/s and θ̇ in rad/s, `(2,)`.
+    """
+
+    def __init__(self, planner: Planner, robot: Robot, period: float) -> None:
+        """Takes the robot to its mission; `start` follows.
+
+        Args:
+            planner: Its mission, and what it knows.
+            robot: Nominal robot.
+            period: Motion period in s.
+        """
+        self._planner, self._robot, self._period = planner, robot, period
+        self._brakes = BRAKING * robot.max_acceleration
+        self._discs = rim(planner.vehicle.footprint, RIM)
+        self._near, self._away = self._barrier(-RIM), self._barrier(AWAY)
+        self.reset()
+
+    def _barrier(self, margin: float) -> Barrier:
+        """Returns the filter that keeps this clearance in m."""
+        return Barrier(self._discs, margin, self._brakes, self._period)
+
+    def reset(self) -> None:
+        """Starts a run."""
+        self._planner.reset()
+        scenario = self._planner.scenario
+        self._follow(self._planner.first, scenario.sensing.periods("delay", scenario.control_period))
+        self.pace, self.driven = 1.0, np.zeros(2)
+
+    def _follow(self, plan: Waypoints, delay: int = 0) -> None:
+        """Goes along a plan from its beginning.
+
+        Args:
+            plan: The plan.
+            delay: Control periods after its beginning at which the first voltage acts.
+        """
+        scenario, footprint = self._planner.scenario, self._planner.vehicle.footprint
+        step = scenario.control_period
+        ticks = round(self._period / step) * np.arange(int(plan.period / self._period) + 2) + delay
+        # For each motion period the plan as the stage gets a reference, `(n, 7)`.
+        self._plan = np.hstack(plan.sample(np.asarray(step * ticks, float)))
+        # The margin from the map is smaller than what the plan has, and negative where the discs overlap the map on it.
+        free = least_clearance(footprint, plan, self._planner.sight.map)
+        self._kept = self._barrier(min(KEPT, free - RIM - TRACKED))
+        self._clock, self._anchor = 0.0, 0.0  # s in motion periods, now and where the robot last got on
+        self._place = np.inf  # where the plan is blocked, in motion periods
+        self._stops = False  # whether the robot stops for a shorter way
+        self._planner.blocked = np.inf
+
+    def take(self, plan: Reference, now: float) -> None:
+        """Takes a plan to another goal at a time in s."""
+        self._begin(self._planner.take(plan, now), now)
+
+    def _begin(self, plan: Waypoints, now: float) -> None:
+        """Drives another plan from now on, a time in s, at the pace at which the robot keeps its speed."""
+        self._follow(plan)
+        velocity, first = float(self.driven[0]), float(self._plan[0, 3])
+        if velocity * first > 0:
+            self.pace = min(1.0, velocity / first)
+        self._planner.got_on, self._planner.tried, self._planner.map_changed = now, -np.inf, False
+
+    def see(self, scan: Scan) -> None:
+        """Takes a scan, and looks whether its plan is free."""
+        self._planner.see(scan)
+        first = self._first
+        way = np.cumsum(np.abs(self._plan[first:, 3])) * self._period
+        place = self._planner.look_ahead(self._plan[first:, :3], way, scan.time)
+        self._place = np.inf if place is None else first + place
+
+    @property
+    def _first(self) -> int:
+        """Index of the sample of the plan before its clock."""
+        return min(int(self._clock), len(self._plan) - 2)
+
+    @property
+    def reference(self) -> Array:
+        """The plan at its clock, in the units of a reference of the stage, `(7,)`."""
+        first = self._first
+        return self._plan[first] + min(self._clock - first, 1.0) * (self._plan[first + 1] - self._plan[first])
+
+    def go_on(self, request: Array, pose: Array, now: Array, time: float) -> None:
+        """Slows the plan by as much as the filter asks for, and advances its clock by a motion period.
+
+        Args:
+            request: Twist that Kanayama's law requests, V in m/s and θ̇ in rad/s, `(2,)`; out: what is allowed of it.
+            pose: x and y in m and θ in rad, `(3,)`.
+            now: The `reference`; out: the same at the pace.
+            time: Time in s.
+        """
+        before, twist = self.pace, now[3:5].copy()
+        change = self._period * self._robot.max_acceleration / max(abs(float(twist[0])), 1e-9)
+        self.pace = min(max(self._share(request, pose, time), before - change), before + BRAKING * change, 1.0)
+        now[3:5] = self.driven = self.pace * twist
+        now[5:] = self.pace * self.pace * now[5:] + (self.pace - before) / self._period * twist
+        self._clock += self.pace
+        request *= self.pace
+
+    def _share(self, request: Array, pose: Array, time: float) -> float:
+        """Returns the largest λ that the filter allows at a time in s."""
+        sight, found = self._planner.sight, 0.0 if self._stops else 1.0
+        if np.isfinite(self._place):
+            part = self._plan[int(self._clock) : int(self._place), 3]
+            left = self._period * float(np.abs(part).sum()) - STANDOFF
+            found = approach.compiled(left, self._brakes, self._period) / max(abs(float(request[0])), 1e-9)
+        around = (sight.map, self._kept), (sight.standing, self._near), (sight.moving(time), self._away)
+        near = [each for each in around if len(each[0].discs) + len(each[0].rings)]
+        return min([found, *(share(request, pose, *each) for each in near)])
+
+    def replan(self, pose: Array, velocity: float, now: float) -> None:
+        """Takes another plan, if there was a scan by which its own is blocked, or the map lets it have a shorter one.
+
+        It takes at once a plan that begins at about its own speed. Otherwise it plans again at rest: after a stop for
+        a shorter way, or when something that stands has hardly let it get on for a second.
+
+        Args:
+            pose: x and y in m and θ in rad, `(3,)`.
+            velocity: V in m/s.
+            now: Time in s.
+        """
+        planner = self._planner
+        if not planner.looked:
+            return
+        planner.looked = False
+        if self._stops:
+            if abs(velocity) < RESTING:
+                self._stops = False
+                if plan := planner.plan(pose, self.driven, now):
+                    self._begin(plan, now)
+            return
+        blocked = planner.is_blocked(now)
+        if self._clock - self._anchor > SLOW * WAITED / self._period or not len(planner.sight.standing.discs):
+            self._anchor, planner.got_on = self._clock, now
+        if now - planner.got_on >= WAITED:
+            planner.got_on = planner.tried = now  # where there is no other plan, it tries again later
+            if plan := planner.plan(pose, self.driven, now):
+                self._begin(plan, now)
+        elif planner.map_changed or (blocked and now - planner.tried >= RETRY):
+            left = np.inf if blocked else self._period * (len(self._plan) - self._clock)
+            planner.tried = now
+            if plan := planner.plan(pose, self.driven, now, ahead=not planner.map_changed):
+                excess = self.driven[0] - plan.sample(np.zeros(1)).twist[0, 0]
+                at_once = excess**2 < 2 * self._robot.max_acceleration * TRACKED  # so far it is off while it brakes
+                if plan.period + (0.0 if at_once else abs(velocity) / self._brakes) < SHORTER * left:
+                    if at_once:
+                        self._begin(plan, now)
+                    else:
+                        self._stops = not blocked
+
+
 class Pacing:
-    """A motion stage that follows a plan with Kanayama's law, and slows the clock of the plan where the filter asks.
+    """A motion stage that follows plans with Kanayama's law, and slows the clock of a plan where the filter asks.
 
     With the clock s of the plan, the request u(s) of Kanayama's law, and the largest λ ≤ 1 for which λ u is allowed,
 
@@ -86,153 +237,41 @@ class Pacing:
             size: Number of robots.
             replan: Makes a plan to the goal.
         """
-        self._robot, self._size, self._replan = robot, size, replan
-        self._brakes = BRAKING * robot.max_acceleration
+        self._robot, self._replan, self._law = robot, replan, Following(size)
 
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Takes the missions of the robots, with their maps and with their plans as references."""
-        self._follow, self._scenarios = Following(self._robot, scenarios), scenarios
         self._planners = Planner.each(self._replan, scenarios)
-        self._footprint = self._planners[0].vehicle.footprint
-        self._near, self._away = self._barrier(-RIM), self._barrier(AWAY)
 
-    def _barrier(self, margin: float) -> Barrier:
-        """Returns the filter that keeps this clearance in m."""
-        return Barrier(rim(self._footprint, RIM), margin, self._brakes, self._scenarios[0].motion_period)
+    def tune(self, row: int, gains: Kanayama) -> None:
+        """Takes the gains of one robot, at the start and from an event."""
+        self._law.tune(row, gains)
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
-        size = self._size
-        for planner in self._planners:
-            planner.reset()
         self._period, self._tick, self.followed = period, 0, reference
-        self._clock, self._pace = np.zeros(size), np.ones(size)  # s in motion periods, and λ
-        self._driven = np.zeros((size, 2))  # twists of the plans at their paces, m/s and rad/s
-        delay = self._scenarios[0].sensing.periods("delay", self._scenarios[0].control_period)
-        self._plans = [self._sampled(planner.first, delay) for planner in self._planners]
-        self._kept = [self._margin(planner.first, row) for row, planner in enumerate(self._planners)]
-        self._blocked = np.full(size, np.inf)  # where plans are blocked, in motion periods
-        self._anchor, self._since = np.zeros(size), np.zeros(size)  # clock and s at which robots last got on
-        self._since_blocked = np.full(size, np.inf)  # s since which their plans are blocked
-        self._tried = np.full(size, -np.inf)  # s at which they last looked for another plan
-        self._looked = np.zeros(size, bool)  # which robots have a scan that is new
-        self._map_changed = np.zeros(size, bool)  # so that a shorter way may be free
-        self._stops = np.zeros(size, bool)  # which stop for a shorter way
+        self._pacers = [Pacer(planner, self._robot, period) for planner in self._planners]
 
-    def _sampled(self, plan: Waypoints, delay: int) -> Array:
-        """Returns a plan as `output` gets it, for each motion period, `(n, 7)`.
-
-        Args:
-            plan: The plan.
-            delay: Control periods after its beginning at which the voltage of the first one acts.
-        """
-        step, period = self._scenarios[0].control_period, self._period
-        ticks = round(period / step) * np.arange(int(plan.period / period) + 2) + delay
-        return np.hstack(plan.sample(np.asarray(step * ticks, float)))
-
-    def _margin(self, plan: Waypoints, row: int) -> Barrier:
-        """Returns the filter for the map of one robot, with less clearance than the plan has.
-
-        The clearance is negative where the discs would overlap the map on the plan.
-        """
-        free = least_clearance(self._footprint, plan, self._planners[row].sight.map)
-        return self._barrier(min(KEPT, free - RIM - TRACKED))
+    @property
+    def _now(self) -> float:
+        """Time in s."""
+        return self._period * self._tick
 
     def follow(self, row: int, plan: Reference) -> None:
         """Takes another plan for one robot, which is a way to another goal."""
-        self._begin(row, self._planners[row].take(plan))
-
-    def tune(self, row: int, gains: Kanayama) -> None:
-        """Takes the gains that an event brings for one robot."""
-        self._follow.tune(row, gains)
-
-    def _begin(self, row: int, plan: Waypoints) -> None:
-        """Lets a robot drive a plan from its beginning, at the pace at which it keeps its speed."""
-        self._plans[row], self._kept[row] = self._sampled(plan, 0), self._margin(plan, row)
-        velocity, first = self._driven[row, 0], self._plans[row][0, 3]
-        if velocity * first > 0:
-            self._pace[row] = min(1.0, velocity / first)
-        self._clock[row], self._anchor[row], self._blocked[row] = 0.0, 0.0, np.inf
-        self._since[row], self._since_blocked[row], self._tried[row] = self._period * self._tick, np.inf, -np.inf
-        self._map_changed[row] = self._stops[row] = False
+        self._pacers[row].take(plan, self._now)
 
     def see(self, row: int, scan: Scan) -> None:
-        """Takes a scan of one robot, and looks whether its plan is free; for the arguments see `stages.Motion`."""
-        self._map_changed[row] |= self._planners[row].sight.see(scan)
-        self._looked[row] = True
-        standing, plan, place = self._planners[row].sight.standing, self._plans[row], None
-        first = min(int(self._clock[row]), len(plan) - 2)
-        if len(standing.discs):
-            way = np.cumsum(np.abs(plan[first:, 3])) * self._period
-            place = blocked_at(self._footprint, plan[first:, :3], way, standing)
-        self._blocked[row] = np.inf if place is None else first + place
-        self._since_blocked[row] = np.inf if place is None else min(self._since_blocked[row], scan.time)
+        """Takes a scan of one robot; for the arguments see `mrctl.control.stages.Motion`."""
+        self._pacers[row].see(scan)
 
     def output(self, pose: Array, twist: Array, reference: Array) -> Array:
         """Returns the allowed twist, `(B, 2)`; the arguments are those of `mrctl.control.stages.Motion`."""
-        for row in np.flatnonzero(self._looked):  # robots that have failed do not look
-            self._get_on(int(row), pose[row], float(twist[row, 0]))
-        self._looked[:] = False
-        now = np.empty((len(pose), 7))
-        for row, plan in enumerate(self._plans):
-            first = min(int(self._clock[row]), len(plan) - 2)
-            now[row] = plan[first] + min(self._clock[row] - first, 1.0) * (plan[first + 1] - plan[first])
-        requests, twists = self._follow.output(pose, now), now[:, 3:5].copy()
-        free = [self._share(row, *own) for row, own in enumerate(zip(requests, pose, strict=True))]
-        change = self._period * self._robot.max_acceleration / np.maximum(np.abs(twists[:, 0]), 1e-9)
-        pace = np.minimum(np.clip(free, self._pace - change, self._pace + BRAKING * change), 1.0)[:, None]
-        now[:, 3:5] = pace * twists
-        now[:, 5:] = pace**2 * now[:, 5:] + (pace - self._pace[:, None]) / self._period * twists
-        self._pace, self._clock, self._driven = pace[:, 0], self._clock + pace[:, 0], pace * twists
-        self._tick, self.followed = self._tick + 1, now
-        return pace * requests
-
-    def _share(self, row: int, request: Array, pose: Array) -> float:
-        """Returns λ of one robot."""
-        sight, allowed = self._planners[row].sight, 0.0 if self._stops[row] else 1.0
-        if np.isfinite(self._blocked[row]):
-            part = self._plans[row][int(self._clock[row]) : int(self._blocked[row]), 3]
-            left = self._period * float(np.abs(part).sum()) - STANDOFF
-            allowed = approach.compiled(left, self._brakes, self._period) / max(abs(float(request[0])), 1e-9)
-        moving = sight.moving(self._period * self._tick)
-        around = (sight.map, self._kept[row]), (sight.standing, self._near), (moving, self._away)
-        near = [each for each in around if len(each[0].discs) + len(each[0].rings)]
-        return min([allowed, *(share(request, pose, *each) for each in near)])
-
-    def _get_on(self, row: int, pose: Array, velocity: float) -> None:
-        """Gives a robot another plan, if its own is blocked, or the map lets it have a shorter one.
-
-        It takes at once a plan that begins at about its own speed. Otherwise it plans again at rest: after a stop for
-        a shorter way, or when something that stands has hardly let it get on for a second.
-
-        Args:
-            row: Which robot.
-            pose: x and y in m and θ in rad, `(3,)`.
-            velocity: V in m/s.
-        """
-        planner, now, asked = self._planners[row], self._period * self._tick, self._driven[row]
-        if self._stops[row]:
-            if abs(velocity) < RESTING:
-                self._stops[row] = False
-                if plan := planner.plan(pose, asked, now):
-                    self._begin(row, plan)
-            return
-        standing, blocked = planner.sight.standing, now - self._since_blocked[row] >= SURE
-        if self._clock[row] - self._anchor[row] > SLOW * WAITED / self._period or not len(standing.discs):
-            self._anchor[row], self._since[row] = self._clock[row], now
-        if now - self._since[row] >= WAITED:
-            self._since[row] = self._tried[row] = now  # where there is no other plan, it tries again later
-            self._map_changed[row] = False
-            if plan := planner.plan(pose, asked, now):
-                self._begin(row, plan)
-        elif self._map_changed[row] or (blocked and now - self._tried[row] >= WAITED):
-            left = np.inf if blocked else self._period * (len(self._plans[row]) - self._clock[row])
-            ahead, self._map_changed[row], self._tried[row] = not self._map_changed[row], False, now
-            if plan := planner.plan(pose, asked, now, ahead):
-                excess = asked[0] - plan.sample(np.zeros(1)).twist[0, 0]
-                at_once = excess**2 < 2 * self._robot.max_acceleration * TRACKED  # so far it is off while it brakes
-                if plan.period + (0.0 if at_once else abs(velocity) / self._brakes) < SHORTER * left:
-                    if at_once:
-                        self._begin(row, plan)
-                    else:
-                        self._stops[row] = not blocked
+        for pacer, place, (velocity, _) in zip(self._pacers, pose, twist, strict=True):
+            pacer.replan(place, float(velocity), self._now)
+        self.followed = np.stack([pacer.reference for pacer in self._pacers])
+        requests = self._law.output(pose, self.followed)
+        for pacer, request, place, now in zip(self._pacers, requests, pose, self.followed, strict=True):
+            pacer.go_on(request, place, now, self._now)
+        self._tick += 1
+        return requests

@@ -10,7 +10,7 @@ import numpy as np
 from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.navigation.chart import RADIUS
-from mrctl.navigation.replanning import SHORTER, SURE, Planner, Replan, blocked_at
+from mrctl.navigation.replanning import RETRY, SHORTER, WAITED, Planner, Replan
 from mrctl.navigation.rollouts import KEPT, STEPS, Bounds, Considered, Scene
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.trail import Trail
@@ -26,10 +26,9 @@ AROUND = 3.0  # m around the plan, which the field covers
 DISCS = 4, 2  # in a row, and rows, that cover the robot, and reach 4 to 6 cm beyond its nose
 AHEAD = 100  # samples of the plan, 20 motion periods, among which its nearest place is looked for
 FINE = 5  # samples of the plan in a motion period
-OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen, like the next two
-WAITED = 1.0  # s without headway, after which it also makes another one
-HEADWAY = 0.05, 0.5  # m, and share of the way at full speed in that time; it gets on if it covers the smaller of them
-RETRY = 1.0  # s, least time between two plans
+OFF = 0.6  # m from its plan, beyond which a robot makes another one; chosen
+# m, and share of the way at full speed in the time WAITED: a robot makes headway if it covers the smaller one; chosen
+HEADWAY = 0.05, 0.5
 STAYS = 1.0  # s at the end of its plan, after which a robot without a goal at which its run ends stays there; chosen
 # How a robot goes back from where there is no way forward; chosen, as all that follows.
 BACK = 0.4, 0.4  # m, length of a piece of the way back, after which it looks for another plan; m/s, its speed there
@@ -41,9 +40,9 @@ class Agent:
     """One robot on its plan: how far it has come, when it needs another plan, and how it goes back where it is stuck.
 
     Attributes:
+        planner: Its mission, and what it knows.
         last: The twist that it was last asked for, V in m/s and θ̇ in rad/s, `(2,)`.
-        blocked: Time in s since when its plan leads through what stands beside the map; infinite where it does not.
-        passes: Whether the twists that were chosen last lead around that.
+        passes: Whether the twists that were chosen last lead around what blocks its plan.
     """
 
     def __init__(
@@ -59,14 +58,11 @@ class Agent:
             start: x and y in m where it is, `(2,)`.
             period: Motion period in s.
         """
-        self._planner, self._bounds, self._discs = planner, bounds, discs
+        self.planner, self._bounds, self._discs = planner, bounds, discs
         self._field, self._reach, self._period = field, reach(discs), period
-        self.last, self.blocked, self.passes = np.zeros(2), np.inf, False
+        self.last, self.passes = np.zeros(2), False
         self._table, self._place, self._away = self._sampled(planner.first), 0, 0.0  # its plan, and its place on that
-        self._looked = False  # whether there is a scan that is new; a robot that has failed gets none
-        self._map_changed = False  # so that a shorter way may be free
-        self._tried = -np.inf  # when it last looked for another plan
-        self._anchor, self._since = start.copy(), 0.0  # where it last was when it had got on, and when
+        self._anchor = start.copy()  # where it last was when it had got on
         self._replanned = False  # whether it has made another plan since
         self._arrived = np.inf  # when it arrived at the end of its plan
         self._trail = Trail(planner.vehicle.footprint, min(BACK[1], bounds.speed / 2), bounds.curvature)
@@ -81,33 +77,27 @@ class Agent:
 
     def follow(self, plan: Reference, now: float) -> None:
         """Takes a plan to another goal at a time in s."""
-        self._take(self._planner.take(plan))
-        self._since, self._tried = now, -np.inf  # it may have waited at its goal, and is not stuck
-        self._replanned = self._approached = self._map_changed = False
+        self._take(self.planner.take(plan, now))
+        self._replanned = self._approached = False
         self._pieces = 0
 
     def _take(self, plan: Waypoints) -> None:
         """Goes along a plan from now on; where the distance field ends before the plan does, makes another field."""
-        self._table, self._place, self.blocked = self._sampled(plan), 0, np.inf
+        self._table, self._place, self.planner.blocked = self._sampled(plan), 0, np.inf
         low, high = self._table[:, :2].min(axis=0), self._table[:, :2].max(axis=0)
         distance, origin, resolution = self._field
         end = origin + resolution * np.array(distance.shape[::-1])
         if (low - self._reach < origin).any() or (high + self._reach > end).any():
-            self._field = field_around(self._table[:, :2], self._planner.sight, self._reach)
+            self._field = field_around(self._table[:, :2], self.planner.sight, self._reach)
 
     def see(self, scan: Scan) -> None:
         """Takes a scan, and looks whether its plan is free."""
-        self._looked = True
-        if self._planner.sight.see(scan):
-            self._field = field_around(self._table[:, :2], self._planner.sight, self._reach)
-            self._map_changed = True
-        standing, rest = self._planner.sight.standing, self._table[self._place :]
-        place = None
-        if len(standing.discs) and len(rest) > 1:
-            poses = np.column_stack([rest[:, :2], np.arctan2(rest[:, 3], rest[:, 2])])
-            way = np.append(0.0, np.cumsum(np.hypot(*np.diff(rest[:, :2], axis=0).T)))
-            place = blocked_at(self._planner.vehicle.footprint, poses, way, standing)
-        self.blocked = np.inf if place is None else min(self.blocked, scan.time)
+        if self.planner.see(scan):
+            self._field = field_around(self._table[:, :2], self.planner.sight, self._reach)
+        rest = self._table[self._place :]
+        poses = np.column_stack([rest[:, :2], np.arctan2(rest[:, 3], rest[:, 2])])
+        way = np.append(0.0, np.cumsum(np.hypot(*np.diff(rest[:, :2], axis=0).T)))
+        self.planner.look_ahead(poses, way, scan.time)
 
     def locate(self, pose: Array) -> None:
         """Finds the place on the plan that is nearest to a pose in m, m, rad, `(3,)`, of those not far ahead."""
@@ -119,7 +109,7 @@ class Agent:
         last = len(self._table) - 1
         places = self._place + FINE * np.arange(1, STEPS + 1)
         targets, end = self._table[np.minimum(places, last)], 1 + int(np.searchsorted(places, last))
-        found, horizon = self._planner.sight.discs(now), self._period * STEPS
+        found, horizon = self.planner.sight.discs(now), self._period * STEPS
         far = self._reach + horizon * (self._bounds.speed + np.hypot(found[:, 2], found[:, 3])) + found[:, 4]
         near = found[np.hypot(*(found[:, :2] - pose[:2]).T) < far]
         return Scene(targets, self._discs, self._field, near, end)
@@ -135,7 +125,7 @@ class Agent:
             speed: V in m/s.
             now: Time in s.
         """
-        if self._planner.scenario.goal is not None or not self._at_end(pose):
+        if self.planner.scenario.goal is not None or not self._at_end(pose):
             self._arrived = np.inf
         elif self._at_end(pose, speed):
             self._arrived = min(self._arrived, now)
@@ -149,7 +139,7 @@ class Agent:
         That is the goal of the mission, unless another plan came since.
         """
         x, y, c, s = self._table[-1]
-        return bool(arrived(pose, speed, np.array(self._planner.goal or (x, y, np.arctan2(s, c)))))
+        return bool(arrived(pose, speed, np.array(self.planner.goal or (x, y, np.arctan2(s, c)))))
 
     def goes_back(self, pose: Array, now: float) -> bool:
         """Looks for another plan where it needs one; tells whether it goes back instead, with the twist `last`.
@@ -164,14 +154,14 @@ class Agent:
             if self._gone(pose) < self._pieces * BACK[0] and self._back(pose, now):
                 return True
             self.last = np.zeros(2)
-            other = self._planned(pose, now)
+            other = self.planner.plan(pose, self.last, now)
             stuck = other is None
         else:
             self._trail.add(pose)
             if not self.needs_plan(pose, now):
                 self._shorten(pose, now)
                 return False
-            other = self._planned(pose, now, self._away <= OFF and not self._waits(now))
+            other = self.planner.plan(pose, self.last, now, self._away <= OFF and not self._waits(now))
             # What it got here before did not help it.
             stuck = self._waits(now) and self._away <= OFF and (other is None or self._replanned)
         self._replanned = self._waits(now) and self._away <= OFF
@@ -191,19 +181,19 @@ class Agent:
         hardly moved for a while; at the end of its plan it needs none.
         """
         if self._at_end(pose):
-            self._since, self.blocked = now, np.inf
+            self.planner.got_on, self.planner.blocked = now, np.inf
         if self._gone(pose) > min(HEADWAY[0], HEADWAY[1] * WAITED * self._bounds.speed):
-            self._anchor, self._since, self._replanned = pose[:2].copy(), now, False
-        blocked = now - self.blocked >= SURE and not self.passes
-        lost = (blocked or self._away > OFF or self._waits(now)) and now - self._tried > RETRY
-        lost, self._looked = lost and self._looked, False
+            self._anchor, self.planner.got_on, self._replanned = pose[:2].copy(), now, False
+        blocked = self.planner.is_blocked(now) and not self.passes
+        lost = (blocked or self._away > OFF or self._waits(now)) and now - self.planner.tried > RETRY
+        lost, self.planner.looked = lost and self.planner.looked, False
         if lost:
-            self._tried = now
+            self.planner.tried = now
         return lost
 
     def _waits(self, now: float) -> bool:
         """Tells whether it has hardly moved for a while."""
-        return now - self._since > WAITED
+        return now - self.planner.got_on > WAITED
 
     def _gone(self, pose: Array) -> float:
         """Returns the distance in m from where it last was when it had got on."""
@@ -216,12 +206,12 @@ class Agent:
 
     def _may_go_back(self, now: float) -> bool:
         """Tells whether it could go back a piece: not where what moves may let it pass, nor twice from a goal."""
-        can = self._planner.vehicle.reverses and not len(self._planner.sight.moving(now).discs)
+        can = self.planner.vehicle.reverses and not len(self.planner.sight.moving(now).discs)
         return can and self._pieces < PIECES and not (self._near_end and self._approached)
 
     def _back(self, pose: Array, now: float) -> bool:
         """Lets `last` be the twist with which it goes back; returns whether it can."""
-        twist = self._trail.back(pose, self._planner.sight.outlines(now, FREE - RADIUS))
+        twist = self._trail.back(pose, self.planner.sight.outlines(now, FREE - RADIUS))
         if twist is not None:
             self.last = twist
         return twist is not None
@@ -229,15 +219,10 @@ class Agent:
     def _shorten(self, pose: Array, now: float) -> None:
         """Takes another plan where the map has changed, if that takes less time than the rest of its own."""
         left = self._period / FINE * (len(self._table) - 1 - self._place)
-        if self._map_changed and now - self._tried > RETRY:
-            self._tried = now
-            if (other := self._planned(pose, now)) and other.period < SHORTER * left:
+        if self.planner.map_changed and now - self.planner.tried > RETRY:
+            self.planner.tried = now
+            if (other := self.planner.plan(pose, self.last, now)) and other.period < SHORTER * left:
                 self._take(other)
-
-    def _planned(self, pose: Array, now: float, ahead: bool = False) -> Waypoints | None:
-        """Makes a plan from where it is, around what it knows; `ahead` is that of `Planner.plan`."""
-        self._map_changed = False
-        return self._planner.plan(pose, self.last, now, ahead)
 
 
 def reach(discs: Array) -> float:
@@ -276,15 +261,15 @@ class Reactive(ABC):
 
     def assign(self, scenarios: Sequence[Scenario]) -> None:
         """Takes the missions of the robots, with their maps and with their plans as references."""
-        self._planners = Planner.each(self._replan, scenarios)
-        self.bounds = [Bounds.of(self._robot, planner.first.speed) for planner in self._planners]
+        self.planners = Planner.each(self._replan, scenarios)
+        self.bounds = [Bounds.of(self._robot, planner.first.speed) for planner in self.planners]
 
     def reset(self, pose: Array, reference: Array, period: float) -> None:
         """Starts a run; the arguments are those of `mrctl.control.stages.Motion`."""
         self._period, self._tick, self._agents = period, 0, []
         self.considered: list[Considered | None] = [None] * self._size
-        discs, fields = cover(self._planners[0].vehicle.footprint, *DISCS), dict[Hashable, Field]()
-        for planner, bounds, start in zip(self._planners, self.bounds, pose, strict=True):
+        discs, fields = cover(self.planners[0].vehicle.footprint, *DISCS), dict[Hashable, Field]()
+        for planner, bounds, start in zip(self.planners, self.bounds, pose, strict=True):
             planner.reset()
             if (own := (planner.first, planner.scenario.known)) not in fields:
                 places = planner.first.sample(np.linspace(0, planner.first.period, 200)).pose[:, :2]
@@ -315,7 +300,7 @@ class Reactive(ABC):
             else:
                 scene = agent.scene(place, now)
                 agent.last = self.choose(row, place, twist[row], agent.last, self._period, scene).copy()
-                agent.passes = bool(np.isfinite(agent.blocked)) and self.passes(row, self._period, scene)
+                agent.passes = bool(np.isfinite(agent.planner.blocked)) and self.passes(row, self._period, scene)
         self._tick += 1
         return self.last
 

@@ -14,6 +14,7 @@ from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.clearance import clearance
 from mrctl.theory.obstacles import Outlines, Pose
+from mrctl.theory.rays import Scan
 from mrctl.theory.references import Reference, Waypoints
 
 # m, rad and m, within which robot and obstacles are where they were when there was no way: more than the noise, and
@@ -22,6 +23,8 @@ SAME = 0.02, 0.05, 0.06
 AGAIN = 3.0  # s, after which a search that found no way is repeated in any case
 SPACING = 0.05  # m, of the places of a plan that `blocked_at` looks at
 SURE = 0.3  # s for which a plan must be blocked by what stands: what moves seems to stand at first; chosen
+WAITED = 1.0  # s without headway, after which a robot makes another plan; chosen
+RETRY = 1.0  # s, least time between two plans; chosen
 SHORTER = 0.9  # a plan since the map has changed is taken if it needs less than this share of the time that is left
 
 Replan = Callable[[Scenario, Vehicle, Array, Array, Outlines, Waypoints | None], Waypoints | None]
@@ -57,13 +60,18 @@ def blocked_at(footprint: Array, poses: Array, way: Array, outlines: Outlines) -
 
 
 class Planner:
-    """Mission and knowledge of one robot, and the plans that follow from them.
+    """Mission and knowledge of one robot, why it may need another plan, and the plans that it makes.
 
     Attributes:
         scenario: The mission.
         first: The plan of the mission.
         sight: What the robot knows of its surroundings.
         vehicle: What its plans need to know of the robot itself.
+        looked: Whether a scan came since this was last set to False; a robot that has failed gets none.
+        map_changed: Whether the map has changed since the last plan was tried, so that a shorter way may be free.
+        blocked: Time in s since when its plan leads through what stands beside the map; infinite where it does not.
+        got_on: Time in s at which it last made headway.
+        tried: Time in s at which it last looked for another plan.
     """
 
     def __init__(self, replan: Replan, scenario: Scenario, sight: Sight, vehicle: Vehicle) -> None:
@@ -74,9 +82,7 @@ class Planner:
         """
         self.scenario, self.first = scenario, open_waypoints(scenario.reference)
         self.sight, self.vehicle, self._replan = sight, vehicle, replan
-        self._given: Waypoints | None = None  # the plan that came since the start
-        # When, where, and among what, a search last found no way.
-        self._hopeless: tuple[float, Array, Outlines] | None = None
+        self.reset()
 
     @classmethod
     def each(cls, replan: Replan, scenarios: Sequence[Scenario]) -> list[Planner]:
@@ -85,18 +91,47 @@ class Planner:
         return [cls(replan, *own, vehicle) for own in zip(scenarios, sights, strict=True)]
 
     def reset(self) -> None:
-        """Forgets the plan that was taken, and all that scans have shown."""
-        self._given = self._hopeless = None
+        """Starts a run: forgets the plan that was taken, and all that scans have shown."""
+        self._given: Waypoints | None = None  # the plan that came since the start
+        # When, where, and among what, a search last found no way.
+        self._hopeless: tuple[float, Array, Outlines] | None = None
+        self.looked = self.map_changed = False
+        self.blocked, self.got_on, self.tried = np.inf, 0.0, -np.inf
         self.sight.forget()
 
-    def take(self, plan: Reference) -> Waypoints:
-        """Takes the plan of an event, to whose end all later plans lead; returns it.
+    def take(self, plan: Reference, now: float) -> Waypoints:
+        """Takes the plan of an event at a time in s, to whose end all later plans lead; returns it.
+
+        The robot may have waited at its goal until then, and is not stuck.
 
         Raises:
             InputError: It is no plan.
         """
         self._given, self._hopeless = open_waypoints(plan), None
+        self.map_changed, self.got_on, self.tried = False, now, -np.inf
         return self._given
+
+    def see(self, scan: Scan) -> bool:
+        """Takes a scan; returns whether the map has changed."""
+        changed = self.sight.see(scan)
+        self.looked, self.map_changed = True, self.map_changed or changed
+        return changed
+
+    def look_ahead(self, poses: Array, way: Array, time: float) -> int | None:
+        """Looks whether the rest of its plan is free of what stands beside the map, in a scan of a time in s.
+
+        Returns:
+            Index of the first pose that is blocked, or None; the other arguments are those of `blocked_at`.
+        """
+        place = None
+        if len(self.sight.standing.discs) and len(poses) > 1:
+            place = blocked_at(self.vehicle.footprint, poses, way, self.sight.standing)
+        self.blocked = np.inf if place is None else min(self.blocked, time)
+        return place
+
+    def is_blocked(self, now: float) -> bool:
+        """Tells whether its plan has been blocked for so long, at a time in s, that it is no passing finding."""
+        return now - self.blocked >= SURE
 
     @property
     def goal(self) -> Pose | None:
@@ -117,6 +152,7 @@ class Planner:
             The plan, or None where there is no way. A search that finds none takes far longer than one that does. It
             is repeated only after 3 s, or when the robot or an obstacle is elsewhere, and never while `ahead`.
         """
+        self.map_changed = False
         if ahead and self._hopeless:
             return None
         near, far = self.sight.outlines(time), self.sight.around(time, self.vehicle.footprint, pose)

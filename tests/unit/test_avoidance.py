@@ -15,6 +15,7 @@ from mrctl.control.design import motion
 from mrctl.control.features import feature_matrix
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.experiments.learned_limits import PLANTS
+from mrctl.loop.simulation import Simulation
 from mrctl.navigation.avoidance import Avoiding, Barrier, approach, avoid, nearest, share
 from mrctl.navigation.pacing import Following, Pacing
 from mrctl.navigation.vehicle import Vehicle
@@ -155,6 +156,16 @@ def test_idle_when_clear() -> None:
             assert avoid(request, pose, outlines, BARRIER).tolist() == request.tolist()
 
 
+class Rests:
+    """A motion stage that asks for no motion."""
+
+    def reset(self, pose, reference, period):
+        pass
+
+    def output(self, pose, twist, reference):
+        return np.zeros((len(pose), 2))
+
+
 @pytest.mark.parametrize("given", [{}, {"prefilter": 0.3}, {"kanayama": Kanayama(k_y=4.0)}])
 def test_following_has_the_gains_of_the_hierarchy(given: dict[str, Any]) -> None:
     """Beside the filter the robot follows with the gains that it has without, also where a part of them is given."""
@@ -169,7 +180,16 @@ def test_following_has_the_gains_of_the_hierarchy(given: dict[str, Any]) -> None
     own = scenario.kanayama.completed(motion(robot, False, loops, latency, period, scenario.prefilter).kanayama)
     gains = np.array([(own.k_x, own.k_y, own.k_theta)], GAINS)
     kanayama.compiled(error, reference[0, 3:5], gains[0], request)
-    assert np.array_equal(Following(robot, [scenario]).output(pose, reference)[0], request)
+    law = Following(1)
+    Simulation([scenario], motion=lambda *_: Told(law))
+    assert np.array_equal(law.output(pose, reference)[0], request)
+
+
+class Told(Rests):
+    """Rests, and tells a law its gains."""
+
+    def __init__(self, law: Following) -> None:
+        self.tune = law.tune
 
 
 def test_share() -> None:
@@ -210,6 +230,8 @@ def test_paced_plan_is_driven_whole() -> None:
     pose[:] = plan.sample(np.zeros(1)).pose
     stage = Pacing(robot, 2, lambda *_: None)
     stage.assign([scenario] * 2)
+    for row in range(2):
+        stage.tune(row, Kanayama(k_x=1.5, k_y=12.0, k_theta=4.0))
     stage.reset(pose, np.zeros((2, 7)), period)
     way, ticks = plan.sample(np.linspace(0, plan.period, 4000)).pose, 0
     least = min(clearance(footprint, place, outlines) for place in way)
@@ -230,23 +252,14 @@ def test_paced_plan_is_driven_whole() -> None:
 def test_wrapped_stage_sees() -> None:
     """The filter hands scans on to the stage that it wraps, and says what that one follows."""
 
-    class Looks:
+    class Looks(Rests):
         followed, seen = np.zeros((1, 7)), 0
-
-        def __init__(self, robot, size):
-            pass
-
-        def reset(self, pose, reference, period):
-            pass
 
         def see(self, row, scan):
             self.seen += 1
 
-        def output(self, pose, twist, reference):
-            return np.zeros((1, 2))
-
     made = []
-    stage = Avoiding(mjcf.build()[1], 1, lambda *robots: made.append(Looks(*robots)) or made[0], BARRIER)
+    stage = Avoiding(mjcf.build()[1], 1, lambda *robots: made.append(Looks()) or made[0], BARRIER)
     stage.assign([Scenario()])
     stage.reset(np.zeros((1, 3)), np.zeros((1, 7)), 0.02)
     stage.see(0, Scan(np.full(8, np.inf), np.arange(8) * np.pi / 4, 5.0, np.zeros(3), 0.0))

@@ -76,7 +76,7 @@ def test_no_way_is_not_searched_again(planner: Planner) -> None:
     assert planner.plan(np.array((0.03, 0.0, 0.1)), REST, 3.9) is None and searches(planner, (0.03, 0.0, 0.1)) == 0
     before = planner._replan.count
     assert planner.plan(np.array((0.03, 0.0, 0.1)), REST, 4.1) is None and planner._replan.count == before + 2
-    planner.take(WAY)
+    planner.take(WAY, 0.0)
     assert searches(planner, (0.03, 0.0, 0.1)) == 2
     planner.reset()
     planner.sight.show((1.0, 1.0))
