@@ -37,7 +37,8 @@ for name in sys.argv[1:]:
 COMPILE_MISSIONS = """
 from mrctl import Disc, Obstacles, Scenario, simulate
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import avoiding, prepared
+from mrctl.navigation.avoiders import avoiding
+from mrctl.navigation.planning import prepared
 
 task = Task(obstacles=Obstacles(shapes=(Disc(y=1.5),)), start=(0, 0, 0), goal=(1, 0, 0))
 for avoid, localisation in (("window", "scan"), ("mppi", "particles")):

@@ -94,7 +94,8 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
             raise InputError(f"world: no file {world}; mrctl navigate --help names the generators, such as doorway:3")
         check_world(chosen.world, chosen.robot)
         warn_if_impossible(chosen)
-        from mrctl.navigation.mission import Order, task_of
+        from mrctl.navigation.mission import Order
+        from mrctl.navigation.tasks import task_of
 
         task = task_of(world, chosen, start, goal, known)
         order = Order(task=task, scenario=chosen, compare=tuple(compare), speed=speed, margin=margin, avoid=avoid)

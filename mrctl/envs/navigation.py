@@ -10,7 +10,8 @@ import numpy as np
 from mrctl.control.kanayama import posture_error
 from mrctl.envs.episodes import AgentMotion, Draw, Episodes, read
 from mrctl.kernel import Array, Rows
-from mrctl.navigation.mission import prepared, task_of
+from mrctl.navigation.planning import prepared
+from mrctl.navigation.tasks import task_of
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 from mrctl.theory.rays import Scan

@@ -16,11 +16,13 @@ import numpy as np
 
 from mrctl.experiments.tables import markdown, number
 from mrctl.loop.simulation import simulate
-from mrctl.navigation import mission
-from mrctl.navigation.mission import Avoid, avoiding, prepared, task_of
+from mrctl.navigation import planning
+from mrctl.navigation.avoiders import avoiding
+from mrctl.navigation.hybrid_astar import cost_to_go, plan, space
 from mrctl.navigation.mppi import SAMPLES, SPREAD, TEMPERATURE, WORTH, Mppi
-from mrctl.navigation.planning import cost_to_go, plan, space
+from mrctl.navigation.planning import Avoid, prepared
 from mrctl.navigation.rollouts import KNOTS, STEPS, roll_out
+from mrctl.navigation.tasks import task_of
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics.obstacles import multi_ray
 from mrctl.record import InputError
@@ -190,7 +192,7 @@ def _generated(worlds: int) -> dict[str, Any]:
     """Measures plans of missions of the car in generated worlds, whose cells are a quarter as wide as the robot."""
     tried = []
     for seed in range(worlds):
-        with mock.patch.object(mission, "plan", wraps=plan) as watched:
+        with mock.patch.object(planning, "plan", wraps=plan) as watched:
             try:
                 prepared(task_of(f"{KINDS[seed % len(KINDS)]}:{seed}", SCENARIO), SCENARIO)
             except InputError:  # no way, or no room to stand

@@ -27,8 +27,9 @@ from mrctl.experiments.tables import Table, centre_cell, frame, share_cell, wins
 from mrctl.loop.learned import kept, save_learned
 from mrctl.loop.simulation import arranged, simulate
 from mrctl.navigation.generators import corridor
-from mrctl.navigation.mission import PATIENCE, SLIM, planned, reached
+from mrctl.navigation.mission import reached
 from mrctl.navigation.plan import Plan
+from mrctl.navigation.planning import PATIENCE, SLIM, planned
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority

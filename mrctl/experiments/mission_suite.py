@@ -29,7 +29,7 @@ from mrctl.kernel import Array
 from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import simulate
 from mrctl.navigation.generators import corridor, corridor_width
-from mrctl.navigation.mission import PATIENCE, planned
+from mrctl.navigation.planning import PATIENCE, planned
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import quantile_interval, superiority

@@ -23,9 +23,11 @@ from mrctl.experiments.journal import Computation, Journal
 from mrctl.experiments.mission_suite import PLANTS, Mode, drawn
 from mrctl.experiments.tables import Table, centre_cell, frame, share_cell, wins_cell, word_of
 from mrctl.loop.simulation import simulate
+from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task, slalom
-from mrctl.navigation.mission import PATIENCE, PERIOD, avoiding, outcomes, prepared
+from mrctl.navigation.mission import outcomes
 from mrctl.navigation.plan import Plan
+from mrctl.navigation.planning import PATIENCE, PERIOD, prepared
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError
 from mrctl.results.comparison import superiority

@@ -2,77 +2,30 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Callable, Sequence
-from functools import partial
-from math import pi, remainder
+from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
 from mrctl.kernel import Array
-from mrctl.loop.goals import RESTING, arrived
+from mrctl.loop.goals import arrived
 from mrctl.loop.simulation import simulate
-from mrctl.navigation import generators
+from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
-from mrctl.navigation.maps import read_map
-from mrctl.navigation.mppi import Mppi
-from mrctl.navigation.pacing import Pacing
-from mrctl.navigation.plan import Plan, least_clearance, run_out
-from mrctl.navigation.planning import NoWay, plan, shortcut, space, wider
-from mrctl.navigation.replanning import open_waypoints
-from mrctl.navigation.sdf import read_sdf
-from mrctl.navigation.vehicle import Vehicle
-from mrctl.navigation.window import Window
-from mrctl.physics.obstacles import read_mjcf
+from mrctl.navigation.plan import Plan
+from mrctl.navigation.planning import MARGIN, Avoid, prepared
 from mrctl.record import InputError, Record, read_file
 from mrctl.results.metrics import as_runs, control_period
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
-from mrctl.theory.clearance import clearance
-from mrctl.theory.obstacles import Obstacles, Outlines, Pose, Surroundings
-from mrctl.theory.references import SLOWEST, Waypoints, check
-from mrctl.theory.robot import ANY_ANGLE, Robot
-from mrctl.theory.timing import RESERVE, Limits
-
-READERS: dict[str, Callable[[str], Obstacles]] = {
-    ".toml": Obstacles.from_toml,
-    ".yaml": lambda path: read_map(path).obstacles(),
-    ".yml": lambda path: read_map(path).obstacles(),
-    ".sdf": read_sdf,
-    ".world": read_sdf,
-    ".xml": read_mjcf,
-}
-# Openings are twice as wide as the robot; aisles, in which it also turns, are 2.5 times as wide as it is long. A bay,
-# into which some robots go back and forth, is 2.5 times as long as the robot and 1.5 times as wide.
-GENERATORS: dict[str, Callable[[float, float, int], Task]] = {
-    "cellular": lambda length, width, seed: generators.cellular(seed),
-    "corridor": lambda length, width, seed: generators.corridor(2 * width, seed),
-    "slalom": lambda length, width, seed: generators.slalom(2 * width, seed),
-    "doorway": lambda length, width, seed: generators.doorway(2 * width, seed),
-    "warehouse": lambda length, width, seed: generators.warehouse(2.5 * length, seed),
-    "parking_bay": lambda length, width, seed: generators.parking_bay(2.5 * length, 1.5 * width, seed),
-}
-ROOM = 1.4  # turning radius of the plan over the robot's least one, for a spline turns tighter where an arc begins
-TIGHTEST = 0.25  # m, turning radius of the plan where a robot could turn on the spot
-GENTLER = 1.2  # factor on that radius, for a second plan where the spline of the first steers beyond the limit
-WIDER = 2.0  # factor on it where a plan may reverse; chosen when splines were straight at changes of direction
-CELLS = 4  # of the search in the width of the robot
-PATIENCE, WAITING = 2, 4  # time of a mission over that of its plan; WAITING where something keeps it from obstacles
-MARGIN = 0.05  # m, margin of a plan
-SLIM = 0.02  # m, margin of a plan that is made on the way, for the robot may be near an obstacle
-PERIOD = 0.05  # s, motion period of `window` and `mppi`, or the multiple of the control period nearest to it
+from mrctl.theory.obstacles import Pose
 
 JERKED = 0.1  # s, step of the differences whose third is the jerk; chosen
 LARGEST = 64 * 2**20  # bytes of a `mission.json`, which holds the obstacles of its world
-
-Avoid = Literal["none", "barrier", "window", "mppi"]
-REACTIVE = "window", "mppi"
-"""Motion stages that go along a plan at their own pace; their plans never reverse."""
 
 
 class Mission(NamedTuple):
@@ -139,59 +92,6 @@ def again(folder: str | Path, progress: bool = False) -> Mission:
     return order_of(folder).drive(progress)
 
 
-def task_of(
-    world: str,
-    scenario: Scenario,
-    start: Pose | None = None,
-    goal: Pose | None = None,
-    known: str | None = None,
-) -> Task:
-    """Reads or makes a world.
-
-    Args:
-        world: TOML file of obstacles, yaml file of a ROS map, world in SDF or MJCF, or a generator with its seed, as
-            `doorway:3`.
-        scenario: Scenario with the robot, whose size sets the openings of all generators but `cellular`.
-        start: x and y in m and θ in rad; by default that of the generator, or the origin.
-        goal: x and y in m and θ in rad; by default that of the generator.
-        known: File of the obstacles on the robot's map, as for a world; by default those that stand still.
-
-    Raises:
-        InputError: The world or the map cannot be read, no generator has that name, or there is no goal.
-    """
-    chart = None if known is None else obstacles_of(known, "map")
-    name, colon, seed = world.partition(":")
-    if colon and name in GENERATORS:
-        if not (seed.isdecimal() and len(seed) < 10):
-            raise InputError(f"world: {world}: the seed must be a whole number from 0 to 999999999, as in {name}:3")
-        vehicle = Vehicle.of(scenario)
-        made = GENERATORS[name](vehicle.length, vehicle.width, int(seed))
-        return made.replace(start=start or made.start, goal=goal or made.goal, map=chart)
-    obstacles = obstacles_of(world, "world", f" nor a generator with a seed, such as {':3, '.join(GENERATORS)}:3")
-    if goal is None:
-        raise InputError("goal: a world from a file needs one: x and y in m, θ in rad")
-    return Task.from_dict({"obstacles": obstacles, "start": start or (0.0, 0.0, 0.0), "goal": goal, "map": chart})
-
-
-def obstacles_of(path: str, what: str, other: str = "") -> Obstacles:
-    """Reads obstacles from a file of one of the `READERS`.
-
-    Args:
-        path: The file.
-        what: Name of the argument, for messages.
-        other: What else the argument may be, for the message.
-
-    Raises:
-        InputError: The file cannot be read, or its name has another ending.
-    """
-    if not (read := READERS.get(Path(path).suffix.lower())):
-        neither = "neither" if other else "not"
-        raise InputError(f"{what}: {path} is {neither} a file that ends in {', '.join(READERS)}{other}")
-    if not Path(path).is_file():
-        raise InputError(f"{what}: no file {path}")
-    return read(path)
-
-
 def navigate(
     task: Task,
     scenario: Scenario,
@@ -220,9 +120,9 @@ def navigate(
         progress: Whether to show a progress bar.
 
     Raises:
-        InputError: The task is none, there is no such feedforward, the margin is out of range, start or goal is within
-            it of an obstacle or off the map, the robot is at its goal, there is no way, or the robot cannot drive the
-            plan or would touch an obstacle on it.
+        InputError: The task is none, there is no such feedforward, the margin or the speed is out of range, start or
+            goal is within the margin of an obstacle or off the map, the robot is at its goal, there is no way, or the
+            robot cannot drive the plan or would touch an obstacle on it.
     """
     if not isinstance(task, Task):
         raise InputError(f"task: must be a world with start and goal, such as `task_of` makes, not {task!r:.60}")
@@ -237,219 +137,6 @@ def navigate(
     driven = np.flatnonzero(np.isfinite(result["x"].values).any(axis=0))
     result = result.isel(time=slice(int(driven[-1]) + 1))
     return Mission(found, result, outcomes(result, task.goal, found), planning_time)
-
-
-def prepared(
-    task: Task,
-    scenario: Scenario,
-    speed: float | None = None,
-    margin: float = MARGIN,
-    avoid: Avoid = "none",
-    twist: tuple[float, float] = (0.0, 0.0),
-) -> tuple[Plan, Scenario]:
-    """Returns a plan, and the scenario that drives it; arguments and errors are those of `navigate`.
-
-    The plan is made for a robot that drives with a twist at its start, V in m/s and θ̇ in rad/s; see `planned`.
-    """
-    reactive, vehicle = avoid in REACTIVE, Vehicle.of(scenario)
-    backwards = vehicle.reverses and not reactive
-    try:
-        found, reference = planned(task, vehicle, speed, margin, None, backwards, twist, not reactive, beyond=True)
-    except NoWay:
-        if not (reactive and vehicle.reverses):
-            raise
-        in_reverse = partial(_planned, task, vehicle, speed, margin, None, True, (0.0, 0.0), True)
-        _or_beyond(in_reverse)  # raises, too, if there is none
-        raise InputError(f"avoid: {avoid} never plans in reverse, and forward there is no way; barrier may") from None
-    laps = PATIENCE if avoid == "none" else WAITING
-    own = {"obstacles": task.obstacles, "map": task.map, "reference": reference, "laps": laps}
-    if reactive:  # the designed prefilter is that of Kanayama's controller, whose loop is faster
-        tick = scenario.control_period
-        shortest = max(tick, 0.01)  # s, that a scenario takes
-        own |= {"motion_period": max(1, round(PERIOD / tick)) * tick, "prefilter": scenario.prefilter or shortest}
-    return found, scenario.replace(**own, initial_pose=task.start, goal=task.goal)
-
-
-def avoiding(avoid: Avoid, *, lag: float = 0.0) -> Callable[[Robot, int], Any] | None:
-    """Returns the factory of the motion stage of missions, which bears the name in tables; None for that of mrctl.
-
-    The scenarios that it drives are those that `prepared` returns for the same `avoid`; their missions may differ.
-
-    Args:
-        avoid: What keeps the robots from obstacles.
-        lag: Time constant of the roll-outs of `mppi` in s; see `Mppi`.
-    """
-    if avoid == "none":
-        return None
-
-    def replan(
-        scenario: Scenario, vehicle: Vehicle, pose: Array, twist: Array, outlines: Outlines, given: Waypoints | None
-    ) -> Waypoints | None:
-        plan = open_waypoints(scenario.reference)
-        goal = scenario.goal if scenario.goal and given is None else end_of(given or plan)
-        start = Task.from_dict({"obstacles": scenario.known, "start": pose.tolist(), "goal": goal})
-        keeps, now = avoid not in REACTIVE, (float(twist[0]), float(twist[1]))
-        back = keeps and vehicle.reverses
-        try:
-            return planned(start, vehicle, plan.speed, SLIM, outlines, back, now, keeps, beyond=True)[1]
-        except NoWay:
-            raise
-        except InputError:  # it waits, and tries again
-            return None
-
-    def made(robot: Robot, size: int) -> Pacing | Window | Mppi:
-        if avoid == "barrier":
-            return Pacing(robot, size, replan)
-        return Window(robot, size, replan) if avoid == "window" else Mppi(robot, size, replan, lag)
-
-    made.__name__ = avoid
-    return made
-
-
-def end_of(plan: Waypoints) -> Pose:
-    """Returns the pose at the end of a plan, x and y in m and θ in rad."""
-    x, y, theta = plan.sample(np.array([plan.period])).pose[0].tolist()
-    return x, y, remainder(theta, 2 * pi)
-
-
-def planned(
-    task: Task,
-    vehicle: Vehicle,
-    speed: float | None,
-    margin: float,
-    outlines: Outlines | None = None,
-    reverse: bool = False,
-    twist: tuple[float, float] = (0.0, 0.0),
-    keeps: bool = True,
-    beyond: bool = False,
-) -> tuple[Plan, Waypoints]:
-    """Returns the plan and its reference; arguments and errors are those of `navigate`.
-
-    The outlines are by default those of the obstacles on the map. The plan reverses only if it may, and where there is
-    none forward that the robot can drive. It stays in the box around the map, with room to turn about start and goal.
-    Where there is no way in it, in reverse neither, a plan that may go beyond goes around what stands at its border.
-
-    The twist is that of the robot at the start, V in m/s and θ̇ in rad/s. If it drives forward, the plan begins with
-    this twist: first the arc on which it drives, for as far as it needs to come to rest, and on from there, so that it
-    can drive the plan whatever follows. Where that arc is within the margin of an obstacle, or no way leads on from it,
-    the plan begins at the robot, straight and with the largest speed from which the limits can be kept; the robot is
-    off it until it is as slow. So does a plan for a robot that goes along it at its own pace, which it need not keep.
-    A plan for a robot that stands or reverses begins at rest.
-    """
-    if arrived(np.array(task.start), 0.0, np.array(task.goal)):
-        raise InputError("goal: the robot starts there")
-    if not 0 <= margin <= 10:
-        raise InputError(f"margin: must be between 0 and 10 m, not {margin:g}")
-    fastest = vehicle.robot.max_speed
-    if speed is not None and not SLOWEST <= speed <= fastest:
-        raise InputError(f"speed: must be between {SLOWEST:g} and {fastest:g} m/s, not {speed:g}")
-
-    def either_way(around: bool) -> tuple[Plan, Waypoints]:
-        try:
-            return _planned(task, vehicle, speed, margin, outlines, False, twist, keeps, around)
-        except InputError as fault:  # there is no way, or none that the robot can drive
-            if not reverse:
-                raise
-            try:
-                return _planned(task, vehicle, speed, margin, outlines, True, twist, keeps, around)
-            except NoWay:
-                if isinstance(fault, NoWay):
-                    raise
-                raise fault from None  # a search has found a way, forward
-
-    return _or_beyond(either_way) if beyond else either_way(False)
-
-
-def _or_beyond(search: Callable[[bool], tuple[Plan, Waypoints]]) -> tuple[Plan, Waypoints]:
-    """Searches in the box around the map, and where there is no way in it, around what stands at its border.
-
-    Raises:
-        NoWay: There is no way in the box, and none around either that the robot can drive.
-    """
-    try:
-        return search(False)
-    except NoWay as fault:
-        if fault.at_border:
-            with contextlib.suppress(InputError):
-                return search(True)
-        raise
-
-
-def _planned(
-    task: Task,
-    vehicle: Vehicle,
-    speed: float | None,
-    margin: float,
-    outlines: Outlines | None,
-    reverse: bool,
-    twist: tuple[float, float],
-    keeps: bool,
-    around: bool,
-) -> tuple[Plan, Waypoints]:
-    """Returns a plan that only drives forward, or one that reverses wherever that is cheaper, and its reference.
-
-    Args:
-        task: World, start and goal.
-        vehicle: The robot.
-        speed: Largest speed in m/s; by default 0.9 of the robot's.
-        margin: Clearance that the plan keeps in m.
-        outlines: The obstacles; by default those on the map.
-        reverse: Whether the plan may reverse.
-        twist: V in m/s and θ̇ in rad/s at the start.
-        keeps: Whether the robot keeps the plan in time.
-        around: Whether the plan may go around what stands at the border of the box around the map.
-
-    Raises:
-        NoWay: There is no way; if it may go around, also where all ways from the goal stay in the box.
-        InputError: Start or goal is within the margin of an obstacle, or the robot cannot drive the plan, or would
-            touch an obstacle on it.
-    """
-    known, (corners, robot, _) = task.known, vehicle
-    speed = RESERVE * robot.max_speed if speed is None else speed
-    outlines = Surroundings(known).at(0.0) if outlines is None else outlines
-    radius = max(TIGHTEST, ROOM * abs(robot.wheelbase) / float(np.tan(robot.steering_limit))) * (
-        WIDER if reverse else 1
-    )
-    start, goal, limits = np.array(task.start), np.array(task.goal), Limits.of(robot)
-    velocity, turn = twist if twist[0] > RESTING else (0.0, 0.0)
-    arc, curvature = start[None], 0.0  # on which it comes to rest
-    if velocity and keeps:
-        curvature = float(np.clip(turn / velocity, -1 / radius, 1 / radius))
-        arc = run_out(start, velocity, curvature, limits)
-    ends = np.array([start[:2], arc[-1, :2], goal[:2]])
-    low, high = ends.min(axis=0) - 3 * radius, ends.max(axis=0) + 3 * radius  # room to turn
-    if known.shapes:
-        low, high = np.minimum(low, known.bounds[0]), np.maximum(high, known.bounds[1])
-    where = space(outlines, corners, low, high, cell=vehicle.width / CELLS, margin=margin)
-    if around:
-        where = wider(where, goal, 3 * radius)
-
-    def attempt(radius: float, arc: Array, curvature: float) -> tuple[Plan, Waypoints]:
-        found = plan(where, arc[-1], goal, radius, reverse)
-        found = shortcut(where, found, radius, reverse).after(arc)
-        return found, found.reference(speed, limits, velocity=velocity, curvature=curvature)
-
-    def after(arc: Array, curvature: float) -> tuple[Plan, Waypoints]:
-        found, reference = attempt(radius, arc, curvature)
-        try:
-            check(reference, robot, reverse)
-        except InputError as fault:
-            check(reference, robot.replace(steering_limit=ANY_ANGLE), reverse)  # wider arcs help the steering alone
-            try:
-                found, reference = attempt(GENTLER * radius, arc, curvature)
-                check(reference, robot, reverse)
-            except InputError:
-                raise fault from None
-        if least_clearance(corners, reference, outlines) <= 0:
-            raise InputError(
-                f"plan: its smooth path touches an obstacle in spite of the margin of {margin:g} m; set more"
-            )
-        return found, reference
-
-    if len(arc) > 1 and min(clearance(corners, pose, outlines) for pose in arc) > margin:
-        with contextlib.suppress(InputError):  # no way leads on from it
-            return after(arc, curvature)
-    return after(start[None], 0.0)
 
 
 def outcomes(result: xr.Dataset, goal: Pose, found: Plan) -> pd.DataFrame:

@@ -1,7 +1,7 @@
 """A plan in time whose clock the braking filter slows: the motion stage `barrier` of missions.
 
-A robot that follows a plan in time is not helped by the nearest twist that the filter of `avoidance` allows: the plan
-goes on without it, and its controller then asks for a way across obstacles. `Pacing` therefore slows the plan itself.
+A robot that follows a plan in time is not helped by the nearest twist that `barrier_filter` allows: the plan goes on
+without it, and its controller then asks for a way across obstacles. `Pacing` therefore slows the plan itself.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.kernel import Array, Rows, kernel
 from mrctl.loop.goals import RESTING
-from mrctl.navigation.avoidance import Barrier, approach, share
+from mrctl.navigation.barrier import Barrier, approach, share
 from mrctl.navigation.plan import least_clearance
 from mrctl.navigation.replanning import RETRY, SHORTER, WAITED, Planner, Replan
 from mrctl.scenario import Scenario

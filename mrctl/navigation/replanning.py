@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mrctl.kernel import Array
-from mrctl.navigation.planning import NoWay
+from mrctl.navigation.hybrid_astar import NoWay
 from mrctl.navigation.sight import Sight
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.record import InputError

@@ -18,7 +18,7 @@ from viser._messages import HotkeyKey
 
 from mrctl.kernel import Array, Rows
 from mrctl.loop.simulation import arranged, suited
-from mrctl.navigation.mission import Avoid
+from mrctl.navigation.planning import Avoid
 from mrctl.physics.files import SHIPPED
 from mrctl.record import InputError
 from mrctl.results.controllers import CONTROLLER, title_of
@@ -55,7 +55,7 @@ FAN_HINT = "Draws some of the ways that `window` or `mppi` considers, and the on
 # What *Save session* writes beside the scenarios of a mission with an avoider.
 AVOIDER = '''"""The motion stage of a session: `mrctl run {scenario} --controller motion={avoid}.py:{avoid}`."""
 
-from mrctl.navigation.mission import avoiding
+from mrctl.navigation.avoiders import avoiding
 
 {avoid} = avoiding("{avoid}")
 '''

@@ -14,9 +14,10 @@ from mrctl.control.margins import Gains
 from mrctl.control.stages import Motion, Stages
 from mrctl.kernel import Array, Rows
 from mrctl.loop.simulation import Simulation, arranged, run, uniform
+from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import MARGIN, SLIM, Avoid, avoiding, prepared
 from mrctl.navigation.plan import Plan
+from mrctl.navigation.planning import MARGIN, SLIM, Avoid, prepared
 from mrctl.navigation.reactive import Reactive
 from mrctl.physics.contacts import NOTHING, Contacts
 from mrctl.physics.hull import footprint

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mrctl.loop.simulation import simulate
 from mrctl.navigation.mission import Order
-from mrctl.navigation.mission import prepared as prepare
+from mrctl.navigation.planning import prepared as prepare
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ import time
 
 from mrctl import Scenario
 from mrctl.loop.simulation import simulate
-from mrctl.navigation.mission import prepared, task_of
+from mrctl.navigation.planning import prepared
+from mrctl.navigation.tasks import task_of
 
 TURNS, SEEDS = 3, 40
 

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from mrctl import Box, Disc, InputError, Line, Obstacles, Scenario, simulate
+from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import Avoid, avoiding, outcomes, prepared, task_of
+from mrctl.navigation.mission import outcomes
+from mrctl.navigation.planning import Avoid, prepared
+from mrctl.navigation.tasks import task_of
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.theory.timing import RESERVE
 

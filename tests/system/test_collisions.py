@@ -8,7 +8,7 @@ import shapely
 from mrctl import Box, Circle, Disc, InputError, Line, Obstacles, Polygon, Scenario, load_robot, simulate
 from mrctl.loop.simulation import Simulation
 from mrctl.navigation.generators import warehouse
-from mrctl.navigation.mission import obstacles_of
+from mrctl.navigation.tasks import obstacles_of
 from mrctl.physics import mjcf
 from mrctl.physics.elements import COLLISION
 from mrctl.physics.files import models_folder

@@ -11,7 +11,8 @@ from mrctl.control.margins import Gains, sampled_loop
 from mrctl.control.pid import Pid
 from mrctl.experiments import single
 from mrctl.experiments.cases import random_scenario
-from mrctl.navigation.mission import prepared, task_of
+from mrctl.navigation.planning import prepared
+from mrctl.navigation.tasks import task_of
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.results.dataset import SIGNALS

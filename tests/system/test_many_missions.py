@@ -6,8 +6,10 @@ import pytest
 
 from mrctl import InputError, Scenario, Sensing, simulate
 from mrctl.experiments.cases import HELD_OUT_SEEDS
-from mrctl.navigation import mission
-from mrctl.navigation.mission import outcomes, prepared, task_of
+from mrctl.navigation import planning
+from mrctl.navigation.mission import outcomes
+from mrctl.navigation.planning import prepared
+from mrctl.navigation.tasks import task_of
 from mrctl.results.comparison import wilson
 
 TIERS = "ideal", "lab"  # with the true posture, and with the estimate
@@ -67,12 +69,12 @@ def test_tight_spline(world: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
     The plans keep the arcs of the search here, since no world is known in which shortcuts leave such a spline.
     """
-    monkeypatch.setattr(mission, "shortcut", lambda where, found, *_: found)
+    monkeypatch.setattr(planning, "shortcut", lambda where, found, *_: found)
     scenario = Scenario(prior="model", learner="composite")
     task = task_of(world, scenario)
     for factor in (1.0, 30.0):  # the same plan again, and one of arcs for which there is no room
         with monkeypatch.context() as patch, pytest.raises(InputError, match="steering angle .* exceeds"):
-            patch.setattr(mission, "GENTLER", factor)
+            patch.setattr(planning, "GENTLER", factor)
             prepared(task, scenario)
     plan, drive = prepared(task, scenario)
     assert outcomes(simulate([drive]), task.goal, plan)["outcome"].tolist() == ["arrived"]
@@ -81,8 +83,8 @@ def test_tight_spline(world: str, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_other_refusals_are_final(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wider arcs are no remedy for what does not turn the wheel; a speed beyond the robot's needs no plan at all."""
     scenario, searches = Scenario(), []
-    task, search = task_of("doorway:3", scenario), mission.plan
-    monkeypatch.setattr(mission, "plan", lambda *arguments: searches.append(arguments) or search(*arguments))
+    task, search = task_of("doorway:3", scenario), planning.plan
+    monkeypatch.setattr(planning, "plan", lambda *arguments: searches.append(arguments) or search(*arguments))
     with pytest.raises(InputError, match=r"^speed: must be between 0.01 and 1.5 m/s, not 9$"):
         prepared(task, scenario, speed=9)
     assert not searches
@@ -90,7 +92,7 @@ def test_other_refusals_are_final(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuses(*_: object) -> None:
         raise InputError("reference: rotation 4 rad/s exceeds the robot's max_rotation")
 
-    monkeypatch.setattr(mission, "check", refuses)
+    monkeypatch.setattr(planning, "check", refuses)
     with pytest.raises(InputError, match="exceeds the robot's max_rotation"):
         prepared(task, scenario)
     assert len(searches) == 1
@@ -106,13 +108,13 @@ def test_second_plan_reverses(monkeypatch: pytest.MonkeyPatch) -> None:
         if not reverse:
             raise InputError("reference: rotation 4 rad/s exceeds the robot's max_rotation")
 
-    monkeypatch.setattr(mission, "check", refuses)
+    monkeypatch.setattr(planning, "check", refuses)
     prepared(task, scenario)
     assert tried == [False, False, True]  # the second time without its steering limit
     with pytest.raises(InputError, match="exceeds the robot's max_rotation"):
         prepared(task, scenario, avoid="mppi")  # which never plans in reverse; but there is a way forward
     searches = []
-    monkeypatch.setattr(mission, "plan", lambda *arguments: searches.append(arguments))
+    monkeypatch.setattr(planning, "plan", lambda *arguments: searches.append(arguments))
     for bad in ({"margin": -1.0}, {"speed": 9.0}):
         with pytest.raises(InputError, match=f"^{next(iter(bad))}: must be "):
             prepared(task, scenario, **bad)

@@ -11,9 +11,13 @@ from test_commands import refused
 import mrctl
 from mrctl import Box, Disc, Event, InputError, Kanayama, Obstacles, Scenario, cli
 from mrctl.loop.simulation import Simulation
-from mrctl.navigation.avoidance import Avoiding, Barrier
+from mrctl.navigation.avoiders import avoiding
+from mrctl.navigation.barrier import Barrier
+from mrctl.navigation.barrier_filter import Avoiding
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import Avoid, again, avoiding, jerk_of, navigate, order_of, outcomes, prepared, task_of
+from mrctl.navigation.mission import again, jerk_of, navigate, order_of, outcomes
+from mrctl.navigation.planning import Avoid, prepared
+from mrctl.navigation.tasks import task_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.theory.clearance import cover

@@ -19,7 +19,8 @@ import mrctl
 from mrctl import Disc, InputError, Line, Obstacles, Scenario, Sweep, simulate
 from mrctl.loop import user_files
 from mrctl.loop.simulation import arranged, uniform
-from mrctl.navigation.mission import prepared, task_of
+from mrctl.navigation.planning import prepared
+from mrctl.navigation.tasks import task_of
 from mrctl.results.dataset import SIGNALS
 from mrctl.sweep import jobs
 from mrctl.sweep.pool import Outcome

@@ -4,8 +4,8 @@ import numpy as np
 
 from mrctl import Limits, Scenario, simulate
 from mrctl.navigation.generators import doorway, parking_bay
+from mrctl.navigation.hybrid_astar import plan, shortcut, space
 from mrctl.navigation.mission import navigate
-from mrctl.navigation.planning import plan, shortcut, space
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.results.dataset import scenarios_of

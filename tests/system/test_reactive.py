@@ -7,9 +7,11 @@ from test_batch_equals_single import equal
 import mrctl
 from mrctl import Box, Disc, Obstacles, Scenario, simulate
 from mrctl.loop.simulation import arranged, uniform
+from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import Avoid, avoiding, navigate, planned, prepared
+from mrctl.navigation.mission import navigate
 from mrctl.navigation.mppi import Mppi
+from mrctl.navigation.planning import Avoid, planned, prepared
 from mrctl.navigation.replanning import Planner
 from mrctl.navigation.rollouts import KNOTS, STEPS, Bounds, Scene, roll_out
 from mrctl.navigation.vehicle import Vehicle

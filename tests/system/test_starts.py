@@ -5,7 +5,8 @@ import pytest
 
 from mrctl import Box, Circle, Disc, InputError, Obstacles, RobotFile, Scenario, Sensing
 from mrctl.loop.simulation import Simulation, simulate
-from mrctl.navigation.mission import prepared, task_of
+from mrctl.navigation.planning import prepared
+from mrctl.navigation.tasks import task_of
 
 WALLS = [
     Box(x=x, y=y, length=0.2 + 6 * (x == 1), width=0.2 + 6 * (y == 0.5))

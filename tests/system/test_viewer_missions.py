@@ -14,8 +14,11 @@ from test_viewer import CHROMIUM, DRAG_ERROR, PATIENCE, ROBOT, SOFTWARE, node, s
 from mrctl import Box, Circle, Disc, Event, InputError, Line, Obstacles, Scenario, save, simulate
 from mrctl.cli import main
 from mrctl.loop.goals import arrived
+from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
-from mrctl.navigation.mission import avoiding, navigate, prepared, task_of
+from mrctl.navigation.mission import navigate
+from mrctl.navigation.planning import prepared
+from mrctl.navigation.tasks import task_of
 from mrctl.physics import mjcf
 from mrctl.physics.hull import footprint
 from mrctl.results.dataset import SIGNALS

@@ -9,7 +9,8 @@ import pytest
 import mrctl
 from mrctl import InputError, Perturbation, Robot, RobotFile, cli
 from mrctl.loop.simulation import Simulation
-from mrctl.navigation.mission import navigate, task_of
+from mrctl.navigation.mission import navigate
+from mrctl.navigation.tasks import task_of
 from mrctl.physics import mjcf
 from mrctl.physics.elements import fronts
 from mrctl.physics.files import models_folder

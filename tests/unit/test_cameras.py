@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mrctl import Scenario
-from mrctl.navigation.mission import prepared, task_of
+from mrctl.navigation.planning import prepared
+from mrctl.navigation.tasks import task_of
 from mrctl.physics import mjcf
 from mrctl.physics.obstacles import HEIGHT
 from mrctl.viewer.cameras import FULL, OVERVIEW, TOP, fitted

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from mrctl import Disc, InputError, Obstacles, Scenario
-from mrctl.navigation import planning
-from mrctl.navigation.mission import prepared, task_of
-from mrctl.navigation.planning import NoWay
+from mrctl.navigation import hybrid_astar
+from mrctl.navigation.hybrid_astar import NoWay
+from mrctl.navigation.planning import prepared
 from mrctl.navigation.replanning import Planner
 from mrctl.navigation.sight import Sight
+from mrctl.navigation.tasks import task_of
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.theory.obstacles import Surroundings
 from mrctl.theory.references import Waypoints
@@ -113,7 +114,7 @@ def test_margin_around_nothing(planner: Planner) -> None:
 def test_no_way_is_proven_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bay that takes reversing is refused to `mppi` after a search forward, one beyond its lane, one in reverse."""
     scenario, tried = Scenario.from_dict({"robot": {"path": "turtlebot"}}), []
-    task, search = task_of("parking_bay:3", scenario), planning.search.compiled
+    task, search = task_of("parking_bay:3", scenario), hybrid_astar.search.compiled
 
     class Counted:
         @staticmethod
@@ -121,7 +122,7 @@ def test_no_way_is_proven_once(monkeypatch: pytest.MonkeyPatch) -> None:
             tried.append(arguments[4])
             return search(*arguments)
 
-    monkeypatch.setattr(planning, "search", Counted)
+    monkeypatch.setattr(hybrid_astar, "search", Counted)
     with pytest.raises(InputError, match="never plans in reverse"):
         prepared(task, scenario, avoid="mppi")
     assert tried == [False, False, True]

@@ -14,7 +14,8 @@ from toppra.constraint import DiscretizationType, LinearConstraint
 from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 
 import mrctl
-from mrctl.navigation.mission import planned, task_of
+from mrctl.navigation.planning import planned
+from mrctl.navigation.tasks import task_of
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot

@@ -16,7 +16,8 @@ from mrctl.control.features import feature_matrix
 from mrctl.control.kanayama import GAINS, Kanayama, kanayama, posture_error
 from mrctl.experiments.learned_limits import PLANTS
 from mrctl.loop.simulation import Simulation
-from mrctl.navigation.avoidance import Avoiding, Barrier, approach, avoid, nearest, share
+from mrctl.navigation.barrier import Barrier, approach, share
+from mrctl.navigation.barrier_filter import Avoiding, avoid, nearest
 from mrctl.navigation.pacing import Following, Pacing
 from mrctl.navigation.vehicle import Vehicle
 from mrctl.physics import mjcf
