@@ -273,6 +273,11 @@ def describe(error: ValidationError, source: str = "", record: type[Record] | No
     return printable(": ".join(part for part in (source, field, message) if part) + more)
 
 
+def is_whole(count: float) -> bool:
+    """Tells whether a number of periods is whole, to a millionth of a period."""
+    return abs(count - round(count)) <= 1e-6
+
+
 def nearest(name: str, known: Sequence[str]) -> str | None:
     """Returns the known field or flag for which a name that nobody knows probably stands; None if it is like no other.
 

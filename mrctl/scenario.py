@@ -22,7 +22,7 @@ from mrctl.control.mrac import Mrac
 from mrctl.control.observer import Observer
 from mrctl.control.pid import Pid
 from mrctl.control.rls import Rls
-from mrctl.record import Record
+from mrctl.record import Record, is_whole
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.obstacles import Known, Obstacles
 from mrctl.theory.perturbation import Perturbation
@@ -74,9 +74,15 @@ class Event(Record):
     without `tune`."""
     pid: Pid | None = None
     """Settings of the velocity PID from then on; the gains of the motion controller stay, and so does the delay that
-    oscillations have added."""
+    oscillations have added. Refused where a user's stage takes the place of the PID."""
     learning: bool | None = None
     """Whether the feedforward learns from then on."""
+
+    @model_validator(mode="after")
+    def _changes(self) -> Event:
+        if all(getattr(self, name) is None for name in set(type(self).model_fields) - {"time", "push_duration"}):
+            raise ValueError("changes nothing: it needs a perturbation, push, reference, kanayama, pid or learning")
+        return self
 
     def tick(self, period: float) -> int:
         """Returns the first control tick that is not before the event; `period` is the control period in s."""
@@ -172,12 +178,12 @@ class Scenario(Record):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Scenario:
-        whole(self.control_period, self.physics_step, "control_period", "physics_step")
-        whole(self.motion_period, self.control_period, "motion_period", "control_period")
+        _check_multiple(self.control_period, self.physics_step, "control_period", "physics_step")
+        _check_multiple(self.motion_period, self.control_period, "motion_period", "control_period")
         changes = [("perturbation", self.perturbation)]
         changes += [(f"events.{i}.perturbation", e.perturbation) for i, e in enumerate(self.events) if e.perturbation]
         for name, perturbation in changes:
-            whole(perturbation.control_delay, self.control_period, f"{name}.control_delay", "control_period")
+            _check_multiple(perturbation.control_delay, self.control_period, f"{name}.control_delay", "control_period")
         if self.learner in MODEL_BASED and self.prior == "none":
             raise ValueError(f"prior: the learner {self.learner} compares the robot with a model; set prior to model")
         if not 1 <= self.duration / self.control_period <= LONGEST:
@@ -242,19 +248,7 @@ def replicates(scenario: Scenario, count: int, first: int = 0) -> list[Scenario]
     return found
 
 
-def whole(value: float, unit: float, name: str, unit_name: str) -> int:
-    """Returns the whole number of units in a duration.
-
-    Args:
-        value: Duration in s.
-        unit: Duration of one unit in s.
-        name: Name of the duration for the message.
-        unit_name: Name of the unit for the message.
-
-    Raises:
-        ValueError: The duration is not a whole multiple of the unit, to 1 part in 10⁹.
-    """
-    count = round(value / unit)
-    if abs(count * unit - value) > 1e-9 * max(unit, value):
-        raise ValueError(f"{name}: {value:g} s is not a whole multiple of {unit_name} ({unit:g} s)")
-    return count
+def _check_multiple(value: float, unit: float, name: str, unit_name: str) -> None:
+    """Raises `ValueError` if a duration is not a whole multiple of another one, both in s; takes the names of both."""
+    if not is_whole(value / unit):
+        raise ValueError(f"{name}: {value:.9g} s is not a whole multiple of {unit_name} ({unit:.9g} s)")

@@ -253,7 +253,7 @@ class Composite(Record):
 
     moved = {"weights": "features are no longer trained; save_learned and `learned` keep what a run has adapted"}
 
-    noise: Annotated[float, Field(gt=0, le=100)] = 0.2
+    noise: Annotated[float, Field(ge=1e-6, le=100)] = 0.2
     """Standard deviation of one sample of the regression in V, if the motion is measured without noise; the noise that
     the measured motion shows is added. On a steering channel it is a tenth of this number in rad/s."""
     gain: Annotated[float, Field(ge=0, le=100)] = 0.3

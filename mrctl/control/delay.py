@@ -62,7 +62,7 @@ def watch_delay(feedback: Array, feedforward: Array, nominal: Array, period: flo
 
     Args:
         feedback: Output of the PID in V (rad/s on a steering channel), `(2,)`.
-        feedforward: Output of prior and learner of the last tick in the same units, `(2,)`.
+        feedforward: Feedforward that was applied in the last tick, after the guard, in the same units, `(2,)`.
         nominal: Output of the nominal inverse dynamics at the command, `(2,)`.
         period: Control period in s.
         s: In and out: a record of `DELAY`.

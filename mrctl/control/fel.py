@@ -240,7 +240,7 @@ class Fel(Record):
     """Share of the distance to the initial weights that the weights go back with each step of learning."""
     weight_bound: Annotated[float, Field(gt=0, le=1e4)] = 30.0
     """Largest Euclidean distance of the weights from the initial ones, dimensionless; a projection keeps it."""
-    output_scale: Annotated[float, Field(gt=0, le=100)] = 6.0
+    output_scale: Annotated[float, Field(ge=1e-3, le=100)] = 6.0
     """Feedforward in V for a network output of one; on a steering channel, a tenth of this number in rad/s."""
     weights: str | None = None
     """File of initial weights, `.safetensors` or a torch state dict; by default the hidden layer is random, the rest

@@ -240,7 +240,7 @@ GUARD = np.dtype(
         ("deviation", "f8", 2),  # peak of the deviation from the fallback, which decays, V (rad/s)
         ("handed", "f8", 2),  # sum of what learning took from the PID's integral, which decays, V (rad/s)
         ("nearest", "f8"),  # smallest posture error so far, m
-        ("model_error", "f8", 2),  # mean of the voltage sent less that of the nominal model, V
+        ("model_error", "f8", 2),  # mean of the voltage sent less that of the nominal model, V (rad/s)
         # Decisions
         ("action", "f8"),  # index into `GUARD_ACTIONS`
         ("reason", "f8"),  # index into `REASONS`
@@ -248,13 +248,13 @@ GUARD = np.dtype(
         ("strikes", "f8"),  # number of failed attempts of the learner
         ("gain", "f8"),  # factor on the feedback that the learner is taught with
         ("authority", "f8"),  # share of the learner in the output; the rest is the fallback's
-        ("bump", "f8", 2),  # step in voltage at the beginning of a fallback, as far as it has not faded yet, V
+        ("bump", "f8", 2),  # step in voltage at the beginning of a fallback, as far as it has not faded yet, V (rad/s)
         ("broken", "?"),  # whether the learner itself is not finite, as its caller found
         ("forget", "?"),  # whether the learner is to be reset to its initial weights
         ("frozen", "?"),  # whether the learner must not learn now
-        ("limited", "f8", 2),  # output of the learner, limited to the supply, V
-        ("output", "f8", 2),  # the feedforward to apply, V
-        ("teaching", "f8", 2),  # the feedback to learn from, V
+        ("limited", "f8", 2),  # output of the learner, limited to the supply, V (rad/s)
+        ("output", "f8", 2),  # the feedforward to apply, V (rad/s)
+        ("teaching", "f8", 2),  # the feedback to learn from, V (rad/s)
     ],
     align=True,
 )

@@ -270,7 +270,7 @@ class Mrac(Record):
     `noise`, `memory`, `spread`, `tracking` and `filter` is changed by a factor of 2 or 5.
     """
 
-    noise: Annotated[float, Field(gt=0, le=10)] = 0.02
+    noise: Annotated[float, Field(ge=1e-6, le=10)] = 0.02
     """Noise density ρ of the prediction error in V √s; the smaller, the faster the prediction error is followed."""
     memory: Annotated[float, Field(ge=0.1, le=1e6)] = 20.0
     """Memory 1/λ of least squares in s."""
@@ -278,7 +278,7 @@ class Mrac(Record):
     """Standard deviation of the parameters at the start in V; its square is the diagonal of P₀."""
     tracking: Annotated[float, Field(ge=0, le=1e3)] = 2.0
     """Weight η of the tracking error in 1/(V² s), per volt of back-EMF of that error."""
-    radius: Annotated[float, Field(gt=0, le=10)] = 1.0
+    radius: Annotated[float, Field(ge=1e-6, le=10)] = 1.0
     """Distance R of the scaled parameters of a channel from those of the prior, beyond which they leak back, as a share
     of the supply (of a tenth of that number in rad/s on a steering channel); the projection acts at twice that
     distance."""

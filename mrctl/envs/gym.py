@@ -229,6 +229,8 @@ class TrackingVectorEnv(VectorEnv):
         Raises:
             InputError: An option is unknown or invalid, or there are not as many seeds as robots.
         """
+        if isinstance(seed, np.ndarray | np.integer):
+            seed = seed.tolist()
         if isinstance(seed, Sequence):
             seeds = list(seed)
             if len(seeds) != self.num_envs:

@@ -254,12 +254,14 @@ def _course(seed: int) -> Waypoints:
 
 
 def score(errors: Array, yardstick: Array) -> Array:
-    """Returns the weighted logarithm of the ratio to `model` in each world, `(worlds,)`; the objective is its mean.
+    """Returns the weighted logarithm of the ratio to `model` in each world, `(n,)`; the objective is its mean.
 
     Args:
         errors: Errors by world and metric of `METRICS`, `(worlds, 3)`; NaN where the run failed.
-        yardstick: Errors of `model`, `(worlds, 3)`.
+        yardstick: Errors of `model`, `(worlds, 3)`; worlds in which it failed are left out.
     """
+    known = np.isfinite(yardstick).all(axis=1)
+    errors, yardstick = errors[known], yardstick[known]
     ratio = np.nan_to_num((errors + FLOORS) / (yardstick + np.array(FLOORS)), nan=LOST, posinf=LOST)
     return np.log(np.minimum(ratio, LOST)) @ np.array(list(METRICS.values()))
 
@@ -345,6 +347,8 @@ def find(searched: Entry, tier: Tier, memory: Memory, among: Sequence[Scenario],
         The settings `found`, the `objective` of these and of the `shipped` ones, and the `origin` in words.
     """
     (yardstick,) = memory.drive(Entry("model", {}, {}), [{}], among)
+    if np.isnan(yardstick).any(axis=1).all():
+        raise InputError("search: the learner `none` with the prior `model` loses the robot in every world")
     limits = np.array(list(searched.bounds.values()))
     low, span = limits[:, 0], np.log(limits[:, 1] / limits[:, 0])
     start = np.log(np.clip(list(searched.shipped.values()), limits[:, 0], limits[:, 1]) / low) / span

@@ -21,7 +21,7 @@ ENDING = np.dtype(
         ("place", "f8", 2),  # where the robot last made headway, x and y in m
         ("since", "i8"),  # tick at which it did so
         ("there", "?"),  # whether it stands at its goal, see `arrived`
-        ("over", "?"),  # whether it does, or the run has come to its own end
+        ("over", "?"),  # whether the run ends without failure: it stands at its goal, or all its ticks are done
         ("stuck", "?"),  # whether it has a goal, and has made no headway for too long
     ],
     align=True,

@@ -52,7 +52,7 @@ CONTROL = np.dtype(
         ("feedback", "f8", 2),  # output of the PID, V (rad/s on a steering channel)
         ("prior", "f8", 2),  # feedforward of the prior, V
         ("feedforward", "f8", 2),  # that of prior and learner, V (rad/s on a steering channel)
-        ("nominal", "f8", 2),  # output of the nominal inverse dynamics, if the guard is on, V (rad/s)
+        ("nominal", "f8", 2),  # output of the nominal inverse dynamics, if guard or delay watch is on, V (rad/s)
         ("delay", DELAY),
         ("guard", GUARD),
         ("allocation", ALLOCATION),

@@ -305,7 +305,10 @@ class Simulation:
                 check(reference, robot, self._reverses)
 
     def _check_gains(self, event: Event) -> None:
-        """Refuses an event with gains for a motion controller that has none of that kind."""
+        """Refuses an event with gains for a controller that has none of that kind."""
+        if event.pid is not None and "feedback" in self._stages:
+            feedback = self._stages["feedback"]
+            raise InputError(f"events: pid at {event.time:g} s: the feedback {feedback} is not the PID")
         if event.kanayama is not None and not self.hierarchy.tunable:
             motion = self._stages["motion"]
             raise InputError(

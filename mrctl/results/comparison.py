@@ -1,4 +1,4 @@
-"""Statistics over runs: means with bootstrap intervals, paired comparisons, the worst runs.
+"""Statistics over runs: means with confidence intervals, paired comparisons, the worst runs.
 
 A sample is an error, so the smaller one is better; NaN or infinite stands for a run that failed. Failed runs are
 counted and lose every comparison.
@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike
 
 from mrctl.kernel import Array
 from mrctl.record import InputError
+
+FEW = 10  # samples, below which the bootstrap of a mean is too narrow: of four it holds the mean in 80 % of the cases
 
 
 class Interval(NamedTuple):
@@ -58,6 +60,8 @@ def bootstrap_interval(
 ) -> Interval:
     """Returns the mean of the finite samples with its bias-corrected, accelerated bootstrap interval (Efron, 1987).
 
+    Of fewer than ten samples the interval of the mean is Student's, because the bootstrap would be too narrow.
+
     Args:
         samples: One number a run (n,); NaN or infinite where it failed.
         level: Confidence level, between 0 and 1.
@@ -72,13 +76,18 @@ def bootstrap_interval(
     values = np.asarray(samples, float).ravel()
     finite = values[np.isfinite(values)]
     statistic = np.median if median else np.mean
-    low, high = _interval((finite,), statistic, level, n, seed)
     value = float(statistic(finite)) if len(finite) else np.nan
+    if median or len(finite) >= FEW:
+        low, high = _interval((finite,), statistic, level, n, seed)
+    else:
+        low, high = _student(finite, level)
     return Interval(value, low, high, len(finite), len(values) - len(finite))
 
 
 def paired_ratio(a: ArrayLike, b: ArrayLike, level: float = 0.95, n: int = 10_000, seed: int = 0) -> Ratio:
-    """Returns the geometric mean of a / b over pairs (same seed, same perturbation), with its bootstrap interval.
+    """Returns the geometric mean of a / b over pairs (same seed, same perturbation), with its interval.
+
+    The interval is that of `bootstrap_interval` for the mean logarithm of the ratio.
 
     Every pair has the same weight, however large its errors, and the ratio of b to a is the inverse of that of a to b.
     A pair with an error of 0 has no such ratio and is left out.
@@ -118,8 +127,7 @@ def superiority(a: ArrayLike, b: ArrayLike, level: float = 0.95, floor: float = 
     Raises:
         InputError: `a` and `b` differ in length.
     """
-    if not 0 < level < 1:
-        raise InputError(f"level: {level} is not between 0 and 1")
+    _check_level(level)
     first, second = (np.where(np.isfinite(one), one, np.inf) for one in _pairs(a, b))
     tied = first == second
     with np.errstate(invalid="ignore"):  # inf − inf of two failures, which tie already
@@ -214,14 +222,31 @@ def _pairs(a: ArrayLike, b: ArrayLike) -> tuple[Array, Array]:
     return first, second
 
 
+def _student(samples: Array, level: float) -> tuple[float, float]:
+    """Returns Student's (1908) interval of a mean."""
+    from scipy.special import stdtrit
+
+    _check_level(level)
+    n = len(samples)
+    if n < 2:
+        return np.nan, np.nan
+    half = float(stdtrit(n - 1, (1 + level) / 2) * samples.std(ddof=1) / np.sqrt(n))
+    return float(samples.mean()) - half, float(samples.mean()) + half
+
+
+def _check_level(level: float) -> None:
+    """Raises `InputError` if a confidence level is not between 0 and 1."""
+    if not 0 < level < 1:
+        raise InputError(f"level: {level} is not between 0 and 1")
+
+
 def _interval(
     data: tuple[Array, ...], statistic: Callable[..., ArrayLike], level: float, n: int, seed: int
 ) -> tuple[float, float]:
     """Returns the BCa bootstrap interval of a paired statistic; percentiles where the data are too alike for BCa."""
     from scipy.stats import bootstrap  # the import takes 0.4 s
 
-    if not 0 < level < 1:
-        raise InputError(f"level: {level} is not between 0 and 1")
+    _check_level(level)
     if len(data[0]) < 2:
         return np.nan, np.nan
     for method in ("BCa", "percentile"):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mrctl.kernel import Array
-from mrctl.record import Record
+from mrctl.record import Record, is_whole
 from mrctl.theory.obstacles import Outlines, turned
 from mrctl.theory.rays import cast
 
@@ -56,7 +56,7 @@ class Lidar(Record):
             ValueError: It is not a whole number of them.
         """
         count = 1 / (self.rate * period)
-        if round(count) < 1 or abs(count - round(count)) > 1e-6:
+        if round(count) < 1 or not is_whole(count):
             raise ValueError(f"sensing.lidar.rate: {self.rate:g} Hz is no whole fraction of the control rate")
         return round(count)
 

@@ -114,6 +114,8 @@ class Localiser:
             points, rays = sensing.lidar.points(scan, POINTS[sensing.localisation]), sensing.lidar.rays(scan, RAYS)
             if particles := self.filters[row]:
                 found = particles.update(float(self._odometry[row, 0]), float(self._odometry[row, 1]), points, rays)
+                # Of a scan that shows nothing of the map the mean is odometry, which the filter has already.
+                now["fix_arrives"][row] &= agreement.compiled(points, found, chart) >= AGREES
             elif (poses := self._sought[row]) is not None:
                 way, turn = self._odometry[row]
                 heading = poses[:, 2] + turn / 2
@@ -126,8 +128,9 @@ class Localiser:
                 self._sought[row] = best if share >= AGREES else poses
                 if begun[row] and np.abs(found[:2] - estimate[row, :2]).max() < SETTLED:
                     self._sought[row] = None
-            elif not begun[row]:
-                continue  # there is no estimate yet
+            elif not begun[row]:  # there is no estimate yet
+                now["fix_arrives"][row] = False
+                continue
             else:
                 x, y, theta, v, omega = estimate[row]
                 guess = np.array(

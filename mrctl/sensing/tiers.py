@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from mrctl.record import Record
+from mrctl.record import Record, is_whole
 from mrctl.sensing.ekf import KEPT
 from mrctl.sensing.lidar import Lidar
 from mrctl.theory.drive import (
@@ -201,7 +201,7 @@ class Sensing(Record):
         count = round(time / control_period)
         if getattr(self, name) is None:
             return max(count, 1 if time else 0)
-        if abs(count * control_period - time) > 1e-6 * control_period:
+        if not is_whole(time / control_period):
             wrong = f"{value:g} s is not a whole multiple of control_period ({control_period:g} s)"
             if rate:
                 wrong = f"{value:g} Hz is no whole fraction of the control rate ({1 / control_period:g} Hz)"
@@ -229,8 +229,8 @@ class Sensing(Record):
 
         Raises:
             ValueError: A time is no whole number of control periods, more than four fixes are on their way at the same
-                time, fixes are older than the run, `fix_rate` is set though fixes come from a lidar, or the start is
-                unknown and nothing looks for it.
+                time, fixes are older than the run, `fix_rate` is set though fixes come from a lidar, these come before
+                the odometry that they need, or the start is unknown and nothing looks for it.
         """
         if self.start_unknown and (self.localisation == "fixes" or self.source != "ekf"):
             raise ValueError("sensing.start_unknown: needs localisation by scan or particles, and the estimator ekf")
@@ -242,6 +242,9 @@ class Sensing(Record):
             if name.endswith(("_rate", "_latency")) or name == "delay":
                 self.periods(name, control_period)
         latency = self.periods("fix_latency", control_period)
+        for name in ("encoder_latency", "gyro_latency"):  # a fix from a scan also needs the way since the last one
+            if self.localisation != "fixes" and latency < self.periods(name, control_period):
+                raise ValueError(f"sensing.fix_latency: with a lidar it must be at least {name}, {self[name]:g} s")
         if latency > IN_FLIGHT * self.periods("fix_rate", control_period):
             raise ValueError(f"sensing.fix_latency: more than {IN_FLIGHT} fixes would be on their way at the same time")
         if latency * control_period >= duration:

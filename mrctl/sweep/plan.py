@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import product
 from multiprocessing import parent_process
@@ -167,7 +167,8 @@ class Sweep(Record):
     """Many runs: a base scenario, and the axes along which it varies."""
 
     base: Scenario = Scenario()
-    """Scenario that the runs have in common; each run has a seed of its own unless `seed` is an axis."""
+    """Scenario that the runs have in common; each run has a seed drawn for it, of 2³² ones, unless `seed`
+    is an axis."""
     axes: tuple[Axis, ...] = ()
     """Axes that vary. Put those that split batches (learner, steering, world) first: large batches are fast."""
     runs: Annotated[int, Field(ge=1, le=100_000_000)] = 1
@@ -213,10 +214,10 @@ class Sweep(Record):
                 raise ValueError(f"axes: {names} are zipped, but differ in length or in `paired`")
         if self.size > 100_000_000:
             raise ValueError(f"runs: {self.size:,} of them, at most 100,000,000")
-        kept = self.size * self.base.ticks // self.stride * 8 * len(SIGNALS)
+        self._check_values()
+        kept = self.size * self._longest // self.stride * 8 * len(SIGNALS)
         if self.record in ("decimated", "full") and kept > LARGEST:
             raise ValueError(f"record: {self.size:,} runs would keep {kept / 1e12:,.0f} TB of signals; keep metrics")
-        self._check_values()
         return self
 
     def _check_controllers(self) -> None:
@@ -306,7 +307,7 @@ class Sweep(Record):
     def chunk_size(self) -> int:
         """Number of runs in a job; it depends on the file alone, so that the store does for any number of workers."""
         share = 2 ** (self.size // JOBS).bit_length() // 2  # a power of two, so that runs are compressed together
-        largest = CHUNK_BYTES // (8 * len(SIGNALS) * self.base.ticks)
+        largest = CHUNK_BYTES // (8 * len(SIGNALS) * self._longest)
         return self.chunk or max(1, min(largest, max(FEWEST, min(share, MOST))))
 
     @property
@@ -319,10 +320,22 @@ class Sweep(Record):
         """Number of samples that the store keeps of the longest run; 0 if it keeps metrics only."""
         if self.record in ("metrics", "laps"):
             return 0
+        return -(-self._ticks(range(self.size)) // self.stride)
+
+    @cached_property
+    def _longest(self) -> int:
+        """Number of control periods of the longest run, of a thousand at random where there are more."""
+        some: Iterable[int] = range(self.size)
+        if self.size > 1000:
+            some = np.random.default_rng(0).integers(self.size, size=1000).tolist()
+        return self._ticks(some)
+
+    def _ticks(self, runs: Iterable[int]) -> int:
+        """Returns the number of control periods of the longest of some runs."""
         ticks = self.base.ticks
         if any(axis.field.startswith((WHOLE, "laps", "reference", "control_period")) for axis in self.axes):
-            ticks = max((scenario.ticks for run in range(self.size) if (scenario := self.valid(run))), default=ticks)
-        return -(-ticks // self.stride)
+            ticks = max((scenario.ticks for run in runs if (scenario := self.valid(run))), default=ticks)
+        return ticks
 
     def values(self, run: int) -> dict[str, Any]:
         """Returns the value of each axis in one run, by field, and the seed.

@@ -85,7 +85,7 @@ class Perturbation(Record):
     """Angle in rad that is added to the constant error of the fork's angle, positive to the left."""
     steering_backlash: Backlash = 0.0
     """Width in rad that is added to the backlash between the steering servo and the fork."""
-    supply_factor: Annotated[float, Field(gt=0, le=2)] = 1.0
+    supply_factor: Annotated[float, Field(ge=0.05, le=2)] = 1.0
     """Factor on the supply voltage and, since the driver works by PWM, on every applied voltage."""
     tyre_friction_factor: Annotated[float, Field(ge=0.01, le=3)] = 1.0
     """Factor on the friction of every tyre on the floor."""

@@ -28,7 +28,7 @@ from mrctl.theory.robot import GRAVITY, Robot
 from mrctl.theory.spline import Plane, Spline, plane, spline
 from mrctl.theory.timing import RESERVE, Limits, SmoothLaw, sample_path, smooth
 
-Length = Annotated[float, Field(gt=0, le=1000)]
+Length = Annotated[float, Field(ge=1e-3, le=1000)]
 SLOWEST = 0.01  # m/s, of a reference with a constant or a largest speed
 Speed = Annotated[float, Field(ge=SLOWEST, le=20)]
 Duration = Annotated[float, Field(ge=0.1, le=3600)]
@@ -324,16 +324,18 @@ class Waypoints(Record):
         if len(self.points) < least:
             raise ValueError(f"points: {'a closed' if self.closed else 'an open'} curve needs at least {least} points")
         self._check_gaps(1e-3, "start_curvature", "end_curvature")
-        path = self._path
-        # The parameter is chord length, so a regular curve has |dp/du| near one.
-        slow, where = path.slowest
-        if slow < 0.02:
-            raise ValueError(f"points: the curve turns on the spot near ({where.real:.2f}, {where.imag:.2f})")
+        self._check_turns()
         if self.timing == "limits":
             _ = self._law  # raises for limits with which the robot cannot move
-        elif not self.closed and self.speed * self.stop_time / 2 > path.length:
-            raise ValueError(f"stop_time: too long to stop from {self.speed:g} m/s within {path.length:.2f} m")
+        elif not self.closed and self.speed * self.stop_time / 2 > self._path.length:
+            raise ValueError(f"stop_time: too long to stop from {self.speed:g} m/s within {self._path.length:.2f} m")
         return self
+
+    def _check_turns(self) -> None:
+        """Refuses a curve that turns on the spot; a regular one has |dp/du| near 1, as u is the length of chords."""
+        slow, where = self._path.slowest
+        if slow < 0.02:
+            raise ValueError(f"points: the curve turns on the spot near ({where.real:.2f}, {where.imag:.2f})")
 
     def _check_gaps(self, least: float, first: str, last: str) -> None:
         """Refuses neighbours that are nearer than so many m, and ends that are no arcs; takes the names of these."""
@@ -356,6 +358,7 @@ class Waypoints(Record):
         for k, (part, back) in enumerate(parts):
             first = "cusp_curvatures" if k else "start_curvature"
             part._check_gaps(1e-9, first, "cusp_curvatures" if k < len(parts) - 1 else "end_curvature")
+            part._check_turns()
             ends = part._path.heading[[0, -1]] + np.pi * back
             if heading is not None and abs(cmath.phase(cmath.exp(1j * (ends[0] - heading)))) > KINK:
                 raise ValueError(f"cusps: the curve turns by more than {KINK:g} rad at a cusp")
@@ -523,7 +526,7 @@ def _fault(reference: Reference, robot: Robot, reverse: bool) -> str:
         ("lateral acceleration", v * omega, "m/s²", "tyre_friction times gravity,", robot.tyre_friction * GRAVITY),
     ):
         worst = int(np.argmax(np.abs(values)))
-        if (peak := abs(values[worst])) > bound * (1 + 1e-9):
+        if not (peak := abs(values[worst])) <= bound * (1 + 1e-9):  # NaN is refused, too
             return f"{name} {peak:.3g} {unit} at t = {t[worst]:.2f} s exceeds the robot's {limit} {bound:.3g} {unit}"
     return ""
 

@@ -226,7 +226,8 @@ def controllable(rows: Array, caps: Array, step: Array, end: float, largest: Arr
         middle = bad
         for _ in range(50):
             low, high = acceleration_range(rows[k], middle)
-            low, high = max(low, -middle / step[k]), min(high, (largest[k + 1] - middle) / step[k])
+            low = max(low, -middle / step[k])
+            high = min(high, middle / step[k], (largest[k + 1] - middle) / step[k])  # x ≥ 0 at both ends
             if low <= high:
                 good = middle
             else:
@@ -428,7 +429,7 @@ def fastest(path: Path, limits: Limits, speed: float, start: float = 0.0) -> Tim
 
 
 def smooth(path: Path, limits: Limits, speed: float, start: float = 0.0) -> SmoothLaw:
-    """A law with continuous acceleration that keeps the limits, between the samples to within 1 %.
+    """A law with continuous acceleration that keeps the limits, between the samples to within 2 %.
 
     It is the average of a law s*(t) over a window, s(t) = mean s*(t + τ). A limit that is convex in ṡ and s̈ holds for
     the average of the motions s*(t + τ) if it holds for each of them with the coefficients of the place s(t). The law

@@ -194,7 +194,7 @@ def test_drawn_perturbations():
     env = TrackingEnv(scenario, draw=scenario.perturbation.drawn)
     several = TrackingVectorEnv(2, scenario, draw=scenario.perturbation.drawn, threads=1)
     other = SUITE["residual"](scenario.replace(seed=8), draw=scenario.perturbation.drawn)
-    several.reset(seed=[8, 9])
+    several.reset(seed=np.array([8, 9]))  # as NumPy draws them
     other.reset()
     for row, seed in enumerate((8, 9)):
         (replicate,) = replicates(scenario, 1, first=seed)

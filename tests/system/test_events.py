@@ -168,6 +168,27 @@ def test_gains():
             assert tuple(hierarchy.state["pid"][name][0]) == value, name
 
 
+def test_settings_of_a_pid_that_is_not_there():
+    """New settings of the PID are refused where a user's feedback takes its place, at the start and on the way."""
+
+    class Nothing:
+        def __init__(self, robot, size):
+            pass
+
+        def reset(self, steady, period):
+            pass
+
+        def output(self, command, twist, excess):
+            return np.zeros_like(command)
+
+    event = Event(time=0.02, pid=Pid(time_constant=0.3))
+    with pytest.raises(InputError, match=r"^events: pid at 0.02 s: the feedback Nothing is not the PID$"):
+        Simulation([with_events(event)], feedback=Nothing)
+    simulation = Simulation([with_events()], feedback=Nothing)
+    with pytest.raises(InputError, match="^events: pid"):
+        simulation.add(event)
+
+
 def test_reference():
     """From the event on the robot is shown the new reference from its own start, and follows it."""
     other = Circle(period=5, radius=0.7, clockwise=True)

@@ -49,6 +49,22 @@ def test_map_that_is_off():
     np.testing.assert_array_equal(same["x_measured"], simulate(RUNS[0])["x_measured"])
 
 
+@pytest.mark.parametrize("localisation", ["particles", "scan"])
+def test_scans_that_show_nothing(localisation):
+    """Where the lidar sees no wall it sends no fixes, and the filter knows that odometry drifts.
+
+    The mean of particles that have nothing to be weighed by is odometry, which the filter has already.
+    """
+    far = Obstacles(shapes=tuple(shape.replace(x=3 * shape.x, y=3 * shape.y) for shape in WALLS))
+    sensing = Sensing(localisation=localisation, lidar={"range": 2.0})
+    base = Scenario(reference=Circle(radius=0.8, period=8.0), laps=8, prior="model", obstacles=far, sensing=sensing)
+    result = simulate([base.replace(seed=seed) for seed in range(4)])
+    assert not np.isfinite(result["fix_x"]).any()
+    error = np.hypot(result["x_measured"] - result["x"], result["y_measured"] - result["y"])[:, -1]
+    deviation = np.sqrt(result["variance_x"] + result["variance_y"])[:, -1]
+    assert (error / deviation).max() < 4 and error.max() > 0.02
+
+
 class Listener:
     """An estimator that stays at its first estimate and keeps the fixes that it receives."""
 
@@ -84,6 +100,10 @@ def test_user_receives_the_same_fixes():
         ({"obstacles": Obstacles()}, "sensing.localisation: the map has no obstacles"),
         ({"sensing": {"localisation": "scan", "lidar": {"rate": 30}}}, "sensing.lidar.rate: 30 Hz is no whole"),
         ({"sensing": {"localisation": "scan", "fix_rate": 10}}, "sensing.fix_rate: with a lidar"),
+        (
+            {"sensing": {"localisation": "particles", "encoder_latency": 0.1, "fix_latency": 0.0}},
+            "sensing.fix_latency: with a lidar it must be at least encoder_latency, 0.1 s",
+        ),
         ({"sensing": {"localisation": "scan", "lidar": {"beams": 0}}}, "sensing.lidar.beams: "),
     ],
 )

@@ -101,6 +101,8 @@ def test_score_by_hand():
     first = 0.5 * log(2.1e-3 / 1.1e-3) + 0.25 * log(3.05e-3 / 6.05e-3)
     expected = [first, 0.0, log(10), 0.5 * log(10)]
     assert search.score(errors, yardstick) == pytest.approx(expected)
+    lost = np.vstack([yardstick, [np.nan] * 3])  # a world in which `model` fails says nothing
+    assert search.score(np.vstack([errors, errors[:1]]), lost) == pytest.approx(expected)
 
 
 def test_same_twice_and_resumed(tmp_path, brief):

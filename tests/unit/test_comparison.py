@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
 from mrctl.record import InputError
 from mrctl.results import comparison
@@ -33,6 +34,16 @@ def test_bootstrap_coverage():
     found = (comparison.bootstrap_interval(d, n=500, seed=k) for k, d in enumerate(draws))
     held = [one.low <= 3 <= one.high for one in found]
     assert 0.89 <= np.mean(held) <= 0.99
+
+
+@pytest.mark.parametrize("n", [2, 4, 9])
+def test_few_samples(n):
+    """About 95 % of the intervals of few samples hold the true mean, too; they are those of scipy."""
+    draws = np.random.default_rng(4).normal(3, 1, (1000, n))
+    found = [comparison.bootstrap_interval(d) for d in draws]
+    assert 0.93 <= np.mean([one.low <= 3 <= one.high for one in found]) <= 0.97
+    expected = stats.t.interval(0.95, n - 1, draws[0].mean(), stats.sem(draws[0]))
+    assert (found[0].low, found[0].high) == pytest.approx(expected)
 
 
 def test_bootstrap_degenerate():

@@ -243,7 +243,7 @@ FIELDS = {
     "mass_factor": (0.05, 20), "inertia_factor": (0.05, 20), "payload": (0, 200), "payload_x": (-1, 1),
     "payload_y": (-1, 1), "payload_z": (0, 1), "left_radius_factor": (0.8, 1.2), "right_radius_factor": (0.8, 1.2),
     "drive_friction_factor": (0, 20), "resistance_factor": (0.05, 20), "motor_constant_factor": (0.05, 20),
-    "supply_factor": (0.01, 2), "tyre_friction_factor": (0.01, 3), "slope": (-0.5, 0.5),
+    "supply_factor": (0.05, 2), "tyre_friction_factor": (0.01, 3), "slope": (-0.5, 0.5),
     "left_drive_friction_factor": (0, 20), "right_drive_friction_factor": (0, 20),
     "left_motor_constant_factor": (0.05, 20), "right_resistance_factor": (0.05, 20),
 }  # fmt: skip

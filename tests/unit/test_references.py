@@ -257,6 +257,13 @@ def test_check_refuses(reference, change, words):
     assert "\n" not in str(refusal.value)
 
 
+def test_check_refuses_nan():
+    """What cannot be told from numbers is no reference to drive: a derivative that overflows."""
+    steep = LaneChange.model_construct(**LaneChange().model_dump() | {"length": 1e-110, "shift": 0.0, "speed": 0.1})
+    with np.errstate(all="ignore"), pytest.raises(InputError, match="lane_change: .* nan "):
+        check(steep, ROBOT, reverse=True)
+
+
 def test_check_reverse():
     """Only a stop-and-go with reverse needs a steering that can reverse."""
     with pytest.raises(InputError, match=r"stop_and_go: reverses at t = 4.0\d s, .* use rigid"):
@@ -288,7 +295,7 @@ NARROW = [
     ("values", "words"),
     [
         ({"kind": "spiral"}, "'kind'"),
-        ({"kind": "circle", "radius": -1}, "circle.radius: .*greater than 0"),
+        ({"kind": "circle", "radius": -1}, "circle.radius: .*greater than or equal to 0.001"),
         ({"kind": "line", "speed": float("inf")}, "line.speed: "),
         ({"kind": "circle", "size": 1}, "circle.size: there is no such field"),
         ({"kind": "rounded_square", "side": 1, "radius": 0.4}, "radius: corners do not fit .*at most 0.2885 m"),
@@ -351,6 +358,7 @@ def test_cusps(cusps: tuple[int, ...], monkeypatch: pytest.MonkeyPatch) -> None:
         ({"cusps": (4, 2)}, "cusps: must increase"),
         ({"cusps": (6,)}, "cusps: must increase"),
         ({"cusps": (1,)}, "cusps: the curve turns"),
+        ({"points": ((0, 0), (1, 0), (0.5, 0), (1.2, 0), (0.4, 0)), "cusps": (1,)}, "points: the curve turns on the"),
     ],
 )
 def test_bad_cusps(changes: dict, words: str) -> None:

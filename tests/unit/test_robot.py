@@ -7,6 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mrctl.physics import mjcf
+from mrctl.physics.parameters import read_robot
 from mrctl.record import InputError, Record
 from mrctl.theory.drive import NO_LIMIT
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -125,6 +127,9 @@ def test_named_perturbations():
     assert PERTURBATIONS["all"].model_dump(exclude_defaults=True) == {
         "mass_factor": 1.5, "supply_factor": 0.8, "drive_friction_factor": 3.0, "resistance_factor": 1.3,
     }  # fmt: skip
+    tyres = read_robot(mjcf.load()).tyre_friction
+    assert tyres * PERTURBATIONS["tyre friction 0.2"].tyre_friction_factor == pytest.approx(0.2)
+    assert tyres * PERTURBATIONS["left tyre on ice"].left_tyre_friction_factor == pytest.approx(0.1)
     nominal = PERTURBATIONS["nominal"].model_dump(exclude={"payload_x", "payload_y", "payload_z"})
     assert nominal.pop("current_limit") == NO_LIMIT
     assert all(value == (1 if name.endswith("_factor") else 0) for name, value in nominal.items())

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from mrctl import Composite, Event, Fel, Kanayama, Observer, Perturbation, Pid, Rls, Scenario
 from mrctl.control.feedforward import Loop, NoLearner
 from mrctl.loop.simulation import simulate
-from mrctl.record import InputError
-from mrctl.scenario import LONGEST, replicates, whole
+from mrctl.record import InputError, is_whole
+from mrctl.scenario import LONGEST, replicates
 from mrctl.sensing.tiers import Sensing
 from mrctl.theory.perturbation import UNKNOWN
 from mrctl.theory.references import Circle, LaneChange, Lemniscate, Line, RoundedSquare, StopAndGo, Waypoints
@@ -51,7 +51,7 @@ def test_nonsense(path, value):
     """A random value in any field is valid, or is refused with one line that names the field."""
     *where, name = path
     if where == ["events"]:
-        source = {"events": [{"time": 0.0, name: value}]}
+        source = {"events": [{"time": 0.0, "learning": True, "push": (0, 0, 0), name: value}]}
     elif where:
         source = {where[0]: {name: value}}
     else:
@@ -85,14 +85,19 @@ def test_unknown(source):
         ("reference.circle.size", {"reference": {"kind": "circle", "size": 1}}),
         ("reference", {"reference": {"kind": "ellipse"}}),
         ("reference", {"reference": {"radius": 1}}),
-        ("events.1.push", {"events": [{"time": 1}, {"time": 2, "push": [1, 2]}]}),
+        ("events.1.push", {"events": [{"time": 1, "learning": False}, {"time": 2, "push": [1, 2]}]}),
         ("events.0.what", {"events": [{"time": 1, "what": 2}]}),
         ("perturbation.mass", {"perturbation": {"mass": 2}}),
         ("laps", {"laps": 0}),
         ("seed", {"seed": -1}),
         ("initial_spread.2", {"initial_spread": [0, 0, 9]}),
         ("initial_pose.0", {"initial_pose": [float("nan"), 0, 0]}),
-        ("laps: a run of", {"reference": {"kind": "line", "length": 1e-6}, "laps": 1}),
+        ("events.0: changes nothing", {"events": [{"time": 1, "push_duration": 5}]}),
+        ("perturbation.supply_factor", {"perturbation": {"supply_factor": 1e-3}}),
+        ("mrac.noise", {"mrac": {"noise": 1e-200}}),
+        ("fel.output_scale", {"fel": {"output_scale": 1e-300}}),
+        ("reference.lane_change.length", {"reference": {"kind": "lane_change", "length": 1e-110}}),
+        ("laps: a run of", {"reference": {"kind": "line", "length": 1e-3, "speed": 9}, "laps": 1}),
         ("laps: a run of", {"reference": {"kind": "circle", "period": 3600}, "laps": 10_000}),
     ],
 )
@@ -112,7 +117,7 @@ def test_refused(name, source):
         ("perturbation.control_delay", {"perturbation": {"control_delay": 0.015}}),
         (
             "events.1.perturbation.control_delay",
-            {"events": [{"time": 0}, {"time": 1, "perturbation": {"control_delay": 0.004}}]},
+            {"events": [{"time": 0, "learning": True}, {"time": 1, "perturbation": {"control_delay": 0.004}}]},
         ),
     ],
 )
@@ -123,10 +128,20 @@ def test_multiples(name, source):
 
 @given(st.integers(0, 10**6), st.floats(1e-5, 1))
 def test_whole(count, unit):
-    """`whole` counts multiples despite rounding, and refuses halves."""
-    assert whole(count * unit, unit, "a", "b") == count
-    with pytest.raises(ValueError, match="^a: .* whole multiple of b"):
-        whole((count + 0.5) * unit, unit, "a", "b")
+    """`is_whole` takes multiples despite rounding, and refuses halves."""
+    assert is_whole(count * unit / unit) and is_whole(count * unit * (1 / unit))
+    assert not is_whole((count + 0.5) * unit / unit)
+
+
+def test_one_rule_of_whole_periods():
+    """A delay that is a whole number of periods to 1 ppm is one in the sensing and in a perturbation."""
+    for value, fine in ((0.010000005, True), (0.0101, False)):
+        for source in ({"sensing": {"delay": value}}, {"perturbation": {"control_delay": value}}):
+            if fine:
+                Scenario.from_dict(source)
+            else:
+                with pytest.raises(InputError, match="0.0101 s is not a whole multiple of control_period"):
+                    Scenario.from_dict(source)
 
 
 def test_rates():

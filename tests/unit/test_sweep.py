@@ -286,6 +286,8 @@ def test_chunk_is_a_function_of_the_file():
     assert sweep(chunk=5).chunk_size == 5
     long = sweep(base={"laps": 100}, runs=10**6)
     assert long.chunk_size * long.base.ticks * len(SIGNALS) * 8 <= 2**27
+    varied = sweep({"field": "laps", "values": [1, 200]}, runs=1500, record="full")
+    assert varied.chunk_size * varied.samples * len(SIGNALS) * 8 <= 2**27
 
 
 @pytest.mark.parametrize(
