@@ -10,7 +10,7 @@ import tyro
 
 from mrctl.cli.arguments import NOT_OF_MISSIONS, fields_set
 from mrctl.cli.flags import FIRST, is_short_help, partial_record
-from mrctl.cli.shared import BEST, Incomplete, check_world, expect_same, report, warn_if_impossible
+from mrctl.cli.shared import BEST, Incomplete, check_world, expect_same, show, warn_if_impossible
 from mrctl.record import InputError, Record
 from mrctl.scenario import FEEDFORWARDS, FeedforwardName, Scenario
 
@@ -105,9 +105,9 @@ def navigate_with(arguments: list[str]) -> Callable[..., None]:
             return viewing.mission(order, "127.0.0.1", port)
         from mrctl.experiments import mission
 
-        text, outcome = mission.run(world, order, out, json)
-        report(text, out, json)
-        _expect_arrival(outcome)
+        found = mission.run(world, order, out, json)
+        show(found, out, json)
+        _expect_arrival(found.ended)
 
     navigate.__annotations__["scenario"] = Annotated[type(part), tyro.conf.arg(name="")]
     return navigate
@@ -128,10 +128,10 @@ def _repeat_mission(folder: Path, arguments: Sequence[str], out: Path | None, js
         raise InputError(f"{new[0].removeprefix('--')}: {folder} holds a mission, which is driven as it was")
     from mrctl.experiments import mission
 
-    text, outcome, departs = mission.repeat(folder, out, json)
-    report(text, out, json)
+    found, departs = mission.repeat(folder, out, json)
+    show(found, out, json)
     expect_same(folder, departs, json)
-    _expect_arrival(outcome)
+    _expect_arrival(found.ended)
 
 
 def _expect_arrival(outcome: str) -> None:

@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"mrctl: {printable(str(error))}", file=sys.stderr)
         return 2
     except OSError as error:
-        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        text = f"{error.filename}: {error.strerror}" if error.filename else error.strerror or str(error)
         print(f"mrctl: {printable(text)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as stop:

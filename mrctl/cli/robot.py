@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from mrctl.cli.flags import IDENTIFIED, is_short_help
-from mrctl.cli.shared import Incomplete, check_world, report
+from mrctl.cli.shared import Incomplete, check_world, show
 from mrctl.record import InputError, Record
 from mrctl.sensing.tiers import LAB, TIERS, Sensing, Tier
 from mrctl.theory.perturbation import PERTURBATIONS, Perturbation
@@ -150,4 +150,4 @@ def tune(
         if (robot, wheels, steering, chassis) == (CAR.path, (), (), "")
         else load_robot(robot, wheels, steering, chassis)
     )
-    report(tuning.tune(file, world, time_constant, delay, lag, out, json), out, json)
+    show(tuning.tune(file, world, time_constant, delay, lag, out, json), out, json)

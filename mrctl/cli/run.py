@@ -11,7 +11,7 @@ import tyro
 
 from mrctl.cli.arguments import check_switches, fields_set, scenario_file_of
 from mrctl.cli.flags import explained, with_fields
-from mrctl.cli.shared import Incomplete, check_exists, check_world, expect_same, report, suited, warn_if_impossible
+from mrctl.cli.shared import Incomplete, check_exists, check_world, expect_same, show, suited, warn_if_impossible
 from mrctl.record import InputError
 from mrctl.scenario import Scenario
 
@@ -61,10 +61,10 @@ def run_with(arguments: list[str]) -> Callable[..., None]:
 
         scenario = suited(scenario, arguments, scenario_file)
         warn_if_impossible(scenario)
-        text, failure = single.run(scenario, out, json, controller)
-        report(text, out, json)
-        if failure:
-            raise Incomplete(f"the run failed {failure}")
+        found = single.run(scenario, out, json, controller)
+        show(found, out, json)
+        if found.ended:
+            raise Incomplete(f"the run failed {found.ended}")
 
     return with_fields(run, default, explained(arguments))
 
@@ -82,9 +82,9 @@ def _repeat_saved(folder: Path, arguments: Sequence[str], out: Path | None, json
     announced_early()
     from mrctl.experiments import single
 
-    text, departs = single.repeat(folder, out, json, controller)
-    report(text, out, json)
-    expect_same(folder, departs, json)
+    found = single.repeat(folder, out, json, controller)
+    show(found, out, json)
+    expect_same(folder, found.ended, json)
 
 
 def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code: bool) -> None:
@@ -99,7 +99,7 @@ def _repeat(store: Path | None, number: int, out: Path | None, json: bool, code:
     jobs.stages_of(store, number, code)
     if out is not None or json:
         own = jobs.sweep_of(Store(store)).driven_by(number)
-        report(single.run(jobs.scenario_of(store, number), out, json, own)[0], out, json)
+        show(single.run(jobs.scenario_of(store, number), out, json, own), out, json)
     repeated = jobs.repeat(store, number)
     verdict = f"run {number}: {repeated.verdict}"
     if not repeated.same:

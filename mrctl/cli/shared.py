@@ -5,11 +5,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mrctl.cli.arguments import fields_set
 from mrctl.record import InputError, printable, reading
 from mrctl.scenario import FeedforwardName, Scenario
 from mrctl.theory.robot import CAR, RobotFile
+
+if TYPE_CHECKING:
+    from mrctl.experiments.tables import Report
 
 BEST: FeedforwardName = "model+composite"
 """Feedforward that is best, or level with the best, in more cases of the suite than any other (31 of 34).
@@ -66,9 +70,10 @@ def suited(scenario: Scenario, arguments: Sequence[str], scenario_file: str | No
     return suited(scenario)
 
 
-def report(text: str, out: Path | None, json: bool) -> None:
-    """Prints a report, and where its files are; JSON stays alone on stdout."""
-    print(text)
+def show(found: Report, out: Path | None, json: bool) -> None:
+    """Prints a report, writes its files, and prints where they are; JSON stays alone on stdout."""
+    print(found.text, flush=True)
+    found.save()
     if out is not None:
         print(f"The files are in {out}.", file=sys.stderr if json else sys.stdout)
 

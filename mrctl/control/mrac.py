@@ -270,7 +270,7 @@ class Mrac(Record):
     `noise`, `memory`, `spread`, `tracking` and `filter` is changed by a factor of 2 or 5.
     """
 
-    noise: Annotated[float, Field(ge=1e-6, le=10)] = 0.02
+    noise: Annotated[float, Field(ge=1e-4, le=10)] = 0.02
     """Noise density ρ of the prediction error in V √s; the smaller, the faster the prediction error is followed."""
     memory: Annotated[float, Field(ge=0.1, le=1e6)] = 20.0
     """Memory 1/λ of least squares in s."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from mrctl.experiments.tables import json_text, markdown, number, output_folder, write_json
+from mrctl.experiments.tables import Report, json_text, markdown, number, output_folder, write_json
 from mrctl.navigation.mission import Mission, Order, order_of
 from mrctl.results import plots
 from mrctl.results.dataset import departure, open_result, save, versions
@@ -26,7 +28,7 @@ FILES = ["result.zarr", "mission.json", *(file for draw in FIGURES for file in p
 """Names of the files that a mission is saved in."""
 
 
-def run(world: str, order: Order, out: Path | None, as_json: bool) -> tuple[str, str]:
+def run(world: str, order: Order, out: Path | None, as_json: bool) -> Report:
     """Drives a mission.
 
     Args:
@@ -36,7 +38,7 @@ def run(world: str, order: Order, out: Path | None, as_json: bool) -> tuple[str,
         as_json: Whether to return JSON instead of a table.
 
     Returns:
-        The report, with a row for each robot; and the outcome of the first robot.
+        The report, with a row for each robot; it `ended` with the outcome of the first robot.
 
     Raises:
         InputError: As `navigate`, or the folder cannot be written or holds a result already.
@@ -46,7 +48,7 @@ def run(world: str, order: Order, out: Path | None, as_json: bool) -> tuple[str,
     return _report(world, order, driven, out, as_json)
 
 
-def repeat(folder: Path, out: Path | None, as_json: bool) -> tuple[str, str, str]:
+def repeat(folder: Path, out: Path | None, as_json: bool) -> tuple[Report, str]:
     """Drives a saved mission again, and compares it with what was saved.
 
     Args:
@@ -64,12 +66,11 @@ def repeat(folder: Path, out: Path | None, as_json: bool) -> tuple[str, str, str
     with output_folder(out, FILES):
         order, saved = order_of(folder), open_result(folder / "result.zarr")
         driven = order.drive(progress=True)
-    text, outcome = _report(str(folder), order, driven, out, as_json)
-    return text, outcome, departure(driven.result, saved)
+    return _report(str(folder), order, driven, out, as_json), departure(driven.result, saved)
 
 
-def _report(world: str, order: Order, driven: Mission, out: Path | None, as_json: bool) -> tuple[str, str]:
-    """Returns what `run` returns, and saves the mission with all that it is a function of."""
+def _report(world: str, order: Order, driven: Mission, out: Path | None, as_json: bool) -> Report:
+    """Returns what `run` returns; what is saved holds all that the mission is a function of."""
     table = driven.table
     values = {
         "world": world,
@@ -80,17 +81,23 @@ def _report(world: str, order: Order, driven: Mission, out: Path | None, as_json
         "versions": versions(),
         "robots": table.reset_index().assign(planning_time=driven.planning_time).to_dict("records"),
     }
-    if out is not None:
-        save(driven.result, out / "result.zarr")
-        write_json(out / "mission.json", values)
-        for draw in FIGURES:
-            plots.save(draw(driven.result), out, draw.__name__)
-    outcome = str(table["outcome"].iloc[0])
+    outcome, write = str(table["outcome"].iloc[0]), partial(_save, driven, values, out)
     if as_json:
-        return json_text(values), outcome
+        return Report(json_text(values), outcome, write)
     rows = [
         [robot["label"], robot["outcome"], *(number(scale * robot[name]) for name, (_, scale) in COLUMNS.items())]
         for robot in values["robots"]
     ]
     title = f"plan of {driven.plan.length:.2f} m; number of poses that the search expanded: {driven.plan.expanded:,}"
-    return "\n".join([title, markdown(["robot", "outcome", *(title for title, _ in COLUMNS.values())], rows)]), outcome
+    text = "\n".join([title, markdown(["robot", "outcome", *(title for title, _ in COLUMNS.values())], rows)])
+    return Report(text, outcome, write)
+
+
+def _save(driven: Mission, values: dict[str, Any], out: Path | None) -> None:
+    """Writes the result, what it is a function of, and the figures to a folder, if there is one."""
+    if out is None:
+        return
+    save(driven.result, out / "result.zarr")
+    write_json(out / "mission.json", values)
+    for draw in FIGURES:
+        plots.save(draw(driven.result), out, draw.__name__)

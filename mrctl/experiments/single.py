@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from mrctl.control.stages import Stages
-from mrctl.experiments.tables import markdown, number, output_folder
+from mrctl.experiments.tables import Report, markdown, number, output_folder
 from mrctl.loop import user_files
 from mrctl.loop.goals import arrived
 from mrctl.loop.learned import save_learned
@@ -42,7 +43,7 @@ FIGURES = {  # file: function of `results.plots`
 }
 
 
-def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = None) -> tuple[str, str]:
+def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = None) -> Report:
     """Runs a scenario.
 
     Args:
@@ -53,7 +54,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
 
     Returns:
         The report, with a row of metrics for each lap that was driven to its end, and what a stage of the user answered
-        that is not finite; and when and why the run failed, or "".
+        that is not finite; it `ended` with when and why the run failed, or "".
 
     Raises:
         InputError: The scenario or a stage is invalid, or the folder cannot be written or holds a result already.
@@ -63,7 +64,7 @@ def run(scenario: Scenario, out: Path | None, as_json: bool, own: str | None = N
     return _report(scenario, result, out, as_json, own)
 
 
-def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None) -> tuple[str, str]:
+def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None) -> Report:
     """Runs a saved run again, and compares it with what was saved.
 
     Args:
@@ -73,7 +74,7 @@ def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None
         own: The stages of the user that drove it; a result holds only their names.
 
     Returns:
-        The report of `run`; and in which signal the run departs from the saved one, or "".
+        The report of `run`; it `ended` with the signal in which the run departs from the saved one, or "".
 
     Raises:
         InputError: There is no result of one run, other stages drove it, or `run` refuses something.
@@ -90,8 +91,7 @@ def repeat(folder: Path, out: Path | None, as_json: bool, own: str | None = None
             with_them = f"--controller with {names}" if names else "no --controller"
             raise InputError(f"controller: the run in {folder} needs {with_them}, as when it was saved")
         result = _driven(scenarios[0], own)
-    text, _ = _report(scenarios[0], result, out, as_json, own)
-    return text, departure(result, saved)
+    return _report(scenarios[0], result, out, as_json, own)._replace(ended=departure(result, saved))
 
 
 def _driven(scenario: Scenario, own: str | None) -> xr.Dataset:
@@ -99,17 +99,13 @@ def _driven(scenario: Scenario, own: str | None) -> xr.Dataset:
     return simulate([scenario], progress=True, **stages)
 
 
-def _report(
-    scenario: Scenario, result: xr.Dataset, out: Path | None, as_json: bool, own: str | None
-) -> tuple[str, str]:
-    """Returns what `run` returns, and saves the result."""
+def _report(scenario: Scenario, result: xr.Dataset, out: Path | None, as_json: bool, own: str | None) -> Report:
+    """Returns what `run` returns."""
     laps, run = metrics.per_lap(result), result.isel(run=0)
-    if out is not None:
-        _save(result, laps, out)
     reason = str(run["failure"].values)
     failure = f"after {float(run['failure_time']):.2f} s: {reason}" if reason else ""
     describe = _as_json if as_json else _as_text
-    return describe(scenario, run, laps.isel(run=0), own, failure), failure
+    return Report(describe(scenario, run, laps.isel(run=0), own, failure), failure, partial(_save, result, laps, out))
 
 
 def _as_json(scenario: Scenario, run: xr.Dataset, laps: xr.Dataset, own: str | None, failure: str) -> str:
@@ -198,8 +194,10 @@ def _written() -> list[str]:
     return ["result.zarr", "learned.safetensors", *(file for name in FIGURES for file in plots.files(name))]
 
 
-def _save(result: xr.Dataset, laps: xr.Dataset, out: Path) -> None:
-    """Writes the result, what was learned and the figures to a folder."""
+def _save(result: xr.Dataset, laps: xr.Dataset, out: Path | None) -> None:
+    """Writes the result, what was learned and the figures to a folder, if there is one."""
+    if out is None:
+        return
     save(result, out / "result.zarr")
     if "weights" in result and not result["failed"].any() and np.isfinite(result["weights"]).all():
         save_learned(out / "learned.safetensors", result)

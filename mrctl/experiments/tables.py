@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,6 +50,17 @@ class Table(NamedTuple):
         """Title, statement, how to read the columns, and table."""
         cells = markdown(list(self.cells), self.cells.to_numpy().tolist())
         return "\n\n".join(filter(None, (f"## {self.title}", self.says, self.reads, cells))) + "\n"
+
+
+class Report(NamedTuple):
+    """What a command prints and what it saves after that, so that a full disk costs no result."""
+
+    text: str
+    """What was found, as text or JSON."""
+    ended: str
+    """How the run ended, or whether it departs from a saved one."""
+    save: Callable[[], None]
+    """Writes the files; does nothing where the command writes none."""
 
 
 def frame(rows: Sequence[Sequence[str]], header: Sequence[str]) -> pd.DataFrame:

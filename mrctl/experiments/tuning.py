@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,10 +18,10 @@ from mrctl.control.kanayama import Kanayama
 from mrctl.control.margins import Gains, learning_ratio, margins, sampled_loop
 from mrctl.control.pid import Pid
 from mrctl.experiments.response import Response, measure, refine, safety
-from mrctl.experiments.tables import json_text, machine, markdown, number, output_folder, write_json
+from mrctl.experiments.tables import Report, json_text, machine, markdown, number, output_folder, write_json
 from mrctl.kernel import Array
 from mrctl.physics import mjcf
-from mrctl.record import InputError
+from mrctl.record import InputError, is_whole
 from mrctl.results import plots
 from mrctl.results.dataset import versions
 from mrctl.scenario import Scenario
@@ -78,8 +79,8 @@ def tune(
     lag: float,
     out: Path | None,
     json: bool,
-) -> str:
-    """Runs the command: designs and measures; writes `table.json` and the figure `sensitivity` to `out` if given.
+) -> Report:
+    """Runs the command: designs and measures; saves `table.json` and the figure `sensitivity` to `out` if given.
 
     Without a time constant the gains are designed; with one they follow the IMC rule.
 
@@ -88,10 +89,14 @@ def tune(
     """
     with output_folder(out, ["table.json", *plots.files("sensitivity")]):
         table = design(world, Pid.from_dict({"time_constant": time_constant, "lag": lag}), delays, robot)
+    return Report(json_text(table) if json else text(table), "", partial(_save, table, out))
+
+
+def _save(table: dict[str, Any], out: Path | None) -> None:
+    """Writes the table and the figure to a folder, if there is one."""
     if out is not None:
         write_json(out / "table.json", table)
         plots.save(figure(table), out, "sensitivity")
-    return json_text(table) if json else text(table)
 
 
 def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR) -> dict[str, Any]:
@@ -118,7 +123,7 @@ def design(world: str, pid: Pid, delays: Sequence[float], robot: RobotFile = CAR
     if not delays:
         raise InputError("delay: at least one delay is needed")
     period = Scenario().control_period
-    if odd := [d for d in delays if not (np.isfinite(d) and np.isclose(d / period, round(d / period)))]:
+    if odd := [d for d in delays if not (np.isfinite(d) and is_whole(d / period))]:
         raise InputError(f"delay: {odd[0]:g} s is not a whole multiple of the control period ({period:g} s)")
     table: dict[str, Any] = {"versions": versions(), "machine": machine(), "robot": robot.model_dump()}
     table |= {"time_constant": pid.time_constant, "lag": pid.lag}

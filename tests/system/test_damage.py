@@ -328,3 +328,21 @@ def test_a_fault_is_told_wherever_the_run_is_shown(tmp_path: Path, capsys: pytes
     assert found["feedforward_fault"].values.tolist() == [""] * 4 and not found["failed"].any()
     assert cli.main(["export", str(tmp_path / "out"), "--to", "npz", "--out", str(tmp_path / "x.npz")]) == 0
     assert np.load(tmp_path / "x.npz")["estimator_fault"].tolist() == [told]
+
+
+@pytest.mark.parametrize(
+    ("command", "shown"),
+    [
+        (["run", "--laps", "1", "--learner", "none", "reference:circle"], "| lap | "),
+        (["navigate", "doorway:3", "--learner", "none"], "| arrived | "),
+    ],
+)
+def test_full_disk_costs_no_table(
+    command: list[str], shown: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """What was driven is printed before its files are written, which may fail."""
+    with mock.patch("mrctl.results.plots.save", side_effect=OSError(28, "No space left on device")):
+        assert cli.main([command[0], "--out", str(tmp_path / "out"), *command[1:]]) == 2
+    told = capsys.readouterr()
+    assert shown in told.out
+    assert told.err.splitlines()[-1] == "mrctl: No space left on device"

@@ -21,6 +21,7 @@ from mrctl import (
     per_lap,
     simulate,
 )
+from mrctl.control.mrac import Mrac
 from mrctl.experiments import single
 from mrctl.experiments.paper import IDEAL
 from mrctl.loop.simulation import Simulation
@@ -220,7 +221,7 @@ def test_nothing_is_taken_where_there_is_no_integral(stages):
 def test_told():
     """A run says how often and why."""
     fast = of(LATE, "fel", Guard(), steering="rigid", laps=1, **FAST)
-    text, _ = single.run(fast, None, False)
+    text, *_ = single.run(fast, None, False)
     assert "guard acted" in text and re.search(r"guard at \d\.\d\d s: fallback, velocity far from the command", text)
     listed = json.loads(single.run(fast, None, True)[0])
     assert {"time", "action", "reason"} == set(listed["guard"][0])
@@ -229,7 +230,8 @@ def test_told():
 
 def test_learner_that_is_not_finite():
     """Where a learner adds NaN, the guard falls back to the model before the integral of the PID takes it over."""
-    broken = Scenario(learner="mrac", mrac={"noise": 1e-8}, laps=1, reference=Circle(radius=1, period=8))
+    silent = Mrac().model_copy(update={"noise": 1e-8})  # below the bound of the field, so that its law overflows
+    broken = Scenario(learner="mrac", laps=1, reference=Circle(radius=1, period=8)).model_copy(update={"mrac": silent})
     run = simulate(broken)
     assert not run.failed and guard_events(run)["reason"].iloc[0] == "output not finite"
     assert np.isfinite(run.voltage_left).all()

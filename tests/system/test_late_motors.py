@@ -65,7 +65,7 @@ def test_a_delay_that_comes():
     scenario = late(perturbation=Perturbation(), events=(event,))
     moves = simulate([scenario])["retunes"].values[0]
     assert (moves[:1200] == 0).all() and moves[-1] > 1
-    text, _ = single.run(scenario, None, False)
+    text, *_ = single.run(scenario, None, False)
     first, second = (0.01 * np.flatnonzero(moves >= count)[0] for count in (1, 2))
     assert f"oscillation at {first:.2f} s: slower motion controller from now on" in text
     assert f"oscillation at {second:.2f} s: slower PID from now on" in text

@@ -149,7 +149,7 @@ def test_ends() -> None:
         own,
         own.replace(seed=1, perturbation="all"),
         own.replace(goal=(1.0, 0.0, 0.0)),  # where it does not rest
-        own.replace(perturbation={"supply_factor": 0.02}),
+        own.replace(perturbation={"supply_factor": 0.05, "drive_friction_factor": 20}),
         own.replace(goal=None),
     ]
     together = mrctl.simulate(cases)
