@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from mrctl.kernel import Array, Rows
 from mrctl.record import InputError
@@ -60,8 +61,24 @@ class Courses:
         Returns:
             Two times a record of `GOAL` of each robot, `(B,)`.
         """
-        if tick == self._tick:
-            return self._now
+        if tick != self._tick:
+            self._tick, self._now = tick, self._sampled(tick)
+        return self._now
+
+    def extended(self, scenarios: Sequence[Scenario]) -> Courses:
+        """Returns the references of the same group with further events."""
+        return Courses(scenarios, self._preview)
+
+    def restart(self, row: int, tick: int) -> None:
+        """Begins the course of one robot again at a control tick.
+
+        Raises:
+            ValueError: These courses were not made for that.
+        """
+        raise ValueError("restart: the simulation was not made with `restarting`")
+
+    def _sampled(self, tick: int) -> tuple[Rows, Rows]:
+        """Returns what `at` returns."""
         if tick not in self._block:  # only one block of samples is held, (ticks of a block, courses)
             first = tick // BLOCK * BLOCK
             self._block = range(first, min(first + BLOCK, self._ticks))
@@ -73,35 +90,34 @@ class Courses:
         if self._preview:
             later = self._samples[row + self._preview]
             later = later if self._own else later.take(self._place)
-        self._tick, self._now = tick, (now, later)
-        return self._now
+        return now, later
 
 
-class RestartingCourses:
+class RestartingCourses(Courses):
     """The references of robots that begin again, so that their clocks start at different ticks."""
 
     def __init__(self, scenarios: Sequence[Scenario], preview: int) -> None:
         """Samples every course once, to the end of the longest run and `preview` ticks beyond; see `Courses`."""
-        ticks = max(s.ticks for s in scenarios)
-        self._last, self._preview = ticks + preview, preview
-        distinct, self._place = distinct_courses(scenarios)
-        whole, end = range(ticks), range(ticks, self._last + 1)
-        self._table = np.stack([np.append(course(s, whole), course(s, end)) for s in distinct], axis=1)
+        super().__init__(scenarios, preview)
+        self._last = self._ticks + preview
+        whole, end = range(self._ticks), range(self._ticks, self._last + 1)
+        self._table = np.stack([np.append(course(s, whole), course(s, end)) for s in self._courses], axis=1)
         self._start = np.zeros(len(scenarios), int)
-        self._tick, self._now = -1, (self._table[0], self._table[0])  # what `at` returned last
 
+    @override
+    def extended(self, scenarios: Sequence[Scenario]) -> Courses:
+        raise ValueError("add: robots that begin again keep their references")
+
+    @override
     def restart(self, row: int, tick: int) -> None:
-        """Begins the course of one robot again at a control tick."""
         self._start[row], self._tick = tick, -1
 
-    def at(self, tick: int) -> tuple[Rows, Rows]:
-        """Returns what `Courses.at` returns, and beyond the end of a course its last sample."""
-        if tick != self._tick:
-            since, place = tick - self._start, self._place
-            now = self._table[np.minimum(since, self._last), place]
-            later = self._table[np.minimum(since + self._preview, self._last), place] if self._preview else now
-            self._tick, self._now = tick, (now, later)
-        return self._now
+    @override
+    def _sampled(self, tick: int) -> tuple[Rows, Rows]:
+        """Returns what `at` returns; beyond the end of a course its last sample."""
+        since, place = tick - self._start, self._place
+        now = self._table[np.minimum(since, self._last), place]
+        return now, self._table[np.minimum(since + self._preview, self._last), place] if self._preview else now
 
 
 def start_pose(scenario: Scenario, reference: Array) -> Array:

@@ -29,6 +29,12 @@ ENDING = np.dtype(
 
 
 @kernel
+def stands_at(x: float, y: float, turn: float, v: float) -> bool:
+    """Tells whether a robot that is x and y in m and a turn in rad from its goal, with V in m/s, has arrived there."""
+    return np.hypot(x, y) < NEAR and abs(np.arctan2(np.sin(turn), np.cos(turn))) < TURNED and abs(v) < RESTING
+
+
+@kernel
 def end(tick: int, patience: int, now: Rows, endings: Rows) -> bool:
     """Judges which runs end at a control tick; returns whether any does.
 
@@ -43,12 +49,7 @@ def end(tick: int, patience: int, now: Rows, endings: Rows) -> bool:
         t, s = now[i], endings[i]
         if np.hypot(t.x - s.place[0], t.y - s.place[1]) > HEADWAY:
             s.place[0], s.place[1], s.since = t.x, t.y, tick
-        turn = t.theta - s.goal[2]
-        s.there = (
-            np.hypot(t.x - s.goal[0], t.y - s.goal[1]) < NEAR
-            and abs(np.arctan2(np.sin(turn), np.cos(turn))) < TURNED
-            and abs(t.v) < RESTING
-        )
+        s.there = stands_at(t.x - s.goal[0], t.y - s.goal[1], t.theta - s.goal[2], t.v)
         s.over = s.there or tick + 1 - s.start >= s.ticks
         s.stuck = np.isfinite(t.x + s.goal[0]) and tick - s.since >= patience
         found |= s.over or s.stuck
@@ -56,16 +57,25 @@ def end(tick: int, patience: int, now: Rows, endings: Rows) -> bool:
 
 
 def arrived(pose: Array, v: ArrayLike, goal: Array) -> NDArray[np.bool]:
-    """Tells which robots stand at their goals: within 0.1 m and 0.2 rad, and slower than 0.05 m/s.
+    """Tells which robots stand at their goals, within `NEAR`, `TURNED` and `RESTING`.
 
     Args:
         pose: x and y in m and θ in rad, `(…, 3)`.
         v: Linear velocities in m/s, `(…)`.
         goal: Goals in m, m, rad, `(…, 3)`; NaN for none.
     """
-    away = pose - goal
-    turned = np.abs(np.angle(np.exp(1j * away[..., 2])))
-    return (np.hypot(away[..., 0], away[..., 1]) < NEAR) & (turned < TURNED) & (np.abs(v) < RESTING)
+    away = np.asarray(pose - goal, float)
+    found = np.empty(away.shape[:-1], bool)
+    speeds = np.array(np.broadcast_to(v, found.shape), float)
+    judge.compiled(away.reshape(-1, 3), speeds.reshape(-1), found.reshape(-1))
+    return found
+
+
+@kernel
+def judge(away: Array, speeds: Array, found: NDArray[np.bool]) -> None:
+    """Writes what `arrived` returns into `found`, `(n,)`, for pose less goal, `(n, 3)`, and speeds in m/s, `(n,)`."""
+    for i in range(len(away)):
+        found[i] = stands_at(away[i, 0], away[i, 1], away[i, 2], speeds[i])
 
 
 class Goals:

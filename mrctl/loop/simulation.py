@@ -375,8 +375,6 @@ class Simulation:
             InputError: The event is in the past, or a scenario with it is refused; then nothing is added.
             ValueError: It has a reference, and the simulation was made with `restarting`.
         """
-        if event.reference is not None and isinstance(self.courses, RestartingCourses):
-            raise ValueError("add: robots that begin again keep their references")
         if event.tick(self.period) < self.tick:
             raise InputError(f"time: {event.time:g} s has passed, it is {self.tick * self.period:g} s")
         if event.reference is not None and event.tick(self.period) < self.tick + self.preview:
@@ -386,10 +384,11 @@ class Simulation:
             self.plant.check(event.perturbation)
         if event.reference is not None:
             check(event.reference, self.plant.robot, self._reverses)
-        self.scenarios = [scenario.with_event(event) for scenario in self.scenarios]
-        self.events.add(event)
+        scenarios = [scenario.with_event(event) for scenario in self.scenarios]
         if event.reference is not None:
-            self.courses = Courses(self.scenarios, self.preview)
+            self.courses = self.courses.extended(scenarios)
+        self.scenarios = scenarios
+        self.events.add(event)
 
     def step(self) -> None:
         """Computes one control period, as in figure 3; an error of a user's stage fails all robots, which share it."""
@@ -455,13 +454,11 @@ class Simulation:
             InputError: The robot could not stand.
             ValueError: The simulation was not made with `restarting`.
         """
-        if not isinstance(self.courses, RestartingCourses):
-            raise ValueError("restart: the simulation was not made with `restarting`")
         plant, tick = self.plant, self.tick
         if scenario.perturbation != self.scenarios[row].perturbation:
             self.events.perturb(row, scenario.perturbation)
-        self.scenarios[row], self._sensed = scenario, False
         self.courses.restart(row, tick)
+        self.scenarios[row], self._sensed = scenario, False
         self.hierarchy.renew(row, scenario)
         self.events.restart(row, scenario, tick)
         goal, _ = self.courses.at(tick)

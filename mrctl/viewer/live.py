@@ -18,6 +18,7 @@ from viser._messages import HotkeyKey
 
 from mrctl.kernel import Array, Rows
 from mrctl.loop.simulation import arranged, suited
+from mrctl.loop.timeline import CHANGEABLE, begun, ends, followed, state
 from mrctl.navigation.planning import Avoid
 from mrctl.physics.files import SHIPPED
 from mrctl.record import InputError
@@ -41,7 +42,7 @@ from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import Metrics
 from mrctl.viewer.sensors import FIX_AGE
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import CHANGEABLE, HOUR, Session, begun, changed, ends, followed, pushed, state
+from mrctl.viewer.session import HOUR, Session, changed, pushed
 from mrctl.viewer.stories import STORIES
 
 WINDOW = 12.0  # s, time span of the plots

@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 
 from mrctl.kernel import Array, Rows
+from mrctl.loop.timeline import state
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.physics.stand import front_rates, stand, steer
@@ -30,7 +31,6 @@ from mrctl.theory.obstacles import turned
 from mrctl.theory.perturbation import Perturbation
 from mrctl.viewer.deviation import drawn
 from mrctl.viewer.looks import Look, looks
-from mrctl.viewer.session import state
 
 MAX_SHOWN = 4  # largest number of runs in a result that are all shown at the beginning
 ABOVE = 0.01  # m, height of a path above the ground

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from typing_extensions import override
 
+from mrctl.loop.timeline import ends
 from mrctl.physics.parameters import read_robot
 from mrctl.results.metrics import METRICS
 from mrctl.viewer.looks import MAX_MARKED
@@ -19,7 +20,6 @@ from mrctl.viewer.scene import Scene
 from mrctl.viewer.score import Metrics
 from mrctl.viewer.sensors import FIX_AGE, error
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import ends
 
 SAMPLES = 800  # about the largest number of samples in a curve
 

@@ -14,6 +14,7 @@ import viser
 from mjviser.conversions import merge_geoms
 
 from mrctl.kernel import Array, Rows
+from mrctl.loop.timeline import ends
 from mrctl.physics import mjcf
 from mrctl.physics.obstacles import quaternion
 from mrctl.physics.parameters import read_robot
@@ -32,7 +33,7 @@ from mrctl.viewer.recording import ABOVE, Recording, event_times, joint_log, pat
 from mrctl.viewer.robots import SEEN, Dragged, Robots, in_order
 from mrctl.viewer.sensors import Marks
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import ends, pushed
+from mrctl.viewer.session import pushed
 from mrctl.viewer.shapes import add_mesh, bar, disc, ribbons
 
 # Colours of the floor: its thin lines, its thick lines, its surface.

@@ -10,12 +10,12 @@ import numpy as np
 from mrctl.control.features import NAMES, feature_scale
 from mrctl.kernel import Array, Rows
 from mrctl.loop.goals import arrived
+from mrctl.loop.timeline import begun, ends, followed
 from mrctl.results.excitation import alone
 from mrctl.results.metrics import excitation, lap_metrics
 from mrctl.scenario import Scenario
 from mrctl.theory.robot import Robot
 from mrctl.viewer.looks import Look
-from mrctl.viewer.session import begun, ends, followed
 
 OF_LAPS = (
     "error now, mm", "RMS of last lap, mm", "best lap, mm", "feedback in last lap, %", "energy of last lap, J",

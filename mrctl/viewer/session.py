@@ -14,6 +14,7 @@ from mrctl.control.margins import Gains
 from mrctl.control.stages import Motion, Stages
 from mrctl.kernel import Array, Rows
 from mrctl.loop.simulation import Simulation, arranged, run, uniform
+from mrctl.loop.timeline import followed, state
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
 from mrctl.navigation.plan import Plan
@@ -27,15 +28,13 @@ from mrctl.scenario import Event, Scenario
 from mrctl.sensing.prediction import advance
 from mrctl.theory.clearance import clearance, clearances
 from mrctl.theory.obstacles import Pose, Surroundings, turned
-from mrctl.theory.references import Reference, Waypoints, check
+from mrctl.theory.references import Waypoints, check
 from mrctl.theory.robot import Robot
 from mrctl.theory.timing import RESERVE, Limits
 
 HOUR = 3600.0  # s of simulated time after which a session ends
 SEEN_PUSH = 0.5  # s, for which a push is drawn, at least
 SHARED_FIELDS = ("world", "obstacles", "map", "robot", "steering", "control_period", "physics_step")
-# Fields of a scenario that can change in the middle of a run; a change of another field needs a new run.
-CHANGEABLE = [name for name in ("perturbation", "kanayama", "pid") if name in Event.model_fields]
 
 AnyRecord = TypeVar("AnyRecord", bound=Record)
 
@@ -396,50 +395,12 @@ class Session:
         return sim.plant.failure[k]
 
 
-def state(scenario: Scenario, time: float) -> dict[str, Any]:
-    """Returns the values of the fields `CHANGEABLE`, and of `learning`, at a time in s of a run."""
-    now: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE} | {"learning": True}
-    for event in sorted(scenario.events, key=lambda e: e.time):
-        if event.time <= time + 1e-9:
-            now |= {name: value for name in now if (value := getattr(event, name)) is not None}
-    return now
-
-
 def pushed(scenario: Scenario, time: float) -> Array | None:
     """Returns the force of a push along the world's x and y in N, `(2,)`, that acts or is half a second old at most."""
     for event in scenario.events:
         if event.push is not None and 0 < time - event.time + 1e-9 < max(event.push_duration, SEEN_PUSH):
             return np.array(event.push[:2])
     return None
-
-
-def followed(scenario: Scenario, time: float) -> Reference:
-    """Returns the reference that a run follows at a time in s."""
-    brought = [e.reference for e in sorted(scenario.events, key=lambda e: e.time) if e.time <= time + 1e-9]
-    return next((reference for reference in reversed(brought) if reference), scenario.reference)
-
-
-def begun(scenario: Scenario, time: float) -> float:
-    """Returns since when a run has followed the reference that it follows at a time in s."""
-    return max((e.time for e in scenario.events if e.reference and e.time <= time + 1e-9), default=0.0)
-
-
-def ends(scenario: Scenario, time: float) -> Array | None:
-    """Returns where the robot of a run comes from and goes to at a time in s; None on a course without end.
-
-    These are the ends of the open reference that it follows then; a goal of the scenario is in place of the end of its
-    own reference.
-
-    Returns:
-        Two poses, x and y in m and θ in rad, `(2, 3)`.
-    """
-    plan = followed(scenario, time)
-    found = plan.sample(np.array([0.0, plan.period])).pose
-    if plan is scenario.reference and scenario.goal is not None:
-        found[1] = scenario.goal
-    elif not isinstance(plan, Waypoints) or plan.closed:
-        return None
-    return found
 
 
 def changed(record: AnyRecord, path: Sequence[str], value: object) -> AnyRecord:

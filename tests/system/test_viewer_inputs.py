@@ -11,6 +11,7 @@ import viser
 
 from mrctl import Event, Kanayama, Perturbation, Pid, Scenario, per_lap, simulate
 from mrctl.loop.simulation import arranged
+from mrctl.loop.timeline import CHANGEABLE
 from mrctl.physics import mjcf
 from mrctl.physics.parameters import read_robot
 from mrctl.sensing.tiers import Sensing
@@ -20,7 +21,6 @@ from mrctl.viewer import live as module
 from mrctl.viewer.controls import ANEW, ANEW_HINT
 from mrctl.viewer.live import Live
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import CHANGEABLE
 from mrctl.viewer.stories import STORIES
 
 

@@ -14,6 +14,7 @@ from test_viewer import CHROMIUM, DRAG_ERROR, PATIENCE, ROBOT, SOFTWARE, node, s
 from mrctl import Box, Circle, Disc, Event, InputError, Line, Obstacles, Scenario, save, simulate
 from mrctl.cli import main
 from mrctl.loop.goals import arrived
+from mrctl.loop.timeline import ends
 from mrctl.navigation.avoiders import avoiding
 from mrctl.navigation.generators import Task
 from mrctl.navigation.mission import navigate
@@ -33,7 +34,7 @@ from mrctl.viewer.page import arrivals
 from mrctl.viewer.recording import Library, looks_of
 from mrctl.viewer.replay import Replay
 from mrctl.viewer.server import Server
-from mrctl.viewer.session import Session, ends
+from mrctl.viewer.session import Session
 
 TURNING = Box(x=0.1, y=3.0, length=0.3, width=0.2, course=Circle(radius=0.5, period=6.0))
 PASSING = Disc(y=-2.0, radius=0.2, course=Line(speed=0.5, length=4.0))

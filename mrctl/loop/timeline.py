@@ -1,0 +1,52 @@
+"""What holds in a run at a moment, by its scenario and the events before."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mrctl.kernel import Array
+from mrctl.scenario import Event, Scenario
+from mrctl.theory.references import Reference, Waypoints
+
+# Fields of a scenario that can change in the middle of a run; a change of another field needs a new run.
+CHANGEABLE = [name for name in ("perturbation", "kanayama", "pid") if name in Event.model_fields]
+
+
+def state(scenario: Scenario, time: float) -> dict[str, Any]:
+    """Returns the values of the fields `CHANGEABLE`, and of `learning`, at a time in s of a run."""
+    now: dict[str, Any] = {name: getattr(scenario, name) for name in CHANGEABLE} | {"learning": True}
+    for event in sorted(scenario.events, key=lambda e: e.time):
+        if event.time <= time + 1e-9:
+            now |= {name: value for name in now if (value := getattr(event, name)) is not None}
+    return now
+
+
+def followed(scenario: Scenario, time: float) -> Reference:
+    """Returns the reference that a run follows at a time in s."""
+    brought = [e.reference for e in sorted(scenario.events, key=lambda e: e.time) if e.time <= time + 1e-9]
+    return next((reference for reference in reversed(brought) if reference), scenario.reference)
+
+
+def begun(scenario: Scenario, time: float) -> float:
+    """Returns since when a run has followed the reference that it follows at a time in s."""
+    return max((e.time for e in scenario.events if e.reference and e.time <= time + 1e-9), default=0.0)
+
+
+def ends(scenario: Scenario, time: float) -> Array | None:
+    """Returns where the robot of a run comes from and goes to at a time in s; None on a course without end.
+
+    These are the ends of the open reference that it follows then; a goal of the scenario is in place of the end of its
+    own reference.
+
+    Returns:
+        Two poses, x and y in m and θ in rad, `(2, 3)`.
+    """
+    plan = followed(scenario, time)
+    found = plan.sample(np.array([0.0, plan.period])).pose
+    if plan is scenario.reference and scenario.goal is not None:
+        found[1] = scenario.goal
+    elif not isinstance(plan, Waypoints) or plan.closed:
+        return None
+    return found
