@@ -166,7 +166,7 @@ def velocities(
     window: tuple[float, float] | None = None,
     lap: int | None = None,
 ) -> Figure:
-    """Draws linear and rotation velocity, or one of them, over time with the original reference (paper's figure 4)."""
+    """Draws linear and yaw rate, or one of them, over time with the original reference (paper's figure 4)."""
     figure, axes = _figure(COLUMN, (0.1 + 0.4 * len(signals)) * COLUMN, rows=len(signals))
     curves = _curves(result, window, lap)
     texts = {"v": r"$V_{AV}$ (m/s)", "omega": r"$\dot\theta$ (rad/s)"}
@@ -415,7 +415,7 @@ class InverseMap(NamedTuple):
     v: np.ndarray
     """Speeds in m/s (n,)."""
     omega: np.ndarray
-    """Rotation velocities in rad/s (m,)."""
+    """Yaw rates in rad/s (m,)."""
     learned: np.ndarray
     """U_Σ and U_Δ in V (m, n, 2)."""
     true: np.ndarray
