@@ -22,7 +22,8 @@ OF_LAPS = (
     "excitation in last lap",
 )  # fmt: skip
 OF_WAY = (
-    "error now, mm", "RMS on the way, mm", "feedback on the way, %", "energy on the way, J", "excitation on the way",
+    "off the timed plan now, mm", "RMS of that on the way, mm", "feedback on the way, %", "energy on the way, J",
+    "excitation on the way",
 )  # fmt: skip
 FRESH, SHARE = 1.0, 0.02  # s, and a share of a way, by which a robot drives on until its metrics are computed again
 

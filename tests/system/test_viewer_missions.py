@@ -136,7 +136,7 @@ def numbers(page):
     return found
 
 
-ON_THE_WAY = ["error now, mm", *(f"{what} on the way, {unit}" for what, unit in (("RMS", "mm"), ("feedback", "%")))]
+ON_THE_WAY = ["off the timed plan now, mm", "RMS of that on the way, mm", "feedback on the way, %"]
 ON_THE_WAY += ["energy on the way, J", "excitation on the way"]
 
 
