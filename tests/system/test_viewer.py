@@ -373,11 +373,15 @@ def test_inputs(browser, tmp_path):
         camera = until(lambda: page.evaluate(CAMERA), "the camera")
         live.ask(live._note_input, ("reference", "radius"), 1.4)
         until(lambda: page.evaluate(CAMERA)[2] > 1.3 * camera[2], "a view of the larger reference")
-        for _ in range(2):  # each takes it down by 36°
+
+        def lowered():
             page.mouse.move(640, 400)
             page.mouse.down()
-            page.mouse.move(640, 60, steps=4)
+            page.mouse.move(640, 60, steps=4)  # takes it down by 36°
             page.mouse.up()
+            return page.evaluate(CAMERA)[2] < 0.1
+
+        until(lowered, "the camera to come down")
         until(lambda: 0.03 < page.evaluate(CAMERA)[2] < 0.1, "the camera to stop above the floor")
         live.ask(live._compare, "rls", False)  # while the page is busy: it gets all of this at once
         live.ask(live._note_input, ("reference",), "rounded_square")
