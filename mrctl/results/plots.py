@@ -455,7 +455,8 @@ def inverse_dynamics(maps: Mapping[str, InverseMap]) -> Figure:
                     panel.set_title(f"$U_{symbol}$ {what} (V)", fontsize=8)
                 if row == len(maps) - 1:
                     panel.set_xlabel("$V$ (m/s)")
-                    figure.colorbar(image, ax=axes[3 * channel + column :: 6], orientation="horizontal", aspect=12)
+                    below = {"orientation": "horizontal", "aspect": 12, "pad": 0.05 / len(maps)}
+                    figure.colorbar(image, ax=axes[3 * channel + column :: 6], **below)
                 if column == channel == 0:
                     panel.set_ylabel(f"{name}\n$\\dot\\theta$ (rad/s)")
     return figure
